@@ -12,7 +12,6 @@ from typing import Any
 
 from edge_server.fields import Field
 from edge_server.fields.common import trainer_settings
-from edge_server.fields.option_types import checked
 
 _PACKAGES: dict[str, str] = {
     "ngp": "edge_server.fields.ngp",
@@ -52,13 +51,10 @@ def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 
 
 
 def settings_of(name: str, options: Mapping[str, Any] | None = None, seed: int = 0) -> Any:
-    """The settings dataclass that these options result in, with defaults and effort. ValueError as
+    """The settings that these options result in, with defaults and effort. ValueError as
     ``make_field``."""
     module = _module(name, "settings")
-    given = checked(name, module.SETTINGS, options or {})
-    if not isinstance(given.get("effort", ""), str):
-        raise ValueError(f"{name}: effort must be a name, not {given['effort']!r}")
-    return trainer_settings.settings_from(module.SETTINGS, module.EFFORTS, given, seed)
+    return trainer_settings.settings_from(module.SETTINGS, module.EFFORTS, options or {}, seed)
 
 
 def _module(name: str, module: str) -> Any:

@@ -38,7 +38,7 @@ def information(
     for first in range(0, len(poses), _CAMERAS_A_RUN):
         some = slice(first, first + _CAMERAS_A_RUN)
         cams = camera_rows(poses[some], lenses[some], snapshot.box)
-        raster.project_and_bin(cams, gaussians, [None] * len(cams))
+        raster.project_and_bin(cams, gaussians)
         found = np.empty((len(cams), *gaussians.params.shape), np.float32)
         snapshot.pool.run(
             fisher_information,

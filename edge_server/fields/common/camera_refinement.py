@@ -1,7 +1,7 @@
-"""Camera refinement while a field trains: each camera's exposure, and small corrections of its pose.
+"""Camera refinement while a field trains: each camera's exposure or appearance, and small corrections of its pose.
 
-Both are off by default, cost nothing then, and serve every representation of ``trained_field``. Pictures are
-rendered at the mean exposure and at the given pose.
+All are off by default, cost nothing then, and serve every representation of ``trained_field``. Pictures are
+rendered at the mean exposure and appearance and at the given pose.
 """
 
 from __future__ import annotations
@@ -14,9 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common.appearance import AppearanceEmbeddings
 from edge_server.fields.common.kernels.rays import Views
+from edge_server.fields.common.kernels.train import Batch
 from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.trainer_settings import TrainerSettings
 from freshfield.geometry import so3_exp
 
 Array = NDArray[np.float64]
@@ -172,24 +175,32 @@ class PoseCorrections:
 
 
 class CameraRefinement:
-    """Exposures and pose corrections of one field's cameras, each None unless enabled.
+    """Exposures, appearances and pose corrections of one field's cameras, each None unless enabled.
 
-    exposure: whether exposures are learned. most_m, most_deg: as in ``PoseCorrections``; both 0: no poses.
+    embeddings: float32 (V, A), appearances of the views in training; A = 0: none.
     """
 
-    def __init__(self, exposure: bool, most_m: float, most_deg: float) -> None:
-        self.exposures = Exposures() if exposure else None
-        self.poses = PoseCorrections(most_m, most_deg) if most_m > 0 or most_deg > 0 else None
+    def __init__(self, settings: TrainerSettings) -> None:
+        s = settings
+        self.seed = s.seed
+        self.exposures = Exposures() if s.exposure else None
+        self.appearances = AppearanceEmbeddings(s.appearance, s.seed) if s.appearance else None
+        self.poses = PoseCorrections(s.refine_m, s.refine_deg) if s.refine_m > 0 or s.refine_deg > 0 else None
+        self.embeddings = np.zeros((0, 0), np.float32)
 
     @property
     def enabled(self) -> bool:
         """Whether anything is to be learned."""
-        return self.exposures is not None or self.poses is not None
+        return not (self.exposures is self.appearances is self.poses is None)
 
     def corrected(self, views: Sequence[View], data: Views, box: SceneBox) -> Views:
-        """``data`` with the corrections known by now."""
+        """``data`` with the corrections known by now; also updates ``embeddings``."""
+        cameras = [v.camera for v in views]
+        self.embeddings = np.zeros((len(views), 0), np.float32)
+        if self.appearances is not None:
+            self.embeddings = self.appearances.rows(cameras)
         if self.exposures is not None:
-            data = data._replace(exposure=self.exposures.rows([v.camera for v in views]))
+            data = data._replace(exposure=self.exposures.rows(cameras))
         if self.poses is not None:
             poses = np.stack([self.poses.pose(view) for view in views])
             data = data._replace(
@@ -204,29 +215,30 @@ class CameraRefinement:
         data: Views,
         box: SceneBox,
         step: int,
-        seed: int,
-        sums: NDArray[np.float64],
+        batch: Batch,
         make_renderer: Callable[[], RaySnapshot],
     ) -> Views:
         """Learn from a step; returns the corrected data.
 
-        step: number of steps made. seed: the field's.
-        sums: float64 (chunks, V, 3, 5), see ``Exposures.learn``; cleared.
+        step: number of steps made. batch: of the last one; the sums of exposures are cleared.
         make_renderer: returns a renderer of the field as it is.
         """
-        changed = False
+        changed, cameras = False, [v.camera for v in views]
+        if self.appearances is not None:
+            self.appearances.learn(cameras, batch.d_embeddings, int(batch.rays.sum()))
+            changed = True
         if self.exposures is not None:
             if step >= START:
-                self.exposures.learn([v.camera for v in views], sums.sum(axis=0))
+                self.exposures.learn(cameras, batch.exposure.sum(axis=0))
                 changed = True
-            sums[...] = 0.0
+            batch.exposure[...] = 0.0
         if self.poses is not None and step >= START and step % EVERY == 0:
             view, renderer = views[step // EVERY % len(views)], make_renderer()
 
             def render(pose: Array, points: Array) -> NDArray[np.float32]:
                 return renderer.render_pixels(pose, view.intrinsics, points)[0]
 
-            rng = np.random.default_rng(np.random.SeedSequence([seed, step, 1]))
+            rng = np.random.default_rng(np.random.SeedSequence([self.seed, step, 1]))
             pixel_m = box.distance_m / view.intrinsics.fx
             self.poses.correct(view, render, pixel_m, rng, renderer.background)
             changed = True
@@ -234,7 +246,9 @@ class CameraRefinement:
 
     def meta(self) -> dict[str, Any]:
         """What a state keeps: exact, ready for JSON."""
+        looks = self.appearances.meta() if self.appearances else {}
         return {
+            **looks,
             "exposures": {c: p.tolist() for c, p in self.exposures.known.items()} if self.exposures else {},
             "poses": {
                 name: [c.given.tolist(), c.rotation.tolist(), c.shift_m.tolist()]
@@ -244,6 +258,8 @@ class CameraRefinement:
 
     def load(self, meta: dict[str, Any]) -> None:
         """Restore what ``meta`` returned; what is not enabled here is left out."""
+        if self.appearances is not None:
+            self.appearances.load(meta)
         if self.exposures is not None:
             self.exposures.known = {c: np.array(p) for c, p in meta.get("exposures", {}).items()}
         if self.poses is not None:

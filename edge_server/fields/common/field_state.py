@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from edge_server.fields.common.view_store import Arrays, ViewStore
@@ -20,7 +20,13 @@ def pack_state(name: str, settings: Any, view_store: ViewStore, counters: dict[s
 
     name: of the representation. counters: facts, ready for JSON. arrays: what was learned.
     """
-    meta = {"version": VERSION, "field": name, "settings": asdict(settings), **counters, **view_store.meta()}
+    meta = {
+        "version": VERSION,
+        "field": name,
+        "settings": msgspec.structs.asdict(settings),
+        **counters,
+        **view_store.meta(),
+    }
     both = {"meta": np.array(json.dumps(meta)), **arrays, **view_store.arrays()}
     return {name: np.array(array) for name, array in both.items()}
 

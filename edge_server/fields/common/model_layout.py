@@ -5,7 +5,6 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid
 from edge_server.fields.common.kernels.mlp import Net, param_count
@@ -42,17 +41,12 @@ def make_grid(settings: HashGridSettings, box: SceneBox | None, rng: np.random.G
     return Grid(resolution, first, dense, table)
 
 
-def net_widths(inputs: int, settings: TrainerSettings, appearance: int = 0) -> NDArray[np.int64]:
-    """Widths of the layers, padded to 4: ``inputs`` features in; density, color, the color's harmonics and
-    three numbers for each dimension of ``appearance`` out."""
-    outputs = _multiple_of_4(1 + 3 * settings.harmonics + 3 * appearance)
+def init_net(inputs: int, settings: TrainerSettings, rng: np.random.Generator) -> Net:
+    """He initialization with a small output: thin gray fog everywhere. Widths are padded to 4: ``inputs`` features in;
+    density, color, the color's harmonics and three numbers for each dimension of the appearance out."""
+    outputs = _multiple_of_4(1 + 3 * settings.harmonics + 3 * settings.appearance)
     hidden = [settings.hidden] * settings.hidden_layers
-    return np.array([_multiple_of_4(inputs), *hidden, outputs], dtype=np.int64)
-
-
-def init_net(inputs: int, settings: TrainerSettings, rng: np.random.Generator, appearance: int = 0) -> Net:
-    """He initialization with a small output: thin gray fog everywhere."""
-    widths = net_widths(inputs, settings, appearance)
+    widths = np.array([_multiple_of_4(inputs), *hidden, outputs], dtype=np.int64)
     params = np.zeros(param_count(widths), np.float32)
     first = 0
     for layer, (n_in, n_out) in enumerate(pairwise(widths)):

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from edge_server.fields import Rendering, View
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.rays import Space
-from edge_server.fields.common.kernels.render import ROUND, TILE, render_tiles
+from edge_server.fields.common.kernels.render import BATCH, render_tiles
 from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.stepped_field import surface_points
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool
 from freshfield.geometry import Pinhole
-
-SOLID = 0.5  # opacity from which on a ray has met a surface
 
 Pixels = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 """Color (N, 3), depth (N,) in meters and opacity (N,) at N image points."""
@@ -63,24 +62,8 @@ class RaySnapshot:
         return Rendering(color.reshape(h, w, 3), depth.reshape(h, w), opacity.reshape(h, w))
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """At most ``count`` points (N, 3) in world meters and colors (N, 3): where the rays of evenly spaced
-        pixels of ``cameras`` meet a surface."""
-        positions, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
-        share = max(count // max(len(self.cameras), 1), 1)
-        for view in self.cameras:
-            camera = view.intrinsics
-            stride = max(np.sqrt(camera.width * camera.height / share), 1.0)
-            u, v = np.meshgrid(
-                np.arange(0.5 * stride, camera.width, stride), np.arange(0.5 * stride, camera.height, stride)
-            )
-            pixels = np.floor(np.stack([u.ravel(), v.ravel()], axis=-1)) + 0.5
-            color, depth, opacity = self.render_pixels(view.camera_to_world, camera, pixels)
-            solid = (opacity > SOLID) & (depth > 0)
-            rays = camera.rays(pixels[solid]) @ view.camera_to_world[:3, :3].T
-            points = view.camera_to_world[:3, 3] + rays * depth[solid, None]
-            positions.append(points.astype(np.float32))
-            colors.append(color[solid])
-        return np.concatenate(positions)[:count], np.concatenate(colors)[:count]
+        """At most ``count`` points (N, 3) in world meters and colors (N, 3), see ``surface_points``."""
+        return surface_points(self.render, self.cameras, count)
 
     def render_pixels(
         self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
@@ -88,22 +71,25 @@ class RaySnapshot:
         """What a camera sees at image points (N, 2)."""
         pose = np.asarray(camera_to_world, dtype=np.float64)
         lens, rotation = np.array(lens_row(intrinsics), dtype=np.float64), np.ascontiguousarray(pose[:3, :3])
-        camera = lens, rotation, self.box.normalise(pose[:3, 3]), np.ascontiguousarray(pixels, dtype=np.float64)
-        n = len(pixels)
+        origin, n = self.box.normalise(pose[:3, 3]), len(pixels)
         out = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
-        self._run(camera, out)
+        units = int(self.net.widths.sum())
+        scratch = tuple(np.empty((self.pool.threads, rows, BATCH), np.float32) for rows in (units, 3, 3))
+        self.pool.run(
+            render_tiles,
+            lens,
+            rotation,
+            origin,
+            np.ascontiguousarray(pixels, dtype=np.float64),
+            self.space,
+            self.encoding,
+            self.levels,
+            self.net,
+            self.settings.harmonics,
+            self.background,
+            scratch,
+            out,
+        )
         color, depth, opacity = out
         depth *= np.float32(self.box.radius_m)
         return color, depth, opacity
-
-    def _run(self, camera: tuple[NDArray[np.float64], ...], out: Pixels) -> None:
-        """Run the kernel that renders ``camera`` (lens row, rotation, origin in scene units, image points) into
-        ``out``, with depth in scene units."""
-        model = self.space, self.encoding, self.levels, self.net, self.settings.harmonics, self.background
-        self.pool.run(render_tiles, *camera, *model, *self._scratch(TILE * ROUND, 2), *out)
-
-    def _scratch(self, samples: int, rows: int) -> Pixels:
-        """Memory of a rendering kernel's workers: activations, points and ``rows`` numbers of ``samples`` samples."""
-        shapes = (int(self.net.widths.sum()), samples), (3, samples), (rows, samples)
-        acts, x, line = (np.empty((self.pool.threads, *shape), np.float32) for shape in shapes)
-        return acts, x, line

@@ -6,9 +6,9 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +23,7 @@ from freshfield.geometry import Pinhole
 # A step at a progress of the fit in [0, 1] -> loss (None: none is known), rays, samples, and how many values
 # were not finite and left out.
 Step = Callable[[float], tuple[float | None, int, int, int]]
+SOLID = 0.5  # opacity above which a pixel shows a surface
 
 
 class StepSnapshot(Snapshot, Protocol):
@@ -36,6 +37,24 @@ class StepSnapshot(Snapshot, Protocol):
     def copied(self) -> Self:
         """The same with arrays of its own."""
         ...
+
+
+def surface_points(
+    render: Callable[[NDArray[np.float64], Pinhole], Rendering], cameras: Sequence[View], count: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Up to ``count`` surface points (N, 3) in world meters and their colors (N, 3): the cameras are rendered small,
+    and the solid pixels unprojected by their depth."""
+    positions, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
+    share = max(count // max(len(cameras), 1), 1)
+    for view in cameras:
+        lens, pose = view.intrinsics, np.asarray(view.camera_to_world, dtype=np.float64)
+        small = lens.scaled(min(float(np.sqrt(share / (lens.width * lens.height))), 1.0))
+        out = render(pose, small)
+        solid = (out.opacity > SOLID) & (out.depth > 0)
+        rays = small.rays()[solid] @ pose[:3, :3].T
+        positions.append((pose[:3, 3] + rays * out.depth[solid, None]).astype(np.float32))
+        colors.append(out.color[solid])
+    return np.concatenate(positions)[:count], np.concatenate(colors)[:count]
 
 
 S = TypeVar("S", bound=StepSnapshot)
@@ -159,7 +178,7 @@ class SteppedField(ABC, Generic[S]):
         tiny, camera, pose = self._tiny(), Pinhole.from_fov(8, 8, 60.0), np.eye(4)
         pose[2, 3] = -3.0
         for channels in (3, 4):
-            field = type(self)(replace(tiny, min_views=1, contracted=channels == 3), pool)
+            field = type(self)(msgspec.structs.replace(tiny, min_views=1, contracted=channels == 3), pool)
             image = np.full((8, 8, channels), 128, np.uint8)
             views = [View(f"warm-up {k}", image, pose, camera) for k in range(3)]
             field.fit(views, Budget(steps=2))  # with a depth guide, if any is to be expected

@@ -102,9 +102,10 @@ def moved_pixels(before: View, now: View) -> NDArray[np.bool_] | None:
     return cv2.dilate(moved, np.ones((size, size), np.uint8)).astype(bool)
 
 
-def remember_views(memory: dict[str, CameraMemory], views: Sequence[View]) -> bool:
-    """Store the newest view of each camera. Returns whether a camera is new, has moved or has a new lens."""
-    news = False
+def remember_views(memory: dict[str, CameraMemory], views: Sequence[View]) -> tuple[bool, bool]:
+    """Store the newest view of each camera. Returns whether a camera is new, has moved or has a new lens, and whether
+    an image was not known before."""
+    news = fresh = False
     for view in views:
         known = memory.get(view.camera)
         if known is not None and known.view is view:
@@ -114,14 +115,15 @@ def remember_views(memory: dict[str, CameraMemory], views: Sequence[View]) -> bo
             and np.allclose(known.view.camera_to_world, view.camera_to_world, atol=1e-3)
         )
         news = news or not stood
-        moved = None
+        moved, same = None, False
         if known is not None:
             # The same frame decoded once more is no news; an equal but newer one says that nothing moved.
             # Otherwise pixels that one wrong picture changed would count as moving while the scene stands.
             same = known.view.generated_ns == view.generated_ns and np.array_equal(known.view.image, view.image)
             moved = known.moved if same else moved_pixels(known.view, view)
+        fresh = fresh or not same
         memory[view.camera] = CameraMemory(view, moved)
-    return news
+    return news, fresh
 
 
 def pack_cameras(views: Sequence[View], box: SceneBox) -> Views:

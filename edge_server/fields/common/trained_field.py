@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,6 +54,7 @@ class TrainedField(SteppedField[RaySnapshot]):
     """A radiance field that learns while it is used. See ``SteppedField``."""
 
     _encoding: Any  # a named tuple with a ``table`` of float32 parameters, see ``kernels.radiance_model``
+    _bins: tuple[Any, ...] = ()  # what the encoding's kernels need for training beside ``Scratch``
     _net: Net
     _batch: Batch
     _cameras: CameraRefinement
@@ -73,14 +74,16 @@ class TrainedField(SteppedField[RaySnapshot]):
             box, cameras = self.view_store.box, self._cameras
             data = cameras.corrected(views, update.data, box)
             data = self._add_depth_guide(views, data, box, step_budget, update.has_new_images)
-            counted = len(views) if cameras.exposures is not None else 0
-            sums = np.zeros((len(self._batch.samples), counted, 3, 5))
-            self._batch = self._batch._replace(exposure=sums)
+            chunks, counted = len(self._batch.samples), len(views) if cameras.exposures is not None else 0
+            self._batch = self._batch._replace(
+                exposure=np.zeros((chunks, counted, 3, 5)),
+                d_embeddings=np.zeros((chunks, *cameras.embeddings.shape), np.float32),
+            )
 
         def one_step(progress: float) -> tuple[float, int, int, int]:
             nonlocal data
             loss, batch = self._one_step(data, progress), self._batch
-            data = cameras.learn(views, data, box, self.step, self.settings.seed, sums, self._live)
+            data = cameras.learn(views, data, box, self.step, batch, self._live)
             dropped = int(batch.dropped.sum() + self._dropped_by_task.sum())
             return loss, int(batch.rays.sum()), int(batch.samples.sum()), dropped
 
@@ -139,7 +142,7 @@ class TrainedField(SteppedField[RaySnapshot]):
         """A fresh encoding and network for ``self.view_store.box`` (None: no scene yet)."""
 
     def _tiny(self) -> Any:
-        return replace(self.settings, **TINY)
+        return msgspec.structs.replace(self.settings, **TINY)
 
     def _levels(self) -> int:
         """How many levels of the encoding are in use."""
@@ -150,13 +153,7 @@ class TrainedField(SteppedField[RaySnapshot]):
         return int(self._net.widths[0])
 
     def _grow(self) -> None:
-        """Give the encoding the size it has at ``self.step``; called after every step."""
-
-    def _train(self, data: Views, ray_sampling: RaySampling, space: Space, weights: Weights) -> None:
-        """Fill ``self._batch``, gradients included, from one step's rays."""
-        self.pool.run(
-            train_chunks, data, ray_sampling, space, self._encoding, self._net, weights, self._batch, self._scratch
-        )
+        """Give the encoding the size and sampling it has at ``self.step``; called after every step."""
 
     @abstractmethod
     def _gather(self, levels: int, scale: float) -> None:
@@ -209,7 +206,7 @@ class TrainedField(SteppedField[RaySnapshot]):
         self._take_table(self._encoding.table)
         self._net_m, self._net_v, self._net_g = (np.zeros_like(self._net.params) for _ in range(3))
         self._occupancy = OccupancyGrid(s.cells, s.min_views, self.view_store.box)
-        self._cameras = CameraRefinement(s.exposure, s.refine_m, s.refine_deg)
+        self._cameras = CameraRefinement(s)
         chunks, workers = max(s.batch_samples // CHUNK, 1), self.pool.threads
         units = int(self._net.widths.sum())
         self._batch = Batch(
@@ -222,11 +219,12 @@ class TrainedField(SteppedField[RaySnapshot]):
             dropped=np.zeros(chunks, np.int64),
             loss=np.zeros(chunks),
             exposure=np.zeros((chunks, 0, 3, 5)),
+            d_embeddings=np.zeros((chunks, 0, 0), np.float32),
         )
         self._scratch = Scratch(
             acts=np.zeros((workers, units, CHUNK), np.float32),
             d_acts=np.zeros((workers, units, CHUNK), np.float32),
-            line=np.zeros((workers, 2, CHUNK), np.float32),
+            line=np.zeros((workers, 3, CHUNK), np.float32),
             by_ray=np.zeros((workers, 11, CHUNK), np.float32),
             column=np.zeros((workers, CHUNK), np.int64),
             ray_first=np.zeros((workers, CHUNK_RAYS + 1), np.int64),
@@ -267,10 +265,21 @@ class TrainedField(SteppedField[RaySnapshot]):
             harmonics=s.harmonics,
             changed_share=np.float32(s.changed_share),
             background=self.view_store.background(),
-            random_background=s.background == "random",
+            embeddings=self._cameras.embeddings,
         )
         weights = Weights(distortion=np.float32(s.distortion), guide=np.float32(self._present_guide_weight()))
-        self._train(data, ray_sampling, space, weights)
+        self.pool.run(
+            train_chunks,
+            data,
+            ray_sampling,
+            space,
+            self._encoding,
+            self._net,
+            weights,
+            batch,
+            self._scratch,
+            self._bins,
+        )
         rays = max(int(batch.rays.sum()), 1)
         self._gather(levels, NOMINAL_RAYS / rays)
         if batch.dropped.any():

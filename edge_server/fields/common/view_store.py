@@ -60,8 +60,8 @@ class ViewStore:
             return PackedUpdate(self._packed[1], False, False, False)
         for view in views:
             check_view(view)
-        has_new_images = any(self._is_new(view) for view in views)
-        visibility_changed, box_changed = remember_views(self.memory, views), False
+        visibility_changed, has_new_images = remember_views(self.memory, views)
+        box_changed = False
         if self.box is None or self._box_cameras < min(len(self.memory), FINAL_BOX_CAMERAS):
             # Two or three cameras say little about where the scene is: find it anew when there are more.
             s = self.settings
@@ -75,12 +75,6 @@ class ViewStore:
         data = pack_views(views, self.box, self.memory)
         self._packed = (tuple(views), data)
         return PackedUpdate(data, box_changed, visibility_changed or box_changed, has_new_images)
-
-    def _is_new(self, view: View) -> bool:
-        known = self.memory.get(view.camera)
-        return known is None or (
-            known.view.generated_ns != view.generated_ns or not np.array_equal(known.view.image, view.image)
-        )
 
     def background(self) -> NDArray[np.float32]:
         """The color (3,) behind everything that is rendered."""

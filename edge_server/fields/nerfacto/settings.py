@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
-from edge_server.fields.common.trainer_settings import HashGridSettings, option
+from edge_server.fields.common.trainer_settings import HashGridSettings
+from freshfield.settings import within
 
 
-@dataclass(frozen=True)
-class NerfactoSettings(HashGridSettings):
+class NerfactoSettings(HashGridSettings, frozen=True):
     """What can be chosen about a ``NerfactoField``.
 
     Tuned: a ray has ``bins`` bins, with one lookup each of the proposal, whose grid has ``proposal_cells``
@@ -20,8 +19,10 @@ class NerfactoSettings(HashGridSettings):
 
     name = "nerfacto"
 
-    samples: int = option(24, "samples of a ray, placed by the proposal density")
-    appearance: int = option(0, "numbers learned for each camera's appearance (exposure, tint); 0: none")
+    samples: Annotated[int, within(8, 512, "samples of a ray, placed by the proposal density")] = 24
+    appearance: Annotated[
+        int, within(0, 16, "numbers learned for each camera's appearance (exposure, tint); 0: none")
+    ] = 0
     rate_net: float = 2e-2
     samples_start: int = 24
     samples_ramp: int = 200
@@ -34,10 +35,9 @@ class NerfactoSettings(HashGridSettings):
     smooth: float = 3e-3
 
     def __post_init__(self) -> None:
-        self._within(("samples", 8, 512), ("appearance", 0, 16))
         if self.appearance and self.exposure:
             # Measured: they compensate each other, and the field is worse than with neither.
-            raise ValueError(f"{self.name}: appearance and exposure explain the same thing: choose one")
+            raise ValueError("appearance and exposure explain the same thing: choose one")
         super().__post_init__()
 
 

@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
 
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter, smooth_grid
@@ -40,7 +40,7 @@ class NgpField(TrainedField):
         return make_grid(self.settings, self.view_store.box, rng), init_net(inputs, self.settings, rng)
 
     def _tiny(self) -> Any:
-        return replace(self.settings, **TINY, log2_table=10)
+        return msgspec.structs.replace(self.settings, **TINY, log2_table=10)
 
     def _levels(self) -> int:
         return active_levels(self.settings, self.step)

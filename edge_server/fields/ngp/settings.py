@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 from edge_server.fields.common.trainer_settings import HashGridSettings
@@ -21,8 +20,7 @@ STATE_SHAPE = (
 """Options in which a state and the field that loads it must agree."""
 
 
-@dataclass(frozen=True)
-class NgpSettings(HashGridSettings):
+class NgpSettings(HashGridSettings, frozen=True):
     """What can be chosen about an ``NgpField``."""
 
     name = "ngp"

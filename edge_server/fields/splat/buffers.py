@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.camera import SIZE
-from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.kernels.bin_tiles import TileLists, bin_tiles
 from edge_server.fields.splat.kernels.composite import PIXELS, SAVED, STRIPS, SUMS
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, adam_step
 from edge_server.fields.splat.kernels.project import BLOCK, FOOTPRINT, PROJECTED, TILE, Gaussians, project
-from edge_server.fields.splat.kernels.rasterize import ROWS, Targets, train_tiles
+from edge_server.fields.splat.kernels.rasterize import ROWS, Raster, Targets, train_tiles
 
 MAX_PAIRS = 1 << 22  # pairs a camera: further Gaussians are left out, so that memory is bounded
 
@@ -38,18 +35,15 @@ class RasterBuffers:
         assert self._lists is not None
         return self._lists
 
-    def project_and_bin(
-        self,
-        cams: NDArray[np.float32],
-        gaussians: Gaussians,
-        wanted: Sequence[NDArray[np.uint8] | None] | None = None,
-        differentiate: bool = True,
-    ) -> None:
+    @property
+    def first(self) -> Raster:
+        """What the kernels read of the first camera."""
+        return Raster(int(self.columns[0]), int(self.rows[0]), self.projected, self.lists, self.memory, self.saved)
+
+    def project_and_bin(self, cams: NDArray[np.float32], gaussians: Gaussians, differentiate: bool = True) -> None:
         """Project the Gaussians into the cameras, and list them by tile.
 
         cams: float32 (B, CAMERA), see ``camera_rows``.
-        wanted: for each camera uint8 (tiles,), 1 for tiles to list, or None for all tiles; None instead of
-            the list: all tiles of all cameras.
         differentiate: whether to make room for gradients.
         """
         count, slots = len(gaussians.params), len(cams)
@@ -57,10 +51,6 @@ class RasterBuffers:
         self.columns, self.rows = (-(-sizes[:, k] // TILE) for k in (0, 1))
         tiles = int((self.columns * self.rows).max())
         self._allocate(slots, count, tiles)
-        masks = wanted if wanted is not None else [None] * slots
-        for b, mask in enumerate(masks):
-            total = int(self.columns[b] * self.rows[b])
-            self.lists.wanted[b, :total] = 1 if mask is None else mask
         self.pool.run(project, cams, gaussians, count, self.projected, self.tiles)
         self._bin(count)
         pairs = min(int(self.lists.needed[:slots].max(initial=0)), MAX_PAIRS)
@@ -82,21 +72,8 @@ class RasterBuffers:
     def train(self, targets: Targets, view: int) -> NDArray[np.float64]:
         """Compare the first camera of the last ``project_and_bin`` with image ``view`` of the targets, and write the
         gradients of its pairs to ``sums``. Returns ``losses``, see ``train_tiles``."""
-        columns, rows = int(self.columns[0]), int(self.rows[0])
-        losses = np.zeros((columns * rows, 2))
-        self.pool.run(
-            train_tiles,
-            targets,
-            view,
-            columns,
-            rows,
-            self.projected,
-            self.lists,
-            self.memory,
-            self.saved,
-            self.sums,
-            losses,
-        )
+        losses = np.zeros((int(self.columns[0] * self.rows[0]), 2))
+        self.pool.run(train_tiles, self.first, targets, view, self.sums, losses)
         return losses
 
     def step(
@@ -130,17 +107,16 @@ class RasterBuffers:
             self._lists is not None
             and self.projected.shape[0] >= slots
             and self.projected.shape[1] >= count
-            and self._lists.wanted.shape[1] >= tiles
+            and self._lists.first.shape[1] > tiles
         ):
             return
         threads = self.pool.threads
         slots, room = max(slots, self.projected.shape[0]), max(count, self.projected.shape[1])
-        tiles = max(tiles, 0 if self._lists is None else self._lists.wanted.shape[1])
+        tiles = max(tiles, 0 if self._lists is None else self._lists.first.shape[1] - 1)
         pairs = max(4 * room, 1024, 0 if self._lists is None else self._lists.pair.shape[1])
         self.projected = np.zeros((slots, room, PROJECTED), np.float32)
         self.tiles = np.zeros((slots, room, FOOTPRINT), np.int32)
         self._lists = TileLists(
-            wanted=np.zeros((slots, tiles), np.uint8),
             first=np.zeros((slots, tiles + 1), np.int32),
             pair=np.zeros((slots, pairs), np.int32),
             owner=np.zeros((slots, pairs), np.int32),
@@ -154,21 +130,12 @@ class RasterBuffers:
             binned=np.zeros((threads, 2, pairs), np.int32),
         )
 
-
-def unweighted_tiles(data: Views) -> list[NDArray[np.uint8] | None]:
-    """For each view the tiles with pixels of weight 0, uint8 (tiles,), or None where there are none."""
-    masks: list[NDArray[np.uint8] | None] = [None] * len(data.size)
-    if data.weight.size:
-        for k, ((w, h), first) in enumerate(zip(data.size, data.first)):
-            silent = data.weight[first : first + w * h].reshape(h, w) == 0
-            masks[k] = _tile_mask(silent) if silent.any() else None
-    return masks
-
-
-def _tile_mask(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    h, w = mask.shape
-    rows, columns = -(-h // TILE), -(-w // TILE)
-    whole = np.zeros((rows * TILE, columns * TILE), np.uint8)
-    whole[:h, :w] = mask
-    tiles: NDArray[np.uint8] = whole.reshape(rows, TILE, columns, TILE).max(axis=(1, 3)).reshape(-1)
-    return tiles
+    def reaching(self, b: int, count: int, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which of the first ``count`` Gaussians, bool (N,), reach a tile of camera b that has pixels of ``mask``."""
+        h, w = mask.shape
+        within = np.zeros((self.rows[b] * TILE + 1, self.columns[b] * TILE + 1), np.int64)
+        within[1 : h + 1, 1 : w + 1] = mask
+        within = within.cumsum(axis=0).cumsum(axis=1)[::TILE, ::TILE]
+        x0, x1, y0, y1 = self.tiles[b, :count, :4].T
+        pixels = within[y1, x1] - within[y0, x1] - within[y1, x0] + within[y0, x0]
+        return (pixels > 0) & (self.lists.own_count[b, :count] > 0)

@@ -61,19 +61,7 @@ def plane_depth(
     """
     width, height = int(camera[SIZE]), int(camera[SIZE + 1])
     out = np.zeros((height, width, 5), np.float32)
-    raster.pool.run(
-        render_planes,
-        int(raster.columns[0]),
-        int(raster.rows[0]),
-        width,
-        height,
-        raster.projected,
-        raster.lists,
-        gaussian_planes(gaussians, camera),
-        raster.memory,
-        raster.saved,
-        out,
-    )
+    raster.pool.run(render_planes, raster.first, gaussian_planes(gaussians, camera), out)
     rays = lens.rays()
     along = (out[..., :3] * rays).sum(axis=-1)
     opacity = np.clip(np.nan_to_num(out[..., 4]), 0.0, 1.0)
@@ -97,21 +85,8 @@ def align(
     together. camera: its row; ``raster`` has the whole image of it at slot 0."""
     gaussians = cloud.gaussians()
     depth, opacity = plane_depth(raster, gaussians, camera, lens)
-    height, width = depth.shape
     normal_sums = np.zeros((raster.lists.pair.shape[1], 4), np.float32)
-    raster.pool.run(
-        accumulate_normals,
-        int(raster.columns[0]),
-        int(raster.rows[0]),
-        width,
-        height,
-        raster.projected,
-        raster.lists,
-        depth_normals(depth, opacity, lens),
-        raster.memory,
-        raster.saved,
-        normal_sums,
-    )
+    raster.pool.run(accumulate_normals, raster.first, depth_normals(depth, opacity, lens), normal_sums)
     first, count = raster.lists.own_first[0, : len(cloud)], raster.lists.own_count[0, : len(cloud)]
     which = np.flatnonzero(count > 0)
     sums = np.concatenate([np.zeros((1, 4)), np.cumsum(normal_sums.astype(np.float64), axis=0)])

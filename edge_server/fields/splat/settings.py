@@ -5,10 +5,10 @@ The texts of the options become help. Numbers of the layers stand in ``layers.se
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
-from edge_server.fields.common.trainer_settings import FieldSettings, option
+from edge_server.fields.common.trainer_settings import FieldSettings, Harmonics
+from freshfield.settings import about, within
 
 # Seeding: scale of new Gaussians in distances to their neighbors, their opacity, and pixels tried for each,
 # because those whose rays meet no surface are discarded.
@@ -41,40 +41,28 @@ ALPHA_MAX, ALPHA_MIN = 0.99, 1.0 / 255.0
 ALIGN_EVERY = 5  # steps between two alignments with the rendered normals
 
 
-@dataclass(frozen=True)
-class SplatSettings(FieldSettings):
+class SplatSettings(FieldSettings, frozen=True):
     """The options of a Gaussian field. Lengths in meters; None means: found from the cameras."""
 
     name = "splat"
 
-    gaussians: int = option(8192, "largest number of Gaussians")
-    start: int = option(4096, "number of Gaussians at the start, at most ``gaussians``")
-    harmonics: int = option(1, "view dependence of color: 1 (none), 4 or 9 spherical harmonics")
-    seed_cells: int = option(64, "cells a side of the grid that gives initial positions")
-    epsilon: float = option(1e-3, "Adam's epsilon, on gradients summed over pixels")
-    densify_every: int = option(
-        50, "minimum number of steps between densifications, and at least one pass over all views"
-    )
-    flatten: float = option(0.0, "decrease a step of each Gaussian's smallest log scale, for surfaces (.02); 0: none")
-    align: float = option(
-        0.0, "share by which Gaussians turn to the normals of the rendered depth, for surfaces (.3); 0: none"
-    )
-    layers: bool = option(
-        False, "background plates, a still field and a moving set instead of one field, where cameras stand still"
-    )
-
-    def __post_init__(self) -> None:
-        self._within(
-            ("gaussians", 1, 1 << 20),
-            ("start", 1, 1 << 20),
-            ("seed_cells", 8, 256),
-            ("densify_every", 1, 1 << 30),
-            ("flatten", 0.0, 1.0),
-            ("align", 0.0, 1.0),
-        )
-        if self.harmonics not in (1, 4, 9):
-            raise ValueError(f"splat: harmonics must be one of 1, 4, 9, not {self.harmonics!r}")
-        super().__post_init__()
+    gaussians: Annotated[int, within(1, 1 << 20, "largest number of Gaussians")] = 8192
+    start: Annotated[int, within(1, 1 << 20, "number of Gaussians at the start, at most ``gaussians``")] = 4096
+    harmonics: Harmonics = 1
+    seed_cells: Annotated[int, within(8, 256, "cells a side of the grid that gives initial positions")] = 64
+    epsilon: Annotated[float, about("Adam's epsilon, on gradients summed over pixels")] = 1e-3
+    densify_every: Annotated[
+        int, within(1, 1 << 30, "minimum number of steps between densifications, and at least one pass over all views")
+    ] = 50
+    flatten: Annotated[
+        float, within(0, 1, "decrease a step of each Gaussian's smallest log scale, for surfaces (.02); 0: none")
+    ] = 0.0
+    align: Annotated[
+        float, within(0, 1, "share by which Gaussians turn to the normals of the rendered depth, for surfaces (.3)")
+    ] = 0.0
+    layers: Annotated[
+        bool, about("background plates, a still field and a moving set instead of one field, where cameras stand still")
+    ] = False
 
     @property
     def planar(self) -> bool:

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from edge_server.fields import Rendering, View
 from edge_server.fields.common.camera_rows import camera_rows, ray_lengths
 from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.stepped_field import surface_points
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.kernels.rasterize import render_tiles
 from freshfield.geometry import Pinhole
-
-SOLID = 0.5  # opacity above which a pixel shows a surface
 
 
 @dataclass(frozen=True)
@@ -58,21 +57,7 @@ class SplatSnapshot:
         raster, _ = self._project(camera_to_world, intrinsics)
         color, depth = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
         opacity = np.empty((h, w), np.float32)
-        self.pool.run(
-            render_tiles,
-            int(raster.columns[0]),
-            int(raster.rows[0]),
-            w,
-            h,
-            raster.projected,
-            raster.lists,
-            self.background,
-            raster.memory,
-            raster.saved,
-            color,
-            depth,
-            opacity,
-        )
+        self.pool.run(render_tiles, raster.first, self.background, color, depth, opacity)
         depth *= ray_lengths(intrinsics) * np.float32(self.box.radius_m)
         return Rendering(color, depth, opacity)
 
@@ -83,18 +68,5 @@ class SplatSnapshot:
         return raster, cams
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Up to ``count`` surface points (N, 3) in world meters and their colors (N, 3): the known cameras
-        are rendered small, and the solid pixels unprojected by their depth."""
-        positions, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
-        if len(self.gaussians.params):
-            share = max(count // max(len(self.cameras), 1), 1)
-            for view in self.cameras:
-                lens = view.intrinsics
-                small = lens.scaled(min(float(np.sqrt(share / (lens.width * lens.height))), 1.0))
-                out = self.render(view.camera_to_world, small)
-                solid = (out.opacity > SOLID) & (out.depth > 0)
-                pose = np.asarray(view.camera_to_world, dtype=np.float64)
-                rays = small.rays()[solid] @ pose[:3, :3].T
-                positions.append((pose[:3, 3] + rays * out.depth[solid, None]).astype(np.float32))
-                colors.append(out.color[solid])
-        return np.concatenate(positions)[:count], np.concatenate(colors)[:count]
+        """Up to ``count`` points (N, 3) in world meters and colors (N, 3), see ``surface_points``."""
+        return surface_points(self.render, self.cameras if len(self.gaussians.params) else (), count)

@@ -10,9 +10,10 @@ backpropagates them through the projection (``kernels.project_backward``) and ma
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,9 +24,9 @@ from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.fields.common.stepped_field import Step, SteppedField
 from edge_server.fields.common.supervision import supervising_views
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.fields.common.training_schedule import StepBudget, StepTimer, step_key
+from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.common.view_store import Arrays, same_views
-from edge_server.fields.splat.buffers import RasterBuffers, unweighted_tiles
+from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_corrections, clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, TILE
@@ -100,7 +101,9 @@ class StillField(SteppedField[SplatSnapshot]):
         )
 
     def _run_kernels(self, pool: Pool) -> None:
-        tiny = replace(self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False)
+        tiny = msgspec.structs.replace(
+            self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False
+        )
         camera = Pinhole.from_fov(32, 32, 60.0)
         pose = np.eye(4)
         pose[2, 3] = -3.0
@@ -157,8 +160,6 @@ class StillField(SteppedField[SplatSnapshot]):
                 self._data.weight,
                 np.zeros((0, 3), np.float32),
                 self.view_store.background(),
-                self.settings.background == "random",
-                np.uint64(0),
             )
             self._asked = supervising_views(self._data) or list(range(len(views)))
             self._views, self._epoch = tuple(views), -1
@@ -181,11 +182,11 @@ class StillField(SteppedField[SplatSnapshot]):
         Returns the mean squared error, pixels, pairs of a Gaussian and a tile, and how many tiles and
         gradients were not finite.
         """
-        key, view = step_key(self.settings.seed, self.step), self._next_view()
+        view = self._next_view()
         camera, cloud, raster = self._cams[[view]], self.cloud, self._raster
         gaussians = cloud.gaussians()
         raster.project_and_bin(camera, gaussians)
-        losses = raster.train(self._targets._replace(key=key), view)
+        losses = raster.train(self._targets, view)
         dropped = raster.step(camera, gaussians, cloud.optimizer_state(), self.adam_parameters(progress))
         if self.settings.planar:
             self._planar_step(view)
@@ -236,8 +237,8 @@ class StillField(SteppedField[SplatSnapshot]):
         without a current view: that a Gaussian has no gradient there does not mean that it is not needed."""
         cloud, box = self.cloud, self.view_store.box
         assert box is not None
-        tiles = unweighted_tiles(self._data)
-        slots = [k for k, mask in enumerate(tiles) if mask is not None]
+        data = self._data
+        slots = [k for k in range(len(data.size)) if (self._weight_of(k) == 0).any()]
         given = {view.camera for view in self._views}
         others = [view for view in self.view_store.views if view.camera not in given]
         if not slots and not others:
@@ -245,10 +246,17 @@ class StillField(SteppedField[SplatSnapshot]):
         cams = np.concatenate(
             [self._cams[slots], camera_rows([v.camera_to_world for v in others], [v.intrinsics for v in others], box)]
         )
-        wanted = [tiles[k] for k in slots] + [None] * len(others)
-        self._render_raster.project_and_bin(cams, cloud.gaussians(), wanted, differentiate=False)
-        shows = (self._render_raster.lists.own_count[: len(cams), : len(cloud)] > 0).any(axis=0)
+        raster, count = self._render_raster, len(cloud)
+        raster.project_and_bin(cams, cloud.gaussians(), differentiate=False)
+        shows = (raster.lists.own_count[len(slots) : len(cams), :count] > 0).any(axis=0)
+        for b, k in enumerate(slots):
+            shows |= raster.reaching(b, count, self._weight_of(k) == 0)
         cloud.looks[shows] = np.maximum(cloud.looks[shows], 1.0)
+
+    def _weight_of(self, view: int) -> NDArray[np.float32]:
+        """How much each pixel of a view counts, (H, W); (0,) where all count in full."""
+        (w, h), first, weight = self._data.size[view], self._data.first[view], self._data.weight
+        return weight[first : first + w * h].reshape(h, w) if weight.size else weight
 
     def _seed(self) -> None:
         """Seed the first Gaussians from the current views."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
-from edge_server.fields.common.trainer_settings import TrainerSettings, option
+from msgspec import Meta
+
+from edge_server.fields.common.trainer_settings import TrainerSettings
+from freshfield.settings import about
 
 
-@dataclass(frozen=True)
-class TensorfSettings(TrainerSettings):
+class TensorfSettings(TrainerSettings, frozen=True):
     """What can be chosen about a ``TensorfField``.
 
     Tuned: components of density and of color for each orientation (multiples of 8); vertices a side of planes
@@ -19,7 +20,10 @@ class TensorfSettings(TrainerSettings):
 
     name = "tensorf"
 
-    resolution: int | None = option(None, "vertices a side in the end; None: about a pixel, 256 at most")
+    resolution: Annotated[
+        Annotated[int, Meta(ge=4, le=1024)] | None,
+        about("vertices a side in the end; None: about a pixel, 256 at most"),
+    ] = None
     density_rank: int = 8
     color_rank: int = 16
     resolution_start: int = 48
@@ -28,10 +32,6 @@ class TensorfSettings(TrainerSettings):
     rate_net: float = 4e-2
     epsilon: float = 1e-3
     first: float = 0.1
-
-    def __post_init__(self) -> None:
-        self._within(("resolution", 4, 1024))
-        super().__post_init__()
 
 
 SETTINGS = TensorfSettings

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from edge_server.fields import View
 from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT
@@ -42,12 +43,12 @@ def reaches(name: str, case: str, psnr_db: float, margin_db: float = 0.5) -> Non
 
 def small(name: str, **changed: Any) -> Any:
     """A small field of that name, with other settings as ``changed`` says."""
-    return CLASSES[name](replace(SMALL[name], **changed))
+    return CLASSES[name](structs.replace(SMALL[name], **changed))
 
 
 def tiny(name: str, **changed: Any) -> Any:
     """A tiny field of that name, with other settings as ``changed`` says."""
-    return CLASSES[name](replace(TINY[name], **changed))
+    return CLASSES[name](structs.replace(TINY[name], **changed))
 
 
 def healthy(field: Any, views: Sequence[View]) -> None:

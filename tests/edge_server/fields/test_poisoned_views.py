@@ -121,15 +121,14 @@ def _unharmed(name: str, updates: int, warm: bool = True) -> float:
     return deployment.score()
 
 
-# Networks take ten times as long as splat, and share what survives: ngp alone meets one of each kind quickly.
-CASES = [("splat", poison) for poison in PICTURES + POSES]
-CASES += [("ngp", poison) for poison in (_noise, _in_millimeters)]
+# Also in the very first update: before anything is known, and where the scene's box is found. Networks take ten times
+# as long as splat, and share what survives: ngp alone meets one of each kind.
+CASES = [("splat", poison, warm) for poison in PICTURES + POSES for warm in (True, False)]
+CASES += [("ngp", _noise, True), ("ngp", _in_millimeters, False)]
 
 
-@pytest.mark.parametrize(("name", "poison"), CASES)
-@pytest.mark.parametrize("warm", [True, False])
+@pytest.mark.parametrize(("name", "poison", "warm"), CASES)
 def test_a_poisoned_view_is_survived(name: str, poison: Poison, warm: bool) -> None:
-    """Also in the very first update: before anything is known, and where the scene's box is found."""
     deployment = _deployment(name) if warm else Deployment(small(name))
     deployment.update(1, poison)
     deployment.update(AFTER)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from edge_server.fields.common.kernels.jit import part
 
@@ -16,37 +17,8 @@ _F1, _F2 = np.float32(1.0), np.float32(2.0)
 @part
 def load_camera(cams, b):
     """Camera b's columns as a tuple of CAMERA numbers. From a tuple, a loop that writes to arrays need not
-    read the camera again for every Gaussian, which would keep LLVM from vectorizing it; and no array object
-    is made of the row, whose references the threads would count."""
-    return (
-        cams[b, 0],
-        cams[b, 1],
-        cams[b, 2],
-        cams[b, 3],
-        cams[b, 4],
-        cams[b, 5],
-        cams[b, 6],
-        cams[b, 7],
-        cams[b, 8],
-        cams[b, 9],
-        cams[b, 10],
-        cams[b, 11],
-        cams[b, 12],
-        cams[b, 13],
-        cams[b, 14],
-        cams[b, 15],
-        cams[b, 16],
-        cams[b, 17],
-        cams[b, 18],
-        cams[b, 19],
-        cams[b, 20],
-        cams[b, 21],
-        cams[b, 22],
-        cams[b, 23],
-        cams[b, 24],
-        cams[b, 25],
-        cams[b, 26],
-    )
+    read the camera again for every Gaussian, which would keep LLVM from vectorizing it."""
+    return to_fixed_tuple(cams[b], CAMERA)
 
 
 @part

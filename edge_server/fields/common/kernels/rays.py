@@ -129,6 +129,23 @@ def _exit(u, d, blocks):
 
 
 @part
+def unit_cube(contracted, px, py, pz):
+    """Map a point in scene units to the encoding's unit cube, [0, 1)."""
+    scale, top = np.float32(0.5), np.float32(0.9999999)
+    if contracted:
+        scale = np.float32(0.25)
+        m = max(abs(px), max(abs(py), abs(pz)))
+        if m > np.float32(1.0):
+            s = (np.float32(2.0) - np.float32(1.0) / m) / m
+            px, py, pz = px * s, py * s, pz * s
+    return (
+        min(max(px * scale + np.float32(0.5), np.float32(0.0)), top),
+        min(max(py * scale + np.float32(0.5), np.float32(0.0)), top),
+        min(max(pz * scale + np.float32(0.5), np.float32(0.0)), top),
+    )
+
+
+@part
 def march(space, o, d, t, leave, x, ts, dts, n, limit, most):
     """Append the samples of the ray from o along d (three float32 each) in occupied cells from distance t on.
 
@@ -143,7 +160,6 @@ def march(space, o, d, t, leave, x, ts, dts, n, limit, most):
     cells, blocks = space.cells, space.cells // COARSE
     f_cells, f_blocks = np.float32(cells), np.float32(blocks)
     scale = np.float32(0.25) if space.contracted else half
-    below_one = np.float32(0.9999999)
     while t < leave:
         px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
         step, inside = space.step, True
@@ -152,11 +168,7 @@ def march(space, o, d, t, leave, x, ts, dts, n, limit, most):
             if m > one:
                 inside = False
                 step *= m * m  # equal steps in contracted space
-                s = (np.float32(2.0) - one / m) / m
-                px, py, pz = px * s, py * s, pz * s
-        ux = min(max(px * scale + half, np.float32(0.0)), below_one)
-        uy = min(max(py * scale + half, np.float32(0.0)), below_one)
-        uz = min(max(pz * scale + half, np.float32(0.0)), below_one)
+        ux, uy, uz = unit_cube(space.contracted, px, py, pz)
         bx, by, bz = np.int64(ux * f_blocks), np.int64(uy * f_blocks), np.int64(uz * f_blocks)
         if space.coarse[bx + blocks * (by + blocks * bz)] == 0:
             if inside:

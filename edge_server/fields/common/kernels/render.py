@@ -3,50 +3,52 @@
 from __future__ import annotations
 
 import numpy as np
+from numba.extending import overload
 
 from edge_server.fields.common.kernels.jit import kernel
-from edge_server.fields.common.kernels.radiance_model import query_color, query_density
+from edge_server.fields.common.kernels.radiance_model import has_own_sampling, query_color, query_density, sample_rays
 from edge_server.fields.common.kernels.rays import NEVER, interval, march, pixel_direction
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite
 from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, activate, add_harmonics
 
 TILE = 256  # rays a task
 ROUND = 8  # samples a ray gets before the opaque ones are dropped
+BATCH = TILE * ROUND  # samples that the network evaluates at a time
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
+@overload(sample_rays)
+def _march(encoding, space, o, travel, active, count, x, line, first):
+    if has_own_sampling(encoding):
+        return None
+
+    def run(encoding, space, o, travel, active, count, x, line, first):
+        n = np.int64(0)  # typed: numba compiles callees anew for a literal
+        for k in range(count):
+            r = active[k]
+            d, t, leave = (travel[r, 0], travel[r, 1], travel[r, 2]), travel[r, 3], travel[r, 4]
+            n, travel[r, 3], _ = march(space, o, d, t, leave, x, line[0], line[1], n, n + ROUND, NEVER)
+            first[k + 1] = n
+        return count
+
+    return run
+
+
 @kernel
 def render_tiles(
-    counter,
-    worker,
-    lens,
-    rotation,
-    origin,
-    pixels,
-    space,
-    encoding,
-    levels,
-    net,
-    harmonics,
-    background,
-    acts,
-    x,
-    line,
-    color,
-    depth,
-    opacity,
+    counter, worker, lens, rotation, origin, pixels, space, encoding, levels, net, harmonics, background, scratch, out
 ):
     """Render image points; tasks are runs of TILE of them.
 
     lens: float64 (8,). rotation: float64 (3, 3), camera to world. origin: float64 (3,), scene units.
     pixels: float64 (N, 2), image points. background: float32 (3,).
-    acts: float32 (W, units, TILE ROUND), x: (W, 3, same), line: (W, 2, same), scratch.
-    color: float32 (N, 3), depth (scene units) and opacity: float32 (N,); all written.
+    scratch: float32 (W, units, BATCH), (W, 3, BATCH) and (W, 3, BATCH), activations, points and lines.
+    out: color, float32 (N, 3), depth (scene units) and opacity: float32 (N,); all written.
     """
-    out_row = acts.shape[1] - net.widths[-1]
-    ts, dts = line[worker, 0], line[worker, 1]
-    out = acts[worker, out_row:]
+    acts, x, line = scratch[0][worker], scratch[1][worker], scratch[2][worker]
+    color, depth, opacity = out
+    dts, shaded = line[1], acts[acts.shape[0] - net.widths[-1] :]
     travel = np.empty((TILE, 6), np.float32)  # direction, distance reached, distance of leaving, optical depth
     first = np.empty(TILE + 1, np.int64)
     active = np.empty(TILE, np.int64)
@@ -68,39 +70,39 @@ def render_tiles(
                 active[count] = r
                 count += 1
         while count > 0:
-            start = n = np.int64(0)  # typed: numba compiles callees anew for a literal
-            first[0] = 0
-            for k in range(count):
-                r = active[k]
-                d, t, leave = (travel[r, 0], travel[r, 1], travel[r, 2]), travel[r, 3], travel[r, 4]
-                n, t, _ = march(space, o, d, t, leave, x[worker], ts, dts, n, n + ROUND, NEVER)
-                travel[r, 3] = t
-                first[k + 1] = n
-            query_density(encoding, levels, net, x[worker], start, n, acts[worker])
-            query_color(encoding, levels, net, x[worker], start, n, acts[worker])
+            first[0] = start = np.int64(0)
+            some = sample_rays(encoding, space, o, travel, active, count, x, line, first)
+            n = first[some]
+            query_density(encoding, levels, net, x, start, n, acts)
+            query_color(encoding, levels, net, x, start, n, acts)
             if harmonics > 1:
-                for k in range(count):
+                for k in range(some):
                     r = active[k]
-                    add_harmonics(out, harmonics, first[k], first[k + 1], travel[r, 0], travel[r, 1], travel[r, 2])
-            activate(out, start, n)
+                    add_harmonics(shaded, harmonics, first[k], first[k + 1], travel[r, 0], travel[r, 1], travel[r, 2])
+            activate(shaded, start, n)
             left = 0
-            for k in range(count):
+            for k in range(some):
                 r = active[k]
                 pixel = base + r
                 through = exp32(-travel[r, 5])
                 for s in range(first[k], first[k + 1]):
-                    travel[r, 5] += out[0, s] * dts[s]
+                    travel[r, 5] += shaded[0, s] * dts[s]
                     after = exp32(-travel[r, 5])
                     w = through - after
-                    color[pixel, 0] += w * out[1, s]
-                    color[pixel, 1] += w * out[2, s]
-                    color[pixel, 2] += w * out[3, s]
-                    depth[pixel] += w * ts[s]
+                    color[pixel, 0] += w * shaded[1, s]
+                    color[pixel, 1] += w * shaded[2, s]
+                    color[pixel, 2] += w * shaded[3, s]
+                    depth[pixel] += w * line[0, s]
                     opacity[pixel] += w
                     through = after
+                    if travel[r, 5] > np.float32(OPAQUE_DEPTH):
+                        break
                 if travel[r, 5] <= np.float32(OPAQUE_DEPTH) and travel[r, 3] < travel[r, 4]:
                     active[left] = r
                     left += 1
+            for k in range(some, count):
+                active[left] = active[k]
+                left += 1
             count = left
         for r in range(rays):
             pixel = base + r

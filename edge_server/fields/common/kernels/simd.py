@@ -7,32 +7,26 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
 from edge_server.fields.common.kernels.jit import part
 
 
 @intrinsic
-def fetch_add(typingctx: Any, array: Any, value: Any) -> Any:
-    """Add ``value`` to ``array[0]`` (int64) atomically; returns what was there before."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
-        return builder.atomic_rmw("add", data, args[1], "seq_cst")
-
-    return types.int64(array, types.int64), codegen
-
-
-@intrinsic
 def fetch_add_at(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
-    """``fetch_add`` of element ``index``."""
+    """Add ``value`` to ``array[index]`` (int64) atomically; returns what was there before."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, args[0]).data
         return builder.atomic_rmw("add", builder.gep(data, [args[1]]), args[2], "seq_cst")
 
     return types.int64(array, types.int64, types.int64), codegen
+
+
+@part
+def fetch_add(array, value):
+    """``fetch_add_at`` the first element."""
+    return fetch_add_at(array, 0, value)
 
 
 # Elements of a counter for each worker: a cache line.
@@ -93,86 +87,6 @@ def lowest_bit(typingctx: Any, value: Any) -> Any:
         return builder.cttz(args[0], ir.IntType(1)(0))
 
     return types.int64(types.uint64), codegen
-
-
-_LANES, _VECTORS = 16, 2
-AT_ONCE = _LANES * _VECTORS
-_WIDE = ir.VectorType(ir.FloatType(), _LANES)
-
-
-@intrinsic
-def add_products(
-    typingctx: Any,
-    w: Any,
-    first: Any,
-    out_stride: Any,
-    in_stride: Any,
-    n_in: Any,
-    x: Any,
-    x_row: Any,
-    y: Any,
-    y_row: Any,
-    a: Any,
-    b: Any,
-) -> Any:
-    """``y[y_row + o, s] += sum_i w[first + o out_stride + i in_stride] x[x_row + i, s]``, o < 4, a <= s < b.
-
-    w: contiguous float32; x, y: contiguous float32 (rows, N), or one array whose rows read and written are
-    not the same; the rest int64, b - a a multiple of ``AT_ONCE``. With AVX-512 the sums stay in registers
-    while all inputs pass: left to LLVM, they are read and written once for every four inputs, which takes
-    twice as long.
-    """
-    wide = types.int64
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        i64 = ir.IntType(64)
-        w_data, x_data, y_data = (
-            context.make_array(signature.args[k])(context, builder, args[k]).data for k in (0, 5, 7)
-        )
-        x_side, y_side = (
-            builder.extract_value(context.make_array(signature.args[k])(context, builder, args[k]).shape, 1)
-            for k in (5, 7)
-        )
-        _, w_first, out_stride, in_stride, n_in, _, x_row, _, y_row, a, b = args
-        sums = [cgutils.alloca_once(builder, _WIDE) for _ in range(4 * _VECTORS)]
-
-        def at(data: Any, row: Any, side: Any, s: Any) -> Any:
-            return builder.bitcast(builder.gep(data, [builder.add(builder.mul(row, side), s)]), _WIDE.as_pointer())
-
-        with cgutils.for_range_slice(builder, a, b, i64(AT_ONCE)) as (s, _):
-            places = [
-                at(y_data, builder.add(y_row, i64(o)), y_side, builder.add(s, i64(_LANES * v)))
-                for o in range(4)
-                for v in range(_VECTORS)
-            ]
-            for total, place in zip(sums, places, strict=True):
-                old = builder.load(place)
-                old.align = 4
-                builder.store(old, total)
-            with cgutils.for_range(builder, n_in) as loop:
-                row = builder.add(x_row, loop.index)
-                given = []
-                for v in range(_VECTORS):
-                    given.append(builder.load(at(x_data, row, x_side, builder.add(s, i64(_LANES * v)))))
-                    given[-1].align = 4
-                here = builder.add(w_first, builder.mul(loop.index, in_stride))
-                for o in range(4):
-                    place = builder.gep(w_data, [builder.add(here, builder.mul(out_stride, i64(o)))])
-                    weight = builder.insert_element(
-                        ir.Constant(_WIDE, ir.Undefined), builder.load(place), ir.IntType(32)(0)
-                    )
-                    same = ir.Constant(ir.VectorType(ir.IntType(32), _LANES), [0] * _LANES)
-                    weight = builder.shuffle_vector(weight, ir.Constant(_WIDE, ir.Undefined), same)
-                    for v in range(_VECTORS):
-                        total = sums[_VECTORS * o + v]
-                        product = builder.fmul(weight, given[v], flags=("contract",))
-                        added = builder.fadd(builder.load(total), product, flags=("contract",))
-                        builder.store(added, total)
-            for total, place in zip(sums, places, strict=True):
-                builder.store(builder.load(total), place).align = 4
-        return context.get_dummy_value()
-
-    return types.void(w, wide, wide, wide, wide, x, wide, y, wide, wide, wide), codegen
 
 
 _F = np.float32

@@ -5,10 +5,18 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba.extending import overload
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel, part
-from edge_server.fields.common.kernels.radiance_model import query_backward, query_color, query_density
+from edge_server.fields.common.kernels.radiance_model import (
+    fill_chunk,
+    has_own_sampling,
+    learn_sampling,
+    query_backward,
+    query_color,
+    query_density,
+)
 from edge_server.fields.common.kernels.rays import interval, march, origin_of, pixel_direction
 from edge_server.fields.common.kernels.simd import fetch_add, uniform
 from edge_server.fields.common.kernels.volume_rendering import (
@@ -45,6 +53,7 @@ class Batch(NamedTuple):
     columns: int64 (C,), how many columns are in use, not all of them by samples of whole rays.
     samples, rays, dropped: int64 (C,). loss: float64 (C,), squared error summed over rays and channels.
     exposure: float64 (C, V, 3, 5), see ``add_exposure_sums``; V = 0: exposures are not learned.
+    d_embeddings: float32 (C, V, A), dLoss / dembedding of each view.
     """
 
     x: NDArray[np.float32]
@@ -56,13 +65,15 @@ class Batch(NamedTuple):
     dropped: NDArray[np.int64]
     loss: NDArray[np.float64]
     exposure: NDArray[np.float64]
+    d_embeddings: NDArray[np.float32]
 
 
 class Scratch(NamedTuple):
     """Memory of each worker, W of them; R = CHUNK_RAYS.
 
     A column of these is a sample, in the order in which samples were found:
-    acts, d_acts: float32 (W, units, CHUNK). line: float32 (W, 2, CHUNK), distance and length.
+    acts, d_acts: float32 (W, units, CHUNK). line: float32 (W, 3, CHUNK), distance, length, and a
+        representation's own number.
     span: int64 (W, CHUNK, 4), samples of a ray that were found together: ray (-1: none), first column, end of
         those before it is opaque, end.
 
@@ -93,7 +104,8 @@ class RaySampling(NamedTuple):
     key: uint64, its random stream. chunk_rays: largest number of rays of a chunk.
     levels: number of levels that are switched on. harmonics: 1, 4 or 9.
     changed_share: share of the rays that are drawn from ``Views.changed``.
-    background: float32 (3,). random_background: a new one for every ray instead.
+    background: float32 (3,).
+    embeddings: float32 (V, A), appearance of each view; A = 0: none.
     """
 
     key: np.uint64
@@ -102,7 +114,7 @@ class RaySampling(NamedTuple):
     harmonics: int
     changed_share: np.float32
     background: NDArray[np.float32]
-    random_background: bool
+    embeddings: NDArray[np.float32]
 
 
 @part
@@ -131,13 +143,12 @@ def draw_ray(views, ray_sampling, n, ray):
         pixel = views.drawn[min(np.int64(choice * views.drawn.size), views.drawn.size - 1)]
     else:
         pixel = min(np.int64(choice * total), total - 1)
-    return take_pixel(views, ray_sampling, pixel, n, ray)
+    return take_pixel(views, ray_sampling.background, pixel, ray)
 
 
 @part
-def take_pixel(views, ray_sampling, pixel, n, ray):
-    """Fill ray (12,), the step's n-th, from a pixel (see ``Scratch``). Returns the view's number."""
-    key, k = ray_sampling.key, np.uint64(n) * np.uint64(8)
+def take_pixel(views, background, pixel, ray):
+    """Fill ray (12,) from a pixel (see ``Scratch``). Returns the view's number."""
     view = _view_of(views.first, pixel)
     local = pixel - views.first[view]
     width = views.size[view, 0]
@@ -147,9 +158,7 @@ def take_pixel(views, ray_sampling, pixel, n, ray):
     if views.pixels.shape[1] == 4:
         alpha = np.float32(views.pixels[pixel, 3]) * _BYTE
     for c in range(3):
-        back = ray_sampling.background[c]
-        if ray_sampling.random_background:
-            back = uniform(key, k + np.uint64(3 + c))
+        back = background[c]
         ray[6 + c] = back
         ray[3 + c] = np.float32(views.pixels[pixel, c]) * np.float32(1.0 / 255.0) * alpha + back * (_F1 - alpha)
     ray[9] = np.float32(view)
@@ -163,7 +172,7 @@ def take_pixel(views, ray_sampling, pixel, n, ray):
     return view
 
 
-_AT, _LEAVE, _DEPTH = 0, 1, 2  # columns of ``Scratch.travel``
+AT, LEAVE, _DEPTH = 0, 1, 2  # columns of ``Scratch.travel``
 
 
 @part
@@ -174,13 +183,12 @@ def begin_rays(views, ray_sampling, space, chunk, first, end, ray, travel):
         view = draw_ray(views, ray_sampling, index, ray[r])
         enter, leave = interval(space, origin_of(views, view), (ray[r, 0], ray[r, 1], ray[r, 2]))
         enter += uniform(ray_sampling.key, np.uint64(index) * np.uint64(8) + np.uint64(6)) * space.step
-        travel[r, _AT], travel[r, _LEAVE], travel[r, _DEPTH] = enter, leave, _F0
+        travel[r, AT], travel[r, LEAVE], travel[r, _DEPTH] = enter, leave, _F0
 
 
 @part
-def fill_chunk(views, ray_sampling, space, encoding, net, chunk, x, line, acts, ray, travel, span):
-    """Fill a chunk with rays, their samples and what ``query_density`` returns for them.
-    Returns (rays drawn, columns, spans); rays that have not ended must not be used.
+def _march_chunk(views, ray_sampling, space, encoding, net, chunk, x, line, acts, ray, travel, span):
+    """Fill a chunk with rays (``fill_chunk``). Returns rays drawn, columns and spans.
 
     Samples behind an opaque one would take room for a gradient of zero. So rays are followed in rounds, by
     the occupancy grid's densities, until they are opaque, and their samples come in spans. The chunk gets as
@@ -207,8 +215,8 @@ def fill_chunk(views, ray_sampling, space, encoding, net, chunk, x, line, acts, 
                 under_way += 1
             r = active[marched]
             o, d = origin_of(views, np.int64(ray[r, 9])), (ray[r, 0], ray[r, 1], ray[r, 2])
-            at, leave = travel[r, _AT], travel[r, _LEAVE]
-            end, travel[r, _AT], _ = march(space, o, d, at, leave, x, ts, dts, end, room, np.float32(ASKED))
+            at, leave = travel[r, AT], travel[r, LEAVE]
+            end, travel[r, AT], _ = march(space, o, d, at, leave, x, ts, dts, end, room, np.float32(ASKED))
             stops[marched] = end
             marched += 1
         query_density(encoding, ray_sampling.levels, net, x, n, end, acts)
@@ -222,8 +230,8 @@ def fill_chunk(views, ray_sampling, space, encoding, net, chunk, x, line, acts, 
                 last += 1
             travel[r, _DEPTH] = depth
             if depth > np.float32(OPAQUE_DEPTH):
-                travel[r, _AT] = travel[r, _LEAVE]
-            elif travel[r, _AT] < travel[r, _LEAVE]:
+                travel[r, AT] = travel[r, LEAVE]
+            elif travel[r, AT] < travel[r, LEAVE]:
                 active[left] = r
                 left += 1
             if stop > begin:
@@ -233,6 +241,55 @@ def fill_chunk(views, ray_sampling, space, encoding, net, chunk, x, line, acts, 
             begin = stop
         n, under_way = end, left  # those that were not followed had no room, and will have none
     return fresh, n, spans
+
+
+@overload(fill_chunk)
+def _fill_chunk(encoding, views, ray_sampling, space, net, chunk, worker, x, line, acts, ray, travel, span, bins):
+    if has_own_sampling(encoding):
+        return None
+
+    def run(encoding, views, ray_sampling, space, net, chunk, worker, x, line, acts, ray, travel, span, bins):
+        drawn, n, spans = _march_chunk(
+            views, ray_sampling, space, encoding, net, chunk, x, line, acts, ray, travel, span
+        )
+        return drawn, n, spans, 0
+
+    return run
+
+
+@overload(learn_sampling)
+def _learn_sampling(encoding, bins, chunk, worker, r, w, line, a, b, good):
+    """Nothing to learn."""
+    if has_own_sampling(encoding):
+        return None
+    return lambda encoding, bins, chunk, worker, r, w, line, a, b, good: None
+
+
+@part
+def add_appearance(out, row, embedding, a, b):
+    """Add the effect of an appearance embedding to the raw colors of samples a to b, rows 1 to 3 of out.
+
+    Each number of the embedding weighs three outputs of the network, from ``row`` on, as harmonics weigh the
+    colors of directions: density cannot depend on it, and rendering at 0 costs nothing.
+    """
+    for k in range(embedding.size):
+        for c in range(3):
+            base, share = out[1 + c, a:b], out[row + 3 * k + c, a:b]
+            for s in range(base.size):
+                base[s] += embedding[k] * share[s]
+
+
+@part
+def add_appearance_backward(out, d_out, row, embedding, a, b, d_embedding):
+    """Backward of ``add_appearance``: writes rows ``row`` on of d_out and adds to d_embedding."""
+    for k in range(embedding.size):
+        total = _F0
+        for c in range(3):
+            base, share, d = d_out[1 + c, a:b], out[row + 3 * k + c, a:b], d_out[row + 3 * k + c, a:b]
+            for s in range(base.size):
+                total += base[s] * share[s]
+                d[s] = embedding[k] * base[s]
+        d_embedding[k] += total
 
 
 @part
@@ -246,7 +303,7 @@ def sort_by_ray(drawn, spans, span, ray, travel, column, ray_first):
     rays, first = 0, 0
     for r in range(drawn):
         number[r] = -1
-        if not travel[r, _AT] < travel[r, _LEAVE]:
+        if not travel[r, AT] < travel[r, LEAVE]:
             number[r], ray_first[rays] = rays, first
             at[r], first = first, first + at[r]
             if rays < r:
@@ -321,43 +378,47 @@ def add_exposure_sums(out, w, dts, first, end, ray, sums):
 
 
 @kernel
-def train_chunks(counter, worker, views, ray_sampling, space, encoding, net, weights, batch, scratch):
-    """Tasks are chunks. Does everything but the encoding's own gradient, which its scatter kernel adds up."""
+def train_chunks(counter, worker, views, ray_sampling, space, encoding, net, weights, batch, scratch, bins):
+    """Tasks are chunks. Does everything but the encoding's own gradient, which its scatter kernel adds up. bins: see
+    ``fill_chunk``."""
     acts, d_acts, line = scratch.acts[worker], scratch.d_acts[worker], scratch.line[worker]
     by_ray, column, span = scratch.by_ray[worker], scratch.column[worker], scratch.span[worker]
     ray_first, ray, travel = scratch.ray_first[worker], scratch.ray[worker], scratch.travel[worker]
     ts, dts, w = by_ray[8], by_ray[9], by_ray[10]
-    outputs = net.widths[-1]
+    outputs, harmonics, embeddings = net.widths[-1], ray_sampling.harmonics, ray_sampling.embeddings
     out, d_out = acts[acts.shape[0] - outputs :], d_acts[acts.shape[0] - outputs :]
+    by_direction = harmonics > 1 or embeddings.shape[1] > 0
     while True:
         chunk = fetch_add(counter, 1)
         if chunk >= batch.samples.size:
             return
         x = batch.x[chunk]
-        drawn, n, spans = fill_chunk(views, ray_sampling, space, encoding, net, chunk, x, line, acts, ray, travel, span)
+        drawn, n, spans, dropped = fill_chunk(
+            encoding, views, ray_sampling, space, net, chunk, worker, x, line, acts, ray, travel, span, bins
+        )
         rays = sort_by_ray(drawn, spans, span, ray, travel, column, ray_first)
         used = ray_first[rays]
         query_color(encoding, ray_sampling.levels, net, x, np.int64(0), n, acts)
-        if ray_sampling.harmonics > 1:
+        if by_direction:
             for k in range(spans):
                 r, a, b = span[k, 0], span[k, 1], span[k, 2]
                 if r >= 0:
-                    add_harmonics(out, ray_sampling.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
+                    add_harmonics(out, harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
+                    add_appearance(out, 1 + 3 * harmonics, embeddings[np.int64(ray[r, 9])], a, b)
         activate_color(out, np.int64(0), n)
         gather_by_ray(out, line, column, used, by_ray)
         # Clear unused columns before sums over columns: 0 times NaN is NaN.
         clear_columns(acts, column, used, n)
         clear_columns(d_out, column, used, n)
         d_out[4:, :n] = _F0
-        loss, dropped = 0.0, 0
+        loss = 0.0
         for r in range(rays):
             a, b = ray_first[r], ray_first[r + 1]
             guide = ray[r, 11] if views.guide.size > 0 else _F0
             error = ray_loss(by_ray[:4], by_ray[4:8], ts, dts, w, a, b, ray[r, 3:6], ray[r, 6:9], guide, weights)
-            if error < _F0:
-                dropped += 1
-                clear_columns(acts, column, a, b)
-            else:
+            good = error >= _F0
+            learn_sampling(encoding, bins, chunk, worker, r, w, line, a, b, good)
+            if good:
                 if views.weight.size > 0:
                     error *= ray[r, 10]
                     for k in range(4, 8):  # loops: slices compile for seconds
@@ -366,12 +427,19 @@ def train_chunks(counter, worker, views, ray_sampling, space, encoding, net, wei
                 loss += error
                 if batch.exposure.shape[1] > 0:
                     add_exposure_sums(by_ray, w, dts, a, b, ray[r], batch.exposure[chunk])
+            else:
+                dropped += 1
+                clear_columns(acts, column, a, b)
         scatter_to_columns(by_ray, column, used, d_out)
-        if ray_sampling.harmonics > 1:
+        batch.d_embeddings[chunk] = _F0
+        if by_direction:
             for k in range(spans):
                 r, a, b = span[k, 0], span[k, 1], span[k, 2]
                 if r >= 0:
-                    add_harmonics_backward(d_out, ray_sampling.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
+                    add_harmonics_backward(d_out, harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
+                    v = np.int64(ray[r, 9])
+                    d_embedding = batch.d_embeddings[chunk, v]
+                    add_appearance_backward(out, d_out, 1 + 3 * harmonics, embeddings[v], a, b, d_embedding)
         batch.d_params[chunk] = _F0
         query_backward(encoding, net, acts, d_acts, n, batch.d_params[chunk], batch.d_features[chunk])
         batch.columns[chunk], batch.samples[chunk], batch.rays[chunk] = n, used, rays

@@ -87,7 +87,6 @@ class Pool:
         self.nice = nice
         self._inboxes: list[SimpleQueue[_Job | None]] = [SimpleQueue() for _ in range(self.threads)]
         self._turn, self._closed = threading.Lock(), False
-        self._last: _Job | None = None  # the one in progress
         for worker in range(0 if nice else 1, self.threads):
             name = f"field-worker-{worker}"
             threading.Thread(target=self._serve, args=(worker,), name=name, daemon=True).start()
@@ -122,9 +121,6 @@ class Pool:
 
     def _lead(self, job: _Job) -> None:
         """For a caller that is worker 0: do its share of a job and wait for the others."""
-        if self._last is not None:
-            self._last.wait()  # its caller was interrupted twice
-        self._last = job
         try:
             self._work(job, 0)
         except BaseException:  # of an interrupt: perhaps not all were woken
@@ -133,7 +129,6 @@ class Pool:
             raise
         finally:
             job.wait()
-        self._last = None
 
     def _serve(self, worker: int) -> None:
         _lower_priority(self.nice)

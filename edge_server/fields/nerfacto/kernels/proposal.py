@@ -17,34 +17,25 @@ import numpy as np
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid
-from edge_server.fields.common.kernels.jit import kernel, part
-from edge_server.fields.common.kernels.radiance_model import is_a, query_backward, query_color, query_density
-from edge_server.fields.common.kernels.rays import interval, slab
-from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite
+from edge_server.fields.common.kernels.hash_grid import Grid
+from edge_server.fields.common.kernels.jit import part
+from edge_server.fields.common.kernels.radiance_model import (
+    is_a,
+    query_backward,
+    query_color,
+    query_density,
+    sample_rays,
+)
+from edge_server.fields.common.kernels.rays import interval, slab, unit_cube
+from edge_server.fields.common.kernels.simd import exp32, is_finite
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
 
 RAW_GAIN = 4.0  # raw density per unit of the table: it must rise in tens of steps at the hash levels' rate
 RAW_START = -1.2  # raw density where the table is 0: the thin fog that the network starts with too
 CUTOFF_DEPTH = 10.0  # optical depth behind which bins are dropped
-SCATTER_TASKS = 8  # tasks of the kernel that adds up the gradient of the grid
 DARK_SHARE = 0.1  # weight of a bin without light in uniform allocation; one in full light: 1 more
-WEIGHT_FLOOR = 1e-3  # in the interlevel loss's denominator, so that a weight of 0 does not divide
 
 _F0, _F1, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
-
-
-class ProposalGrid(NamedTuple):
-    """A hash grid (``hash_grid.Grid``) and, in its table from row first[-1] on, the proposal.
-
-    The proposal is cells^3 float32, x fastest; raw density is RAW_GAIN times a number, plus RAW_START.
-    """
-
-    resolution: NDArray[np.int32]
-    first: NDArray[np.int64]
-    dense: NDArray[np.bool_]
-    table: NDArray[np.float32]
-    cells: int
 
 
 class ProposalSampling(NamedTuple):
@@ -62,21 +53,18 @@ class ProposalSampling(NamedTuple):
     decay: np.float32
 
 
-@part
-def unit_cube(contracted, px, py, pz):
-    """Map a point in scene units to the encoding's unit cube, [0, 1)."""
-    scale, top = _HALF, np.float32(0.9999999)
-    if contracted:
-        scale = np.float32(0.25)
-        m = max(abs(px), max(abs(py), abs(pz)))
-        if m > _F1:
-            s = (np.float32(2.0) - _F1 / m) / m
-            px, py, pz = px * s, py * s, pz * s
-    return (
-        min(max(px * scale + _HALF, _F0), top),
-        min(max(py * scale + _HALF, _F0), top),
-        min(max(pz * scale + _HALF, _F0), top),
-    )
+class ProposalGrid(NamedTuple):
+    """A hash grid (``hash_grid.Grid``) and, in its table from row first[-1] on, the proposal.
+
+    The proposal is cells^3 float32, x fastest; raw density is RAW_GAIN times a number, plus RAW_START.
+    """
+
+    resolution: NDArray[np.int32]
+    first: NDArray[np.int64]
+    dense: NDArray[np.bool_]
+    table: NDArray[np.float32]
+    cells: int
+    sampling: ProposalSampling
 
 
 @part
@@ -252,7 +240,19 @@ def place_samples(contracted, o, d, edges, group, first, count, share, shift, n,
 
 
 @part
-def sample_ray(space, encoding, sampling, o, d, shift, within, bins, first, scratch, n, x, line):
+def bin_memory(size):
+    """Memory for the bins of rays, ``size`` of them: see ``sample_ray``."""
+    return (np.empty(size, np.int32), np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.int32))
+
+
+@part
+def bin_scratch(size):
+    """Scratch of ``sample_ray`` for a ray of ``size`` bins."""
+    return np.empty((2, size + 1), np.float32), np.empty((2, size), np.int32), np.empty(size, np.int64)
+
+
+@part
+def sample_ray(space, encoding, o, d, shift, within, bins, first, scratch, n, x, line):
     """Bins of the ray from o along d (three float32 each), from ``first`` on, and its samples from column n on.
 
     shift: of the raster of bins; within: of samples within their part; both in [0, 1).
@@ -261,7 +261,7 @@ def sample_ray(space, encoding, sampling, o, d, shift, within, bins, first, scra
     Returns (bins kept, whether the proposal is finite, the new number of samples).
     """
     cell, depth, weight, group = bins
-    edges, at, share = scratch
+    (edges, at, share), sampling = scratch, encoding.sampling
     enter, leave = interval(space, o, d)
     if not leave > enter:
         return np.int64(0), True, n
@@ -272,72 +272,25 @@ def sample_ray(space, encoding, sampling, o, d, shift, within, bins, first, scra
     return count, finite, n
 
 
-@part
-def interlevel_loss(
-    encoding, cell, depth, weight, group, first, count, w, group_of, start, stop, sampling, slope, grad
-):
-    """The proposal's loss on one ray (eq. 13) and its gradient: a group of bins must not weigh less than its
-    samples.
+@overload(sample_rays)
+def _sample_rays(encoding, space, o, travel, active, count, x, line, first):
+    """All samples of a ray at once, from the middle of the raster's places."""
+    if not is_a(encoding, ProposalGrid):
+        return None
 
-    The loss is the sum over groups of max(0, W - bound)^2 / (W + WEIGHT_FLOOR). W sums the weights w of the
-    samples start to stop (in groups group_of), constants here; bound sums the weights of the bins.
-    cell, depth, weight, group: of bins first to first + count. slope: float32 (2, bins), scratch.
-    grad: float32, like depth, receives ``sampling.interlevel`` times dLoss / dcell, plus the gradient of
-    sampling.decay / 2 times the squared excess of raw densities over RAW_START: an upper bound never lowers
-    what is too high, and behind an opaque bin no gradient tells that the surface has moved.
-    Returns the loss.
-    """
-    raw_of = proposal_cells_of(encoding)
-    loss = _F0
-    inside, bound = slope[0], slope[1]
-    for k in range(count):
-        inside[k] = bound[k] = _F0
-    for s in range(start, stop):
-        inside[np.int64(group_of[s])] += w[s]
-    for k in range(first, first + count):
-        bound[group[k]] += weight[k]
-    for g in range(count):
-        lack, norm = max(inside[g] - bound[g], _F0), inside[g] + np.float32(WEIGHT_FLOOR)
-        loss += lack * lack / norm
-        inside[g] = np.float32(-2.0) * sampling.interlevel * lack / norm
-    total, behind = _F0, _F0
-    for k in range(first, first + count):
-        total += depth[k]
-    after = exp32(-total)  # transmittance behind the last bin
-    for k in range(count - 1, -1, -1):
-        d_w, own = inside[group[first + k]], weight[first + k]
-        d_depth = d_w * after - behind
-        behind += own * d_w
-        after += own
-        raw = np.float32(RAW_GAIN) * raw_of[cell[first + k]] + np.float32(RAW_START)
-        free = raw > np.float32(RAW_LOW) and raw < np.float32(RAW_HIGH)
-        pull = sampling.decay * max(raw - np.float32(RAW_START), _F0)
-        grad[first + k] = np.float32(RAW_GAIN) * (pull + (d_depth * depth[first + k] if free else _F0))
-    return loss
+    def run(encoding, space, o, travel, active, count, x, line, first):
+        size, n, zero = encoding.sampling.bins, np.int64(0), np.int64(0)
+        bins, scratch = bin_memory(size), bin_scratch(size)
+        for k in range(count):
+            if k > 0 and n + 2 * encoding.sampling.samples + 1 > x.shape[1]:
+                return k
+            r = active[k]
+            d = travel[r, 0], travel[r, 1], travel[r, 2]
+            _, _, n = sample_ray(space, encoding, o, d, _HALF, _HALF, bins, zero, scratch, n, x, line)
+            travel[r, 3], first[k + 1] = travel[r, 4], n
+        return count
 
-
-@kernel
-def scatter_proposal(counter, worker, encoding, cell, grad, counts, gradient, dirty):
-    """Add the proposal's gradient to ``gradient`` (float32 like ``encoding.table``).
-
-    A task is a range of cells, so nothing races. cell: int32 (chunks, N), grad: float32 (chunks, N), the
-    first counts[c] are in use. dirty: bool (table rows / SEGMENT,), set where a segment received a gradient.
-    """
-    row = encoding.first[encoding.first.size - 1]
-    flat, flags = gradient[row:].reshape(-1), dirty[row // SEGMENT :]
-    width = SEGMENT * FEATURES
-    size = (flags.size + SCATTER_TASKS - 1) // SCATTER_TASKS * width
-    while True:
-        task = fetch_add(counter, 1)
-        if task >= SCATTER_TASKS:
-            return
-        low, high = task * size, (task + 1) * size
-        for c in range(counts.size):
-            for k in range(counts[c]):
-                place, g = cell[c, k], grad[c, k]
-                if low <= place < high and g != _F0:
-                    flat[place] += g
-                    flags[place // width] = True
+    return run
 
 
 @part

@@ -19,7 +19,6 @@ class TileLists(NamedTuple):
     """Pairs of a Gaussian and a tile that it touches. The pairs of a Gaussian have consecutive numbers.
     B cameras, at most T tiles, N Gaussians, at most P pairs, at most W bands.
 
-    wanted: uint8 (B, T), 1 for tiles to process.
     first: int32 (B, T + 1), where each tile's list begins in ``pair``.
     pair: int32 (B, P), pair numbers, tile by tile, front to back.
     owner: int32 (B, P), the Gaussian of each pair.
@@ -31,7 +30,6 @@ class TileLists(NamedTuple):
         (workers, 2, P): scratch of each worker, kept because allocating it costs more than using it.
     """
 
-    wanted: NDArray[np.uint8]
     first: NDArray[np.int32]
     pair: NDArray[np.int32]
     owner: NDArray[np.int32]
@@ -84,21 +82,10 @@ def _low_bits(bits, n):
 
 
 @part
-def _touches_tile(bits, n):
-    """1 if a Gaussian touches the n-th tile of its bounding box, else 0."""
-    return np.int64((bits >> np.uint64(min(n, 63))) & np.uint64(1)) if n < 64 else 1
-
-
-@part
-def _count_tiles(bits, n, x0, x1, begin, end, across, wanted):
-    """Count the wanted tiles that a Gaussian touches in rows begin, ..., end - 1. n: index, within its
-    bounding box, of the first of these tiles."""
-    hits = 0
-    for ty in range(begin, end):
-        for tx in range(x0, x1):
-            hits += np.int64(wanted[ty * across + tx]) * _touches_tile(bits, n)
-            n += 1
-    return hits
+def _count_tiles(bits, n):
+    """How many of the first n tiles of its bounding box a Gaussian touches: it is taken to touch all from the 65th
+    on."""
+    return count_bits(_low_bits(bits, n)) + max(n - 64, 0)
 
 
 @kernel
@@ -120,12 +107,8 @@ def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
             return
         across, down = columns[b], rows[b]
         top, bottom = down * band // bands, down * (band + 1) // bands
-        wanted, first, pair, owner = lists.wanted[b], lists.first[b], lists.pair[b], lists.owner[b]
+        first, pair, owner = lists.first[b], lists.pair[b], lists.owner[b]
         own_first, own_count, room = lists.own_first[b], lists.own_count[b], lists.pair.shape[1]
-        asked = 0
-        for t in range(across * down):
-            asked += np.int64(wanted[t])
-        whole = asked == across * down
         keys, order, begins, binned = (
             lists.keys[worker],
             lists.order[worker],
@@ -139,14 +122,9 @@ def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
             x0, x1, y0, y1 = tiles[b, i, 0], tiles[b, i, 1], tiles[b, i, 2], tiles[b, i, 3]
             bits, width, size = _tile_bits(tiles, b, i), x1 - x0, (x1 - x0) * (y1 - y0)
             begin, end = min(max(y0, top), y1), min(max(y0, bottom), y1)
-            if whole & (size <= 64):
-                pairs = count_bits(_low_bits(bits, size))
-                before = count_bits(_low_bits(bits, (begin - y0) * width))
-                here = count_bits(_low_bits(bits, (end - y0) * width)) - before
-            else:  # Gaussians outside the wanted tiles are not sorted
-                before = _count_tiles(bits, 0, x0, x1, y0, begin, across, wanted)
-                here = _count_tiles(bits, (begin - y0) * width, x0, x1, begin, end, across, wanted)
-                pairs = before + here + _count_tiles(bits, (end - y0) * width, x0, x1, end, y1, across, wanted)
+            before = _count_tiles(bits, (begin - y0) * width)
+            here = _count_tiles(bits, (end - y0) * width) - before
+            pairs = _count_tiles(bits, size)
             needed += pairs
             if made + pairs > room:
                 pairs = before = here = 0
@@ -176,12 +154,13 @@ def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
             x0, x1, y0, y1 = tiles[b, i, 0], tiles[b, i, 1], tiles[b, i, 2], tiles[b, i, 3]
             bits, width, size = _tile_bits(tiles, b, i), x1 - x0, (x1 - x0) * (y1 - y0)
             begin, end, p = min(max(y0, top), y1), min(max(y0, bottom), y1), np.int64(begins[i])
-            if whole & (size <= 64):
-                skipped = (begin - y0) * width
+            skipped = (begin - y0) * width
+            p += _count_tiles(bits, skipped)
+            corner, over = begin * across + x0 - t0, across - width
+            if size <= 64:
                 left = _low_bits(bits, (end - y0) * width)
-                p += count_bits(_low_bits(bits, skipped))
                 left = (left >> np.uint64(skipped)) if skipped < 64 else np.uint64(0)
-                corner, over, scale = begin * across + x0 - t0, across - width, 4096 // width + 1
+                scale = 4096 // width + 1
                 while left != np.uint64(0):
                     bit = lowest_bit(left)
                     left &= left - np.uint64(1)
@@ -191,17 +170,13 @@ def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
                     made += 1
                     p += 1
             else:
-                p += _count_tiles(bits, 0, x0, x1, y0, begin, across, wanted)
-                bit = (begin - y0) * width
-                for ty in range(begin, end):
-                    for tx in range(x0, x1):
-                        t = ty * across + tx
-                        if wanted[t] * _touches_tile(bits, bit) > 0:
-                            binned[0, made], binned[1, made] = p, t - t0
-                            cursor[t - t0 + 1] += 1
-                            made += 1
-                            p += 1
-                        bit += 1
+                for bit in range(skipped, (end - y0) * width):
+                    if bit >= 64 or (bits >> np.uint64(bit)) & np.uint64(1):
+                        t = corner + bit - skipped + (bit - skipped) // width * over
+                        binned[0, made], binned[1, made] = p, t
+                        cursor[t + 1] += 1
+                        made += 1
+                        p += 1
         longest = 0
         if band == 0:
             first[0] = lists.longest[b, bands:] = 0

@@ -16,6 +16,15 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from edge_server.fields.common.kernels.jit import part
+from edge_server.fields.common.kernels.simd_vectors import (
+    LANES,
+    Vector,
+    any_lane,
+    constant,
+    eight_lane_sums,
+    lane_sum,
+    require_contiguous,
+)
 from edge_server.fields.splat.kernels.project import (
     ALPHA,
     CONIC_A,
@@ -28,16 +37,6 @@ from edge_server.fields.splat.kernels.project import (
     PROJECTED,
     RED,
     TILE,
-)
-from edge_server.fields.splat.kernels.simd_vectors import (
-    LANES,
-    Vector,
-    any_lane,
-    constant,
-    eight_lane_sums,
-    lane_sum,
-    mask_and,
-    require_contiguous,
 )
 from edge_server.fields.splat.settings import ALPHA_MAX, ALPHA_MIN
 
@@ -168,7 +167,7 @@ def composite(
             dx, dy = x - mx, y - my
             form = dx * (dx * qa + (dy + dy) * qb) + (dy * qc) * dy
             a = ((form * _TO_2).exp2() * alpha).minimum(ALPHA_MAX)
-            a = a.where(mask_and(builder, a.greater_equal(ALPHA_MIN), light.greater_equal(STOP)))
+            a = a.where(builder.and_(a.greater_equal(ALPHA_MIN), light.greater_equal(STOP)))
             keep = strip.at(saved_data, builder.mul(loop.index, step))
             a.store(keep)
             light.store(strip.at(keep, _I64(STRIP)))
@@ -241,22 +240,3 @@ def composite_backward(
 
     f32, i64 = types.float32, types.int64
     return types.void(pairs, i64, owner, projected, f32, f32, slopes, i64, saved, sums), codegen
-
-
-@part
-def composite_strips(strip_pairs, count, lists, b, projected, x0, y0, tile, store, size, composited):
-    """``composite`` all strips of a tile of camera slot b whose first pixel is (x0, y0). tile: rows of PIXELS from
-    light on. store: float32, of which each strip gets ``size``. composited: int64 (STRIPS,), written."""
-    for n in range(STRIPS):
-        composited[n] = composite(
-            strip_pairs[n],
-            count[n],
-            lists.owner[b],
-            projected[b],
-            np.float32(x0),
-            np.float32(y0 + 2 * n),
-            tile,
-            n * STRIP,
-            store[n * size : (n + 1) * size],
-            SAVED,
-        )

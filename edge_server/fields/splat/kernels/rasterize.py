@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel, part
-from edge_server.fields.common.kernels.simd import draw, fetch_add, is_finite, uniform
+from edge_server.fields.common.kernels.simd import draw, fetch_add, is_finite
+from edge_server.fields.splat.kernels.bin_tiles import TileLists
 from edge_server.fields.splat.kernels.composite import (
     PIXELS,
     SAVED,
@@ -23,7 +24,6 @@ from edge_server.fields.splat.kernels.composite import (
     bin_strips,
     composite,
     composite_backward,
-    composite_strips,
 )
 from edge_server.fields.splat.kernels.project import TILE
 
@@ -45,7 +45,6 @@ class Targets(NamedTuple):
     weight: float32 (P,), how much each pixel counts; (0,) where all count in full.
     behind: float32 (P, 3), steps of 255, what is behind the Gaussians in each pixel; (0, 3): ``background``.
     background: float32 (3,), in [0, 1].
-    random: use a random background for each tile, from stream ``key``, instead.
     """
 
     first: NDArray[np.int64]
@@ -54,8 +53,23 @@ class Targets(NamedTuple):
     weight: NDArray[np.float32]
     behind: NDArray[np.float32]
     background: NDArray[np.float32]
-    random: bool
-    key: np.uint64
+
+
+class Raster(NamedTuple):
+    """The Gaussians that a camera sees, and the memory in which W workers rasterize them.
+
+    columns, rows: tiles across and down.
+    projected: float32 (B, N, PROJECTED), see ``project``. lists: by tile. The camera is slot 0 of both.
+    memory: float32 (W, ROWS * PIXELS), a tile. saved: float32 (W, longest * STRIPS * SAVED), what compositing saves;
+        (W, SAVED) where nothing is differentiated.
+    """
+
+    columns: int
+    rows: int
+    projected: NDArray[np.float32]
+    lists: TileLists
+    memory: NDArray[np.float32]
+    saved: NDArray[np.float32]
 
 
 @part
@@ -77,16 +91,45 @@ def strip_scratch(lists):
 
 
 @part
-def _load_tile(targets, view, x0, y0, t, target, behind, share):
+def begin_tile(raster, t, s, strip_pairs, count):
+    """Reset the tile memory ``s`` and list the Gaussians of each strip of tile t. Returns the tile's first pixel, x and
+    y, and where its list begins and ends."""
+    x0, y0 = TILE * (t % raster.columns), TILE * (t // raster.columns)
+    begin, end = np.int64(raster.lists.first[0, t]), np.int64(raster.lists.first[0, t + 1])
+    clear_tile(s)
+    bin_strips(raster.lists, 0, begin, end, raster.projected, y0, strip_pairs, count)
+    return x0, y0, begin, end
+
+
+@part
+def composite_strips(raster, strip_pairs, count, x0, y0, s, store, size, step, composited):
+    """``composite`` all strips of a tile whose first pixel is (x0, y0). s: the tile's memory. store: float32, of which
+    each strip gets ``size``, and each of its Gaussians ``step``. composited: int64 (STRIPS,), written."""
+    for n in range(STRIPS):
+        composited[n] = composite(
+            strip_pairs[n],
+            count[n],
+            raster.lists.owner[0],
+            raster.projected[0],
+            np.float32(x0),
+            np.float32(y0 + 2 * n),
+            s,
+            n * STRIP,
+            store[n * size :],
+            step,
+        )
+
+
+@part
+def _load_tile(targets, view, x0, y0, target, behind, share):
     """Fill target and behind, (3, PIXELS), and share (PIXELS,), the pixels' weights, 0 outside the image. Returns
     whether any pixel counts."""
     width, height, first = targets.size[view, 0], targets.size[view, 1], targets.first[view]
     own, weighed = targets.behind.shape[0] > 0, targets.weight.size > 0
     transparent, some = targets.pixels.shape[1] == 4, False
     for c in range(3):
-        color = uniform(targets.key, np.uint64(3 * t + c)) if targets.random else targets.background[c]
         for k in range(PIXELS):
-            behind[c, k] = color
+            behind[c, k] = targets.background[c]
     for k in range(PIXELS):
         x, y = x0 + k % TILE, y0 + k // TILE
         share[k] = _F0
@@ -106,31 +149,30 @@ def _load_tile(targets, view, x0, y0, t, target, behind, share):
 
 
 @kernel
-def train_tiles(counter, worker, targets, view, columns, rows, projected, lists, memory, saved, sums, losses):
-    """Render camera slot 0, compare it with image ``view`` of the targets, and backpropagate to the pairs. Tasks are
+def train_tiles(counter, worker, raster, targets, view, sums, losses):
+    """Render the raster, compare it with image ``view`` of the targets, and backpropagate to the pairs. Tasks are
     tiles. The loss is the squared color error times the pixel's weight, summed over pixels.
 
-    memory, saved: float32 (W, ROWS * PIXELS) and (W, longest * STRIPS * SAVED), scratch of each worker.
     sums: float32 (B, P, SUMS), written for the pairs of slot 0.
     losses: float64 (tiles, 2), written: the loss, and 1 if the tile is left out as not finite.
     """
-    s, store, share = memory[worker], saved[worker], np.empty(PIXELS, np.float32)
+    lists, tiles = raster.lists, raster.columns * raster.rows
+    s, store, share = raster.memory[worker], raster.saved[worker], np.empty(PIXELS, np.float32)
     target, behind = np.empty((3, PIXELS), np.float32), np.empty((3, PIXELS), np.float32)
     (strip_pairs, count), composited = strip_scratch(lists), np.empty(STRIPS, np.int64)
     while True:
-        t = draw(counter, worker, columns * rows)
-        if t >= columns * rows:
+        t = draw(counter, worker, tiles)
+        if t >= tiles:
             return
-        x0, y0 = TILE * (t % columns), TILE * (t // columns)
-        begin, end = np.int64(lists.first[0, t]), np.int64(lists.first[0, t + 1])
-        if (begin == end) & (targets.behind.shape[0] > 0):  # nothing to learn, and most tiles are such
+        # Nothing to learn, and most tiles are such.
+        if (lists.first[0, t] == lists.first[0, t + 1]) & (targets.behind.shape[0] > 0):
             losses[t, 0] = losses[t, 1] = 0.0
             continue
-        some = _load_tile(targets, view, x0, y0, t, target, behind, share)
-        clear_tile(s)
+        x0, y0, begin, end = begin_tile(raster, t, s, strip_pairs, count)
+        if not _load_tile(targets, view, x0, y0, target, behind, share):
+            count[0] = count[1] = count[2] = count[3] = 0
         size = (end - begin) * SAVED
-        bin_strips(lists, 0, begin, end if some else begin, projected, y0, strip_pairs, count)
-        composite_strips(strip_pairs, count, lists, 0, projected, x0, y0, s, store, size, composited)
+        composite_strips(raster, strip_pairs, count, x0, y0, s, store, size, SAVED, composited)
         square = _F0
         for k in range(PIXELS):
             s[_BEHIND + k] = _F0
@@ -154,7 +196,7 @@ def train_tiles(counter, worker, targets, view, columns, rows, projected, lists,
                 strip_pairs[n],
                 composited[n],
                 lists.owner[0],
-                projected[0],
+                raster.projected[0],
                 np.float32(x0),
                 np.float32(y0 + 2 * n),
                 s,
@@ -165,37 +207,20 @@ def train_tiles(counter, worker, targets, view, columns, rows, projected, lists,
 
 
 @kernel
-def render_tiles(
-    counter, worker, columns, rows, width, height, projected, lists, background, memory, saved, color, depth, opacity
-):
-    """Render camera slot 0. Tasks are tiles. color: float32 (H, W, 3), depth (z): (H, W), opacity: (H, W),
-    all written."""
-    s, store = memory[worker], saved[worker]
-    strip_pairs, count = strip_scratch(lists)
+def render_tiles(counter, worker, raster, background, color, depth, opacity):
+    """Render the raster. Tasks are tiles. color: float32 (H, W, 3), depth (z): (H, W), opacity: (H, W), all written."""
+    s, store, tiles = raster.memory[worker], raster.saved[worker], raster.columns * raster.rows
+    (strip_pairs, count), composited = strip_scratch(raster.lists), np.empty(STRIPS, np.int64)
     while True:
         t = fetch_add(counter, 1)
-        if t >= columns * rows:
+        if t >= tiles:
             return
-        x0, y0 = TILE * (t % columns), TILE * (t // columns)
-        clear_tile(s)
-        begin, end = np.int64(lists.first[0, t]), np.int64(lists.first[0, t + 1])
-        bin_strips(lists, 0, begin, end, projected, y0, strip_pairs, count)
-        for n in range(STRIPS):  # what the forward pass saves is of no use: all at the same place
-            composite(
-                strip_pairs[n],
-                count[n],
-                lists.owner[0],
-                projected[0],
-                np.float32(x0),
-                np.float32(y0 + 2 * n),
-                s,
-                n * STRIP,
-                store,
-                0,
-            )
+        x0, y0, _, _ = begin_tile(raster, t, s, strip_pairs, count)
+        # What the forward pass saves is of no use: all at the same place.
+        composite_strips(raster, strip_pairs, count, x0, y0, s, store, 0, 0, composited)
         for k in range(PIXELS):
             x, y = x0 + k % TILE, y0 + k // TILE
-            if x >= width or y >= height:
+            if x >= color.shape[1] or y >= color.shape[0]:
                 continue
             left = s[_T + k]
             for c in range(3):

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -199,7 +200,9 @@ class LayeredField:
 
     def _run_kernels(self, pool: Pool) -> None:
         """Run every kernel of the layers once, in a small field of its own."""
-        tiny = replace(self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False)
+        tiny = msgspec.structs.replace(
+            self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False
+        )
         camera, pose = Pinhole.from_fov(32, 32, 60.0), np.eye(4)
         pose[2, 3] = -3.0
         field = LayeredField(tiny, pool)

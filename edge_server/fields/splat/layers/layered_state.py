@@ -7,6 +7,7 @@ from collections import deque
 from dataclasses import asdict, replace
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -71,7 +72,7 @@ def pack(field: Any) -> Arrays:
     meta = {
         "version": VERSION,
         "field": NAME,
-        "settings": asdict(field.settings),
+        "settings": msgspec.structs.asdict(field.settings),
         **counters,
         "refused": refused,
         "tracked": tracked,

@@ -297,8 +297,6 @@ def _over_plate(observation: Observation, camera: FixedCamera) -> Targets:
         weight.reshape(-1),
         camera.plate.picture.reshape(-1, 3),
         np.zeros(3, np.float32),
-        False,
-        np.uint64(0),
     )
 
 

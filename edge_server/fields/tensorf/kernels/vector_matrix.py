@@ -20,6 +20,7 @@ from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.mlp import backward, forward
 from edge_server.fields.common.kernels.radiance_model import is_a, query_backward, query_color, query_density
 from edge_server.fields.common.kernels.simd import fetch_add
+from edge_server.fields.common.kernels.simd_vectors import Vector
 
 CHANNELS = 8  # components of a group; one 256-bit register
 ROWS = 4  # rows of a table in a segment; a dirty flag stands for one segment
@@ -49,47 +50,29 @@ class Planes(NamedTuple):
     table: NDArray[np.float32]
 
 
-_VECTOR = ir.VectorType(ir.FloatType(), CHANNELS)
-_I32 = ir.IntType(32)
-_MAY_FUSE = ("contract",)
+class _RowBuilder:
+    """Emits what both passes share: rows of a table as vectors, and the factors of a product."""
 
+    def __init__(self, context: Any, builder: Any, signature: Any, args: Any) -> None:
+        self.context, self.builder, self.kinds, self.args = context, builder, signature.args, args
+        self.rows = [builder.extract_value(args[1], k) for k in range(6)]
+        numbers = [builder.extract_value(args[2], k) for k in range(6)]
+        self.weights = [Vector.broadcast(builder, number, CHANNELS) for number in numbers]
 
-def _address(context: Any, builder: Any, array_type: Any, array: Any, row: Any) -> Any:
-    data = context.make_array(array_type)(context, builder, array).data
-    pointer = builder.bitcast(data, _VECTOR.as_pointer())
-    return builder.gep(pointer, [builder.zext(row, ir.IntType(64))])
+    def at(self, n: int, row: Any) -> Any:
+        """A pointer to a row of array argument n."""
+        data = self.context.make_array(self.kinds[n])(self.context, self.builder, self.args[n]).data
+        first = self.builder.mul(self.builder.zext(row, ir.IntType(64)), ir.IntType(64)(CHANNELS))
+        return self.builder.gep(data, [first])
 
+    def load(self, n: int, row: Any) -> Vector:
+        """A row of array argument n."""
+        return Vector.load(self.builder, self.at(n, row), CHANNELS)
 
-def _load(builder: Any, pointer: Any) -> Any:
-    value = builder.load(pointer)
-    value.align = 4
-    return value
-
-
-def _store(builder: Any, value: Any, pointer: Any) -> None:
-    builder.store(value, pointer).align = 4
-
-
-def _broadcast(builder: Any, number: Any) -> Any:
-    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), number, _I32(0))
-    return builder.shuffle_vector(
-        one, ir.Constant(_VECTOR, ir.Undefined), ir.Constant(ir.VectorType(_I32, CHANNELS), [0] * CHANNELS)
-    )
-
-
-def _blend(context: Any, builder: Any, array_type: Any, array: Any, rows: Any, weights: Any) -> Any:
-    total = None
-    for row, weight in zip(rows, weights):
-        value = _load(builder, _address(context, builder, array_type, array, row))
-        term = builder.fmul(value, weight, flags=_MAY_FUSE)
-        total = term if total is None else builder.fadd(total, term, flags=_MAY_FUSE)
-    return total
-
-
-def _unpack(builder: Any, rows: Any, weights: Any) -> tuple[list[Any], list[Any]]:
-    places = [builder.extract_value(rows, k) for k in range(6)]
-    shares = [_broadcast(builder, builder.extract_value(weights, k)) for k in range(6)]
-    return places, shares
+    def factors(self) -> tuple[Vector, Vector]:
+        """The plane's and the line's values: rows of argument 0 times weights."""
+        terms = [self.load(0, row) * weight for row, weight in zip(self.rows, self.weights, strict=True)]
+        return terms[0] + terms[1] + terms[2] + terms[3], terms[4] + terms[5]
 
 
 @intrinsic
@@ -97,15 +80,13 @@ def store_products(typingctx: Any, table: Any, rows: Any, weights: Any, out: Any
     """``out[at] = (sum_k<4 weights[k] table[rows[k]]) * (sum_k>=4 weights[k] table[rows[k]])``.
 
     table, out: contiguous float32 (N, 8); rows: 6 uint32, weights: 6 float32 (four vertices of the plane,
-    two of the line); at: uint32.
+    two of the line); at: uint32. As a plain loop over the channels it takes twice as long.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        places, shares = _unpack(builder, args[1], args[2])
-        plane = _blend(context, builder, signature.args[0], args[0], places[:4], shares[:4])
-        line = _blend(context, builder, signature.args[0], args[0], places[4:], shares[4:])
-        target = _address(context, builder, signature.args[3], args[3], args[4])
-        _store(builder, builder.fmul(plane, line), target)
+        build = _RowBuilder(context, builder, signature, args)
+        plane, line = build.factors()
+        (plane * line).store(build.at(3, args[4]))
         return context.get_dummy_value()
 
     return types.void(table, rows, weights, out, types.uint32), codegen
@@ -116,15 +97,12 @@ def store_products_backward(typingctx: Any, table: Any, rows: Any, weights: Any,
     """Backward of ``store_products``: d[at] is dLoss / dout[at]; adds to ``gradient``, shaped like table."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        places, shares = _unpack(builder, args[1], args[2])
-        plane = _blend(context, builder, signature.args[0], args[0], places[:4], shares[:4])
-        line = _blend(context, builder, signature.args[0], args[0], places[4:], shares[4:])
-        above = _load(builder, _address(context, builder, signature.args[3], args[3], args[4]))
-        steps = [builder.fmul(above, line)] * 4 + [builder.fmul(above, plane)] * 2
-        for place, share, step in zip(places, shares, steps):
-            pointer = _address(context, builder, signature.args[5], args[5], place)
-            term = builder.fmul(step, share, flags=_MAY_FUSE)
-            _store(builder, builder.fadd(_load(builder, pointer), term, flags=_MAY_FUSE), pointer)
+        build = _RowBuilder(context, builder, signature, args)
+        plane, line = build.factors()
+        above = build.load(3, args[4])
+        steps = [above * line] * 4 + [above * plane] * 2
+        for row, weight, step in zip(build.rows, build.weights, steps, strict=True):
+            (build.load(5, row) + step * weight).store(build.at(5, row))
         return context.get_dummy_value()
 
     return types.void(table, rows, weights, d, types.uint32, gradient), codegen

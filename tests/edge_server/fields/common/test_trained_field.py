@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget
+from edge_server.fields.common.kernels.volume_rendering import Weights
 from tests.edge_server.fields.small import SEEN, small
 
 
@@ -15,13 +16,13 @@ from tests.edge_server.fields.small import SEEN, small
 def test_shipped_settings_regularize(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The weights that a field gives its kernels where nothing is asked for."""
     field, given = small(name), []
-    train = field._train
+    run = field.pool.run
 
-    def noted(data, ray_sampling, space, weights) -> None:
-        given.append(weights)
-        train(data, ray_sampling, space, weights)
+    def noted(kernel, *args) -> None:
+        given.extend(arg for arg in args if isinstance(arg, Weights))
+        run(kernel, *args)
 
-    monkeypatch.setattr(field, "_train", noted)
+    monkeypatch.setattr(field.pool, "run", noted)
     field.fit(SEEN, Budget(steps=1))
     assert given[0].distortion == np.float32(0.01) and given[0].guide == np.float32(0.1)
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget
@@ -16,11 +17,11 @@ from tests.edge_server.fields.small import HELD, SEEN, score
 
 
 def test_samples_are_uniform_at_first_and_then_follow_the_proposal() -> None:
-    field = NerfactoField(replace(SMALL, even=0.4, anneal=40))
+    field = NerfactoField(structs.replace(SMALL, even=0.4, anneal=40))
     for step, share in ((0, 1.0), (10, 0.85), (40, 0.4), (400, 0.4)):
         field.step = step
         assert field._sampling().uniform_share == pytest.approx(share)
-    assert NerfactoField(replace(SMALL, interlevel=0.0))._sampling().uniform_share == 1.0
+    assert NerfactoField(structs.replace(SMALL, interlevel=0.0))._sampling().uniform_share == 1.0
 
 
 def test_the_proposal_learns_where_surfaces_are() -> None:
@@ -28,10 +29,11 @@ def test_the_proposal_learns_where_surfaces_are() -> None:
     both where surfaces are."""
     scores = []
     for interlevel in (SMALL.interlevel, 0.0):
-        field = NerfactoField(replace(SMALL, interlevel=interlevel, depth_guide=0.0))
+        field = NerfactoField(structs.replace(SMALL, interlevel=interlevel, depth_guide=0.0))
         field.fit(SEEN, Budget(steps=250))
         full = field.snapshot()
-        few = replace(full, sampling=full.sampling._replace(samples=4))
+        sampling = full.encoding.sampling._replace(samples=4)
+        few = replace(full, encoding=full.encoding._replace(sampling=sampling))
         color = few.render(HELD.camera_to_world, HELD.intrinsics).color
         scores.append(psnr(color, HELD.image / 255.0))
     assert scores[0] > scores[1] + 0.5
@@ -46,7 +48,7 @@ def test_appearances_take_up_what_differs_between_cameras() -> None:
     ]
     scores, looks = [], None
     for appearance in (0, 4):
-        field = NerfactoField(replace(SMALL, appearance=appearance))
+        field = NerfactoField(structs.replace(SMALL, appearance=appearance))
         field.fit(views, Budget(steps=300))
         scores.append(score(field, still.held_out[0]))
         looks = field._cameras.appearances
@@ -62,8 +64,4 @@ def test_appearances_take_up_what_differs_between_cameras() -> None:
 def test_appearance_costs_nothing_where_it_is_not_asked_for() -> None:
     field = NerfactoField(SMALL)
     field.fit(SEEN, Budget(steps=2))
-    assert (
-        field._cameras.appearances is None
-        and field._proposal_gradients.d_embeddings.size == 0
-        and field._net.widths[-1] == 4
-    )
+    assert field._cameras.appearances is None and field._batch.d_embeddings.size == 0 and field._net.widths[-1] == 4

@@ -9,7 +9,7 @@ import torch
 from edge_server.fields import Budget
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT
 from edge_server.fields.common.kernels.rays import COARSE, Space
-from edge_server.fields.common.kernels.train import RaySampling
+from edge_server.fields.common.kernels.train import RaySampling, add_appearance, add_appearance_backward, train_chunks
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW, Weights
 from edge_server.fields.common.occupancy_grid import OccupancyGrid
 from edge_server.fields.nerfacto.field import NerfactoField
@@ -18,19 +18,16 @@ from edge_server.fields.nerfacto.kernels.proposal import (
     DARK_SHARE,
     RAW_GAIN,
     RAW_START,
-    WEIGHT_FLOOR,
     ProposalGrid,
     ProposalSampling,
     allocate_samples,
     bin_weights,
-    interlevel_loss,
     make_bins,
     place_samples,
-    scatter_proposal,
     unwarp,
     warp,
 )
-from edge_server.fields.nerfacto.kernels.train import add_appearance, add_appearance_backward
+from edge_server.fields.nerfacto.kernels.train import WEIGHT_FLOOR, interlevel_loss, scatter_proposal
 from edge_server.fields.nerfacto.settings import NerfactoSettings
 from tests.edge_server.fields.scenes import ring
 
@@ -49,7 +46,8 @@ def _encoding(values: np.ndarray) -> ProposalGrid:
     """Four vertices of a hash level, then the proposal's cells."""
     table = np.concatenate([np.full((SEGMENT, FEATURES), 50.0, F), values.astype(F).reshape(-1, FEATURES)])
     first = np.array([0, SEGMENT], np.int64)
-    return ProposalGrid(np.array([2], np.int32), first, np.array([True]), table, CELLS)
+    sampling = ProposalSampling(BINS, 16, F(0.1), F(1.5), F(0.04))
+    return ProposalGrid(np.array([2], np.int32), first, np.array([True]), table, CELLS, sampling)
 
 
 def _bins_of(space: Space, encoding: ProposalGrid, shift: float = 0.4, leave: float = 6.0, bins: int = BINS):
@@ -235,7 +233,6 @@ def test_interlevel_loss_and_gradient_equal_the_oracle_and_finite_differences(se
         of,
         0,
         len(of),
-        ProposalSampling(BINS, 16, F(0.1), F(1.5), F(0.04)),
         np.empty((2, BINS), F),
         grad,
     )
@@ -322,20 +319,21 @@ def test_a_whole_steps_gradients_equal_finite_differences() -> None:
     field._net.params[-field._net.widths[-1]] = -1.0
     assert field.view_store.box is not None
     data = field._cameras.corrected(views, field.view_store.add(views).data, field.view_store.box)
-    ray_sampling = RaySampling(np.uint64(3), 32, 3, 4, F(0.0), np.full(3, 0.5, F), False)
-    weights = Weights(F(0.0))
+    looks = field._cameras.embeddings
+    ray_sampling = RaySampling(np.uint64(3), 32, 3, 4, F(0.0), np.full(3, 0.5, F), looks)
+    weights, batch = Weights(F(0.0)), field._batch
     space = OccupancyGrid(settings.cells, 0, field.view_store.box).space(0.1)
     space.occupied[:], space.coarse[:] = 1, 1
 
     def loss() -> float:
-        field._train(data, ray_sampling, space, weights)
-        return float(field._batch.loss.sum())
+        model = field._encoding, field._net, weights
+        field.pool.run(train_chunks, data, ray_sampling, space, *model, batch, field._scratch, field._bins)
+        return float(batch.loss.sum())
 
     loss()
-    rays = int(field._batch.rays.sum())
-    slopes = field._batch.d_params.sum(axis=0), field._proposal_gradients.d_embeddings.sum(axis=0)
-    assert rays == 64 and field._batch.samples.sum() > 64 and np.abs(slopes[1]).max() > 1e-4
-    net, looks = field._net.params, field._cameras.embeddings
+    slopes = batch.d_params.sum(axis=0), batch.d_embeddings.sum(axis=0)
+    assert batch.rays.sum() == 64 and batch.samples.sum() > 64 and np.abs(slopes[1]).max() > 1e-4
+    net = field._net.params
     checked = 0
     for array, slope in ((net, slopes[0]), (looks, slopes[1])):
         flat, wanted = array.reshape(-1), slope.reshape(-1)

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Budget
 from edge_server.fields.common.kernels.hash_grid import Grid
+from edge_server.fields.common.kernels.render import BATCH, TILE, render_tiles
+from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import CallerPool
-from edge_server.fields.nerfacto.field import NerfactoField, NerfactoSnapshot
-from edge_server.fields.nerfacto.kernels.render import SAMPLE_BATCH, TILE, render_with_proposal
+from edge_server.fields.nerfacto.field import NerfactoField
 from edge_server.fields.nerfacto.settings import NerfactoSettings
 from tests.edge_server.fields.scenes import ring
 from tests.edge_server.fields.torch_model import encode, mlp, ray_weights, shade, to_torch
@@ -46,35 +47,32 @@ def snapshot() -> Any:
 
 
 def _render(
-    snapshot: NerfactoSnapshot, pixels: NDArray[np.float64]
+    snapshot: RaySnapshot, pixels: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Places (N, 3), distances and lengths (2, N) of the samples that stay in the scratch; RGBDA (P, 5)."""
     view, n = VIEWS[2], len(pixels)
-    x, line = (np.full((1, 3, SAMPLE_BATCH), np.nan, np.float32), np.full((1, 3, SAMPLE_BATCH), np.nan, np.float32))
+    x, line = (np.full((1, 3, BATCH), np.nan, np.float32) for _ in range(2))
     out = np.full((n, 3), np.nan, np.float32), np.full(n, np.nan, np.float32), np.full(n, np.nan, np.float32)
     CallerPool().run(
-        render_with_proposal,
+        render_tiles,
         np.array(lens_row(view.intrinsics)),
         view.camera_to_world[:3, :3].copy(),
         snapshot.box.normalise(view.camera_to_world[:3, 3]),
         pixels,
-        snapshot.sampling,
         snapshot.space,
         snapshot.encoding,
         snapshot.levels,
         snapshot.net,
         snapshot.settings.harmonics,
         snapshot.background,
-        np.empty((1, int(snapshot.net.widths.sum()), SAMPLE_BATCH), np.float32),
-        x,
-        line,
-        *out,
+        (np.empty((1, int(snapshot.net.widths.sum()), BATCH), np.float32), x, line),
+        out,
     )
     here = np.isfinite(x[0, 0])
     return x[0][:, here].T, line[0, 0, here], line[0, 1, here], np.column_stack(out)
 
 
-def test_a_ray_is_what_torch_makes_of_its_samples(snapshot: NerfactoSnapshot) -> None:
+def test_a_ray_is_what_torch_makes_of_its_samples(snapshot: RaySnapshot) -> None:
     view, solid = VIEWS[2], []
     levels = snapshot.encoding
     grid = to_torch(Grid(levels.resolution, levels.first, levels.dense, levels.table), dtype=torch.float64)
@@ -99,10 +97,10 @@ def test_a_ray_is_what_torch_makes_of_its_samples(snapshot: NerfactoSnapshot) ->
     assert np.ptp(solid) > 0.5, "the pixels must show full and empty space"
 
 
-def test_rays_do_not_depend_on_those_beside_them(snapshot: NerfactoSnapshot) -> None:
+def test_rays_do_not_depend_on_those_beside_them(snapshot: RaySnapshot) -> None:
     """More rays than one task holds, and more samples than there is room for at a time."""
     pixels = np.random.default_rng(1).uniform(0.0, 24.0, (TILE + 30, 2))
-    assert TILE * SETTINGS.samples >= 2 * SAMPLE_BATCH
+    assert TILE * SETTINGS.samples >= 2 * BATCH
     together = _render(snapshot, pixels)[-1]
     alone = np.concatenate([_render(snapshot, p[None])[-1] for p in pixels])
     np.testing.assert_allclose(together, alone, atol=1e-6)

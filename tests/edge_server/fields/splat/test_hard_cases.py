@@ -97,12 +97,13 @@ def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.Fixture
     code = """
 from dataclasses import replace
 import numpy as np
+from msgspec import structs
 from edge_server.fields import Budget
 from tests.edge_server.fields.splat.test_hard_cases import TINY, VIEWS, StillField
 bent = [replace(v, intrinsics=replace(v.intrinsics, distortion=(-.1, .01, .002, .001))) for v in VIEWS]
 for extra, views in (({}, VIEWS), ({"harmonics": 9, "contracted": True}, bent),
                      ({"flatten": 0.1, "align": 0.05}, bent)):
-    field = StillField(replace(TINY, **extra))
+    field = StillField(structs.replace(TINY, **extra))
     field.fit(views, Budget(steps=25))
     out = field.render(VIEWS[0].camera_to_world, replace(VIEWS[0].intrinsics, width=37, height=19))
     field.points(50)

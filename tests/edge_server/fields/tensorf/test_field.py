@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from msgspec import structs
 
 from edge_server.fields import Budget
 from edge_server.fields.tensorf.field import TensorfField
@@ -12,7 +12,7 @@ from tests.edge_server.fields.tensorf.small import SMALL
 
 
 def test_upsampling_hardly_changes_the_picture() -> None:
-    field = TensorfField(replace(SMALL, upsample=(60,)))
+    field = TensorfField(structs.replace(SMALL, upsample=(60,)))
     field.fit(SEEN, Budget(steps=59))
     before, table = field.render(HELD.camera_to_world, HELD.intrinsics).color, field._encoding.table
     field.step = 60

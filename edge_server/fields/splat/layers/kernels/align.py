@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.camera import LENS, NEAR, load_camera
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import draw
-from edge_server.fields.splat.kernels.composite import (
-    PIXELS,
-    SAVED,
-    STRIP,
-    STRIPS,
-    _StripBuilder,
-    bin_strips,
-    composite_strips,
+from edge_server.fields.common.kernels.simd_vectors import (
+    LANES,
+    Vector,
+    any_lane,
+    constant,
+    eight_lane_sums,
+    require_contiguous,
 )
+from edge_server.fields.splat.kernels.composite import PIXELS, SAVED, STRIP, STRIPS, _StripBuilder
 from edge_server.fields.splat.kernels.project import (
     CONIC_A,
     CONIC_B,
@@ -41,15 +41,7 @@ from edge_server.fields.splat.kernels.project import (
     lens_terms,
     rotate_to_camera,
 )
-from edge_server.fields.splat.kernels.rasterize import clear_tile, strip_scratch
-from edge_server.fields.splat.kernels.simd_vectors import (
-    LANES,
-    Vector,
-    any_lane,
-    constant,
-    eight_lane_sums,
-    require_contiguous,
-)
+from edge_server.fields.splat.kernels.rasterize import begin_tile, composite_strips, strip_scratch
 from edge_server.fields.splat.layers.settings import ATTACHED, NOISE, ROBUST
 from edge_server.fields.splat.settings import ALPHA_MAX, ALPHA_MIN
 
@@ -89,11 +81,9 @@ def align_view(
         image,
         plate,
         weight,
-        int(raster.columns[0]),
+        raster.first,
         camera[None],
         places,
-        raster.projected,
-        raster.lists,
         anchor,
         share,
         matrix,
@@ -204,7 +194,7 @@ def _multiply(typingctx: Any, slopes: Any, a0: Any, a1: Any, b0: Any, b1: Any, o
 
 
 @part
-def _prepare(cam, places, projected, anchor, share, scale, across):
+def _prepare(cam, places, anchor, share, scale, across):
     """What the picture's slopes are multiplied by.
 
     scale: float32 (N, 4), written: pixels x by U and V, pixels y by U and V, for each Gaussian.
@@ -286,34 +276,19 @@ def _heaviest(image, plate, weight, x0, y0, behind):
 
 @kernel
 def add_view(
-    counter,
-    worker,
-    image,
-    plate,
-    weight,
-    columns,
-    cams,
-    places,
-    projected,
-    lists,
-    anchor,
-    share,
-    matrix,
-    vector,
-    shown,
-    opacity,
+    counter, worker, image, plate, weight, raster, cams, places, anchor, share, matrix, vector, shown, opacity
 ):
     """See ``align_view``; one task, so that sums do not depend on the number of threads."""
     if draw(counter, worker, 1) >= 1:
         return
-    height, width, anchors = image.shape[0], image.shape[1], vector.size // 3
+    height, width, anchors, lists = image.shape[0], image.shape[1], vector.size // 3, raster.lists
     for y in range(height):
         for x in range(width):
             opacity[y, x] = _F0
             for c in range(3):
                 shown[y, x, c] = plate[y, x, c] * _BYTE
     scale, across = np.empty((places.shape[0], 4), np.float32), np.empty((anchors, 2, 3))
-    _prepare(load_camera(cams, 0), places, projected, anchor, share, scale, across)
+    _prepare(load_camera(cams, 0), places, anchor, share, scale, across)
     # One anchor more than there are: nobody's, for tiles with an odd number of anchors.
     flat, flat_vector = np.zeros((2, 2, anchors + 1, anchors + 1)), np.zeros((anchors, 2))
     slopes = np.zeros((anchors + 1) * _ANCHOR, np.float32)
@@ -323,14 +298,13 @@ def add_view(
     (strip_pairs, count), composited = strip_scratch(lists), np.empty(STRIPS, np.int64)
     size = strip_pairs.shape[1] * SAVED
     store = np.empty(STRIPS * size, np.float32)
-    for t in range(columns * ((height + TILE - 1) // TILE)):
-        begin, end = np.int64(lists.first[0, t]), np.int64(lists.first[0, t + 1])
-        x0, y0 = TILE * (t % columns), TILE * (t // columns)
-        if begin == end or not _heaviest(image, plate, weight, x0, y0, behind) > _F0:
+    for t in range(raster.columns * raster.rows):
+        x0, y0 = TILE * (t % raster.columns), TILE * (t // raster.columns)
+        some = lists.first[0, t] < lists.first[0, t + 1]
+        if not some or not _heaviest(image, plate, weight, x0, y0, behind) > _F0:
             continue
-        clear_tile(s)
-        bin_strips(lists, 0, begin, end, projected, y0, strip_pairs, count)
-        composite_strips(strip_pairs, count, lists, 0, projected, x0, y0, s, store, size, composited)
+        _, _, begin, end = begin_tile(raster, t, s, strip_pairs, count)
+        composite_strips(raster, strip_pairs, count, x0, y0, s, store, size, SAVED, composited)
         _compare(s, image, weight, x0, y0, behind, rest, shown, opacity)
         many = 0
         for j in range(begin, end):
@@ -348,7 +322,7 @@ def add_view(
                 strip_pairs[n],
                 composited[n],
                 lists.owner[0],
-                projected[0],
+                raster.projected[0],
                 np.float32(x0),
                 np.float32(y0 + 2 * n),
                 behind,

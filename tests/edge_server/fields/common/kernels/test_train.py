@@ -69,13 +69,13 @@ def _train(
         harmonics=1,
         changed_share=np.float32(0.5),
         background=np.full(3, 0.5, np.float32),
-        random_background=False,
+        embeddings=np.zeros((len(VIEWS), 0), np.float32),
     )
     space = field._occupancy.space(step_length(SETTINGS, field.step))
     space = space._replace(density=space.density * np.float32(over))
     weights = Weights(np.float32(DISTORTION))
     batch, scratch = field._batch, field._scratch
-    field.pool.run(train_chunks, data, ray_sampling, space, field._encoding, field._net, weights, batch, scratch)
+    field.pool.run(train_chunks, data, ray_sampling, space, field._encoding, field._net, weights, batch, scratch, ())
     return float(batch.loss[0]), batch.d_params[0].copy(), int(batch.rays[0])
 
 
@@ -118,7 +118,7 @@ def test_rays_are_whole_and_in_order(field: NgpField) -> None:
     assert sorted(column) == list(range(batch.columns[0]))  # each once, those nobody uses last
     density = scratch.by_ray[0, 0]
     for a, b in pairwise(first):
-        t, length = scratch.line[0, :, column[a:b]].T
+        t, length = scratch.line[0, :2, column[a:b]].T
         assert (np.diff(t) > 0).all()
         depth = np.cumsum(density[a:b] * length)
         assert (depth[:-1] <= OPAQUE_DEPTH).all()  # nothing behind the first opaque sample

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from edge_server.fields.common.kernels.simd import COUNTER, draw, fetch_add
+from edge_server.fields.common.kernels.simd import draw, fetch_add
 from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
 
 # With a nice of 0 the caller is a worker itself.
@@ -55,18 +55,6 @@ def test_all_workers_compute_at_once_and_each_task_is_done_once(threads: int, ni
         assert (done == 1).all()
     pool.close()
     assert sorted(seen) == sorted(2 * list(range(threads)))
-
-
-@pytest.mark.parametrize("tasks", [0, 1, 2, 7, 100])
-@pytest.mark.parametrize("workers", [1, 3])
-def test_each_worker_draws_its_own_tasks_first(workers: int, tasks: int) -> None:
-    drawn = njit(lambda counter, worker, tasks: draw(counter, worker, tasks))
-    counter = np.zeros(COUNTER * workers, np.int64)
-    first = [drawn(counter, worker, tasks) for worker in range(workers)]
-    if tasks >= workers:  # fewer: some begin by helping
-        assert first == [tasks * w // workers for w in range(workers)]
-    rest = [drawn(counter, workers - 1, tasks) for _ in range(tasks + 1)]
-    assert sorted(t for t in (*first, *rest) if t < tasks) == list(range(tasks)) and rest[-1] >= tasks
 
 
 @either_priority
@@ -221,27 +209,6 @@ def test_a_caller_interrupted_before_it_has_woken_all_workers_loses_none(monkeyp
     assert sorted(seen) == [1, 2], "one of them twice, or not at all"
     pool.run(lambda counter, worker: seen.append(worker))
     assert sorted(seen[2:]) == [0, 1, 2]
-    pool.close()
-
-
-def test_who_is_interrupted_twice_leaves_it_to_the_next_job(monkeypatch) -> None:
-    pool, seen, sleep = Pool(2), [], time.sleep
-
-    def slow(counter, worker):
-        if worker == 1:
-            sleep(0.3)
-            seen.append("slow")
-
-    def interrupted_again(seconds):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(time, "sleep", interrupted_again)
-        _interrupted_after(0.1, lambda: pool.run(slow))
-    assert seen == []
-    for _ in range(3):
-        pool.run(lambda counter, worker: seen.append(worker))
-    assert seen[0] == "slow" and sorted(seen[1:]) == [0, 0, 0, 1, 1, 1]
     pool.close()
 
 

@@ -28,14 +28,8 @@ def as_gaussians(params: np.ndarray) -> Gaussians:
     return Gaussians(params, (params.shape[1] - BASE) // 3 + 1)
 
 
-def binned(
-    cams: np.ndarray,
-    params: np.ndarray,
-    wanted: list[np.ndarray | None] | None = None,
-    differentiate: bool = True,
-    pool: Pool | None = None,
-) -> RasterBuffers:
-    """Buffers after ``project_and_bin``; wanted: None for all tiles of all cameras."""
+def binned(cams: np.ndarray, params: np.ndarray, differentiate: bool = True, pool: Pool | None = None) -> RasterBuffers:
+    """Buffers after ``project_and_bin``."""
     raster = RasterBuffers(pool or CallerPool())
-    raster.project_and_bin(cams, as_gaussians(params), wanted, differentiate)
+    raster.project_and_bin(cams, as_gaussians(params), differentiate)
     return raster

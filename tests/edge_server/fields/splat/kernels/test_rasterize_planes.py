@@ -61,13 +61,13 @@ def flat(count: int, tilt: np.ndarray, seed: int = 0, thickness: float = -7.0) -
 def looked(params: np.ndarray) -> tuple[RasterBuffers, Gaussians, np.ndarray]:
     gaussians = Gaussians(params, 1)
     raster, cams = RasterBuffers(POOL), camera_rows([POSE], [LENS], BOX)
-    raster.project_and_bin(cams, gaussians, [None], differentiate=False)
+    raster.project_and_bin(cams, gaussians, differentiate=False)
     return raster, gaussians, cams[0]
 
 
 def blended(raster: RasterBuffers, planes: np.ndarray) -> np.ndarray:
     out = np.zeros((24, 24, 5), np.float32)
-    POOL.run(render_planes, 3, 3, 24, 24, raster.projected, raster.lists, planes, raster.memory, raster.saved, out)
+    POOL.run(render_planes, raster.first, planes, out)
     return out
 
 
@@ -116,19 +116,7 @@ def test_what_pixels_tell_adds_up_to_what_they_show():
     normals = np.random.default_rng(2).normal(size=(24, 24, 4)).astype(np.float32)
     normals[..., 3] = 1.0
     normal_sums = np.zeros((raster.lists.pair.shape[1], 4), np.float32)
-    POOL.run(
-        accumulate_normals,
-        3,
-        3,
-        24,
-        24,
-        raster.projected,
-        raster.lists,
-        normals,
-        raster.memory,
-        raster.saved,
-        normal_sums,
-    )
+    POOL.run(accumulate_normals, raster.first, normals, normal_sums)
     out = blended(raster, gaussian_planes(gaussians, camera))
     pairs = int(raster.lists.needed[0])
     np.testing.assert_allclose(normal_sums[:pairs, 3].sum(), out[..., 4].sum(), rtol=1e-4)

@@ -14,13 +14,12 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import FAST
-from edge_server.fields.splat.kernels.simd_vectors import (
+from edge_server.fields.common.kernels.simd_vectors import (
     LANES,
     Vector,
     any_lane,
     eight_lane_sums,
     lane_sum,
-    mask_and,
     require_contiguous,
 )
 
@@ -70,7 +69,7 @@ def test_masks_select_and_combine(pair):
     a, b = pair
 
     def chosen(x: Vector, y: Vector) -> Vector:
-        return x.where(mask_and(x.builder, x.greater_equal(-0.5), x.less(0.5)), 9.0)
+        return x.where(x.builder.and_(x.greater_equal(-0.5), x.less(0.5)), 9.0)
 
     np.testing.assert_array_equal(_run(chosen, a, b), np.where((a >= -0.5) & (a < 0.5), a, np.float32(9.0)))
 

@@ -1,6 +1,6 @@
-"""Explicit SIMD for the code of numba intrinsics: vectors of 16 float32 whose operators emit instructions.
+"""Explicit SIMD for the code of numba intrinsics: vectors of float32 whose operators emit instructions.
 
-LLVM would vectorize only some of the loops that these replace. A vector takes one register with AVX-512 and
+LLVM would vectorize only some of the loops that these replace. A vector of 16 takes one register with AVX-512 and
 two with AVX2.
 """
 
@@ -27,32 +27,37 @@ _MIN_EXPONENT = -64.0
 
 
 def constant(*numbers: float) -> ir.Constant:
-    """A vector constant: one number for all lanes, or one for each."""
+    """A constant of 16 lanes: one number for all, or one for each."""
     return ir.Constant(_VECTOR, [float(n) for n in (numbers * LANES if len(numbers) == 1 else numbers)])
 
 
+def _kind(lanes: int) -> ir.VectorType:
+    return ir.VectorType(ir.FloatType(), lanes)
+
+
 class Vector:
-    """16 float32 lanes. ``+ - *`` and ``/`` take another vector, or a number for all lanes."""
+    """Float32 lanes, 16 unless said otherwise. ``+ - *`` and ``/`` take another vector, or a number for all 16."""
 
     def __init__(self, builder: Any, value: Any) -> None:
         self.builder, self.value = builder, value
 
     @classmethod
-    def load(cls, builder: Any, pointer: Any) -> Vector:
-        """Load 16 numbers from a float pointer."""
-        value = builder.load(builder.bitcast(pointer, _VECTOR.as_pointer()))
+    def load(cls, builder: Any, pointer: Any, lanes: int = LANES) -> Vector:
+        """Load numbers from a float pointer."""
+        value = builder.load(builder.bitcast(pointer, _kind(lanes).as_pointer()))
         value.align = 4
         return cls(builder, value)
 
     @classmethod
-    def broadcast(cls, builder: Any, number: Any) -> Vector:
+    def broadcast(cls, builder: Any, number: Any, lanes: int = LANES) -> Vector:
         """A vector with a float value in all lanes."""
-        undefined = ir.Constant(_VECTOR, ir.Undefined)
+        undefined = ir.Constant(_kind(lanes), ir.Undefined)
         first = builder.insert_element(undefined, number, ir.IntType(32)(0))
-        return cls(builder, builder.shuffle_vector(first, undefined, ir.Constant(_INTEGERS, [0] * LANES)))
+        same = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
+        return cls(builder, builder.shuffle_vector(first, undefined, same))
 
     def store(self, pointer: Any) -> None:
-        self.builder.store(self.value, self.builder.bitcast(pointer, _VECTOR.as_pointer())).align = 4
+        self.builder.store(self.value, self.builder.bitcast(pointer, self.value.type.as_pointer())).align = 4
 
     def _binary(self, operation: str, other: Vector | float) -> Vector:
         operand = other.value if isinstance(other, Vector) else constant(other)
@@ -120,10 +125,6 @@ def require_contiguous(*kinds: Any) -> None:
     for kind in kinds:
         if not (isinstance(kind, types.Array) and kind.layout == "C"):
             raise TypingError(f"vectors take contiguous arrays, not {kind}")
-
-
-def mask_and(builder: Any, a: Any, b: Any) -> Any:
-    return builder.and_(a, b)
 
 
 def any_lane(builder: Any, mask: Any) -> Any:

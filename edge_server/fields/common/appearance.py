@@ -9,17 +9,12 @@ of taking them as input, since one network gives density and color here. And the
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import View
-from edge_server.fields.common.camera_refinement import CameraRefinement
-from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.ray_snapshot import RaySnapshot
-from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.training_schedule import BETA1, BETA2
 
 Array = NDArray[np.float64]
@@ -69,60 +64,12 @@ class AppearanceEmbeddings:
         for known in self.known.values():
             known[0] -= mean
 
-
-class CameraAppearance(CameraRefinement):
-    """A field's camera corrections (``CameraRefinement``) and, if enabled, appearance embeddings.
-
-    embeddings: float32 (V, A), of the views in training.
-    gradient: float32 (chunks, V, A), of the last step. rays: number of rays of that step.
-    """
-
-    def __init__(self, exposure: bool, most_m: float, most_deg: float, size: int, seed: int) -> None:
-        super().__init__(exposure, most_m, most_deg)
-        self.appearances = AppearanceEmbeddings(size, seed) if size else None
-        self.embeddings = np.zeros((0, 0), np.float32)
-        self.gradient, self.rays = np.zeros((0, 0, 0), np.float32), 0
-
-    @property
-    def enabled(self) -> bool:
-        """Whether corrections or appearances are learned."""
-        return super().enabled or self.appearances is not None
-
-    def corrected(self, views: Sequence[View], data: Views, box: SceneBox) -> Views:
-        """``data`` with the current corrections; also updates ``embeddings``."""
-        if self.appearances is not None:
-            self.embeddings = self.appearances.rows([v.camera for v in views])
-        else:
-            self.embeddings = np.zeros((len(views), 0), np.float32)
-        return super().corrected(views, data, box)
-
-    def learn(
-        self,
-        views: Sequence[View],
-        data: Views,
-        box: SceneBox,
-        step: int,
-        seed: int,
-        sums: NDArray[np.float64],
-        make_renderer: Callable[[], RaySnapshot],
-    ) -> Views:
-        """Update from the gradients of ``step``; returns the corrected data."""
-        if self.appearances is not None:
-            cameras = [v.camera for v in views]
-            self.appearances.learn(cameras, self.gradient, self.rays)
-            self.embeddings = self.appearances.rows(cameras)
-        return super().learn(views, data, box, step, seed, sums, make_renderer)
-
     def meta(self) -> dict[str, Any]:
-        """Everything a state keeps, exactly, as JSON types."""
-        own = self.appearances
-        known = {name: k.tolist() for name, k in own.known.items()} if own else {}
-        return {**super().meta(), "appearances": known, "appearance_steps": own.steps if own else 0}
+        """What a state keeps: exact, ready for JSON."""
+        known = {name: array.tolist() for name, array in self.known.items()}
+        return {"appearances": known, "appearance_steps": self.steps}
 
     def load(self, meta: dict[str, Any]) -> None:
         """Restore what ``meta`` returned."""
-        super().load(meta)
-        if self.appearances is not None:
-            known = meta.get("appearances", {})
-            self.appearances.known = {name: np.array(k, dtype=np.float64) for name, k in known.items()}
-            self.appearances.steps = int(meta.get("appearance_steps", 0))
+        self.known = {name: np.array(array, dtype=np.float64) for name, array in meta.get("appearances", {}).items()}
+        self.steps = int(meta.get("appearance_steps", 0))
