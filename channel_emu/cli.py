@@ -8,7 +8,8 @@ import json
 import logging
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,7 @@ from freshfield import scenario, transport
 from freshfield.files import format_table, out_file, out_folder
 
 if TYPE_CHECKING:
-    from channel_emu.live.proxy import Hook, Report
+    from channel_emu.live.proxy import Proxy, Report
 
 DESCRIPTION = """\
 Emulates a bad network between cameras and the edge server, per frame and from a random seed.
@@ -83,13 +84,15 @@ def _add_run(commands: Any) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from channel_emu.live.frame_stream import FrameStream
+    from channel_emu.live.frame_proxy import FrameProxy
     from channel_emu.live.priority import raise_priority
 
     plan = scenario.load(args.scenario, args.seed)
     config = channel_from_mapping(plan.channel, f"{plan.path}: channel", plan.path.parent)
     priority = "normal" if args.no_priority else raise_priority()
-    status, _ = _serve(args, config, plan.seed, hook=FrameStream(plan.cameras, args.out, priority))
+    status, _ = _serve(
+        args, partial(FrameProxy, cameras=plan.cameras, out=args.out, priority=priority), config, plan.seed
+    )
     return status
 
 
@@ -105,11 +108,12 @@ def _add_live_options(sub: argparse.ArgumentParser, what: str) -> None:
 
 
 def _serve(
-    args: argparse.Namespace, config: ChannelConfig, seed: int, hook: Hook | None = None, **options: Any
+    args: argparse.Namespace, make: Callable[..., Proxy], config: ChannelConfig, seed: int, **options: Any
 ) -> tuple[int, Report | None]:
-    """Run a proxy until SIGINT or SIGTERM. Returns the exit status, and the report if nothing failed."""
+    """Run the proxy that ``make`` returns until SIGINT or SIGTERM. Returns the exit status, and the report if nothing
+    failed."""
     from channel_emu.live.priority import SWITCH_INTERVAL_S, return_freed_memory
-    from channel_emu.live.proxy import EmulatorFailed, Proxy, ProxyOptions
+    from channel_emu.live.proxy import EmulatorFailed, ProxyOptions
     from channel_emu.model import trace
 
     chosen = ProxyOptions(
@@ -127,7 +131,7 @@ def _serve(
         stop = asyncio.Event()
         for name in (signal.SIGINT, signal.SIGTERM):
             asyncio.get_running_loop().add_signal_handler(name, stop.set)
-        return await Proxy(config, seed, chosen, hook).run(stop)
+        return await make(config, seed, chosen).run(stop)
 
     try:
         return 0, asyncio.run(live())
@@ -354,12 +358,13 @@ def _add_proxy(commands: Any) -> None:
 
 def _proxy(args: argparse.Namespace) -> int:
     from channel_emu.live.priority import raise_priority
+    from channel_emu.live.proxy import Proxy
     from channel_emu.live.report import show
 
     config = _config_of(args)
     if not args.no_priority:
         raise_priority()
-    status, report = _serve(args, config, args.seed, direction=args.direction, shared=args.shared)
+    status, report = _serve(args, Proxy, config, args.seed, direction=args.direction, shared=args.shared)
     if report is not None:
         print(json.dumps(report.plain()) if args.json else show(report))
     return status

@@ -30,7 +30,7 @@ from camera_node.synthetic import make_scene
 make_scene("tile", {"width": 16, "height": 16}).render("cam00", 0.0)
 """
 EMULATOR = """
-import channel_emu.cli, channel_emu.live.frame_stream
+import channel_emu.cli, channel_emu.live.frame_proxy
 import channel_emu.virtual.simulate
 """
 

@@ -1,2 +1,1 @@
-"""The emulator on the wall clock: a gRPC proxy for any service, with freshfield's frame stream as its
-hook."""
+"""The emulator on the wall clock: a gRPC proxy for any service, and one of freshfield's frame stream."""

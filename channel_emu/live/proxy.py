@@ -1,15 +1,13 @@
 """A gRPC proxy that passes every message through a seeded link, on one event loop woken by an exact timer.
 
-Without a hook it serves any service and parses nothing. Each method has its own link in each delayed
+``Proxy`` serves any service and parses nothing. Each method has its own link in each delayed
 direction, or one link carries all methods. On the wire all four kinds of call are streams, so one handler
 serves them. Metadata, deadline, status, trailers and cancellation are passed on without delay, the status
 after the messages that came before it. A dropped message of a stream is left out. If the only message of a
 direction is dropped, the call ends UNAVAILABLE: so does a dropped unary request or answer (and a stream of
 one message, which is the same on the wire).
 
-With a hook, the hook answers the methods that it names, and no others are served. ``frame_stream`` is the
-hook for freshfield's frame stream. Links, event queue, delay statistics, trace, replay and shutdown are the
-same.
+``frame_proxy`` is the same for freshfield's frame stream, whose headers it reads.
 """
 
 from __future__ import annotations
@@ -17,10 +15,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import grpc
 import grpc.aio
@@ -47,8 +45,6 @@ _STOP_GRACE_S = 0.5
 _REFRESH_EVERY_S = 0.5
 # How much of the chain's past path is kept; no event is processed later than this.
 _KEEP_PATH_NS = 60 * 10**9
-# Any other service has not agreed to the project's keepalive pings, and would close the connection.
-_CLIENT_OPTIONS = [(key, value) for key, value in CLIENT_OPTIONS if "keepalive" not in key and "ping" not in key]
 
 
 class EmulatorFailed(RuntimeError):
@@ -81,37 +77,21 @@ class ProxyOptions:
             raise ValueError(f"direction: expected one of {', '.join(DIRECTIONS)}, got {self.direction!r}")
 
 
-class Hook(Protocol):
-    """Answers a service's methods itself, with the proxy's links."""
-
-    client_options: list[tuple[str, Any]]
-    """Options of the gRPC channel to the service."""
-
-    def attach(self, proxy: Proxy) -> Mapping[str, grpc.RpcMethodHandler]:
-        """Called once, by the proxy's constructor. Returns the handlers by method path."""
-
-    async def start(self, server: grpc.aio.Server) -> None:
-        """Called before the server accepts calls."""
-
-    async def refresh(self) -> None:
-        """Called twice a second."""
-
-    def close(self) -> None:
-        """Called after the last message: close the hook's files. Raises OSError if that fails."""
-
-    @property
-    def pending(self) -> int:
-        """Number of messages that left their link and are still being handed on."""
-
-
 class Proxy(grpc.GenericRpcHandler):
     """Usage: ``start``, then ``stop``; or ``run``. Needs a running event loop.
 
-    config, seed: of the emulated channel. hook: answers the methods itself; None: any service is passed on.
-    Raises OSError if the trace or a file of the hook cannot be created, and TransportError.
+    config, seed: of the emulated channel.
+    Raises OSError if the trace cannot be created, and TransportError.
     """
 
-    def __init__(self, config: ChannelConfig, seed: int, options: ProxyOptions, hook: Hook | None = None) -> None:
+    streams_last: ClassVar[bool] = False
+    """Whether the clients' calls never end by themselves."""
+    # Any other service has not agreed to the project's keepalive pings, and would close the connection.
+    client_options: ClassVar = [
+        (key, value) for key, value in CLIENT_OPTIONS if "keepalive" not in key and "ping" not in key
+    ]
+
+    def __init__(self, config: ChannelConfig, seed: int, options: ProxyOptions) -> None:
         self.options = options
         self.clock = WallClock()
         self.origin_ns = self.clock.now_ns()
@@ -129,19 +109,14 @@ class Proxy(grpc.GenericRpcHandler):
         self._calls = 0
         self._tasks: list[asyncio.Task[None]] = []
         self._server = options.transport.aio_server()
-        self.service_channel = options.transport.aio_channel(
-            options.to, _CLIENT_OPTIONS if hook is None else hook.client_options
-        )
-        self._hook = hook
-        self._hooked = {} if hook is None else hook.attach(self)
+        self.service_channel = options.transport.aio_channel(options.to, self.client_options)
 
     async def start(self) -> int:
         """Start to listen. Returns the port. Raises TransportError if the address cannot be used."""
         self._server.add_generic_rpc_handlers((self,))
         self.port = self.options.transport.bind(self._server, self.options.listen)
         self.spawn(self._refresh())
-        if self._hook is not None:
-            await self._hook.start(self._server)
+        await self.prepare(self._server)
         await self._server.start()
         return self.port
 
@@ -166,8 +141,7 @@ class Proxy(grpc.GenericRpcHandler):
         """End open calls and close every file, each even if another fails. Messages inside the links remain
         ``in_flight``. Raises OSError if a file cannot be closed. Call it once."""
         with contextlib.ExitStack() as closing:  # runs the callbacks in reverse order
-            if self._hook is not None:
-                closing.callback(self._hook.close)
+            closing.callback(self.close)
             if self._trace is not None:
                 closing.callback(self._trace.close)
             for link in self.links.values():
@@ -176,9 +150,9 @@ class Proxy(grpc.GenericRpcHandler):
             for task in self._tasks:
                 task.cancel()
             await asyncio.gather(*self._tasks, return_exceptions=True)
-            # A node's stream does not end by itself, so the grace period would wait in vain.
-            for call in {call for link in self.links.values() if self._hook for call in link.calls}:
-                call.task.cancel()
+            if self.streams_last:  # the grace period would wait in vain
+                for call in {call for link in self.links.values() for call in link.calls}:
+                    call.task.cancel()
             await self._server.stop(_STOP_GRACE_S)
             await self.service_channel.close()
 
@@ -203,7 +177,7 @@ class Proxy(grpc.GenericRpcHandler):
 
     async def settled(self) -> None:
         """Wait until no message is inside a link or being handed on. Raises EmulatorFailed."""
-        while any(link.model.in_flight for link in self.links.values()) or self._pending():
+        while any(link.model.in_flight for link in self.links.values()) or self.pending:
             self.check()
             await asyncio.sleep(0.002)
 
@@ -243,14 +217,28 @@ class Proxy(grpc.GenericRpcHandler):
 
     def service(self, details: grpc.HandlerCallDetails) -> grpc.RpcMethodHandler | None:
         """The handler of a method, as gRPC asks for it; None: not served."""
-        if self._hook is not None:
-            return self._hooked.get(details.method)
 
         async def carry(_: Any, context: grpc.aio.ServicerContext) -> None:
             async with ServedCall(context) as call:
                 await self._carry(details.method, context, call)
 
         return grpc.stream_stream_rpc_method_handler(carry)
+
+    async def prepare(self, server: grpc.aio.Server) -> None:
+        """Called before the server accepts calls."""
+
+    async def refresh(self) -> None:
+        """Called twice a second."""
+
+    def close(self) -> None:
+        """Called after the last message."""
+
+    @property
+    def pending(self) -> int:
+        """Number of messages that left their link and are still being handed on."""
+        return sum(
+            link.model.counts[EventKind.DELIVERED] - link.forwarded - link.cancelled for link in self.links.values()
+        )
 
     async def _carry(self, method: str, context: grpc.aio.ServicerContext, served: ServedCall) -> None:
         """Pass one call of any kind on."""
@@ -300,22 +288,13 @@ class Proxy(grpc.GenericRpcHandler):
             f"discipline {self.channel.config.discipline})"
         )
 
-    def _pending(self) -> int:
-        """Number of messages that the links delivered and that are neither handed on nor cancelled."""
-        if self._hook is not None:
-            return self._hook.pending
-        return sum(
-            link.model.counts[EventKind.DELIVERED] - link.forwarded - link.cancelled for link in self.links.values()
-        )
-
     def _ended(self, task: asyncio.Task[None]) -> None:
         if not task.cancelled() and (error := task.exception()) is not None:
             self.fail(error)
 
     async def _refresh(self) -> None:
         while True:
-            if self._hook is not None:
-                await self._hook.refresh()
+            await self.refresh()
             before_ns = self.events.now_ns() - _KEEP_PATH_NS
             self.channel.forget(before_ns)
             for link in self.links.values():

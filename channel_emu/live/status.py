@@ -1,4 +1,4 @@
-"""The emulator's status, which ``frame_stream`` writes to ``OUT/channel.json`` twice a second."""
+"""The emulator's status, which ``frame_proxy`` writes to ``OUT/channel.json`` twice a second."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from channel_emu.live.camera_flow import CameraFlow
+from channel_emu.live.camera_stream import CameraStream
 from channel_emu.live.histogram import Histogram
 from channel_emu.live.live_link import DelayStats
 from channel_emu.model.channel import Channel
@@ -18,7 +18,7 @@ _SERIES_MOST = 600
 
 def snapshot(
     channel: Channel,
-    flows: Sequence[CameraFlow],
+    flows: Sequence[CameraStream],
     stats: DelayStats,
     rejected: dict[str, int],
     now_ns: int,
@@ -44,8 +44,8 @@ def snapshot(
     for flow in flows:
         counts = _counts(flow)
         totals.update(counts)
-        edge_rejected.update(flow.upstream.rejected)
-        entry: dict[str, Any] = {**counts, "connected": flow.upstream.connected, "streams": len(flow.link.calls)}
+        edge_rejected.update(flow.rejected)
+        entry: dict[str, Any] = {**counts, "connected": flow.connected, "streams": len(flow.link.calls)}
         if channel.chain is None and flow.link.model.chain is not None:
             entry["state"] = names[flow.link.model.chain.state(now)]
         by_camera[flow.camera] = entry
@@ -70,7 +70,7 @@ def snapshot(
     }
 
 
-def _counts(flow: CameraFlow) -> dict[str, int]:
+def _counts(flow: CameraStream) -> dict[str, int]:
     link = flow.link.model
     return {
         "received": link.offered + flow.held_out,
@@ -79,12 +79,12 @@ def _counts(flow: CameraFlow) -> dict[str, int]:
         **{str(kind): link.counts[kind] for kind in EventKind if kind is not EventKind.STARTED},
         # Frames are broken by a reset of the stream, and by an edge that is not connected.
         "broken": link.counts[EventKind.BROKEN] + flow.broken,
-        "in_flight": link.in_flight + flow.upstream.pending,
+        "in_flight": link.in_flight + flow.pending,
         "clock_backwards": link.clock_backwards,
     }
 
 
-def _shares(channel: Channel, flows: Sequence[CameraFlow], now_ns: int) -> dict[str, float]:
+def _shares(channel: Channel, flows: Sequence[CameraStream], now_ns: int) -> dict[str, float]:
     chains = [channel.chain] if channel.chain else [flow.link.model.chain for flow in flows]
     shares = [chain.occupancy(now_ns) for chain in chains if chain is not None]
     if not shares:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from camera_node.capture import Camera
-from channel_emu.live.upstream import CREDITS
+from channel_emu.live.camera_stream import CREDITS
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.faults.corruption import damage

@@ -18,7 +18,7 @@ import numpy as np
 from camera_node.config import source_config
 from camera_node.sources.datasets import colmap, transforms
 from camera_node.sources.datasets.records import Dataset, DatasetError
-from channel_emu.live.frame_stream import damage_payload
+from channel_emu.live.frame_proxy import damage_payload
 from channel_emu.model.config import channel_from_mapping
 from edge_server.config import read_config
 from edge_server.fields import checkpoint

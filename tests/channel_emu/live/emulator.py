@@ -14,9 +14,9 @@ import grpc
 import grpc.aio
 import numpy as np
 
-from channel_emu.live.camera_flow import CameraFlow
-from channel_emu.live.frame_stream import FrameStream
-from channel_emu.live.proxy import Proxy, ProxyOptions
+from channel_emu.live.camera_stream import CameraStream
+from channel_emu.live.frame_proxy import FrameProxy
+from channel_emu.live.proxy import ProxyOptions
 from channel_emu.model.config import channel_from_mapping
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.grpc_services import ClockService
@@ -52,14 +52,14 @@ def run(coroutine: Coroutine[Any, Any, None]) -> None:
 
 def make(
     out: Path, address: str, section: dict, cameras: tuple[str, ...] = ("cam00",), **options
-) -> tuple[Proxy, list[CameraFlow]]:
+) -> tuple[FrameProxy, list[CameraStream]]:
     """A proxy for the frame stream, not started, and its cameras' flows."""
-    stream = FrameStream(cameras, out)
     chosen = ProxyOptions("127.0.0.1:0", address, Transport(), **options)
-    return Proxy(channel_from_mapping(section), 0, chosen, stream), list(stream.flows.values())
+    proxy = FrameProxy(channel_from_mapping(section), 0, chosen, cameras, out)
+    return proxy, list(proxy.flows.values())
 
 
-def offer(flow: CameraFlow, sequence: int) -> None:
+def offer(flow: CameraStream, sequence: int) -> None:
     """A frame comes in."""
     request = to_request(frame_of(flow.camera, "s", sequence, sequence))
     flow.take(request.SerializeToString(), request.header)
@@ -154,13 +154,13 @@ class Camera:
 class Emulation:
     """Edge, emulator and cameras in one folder."""
 
-    def __init__(self, edge: Edge, proxy: Proxy, stream: FrameStream, cameras: dict[str, Camera]) -> None:
-        self.edge, self.proxy, self.stream, self.cameras = edge, proxy, stream, cameras
+    def __init__(self, edge: Edge, proxy: FrameProxy, cameras: dict[str, Camera]) -> None:
+        self.edge, self.proxy, self.cameras = edge, proxy, cameras
 
     async def connected(self) -> None:
         """Wait until every stream to the edge is open."""
         async with asyncio.timeout(30):
-            while not all(flow.upstream.connected for flow in self.stream.flows.values()):
+            while not all(flow.connected for flow in self.proxy.flows.values()):
                 await asyncio.sleep(0.01)
 
     async def settled(self) -> None:
@@ -184,12 +184,11 @@ async def emulate(
     edge = Edge(out, cameras, held_out, transport)
     await edge.start()
     chosen = ProxyOptions("127.0.0.1:0", f"127.0.0.1:{edge.port}", transport, **options)
-    stream = FrameStream(cameras, out)
-    proxy = Proxy(channel_from_mapping(section), seed, chosen, stream)
+    proxy = FrameProxy(channel_from_mapping(section), seed, chosen, cameras, out)
     await proxy.start()
     ledger = Ledger(out, "node", "all", WallClock().now_ns())
     nodes = {c: Camera(c, proxy.port, transport, c in held_out, ledger) for c in cameras}
-    made = Emulation(edge, proxy, stream, nodes)
+    made = Emulation(edge, proxy, nodes)
     await made.connected()
     try:
         yield made

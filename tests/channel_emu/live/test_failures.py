@@ -11,7 +11,7 @@ import grpc.aio
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from channel_emu.live import frame_stream
+from channel_emu.live import frame_proxy
 from channel_emu.live.proxy import EmulatorFailed, Proxy
 from channel_emu.model.chain import ChainError
 from freshfield.ledger import read_all
@@ -39,14 +39,14 @@ def test_a_full_disk_ends_the_emulator_and_its_other_books_are_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edge_is_there: bool
 ) -> None:
     """A frame comes due whose fate cannot be recorded: broken at once, or forwarded by the stream's task."""
-    monkeypatch.setattr(frame_stream, "_FIRST_WAIT_S", 5.0 if edge_is_there else 0.1)
+    monkeypatch.setattr(frame_proxy, "_FIRST_WAIT_S", 5.0 if edge_is_there else 0.1)
 
     async def live() -> None:
         edge = await Peer().start() if edge_is_there else None
         address = edge.address if edge else f"127.0.0.1:{free_port()}"
         proxy, (flow,) = make(tmp_path, address, SHORT, trace=tmp_path / "t.jsonl")
         running = asyncio.create_task(proxy.run(asyncio.Event()))
-        while not proxy.port or flow.upstream.opened.is_set() is not edge_is_there:
+        while not proxy.port or flow.opened.is_set() is not edge_is_there:
             await asyncio.sleep(0.01)
         offer(flow, 0)
         fill_the_disk(proxy)
@@ -64,7 +64,7 @@ def test_a_full_disk_ends_the_emulator_and_its_other_books_are_closed(
 
 def test_a_part_that_breaks_ends_the_emulator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A background task and the timer's callback, each with an error that is no OSError."""
-    monkeypatch.setattr(frame_stream, "_FIRST_WAIT_S", 0.1)
+    monkeypatch.setattr(frame_proxy, "_FIRST_WAIT_S", 0.1)
 
     async def live(break_it) -> None:
         proxy, (flow,) = make(tmp_path, f"127.0.0.1:{free_port()}", SHORT)
@@ -100,7 +100,7 @@ def test_an_answer_that_is_none_ends_the_stream_and_not_the_emulator(tmp_path: P
         await proxy.start()
         offer(flow, 0)
         async with asyncio.timeout(10):
-            while flow.upstream.connections < 2:
+            while flow.connections < 2:
                 await asyncio.sleep(0.01)
         assert flow.broken == 1 and not proxy._failure.done()
         await proxy.stop()
@@ -137,7 +137,7 @@ def test_cameras_are_let_in_once_the_streams_to_the_edge_stand(tmp_path: Path) -
         edge = await Peer().start()
         proxy, flows = make(tmp_path, edge.address, {}, ("cam00", "cam01", "cam02"))
         await proxy.start()
-        assert all(flow.upstream.connected for flow in flows)
+        assert all(flow.connected for flow in flows)
         offer(flows[0], 0)
         assert flows[0].broken == 0
         await proxy.stop()
@@ -147,7 +147,7 @@ def test_cameras_are_let_in_once_the_streams_to_the_edge_stand(tmp_path: Path) -
 
 
 def test_without_an_edge_they_are_let_in_a_moment_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_stream, "_FIRST_WAIT_S", 0.2)
+    monkeypatch.setattr(frame_proxy, "_FIRST_WAIT_S", 0.2)
 
     async def live() -> None:
         proxy, _ = make(tmp_path, f"127.0.0.1:{free_port()}", {})
@@ -162,7 +162,10 @@ def test_without_an_edge_they_are_let_in_a_moment_later(tmp_path: Path, monkeypa
 
 
 def test_a_status_that_a_thread_still_holds_does_not_replace_the_last(tmp_path: Path) -> None:
-    hook = frame_stream.FrameStream(["cam00"], tmp_path)
-    hook._write_status({"running": False})
-    hook._write_status({"running": True})
+    async def live() -> None:
+        proxy, _ = make(tmp_path, "127.0.0.1:1", {})
+        proxy._write_status({"running": False})
+        proxy._write_status({"running": True})
+
+    run(live())
     assert json.loads((tmp_path / "channel.json").read_text()) == {"running": False}

@@ -14,8 +14,8 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from channel_emu.live import live_link
+from channel_emu.live.camera_stream import CREDITS, PUSH
 from channel_emu.live.live_link import Message
-from channel_emu.live.upstream import CREDITS, PUSH
 from channel_emu.model import trace
 from channel_emu.virtual.replay import compare
 from edge_server.report.frame_accounting import account_frames
@@ -117,11 +117,11 @@ def test_a_reset_breaks_the_stream_and_the_camera_comes_back(tmp_path: Path) -> 
                     await asyncio.sleep(0.1)
             # INTERNAL is what gRPC's client makes of a write that crosses the reset on the wire.
             assert await camera.code() in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.INTERNAL)
-            assert r.stream.flows["cam00"].link.model.resets == 1
+            assert r.proxy.flows["cam00"].link.model.resets == 1
             await camera.connect()
             assert (await camera.push()).outcome == pb.OUTCOME_ACCEPTED
             await r.settled()
-            assert r.stream.flows["cam00"].link.model.counts["broken"] == 1
+            assert r.proxy.flows["cam00"].link.model.counts["broken"] == 1
 
     run(live())
 
@@ -158,8 +158,8 @@ def test_the_edge_may_die_and_come_back(tmp_path: Path) -> None:
             await r.connected()
             await asyncio.gather(*(c.stream(20, 0.005) for c in cameras))
             await r.settled()
-            assert sum(flow.broken for flow in r.stream.flows.values()) > 20
-            assert all(flow.upstream.connections == 2 for flow in r.stream.flows.values())
+            assert sum(flow.broken for flow in r.proxy.flows.values()) > 20
+            assert all(flow.connections == 2 for flow in r.proxy.flows.values())
             assert all(r.edge.ingest.delivered[c] > 0 for c in CAMERAS)
 
     run(live())
@@ -172,13 +172,13 @@ def test_an_edge_that_never_answers_costs_frames_and_no_memory(tmp_path: Path) -
         edge = await Peer(respond=silence).start()
         proxy, (flow,) = make(tmp_path, edge.address, {})
         await proxy.start()
-        while not flow.upstream.connected:
+        while not flow.connected:
             await asyncio.sleep(0.01)
         for n in range(200):
             offer(flow, n)
             await asyncio.sleep(0)
         await edge.until(CREDITS)
-        assert flow.upstream.pending == CREDITS + 1
+        assert flow.pending == CREDITS + 1
         assert flow.broken == 200 - CREDITS - 1
         await proxy.stop()
         assert flow.broken == 200
@@ -229,7 +229,7 @@ def test_strangers_and_nonsense_are_refused_and_counted(tmp_path: Path) -> None:
             # The stream goes on, and the cameras never noticed.
             assert await send(good) == ""
             await r.cameras["cam01"].stream(3, 0)
-            assert r.stream.rejected == {"unknown_camera": 2, "bad_id": 1, "unparsable": len(wrong)}
+            assert r.proxy.rejected == {"unknown_camera": 2, "bad_id": 1, "unparsable": len(wrong)}
             await channel.close()
 
     run(live())
@@ -255,7 +255,7 @@ def test_silent_streams_and_a_spoofed_session_do_not_keep_a_camera_out(tmp_path:
                 assert answer.reason == "session_in_use"
                 await camera.stream(3, 0)
                 await r.cameras["cam01"].stream(1, 0)  # opens a stream of its own only now
-                assert r.stream.streams.ended > 10
+                assert r.proxy.streams.ended > 10
             assert camera.answers == {"accepted": 5}
             await r.settled()
             assert r.edge.ingest.delivered["cam00"] == 5 and not r.edge.ingest.rejected
@@ -271,14 +271,14 @@ def test_what_is_inside_the_links_is_bounded_in_bytes(tmp_path: Path, monkeypatc
         async with emulate(tmp_path, section, cameras=("cam00", "cam01")) as r:
             for name in r.cameras:
                 await r.cameras[name].stream(5, 0)
-            inside = [len(t.item.raw) for f in r.stream.flows.values() for t in f.link.model.pending()]
+            inside = [len(t.item.raw) for f in r.proxy.flows.values() for t in f.link.model.pending()]
             assert 0 < sum(inside) == r.proxy._budget.held_bytes <= 20_000
-            full = r.stream.rejected["queue_full"]
+            full = r.proxy.rejected["queue_full"]
             assert full == 10 - len(inside) and r.cameras["cam01"].reasons["queue_full"] > 0
             await r.settled()
             assert r.proxy._budget.held_bytes == 0
             await r.cameras["cam00"].stream(1, 0)
-            assert r.stream.rejected["queue_full"] == full
+            assert r.proxy.rejected["queue_full"] == full
 
     run(live())
     frame_account(tmp_path)
@@ -312,8 +312,8 @@ def test_the_credits_at_the_edge_hold_for_bytes_too(tmp_path: Path) -> None:
         await proxy.start()
         large = Message(bytes(5 * 2**20), "s", 0, flow)
         for _ in range(6):
-            flow.upstream.send(large)
-        assert flow.upstream.pending == 2 and flow.broken == 4  # one on its way, the newest held
+            flow.send(large)
+        assert flow.pending == 2 and flow.broken == 4  # one on its way, the newest held
         await proxy.stop()
         await edge.stop()
 

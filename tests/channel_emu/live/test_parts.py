@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from channel_emu.live import priority, timer
 from channel_emu.live.call_flow import CallFlow
-from channel_emu.live.frame_stream import damage_payload
+from channel_emu.live.frame_proxy import damage_payload
 from channel_emu.live.histogram import Histogram
 from channel_emu.live.live_link import Message
 from channel_emu.live.timer import LoopTimer

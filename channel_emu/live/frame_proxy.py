@@ -1,4 +1,4 @@
-"""freshfield's frame stream as a hook of the proxy: nodes stream to the emulator, the emulator to the edge.
+"""The proxy of freshfield's frame stream: nodes stream to the emulator, the emulator to the edge.
 
 Frames are opaque bytes: only their headers are read. A node's answer is its link's decision. The edge's
 answers are counted here and not passed on.
@@ -11,7 +11,7 @@ import contextlib
 import gc
 import logging
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,11 @@ import grpc
 import grpc.aio
 import numpy as np
 
-from channel_emu.live.camera_flow import CameraFlow
+from channel_emu.live.camera_stream import PUSH, CameraStream
 from channel_emu.live.live_link import Flips
-from channel_emu.live.proxy import Proxy
+from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.live.status import snapshot
-from channel_emu.live.upstream import PUSH
+from channel_emu.model.config import ChannelConfig
 from channel_emu.model.counter_rng import stream_key
 from freshfield.files import write_json
 from freshfield.frame import FrameRejected, counted_ids, parse, valid_id
@@ -45,71 +45,69 @@ _WARN_AFTER_NS = 3 * 10**9
 _FIRST_WAIT_S = 2.0
 
 
-class FrameStream:
-    """The ``Hook`` of the frame stream, for ``Proxy``.
+class FrameProxy(Proxy):
+    """The proxy of the frame stream. A frame's header selects the camera, and with it the link.
 
     cameras: ids of the scenario's cameras; others are refused.
     out: folder of ``channel.json`` and the ledger.
     priority: result of ``priority.raise_priority``, for the status.
+    Further arguments as of ``Proxy``. Raises OSError if the ledger cannot be created.
     """
 
     client_options = CLIENT_OPTIONS
+    streams_last = True
 
-    def __init__(self, cameras: Sequence[str], out: Path, priority: str = "normal") -> None:
-        self.cameras = tuple(cameras)
-        self.flows: dict[str, CameraFlow] = {}
+    def __init__(
+        self,
+        config: ChannelConfig,
+        seed: int,
+        options: ProxyOptions,
+        cameras: Sequence[str],
+        out: Path,
+        priority: str = "normal",
+    ) -> None:
+        super().__init__(config, seed, options)
         self.rejected: dict[str, int] = {}
         """Frames refused here, by reason."""
+        self.streams = OpenStreams(MAX_STREAMS_PER_CAMERA * len(cameras))
+        self._sessions = SessionStreams(cameras)
         self._out = out
         self._status_lock, self._status_is_final = threading.Lock(), False
         self._priority = priority
-        self.streams = OpenStreams(MAX_STREAMS_PER_CAMERA * len(self.cameras))
-        self._sessions = SessionStreams(self.cameras)
-
-    def attach(self, proxy: Proxy) -> Mapping[str, grpc.RpcMethodHandler]:
-        """See ``Hook``. Raises OSError if the ledger cannot be created."""
-        self._proxy = proxy
-        self._ledger = Ledger(self._out, "emulator", "channel", proxy.origin_ns)
-        self._exchange = proxy.service_channel.unary_unary(_EXCHANGE)
-        self._warn_at_ns = proxy.origin_ns + _WARN_AFTER_NS
-        for camera in self.cameras:
-            jitter = np.random.default_rng(stream_key(proxy.channel.seed, camera, "channel.backoff"))
-            self.flows[camera] = CameraFlow(
-                proxy.link(camera, damage_payload),
-                proxy.clock,
-                proxy.origin_ns,
-                self._ledger,
-                proxy.service_channel,
-                proxy.options.transport.metadata(),
-                jitter,
-            )
-        return {
+        self._ledger = Ledger(out, "emulator", "channel", self.origin_ns)
+        self._metadata = options.transport.metadata()
+        self._exchange = self.service_channel.unary_unary(_EXCHANGE)
+        self._warn_at_ns = self.origin_ns + _WARN_AFTER_NS
+        self.flows = {camera: self._flow(camera) for camera in cameras}
+        self._handlers = {
             PUSH: grpc.stream_stream_rpc_method_handler(self._push),
             _EXCHANGE: grpc.unary_unary_rpc_method_handler(self._pass_exchange),
         }
 
-    async def start(self, server: grpc.aio.Server) -> None:
+    def service(self, details: grpc.HandlerCallDetails) -> grpc.RpcMethodHandler | None:
+        """The handler of a method, as gRPC asks for it; None: not served."""
+        return self._handlers.get(details.method)
+
+    async def prepare(self, server: grpc.aio.Server) -> None:
         """Connect to the edge. Returns when all streams are open, or after _FIRST_WAIT_S."""
         await serve_health(server, (SERVICE, CLOCK_SERVICE))
         for flow in self.flows.values():
-            self._proxy.spawn(flow.upstream.run())
+            self.spawn(flow.run())
         # Frames that came before the streams to the edge were open would be broken, but not by the channel.
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_FIRST_WAIT_S):
                 for flow in self.flows.values():
-                    await flow.upstream.opened.wait()
+                    await flow.opened.wait()
         # Scanning old objects makes the garbage collector's long pauses, and nearly all of them exist by now.
         gc.collect()
         gc.freeze()
 
     async def refresh(self) -> None:
         """Write the status; warn once if the edge is not connected."""
-        if self._warn_at_ns and self._proxy.clock.now_ns() > self._warn_at_ns:
+        if self._warn_at_ns and self.clock.now_ns() > self._warn_at_ns:
             self._warn_at_ns = 0
-            if not any(flow.upstream.connected for flow in self.flows.values()):
-                log.warning(
-                    "no answer from the edge at %s yet; frames are broken until it is there", self._proxy.options.to
-                )
+            if not any(flow.connected for flow in self.flows.values()):
+                log.warning("no answer from the edge at %s yet; frames are broken until it is there", self.options.to)
         await asyncio.to_thread(self._write_status, self._snapshot())
 
     def close(self) -> None:
@@ -117,19 +115,25 @@ class FrameStream:
         try:
             for flow in self.flows.values():
                 flow.close()
-            self._ledger.close(self._proxy.clock.now_ns())
+            self._ledger.close(self.clock.now_ns())
         finally:
             self._write_status(self._snapshot(final=True))
 
     @property
     def pending(self) -> int:
-        """See ``Hook``."""
-        return sum(flow.upstream.pending for flow in self.flows.values())
+        return sum(flow.pending for flow in self.flows.values())
+
+    def _flow(self, camera: str) -> CameraStream:
+        jitter = np.random.default_rng(stream_key(self.channel.seed, camera, "channel.backoff"))
+        link = self.link(camera, damage_payload)
+        return CameraStream(
+            link, self.clock, self.origin_ns, self._ledger, self.service_channel, self._metadata, jitter
+        )
 
     async def _push(self, _: Any, context: grpc.aio.ServicerContext) -> None:
         """Handle one stream of a node. Each message is answered as soon as the link has taken or dropped
         it."""
-        flow: CameraFlow | None = None
+        flow: CameraStream | None = None
         async with self.streams.open(context) as call:
             try:
                 # Nodes wait for this before they send.
@@ -142,8 +146,8 @@ class FrameStream:
                     flow.link.calls.discard(call)
 
     def _take(
-        self, raw: bytes, flow: CameraFlow | None, call: ServedCall
-    ) -> tuple[frames_pb2.PushResponse, CameraFlow | None]:
+        self, raw: bytes, flow: CameraStream | None, call: ServedCall
+    ) -> tuple[frames_pb2.PushResponse, CameraStream | None]:
         """Take one frame. flow: of the previous frame on the same stream. Returns the answer and the frame's
         flow."""
         try:
@@ -161,7 +165,7 @@ class FrameStream:
             detail = "session ids are 1 to 64 letters, digits, '.', '_', '-'"
             return self._reject(header, "bad_id", detail), flow
         try:
-            self._sessions.claim(flow.camera, header.session_id, call, self._proxy.clock.now_ns())
+            self._sessions.claim(flow.camera, header.session_id, call, self.clock.now_ns())
         except FrameRejected as error:
             return self._reject(header, error.reason, str(error)), flow
         if not flow.link.has_room(raw):
@@ -170,13 +174,13 @@ class FrameStream:
         try:
             return flow.take(raw, header), flow
         except Exception as error:
-            self._proxy.fail(error)
+            self.fail(error)
             raise
 
     def _reject(self, header: frames_pb2.FrameHeader, reason: str, detail: str) -> frames_pb2.PushResponse:
         self.rejected[reason] = self.rejected.get(reason, 0) + 1
         ids = counted_ids(header, self.flows)
-        self._ledger.write(self._proxy.clock.now_ns(), *ids, header.sequence, "rejected", reason)
+        self._ledger.write(self.clock.now_ns(), *ids, header.sequence, "rejected", reason)
         return frames_pb2.PushResponse(
             sequence=header.sequence, outcome=frames_pb2.OUTCOME_REJECTED, reason=reason, detail=detail
         )
@@ -184,9 +188,7 @@ class FrameStream:
     async def _pass_exchange(self, request: bytes, context: grpc.aio.ServicerContext) -> bytes:
         """Pass a clock exchange on without delay: it is for measuring, not part of the emulated network."""
         try:
-            return await self._exchange(
-                request, timeout=_EXCHANGE_TIMEOUT_S, metadata=self._proxy.options.transport.metadata()
-            )
+            return await self._exchange(request, timeout=_EXCHANGE_TIMEOUT_S, metadata=self._metadata)
         except grpc.aio.AioRpcError as error:
             await context.abort(error.code(), f"edge: {error.details()}")
             raise AssertionError("abort raises") from None
@@ -198,15 +200,8 @@ class FrameStream:
                 write_json(self._out / "channel.json", state)
 
     def _snapshot(self, final: bool = False) -> dict[str, Any]:
-        return snapshot(
-            self._proxy.channel,
-            list(self.flows.values()),
-            self._proxy.stats,
-            self.rejected,
-            self._proxy.events.now_ns(),
-            self._priority,
-            final,
-        )
+        flows, now_ns = list(self.flows.values()), self.events.now_ns()
+        return snapshot(self.channel, flows, self.stats, self.rejected, now_ns, self._priority, final)
 
 
 def damage_payload(raw: bytes, flips: Flips) -> bytes:

@@ -1,4 +1,4 @@
-"""One camera's stream from the emulator to the edge: up to CREDITS unanswered frames, reconnects for ever."""
+"""One camera: its frames pass a link and go on to the edge, on a stream that reconnects for ever."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import logging
 from collections import Counter, deque
-from collections.abc import Callable
 from typing import Any
 
 import grpc
@@ -14,7 +13,10 @@ import grpc.aio
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from channel_emu.live.live_link import STREAM_ENDED, Message
+from channel_emu.live.live_link import STREAM_ENDED, LiveLink, Message
+from channel_emu.model.link import EventKind
+from freshfield.clock import Clock
+from freshfield.ledger import Ledger
 from freshfield.limits import MAX_MESSAGE_BYTES, MAX_REASONS
 from freshfield.transport import backoff_s, peer_text
 from freshfield.v1 import frames_pb2 as pb
@@ -29,37 +31,42 @@ FIRST_BACKOFF_S = 0.1
 MAX_BACKOFF_S = 1.0
 
 
-class Upstream:
-    """Sends frames as they are given. While CREDITS frames are unanswered, one more is held. A frame is
-    broken if the edge is not connected, or if a newer frame replaces it while it is held.
+class CameraStream:
+    """Offers a camera's frames to its link as they come in, and sends them on when they are due.
 
-    channel, metadata: of the calls to the edge.
-    forwarded: called with a frame that is about to be handed to gRPC.
-    broken: called with a broken frame, also with a forwarded one whose stream ends before the answer (the
-        edge's ledger tells whether it arrived).
+    Held-out frames get no link and are not in its statistics. While CREDITS frames are unanswered, one more is held.
+    A frame is broken if the edge is not connected, if a newer one replaces it while it is held, or if the stream ends
+    before the answer (the edge's ledger tells whether it arrived).
+
+    origin_ns: the clock's reading at the channel's instant zero.
+    edge, metadata: of the calls to the edge.
     jitter: random generator for the pauses before reconnecting.
     """
 
     def __init__(
         self,
-        camera: str,
-        channel: grpc.aio.Channel,
+        link: LiveLink,
+        clock: Clock,
+        origin_ns: int,
+        ledger: Ledger,
+        edge: grpc.aio.Channel,
         metadata: tuple[tuple[str, str], ...],
-        forwarded: Callable[[Message], None],
-        broken: Callable[[Message], None],
         jitter: np.random.Generator,
     ) -> None:
-        self.camera = camera
+        self.camera = link.name
+        self.link = link
+        self.held_out = self.forwarded = self.broken = 0
         self.connected = False
         self.connections = 0
         self.opened = asyncio.Event()
         """Set when the first stream is open."""
         self.rejected: Counter[str] = Counter()
         """Number of the edge's refusals, by reason."""
-        self._channel = channel
+        self._clock = clock
+        self._origin_ns = origin_ns
+        self._ledger = ledger
+        self._edge = edge
         self._metadata = metadata
-        self._forwarded = forwarded
-        self._broken = broken
         self._jitter = jitter
         self._outbox: deque[Message] = deque()
         self._unanswered: deque[Message] = deque()
@@ -67,35 +74,55 @@ class Upstream:
         self._wake = asyncio.Event()
         self._trouble = ""
 
+    def take(self, raw: bytes, header: pb.FrameHeader) -> pb.PushResponse:
+        """Let the link decide about a frame that came in. Returns the answer to the node."""
+        now_ns = self._clock.now_ns()
+        message = Message(raw, header.session_id, header.sequence, self)
+        self._record(message, "received", now_ns)
+        outcome = pb.OUTCOME_ACCEPTED
+        if header.role == pb.ROLE_HELD_OUT:
+            self.held_out += 1
+            self.send(message)
+        elif self.link.offer(message, now_ns - self._origin_ns).outcome is EventKind.DROPPED_BUSY:
+            outcome = pb.OUTCOME_DROPPED_BUSY
+        return pb.PushResponse(sequence=header.sequence, outcome=outcome)
+
+    def settle(self, message: Message, kind: EventKind) -> None:
+        """See ``Receiver``."""
+        if kind is not EventKind.DELIVERED:
+            self._record(message, str(kind), self._clock.now_ns())
+        if kind in (EventKind.DELIVERED, EventKind.DUPLICATED):
+            self.send(message)
+
     def send(self, frame: Message) -> None:
         """Send a frame that is due now. Never blocks."""
         if not self.connected:
-            self._broken(frame)
+            self._break(frame)
         elif self._full(frame):
             if self._held is not None:
-                self._broken(self._held)
+                self._break(self._held)
             self._held = frame
         else:
             self._outbox.append(frame)
             self._wake.set()
-
-    def _full(self, frame: Message) -> bool:
-        """Whether the credits are used up: CREDITS frames, or MAX_MESSAGE_BYTES in more than one frame."""
-        out = [len(each.raw) for each in (*self._outbox, *self._unanswered)]
-        return len(out) >= CREDITS or (bool(out) and sum(out) + len(frame.raw) > MAX_MESSAGE_BYTES)
 
     @property
     def pending(self) -> int:
         """Number of frames given to ``send`` and neither answered nor broken yet."""
         return len(self._outbox) + len(self._unanswered) + (self._held is not None)
 
+    def close(self) -> None:
+        """At the emulator's end: record frames inside the link as ``in_flight`` in the ledger."""
+        for transit in self.link.model.pending():
+            self._record(transit.item, "in_flight", self._clock.now_ns())
+
     async def run(self) -> None:
-        """Keep a stream open until cancelled. Raises what ``forwarded`` or ``broken`` raises."""
+        """Keep a stream open until cancelled. Raises OSError if trace or ledger cannot be written."""
         failures = 0
         while True:
             answered = False
             try:
-                await self._channel.channel_ready()
+                await self._edge.channel_ready()
                 answered = await self._session()
             except STREAM_ENDED as error:
                 self._log_trouble(error)
@@ -106,7 +133,7 @@ class Upstream:
 
     async def _session(self) -> bool:
         """Run one stream until it fails. Returns whether the edge answered anything on it."""
-        call = self._channel.stream_stream(PUSH)(metadata=self._metadata)
+        call = self._edge.stream_stream(PUSH)(metadata=self._metadata)
         reader = asyncio.create_task(self._read(call))
         writer = asyncio.create_task(self._write(call))
         self.connected = True
@@ -140,7 +167,7 @@ class Upstream:
             while self._outbox:
                 frame = self._outbox.popleft()
                 self._unanswered.append(frame)
-                self._forwarded(frame)
+                self._hand_on(frame)
                 await call.write(frame.raw)
 
     async def _read(self, call: grpc.aio.StreamStreamCall) -> bool:
@@ -176,7 +203,27 @@ class Upstream:
         self._held = None
         self._wake.clear()
         for frame in ended:
-            self._broken(frame)
+            self._break(frame)
+
+    def _full(self, frame: Message) -> bool:
+        """Whether the credits are used up: CREDITS frames, or MAX_MESSAGE_BYTES in more than one frame."""
+        out = [len(each.raw) for each in (*self._outbox, *self._unanswered)]
+        return len(out) >= CREDITS or (bool(out) and sum(out) + len(frame.raw) > MAX_MESSAGE_BYTES)
+
+    def _hand_on(self, frame: Message) -> None:
+        now_ns = self._clock.now_ns()
+        self.forwarded += 1
+        self._record(frame, "forwarded", now_ns)
+        if frame.transit is not None:  # not a held-out frame
+            self.link.hand_on(frame, now_ns - self._origin_ns)
+
+    def _break(self, frame: Message) -> None:
+        self.broken += 1
+        self._record(frame, "broken", self._clock.now_ns())
+        self.link.record(frame)
+
+    def _record(self, frame: Message, event: str, now_ns: int) -> None:
+        self._ledger.write(now_ns, self.camera, frame.session, frame.sequence, event)
 
     def _log_trouble(self, trouble: Any) -> None:
         """Log what failed, once per kind of trouble and not once per attempt."""
