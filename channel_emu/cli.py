@@ -30,7 +30,7 @@ In the help of a command, [x] after an option is its default.
   channel-emu run room --listen 127.0.0.1:7001 --to 127.0.0.1:7000 --out runs/room --trace trace.jsonl
   channel-emu presets
   channel-emu simulate --preset ch6 --cameras 18 --seconds 600
-  channel-emu simulate --preset gilbert-elliott --csv frames.csv --plot ages.png
+  channel-emu simulate --preset gilbert-elliott --csv frames.csv
   channel-emu simulate --arrivals poisson:1/60ms --service exp:30ms --discipline lcfs-preempt
   channel-emu replay trace.jsonl
   channel-emu proxy --preset ch5 --to localhost:50051 --listen 127.0.0.1:50052 --seed 1
@@ -144,8 +144,8 @@ def _add_simulate(commands: Any) -> None:
     sub = commands.add_parser(
         "simulate",
         help="the same links in virtual time: ages and losses of a channel",
-        description="Simulates every camera's link and prints mean age (continuous time average), mean age "
-        "at slot boundaries, peak age, frames delivered and dropped, time shares of the states, and delays.",
+        description="Simulates every camera's link and prints mean age (continuous time average), peak "
+        "age, frames delivered and dropped, time shares of the states, and delays.",
     )
     _add_channel_options(sub)
     sub.add_argument("--spread", action="store_true", help="spread periodic cameras' frames evenly over the period")
@@ -162,15 +162,11 @@ def _add_simulate(commands: Any) -> None:
         "--frame-bytes", type=int, default=20_000, metavar="N", help="size of a frame, for bandwidth [%(default)s]"
     )
     sub.add_argument(
-        "--slot-ms", type=float, default=1.0, metavar="MS", help="slot of the slotted mean age [%(default)g]"
-    )
-    sub.add_argument(
         "--csv",
         type=out_file,
         metavar="FILE",
         help="write a row per frame, when offered and delivered, as fit reads it",
     )
-    sub.add_argument("--plot", type=out_file, metavar="FILE", help="write a figure: ages over time, delays")
     sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     sub.set_defaults(go=_simulate)
 
@@ -225,9 +221,7 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _simulate(args: argparse.Namespace) -> int:
-    from channel_emu.virtual import output
-    from channel_emu.virtual.link_run import OUTCOMES
-    from channel_emu.virtual.simulate import simulate
+    from channel_emu.virtual.simulate import OUTCOMES, simulate
 
     simulation = simulate(
         _config_of(args),
@@ -236,22 +230,18 @@ def _simulate(args: argparse.Namespace) -> int:
         args.seed,
         frame_period_ms=args.frame_period_ms,
         frame_bytes=args.frame_bytes,
-        slot_ms=args.slot_ms,
     )
     result = simulation.summary()
     if args.csv:
-        output.write_frames(simulation, args.csv)
-    if args.plot:
-        output.plot_ages(simulation, args.plot)
+        simulation.write_frames(args.csv)
     if args.json:
         print(json.dumps(result))
         return 0
     shown = {
         "mean age (ms)": result["mean_age_ms"],
         "peak age (ms)": result["peak_age_ms"],
-        "mean age at slot boundaries (ms)": result["mean_age_slotted_ms"],
         **{f"drawn delay, {name} (ms)": value for name, value in result["delay_ms"].items()},
-        **{key: result[key] for key in ("offered", "delivered", *OUTCOMES[2:], "in_flight") if result[key]},
+        **{key: result[key] for key in ("offered", "delivered", *OUTCOMES[1:], "in_flight") if result[key]},
         **{f"share of state {name}": share for name, share in result["state_share"].items() if share < 1},
         **{key: result[key] for key in ("cameras", "seconds", "seed")},
     }
@@ -288,20 +278,16 @@ def _add_presets(commands: Any) -> None:
         description="Lists the presets: parameters, written as simulate's options and a scenario take them; "
         "the mean delay over the stationary distribution of the states; what each is for.",
     )
-    sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     sub.set_defaults(go=_presets)
 
 
-def _presets(args: argparse.Namespace) -> int:
+def _presets(_: argparse.Namespace) -> int:
     parts = ("arrivals", "service", "chain", "discipline", "faults")
     rows: list[dict[str, Any]] = []
-    for name, (_, channel) in PRESETS.items():
+    for name, (_about, channel) in PRESETS.items():
         mean_ms = channel_from_mapping({"preset": name}).mean_delay_ms
         shown = {part: "" if part not in channel else str(channel[part]).replace("'", "") for part in parts}
         rows.append({"preset": name, "mean_delay_ms": mean_ms, **shown})
-    if args.json:
-        print(json.dumps([{**row, **PRESETS[row["preset"]]._asdict()} for row in rows]))
-        return 0
     print(format_table(rows) + "\n")
     print(format_table([{"preset": name, "what it is": preset.about} for name, preset in PRESETS.items()]))
     return 0

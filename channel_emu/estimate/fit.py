@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 
 from channel_emu.estimate import two_states
 from channel_emu.estimate.recording import (
-    LOST,
     MAX_DELAY_MS,
-    Camera,
     Recording,
     RecordingError,
     Transmissions,
@@ -28,7 +26,6 @@ from channel_emu.estimate.recording import (
 )
 from channel_emu.estimate.two_states import Segments, TwoStates
 from channel_emu.model.config import channel_from_mapping
-from channel_emu.model.link import EventKind
 from freshfield.scenario import ScenarioError
 
 MIN_DELAYS = 20
@@ -46,7 +43,6 @@ _MISFIT = 2.0
 _MAX_LOG_SD = 5.0
 # Searches begin with sojourns of so many frames, on so many segments.
 _START_FRAMES, _START_STEPS, _START_SEGMENTS = (5, 50, 500), 8, 80
-_DROPPED = (str(EventKind.DROPPED_BUSY), str(EventKind.SUPERSEDED))
 
 Interval = tuple[float, float] | None
 
@@ -71,7 +67,6 @@ class Fit:
     arrivals: periodic, poisson or as-offered.
     parameters: by name, in 1/ms and ms.
     bic: by number of states.
-    bursts: shares and runs of undelivered frames, by name.
     channel: the ``channel:`` section for a scenario.
     lines: the transmissions, one timeline a chain; second_state: probability of the second state at each.
     """
@@ -82,7 +77,6 @@ class Fit:
     arrivals: str
     parameters: dict[str, IntervalEstimate]
     bic: dict[int, float]
-    bursts: dict[str, IntervalEstimate]
     channel: dict[str, Any]
     warnings: list[str] = field(default_factory=list)
     lines: list[Transmissions] = field(default_factory=list)
@@ -103,7 +97,6 @@ class Fit:
             "bic": {str(k): round(v, 3) for k, v in self.bic.items()},
             "arrivals": self.arrivals,
             "parameters": {name: value.as_dict() for name, value in self.parameters.items()},
-            "bursts": {name: value.as_dict() for name, value in self.bursts.items()},
             "intervals": "95 %, by parametric bootstrap",
             "warnings": self.warnings,
             "channel": self.channel,
@@ -164,7 +157,6 @@ def fit(
     kind, period_ms = _arrivals(recording)
     if kind == "poisson":
         parameters["rate_per_ms"] = _arrival_rate(recording)
-    bursts = _loss_statistics(recording.cameras)
     channel = _channel_section(recording, parameters, chosen.law, kind, period_ms, scope)
     try:
         channel_from_mapping(channel, "the fitted channel")
@@ -179,7 +171,6 @@ def fit(
         kind,
         parameters,
         {k: each.bic for k, each in best.items()},
-        bursts,
         channel,
         warnings,
         lines,
@@ -348,7 +339,9 @@ def _interval(value: float, samples: NDArray[np.float64], chance: bool) -> Inter
     if not reach < _Z_95 * _MAX_LOG_SD:
         return None
     low, high = (math.exp(at + sign * reach) for sign in (-1, 1))
-    return (low / (1 + low), high / (1 + high)) if chance else (min(low, value), max(high, value))
+    if chance:
+        low, high = low / (1 + low), high / (1 + high)
+    return min(low, value), max(high, value)
 
 
 def _misfit_warnings(delays_ms: NDArray[np.float64], drawn_ms: NDArray[np.float64]) -> list[str]:
@@ -392,25 +385,6 @@ def _arrival_rate(recording: Recording) -> IntervalEstimate:
     rate = max(arrivals, 1) / max(waited_ms, 1e-6)
     reach = math.exp(_Z_95 / math.sqrt(max(arrivals, 1)))
     return IntervalEstimate(rate, (rate / reach, rate * reach))
-
-
-def _loss_statistics(cameras: list[Camera]) -> dict[str, IntervalEstimate]:
-    """Shares of dropped and lost frames, and lengths of runs of undelivered frames. Skipped frames and those still
-    inside the link are not counted."""
-    kept = [camera.outcome[(camera.outcome != EventKind.SKIPPED) & (camera.outcome != "")] for camera in cameras]
-    outcome = np.concatenate(kept)
-    dropped, lost = np.isin(outcome, _DROPPED), np.isin(outcome, LOST)
-    found = {"dropped_share": float(dropped.mean()), "lost_share": float(lost.sum() / max((~dropped).sum(), 1))}
-    runs = np.concatenate([_runs(np.isin(o, _DROPPED + LOST)) for o in kept])
-    if len(runs):
-        found |= {"run_of_missing_frames": float(runs.mean()), "longest_run_of_missing_frames": float(runs.max())}
-    return {name: IntervalEstimate(value) for name, value in found.items()}
-
-
-def _runs(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Lengths of the runs of True."""
-    edges = np.diff(np.concatenate([[0], flags.astype(np.int64), [0]]))
-    return np.flatnonzero(edges == -1) - np.flatnonzero(edges == 1)
 
 
 def _channel_section(

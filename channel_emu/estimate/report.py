@@ -12,8 +12,7 @@ from channel_emu.estimate.fit import Fit, IntervalEstimate
 from freshfield.files import picture
 from freshfield.untrusted import YamlWriter
 
-_MIN_FRAMES, _MAX_FRAMES, _CYCLES = 300, 4000, 40
-_COLORS, _GRAY = ("#0072B2", "#D55E00"), "#777777"
+_MAX_FRAMES = 2000
 
 
 def format_fit(fit: Fit) -> str:
@@ -33,8 +32,6 @@ def format_fit(fit: Fit) -> str:
             f"  a visit lasts {stay[0]:.4g} ms in {names[0]}, {stay[1]:.4g} ms in {names[1]}; "
             f"shares of time {share:.3f}, {1 - share:.3f}"
         )
-    lines.append("how frames fail to come")
-    lines += [_row(name, value) for name, value in fit.bursts.items()]
     lines.append(f"intervals: {summary['intervals']}")
     lines += [f"note: {warning}" for warning in fit.warnings]
     return "\n".join([*lines, "", _yaml({"channel": fit.channel}).rstrip()])
@@ -49,56 +46,26 @@ def scenario_text(fit: Fit) -> str:
 
 
 def plot(fit: Fit, path: Path) -> None:
-    """Plot delays and the second state's probability over time to ``path``; only the first part of a long
-    recording. Raises PlotError."""
-    cameras = fit.recording.cameras
+    """Plot the first delays, with the means, and below them the probability of the second state. Raises PlotError."""
+    cameras, two = fit.recording.cameras, fit.states == 2
     start_s = np.concatenate([c.started_ms for c in cameras]) / 1e3
-    delay_ms = np.concatenate([c.delay_ms for c in cameras])
-    has_delay = ~np.isnan(delay_ms)
-    order = np.argsort(start_s[has_delay], kind="stable")[: _plotted_frames(fit, np.sort(start_s[has_delay]))]
-    start_s, delay_ms = start_s[has_delay][order], delay_ms[has_delay][order]
-    two = fit.states == 2
-    ratios = [3, 1] if two else [1]
-    with picture(path, 1 + two, 1, sharex=True, size=(9, 3 + 1.5 * two), height_ratios=ratios) as axes:
-        top = axes[0, 0]
+    order = np.argsort(start_s, kind="stable")[:_MAX_FRAMES]  # frames that did not start come last
+    start_s, delay_ms = start_s[order], np.concatenate([c.delay_ms for c in cameras])[order]
+    with picture(path, 1 + two, 1, sharex=True, size=(9, 3 + 1.5 * two), height_ratios=[3, 1][: 1 + two]) as axes:
+        top, bottom = axes[0, 0], axes[-1, 0]
+        top.scatter(start_s, delay_ms, s=5, color="#777777")
         top.set_ylabel("delay (ms)")
-        if two:
-            _draw_states(fit, axes[:, 0], start_s, delay_ms)
-        else:
-            mean = fit.parameters["mean_ms"].value
-            top.scatter(start_s, delay_ms, s=5, color=_GRAY)
-            top.axhline(mean, color=_COLORS[0], lw=0.8, label=f"mean {mean:.3g} ms")
-        if top.get_legend_handles_labels()[0]:
+        bottom.set_xlabel("start of transmission (s)")
+        means = {name: value.value for name, value in fit.parameters.items() if name.startswith("mean")}
+        for (name, mean_ms), color in zip(means.items(), ("#0072B2", "#D55E00")):
+            top.axhline(mean_ms, color=color, lw=0.8, label=f"{name}: {mean_ms:.3g}")
+        if means:
             top.legend(loc="upper right")
-        axes[-1, 0].set_xlabel("start of transmission (s)")
-
-
-def _plotted_frames(fit: Fit, start_s: np.ndarray) -> int:
-    """Number of frames to plot: about forty visits to each state, so that single visits are visible."""
-    if fit.states == 1 or not len(start_s):
-        return _MAX_FRAMES
-    cycle_s = sum(1 / fit.parameters[f"mu{i}_per_ms"].value for i in (1, 2)) / 1e3
-    wanted = int(np.searchsorted(start_s, start_s[0] + _CYCLES * cycle_s))
-    return min(max(wanted, _MIN_FRAMES), _MAX_FRAMES)
-
-
-def _draw_states(fit: Fit, axes: Any, start_s: np.ndarray, delay_ms: np.ndarray) -> None:
-    """Draw delays colored by the state's probability, the means, and below the probability over time."""
-    names, (top, bottom) = fit.channel["chain"]["states"], axes
-    bottom.set(ylim=(-0.05, 1.05), ylabel=f"P({names[1]})")
-    for i, (name, color) in enumerate(zip(names, _COLORS), start=1):
-        if f"mean_{i}_ms" in fit.parameters:
-            mean = fit.parameters[f"mean_{i}_ms"].value
-            top.axhline(mean, color=color, lw=0.8, label=f"{name}: mean {mean:.3g} ms")
-    for (at_ms, _, _), states in zip(fit.lines, fit.second_state):
-        at_s = at_ms / 1e3
-        bottom.plot(at_s[at_s <= start_s[-1]], states[at_s <= start_s[-1]], lw=0.8, color=_COLORS[1])
-        if len(fit.lines) == 1:
-            second = states[np.minimum(np.searchsorted(at_s, start_s), len(at_s) - 1)]
-            drawn = top.scatter(start_s, delay_ms, c=second, s=8, cmap="coolwarm", vmin=0, vmax=1)
-            top.figure.colorbar(drawn, ax=top, label=f"P({names[1]})")
-    if len(fit.lines) > 1:
-        top.scatter(start_s, delay_ms, s=5, color=_GRAY)
+        if two:
+            bottom.set(ylim=(-0.05, 1.05), ylabel=f"P({fit.channel['chain']['states'][1]})")
+            for (at_ms, _, _), states in zip(fit.lines, fit.second_state):
+                shown = at_ms / 1e3 <= np.nanmax(start_s)
+                bottom.plot(at_ms[shown] / 1e3, states[shown], lw=0.8, color="#D55E00")
 
 
 def _bic_difference(bic: dict[int, float]) -> str:

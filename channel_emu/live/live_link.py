@@ -100,7 +100,6 @@ class LiveLink:
     ) -> None:
         self.name = name
         self.model = model
-        self.scheduled_ns = -1
         self.calls: set[ServedCall] = set()
         """The open calls whose messages pass this link; a reset ends them."""
         self.stats = stats
@@ -134,7 +133,7 @@ class LiveLink:
         transit, events = self.model.offer(at_ns, message, len(message.raw))
         message.transit = transit
         self._act(events)
-        self._events.reschedule(self)
+        self._events.schedule(self)
         return transit
 
     def advance(self, now_ns: int) -> None:

@@ -16,15 +16,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from channel_emu.model import faults as fault_modules
-from channel_emu.model.chain import (
-    MAX_JUMPS_PER_MS,
-    ChainError,
-    check_generator,
-    leaving,
-    stationary,
-    transition_matrix,
-    two_state_generator,
-)
+from channel_emu.model.chain import ChainError, check_generator, stationary, two_state_generator
 from channel_emu.model.faults import per_state
 from channel_emu.model.link import DISCIPLINES
 from channel_emu.model.notation import section
@@ -104,15 +96,6 @@ class ChainConfig(Settings, frozen=True):
             raise ValueError("expected a square matrix, row by row")
         return check_generator(np.array(self.generator_per_ms, float))
 
-    def switches_per_ms(self) -> float:
-        """Long-run rate of state changes, as sampled. Raises ChainError without a unique long-run
-        distribution."""
-        generator = self.generator()
-        shares = stationary(generator)
-        if self.slot_ms is None:
-            return float(-shares @ generator.diagonal())
-        return float(shares @ leaving(transition_matrix(generator, self.slot_ms))) / self.slot_ms
-
     def names(self) -> list[str]:
         count = 2 if self.generator_per_ms is None else len(self.generator_per_ms)
         return self.states or [f"s{i + 1}" for i in range(count)]
@@ -179,28 +162,6 @@ class ChannelConfig(Settings, frozen=True):
             if isinstance(value, list) and len(value) != states:
                 what = "there is no chain" if self.chain is None else f"the chain has {states} states"
                 raise ValueError(f"{key}: expected one number or one a state, got {len(value)}; {what}")
-        if isinstance(self.arrivals.rate_per_ms, list):
-            self._refuse_endless("arrivals.rate_per_ms", self.arrivals.rate_per_ms)
-        if isinstance(self.service.mean_ms, list) and self.service_state == "modulated":
-            rates = [1 / max(mean, 1e-300) for mean in self.service.mean_ms]
-            self._refuse_endless("service.mean_ms", rates)
-
-    def _refuse_endless(self, key: str, rates_per_ms: list[float]) -> None:
-        """Refuse a chain with millions of jumps during a single frame."""
-        if self.chain is None or len(set(rates_per_ms)) == 1:
-            return
-        generator = self.chain.generator()
-        try:
-            shares = stationary(generator)
-        except ChainError:
-            return  # an absorbing state bounds the jumps during a frame
-        jumps = self.chain.switches_per_ms()
-        rate = max(r for r, share in zip(rates_per_ms, shares) if share > 1e-12)
-        if jumps > 1e5 * rate and jumps <= MAX_JUMPS_PER_MS:
-            raise ValueError(
-                f"{key}: the chain switches {jumps:.3g} times a ms, more than 100000 times while one frame "
-                "waits or is served; give one number for all states"
-            )
 
     @property
     def state_names(self) -> list[str]:

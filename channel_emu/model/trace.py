@@ -17,44 +17,43 @@ message's index in the call.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
 
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from channel_emu.model.link import MAX_SIZE_BYTES, EventKind, Transit
 from channel_emu.model.nanoseconds import NEVER_NS
-from freshfield.scenario import ScenarioError
 from freshfield.untrusted import read_json
 
 VERSION = 2
-_INSTANTS = ("offered_ns", "arrived_ns", "started_ns", "drawn_ns", "due_ns", "ended_ns", "actual_ns")
-_KINDS = {"camera": str, "session": str, "sequence": int, "number": int, "state": int}
+Instant = Annotated[int, Meta(ge=0, le=NEVER_NS)]
 
 
 class TraceError(ValueError):
     """A file that is not a trace, or a trace that cannot be replayed. The message says where."""
 
 
-@dataclass(frozen=True)
-class Record:
+class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One offered message: a line of the file, whose fields the module describes."""
 
     camera: str
     session: str
     sequence: int
     number: int
-    bytes: int
-    offered_ns: int
-    arrived_ns: int | None
-    outcome: str | None
+    bytes: Annotated[int, Meta(ge=0, le=MAX_SIZE_BYTES)]
+    offered_ns: Instant
+    arrived_ns: Instant | None
+    outcome: EventKind | None
     state: int
-    started_ns: int | None
-    drawn_ns: int | None
-    due_ns: int | None
-    ended_ns: int | None
-    actual_ns: int | None = None
+    started_ns: Instant | None
+    drawn_ns: Instant | None
+    due_ns: Instant | None
+    ended_ns: Instant | None
+    actual_ns: Instant | None = None
     duplicated: bool = False
     flips: tuple[tuple[float, int], ...] = ()
 
@@ -84,7 +83,7 @@ class TraceWriter:
 
     def __init__(self, path: Path, config: ChannelConfig, seed: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._file: TextIO = path.open("w", buffering=1 << 16)
+        self._file = path.open("wb", buffering=1 << 16)
         self._line({"freshfield_trace": VERSION, "seed": seed, "channel": config.to_mapping()})
 
     def write(
@@ -97,68 +96,37 @@ class TraceWriter:
         duplicated: bool = False,
     ) -> None:
         """Write the line of one message; the module describes its fields."""
-        self._line(
-            {
-                "camera": camera,
-                "session": session,
-                "sequence": sequence,
-                "number": transit.number,
-                "bytes": transit.size_bytes,
-                "offered_ns": transit.offered_ns,
-                "arrived_ns": transit.arrived_ns,
-                "outcome": None if transit.outcome is None else str(transit.outcome),
-                "state": transit.state,
-                "started_ns": transit.started_ns,
-                "drawn_ns": transit.drawn_ns,
-                "due_ns": transit.due_ns,
-                "ended_ns": transit.ended_ns,
-                "actual_ns": actual_ns,
-                "duplicated": duplicated,
-                "flips": transit.flips,
-            }
-        )
+        t = transit
+        before = (camera, session, sequence, t.number, t.size_bytes, t.offered_ns, t.arrived_ns, t.outcome, t.state)
+        after = (t.started_ns, t.drawn_ns, t.due_ns, t.ended_ns, actual_ns, duplicated, t.flips)
+        self._line(Record(*before, *after))
 
     def close(self) -> None:
         self._file.close()
 
-    def _line(self, values: dict[str, Any]) -> None:
-        self._file.write(json.dumps(values, separators=(",", ":")) + "\n")
+    def _line(self, values: Any) -> None:
+        self._file.write(msgspec.json.encode(values) + b"\n")
 
 
 def read(path: Path) -> Trace:
-    """Read a trace, without an incomplete last line. Raises TraceError if it is unreadable or invalid."""
+    """Read a trace, without an incomplete last line. Raises TraceError or ScenarioError if it is unreadable or
+    invalid."""
     try:
         lines = path.read_text().split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise TraceError(f"{path}: cannot be read: {error}") from None
     try:
         head = read_json(lines[0])
-        if head["freshfield_trace"] != VERSION:
-            version = head["freshfield_trace"]
-            raise TraceError(f"{path}: trace version {version}, expected {VERSION}: record it again")
-        config = channel_from_mapping(head["channel"], f"{path}: channel")
-        seed = int(head["seed"])
-    except (ScenarioError, TraceError):
-        raise
+        version, seed, channel = head["freshfield_trace"], int(head["seed"]), head["channel"]
     except (KeyError, TypeError, ValueError, OverflowError):
         raise TraceError(f"{path}: not a freshfield trace: the first line has no trace header") from None
-    records = []
+    if version != VERSION:
+        raise TraceError(f"{path}: trace version {version}, expected {VERSION}: record it again")
+    config = channel_from_mapping(channel, f"{path}: channel")
+    records, decoder = [], msgspec.json.Decoder(Record)
     for number, line in enumerate(lines[1:-1], start=2):
         try:
-            values = read_json(line)
-            values["flips"] = tuple((float(place), int(mask)) for place, mask in values["flips"])
-            record = Record(**values)
-            if any(type(values[key]) is not kind for key, kind in _KINDS.items()):
-                raise TypeError
-        except (KeyError, TypeError, ValueError, OverflowError):
-            raise TraceError(f"{path}: line {number} is not a trace record") from None
-        for key in _INSTANTS:
-            instant = getattr(record, key)
-            if instant is not None and (type(instant) is not int or not 0 <= instant <= NEVER_NS):
-                raise TraceError(f"{path}: line {number}: {key}: expected nanoseconds, got {instant!r}")
-        if type(record.bytes) is not int or not 0 <= record.bytes <= MAX_SIZE_BYTES:
-            raise TraceError(f"{path}: line {number}: bytes: expected a message's size, got {record.bytes!r}")
-        if record.outcome is not None and record.outcome not in list(EventKind):
-            raise TraceError(f"{path}: line {number}: outcome: unknown, got {record.outcome!r}")
-        records.append(record)
+            records.append(decoder.decode(line))
+        except (msgspec.MsgspecError, RecursionError) as error:
+            raise TraceError(f"{path}: line {number} is not a trace record: {error}") from None
     return Trace(seed, config, records)

@@ -38,7 +38,6 @@ def test_simulate_takes_the_short_notation(capsys) -> None:
     spelled = "--arrivals periodic:30ms --service exp:30ms,exp:60ms --chain mu1=1/30,mu2=1/30"
     found = simulate(capsys, f"{spelled} {rest}")
     assert found["mean_age_ms"] == pytest.approx(84, abs=4)
-    assert set(found) >= {"mean_age_ms", "mean_age_slotted_ms", "peak_age_ms"}
     assert found["offered"] == found["delivered"] + found["dropped"] + found["in_flight"]
     assert set(found["delay_ms"]) == {"mean", "p50", "p95"}
     assert sum(found["state_share"].values()) == pytest.approx(1)
@@ -72,19 +71,15 @@ def test_presets_are_listed_with_their_mean_delays(capsys) -> None:
     assert all(f"\n{name} " in text for name in PRESETS)
     assert "\nch6                         45  mmpp:1/120ms,1/30ms  exp:30ms,exp:60ms " in text
     assert " mu1=1/30,mu2=1/30,states=low/high " in text and " {loss: [0.01, 0.5]}\n" in text
-    assert main(["presets", "--json"]) == 0
-    found = {row["preset"]: row for row in json.loads(capsys.readouterr().out)}
-    assert found["swing"]["mean_delay_ms"] == 82.5 and found["ideal"]["mean_delay_ms"] == 0
+    assert "\nswing                     82.5 " in text
 
 
-def test_frames_and_a_picture_of_a_simulation(capsys, tmp_path: Path) -> None:
-    frames, drawn = tmp_path / "new" / "frames.csv", tmp_path / "ages.png"
-    line = f"--preset ch5 --seconds 60 --csv {frames} --plot {drawn}"
-    found = simulate(capsys, f"{line} --fault loss:0.1 --fault", "duplication:{probability: 0.5}")
+def test_the_frames_of_a_simulation_can_be_fitted(capsys, tmp_path: Path) -> None:
+    frames = tmp_path / "new" / "frames.csv"
+    line = f"--preset ch5 --seconds 60 --csv {frames} --fault loss:0.1 --fault"
+    found = simulate(capsys, line, "duplication:{probability: 0.5}")
     assert found["lost"] > 0 and found["duplicated"] > 0
-    assert drawn.read_bytes().startswith(b"\x89PNG")
-    none = simulate(capsys, f"--fault loss:1 --seconds 1 --plot {drawn}")
-    assert none["delivered"] == 0
+    assert simulate(capsys, "--fault loss:1 --seconds 1")["delivered"] == 0
     rows = frames.read_text().splitlines()
     assert rows[0] == "offered_ms,delivered_ms,camera" and len(rows) == found["offered"] + 1
     assert main(["fit", str(frames), "--states", "1", "--json"]) == 0
@@ -123,7 +118,6 @@ def test_rates(text: str, value: float) -> None:
         (["--service", "trace:/no/such/file"], "cannot be read"),
         (["--chain", "mu3=1"], "expected mu1="),
         (["--chain", "{generator_per_ms: [[-1, 2], [1, -1]]}"], "rows sum to zero"),
-        (["--slot-ms", "0"], "slot_ms: expected"),
         (["--frame-bytes", "9" * 400], "frame_bytes: expected 0 to"),
         (["--fault", "bandwidth:" + "9" * 400], "bandwidth.megabits_per_s: expected a number"),
         (["--seconds", "1e9", "--cameras", "18"], "frames: expected at most"),
@@ -215,7 +209,6 @@ def test_a_path_that_cannot_be_written_is_said_in_one_line(capsys, scenario: Pat
         ["fit", str(rows), "--states", "1", "--out", nowhere],
         ["fit", str(rows), "--states", "1", "--plot", nowhere],
         ["simulate", "--seconds", "1", "--csv", nowhere],
-        ["simulate", "--seconds", "1", "--plot", nowhere],
         ["run", str(scenario), "--no-priority", "--listen", listen, "--out", nowhere],
         ["proxy", "--no-priority", "--to", "127.0.0.1:1", "--listen", listen, "--trace", nowhere],
     ):

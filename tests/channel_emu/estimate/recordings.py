@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from channel_emu.model.channel import Channel
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.trace import TraceWriter
-from channel_emu.virtual.simulate import OUTCOMES, simulate
+from channel_emu.virtual.simulate import simulate
 
 
 def write_trace(
@@ -23,12 +22,8 @@ def write_trace(
     names = [f"cam{i:02d}" for i in range(cameras)]
     made = simulate(config, names, seconds, seed, frame_period_ms=frame_period_ms)
     writer = TraceWriter(path, config, seed)
-    channel = Channel(config, seed)
     for run in made.runs:
-        link = channel.link(run.camera, sampled=frame_period_ms is not None)
-        transits = [link.offer(int(at_ns), None, 1000)[0] for at_ns in run.offered_ns]
-        link.advance(run.end_ns)
-        for transit in transits:
+        for transit in run.transits:
             writer.write(run.camera, "s", transit.number, transit)
     writer.close()
     return path
@@ -36,9 +31,5 @@ def write_trace(
 
 def write_rows(path: Path, section: dict, seed: int = 1, seconds: float = 120.0) -> Path:
     """offered_ms, delivered_ms of one camera; what did not come is blank."""
-    (run,) = simulate(channel_from_mapping(section), 1, seconds, seed).runs
-    came = run.outcome == OUTCOMES.index("delivered")
-    pairs = zip(run.offered_ns, run.due_ns, came)
-    rows = [f"{at / 1e6:.6f},{due / 1e6:.6f}" if c else f"{at / 1e6:.6f}," for at, due, c in pairs]
-    path.write_text("\n".join(["offered_ms,delivered_ms", *rows]) + "\n")
+    simulate(channel_from_mapping(section), 1, seconds, seed).write_frames(path)
     return path

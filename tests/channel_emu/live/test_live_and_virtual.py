@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from channel_emu.model import ages, trace
+from channel_emu.model import trace
+from channel_emu.model.ages import RunningAge
 from channel_emu.model.channel import Channel
-from channel_emu.model.link import EventKind, Transit
+from channel_emu.model.link import EventKind
 from channel_emu.model.trace import Record
 from channel_emu.virtual.replay import offer_all
 from tests.channel_emu.live.emulator import CAMERAS, emulate, run
@@ -51,12 +52,13 @@ def test_ages_live_are_those_of_virtual_time_and_the_delay_error(tmp_path: Path,
         came = [r for r in records if r.actual_ns is not None]
         due = [virtual[camera][r.number] for r in came]
         assert len(came) > 15
-        live_saw = _saw([r.actual_ns for r in came], [r.offered_ns for r in came], end_ns)
-        virtual_saw = _saw([_due(t) for t in due], [t.offered_ns for t in due], end_ns)
+        live = RunningAge((r.actual_ns, r.offered_ns) for r in came)
         # Over the same span: the first tooth begins where the live one does.
-        live, expected = ages.mean_age_ms(live_saw), ages.mean_age_ms(_from(virtual_saw, live_saw))
-        assert live is not None and expected is not None
-        assert 0 <= live - expected <= late_ms(came).max()
+        begin_ns = came[0].actual_ns
+        virtual_age = RunningAge((max(t.due_ns, begin_ns), t.offered_ns) for t in due)
+        live_ms, expected_ms = live.mean_age_ms(end_ns), virtual_age.mean_age_ms(end_ns)
+        assert live_ms is not None and expected_ms is not None
+        assert 0 <= live_ms - expected_ms <= late_ms(came).max()
     assert np.median(late_ms(found.records)) < TYPICAL_MS
 
 
@@ -90,23 +92,6 @@ def test_a_trace_replayed_twice_is_decided_and_delivered_alike(tmp_path: Path) -
     assert np.median(apart_ms) < TYPICAL_MS
 
 
-def _due(transit: Transit) -> int:
-    assert transit.due_ns is not None
-    return transit.due_ns
-
-
 def _lasted(record: Record) -> int:
     assert record.ended_ns is not None
     return record.ended_ns - record.offered_ns
-
-
-def _saw(delivered: list, generated: list, end_ns: int) -> ages.Sawtooth:
-    return ages.sawtooth(np.array(delivered, np.int64), np.array(generated, np.int64), end_ns)
-
-
-def _from(saw: ages.Sawtooth, other: ages.Sawtooth) -> ages.Sawtooth:
-    """``saw`` from ``other``'s first delivery on."""
-    begin = other.delivered_ns[0]
-    kept = max(0, int(np.searchsorted(saw.delivered_ns, begin, side="right")) - 1)
-    delivered = np.maximum(saw.delivered_ns[kept:], begin)
-    return ages.Sawtooth(delivered, saw.generated_ns[kept:], saw.end_ns)

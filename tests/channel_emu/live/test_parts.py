@@ -19,7 +19,6 @@ from channel_emu.live.frame_proxy import damage_payload
 from channel_emu.live.histogram import Histogram
 from channel_emu.live.live_link import Message
 from channel_emu.live.timer import LoopTimer
-from channel_emu.model import ages
 from channel_emu.model.link import EventKind
 from freshfield.frame import FrameRejected, from_request, to_request
 from freshfield.streams import ServedCall
@@ -102,25 +101,6 @@ def test_without_real_time_the_priority_is_raised(monkeypatch: pytest.MonkeyPatc
     assert len(asked) == 1 and asked[0] < 0
     monkeypatch.setattr(os, "nice", forbidden)
     assert priority.raise_priority() == ("short-slice" if short_slice else "normal")
-
-
-@given(st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 10**9)), max_size=30), st.integers(0, 10**9))
-def test_running_ages_are_those_of_the_whole_sawtooth(steps: list[tuple[int, int]], after: int) -> None:
-    """Deliveries in order of time, of frames of any age, out of order and doubled."""
-    running, at_ns = ages.RunningAge(), 2 * 10**9
-    deliveries = []
-    for step, old in steps:
-        at_ns += step
-        deliveries.append((at_ns, at_ns - old))
-        running.add(at_ns, at_ns - old)
-    end_ns = at_ns + after
-    columns = np.array(deliveries, np.int64).reshape(-1, 2)
-    saw = ages.sawtooth(columns[:, 0], columns[:, 1], end_ns)
-    for found, expected in (
-        (running.peak_age_ms(), ages.peak_age_ms(saw)),
-        (running.mean_age_ms(end_ns), ages.mean_age_ms(saw)),
-    ):
-        assert found == (None if expected is None else pytest.approx(expected, rel=1e-9))
 
 
 def test_dropped_messages_hold_no_bytes() -> None:

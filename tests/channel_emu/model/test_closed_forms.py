@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 
 pytest.importorskip("scipy", reason="the closed forms need scipy")
 
 from scipy import stats
 
-from channel_emu.model import ages
+from channel_emu.model.ages import RunningAge
 from channel_emu.model.config import channel_from_mapping
-from channel_emu.virtual.simulate import OUTCOMES, simulate
+from channel_emu.virtual.simulate import simulate
 from tests.channel_emu.model import exact_forms as exact
 
 TOLERANCE = 0.02
@@ -165,24 +164,9 @@ def _unequal(discipline: str, rates: tuple[float, float]) -> list[float]:
     runs = simulate(config, 5, 60, seed=5).runs
     merged = []
     for group in (runs[:2], runs[2:]):
-        got = [run.outcome == OUTCOMES.index("delivered") for run in group]
-        due = np.concatenate([run.due_ns[ok] for run, ok in zip(group, got)])
-        born = np.concatenate([run.offered_ns[ok] for run, ok in zip(group, got)])
-        age = ages.mean_age_ms(ages.sawtooth(due, born, group[0].end_ns))
-        assert age is not None
-        merged.append(age)
+        came = [(t.ended_ns, t.offered_ns) for run in group for t in run.transits if t.outcome == "delivered"]
+        merged.append(RunningAge(sorted(came)).mean_age_ms(group[0].end_ns))
     return merged
-
-
-def test_slotted_age_differs_by_what_theory_says() -> None:
-    """Deliveries anywhere within a slot: sampling at boundaries neither adds nor removes age on average.
-    Deliveries on boundaries: each tooth is sampled from its foot on, half a slot below its mean."""
-    section = {"arrivals": periodic(30.0), "service": deterministic(70.0), "discipline": "drop-new"}
-    found = simulate(channel_from_mapping(section), 1, 900, slot_ms=1.0).summary()
-    assert found["mean_age_ms"] - found["mean_age_slotted_ms"] == pytest.approx(0.5, abs=1e-3)
-    section["service"] = exponential(60.0)
-    found = simulate(channel_from_mapping(section), 4, 900, slot_ms=1.0).summary()
-    assert found["mean_age_slotted_ms"] == pytest.approx(found["mean_age_ms"], abs=0.1)
 
 
 def test_losses_by_state() -> None:
