@@ -40,6 +40,7 @@ from edge_server.fields.splat.layers.settings import (
     FINE_EVERY_S,
     FINE_FRAMES,
     LEAST_CAMERAS,
+    MOST_MOVES,
     MOST_PIXELS,
     PLATE_FRAMES,
     PLATE_S,
@@ -64,8 +65,8 @@ class LayeredField:
     """See ``fields.Field`` for the protocol.
 
     Until plates are known, with a single camera, and for good where a camera moves or images are transparent,
-    the still field learns from the views themselves. Call ``fit`` from one thread only; snapshots may be taken
-    and rendered from any thread.
+    the still field learns from the views themselves. A camera that is knocked begins anew where it stands then.
+    Call ``fit`` from one thread only; snapshots may be taken and rendered from any thread.
 
     part_s: seconds spent by part, in all fits.
     """
@@ -90,7 +91,7 @@ class LayeredField:
         self.cameras: dict[str, FixedCamera] = {}
         self.observations = Observations()
         self.tracker: MotionTracker | None = None
-        self.layered = True  # False: a camera moved
+        self.layered = True  # False: a camera moves, or its frames are none for layers
         self.refused: set[str] = set()  # cameras whose newest frame shows something else than their plate
         self.origin_ns: int | None = None
         self.plates_s = -np.inf  # instant of the frames when plates were last compared
@@ -134,6 +135,9 @@ class LayeredField:
         if self.tracker is not None and self.tracker.moving.box is not self.still.view_store.box:
             self._begin_again()
         taken = self._take_in(views)
+        if wandering := [name for name, camera in self.cameras.items() if camera.moves > MOST_MOVES]:
+            self._give_up_layers(f"{wandering[0]} moves")
+            return self._fit_still(views, budget, pace)
         if self.tracker is None:
             if not self._plates_are_known():
                 return self._fit_still(views, budget, pace)
@@ -243,8 +247,6 @@ class LayeredField:
             return f"images of {view.camera} are transparent"
         if known is not None and known.view.intrinsics != view.intrinsics:
             return f"the lens or the image size of {view.camera} has changed"
-        if known is not None and not np.allclose(known.view.camera_to_world, view.camera_to_world, atol=1e-3):
-            return f"{view.camera} has moved"
         return ""
 
     def _give_up_layers(self, reason: str) -> None:
@@ -276,12 +278,14 @@ class LayeredField:
     def _take(self, view: View) -> None:
         assert self.origin_ns is not None
         if view.camera not in self.cameras:
-            plate = Plate(view.image.shape[0], view.image.shape[1], self.caller)
-            whole = None if view.whole is None else view.whole()
-            fine = None if whole is None else FinePlate(whole)
-            self.cameras[view.camera] = FixedCamera(replace(view, whole=None), plate, fine=fine)
+            self.cameras[view.camera] = self._new_camera(view)
         camera = self.cameras[view.camera]
         camera.taken.append(view.generated_ns)
+        if not camera.stands_at(view):
+            if not camera.leaves_for(view):
+                self.refused |= {view.camera}
+                return
+            camera = self._move_camera(view)
         refused = self.refused | {view.camera}
         may_refuse = self.tracker is not None and 4 * len(refused) <= len(self.cameras)
         foreground = camera.plate.take(view.image, may_refuse)
@@ -289,6 +293,8 @@ class LayeredField:
             self.refused = refused
             return
         self.refused -= {view.camera}
+        if camera.moves and camera.rendered_step < 0:
+            return  # against an empty plate nothing is foreground
         self.observations.add(
             Observation(
                 (view.generated_ns - self.origin_ns) / 1e9,
@@ -297,6 +303,24 @@ class LayeredField:
                 foreground,
             )
         )
+
+    def _new_camera(self, view: View) -> FixedCamera:
+        """A camera that has shown nothing yet. view: its first frame."""
+        plate = Plate(view.image.shape[0], view.image.shape[1], self.caller)
+        whole = None if view.whole is None else view.whole()
+        return FixedCamera(replace(view, whole=None), plate, fine=None if whole is None else FinePlate(whole))
+
+    def _move_camera(self, view: View) -> FixedCamera:
+        """Begin a camera anew where it stands now, at the exposure that it had; the others go on."""
+        log.info("%s stands somewhere else: its plate begins anew", view.camera)
+        self.static.stop()
+        self.static.rendered.pop(view.camera, None)
+        before, camera = self.cameras[view.camera], self._new_camera(view)
+        camera.taken, camera.moves = before.taken, before.moves
+        camera.correct_exposure(before.plate.gain)
+        self.cameras[view.camera] = camera
+        self.observations.forget_camera(view.camera)
+        return camera
 
     def _take_whole(self, taken: Sequence[View]) -> None:
         """Take one of the frames into its camera's fine plate, now and then; the cameras take turns."""

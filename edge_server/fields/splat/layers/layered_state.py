@@ -24,7 +24,7 @@ from freshfield.geometry import Pinhole
 Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
-VERSION = 4
+VERSION = 5
 COUNTERS = ("layered", "origin_ns", "plates_s", "fine_s", "fine", "exposure_rounds")  # of the field
 TRACKED = ("anchors_s", "seeded_s", "fits", "left_out")  # and of its tracker
 
@@ -42,6 +42,7 @@ def pack(field: Any) -> Arrays:
                 "taken": list(camera.taken),
                 "newest_s": _number(camera.newest_s),
                 "rendered_step": camera.rendered_step,
+                "moves": camera.moves,
                 "intrinsics": asdict(view.intrinsics),
             }
         )
@@ -49,6 +50,8 @@ def pack(field: Any) -> Arrays:
         state |= _prefixed(f"camera_{k}.plate.", camera.plate.state())
         if camera.fine is not None:
             state |= _prefixed(f"camera_{k}.fine.", camera.fine.state())
+        if camera.away is not None:
+            state[f"camera_{k}.away"] = camera.away
         if camera.depth_m is not None:
             state[f"camera_{k}.depth_m"] = camera.depth_m
     for k, o in enumerate(field.observations):
@@ -103,8 +106,9 @@ def unpack(field: Any, state: Arrays) -> None:
         depth_m = np.array(arrays["depth_m"]) if "depth_m" in arrays else None
         newest_s = -np.inf if facts["newest_s"] is None else facts["newest_s"]
         taken = deque(facts["taken"], maxlen=FRAMES_KNOWN)
+        away = np.array(arrays["away"]) if "away" in arrays else None
         field.cameras[view.camera] = FixedCamera(
-            view, plate, None, depth_m, facts["rendered_step"], newest_s, taken, fine
+            view, plate, None, depth_m, facts["rendered_step"], newest_s, taken, fine, away, facts["moves"]
         )
     for k, facts in enumerate(meta["frames"]):
         field.observations.add(_observation(field, facts, _under(f"frame_{k}.", state)))

@@ -20,6 +20,8 @@ from edge_server.fields.splat.layers.settings import (
     KNOTS_PER_S,
     NEAR_FOREGROUND_PX,
     OCCLUDED_M,
+    SAME_POSE,
+    STANDS_FRAMES,
 )
 from edge_server.fields.splat.layers.static_layer import PlateImage
 
@@ -34,6 +36,8 @@ class FixedCamera:
     newest_s: instant of the newest frame that was aligned.
     taken: ``generated_ns`` of the latest frames taken in.
     fine: the plate at the full resolution; None where the frames taken in have it.
+    away: float64 (4, 4), pose of the newest frame, where that was taken elsewhere.
+    moves: number of places other than its own from which frames came, since it last stood still.
     """
 
     view: View
@@ -44,6 +48,25 @@ class FixedCamera:
     newest_s: float = -np.inf
     taken: deque[int] = field(default_factory=lambda: deque(maxlen=FRAMES_KNOWN))
     fine: FinePlate | None = None
+    away: NDArray[np.float64] | None = None
+    moves: int = 0
+
+    def stands_at(self, view: View) -> bool:
+        """Whether a frame was taken from the camera's place."""
+        if not _same_pose(self.view.camera_to_world, view.camera_to_world):
+            return False
+        self.away = None
+        if self.plate.count > STANDS_FRAMES:
+            self.moves = 0
+        return True
+
+    def leaves_for(self, view: View) -> bool:
+        """Whether the camera stands elsewhere now: the second frame in a row from one other place. The first may
+        have a wrong pose, and a camera that moves shows a new place each time."""
+        stands = self.away is not None and _same_pose(self.away, view.camera_to_world)
+        self.moves += not stands
+        self.away = view.camera_to_world
+        return stands
 
     @property
     def fine_count(self) -> int:
@@ -133,9 +156,17 @@ class Observations:
         """Drop the frames before ``instant_s``."""
         self._sorted = [o for o in self._sorted if o.instant_s >= instant_s]
 
+    def forget_camera(self, camera: str) -> None:
+        """Drop the frames of a camera."""
+        self._sorted = [o for o in self._sorted if o.camera != camera]
+
     def of_knots(self, first: int, last: int) -> list[Observation]:
         """The frames from knot ``first`` to knot ``last``, both included."""
         return [o for o in self._sorted if first <= o.knot <= last]
+
+
+def _same_pose(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+    return bool(np.allclose(a, b, atol=SAME_POSE))
 
 
 def pixel_weights(

@@ -11,6 +11,9 @@ RENDERINGS_A_FIT = 2  # renderings of the still field that plates take over in a
 SHOWN_AFTER = 400  # steps, after which a still field that began anew is better than what was shown before
 MOST_PIXELS = 400_000  # of one image of every camera together, if 15 frames a second of each are taken in
 FRAMES_KNOWN = 256  # instants of earlier frames that are remembered for each camera
+SAME_POSE = 1e-3  # largest difference of poses of one place, meters and entries of the rotation
+MOST_MOVES = 3  # places from which a camera shows something, above which it moves
+STANDS_FRAMES = 60  # frames from one place, after which earlier moves are forgotten
 MAX_AHEAD_S = 0.3  # motion is extrapolated no farther than this: people turn
 
 # --- plates at full resolution, where frames are taken in at a lower one ---

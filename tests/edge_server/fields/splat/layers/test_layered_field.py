@@ -20,6 +20,7 @@ from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
 from edge_server.fields.splat.layers import layered_field
 from edge_server.fields.splat.layers.layered_field import LayeredField
+from edge_server.fields.splat.layers.layered_state import VERSION
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.still_field import StillField
 from tests.edge_server.fields.scenes import picture, psnr, ring
@@ -99,14 +100,20 @@ def test_the_option_makes_it() -> None:
     assert type(make_field("splat", {"threads": 1})) is StillField
 
 
+def _turning() -> list[View]:
+    """Frames of the first camera, each from another place."""
+    poses = [camera.camera_to_world for camera in (*CAMERAS[1:4], HELD)]
+    return [replace(_frame(0, frame, True), camera_to_world=pose) for frame, pose in enumerate(poses, start=4)]
+
+
 def test_it_is_the_still_field_at_first_and_where_a_camera_moves() -> None:
     layered, plain = LayeredField(SMALL), StillField(SMALL)
     for field in (layered, plain):
         _run(field, range(4))
     _same_state(layered.still, plain)
-    turned = replace(_frame(0, 4, True), camera_to_world=CAMERAS[1].camera_to_world)
     for field in (layered, plain):
-        field.fit([turned, _frame(2, 4, True)], Budget(steps=10))
+        for frame, turned in enumerate(_turning(), start=4):
+            field.fit([turned, _frame(2, frame, True)], Budget(steps=10))
     assert not layered.layered
     _run(layered, range(20, 40), steps=2)
     _run(plain, range(20, 40), steps=2)
@@ -230,7 +237,7 @@ def test_a_refused_state_changes_nothing() -> None:
         {k: v for k, v in _moving().state().items() if k != "moving.anchor"},
         {k: v * np.nan if k == "moving.share" else v for k, v in _moving().state().items()},
         {
-            k: np.array(str(v).replace('"version": 4', '"version": 1')) if k == "meta" else v
+            k: np.array(str(v).replace(f'"version": {VERSION}', '"version": 1')) if k == "meta" else v
             for k, v in _moving().state().items()
         },
     ):
@@ -335,7 +342,8 @@ def test_it_wants_every_frame_and_tells_how_long_one_takes_until_a_camera_moves(
     field.now = lambda: float(next(ticks))
     field.fit(views, Budget(seconds=0.05))
     assert field.frame_s == 1.0 / len(views)
-    field.fit([replace(views[0], camera_to_world=HELD.camera_to_world)], Budget(steps=1))
+    for turned in _turning():
+        field.fit([turned], Budget(steps=1))
     assert field.frame_s is None
     field.reset()
     assert field.frame_s is not None
@@ -395,10 +403,26 @@ def test_a_camera_that_is_knocked_costs_what_moves_not_the_scene() -> None:
         field = LayeredField(structs.replace(SMALL, seed=seed))
         _run(field, range(42))
         before_db = score(field)
-        field.fit([knocked, *now], Budget(steps=2))
-        assert not field.layered
+        for later in (0, 1):
+            ns = knocked.generated_ns + later * round(FRAME_S * 1e9)
+            field.fit([replace(view, generated_ns=ns) for view in (knocked, *now)], Budget(steps=2))
+        assert field.layered and np.array_equal(field.cameras[knocked.camera].view.camera_to_world, pose)
         lost_db.append(before_db - score(field))
     assert np.median(lost_db) < 1.0, lost_db
+
+
+def test_one_wrong_pose_is_left_out_and_a_camera_that_shows_new_places_moves() -> None:
+    field = LayeredField(SMALL)
+    for frame in range(8):
+        place = [0.0, 0.1, 0.0, 0.0, 0.1, 0.2, 0.3, 0.4][frame]
+        pose = CAMERAS[0].camera_to_world.copy()
+        pose[0, 3] += place
+        views = [_frame(k, frame, True) for k in range(len(CAMERAS))]
+        field.fit([replace(views[0], camera_to_world=pose), *views[1:]], Budget(steps=1))
+        if frame < 4:
+            assert field.cameras[views[0].camera].plate.count == frame + 1 - (frame > 0)
+            assert field.refused == ({views[0].camera} if frame == 1 else set())
+        assert field.layered == (frame < 6)  # the fourth place from which it showed something
 
 
 def _small(camera: int, frame: int) -> View:
