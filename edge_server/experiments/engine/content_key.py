@@ -13,6 +13,8 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 import camera_node
 import channel_emu
 import edge_server
@@ -45,10 +47,12 @@ def result_key(work: Callable[..., Any], inputs: Any, files: Iterable[Path | Non
 
 
 def plain(value: Any) -> Any:
-    """``value`` as JSON has it, for ``json.dumps(default=...)``: dataclasses, paths and NumPy's numbers. Raises
-    TypeError for anything else."""
+    """``value`` as JSON has it, for ``json.dumps(default=...)``: dataclasses, structs, paths and NumPy's numbers.
+    Raises TypeError for anything else."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, msgspec.Struct):
+        return msgspec.structs.asdict(value)
     if isinstance(value, Path):
         return str(value)
     if hasattr(value, "item") and getattr(value, "ndim", None) == 0:

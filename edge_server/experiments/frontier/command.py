@@ -23,7 +23,7 @@ from edge_server.experiments.engine import Engine
 from edge_server.experiments.frontier import from_scratch, update_time
 from edge_server.experiments.frontier.from_scratch import Fit, Still
 from edge_server.experiments.frontier.output import recommendation, write_output
-from edge_server.experiments.frontier.update_time import MEDIUM, Charged, MovingRun, MovingScene, live_settings
+from edge_server.experiments.frontier.update_time import Charged, MovingRun, MovingScene, variants
 from edge_server.experiments.virtual.run_settings import Compute
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import field_names, make_field
@@ -66,8 +66,7 @@ class Sweep:
     planned_s: seconds of fitting from scratch.
     speeds: speeds of the moving scene, m/s.
     update_s: seconds per update.
-    run_s: virtual seconds of a moving run; six updates if those take longer.
-    warm_steps: steps of the warm field before a moving run.
+    run_s: virtual seconds of a moving run that count; six updates if those take longer.
     size: image width and height of the still scene.
     """
 
@@ -76,7 +75,6 @@ class Sweep:
     speeds: tuple[float, ...]
     update_s: tuple[float, ...]
     run_s: float
-    warm_steps: int
     size: int
     moving: MovingScene
 
@@ -87,7 +85,6 @@ QUICK = Sweep(
     speeds=(0.3, 1.0, 3.0),
     update_s=(0.1, 0.25, 0.5, 1.0, 2.0),
     run_s=4.0,
-    warm_steps=150,
     size=128,
     moving=MovingScene(cameras=13, size=64),
 )
@@ -97,7 +94,6 @@ FULL = Sweep(
     speeds=(0.3, 1.0, 3.0),
     update_s=(0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0),
     run_s=20.0,
-    warm_steps=600,
     size=128,
     moving=MovingScene(cameras=19, size=128),
 )
@@ -149,9 +145,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
-    name, value = parse_policy(args.policy)
-    policy = make_policy(name, value, np.random.default_rng(0))
-    sweep = replace(sweep, moving=replace(sweep.moving, policy=name, policy_value=policy.value))
+    make_policy(*parse_policy(args.policy), np.random.default_rng(0))  # rejected now, not between two measurements
+    sweep = replace(sweep, moving=replace(sweep.moving, policy=args.policy))
     if args.seeds is not None:
         if args.seeds < 1:
             raise ValueError(f"--seeds {args.seeds}: expected 1 or more")
@@ -247,26 +242,25 @@ class Frontier:
 
     def _live(self) -> tuple[Row, list[Row]]:
         """What updates are charged, and the rows of figure 2 as means over the seeds."""
-        sweep, settings = self.sweep, live_settings(self.fields, self.options)
+        sweep, measured_of = self.sweep, variants(self.fields, self.options)
         # With the number of images of the moving scene and the image size of figure 1.
         moving, speed = replace(sweep.moving, size=sweep.size), sweep.speeds[len(sweep.speeds) // 2]
-        asked = [Charged(moving, speed, setting, sweep.warm_steps) for setting in settings]
+        asked = [Charged(moving, speed, variant) for variant in measured_of]
         measured = self.engine.run(
             update_time.measure_compute,
             asked,
             "cost of updates",
             describe=lambda one, row: (
-                f"{one.setting.label}: {row['ms_per_step']:.1f} ms a step, {row['ms_per_view']:.1f} ms a new view, "
+                f"{one.variant.label}: {row['ms_per_step']:.1f} ms a step, {row['ms_per_view']:.1f} ms a new view, "
                 f"{row['ms_per_update']:.1f} ms for everything else"
             ),
         )
         runs = []
-        for (setting, row), speed, seed in product(zip(settings, measured), sweep.speeds, self.seeds):
-            times = sweep.update_s if setting.name == MEDIUM else (LAYERS_S, *sweep.update_s)
+        for (variant, row), speed, seed in product(zip(measured_of, measured), sweep.speeds, self.seeds):
+            times = (LAYERS_S, *sweep.update_s) if variant.layers else sweep.update_s
             compute = Compute(**row)
             runs += [
-                MovingRun(sweep.moving, speed, setting, seed, sweep.warm_steps, s, max(sweep.run_s, 6.0 * s), compute)
-                for s in times
+                MovingRun(sweep.moving, speed, variant, seed, s, max(sweep.run_s, 6.0 * s), compute) for s in times
             ]
         points = self.engine.run(
             partial(update_time.run_updates, weights=self.weights),
@@ -274,12 +268,12 @@ class Frontier:
             "updates",
             files=lambda run: [self.weights],
             describe=lambda run, row: (
-                f"{run.setting.label:16} {run.speed:g} m/s, update {row['update_s']:5.2f} s  "
+                f"{run.variant.label:16} {run.speed:g} m/s, update {row['update_s']:5.2f} s  "
                 f"shown {_db(row['shown_psnr_db'])}  moving {_db(row['shown_psnr_moving_db'])}"
             ),
         )
         rows = [{**point, **run.facts()} for run, point in zip(runs, points)]
-        charged = {setting.label: row for setting, row in zip(settings, measured)}
+        charged = {variant.label: row for variant, row in zip(measured_of, measured)}
         return charged, update_time.mean_over_seeds(rows)
 
 

@@ -47,20 +47,20 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def updates_table(rows: Sequence[Row]) -> str:
-    """Table of the shown and published fidelity by speed and seconds per update."""
+    """Table of the shown fidelity by speed and seconds per update."""
     digits = {
         "speed_m_per_s": 1,
         "update_s": 2,
         "steps": 0,
-        "shown_age_ms": 0,
+        "aaoi_ms": 0,
         "shown_psnr_db": 2,
         "shown_psnr_moving_db": 2,
-        "psnr_db": 2,
-        "psnr_moving_db": 2,
+        "shown_ssim": 3,
+        "shown_lpips": 3,
     }
-    cells = [(_label(row), *(number(row[name], n) for name, n in digits.items())) for row in rows]
-    head = "field, setting|m/s|an update, s|steps|age, ms|shown, dB|moving|published, dB|moving"
-    about = "shown: at random instants, the newest publication carried on; age: of its views then"
+    cells = [(f"{row['field']} {row['effort']}", *(number(row[name], n) for name, n in digits.items())) for row in rows]
+    head = "field, setting|m/s|an update, s|steps|age, ms|shown, dB|moving|SSIM|LPIPS"
+    about = "shown: at random instants, the newest publication carried on; age: of its views at publication"
     return f"{markdown_table(head.split('|'), cells)}\n{about}"
 
 
@@ -101,11 +101,9 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
 
 def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
     """Draw the shown fidelity against seconds per update: a column for each speed, a color for each
-    representation, a line style for each setting, the best of all encircled. The published fidelity is drawn
-    for one of them."""
+    representation, a line style for each setting, the best of all encircled."""
     speeds = list(dict.fromkeys(row["speed_m_per_s"] for row in rows))
     settings = list(dict.fromkeys((row["field"], row["effort"]) for row in rows))
-    main = next((who for who in settings if who[1] == "medium"), settings[-1])
     panels = (("psnr_db", "shown, whole image (dB)"), ("psnr_moving_db", "shown where it moves (dB)"))
     with figure(path, len(panels), len(speeds), height_inch=3.0, sharex=True, sharey="row") as (fig, axes):
         for row, (key, label) in enumerate(panels):
@@ -117,15 +115,6 @@ def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
                     x = [r["update_s"] for r in group]
                     shown = [r[f"shown_{key}"] for r in group]
                     ax.plot(x, shown, marker=".", linewidth=1.2, label=" ".join(who), **look)
-                    if who == main:
-                        ax.plot(
-                            x,
-                            [r[key] for r in group],
-                            ":",
-                            color=look["color"],
-                            linewidth=1.0,
-                            label=f"{' '.join(main)},\nat publication",
-                        )
                 top = best(here, f"shown_{key}")
                 if top is not None:
                     _encircle(ax, [top["update_s"]], [top[f"shown_{key}"]], "best")
@@ -162,7 +151,3 @@ def _seconds_axis(axes: Axes, seconds: Sequence[float]) -> None:
 def _flat(rows: Sequence[Row]) -> list[Row]:
     """Rows without the values that do not fit in a single cell of a CSV file."""
     return [{k: v for k, v in row.items() if not isinstance(v, dict)} for row in rows]
-
-
-def _label(row: Row) -> str:
-    return f"{row['field']} {row['effort']}"

@@ -168,6 +168,7 @@ def _timed(scenario: Scenario, share: float, seconds: float, data: Path | None) 
             rows.append((done[1].steps, selection.arrivals, 1e3 * spent_s))
         return done
 
+    updates.field.warm_up()
     updates.fit = timed  # type: ignore[method-assign]
     deployment.run(seconds)
     if len(rows) < 2:

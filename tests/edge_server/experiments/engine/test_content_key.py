@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from edge_server.config import ComputeConfig
 from edge_server.experiments.engine import content_key
 from edge_server.experiments.engine.content_key import code_digest, content_digest, result_key
 from edge_server.experiments.engine.result_store import ResultStore
@@ -27,7 +28,15 @@ def work(one):
 
 def test_inputs_count_by_their_content_and_not_by_their_order():
     assert result_key(measure, {"a": 1, "b": [2]}) == result_key(measure, {"b": (2,), "a": 1})
-    assert len({result_key(measure, x) for x in (1, 1.5, "1", [1], Point(1), Point(2), Point(1, scene="tower"))}) == 7
+    assert (
+        len(
+            {
+                result_key(measure, x)
+                for x in (1, 1.5, "1", [1], Point(1), Point(2), Point(1, scene="tower"), ComputeConfig(2.0))
+            }
+        )
+        == 8
+    )
     assert len(result_key(measure, 1)) == 40
     with pytest.raises(TypeError, match="no JSON value"):
         result_key(measure, object())

@@ -6,22 +6,20 @@ import csv
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.frontier import command, from_scratch
 from edge_server.experiments.frontier.output import recommendation
 from edge_server.experiments.frontier.update_time import (
-    Charged,
+    MovingRun,
     MovingScene,
-    Setting,
-    WarmStart,
-    live_settings,
+    Variant,
     mean_over_seeds,
-    measure_compute,
+    run_updates,
     static_steps,
     steps_for,
+    variants,
 )
 from edge_server.experiments.virtual.run_settings import Compute
 from edge_server.live.frontier import read_frontier
@@ -32,45 +30,17 @@ COMPUTE = Compute(ms_per_step=30.0, ms_per_update=10.0)
 
 
 def test_an_update_time_point_is_the_same_bit_for_bit_whatever_ran_before():
-    points = []
-    for before in ((), (9,)):
-        start = WarmStart(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=5)
-        for steps in before:
-            start.run(steps, COMPUTE, seconds=0.6)
-        points.append(start.run(3, COMPUTE, seconds=1.0))
-    assert points[0] == points[1]
-    assert points[0]["update_s"] == 0.1 and 5 <= points[0]["updates"] <= 9
-    assert points[0]["psnr_db"] is not None and points[0]["psnr_moving_db"] is not None
-
-
-def test_updates_are_charged_what_they_take_where_everything_is_new(monkeypatch):
-    """A field that takes 60 ms for new pictures, 30 for a snapshot and 5 a step, by a clock of its own."""
-    seen, clock = [], [0.0]
-
-    class Slow:
-        def warm_up(self):
-            clock[0] += 9.0
-
-        def state(self):
-            return {}
-
-        def fit(self, views, budget):
-            seen.append(views)
-            clock[0] += 0.060 + 0.005 * budget.steps
-
-        def snapshot(self):
-            clock[0] += 0.030
-
-    monkeypatch.setattr("edge_server.experiments.frontier.update_time.make_field", lambda *args, **more: Slow())
-    for name, factor in (("perf_counter", 1.0), ("process_time", 3.0)):  # of three threads
-        monkeypatch.setattr(
-            f"edge_server.experiments.frontier.update_time.time.{name}", lambda factor=factor: factor * clock[0]
-        )
-    found = measure_compute(Charged(TINY, 1.0, Setting("ngp", "medium", {}), warm_steps=5))
-    assert found == {"ms_per_step": pytest.approx(5.0), "ms_per_update": pytest.approx(90.0), "ms_per_view": 0.0}
-    stamps = [{v.generated_ns for v in views} for views in seen]
-    assert all(len(s) == 1 for s in stamps) and len(set().union(*stamps)) == len(seen)
-    assert not np.array_equal(seen[1][0].image, seen[-1][0].image), "nothing moved: nothing was new"
+    medium, layers = Variant("ngp", "medium", SMALL), Variant("splat", "layers", {"gaussians": 64, "start": 32})
+    run = MovingRun(TINY, 1.0, medium, 5, 0.1, 0.6, COMPUTE, lead_s=0.5)
+    first = run_updates(run)
+    run_updates(replace(run, update_s=0.4))
+    assert run_updates(run) == first
+    assert (first["steps"], first["update_s"]) == (3, 0.1) and first["shown_psnr_moving_db"] > 5.0
+    longer = run_updates(replace(run, update_s=0.4))
+    assert longer["update_s"] == pytest.approx(0.4)
+    assert longer["aaoi_ms"] - first["aaoi_ms"] == pytest.approx(300, abs=90)
+    at_arrivals = run_updates(replace(run, variant=layers, update_s=0.04, compute=Compute(0.0, 1.0)))
+    assert (at_arrivals["steps"], at_arrivals["update_s"]) == (10, 0.04) and at_arrivals["aaoi_ms"] < first["aaoi_ms"]
 
 
 def test_the_front_is_what_nothing_beats_in_both():
@@ -91,38 +61,22 @@ def test_steps_that_fit_into_an_update():
     assert static_steps(0.02) == 5 and static_steps(0.001) == 1
 
 
-def test_layers_are_a_setting_of_fields_that_have_them():
-    found = live_settings(("splat", "ngp"), {"threads": 1})
-    assert [s.label for s in found] == ["splat layers", "splat medium", "ngp medium"]
-    assert found[0].options == {"layers": True, "threads": 1} and found[1].options == {"threads": 1}
+def test_layers_are_a_variant_of_fields_that_have_them():
+    found = variants(("splat", "ngp"), {"threads": 1})
+    assert [v.label for v in found] == ["splat layers", "splat medium", "ngp medium"]
+    chosen = [TINY.scenario(1.0, v).edge for v in found[:2]]
+    assert [edge["field_options"] for edge in chosen] == [{"threads": 1, "layers": True}, {"threads": 1}]
+    assert [edge["updates"] for edge in chosen] == ["arrivals", "cycle"]
 
 
 def test_seeds_are_averaged_with_their_standard_error():
-    base = {
-        "speed_m_per_s": 1.0,
-        "planned_update_s": 0.5,
-        "update_s": 0.5,
-        "steps": 4,
-        "updates": 2,
-        "scored": 2,
-        "aaoi_ms": 100.0,
-        "psnr_moving_db": None,
-        "ssim": 0.5,
-        "lpips": None,
-        "shown_age_ms": 90.0,
-        "shown_psnr_moving_db": None,
-        "shown_psnr_still_db": None,
-        "shown_ssim": 0.5,
-        "shown_lpips": None,
-        "psnr_db": 20.0,
-        "field": "ngp",
-        "effort": "low",
-        "options": {"effort": "low"},
-    }
+    base = {"speed_m_per_s": 1.0, "planned_update_s": 0.5, "update_s": 0.5, "steps": 4, "aaoi_ms": 100.0}
+    base |= {"shown_psnr_moving_db": None, "shown_ssim": 0.5, "shown_lpips": None}
+    base |= {"field": "ngp", "effort": "low", "options": {"effort": "low"}}
     (row,) = mean_over_seeds([{**base, "shown_psnr_db": 20.0}, {**base, "shown_psnr_db": 22.0}])
     assert row["shown_psnr_db"] == 21.0 and row["shown_psnr_db_error"] == pytest.approx(1.0)
     assert row["shown_psnr_moving_db"] is None and row["shown_psnr_moving_db_error"] is None
-    assert row["psnr_db"] == 20.0 and row["seeds"] == 2
+    assert row["steps"] == 4 and row["seeds"] == 2
 
 
 def test_the_last_line_recommends_an_update_time_at_a_persons_speed():
@@ -146,16 +100,10 @@ def test_the_last_line_recommends_an_update_time_at_a_persons_speed():
 @pytest.fixture
 def tiny_sweep(monkeypatch):
     sweep = replace(
-        command.QUICK,
-        planned_s=(0.2, 0.4),
-        speeds=(1.0,),
-        update_s=(0.1, 0.4),
-        run_s=0.8,
-        warm_steps=3,
-        size=32,
-        moving=TINY,
+        command.QUICK, planned_s=(0.2, 0.4), speeds=(1.0,), update_s=(0.1, 0.4), run_s=0.8, size=32, moving=TINY
     )
     monkeypatch.setattr(command, "QUICK", sweep)
+    monkeypatch.setattr("edge_server.experiments.frontier.update_time._COSTS_S", 0.3)
     return sweep
 
 
