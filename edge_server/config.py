@@ -96,7 +96,6 @@ class EdgeConfig(Settings, frozen=True):
     grace_ms: Annotated[float, within(0.0, LONGEST_MS, "the first update waits for cameras without a report")] = 3000.0
     lpips: Annotated[Literal["alex", "squeeze", "none"], about("network to score with, where it is installed")] = "alex"
     noisy_truth: Annotated[bool, about("held-out frames are noisy video")] = False
-    metrics: Annotated[tuple[Literal["perceptual"], ...], about("the stand-in where there is no LPIPS")] = ()
     embedding: Annotated[Any, about("for policies that look at what cameras see")] = None
     keyframes: Annotated[KeyframesConfig | None, about("earlier viewpoints of moving cameras go on supervising")] = None
     foreground: Annotated[Any, about("cuts the background out of every view")] = None

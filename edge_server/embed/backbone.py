@@ -136,7 +136,7 @@ def load_backbone(path: Path, tap: str | None = None, size: int | None = None) -
     meta = {p.key: p.value for p in model.metadata_props}
     image = _image_input(model, path)
     at = _find_tap(model, tap, path)
-    cut = _cut(model, image.name, {at: OUTPUT}, path)
+    cut = _cut(model, image.name, at, path)
     batch, (height, width) = _shape_of(cut, size, meta, path)
     channels = _check_shapes(cut, batch or 1, height, width, path)
     return Backbone(
@@ -152,15 +152,6 @@ def load_backbone(path: Path, tap: str | None = None, size: int | None = None) -
         digest=hashlib.sha256(data).hexdigest()[:8],
         projection=_projection(meta, channels, path) if tap is None else None,
     )
-
-
-def cut_layers(path: Path, taps: tuple[str, ...]) -> tuple[bytes, str]:
-    """Cut the detector at ``path`` after the feature maps ``taps``. Returns its ONNX bytes and the name of
-    its input; the outputs are the maps, under their own names. Raises EmbeddingError."""
-    model = parse_model(_read(path), path)
-    image = _image_input(model, path)
-    cut = _cut(model, image.name, {_find_tap(model, tap, path): None for tap in taps}, path)
-    return cut.SerializeToString(), image.name
 
 
 def _read(path: Path) -> bytes:
@@ -259,15 +250,14 @@ def _is_joined(node: onnx.NodeProto, readers: dict[str, list[onnx.NodeProto]]) -
     )
 
 
-def _cut(model: onnx.ModelProto, image: str, taps: dict[str, str | None], path: Path) -> onnx.ModelProto:
-    """The graph from the images to ``taps``: tensor -> name of its mean over the image, or None for the map
-    itself."""
+def _cut(model: onnx.ModelProto, image: str, tap: str, path: Path) -> onnx.ModelProto:
+    """The graph from the images to the mean of the tensor ``tap`` over the image."""
     # Exported shapes may be wrong for another size, but the extractor needs an entry per tap.
     model.graph.name = "backbone"
     del model.graph.value_info[:]
-    model.graph.value_info.extend(helper.make_empty_tensor_value_info(name) for name in taps)
+    model.graph.value_info.append(helper.make_empty_tensor_value_info(tap))
     try:
-        cut = Extractor(model).extract_model([image], list(taps))
+        cut = Extractor(model).extract_model([image], [tap])
     except (ValueError, AssertionError) as error:
         raise EmbeddingError(f"{path}: the backbone cannot be cut out: {error}") from None
     unknown = sorted({node.op_type for node in cut.graph.node} - _KNOWN)
@@ -275,27 +265,23 @@ def _cut(model: onnx.ModelProto, image: str, taps: dict[str, str | None], path: 
         raise EmbeddingError(
             f"{path}: the backbone holds {', '.join(unknown) or 'functions'}, which no YOLO backbone does"
         )
-    if any(node.op_type == _PER_IMAGE and tap in node.output for node in cut.graph.node for tap in taps):
+    if any(node.op_type == _PER_IMAGE and tap in node.output for node in cut.graph.node):
         raise EmbeddingError(
-            f"{path}: tap: {', '.join(taps)} is quantised with another scale for every image; name the tensor before it"
+            f"{path}: tap: {tap} is quantised with another scale for every image; name the tensor before it"
         )
     if not any(node.op_type in _CONVOLVE for node in cut.graph.node):
-        raise EmbeddingError(f"{path}: no convolution lies between the images and {', '.join(taps)}")
+        raise EmbeddingError(f"{path}: no convolution lies between the images and {tap}")
     del cut.graph.value_info[:]
     del cut.graph.output[:]
-    for tap, pooled in taps.items():
-        if pooled is None:
-            cut.graph.output.append(helper.make_tensor_value_info(tap, TensorProto.FLOAT, None))
-            continue
-        # A statically quantized map holds integers, with the same offset and scale in every image.
-        cut.graph.node.extend(
-            [
-                helper.make_node("Cast", [tap], ["pooled.float"], to=TensorProto.FLOAT),
-                helper.make_node("GlobalAveragePool", ["pooled.float"], ["pooled.mean"]),
-                helper.make_node("Flatten", ["pooled.mean"], [pooled]),
-            ]
-        )
-        cut.graph.output.append(helper.make_tensor_value_info(pooled, TensorProto.FLOAT, None))
+    # A statically quantized map holds integers, with the same offset and scale in every image.
+    cut.graph.node.extend(
+        [
+            helper.make_node("Cast", [tap], ["pooled.float"], to=TensorProto.FLOAT),
+            helper.make_node("GlobalAveragePool", ["pooled.float"], ["pooled.mean"]),
+            helper.make_node("Flatten", ["pooled.mean"], [OUTPUT]),
+        ]
+    )
+    cut.graph.output.append(helper.make_tensor_value_info(OUTPUT, TensorProto.FLOAT, None))
     return cut
 
 

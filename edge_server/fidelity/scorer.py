@@ -55,7 +55,7 @@ def fidelity_title(scored_on: Iterable[str | None]) -> str:
 
 
 class PerceptualMetric(Protocol):
-    """LPIPS or its stand-in (fidelity.perceptual)."""
+    """LPIPS of one network."""
 
     network: str
     minimum_side: int
@@ -76,7 +76,6 @@ class Score:
     truth_gap_ms: capture of the truth minus the present; None on selected views.
     moving_share: share of the pixels that are known to move.
     on: the kind of truth.
-    perceptual: None unless it was asked for; it is not LPIPS, see fidelity.perceptual.
     """
 
     camera: str
@@ -88,7 +87,6 @@ class Score:
     truth_gap_ms: float | None
     moving_share: float = 0.0
     on: Literal["held-out", "selected"] = "held-out"
-    perceptual: float | None = None
     psnr_still_db: float | None = None
 
 
@@ -129,7 +127,7 @@ class _Camera:
 class Scorer:
     """Keeps a short history of each held-out camera and the renderings that wait for it.
 
-    lpips: an ``Lpips`` or None. perceptual: a ``Perceptual`` or None.
+    lpips: an ``Lpips`` or None.
     noisy_truth: held-out frames are real video, so that the bound of moving pixels follows their noise.
     period_ms: period of the held-out cameras; None takes the median gap of their frames.
     background: color that held-out images with alpha are composited over.
@@ -142,10 +140,8 @@ class Scorer:
         noisy_truth: bool = False,
         period_ms: float | None = None,
         background: Color = BLACK,
-        perceptual: PerceptualMetric | None = None,
     ) -> None:
         self._lpips = lpips
-        self._perceptual = perceptual
         self._noisy_truth = noisy_truth
         self._period_ms = period_ms
         self._background = background
@@ -229,10 +225,6 @@ class Scorer:
         total = psnr(a, b)
         assert total is not None  # no mask was given
         side = 0 if psnr_only else min(a.shape[:2])
-
-        def by(metric: PerceptualMetric | None) -> float | None:
-            return metric(a, b) if metric is not None and side >= metric.minimum_side else None
-
         return Score(
             camera=camera,
             published_ns=published_ns,
@@ -240,8 +232,7 @@ class Scorer:
             psnr_moving_db=psnr(a, b, moving),
             psnr_still_db=psnr(a, b, ~moving),
             ssim=ssim(a, b) if side >= TAPS else None,
-            lpips=by(self._lpips),
-            perceptual=by(self._perceptual),
+            lpips=self._lpips(a, b) if self._lpips is not None and side >= self._lpips.minimum_side else None,
             truth_gap_ms=(generated_ns - published_ns) / 1e6,
             moving_share=float(moving.mean()),
         )
@@ -316,26 +307,13 @@ class Scorer:
         return self.score(camera, image, published_ns, truth, times[nearest], earlier, bound, psnr_only)
 
 
-def open_listed_perceptual(metrics: Sequence[str]) -> PerceptualMetric | None:
-    """The stand-in for LPIPS if a scenario's ``edge.metrics`` lists it. ValueError with the reason where it
-    cannot be used."""
-    if "perceptual" not in metrics:
-        return None
-    from edge_server.fidelity.perceptual import open_perceptual
-
-    metric, missing = open_perceptual()
-    if metric is None:
-        raise ValueError(f"edge.metrics: {missing}")
-    return metric
-
-
 def mean_score(scores: Sequence[Score]) -> Score:
     """Mean over several held-out cameras of one publication; a metric is averaged over the cameras that have
     it. Raises ImageError for no scores."""
     if not scores:
         raise ImageError("no scores to average")
     means: dict[str, Any] = {}
-    for name in (*SHOWN, "perceptual", "truth_gap_ms", "moving_share"):
+    for name in (*SHOWN, "truth_gap_ms", "moving_share"):
         known = [v for s in scores if (v := getattr(s, name)) is not None]
         means[name] = float(np.mean(known)) if known else None
     return replace(scores[0], camera=",".join(dict.fromkeys(s.camera for s in scores)), **means)

@@ -23,7 +23,7 @@ import msgspec
 from edge_server.config import EdgeConfig, described, embedding_for, read_config
 from edge_server.edge_defaults import cameras_move
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.scorer import Score, Scorer, open_listed_perceptual
+from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.common.threads.thread_pool import SERVER_NICE
 from edge_server.fields.registry import make_field
@@ -129,7 +129,7 @@ class EdgeServer:
             if config.lpips == "none"
             else open_lpips(options.lpips_folder, config.lpips)  # type: ignore[arg-type]
         )
-        scorer = Scorer(lpips, config.noisy_truth, perceptual=open_listed_perceptual(config.metrics))
+        scorer = Scorer(lpips, config.noisy_truth)
         self.scoring = ScoringThread(scenario.held_out, scorer, self._scored, self._shown, scenario.seed)
         try:
             self.policies = LivePolicies(config.policy.name, config.policy.value, partial(scenario.rng, "policy"))
@@ -382,10 +382,7 @@ class EdgeServer:
             else {**_values(last, "t_s", "aaoi_ms", "update_ms", "omega_ms", "steps"), "selected": len(last.selected)},
             "scores": None
             if scored is None
-            else {
-                **_values(scored, "psnr_db", "ssim", "psnr_moving_db", "lpips", "perceptual"),
-                "on": scored.scored_on,
-            },
+            else {**_values(scored, "psnr_db", "ssim", "psnr_moving_db", "lpips"), "on": scored.scored_on},
         }
 
     def _write_final(self) -> None:

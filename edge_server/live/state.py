@@ -46,7 +46,6 @@ class Publication:
     psnr_db to truth_gap_ms: None until the held-out truth nearest to the present has arrived, or where there
     is nothing to score. truth_gap_ms: time from the present to that truth.
     scored_on: held-out camera, or SELECTED where nothing is held out (6.21-6.22).
-    perceptual: the stand-in for LPIPS, where the scenario lists it (edge.metrics).
     """
 
     number: int
@@ -66,7 +65,6 @@ class Publication:
     lpips: float | None = None
     truth_gap_ms: float | None = None
     scored_on: str | None = None
-    perceptual: float | None = None
     network_ms: float | None = None
 
     @property
@@ -82,7 +80,6 @@ class Publication:
             psnr_moving_db=score.psnr_moving_db,
             ssim=score.ssim,
             lpips=score.lpips,
-            perceptual=score.perceptual,
             truth_gap_ms=score.truth_gap_ms,
             scored_on=score.camera if score.on == "held-out" else SELECTED,
         )

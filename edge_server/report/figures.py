@@ -54,7 +54,6 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
         _plot(bottom, series, "ssim", GREEN, "SSIM (higher is better)")
         network = found.get("lpips_network") or "network unknown"
         _plot(bottom, series, "lpips", ORANGE, f"LPIPS-{network} (lower is better)")
-        _plot(bottom, series, "perceptual", GRAY, "perceptual, not LPIPS (lower is better)")
         bottom.set_ylim(0.0, 1.02)
         label_lines(bottom, "score", "seconds of fitting" if fit else "seconds since the edge started")
     return True

@@ -28,7 +28,7 @@ from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.truth import ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import Truth, VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.scorer import Score, Scorer, mean_score, open_listed_perceptual
+from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
 from edge_server.live.buffer import FrameBuffer
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 Image = Callable[[str, float], NDArray[np.uint8]]
 _TRUTHS_KEPT = 8192
-SCORES = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual")
+SCORES = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
 # Instant of the first decision of the deployment's own edge: never within an episode.
 _NEVER_MS = 1e11
 
@@ -75,7 +75,6 @@ class Outcome:
     psnr_moving_db: float | None
     ssim: float | None
     lpips: float | None
-    perceptual: float | None
     aaoi_ms: float | None
     views: float
     wait_ms: float
@@ -190,7 +189,7 @@ class EpisodeFactory:
             if scene.moving and effects is NO_EFFECTS and not self._moving:
                 self._period_ns = round(scene.period_s * 1e9)
         lpips = None if edge.lpips == "none" else open_lpips(folders.lpips, edge.lpips)[0]  # type: ignore[arg-type]
-        self._scorer = Scorer(lpips, edge.noisy_truth, perceptual=open_listed_perceptual(edge.metrics))
+        self._scorer = Scorer(lpips, edge.noisy_truth)
         self.setting, self.folders = setting, folders
         self._shared = None if self._moving else self._stage(scenario)
         self._last: tuple[int, Stage] | None = None

@@ -152,13 +152,11 @@ def reward_of(
     on: whole or moving, the pixels of the PSNR.
     lpips_folder: folder of the LPIPS weights.
     network: the scenario's edge.lpips.
-    distance: lpips, perceptual (its stand-in) or none.
+    distance: lpips or none.
     """
     reward = make_reward(name, fidelity=on)
     if distance == "none":
         return dataclasses.replace(reward, distance=0.0), None
-    if distance == "perceptual":
-        return dataclasses.replace(reward, distance_is="perceptual"), None
     missing: str | None = "the scenario's edge.lpips is none"
     if network != "none":
         _, missing = open_lpips(lpips_folder, network)  # type: ignore[arg-type]

@@ -24,7 +24,7 @@ from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.lpips_weights import Network, open_lpips
-from edge_server.fidelity.scorer import SHOWN, Scorer, open_listed_perceptual
+from edge_server.fidelity.scorer import SHOWN, Scorer
 from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.state import Publication
 from edge_server.report.machine import versions
@@ -45,7 +45,7 @@ steps, and they take virtual time: none, as in the thesis, or ms per step and ms
 the scenario, or --compute; edge-server costs measures them). The same seed gives the same result on the same
 kind of processor: the printed digest covers every publication and the field's parameters.
 """
-_METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual", "aaoi_ms")
+_METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "aaoi_ms")
 _SCORED_EVERY_MS = 250.0  # publications, and what is shown at random instants
 _CYCLE_MS = 250.0  # between two decisions
 # Seconds of virtual time between two lines of progress.
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         metric, missing = None, None
         if config.lpips != "none":
             metric, missing = open_lpips(folders.lpips, cast(Network, config.lpips))
-        scorer = Scorer(metric, config.noisy_truth, perceptual=open_listed_perceptual(config.metrics))
+        scorer = Scorer(metric, config.noisy_truth)
         decisions: DecisionLog | None = None
 
         def published(publication: Publication) -> None:
@@ -159,10 +159,7 @@ def show(found: dict[str, Any]) -> str:
         f"{short_name(found['policy'])}{value}",
         f"  updates     {found['updates']} of {found['steps']} steps, {cost_text}",
         f"  views       {number(found['views'], 1)} an update",
-        "  last fifth  "
-        + ", ".join(
-            f"{k} {number(v, 3)}" for k, v in found["last_fifth"].items() if k != "perceptual" or v is not None
-        ),
+        "  last fifth  " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["last_fifth"].items()),
         "  shown       " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["shown"].items()),
         "  frames      " + ", ".join(f"{k} {v}" for k, v in found["frames"].items() if v),
         f"  digest      {found['digest'][:32]} on {found['processor']}",

@@ -32,7 +32,7 @@ from freshfield.geometry import Pose
 log = logging.getLogger(__name__)
 
 # After this many newer publications, one without scores will not get any.
-_FINAL_AFTER = 8
+_FINAL_AFTER = 32  # more than a second of updates at arrivals
 LINE_EVERY_S = 0.08  # on average: there may be fifty publications a second
 _INTERVAL_SHARE = 0.01  # weight of the newest interval in the running mean
 # Some 100 MB: days of an arm that never rests.

@@ -48,7 +48,7 @@ class EdgeCollector:
         yield GaugeMetricFamily("freshfield_aaoi_seconds", "mean age of selection", value=last.aaoi_ms / 1e3)
         yield GaugeMetricFamily("freshfield_selected_views", "views used last", value=len(last.selected))
         about = fidelity_title([scored.scored_on if scored else None])
-        for name in ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual"):
+        for name in ("psnr_db", "psnr_moving_db", "ssim", "lpips"):
             if (value := getattr(scored, name, None)) is not None:
                 yield GaugeMetricFamily(f"freshfield_{name}", about, value=value)
 

@@ -64,7 +64,6 @@ class Reward:
     views: per used view, for the cost of sending, decoding and fitting it; the thesis has no such term.
     fidelity: PSNR of the ``whole`` image or of its ``moving`` pixels; in a mostly static scene the whole
     image hides the cost of age. SSIM and the distance are always of the whole image.
-    distance_is: ``lpips``, or ``perceptual``, the stand-in without LPIPS weights; the term carries its name.
     """
 
     name: str
@@ -73,7 +72,6 @@ class Reward:
     distance: float
     age: float = 0.0
     fidelity: Literal["whole", "moving"] = "whole"
-    distance_is: Literal["lpips", "perceptual"] = "lpips"
     views: float = 0.0
 
     def __post_init__(self) -> None:
@@ -81,17 +79,15 @@ class Reward:
             raise ValueError(f"reward {self.name}: weights must be finite")
         if self.fidelity not in ("whole", "moving"):
             raise ValueError(f"reward {self.name}: fidelity is whole or moving, not {self.fidelity!r}")
-        if self.distance_is not in ("lpips", "perceptual"):
-            raise ValueError(f"reward {self.name}: distance_is lpips or perceptual, not {self.distance_is!r}")
 
     def of(self, score: Scored) -> RewardTerms:
-        """The reward of a score. ``aaoi_ms``, ``views`` and ``perceptual`` are read where it has them, as a
-        publication does. A metric that the score lacks, or that is None or not finite, is missing."""
+        """The reward of a score. ``aaoi_ms`` and ``views`` are read where it has them, as a publication
+        does. A metric that the score lacks, or that is None or not finite, is missing."""
         psnr_db = score.psnr_db if self.fidelity == "whole" else score.psnr_moving_db
         found = {
             "psnr" if self.fidelity == "whole" else "psnr_moving": (self.psnr, psnr_db),
             "ssim": (self.ssim, score.ssim),
-            self.distance_is: (self.distance, getattr(score, self.distance_is, None)),
+            "lpips": (self.distance, score.lpips),
             "age": (self.age, getattr(score, "aaoi_ms", None)),
             "views": (self.views, getattr(score, "views", None)),
         }
@@ -136,4 +132,4 @@ def make_reward(name: str = "corrected", fidelity: str = "whole", **others: Any)
 def without_missing_lpips(reward: Reward, lpips_missing: str | None) -> Reward:
     """``reward`` without its LPIPS term where LPIPS is missing: nothing can be learned from rewards that are
     never complete."""
-    return replace(reward, distance=0.0) if lpips_missing and reward.distance_is == "lpips" else reward
+    return replace(reward, distance=0.0) if lpips_missing else reward

@@ -1,4 +1,4 @@
-"""``edge.embedding`` and ``edge.metrics`` of a scenario: strict, and nothing where they are absent."""
+"""``edge.embedding`` of a scenario: strict, and nothing where they are absent."""
 
 from __future__ import annotations
 
@@ -47,10 +47,3 @@ def test_one_line_for_what_is_wrong(section, told):
     with pytest.raises(ScenarioError) as caught:
         read_config(scenario(embedding=section))
     assert str(caught.value).startswith(f"{FILE}: {told}") and "\n" not in str(caught.value)
-
-
-def test_metrics_are_perceptual_or_nothing():
-    assert read_config(scenario()).metrics == ()
-    assert read_config(scenario(metrics=["perceptual"])).metrics == ("perceptual",)
-    with pytest.raises(ScenarioError, match=r"edge\.metrics\[0\]: expected one of perceptual"):
-        read_config(scenario(metrics=["fid"]))

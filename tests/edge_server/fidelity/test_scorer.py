@@ -7,7 +7,7 @@ import pytest
 
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.psnr import PSNR_CEILING_DB
-from edge_server.fidelity.scorer import MAX_PENDING, Scorer, mean_score, open_listed_perceptual
+from edge_server.fidelity.scorer import MAX_PENDING, Scorer, mean_score
 from tests.conftest import data_dir
 
 MS = 1_000_000
@@ -253,7 +253,3 @@ def test_what_was_shown_at_the_newest_truth_is_scored_once_the_period_is_known()
     assert score is not None and score.psnr_db == PSNR_CEILING_DB
     with pytest.raises(ValueError, match="48 x 24 but the truth is 48 x 48"):
         scorer.newest("h", lambda taken_ns: truth_at(40)[:24])
-
-
-def test_only_listed_metrics_are_opened():
-    assert open_listed_perceptual(["psnr", "ssim"]) is None

@@ -15,7 +15,7 @@ from edge_server.cli import main as edge_server
 from edge_server.config import ExportConfig
 from edge_server.live.state import Publication
 from edge_server.report.build_report import METRICS, SERIES, assemble, build_report, fidelity, updates
-from edge_server.report.figures import draw_fidelity, draw_frontier
+from edge_server.report.figures import draw_frontier
 from edge_server.report.page import counts, number, render_page
 from edge_server.report.run_files import continuous, read_run_files
 from edge_server.run_records import EdgeStatus, UpdateCounts, UpdateRow
@@ -314,27 +314,6 @@ def test_the_run_stands_beside_the_measured_frontier(tmp_path, monkeypatch):
     files.series = files.series[::2]  # a busy edge writes no row for some updates
     assert draw_frontier(report, files, path) and at[-1] == pytest.approx(0.75), "one update to the next"
     assert ((cv2.imread(str(path)) < 200).any(axis=-1)).sum() > 2000, "axes, words and points are drawn"
-
-
-def test_the_stand_in_distance_is_never_shown_as_lpips(tmp_path, monkeypatch):
-    """Where LPIPS is missing, tiles, table and figure name the distance that took its place."""
-    write_run(tmp_path)
-    report = build_report(tmp_path)
-    for values in (report["fidelity"]["final"], report["fidelity"]["mean"]):
-        values |= {"lpips": None, "perceptual": 0.4321}
-    page = render_page(report, {})
-    assert "<b>0.432</b><span>perceptual (not LPIPS)</span>" in page
-    heads = re.findall(r"<th[^>]*>([^<]*)</th>", page)
-    assert [head for head in heads if "LPIPS" in head] == ["LPIPS-alex", "perceptual (not LPIPS)"]
-
-    labels: list[str] = []
-    monkeypatch.setattr(
-        "matplotlib.axes.Axes.legend", lambda axes, **_: labels.extend(axes.get_legend_handles_labels()[1])
-    )
-    for row in report["fidelity"]["series"]:
-        row["perceptual"], row["lpips"] = row["lpips"], None
-    assert draw_fidelity(report, read_run_files(tmp_path), tmp_path / "fidelity.png")
-    assert [label for label in labels if "LPIPS" in label] == ["perceptual, not LPIPS (lower is better)"]
 
 
 def test_what_was_chosen_and_why_is_said(tmp_path):

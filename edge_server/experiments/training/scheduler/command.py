@@ -153,8 +153,6 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
             raise ValueError(f"--field: expected one of {', '.join(field_names())}, got {args.field!r}")
         edge["field"], edge["updates"] = args.field, "cycle"
         edge["field_options"] = {"effort": "low"} if args.field in ("splat", "ngp") else {}
-    if args.distance == "perceptual":
-        edge["metrics"] = sorted({*edge.get("metrics", ()), "perceptual"})
     edge["policy"] = {"name": "all"}
     report = _reporting(args, scenario)
     held_out = tuple(c for c in scenario.cameras if c in {*scenario.held_out, *report})
@@ -254,9 +252,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     add(
         "--distance",
-        choices=("lpips", "perceptual", "none"),
+        choices=("lpips", "none"),
         default="lpips",
-        help="distance in the reward; perceptual: a substitute without LPIPS weights [%(default)s]",
+        help="distance in the reward; without weights there is none [%(default)s]",
     )
     add(
         "--price",

@@ -229,7 +229,6 @@ def _missing_reward_reason(outcomes: list[Outcome], found: list[RewardTerms]) ->
     missing = list(dict.fromkeys(name for r in found for name in r.missing))
     hints = {
         "lpips": "lpips: see edge.lpips and --lpips, or leave it out with --distance none",
-        "perceptual": "perceptual: see edge.metrics, or leave it out with --distance none",
         "psnr_moving": "psnr_moving: nothing moves where the held-out cameras look; --on whole",
     }
     return "no decision of the first batch has a reward, it lacks " + "; ".join(

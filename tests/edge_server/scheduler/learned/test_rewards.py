@@ -16,8 +16,8 @@ def score(psnr_db=25.0, psnr_moving_db=20.0, ssim=0.9, lpips=0.2):
     return Score("cam00", 0, psnr_db, psnr_moving_db, ssim, lpips, 0.0)
 
 
-def outcome(aaoi_ms=60.0, ssim=0.9, perceptual=None, views=3.0):
-    return Outcome(25.0, 20.0, ssim, 0.2, perceptual, aaoi_ms, views, 0.0)
+def outcome(aaoi_ms=60.0, ssim=0.9, views=3.0):
+    return Outcome(25.0, 20.0, ssim, 0.2, aaoi_ms, views, 0.0)
 
 
 def test_the_reward_of_sets_is_519():
@@ -53,13 +53,6 @@ def test_a_missing_metric_is_reported_and_the_rest_stays_finite(value):
     assert found.total == pytest.approx(0.95)
 
 
-def test_the_stand_in_for_lpips_carries_its_own_name():
-    found = make_reward("set", distance_is="perceptual").of(outcome(perceptual=0.3))
-    assert found.terms["perceptual"] == pytest.approx(-0.3)
-    assert "lpips" not in found.terms
-    assert make_reward("set", distance_is="perceptual").of(score()).missing == ("perceptual",)
-
-
 def test_weights_can_be_replaced_and_a_weight_of_zero_is_no_term():
     found = make_reward("corrected", distance=0.0, age=-0.001).of(outcome(aaoi_ms=100.0))
     assert found.terms.keys() == {"psnr", "ssim", "age"}
@@ -80,7 +73,6 @@ def test_a_view_costs_its_price_in_a_simulated_update_and_in_a_live_one():
     [
         ({"name": "best"}, "corrected"),
         ({"name": "set", "fidelity": "all"}, "whole or moving"),
-        ({"name": "set", "distance_is": "ssim"}, "lpips or perceptual"),
         ({"name": "set", "age": math.nan}, "finite"),
     ],
 )

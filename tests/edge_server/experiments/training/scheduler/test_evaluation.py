@@ -29,7 +29,7 @@ BY_PSNR = Reward("psnr", psnr=1.0, ssim=0.0, distance=0.0)
 
 
 def outcome(psnr_db: float | None) -> dict[str, Outcome]:
-    return {"cam00": Outcome(psnr_db, *[None] * 5, views=1.0, wait_ms=0.0)}
+    return {"cam00": Outcome(psnr_db, *[None] * 4, views=1.0, wait_ms=0.0)}
 
 
 def evaluation_of(rng: np.random.Generator, matters: float) -> Evaluation:
