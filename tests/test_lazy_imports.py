@@ -25,7 +25,7 @@ from freshfield.scenario import load
 build_cameras(load("tile"), source_config(load("tile")), ["cam00"])
 """
 TILE = """
-import camera_node.synthetic.frame_cache
+import camera_node.synthetic.source
 from camera_node.synthetic import make_scene
 make_scene("tile", {"width": 16, "height": 16}).render("cam00", 0.0)
 """

@@ -25,7 +25,7 @@ from camera_node.robot.simulated_controller.joint_motion import STEP_S
 from camera_node.sources.base import Shot, Source
 from camera_node.synthetic import Scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects
-from camera_node.synthetic.frame_cache import FrameCache
+from camera_node.synthetic.source import WorldSource
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario, ScenarioError
 
@@ -116,11 +116,11 @@ class FlangeCamera(Source):
 
 
 def open_flange_cameras(
-    scenario: Scenario, config: ArmConfig, frames: Mapping[str, FrameCache], effects: Mapping[str, Effects | None]
+    scenario: Scenario, config: ArmConfig, still: Mapping[str, WorldSource], effects: Mapping[str, Effects | None]
 ) -> dict[str, Source]:
-    """Connect to the arm and open the cameras of ``frames``, which are on its flange. Raises ScenarioError and
+    """Connect to the arm and open the cameras of ``still``, which are on its flange. Raises ScenarioError and
     ArmError."""
-    for camera in frames:
+    for camera in still:
         made = effects.get(camera)
         if made is not None and made.exposure:
             names = ", ".join(type(effect).__module__.rsplit(".", 1)[1] for effect in made.exposure)
@@ -128,8 +128,8 @@ def open_flange_cameras(
                 f"{scenario.path}: source.effects: {names}: not for a camera that an arm carries ({camera}): "
                 "they take the camera to stand still while it exposes"
             )
-    mounts = load_hand_eyes(scenario, config, frames)
-    poses = camera_poses(scenario, config, frames)
+    mounts = load_hand_eyes(scenario, config, still)
+    poses = camera_poses(scenario, config, still)
     truth, arm, base = TruthClient(config.host), arm_model(scenario, config), base_matrix(config)
     return {
         camera: FlangeCamera(
@@ -144,5 +144,5 @@ def open_flange_cameras(
             base,
             mounts[camera].transform,
         )
-        for camera, each in frames.items()
+        for camera, each in still.items()
     }

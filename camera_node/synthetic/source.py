@@ -2,48 +2,148 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import cast
+
+import numpy as np
 
 from camera_node.config import SourceConfig, WorldConfig, errors_of
 from camera_node.sources.base import Shot, Source, rate
 from camera_node.synthetic import Scene, make_scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects
-from camera_node.synthetic.frame_cache import FrameCache
+from camera_node.synthetic.frame_cache import FrameCache, default_folder, renderer_version
+from camera_node.synthetic.motion import PERIOD_UNIT_S
+from camera_node.synthetic.render import Image
+from freshfield import payload
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
+from freshfield.settings import as_mapping
 
 WORLD_FPS = 15.0
+# A sequence with more different frames counts as not repeating: frames are rendered on demand and not kept.
+MAX_FRAMES = 3000
 
 
 class WorldSource(Source):
-    """One camera of a scene, with its frames in a ``FrameCache``."""
+    """One camera of a scene. Frame k shows the scene at k / fps + phase_ns.
 
-    def __init__(self, camera: str, frames: FrameCache, effects: Effects) -> None:
-        self.camera = camera
-        self.fps, self.phase_ns = frames.fps, frames.phase_ns
-        lens, matrix = frames.scene.cameras[frames.camera_id]
+    camera, camera_id: names in the scenario and in the scene.
+    effects: of this camera, from ``load_effects``.
+    codec, quality: of the encoded frames.
+    folder: root of the cache of rendered frames; None renders every frame anew.
+    Raises ValueError for a rate that is not positive, EffectError for effects that do not fit the scene.
+
+    Attributes:
+    repeats_after: frames until the scene repeats (1 for a static scene); None for more than MAX_FRAMES.
+    cache: of the frames; None if they are rendered anew.
+    """
+
+    def __init__(
+        self,
+        camera: str,
+        scene: Scene,
+        camera_id: str,
+        fps: float | Fraction,
+        *,
+        effects: Effects = NO_EFFECTS,
+        codec: str = "jpeg",
+        quality: int = 92,
+        phase_ns: int = 0,
+        folder: Path | None = None,
+    ) -> None:
+        self.scene = effects.extend(scene)
+        self.camera, self.camera_id, self.phase_ns = camera, camera_id, phase_ns
+        self.fps = Fraction(fps).limit_denominator(1001)
+        if self.fps <= 0:
+            raise ValueError(f"fps must be positive, got {fps}")
+        lens, matrix = self.scene.cameras[camera_id]
         self.intrinsics = effects.reported_lens(lens)
+        self.repeats_after = _repeats_after(self.scene, self.fps)
         # Frames with equal images but different reported poses are different shots.
-        self.contents = None if effects.pose_varies else frames.contents
-        self._pose = Pose.from_matrix(matrix)
-        self._effects = effects
-        self._frames = frames
+        self.contents = None if effects.image or effects.pose_varies else self.repeats_after
+        self._pose, self._effects = Pose.from_matrix(matrix), effects
+        # Frames to which image effects are applied later are stored losslessly.
+        self._codec, self._quality = "zstd" if effects.image else codec, quality
+        self.cache: FrameCache | None = None
+        if folder is not None and self.repeats_after is not None:
+            self.cache = FrameCache(self.key(), self._codec, (lens.width, lens.height), folder)
 
     def content(self, tick: int) -> int:
-        return tick if self.contents is None else self._frames.content(tick)
+        return tick % self.contents if self.contents else tick
 
     def read(self, content: int) -> Shot:
-        pose = self._effects.reported_pose(self._pose, content)
-        return Shot(self._frames.read(self._frames.content(content)), pose, self.intrinsics)
+        """Shot number ``content``: encoded or, if there are image effects, an image still to be encoded."""
+        frame = content % self.repeats_after if self.repeats_after else content
+        image: Image | bytes
+        if self._effects.image:
+            image = self._effects.apply(self.image(frame), content, self._time_s(content))
+        else:
+            image = self._stored(frame)
+        return Shot(image, self._effects.reported_pose(self._pose, content), self.intrinsics)
+
+    def image(self, frame: int) -> Image:
+        """Frame before effects of kind image: uint8 (H, W, 3), exact."""
+        if self.cache is None or not self._effects.image:
+            return self._render(frame)
+        return payload.decode(self._stored(frame), self._codec, self.intrinsics.width, self.intrinsics.height)
 
     def prepare(self, stopped: Callable[[], bool]) -> None:
-        self._frames.fill(stop=stopped)
+        for frame in range(self.repeats_after or 0):
+            if stopped() or self.cache is None or self.cache.error is not None:
+                break
+            self._stored(frame)
 
     def release(self) -> None:
         # Replace the scene by the same one without its renderers.
-        self._frames.scene = self._frames.scene.with_world(self._frames.scene.world)
+        self.scene = self.scene.with_world(self.scene.world)
+
+    def key(self) -> str:
+        """Hash (hex) of everything that determines the frames' bytes."""
+        camera, pose = self.scene.cameras[self.camera_id]
+        what = {
+            "scene": self.scene.name,
+            "params": as_mapping(self.scene.params),
+            "camera": dataclasses.asdict(camera),
+            "pose": np.asarray(pose, dtype=np.float64).tolist(),
+            "fps": str(self.fps),
+            "effects": [[name, as_mapping(p)] for name, p in self._effects.rendered],
+            "codec": [self._codec, self._quality if self._codec == "jpeg" else None],
+            "renderer": renderer_version(),
+            "phase_ns": self.phase_ns,
+        }
+        # ``count`` determines which cameras there are, not what one of them sees.
+        what["params"].pop("count")
+        return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+
+    def _stored(self, frame: int) -> bytes:
+        """The frame, encoded: from the cache, or rendered and kept there."""
+        data = None if self.cache is None else self.cache.load(frame)
+        if data is None:
+            data = payload.encode(self._render(frame), self._codec, self._quality)
+            if self.cache is not None:
+                self.cache.save(frame, data)
+        return data
+
+    def _render(self, frame: int) -> Image:
+        view = self._effects.with_exposure(self.scene.renderer(self.camera_id))
+        return view.image(self._time_s(frame))
+
+    def _time_s(self, frame: int) -> float:
+        return float(frame / self.fps) + self.phase_ns / 1e9
+
+
+def _repeats_after(scene: Scene, fps: Fraction) -> int | None:
+    if not scene.moving:
+        return 1
+    period = Fraction(round(scene.period_s / PERIOD_UNIT_S)) * Fraction(PERIOD_UNIT_S).limit_denominator(10)
+    # The numerator is the least number of frames that take a whole number of periods.
+    frames = (period * fps).numerator
+    return frames if frames <= MAX_FRAMES else None
 
 
 def open_sources(
@@ -57,40 +157,31 @@ def open_sources(
     config = cast(WorldConfig, config)
     if config.arm is not None and scenario.phase != "locked":
         raise ScenarioError(f"{scenario.path}: cameras.phase: an arm's cameras are locked to its poses")
-    frames = frame_caches(scenario, config, cameras, effects)
-    carried: dict[str, Source] = {}
-    if config.arm is not None and any(camera in config.arm.cameras for camera in cameras):
-        from camera_node.robot.flange_camera import open_flange_cameras
-
-        on_hand = {camera: frames.pop(camera) for camera in cameras if camera in config.arm.cameras}
-        carried = open_flange_cameras(scenario, config.arm, on_hand, effects)
-    return carried | {
-        camera: WorldSource(camera, each, effects.get(camera) or NO_EFFECTS) for camera, each in frames.items()
-    }
-
-
-def frame_caches(
-    scenario: Scenario, config: WorldConfig, cameras: Sequence[str], effects: Mapping[str, Effects | None]
-) -> dict[str, FrameCache]:
-    """The frame cache of each camera; nothing is rendered yet. Raises ScenarioError."""
     with errors_of(f"{scenario.path}: source"):
         scene = make_scene(config.scene, {"count": len(scenario.cameras), **config.scene_parameters()})
     names = _scene_cameras(scenario, scene)
+    # Training of a scheduler draws hundreds of motions, each used once.
+    folder = default_folder() if config.motion_seed is None else None
+    sources: dict[str, Source] = {}
     with errors_of(f"{scenario.path}: source.effects"):  # of one that does not fit this scene
-        return {
-            camera: FrameCache(
+        for camera in cameras:
+            sources[camera] = WorldSource(
+                camera,
                 scene,
                 names[camera],
                 rate(config.fps or WORLD_FPS),
                 effects=effects.get(camera) or NO_EFFECTS,
                 codec=config.codec,
                 quality=config.quality,
-                # Training of a scheduler draws hundreds of motions, each used once.
-                on_disk=config.motion_seed is None,
                 phase_ns=scenario.phase_ns(camera, config.fps or WORLD_FPS),
+                folder=folder,
             )
-            for camera in cameras
-        }
+    if config.arm is not None and any(camera in config.arm.cameras for camera in cameras):
+        from camera_node.robot.flange_camera import open_flange_cameras
+
+        on_hand = {c: cast(WorldSource, sources[c]) for c in cameras if c in config.arm.cameras}
+        sources.update(open_flange_cameras(scenario, config.arm, on_hand, effects))
+    return sources
 
 
 def _scene_cameras(scenario: Scenario, scene: Scene) -> dict[str, str]:

@@ -1,6 +1,7 @@
 """Hot pixels: permanent and transient damage of a sensor by radiation.
 
-Damaged pixels leak charge in every frame. Particles leave charge in a pixel for one frame. With a color filter, one of a pixel's three values is hit.
+Damaged pixels leak charge in every frame. Particles leave charge in a pixel for one frame. With a color filter,
+one of a pixel's three values is hit.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def test_what_it_sees_and_what_it_claims_agree_where_the_arm_stands(host):
         mount = load_hand_eyes(scenario, config, ["hand"])["hand"].transform
         place = base_matrix(config) @ UR3E.forward(np.deg2rad(LOOKING)) @ mount
         assert np.allclose(shot.pose.matrix(), place, atol=1e-12)
-        scene = fixed.source._frames.scene
+        scene = fixed.source.scene
         expected = scene.view(shot.intrinsics, place).image(0.0)
         assert np.array_equal(payload.decode(shot.payload, "png", 48, 48), expected)
         assert shot.intrinsics == fixed.source.intrinsics

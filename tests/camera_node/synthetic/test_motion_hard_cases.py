@@ -7,7 +7,7 @@ import pytest
 
 from camera_node.synthetic import SCENES, make_scene
 from camera_node.synthetic.effects import NAMES, load_effects
-from camera_node.synthetic.frame_cache import FrameCache
+from camera_node.synthetic.source import WorldSource
 from freshfield.geometry import Pinhole, Pose, look_at
 
 pytestmark = pytest.mark.stability
@@ -48,11 +48,10 @@ def test_what_is_no_instant_is_refused(t):
 @pytest.mark.parametrize("speed", [0.0, 0.05, 0.7, 1.0, 8.0])
 def test_every_speed_repeats_exactly_through_the_cache(speed):
     scene = make_scene("room", {**SMALL, "speed_m_per_s": speed})
-    frames = FrameCache(scene, "cam01", 15, on_disk=False)
-    assert frames.repeats_after is not None
+    camera = WorldSource("eye", scene, "cam01", 15)
+    assert camera.repeats_after is not None
     for k in (0, 7):
-        assert np.array_equal(frames.frame(k), frames.frame(k + 10**9 * frames.repeats_after))
-        assert frames.encoded(k) == frames.encoded(k + 10**9 * frames.repeats_after)
+        assert camera.read(k).image == camera.read(k + 10**9 * camera.repeats_after).image
 
 
 def test_a_faster_world_is_the_same_world_sooner():
@@ -96,11 +95,11 @@ def test_cameras_in_awkward_places(eye, target):
 def test_all_effects_at_once_for_a_thousand_frames():
     made = load_effects(EFFECTS, lambda name: np.random.default_rng(2))
     scene = make_scene("room", {"width": 16, "height": 16, "supersample": 1, "speed_m_per_s": 8.0})
-    frames = FrameCache(scene, "cam01", 15, effects=made, on_disk=False)
+    camera = WorldSource("eye", scene, "cam01", 15, effects=made)
     pose = Pose.from_matrix(scene.cameras["cam01"][1])
     means, stamp = [], 0
     for k in range(1000):
-        image = frames.read(frames.content(k))
+        image = camera.read(camera.content(k)).image
         assert isinstance(image, np.ndarray) and image.shape == (16, 16, 3)
         means.append(image.mean())
         now = made.node_ns(10**18 + k * 66_666_667)

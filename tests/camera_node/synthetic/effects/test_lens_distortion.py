@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from camera_node.synthetic import make_scene
-from camera_node.synthetic.effects import EffectError, load_effects
-from camera_node.synthetic.frame_cache import FrameCache
+from camera_node.synthetic.effects import NO_EFFECTS, EffectError, load_effects
 from camera_node.synthetic.placement import Part
 from camera_node.synthetic.render import World
 from camera_node.synthetic.shapes import Sphere
+from camera_node.synthetic.source import WorldSource
 from camera_node.synthetic.textures import Plain
 from freshfield.geometry import se3_inverse
 from tests.camera_node.synthetic.worlds import FLAT_LIGHT as FLAT
@@ -52,9 +52,9 @@ def test_frames_carry_the_coefficients_unless_uncalibrated():
     assert naive.extend(scene).cameras["cam03"][0] == seen
     assert naive.reported_lens(seen) == scene.cameras["cam03"][0]
     # The reported lens does not change the image, so both share what was rendered.
-    caches = [FrameCache(scene, "cam03", 15, effects=e, on_disk=False) for e in (calibrated, naive)]
-    assert caches[0].key() == caches[1].key() != FrameCache(scene, "cam03", 15, on_disk=False).key()
-    assert np.array_equal(caches[0].frame(2), caches[1].frame(2))
+    shared, other, plain = (WorldSource("eye", scene, "cam03", 15, effects=e) for e in (calibrated, naive, NO_EFFECTS))
+    assert shared.key() == other.key() != plain.key()
+    assert np.array_equal(shared.image(2), other.image(2))
 
 
 def test_a_lens_that_cannot_be_undone_is_refused_in_one_line():

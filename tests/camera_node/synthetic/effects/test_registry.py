@@ -18,7 +18,7 @@ import sys, tracemalloc
 from pathlib import Path
 import numpy as np
 from camera_node.synthetic import effects as fx, make_scene
-from camera_node.synthetic.frame_cache import FrameCache
+from camera_node.synthetic.source import WorldSource
 
 listed, folder = {listed!r}, Path({folder!r})
 streams = []
@@ -30,10 +30,10 @@ def count(frame, event, argument):
     calls += event == "call" and Path(frame.f_code.co_filename).parent.name == "effects" \\
         and not frame.f_code.co_filename.endswith("__init__.py")
 effects = fx.load_effects(listed, lambda n: streams.append(n) or np.random.default_rng(0))
-cache = FrameCache(scene, "cam01", 15, effects=effects, folder=folder)
+camera = WorldSource("cam01", scene, "cam01", 15, effects=effects, folder=folder)
 sys.setprofile(count)
 for k in range(12):
-    cache.read(cache.content(k))
+    camera.read(camera.content(k))
     effects.node_ns(k)
 sys.setprofile(None)
 held = tracemalloc.take_snapshot().filter_traces(
