@@ -25,7 +25,6 @@ from camera_node.robot.simulated_controller.joint_motion import STEP_S
 from camera_node.sources.base import Shot, Source
 from camera_node.synthetic import Scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects
-from camera_node.synthetic.source import WorldSource
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario, ScenarioError
 
@@ -116,11 +115,15 @@ class FlangeCamera(Source):
 
 
 def open_flange_cameras(
-    scenario: Scenario, config: ArmConfig, still: Mapping[str, WorldSource], effects: Mapping[str, Effects | None]
+    scenario: Scenario,
+    config: ArmConfig,
+    fps: Fraction,
+    seen: Mapping[str, tuple[Scene, Pinhole]],
+    effects: Mapping[str, Effects | None],
 ) -> dict[str, Source]:
-    """Connect to the arm and open the cameras of ``still``, which are on its flange. Raises ScenarioError and
-    ArmError."""
-    for camera in still:
+    """Connect to the arm and open the cameras on its flange. seen: each camera's scene, with its effects, and lens.
+    Raises ScenarioError and ArmError."""
+    for camera in seen:
         made = effects.get(camera)
         if made is not None and made.exposure:
             names = ", ".join(type(effect).__module__.rsplit(".", 1)[1] for effect in made.exposure)
@@ -128,15 +131,15 @@ def open_flange_cameras(
                 f"{scenario.path}: source.effects: {names}: not for a camera that an arm carries ({camera}): "
                 "they take the camera to stand still while it exposes"
             )
-    mounts = load_hand_eyes(scenario, config, still)
-    poses = camera_poses(scenario, config, still)
+    mounts = load_hand_eyes(scenario, config, seen)
+    poses = camera_poses(scenario, config, seen)
     truth, arm, base = TruthClient(config.host), arm_model(scenario, config), base_matrix(config)
     return {
         camera: FlangeCamera(
             camera,
-            each.fps,
-            each.scene,
-            each.scene.cameras[each.camera_id][0],
+            fps,
+            scene,
+            lens,
             effects.get(camera) or NO_EFFECTS,
             poses[camera],
             truth,
@@ -144,5 +147,5 @@ def open_flange_cameras(
             base,
             mounts[camera].transform,
         )
-        for camera, each in still.items()
+        for camera, (scene, lens) in seen.items()
     }

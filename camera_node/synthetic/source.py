@@ -162,14 +162,14 @@ def open_sources(
     names = _scene_cameras(scenario, scene)
     # Training of a scheduler draws hundreds of motions, each used once.
     folder = default_folder() if config.motion_seed is None else None
-    sources: dict[str, Source] = {}
+    fps, made = rate(config.fps or WORLD_FPS), dict[str, WorldSource]()
     with errors_of(f"{scenario.path}: source.effects"):  # of one that does not fit this scene
         for camera in cameras:
-            sources[camera] = WorldSource(
+            made[camera] = WorldSource(
                 camera,
                 scene,
                 names[camera],
-                rate(config.fps or WORLD_FPS),
+                fps,
                 effects=effects.get(camera) or NO_EFFECTS,
                 codec=config.codec,
                 quality=config.quality,
@@ -179,9 +179,9 @@ def open_sources(
     if config.arm is not None and any(camera in config.arm.cameras for camera in cameras):
         from camera_node.robot.flange_camera import open_flange_cameras
 
-        on_hand = {c: cast(WorldSource, sources[c]) for c in cameras if c in config.arm.cameras}
-        sources.update(open_flange_cameras(scenario, config.arm, on_hand, effects))
-    return sources
+        seen = {c: (made[c].scene, made[c].scene.cameras[names[c]][0]) for c in cameras if c in config.arm.cameras}
+        return {**made, **open_flange_cameras(scenario, config.arm, fps, seen, effects)}
+    return {**made}
 
 
 def _scene_cameras(scenario: Scenario, scene: Scene) -> dict[str, str]:
