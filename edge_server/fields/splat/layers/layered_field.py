@@ -31,8 +31,13 @@ from edge_server.fields.splat.kernels.project import COLOR, Gaussians
 from edge_server.fields.splat.layers.exposures import equalize_exposures
 from edge_server.fields.splat.layers.layered_state import pack, unpack
 from edge_server.fields.splat.layers.moving_set import MovingSet
-from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
-from edge_server.fields.splat.layers.plates import FinePlate, Plate
+from edge_server.fields.splat.layers.observations import (
+    FixedCamera,
+    Observation,
+    Observations,
+    cameras_of,
+    newest_of_each,
+)
 from edge_server.fields.splat.layers.settings import (
     EVIDENCE_S,
     EXPOSURE_ROUNDS,
@@ -168,7 +173,7 @@ class LayeredField:
             rays,
             samples,
             note=note,
-            refused=tuple(camera for camera in _cameras(views) if camera in self.refused),
+            refused=tuple(camera for camera in cameras_of(views) if camera in self.refused),
         )
 
     def _fit_still(self, views: Sequence[View], budget: Budget, pace: StepBudget) -> FitReport:
@@ -176,7 +181,7 @@ class LayeredField:
         begun, left = self.now(), budget
         if budget.seconds is not None:
             left = Budget(seconds=max(budget.seconds - pace.elapsed_s(), 0.0))
-        report = self.still.fit(_newest_of_each(views), left)
+        report = self.still.fit(newest_of_each(views), left)
         self.part_s.add("static field", begun)
         return report
 
@@ -278,7 +283,7 @@ class LayeredField:
     def _take(self, view: View) -> None:
         assert self.origin_ns is not None
         if view.camera not in self.cameras:
-            self.cameras[view.camera] = self._new_camera(view)
+            self.cameras[view.camera] = FixedCamera.begin(view, self.caller)
         camera = self.cameras[view.camera]
         camera.taken.append(view.generated_ns)
         if not camera.stands_at(view):
@@ -304,18 +309,12 @@ class LayeredField:
             )
         )
 
-    def _new_camera(self, view: View) -> FixedCamera:
-        """A camera that has shown nothing yet. view: its first frame."""
-        plate = Plate(view.image.shape[0], view.image.shape[1], self.caller)
-        whole = None if view.whole is None else view.whole()
-        return FixedCamera(replace(view, whole=None), plate, fine=None if whole is None else FinePlate(whole))
-
     def _move_camera(self, view: View) -> FixedCamera:
         """Begin a camera anew where it stands now, at the exposure that it had; the others go on."""
         log.info("%s stands somewhere else: its plate begins anew", view.camera)
         self.static.stop()
         self.static.rendered.pop(view.camera, None)
-        before, camera = self.cameras[view.camera], self._new_camera(view)
+        before, camera = self.cameras[view.camera], FixedCamera.begin(view, self.caller)
         camera.taken, camera.moves = before.taken, before.moves
         camera.correct_exposure(before.plate.gain)
         self.cameras[view.camera] = camera
@@ -508,17 +507,3 @@ class LayeredField:
             params[:, COLOR:] *= np.tile(gain, (params.shape[1] - COLOR) // 3)
             self._exposed = (key, gaussians(params, self.settings))
         return self._exposed[1]
-
-
-def _cameras(views: Sequence[View]) -> list[str]:
-    """The cameras of ``views``, in the order of their first appearance."""
-    return list(dict.fromkeys(view.camera for view in views))
-
-
-def _newest_of_each(views: Sequence[View]) -> list[View]:
-    """The newest view of each camera, in the order of the cameras' first appearance."""
-    newest: dict[str, View] = {}
-    for view in views:
-        if view.camera not in newest or view.generated_ns > newest[view.camera].generated_ns:
-            newest[view.camera] = view
-    return list(newest.values())

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Rendering, View
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.layers.motion import ViewRow
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
 from edge_server.fields.splat.layers.settings import (
@@ -50,6 +51,13 @@ class FixedCamera:
     fine: FinePlate | None = None
     away: NDArray[np.float64] | None = None
     moves: int = 0
+
+    @classmethod
+    def begin(cls, view: View, pool: Pool) -> FixedCamera:
+        """A camera that has shown nothing yet. view: its first frame. pool: runs the plate's kernels."""
+        whole = None if view.whole is None else view.whole()
+        plate = Plate(view.image.shape[0], view.image.shape[1], pool)
+        return cls(replace(view, whole=None), plate, fine=None if whole is None else FinePlate(whole))
 
     def stands_at(self, view: View) -> bool:
         """Whether a frame was taken from the camera's place."""
@@ -184,3 +192,17 @@ def pixel_weights(
     if depth_m is not None:
         weight[~foreground & (depth_m > 0.0) & (depth_m < distance_m - OCCLUDED_M)] = 0.0
     return weight if given is None else weight * given
+
+
+def cameras_of(views: Sequence[View]) -> list[str]:
+    """The cameras of ``views``, in the order of their first appearance."""
+    return list(dict.fromkeys(view.camera for view in views))
+
+
+def newest_of_each(views: Sequence[View]) -> list[View]:
+    """The newest view of each camera, in the order of the cameras' first appearance."""
+    newest: dict[str, View] = {}
+    for view in views:
+        if view.camera not in newest or view.generated_ns > newest[view.camera].generated_ns:
+            newest[view.camera] = view
+    return list(newest.values())
