@@ -173,7 +173,7 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 	@touch $@
 
 .venv/.ok-edge: .venv/.ok-torch .venv/.ok-numba
-	@$(INSTALL) -e '.[edge,embed,up]'
+	@$(INSTALL) -e '.[edge,embed]'
 	@touch $@
 
 # The field's kernels are compiled at their first use, which takes some ten seconds: better beside the
@@ -198,7 +198,7 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 
 .venv/.ok-test: .venv/.ok-run pyproject.toml
 	@echo "test tools"
-	@$(INSTALL) -e '.[edge,embed,up,test,dev]'
+	@$(INSTALL) -e '.[edge,embed,test,dev]'
 	@touch $@
 
 # What slow tests need besides: Ray, some 240 MB; scikit-image and pycolmap for surfaces; and what tests of cameras and arms skip without, 200 MB.

@@ -19,14 +19,11 @@ from freshfield import scenario as scenarios
 from freshfield_up.commands import MissingCommand
 from freshfield_up.folder import FolderError
 from freshfield_up.net import is_free
+from freshfield_up.run import Launcher, Options
 
 
 def main(arguments: list[str] | None = None) -> int:
     args = _parser().parse_args(arguments)
-    try:
-        from freshfield_up.run import Launcher, Options
-    except ModuleNotFoundError as error:
-        return _refuse(f"{error.name} is not installed: pip install 'freshfield[edge,embed,up]'")
     try:
         scenario = scenarios.load(args.scenario, args.seed)
         if not is_free(args.port):
@@ -42,9 +39,8 @@ def main(arguments: list[str] | None = None) -> int:
             data=args.data,
             seed=args.seed,
             restart=args.restart,
-            table=not args.no_table,
             process_per_camera=args.process_per_camera,
-            edge=_edge_options(args),
+            edge=() if args.policy is None else (f"--policy={args.policy}",),
         )
         return Launcher(scenario, options).run()
     except (scenarios.ScenarioError, FolderError, MissingCommand) as error:
@@ -69,11 +65,6 @@ def _is_inside(policy: str | None, out: Path) -> bool:
     """Whether the learned policy is a file of the earlier run that this one replaces."""
     kind, _, file = (policy or "").partition(":")
     return kind == "bandit" and Path(file).expanduser().resolve().is_relative_to(out.resolve())
-
-
-def _edge_options(args: argparse.Namespace) -> tuple[str, ...]:
-    """Arguments for the edge server, which checks them."""
-    return () if args.policy is None else (f"--policy={args.policy}",)
 
 
 def _refuse(message: str) -> int:
@@ -109,7 +100,6 @@ def _parser() -> argparse.ArgumentParser:
         help="in place of the scenario's: all, threshold:120, bandit:FILE (docs/scheduling.md)",
     )
     add("--restart", action="store_true", help="start a process again when it dies, instead of ending the run")
-    add("--no-table", action="store_true", help="print plain lines instead of a live table, even on a terminal")
     add("--process-per-camera", action="store_true", help="one camera-node process for each camera [one for all]")
     return parser
 

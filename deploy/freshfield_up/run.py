@@ -13,13 +13,14 @@ from types import FrameType
 from freshfield.scenario import Scenario
 from freshfield_up import folder, mesh, net
 from freshfield_up.commands import ProcessSet, process_set, program
-from freshfield_up.display import Display, make_display
+from freshfield_up.display import status_line
 from freshfield_up.processes import GRACE_S, Child, kill, stop
 from freshfield_up.resources import ResourceMonitor
 from freshfield_up.status import read_json, read_status
 from freshfield_up.summary import summarize
 
 TICK_S = 0.25
+LINE_EVERY_S = 5.0
 READY_WITHIN_S = 600.0
 """A first start compiles the field's kernels: a minute, or more on a busy machine."""
 _COMPILING = "compiling"
@@ -38,7 +39,6 @@ class Options:
     port: loopback port of the page.
     data, seed, process_per_camera: see ``commands.process_set``.
     restart: restart a process that ends, instead of ending the run.
-    table: show a live table on a terminal.
     edge: further arguments for the edge server.
     """
 
@@ -48,7 +48,6 @@ class Options:
     data: Path | None = None
     seed: int | None = None
     restart: bool = False
-    table: bool = True
     process_per_camera: bool = False
     edge: tuple[str, ...] = ()
 
@@ -60,7 +59,6 @@ class Launcher:
         self.scenario = scenario
         self.options = options
         self.processes: ProcessSet
-        self._display: Display
         self._signals: list[str] = []
         self._stop_requested = threading.Event()
         self._began_s = time.monotonic()
@@ -88,22 +86,20 @@ class Launcher:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
                 signal.signal(number, self._on_signal)
-        self._display = make_display(options.table)
         try:
-            with self._display:
-                cameras = f"{len(self.scenario.training)} cameras"
-                if self.scenario.held_out:
-                    cameras += f" + {len(self.scenario.held_out)} held out"
-                self._display.message(f"{self.scenario.name}: {cameras}, seed {self.scenario.seed}")
-                self._display.message(f"logs and results: {options.out}")
-                try:
-                    self._supervise()
-                finally:
-                    self._stop()
+            cameras = f"{len(self.scenario.training)} cameras"
+            if self.scenario.held_out:
+                cameras += f" + {len(self.scenario.held_out)} held out"
+            _say(f"{self.scenario.name}: {cameras}, seed {self.scenario.seed}")
+            _say(f"logs and results: {options.out}")
+            try:
+                self._supervise()
+            finally:
+                self._stop()
             self._export()
             self._report()
             if (earlier := options.out / folder.EARLIER).exists():
-                self._display.message(f"the run was never up; an earlier run's files are in {earlier}")
+                _say(f"the run was never up; an earlier run's files are in {earlier}")
         finally:
             lock.close()
         return 1 if self._failures else 0
@@ -117,7 +113,7 @@ class Launcher:
             arm.start()
         if not self.processes.arms:
             self._start_nodes()
-        resources = ResourceMonitor(self.options.out / "processes.jsonl")
+        resources, next_line_s = ResourceMonitor(self.options.out / "processes.jsonl"), 0.0
         while not self._stop_requested.wait(TICK_S):
             now_s = time.monotonic()
             if not self._check_alive(now_s):
@@ -127,9 +123,10 @@ class Launcher:
                 if self._failures:
                     return
             resources.sample(now_s - self._began_s, self.processes.children)
-            self._display.update(
-                read_status(self.options.out, self.scenario.cameras), self._headline(now_s), resources.latest
-            )
+            if now_s >= next_line_s:
+                next_line_s = now_s + LINE_EVERY_S
+                status = read_status(self.options.out, self.scenario.cameras)
+                _say(f"[{self._headline(now_s)}] {status_line(status)}")
             if self._ready_s and self.options.duration_s and now_s - self._ready_s >= self.options.duration_s:
                 return
 
@@ -148,8 +145,8 @@ class Launcher:
         if not self._page_announced and net.page_answers(self.options.port):
             self._page_announced = True
             here, port, after_s = net.LOOPBACK, self.options.port, now_s - self._began_s
-            self._display.message(f"page: http://{here}:{port}   (after {after_s:.0f} s)")
-            self._display.message(f"      from another machine first: ssh -L {port}:{here}:{port} THIS-MACHINE")
+            _say(f"page: http://{here}:{port}   (after {after_s:.0f} s)")
+            _say(f"      from another machine first: ssh -L {port}:{here}:{port} THIS-MACHINE")
         waited_for = self._waiting_for()
         if waited_for is None:
             self._ready_s = now_s
@@ -182,7 +179,7 @@ class Launcher:
                 if not self.options.restart or child.restarts >= MAX_RESTARTS:
                     self._fail(child.exit_summary())
                     continue
-                self._display.message(f"{child.exit_summary()}\nIt is started again in a second (--restart).")
+                _say(f"{child.exit_summary()}\nIt is started again in a second (--restart).")
                 self._restart_at[child.name] = now_s + 1.0
             elif now_s >= due_s:
                 del self._restart_at[child.name]
@@ -192,17 +189,15 @@ class Launcher:
 
     def _fail(self, text: str) -> None:
         self._failures.append(text)
-        self._display.message(text)
+        _say(text)
 
     def _headline(self, now_s: float) -> str:
         if self._ready_s is None:
             if self.processes.emulator.process is None:
                 return "starting: the edge server loads, the cameras prepare their frames"
             return "starting: the cameras prepare their frames, the field its kernels"
-        elapsed = int(now_s - self._ready_s)
         end = f" of {self.options.duration_s:.0f}" if self.options.duration_s else ""
-        page = f"http://{net.LOOPBACK}:{self.options.port}"
-        return f"{elapsed}{end} s   {page}   Ctrl-C ends it with a report"
+        return f"{int(now_s - self._ready_s)}{end} s"
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._signals.append(signal.Signals(number).name)
@@ -212,12 +207,12 @@ class Launcher:
         """Stop nodes first and the edge last, so that frames on the way arrive. A second Ctrl-C kills."""
         why = {"SIGINT": "Ctrl-C", "SIGTERM": "SIGTERM", "SIGHUP": "the terminal was closed"}
         reason = f" ({why[self._signals[0]]})" if self._signals else ""
-        self._display.message(f"stopping{reason}: cameras, channel, edge")
+        _say(f"stopping{reason}: cameras, channel, edge")
         for group in self.processes.groups:
             stop(group, 0.0 if len(self._signals) > 1 else GRACE_S)
             for child in group:
                 if child.killed:
-                    self._display.message(f"{child.role} did not end in time and was killed; see {child.log}")
+                    _say(f"{child.role} did not end in time and was killed; see {child.log}")
 
     def _export(self) -> None:
         """Make the mesh if the scenario asks for one. A further signal cancels it."""
@@ -225,16 +220,16 @@ class Launcher:
         if export is None or self._failures:
             return
         if not mesh.possible(self.options.out):
-            self._display.message("no mesh: nothing to export yet, the field was never updated")
+            _say("no mesh: nothing to export yet, the field was never updated")
             return
-        self._display.message(f"making the mesh (Ctrl-C cancels it); see {export.log}")
+        _say(f"making the mesh (Ctrl-C cancels it); see {export.log}")
         signals, begin_s = len(self._signals), time.monotonic()
         export.start()
         while export.running:
             time.sleep(TICK_S)
             if len(self._signals) > signals:
                 kill(export)
-                self._display.message("no mesh: cancelled")
+                _say("no mesh: cancelled")
                 return
             if time.monotonic() - begin_s > EXPORT_WITHIN_S:
                 kill(export)
@@ -248,10 +243,10 @@ class Launcher:
         """Write the report, also after a failure, if the run was up."""
         out = self.options.out
         if self._failures and self._ready_s is None:
-            self._display.message("no report: the run did not start")
+            _say("no report: the run did not start")
             return
         if not any(out.glob("ledger-*.tsv")):
-            self._display.message("no report: no process has written about a frame")
+            _say("no report: no process has written about a frame")
             return
         report = Child("report", "the report", [program("edge-server"), "report", str(out)], out / "log-report.txt")
         report.start()
@@ -265,4 +260,8 @@ class Launcher:
         if code != 0:
             self._fail(report.exit_summary())
             return
-        self._display.message(summarize(out))
+        _say(summarize(out))
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)

@@ -110,7 +110,7 @@ def test_several_machines_start_from_an_empty_folder(machine: Path, started, tmp
 
 
 def test_the_launcher_runs_a_shipped_scenario_by_name(machine: Path, tmp_path: Path) -> None:
-    words = ["compose", "--for", "5s", "--out", "runs/up", "--port", str(free_port()), "--no-table"]
+    words = ["compose", "--for", "5s", "--out", "runs/up", "--port", str(free_port())]
     done = run([str(machine / "freshfield-up"), *words], tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((tmp_path / "runs/up/report.json").read_text())
