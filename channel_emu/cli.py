@@ -32,7 +32,6 @@ In the help of a command, [x] after an option is its default.
   channel-emu simulate --preset ch6 --cameras 18 --seconds 600
   channel-emu simulate --preset gilbert-elliott --csv frames.csv
   channel-emu simulate --arrivals poisson:1/60ms --service exp:30ms --discipline lcfs-preempt
-  channel-emu replay trace.jsonl
   channel-emu proxy --preset ch5 --to localhost:50051 --listen 127.0.0.1:50052 --seed 1
   channel-emu fit trace.jsonl --plot fit.png --out fitted.yaml
 """
@@ -41,14 +40,14 @@ In the help of a command, [x] after an option is its default.
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line. argv: arguments without the program's name; None: those of the process.
 
-    Returns the exit status: 0; 1 if a replay differed or the live emulator failed; 2 for bad input; 130 after
+    Returns the exit status: 0; 1 if the live emulator failed; 2 for bad input; 130 after
     Ctrl-C.
     """
     parser = argparse.ArgumentParser(
         prog="channel-emu", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_add_run, _add_simulate, _add_presets, _add_replay, _add_proxy, _add_fit):
+    for add in (_add_run, _add_simulate, _add_presets, _add_proxy, _add_fit):
         add(commands)
     args = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
@@ -291,32 +290,6 @@ def _presets(_: argparse.Namespace) -> int:
     print(format_table(rows) + "\n")
     print(format_table([{"preset": name, "what it is": preset.about} for name, preset in PRESETS.items()]))
     return 0
-
-
-def _add_replay(commands: Any) -> None:
-    sub = commands.add_parser(
-        "replay",
-        help="replay a recorded trace in virtual time and compare every decision",
-        description="Offers the recorded frames to fresh links of the recorded channel and seed, at the "
-        "recorded instants. Every decision must come out as recorded. To repeat a trace live: run --replay.",
-    )
-    sub.add_argument("trace", type=Path, help="file written by --trace")
-    sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
-    sub.set_defaults(go=_replay)
-
-
-def _replay(args: argparse.Namespace) -> int:
-    from channel_emu.model import trace
-    from channel_emu.virtual.replay import compare
-
-    result = compare(trace.read(args.trace))
-    if args.json:
-        print(json.dumps(result))
-    else:
-        print(f"{result['frames']:,} frames, {result['equal']:,} decided as recorded")
-        for line in result["different"]:
-            print(f"  {line}")
-    return 0 if result["equal"] == result["frames"] else 1
 
 
 def _add_proxy(commands: Any) -> None:

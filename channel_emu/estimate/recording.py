@@ -3,16 +3,17 @@
 A recording is either a trace of this emulator (``trace.py``; its recorded states are ignored), or rows of any
 other link, one frame a line::
 
-    # offered_ms, delivered_ms (blank: it never came), camera (optional)
-    0.0, 41.5, cam00
-    33.3, , cam00
+    offered_ms,delivered_ms,camera
+    0.0,41.5,cam00
+    33.3,,cam00
 
-The separator is a comma, semicolon or tab, the same in all lines. Lines that start with # and a first line of
-column names are skipped.
+A frame that never came has no delivered_ms; the camera may be left out. The separator is a comma, semicolon or tab.
+Lines that start with # are skipped.
 """
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -129,26 +130,20 @@ def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:
 
 
 def _from_rows(path: Path, discipline: str) -> Recording:
+    lines = [line for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    separator = next((mark for mark in "\t;" if lines and mark in lines[0]), ",")
     rows: dict[str, list[tuple[float, float]]] = {}
-    separator = ""
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        separator = separator or next((mark for mark in "\t;" if mark in line.strip()), ",")
-        words = [w.strip() for w in line.strip().split(separator)]
+    for row in csv.DictReader(lines, delimiter=separator, skipinitialspace=True):
         try:
-            offered = float(words[0])
-            delivered = float(words[1]) if len(words) > 1 and words[1] else math.nan
-            if len(words) > 3 or abs(offered) > _MAX_ROWS_MS or delivered < offered or math.isnan(offered):
+            offered, delivered = float(row["offered_ms"]), float(row["delivered_ms"] or math.nan)
+            if abs(offered) > _MAX_ROWS_MS or delivered < offered or math.isnan(offered):
                 raise ValueError
-        except ValueError:
-            if not rows and number == 1 and not words[0][:1].isdigit():
-                continue  # names of the columns
+        except (KeyError, TypeError, ValueError):
             raise RecordingError(
-                f"{path}: line {number}: expected offered_ms, delivered_ms (not earlier, or blank) and "
-                f"perhaps a camera, numbers with a point, one separator in all lines, got {line.strip()!r}"
+                f"{path}: expected columns offered_ms, delivered_ms (not earlier, or blank) and perhaps camera, "
+                f"numbers with a point, got {separator.join(str(value) for value in row.values())!r:.100}"
             ) from None
-        rows.setdefault(words[2] if len(words) > 2 else "cam00", []).append((offered, delivered))
+        rows.setdefault(row.get("camera") or "cam00", []).append((offered, delivered))
     if not rows:
         raise RecordingError(f"{path}: there is no frame in it")
     tables: dict[str, NDArray[np.float64]] = {}

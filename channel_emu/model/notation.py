@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from freshfield.untrusted import UntrustedError, read_json, read_yaml
+from freshfield.untrusted import UntrustedError, read_yaml
 
 _UNITS_MS = {"": 1.0, "us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
 _DISTRIBUTIONS = {
@@ -168,25 +168,15 @@ def read_text(path: Path) -> str:
 
 
 def delays_ms(path: Path) -> list[float]:
-    """One-way delays from a file, in ms.
+    """One-way delays in ms from a file: one number a line, or CSV with a header that names a column ``delay_ms``.
 
-    The file has one number of ms a line, or is CSV with a header that names a column ``delay_ms``,
-    ``delay_us`` or ``delay_s``, or is a trace of this emulator (its drawn delays). Lines that start with #
-    are skipped. Raises NotationError.
+    Lines that start with # are skipped. Raises NotationError.
     """
-    text = read_text(path)
-    if text.startswith("{"):
-        try:
-            records = [read_json(line) for line in text.split("\n")[1:-1]]
-            return [r["drawn_ns"] / 1e6 for r in records if r["drawn_ns"] is not None]
-        except (KeyError, TypeError, ValueError):
-            raise NotationError(f"{path}: neither delays nor a trace of this emulator") from None
-    lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
-    names = {f"delay_{unit}": ms for unit, ms in _UNITS_MS.items()}
+    lines = (line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#"))
     try:
-        rows = list(csv.reader(lines))
-        columns = [(i, names[word.strip()]) for i, word in enumerate(rows[0] if rows else ()) if word.strip() in names]
-        column, unit_ms = columns[0] if columns else (0, 1.0)
-        return [float(row[column]) * unit_ms for row in rows[bool(columns) :]]
+        rows = [[word.strip() for word in row] for row in csv.reader(lines)]
+        named = bool(rows) and "delay_ms" in rows[0]
+        column = rows[0].index("delay_ms") if named else 0
+        return [float(row[column]) for row in rows[named:]]
     except (csv.Error, ValueError, IndexError) as error:
         raise NotationError(f"{path}: expected a column delay_ms, or one delay in ms a line: {error}") from None

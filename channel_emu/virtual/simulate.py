@@ -15,7 +15,6 @@ from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig
 from channel_emu.model.link import MAX_SIZE_BYTES, EventKind, Link, Transit
 from channel_emu.model.traffic import PeriodicArrivals, PoissonArrivals
-from channel_emu.virtual.replay import offer_all
 from freshfield.files import write_csv
 
 OUTCOMES = tuple(kind for kind in EventKind if kind not in (EventKind.STARTED, EventKind.DUPLICATED))
@@ -155,3 +154,21 @@ def simulate(
             at_ns = source.next_ns(at_ns, len(offers[name]))
     links, transits = offer_all(channel, offers, end_ns, sampled=frame_period_ms is not None)
     return Simulation(config, seed, seconds, [LinkRun(links[name], transits[name], end_ns) for name in names])
+
+
+def offer_all(
+    channel: Channel, offers: dict[str, list[tuple[int, int]]], end_ns: int, sampled: bool = True
+) -> tuple[dict[str, Link], dict[str, list[Transit]]]:
+    """Offer frames to fresh links, in the order of time, as to the live emulator.
+
+    offers: (instant in ns, bytes) of each frame, by camera.
+    sampled: see ``Channel.link``.
+    Returns links and transits by camera, advanced to ``end_ns``.
+    """
+    links = {camera: channel.link(camera, sampled=sampled) for camera in offers}
+    transits: dict[str, list[Transit]] = {camera: [] for camera in offers}
+    for at_ns, camera, size in sorted((at, name, size) for name, given in offers.items() for at, size in given):
+        transits[camera].append(links[camera].offer(at_ns, None, size)[0])
+    for link in links.values():
+        link.advance(end_ns)
+    return links, transits

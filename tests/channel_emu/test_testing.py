@@ -14,7 +14,7 @@ import pytest
 
 from channel_emu.model import trace
 from channel_emu.testing import EmulatedLink, channel
-from channel_emu.virtual.replay import compare
+from tests.channel_emu.decided_again import compare
 
 assert channel  # the fixture; where a conftest.py lists the plugin, no import is needed
 

@@ -224,19 +224,3 @@ def test_times_are_read_as_people_write_them(text: str, seconds: float) -> None:
     from freshfield_up import cli as script
 
     assert script.seconds(text) == seconds
-
-
-@pytest.mark.parametrize(("words", "expected"), [([], []), (["--policy", "threshold:120"], ["--policy=threshold:120"])])
-def test_policy_options_are_passed_on_to_the_edge(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], expected: list[str]
-) -> None:
-    from freshfield.scenario import load
-    from freshfield_up import cli as script
-    from freshfield_up import commands
-
-    monkeypatch.setattr(commands, "program", lambda name: name)
-    asked = script._edge_options(script._parser().parse_args(["room", *words]))
-    found = commands.process_set(load("room"), tmp_path, 8080, edge_options=asked)
-    assert [w for w in found.edge.command if w.startswith("--policy")] == expected
-    others = [word for child in (found.emulator, *found.nodes) for word in child.command]
-    assert not set(expected) & set(others)

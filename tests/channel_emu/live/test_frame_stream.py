@@ -17,13 +17,13 @@ from channel_emu.live import live_link
 from channel_emu.live.camera_stream import CREDITS, PUSH
 from channel_emu.live.live_link import Message
 from channel_emu.model import trace
-from channel_emu.virtual.replay import compare
 from edge_server.report.frame_accounting import account_frames
 from freshfield.frame import to_request
 from freshfield.ledger import read_all
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, clock_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
+from tests.channel_emu.decided_again import compare
 from tests.channel_emu.live.emulator import CAMERAS, emulate, frame_of, make, offer, run
 from tests.integration.peer import Peer, silence
 

@@ -13,7 +13,7 @@ from channel_emu.model.ages import RunningAge
 from channel_emu.model.channel import Channel
 from channel_emu.model.link import EventKind
 from channel_emu.model.trace import Record
-from channel_emu.virtual.replay import offer_all
+from channel_emu.virtual.simulate import offer_all
 from tests.channel_emu.live.emulator import CAMERAS, emulate, run
 from tests.channel_emu.live.test_frame_stream import FAST, frame_account
 

@@ -12,7 +12,7 @@ from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from channel_emu.model.link import Event, EventKind
 from channel_emu.model.trace import TraceError, TraceWriter
-from channel_emu.virtual.replay import compare
+from tests.channel_emu.decided_again import compare
 
 MS = 10**6
 CHANCE = {"probability": 0.15}

@@ -4,8 +4,7 @@ import pytest
 
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import channel_from_mapping
-from channel_emu.virtual.replay import offer_all
-from channel_emu.virtual.simulate import OUTCOMES, LinkRun, SimulationError, simulate
+from channel_emu.virtual.simulate import OUTCOMES, LinkRun, SimulationError, offer_all, simulate
 
 
 def decisions(run: LinkRun) -> list[tuple]:

@@ -1,30 +1,12 @@
-"""Replays offers in virtual time, and compares a recorded trace with the decisions of fresh links."""
+"""Offers the frames of a recorded trace again, in virtual time, and compares what is decided."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from channel_emu.model.channel import Channel
-from channel_emu.model.link import Link, Transit
 from channel_emu.model.trace import Trace
-
-
-def offer_all(
-    channel: Channel, offers: dict[str, list[tuple[int, int]]], end_ns: int, sampled: bool = True
-) -> tuple[dict[str, Link], dict[str, list[Transit]]]:
-    """Offer frames to fresh links, in the order of time, as to the live emulator.
-
-    offers: (instant in ns, bytes) of each frame, by camera.
-    sampled: see ``Channel.link``.
-    Returns links and transits by camera, advanced to ``end_ns``.
-    """
-    links = {camera: channel.link(camera, sampled=sampled) for camera in offers}
-    transits: dict[str, list[Transit]] = {camera: [] for camera in offers}
-    for at_ns, camera, size in sorted((at, name, size) for name, given in offers.items() for at, size in given):
-        transits[camera].append(links[camera].offer(at_ns, None, size)[0])
-    for link in links.values():
-        link.advance(end_ns)
-    return links, transits
+from channel_emu.virtual.simulate import offer_all
 
 
 def compare(trace: Trace) -> dict[str, Any]:
