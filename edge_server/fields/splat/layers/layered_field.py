@@ -463,28 +463,10 @@ class LayeredField:
         if still is None:
             return
         assert tracker is not None and self.origin_ns is not None
-        begun, moving, shown = self.now(), tracker.moving, None
-        if moving.alive:
-            shown = MovingSnapshot(
-                moving.cloud.params.copy(),
-                moving.anchor.copy(),
-                moving.share.copy(),
-                moving.motion.copy(),
-                self.origin_ns,
-                self.observations.newest_s,
-            )
+        begun, moving = self.now(), tracker.moving
+        shown = MovingSnapshot.of(moving, self.origin_ns, self.observations.newest_s) if moving.alive else None
         exposed = self._at_present_exposure(still)
-        self._published = LayeredSnapshot(
-            still.box,
-            exposed,
-            still.background,
-            still.cameras,
-            still.pool,
-            still.step,
-            planar=still.planar,
-            static=exposed.params,
-            moving=shown,
-        )
+        self._published = LayeredSnapshot.of(still, exposed, shown)
         self.part_s.add("publication", begun)
 
     def _still_to_show(self) -> SplatSnapshot | None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.layers.motion import Motion
+from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.settings import MAX_AHEAD_S
 from edge_server.fields.splat.snapshot import SplatSnapshot
 
@@ -28,6 +29,12 @@ class MovingSnapshot:
     motion: Motion
     origin_ns: int
     newest_s: float
+
+    @classmethod
+    def of(cls, moving: MovingSet, origin_ns: int, newest_s: float) -> MovingSnapshot:
+        """A copy of a moving set as it is now."""
+        arrays = moving.cloud.params.copy(), moving.anchor.copy(), moving.share.copy()
+        return cls(*arrays, moving.motion.copy(), origin_ns, newest_s)
 
     def ahead_s(self, present_ns: int | None) -> float:
         """How much later than the newest frame to show: no farther than motion can be extrapolated."""
@@ -51,6 +58,13 @@ class LayeredSnapshot(SplatSnapshot):
 
     static: NDArray[np.float32] | None = None
     moving: MovingSnapshot | None = None
+
+    @classmethod
+    def of(cls, still: SplatSnapshot, exposed: Gaussians, moving: MovingSnapshot | None) -> LayeredSnapshot:
+        """A snapshot of the newest frame's instant. still: what the static field shows. exposed: its Gaussians at the
+        exposure to show."""
+        parts = still.box, exposed, still.background, still.cameras, still.pool, still.step
+        return cls(*parts, planar=still.planar, static=exposed.params, moving=moving)
 
     def at(self, present_ns: int | None) -> LayeredSnapshot:
         """The snapshot of another instant; None: that of the newest frame."""
