@@ -14,7 +14,6 @@ from camera_node.robot.calibration import DEFAULT_METHOD, CalibrationError
 EXAMPLES = """examples:
   camera-node calibrate target charuco:7x5:30mm:22mm --out board.png        print it, measure it, fix it flat
   camera-node calibrate intrinsics pictures/ --board charuco:7x5:30mm:22mm --out lens.json
-  camera-node calibrate intrinsics --live bench.yaml --camera hand --board charuco:7x5:30mm:22mm
   camera-node calibrate hand-eye handeye/ --board chessboard:9x6:23.6mm     ViSP's layout: pictures and poses
   camera-node calibrate hand-eye --pairs samples.json --json                MoveIt's: [flange, target] pairs
   camera-node calibrate hand-eye --live cell.yaml --camera cam00 --board charuco:7x5:30mm:22mm --out hand.yaml
@@ -33,8 +32,7 @@ input, one of:
 """
 
 INTRINSICS = """Estimates a camera's intrinsics and their uncertainty from 10 to 20 pictures of a target, tilted and in
-every corner: those of FOLDER, or of a guided session (--live SCENARIO) that says where to show the target and when
-to stop. Reports the reprojection error also in pictures held out.
+every corner: ten are enough if the target has been everywhere and tilted by 30 degrees between them.
 """
 
 BOARD = (
@@ -83,28 +81,21 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
     add("--json", action="store_true", help="print {transform, residual_mm, residual_deg, method, std_mm, std_deg}")
     out = "file to write, for source.arm.cameras or source.trajectory.hand_eye"
     add("--out", type=Path, metavar="FILE.yaml", help=out)
-    _add_live(parser)
-    add("--camera", metavar="ID", help="camera of the scenario --live")
+    add = parser.add_argument_group("guided session").add_argument
+    add("--live", metavar="SCENARIO", help="take pictures with a camera of this scenario")
+    add("--camera", metavar="ID", help="which of its cameras")
+    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    add("--seconds", type=float, metavar="S", help="end the session after S seconds")
 
 
 def _add_intrinsics(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("folder", type=Path, nargs="?", metavar="FOLDER", help="pictures of the target")
+    add("folder", type=Path, metavar="FOLDER", help="pictures of the target")
     add("--board", required=True, metavar="SPEC", help=BOARD)
-    camera = "camera of --live, and its name in the file [%(default)s]"
-    add("--camera", dest="name", default="cam00", metavar="ID", help=camera)
+    add("--camera", default="cam00", metavar="ID", help="its name in the file [%(default)s]")
     out = "calibration JSON to write, as source kinds camera and video read it"
     add("--out", type=Path, metavar="FILE", help=out)
     add("--json", action="store_true", help="print the calibration as JSON, as --out writes it")
-    _add_live(parser)
-
-
-def _add_live(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a guided session."""
-    add = parser.add_argument_group("guided session").add_argument
-    add("--live", metavar="SCENARIO", help="take pictures with a camera of this scenario")
-    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
-    add("--seconds", type=float, metavar="S", help="end the session after S seconds")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -122,12 +113,11 @@ def run(args: argparse.Namespace) -> int:
         raise CalibrationError(str(error)) from None
 
 
-def _require_one_input(args: argparse.Namespace, *inputs: str) -> None:
-    """Raise CalibrationError unless one of ``inputs`` is given, with options that go with it."""
-    given = [name for name in inputs if getattr(args, name) is not None]
+def _require_one_input(args: argparse.Namespace) -> None:
+    """Raise CalibrationError unless one input is given, with options that go with it."""
+    given = [name for name in ("folder", "pairs", "live") if getattr(args, name) is not None]
     if len(given) != 1:
-        names = {**_INPUT_NAMES, "pairs": "--pairs FILE"}
-        raise CalibrationError(f"expected one of {', '.join(names[name] for name in inputs)}")
+        raise CalibrationError("expected one of FOLDER, --pairs FILE, --live SCENARIO")
     for option, goes_with in _GOES_WITH.items():
         if getattr(args, option, None) is not None and given[0] not in goes_with:
             places = " or ".join(_INPUT_NAMES[each] for each in goes_with)
@@ -135,7 +125,7 @@ def _require_one_input(args: argparse.Namespace, *inputs: str) -> None:
 
 
 def _hand_eye(args: argparse.Namespace) -> int:
-    _require_one_input(args, "folder", "pairs", "live")
+    _require_one_input(args)
     from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, calibrate
 
     if args.method not in ALL_METHODS:
@@ -176,22 +166,15 @@ def _samples(args: argparse.Namespace) -> Any:
 
 
 def _intrinsics(args: argparse.Namespace) -> int:
-    _require_one_input(args, "folder", "live")
     from camera_node.robot.calibration import inputs
     from camera_node.robot.calibration.lens_calibration import calibrate_lens
     from camera_node.robot.calibration.targets import parse_target
     from freshfield import files
 
     board = parse_target(args.board)
-    if args.live is not None:
-        from camera_node.robot.calibration.guided import live_lens
-
-        args.camera = args.name
-        lens = live_lens(args, board)
-    else:
-        found, unused, size = inputs.find_corners(inputs.list_images(args.folder), board, None, _print_progress)
-        lens = calibrate_lens(found, size, unused)
-    data = lens.to_json(args.name)
+    found, unused, size = inputs.find_corners(inputs.list_images(args.folder), board, None, _print_progress)
+    lens = calibrate_lens(found, size, unused)
+    data = lens.to_json(args.camera)
     if args.out is not None:
         try:
             files.write_json(args.out, data, indent=1)

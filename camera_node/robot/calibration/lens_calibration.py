@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array
-from camera_node.robot.calibration.targets import Corners, estimate_pose, opencv_lens
+from camera_node.robot.calibration.targets import Corners, opencv_lens
 from freshfield.geometry import Pinhole
 
 MIN_VIEWS = 4
 # With all views parallel to the sensor, focal length and distance cannot be told apart.
 MIN_TILT_DEG = 10.0
 MIN_CORNERS = 6
-_HOLD_OUT_EVERY = 4
 _OUTLIER = 4.0
 # Focal lengths over the image's longer side: 136 and 7 degrees of view. The solver diverges beyond them if
 # the images do not determine a lens.
@@ -34,7 +33,6 @@ class LensCalibration:
     pinhole: in this project's convention (corner origin).
     std: deviations of fx, fy, cx, cy (pixels), k1, k2, p1, p2.
     error_px: root mean square of the reprojection errors; views: the same by image.
-    held_out_px: the same in every fourth image, with a lens from the others; None: too few images.
     tilt_deg: largest angle between the target's tilts in two views.
     covered: share of a 6 x 6 grid over the image in which corners were seen.
     unused: reason for every unused image.
@@ -44,7 +42,6 @@ class LensCalibration:
     std: tuple[float, ...]
     error_px: float
     views: Mapping[str, float]
-    held_out_px: float | None
     tilt_deg: float
     covered: float
     unused: Mapping[str, str]
@@ -59,16 +56,14 @@ class LensCalibration:
                 "K": matrix.tolist(),
                 "dist_k1k2p1p2": distortion.tolist(),
                 "error_px": self.error_px,
-                "held_out_px": self.held_out_px,
                 "std_fx_fy_cx_cy_k1_k2_p1_p2": list(self.std),
             }
         }
 
     def show(self) -> str:
         p, s = self.pinhole, self.std
-        held_out = "" if self.held_out_px is None else f", {self.held_out_px:.3f} px in pictures held out"
         lines = [
-            f"{len(self.views)} pictures of {p.width} x {p.height}; reprojection {self.error_px:.3f} px{held_out}; "
+            f"{len(self.views)} pictures of {p.width} x {p.height}; reprojection {self.error_px:.3f} px; "
             f"the target tilted by up to {self.tilt_deg:.0f} degrees between them; corners over "
             f"{100 * self.covered:.0f} % of the picture",
             f"fx {p.fx:.2f} +- {s[0]:.2f}  fy {p.fy:.2f} +- {s[1]:.2f}  cx {p.cx:.2f} +- {s[2]:.2f}  "
@@ -115,40 +110,18 @@ def calibrate_lens(views: Mapping[str, Corners], size: tuple[int, int], unused: 
         )
     counts = [len(c.points) for c in usable.values()]
     error_px = float(np.sqrt(np.average(np.square(errors), weights=counts)))
-    covered = float(coverage_grid(usable.values(), size).mean())
+    covered = float(_coverage_grid(usable.values(), size).mean())
     found = dict(zip(usable, errors.tolist()))
-    return LensCalibration(lens, std, error_px, found, _held_out_error(usable, size), tilt_deg, covered, unused)
+    return LensCalibration(lens, std, error_px, found, tilt_deg, covered, unused)
 
 
-def coverage_grid(views: Iterable[Corners], size: tuple[int, int]) -> NDArray[np.bool_]:
+def _coverage_grid(views: Iterable[Corners], size: tuple[int, int]) -> NDArray[np.bool_]:
     """Cells (6, 6) of the image, rows first, in which corners were seen."""
     cells = np.zeros((6, 6), dtype=np.bool_)
     for corners in views:
         at = np.clip(corners.pixels / size * 6, 0, 5).astype(int)
         cells[at[:, 1], at[:, 0]] = True
     return cells
-
-
-def reprojection_errors(corners: Corners, lens: Pinhole) -> Array:
-    """Distances (N,) in pixels of corners from where the target's estimated pose puts them. Raises
-    CalibrationError."""
-    pose = estimate_pose(corners, lens)
-    off = lens.project(corners.points @ pose[:3, :3].T + pose[:3, 3]) - corners.pixels
-    return np.asarray(np.linalg.norm(off, axis=1))
-
-
-def _held_out_error(views: Mapping[str, Corners], size: tuple[int, int]) -> float | None:
-    names = list(views)
-    held_out = names[_HOLD_OUT_EVERY - 1 :: _HOLD_OUT_EVERY]
-    training = {name: corners for name, corners in views.items() if name not in held_out}
-    if not held_out or len(training) < MIN_VIEWS:
-        return None
-    try:
-        lens = _solve(training, size)[0]
-        errors = np.concatenate([reprojection_errors(views[name], lens) for name in held_out])
-    except CalibrationError:
-        return None
-    return float(np.sqrt(np.mean(errors**2)))
 
 
 def _solve(views: Mapping[str, Corners], size: tuple[int, int]) -> tuple[Pinhole, tuple[float, ...], Array, Array]:

@@ -41,17 +41,17 @@ _DRIVE_CENTER, _DRIVE_RADII_M = (0.0, 2.9), (1.9, 0.8)
 # Where a person alone may walk: the sides that cameras tell apart: south, east, north, west.
 _SIDES = ((0.0, -2.9), (2.6, 0.0), (0.0, 2.9), (-2.6, 0.0))
 _SIDE_RADII_M = (0.5, 0.25)  # between the pillars
-_MOVERS_STREAM = 5  # random stream that draws which bodies there are
+_MOVERS_STREAM = 5  # random stream that draws the side
 _STILL_PHASE = 0.62  # where the cart stands at speed 0, as the person does
 
 
 class Params(MovingParams, frozen=True, kw_only=True):
-    """speed_m_per_s: mean speed of the person's parts and of the cart; 0 stands still. movers: ``both``, only
-    ``one`` of them, or ``person``, alone on one of four sides; motion_seed draws which. Camera positions then
-    do not tell where something moves, but images do."""
+    """speed_m_per_s: mean speed of the person's parts and of the cart; 0 stands still. movers: ``both``, or ``person``,
+    alone on one of four sides; motion_seed draws which. Camera positions then do not tell where something moves, but
+    images do."""
 
     horizontal_fov_deg: Fov = 90.0
-    movers: Literal["both", "one", "person"] = "both"
+    movers: Literal["both", "person"] = "both"
 
 
 def build(params: Params) -> Scene:
@@ -61,6 +61,8 @@ def build(params: Params) -> Scene:
     alone = params.movers == "person"
     center, radii = (_SIDES[int(4 * drawn)], _SIDE_RADII_M) if alone else (_WALK_CENTER, _WALK_RADII_M)
     walk = make_walk(center, radii, params.speed_m_per_s, params.motion_seed)
+    person = walking_person(walk)
+    bodies = (person,) if alone else (person, _cart(walk, params.speed_m_per_s))
     grid = np.stack(np.meshgrid([-2.6, 0.0, 2.6], [-2.6, 0.0, 2.6], [3.9]), axis=-1).reshape(-1, 3)
     light = Light(
         points=grid,
@@ -75,22 +77,11 @@ def build(params: Params) -> Scene:
         params=params,
         cameras=build_rig(_ANGLES_DEG, _MAST, _RADIUS_M, params.count, pinhole(params), outward=True),
         target=_MAST,
-        world=World((*_shell(), *_mast(), *_workshop()), _moving_bodies(params, walk, drawn), light),
+        world=World((*_shell(), *_mast(), *_workshop()), bodies, light),
         bounds=np.array([[-_HALF_M, -_HALF_M, 0.0], [_HALF_M, _HALF_M, _HEIGHT_M]]),
         period_s=walk.period_s,
         moving=not walk.still,
     )
-
-
-def _moving_bodies(params: Params, walk: Walk, drawn: float) -> tuple[MovingBody, ...]:
-    """The moving bodies of the scene. drawn: random number in [0, 1) that selects one of two bodies."""
-    person = walking_person(walk)
-    if params.movers == "person":
-        return (person,)
-    cart = _cart(walk, params.speed_m_per_s)
-    if params.movers == "both":
-        return person, cart
-    return (person,) if drawn < 0.5 else (cart,)
 
 
 def _cart(walk: Walk, speed_m_per_s: float) -> MovingBody:

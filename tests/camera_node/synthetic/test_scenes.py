@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from camera_node.synthetic import SCENES, SceneError, camera_rig, make_scene
+from camera_node.synthetic import SCENES, SceneError, make_scene
 from camera_node.synthetic.person import loop_length_m, make_walk
 from camera_node.synthetic.shapes import Box
 from freshfield.geometry import Pose, world_rays
@@ -46,14 +46,6 @@ def test_fewer_cameras_keep_their_places_and_stay_spread(name):
     # No camera that was left out is further from a kept one than 35 degrees.
     nearest = np.degrees(np.arccos(np.clip((axes[13:] @ axes[:13].T).max(axis=1), -1, 1)))
     assert nearest.max() < 35.0
-
-
-def test_spread_order_is_a_permutation_that_starts_far_apart():
-    d = np.random.default_rng(0).standard_normal((12, 3))
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    order = camera_rig.spread_order(d)
-    assert sorted(order) == list(range(12)) and order[0] == 0
-    assert order[1] == int(np.argmin(d @ d[0]))
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -130,21 +122,10 @@ def test_the_share_of_moving_pixels():
     assert shares[0.5] < shares[1.0] < shares[4.0]
 
 
-def test_which_of_two_moves_in_the_tower_is_drawn_and_only_it_is_there():
-    small = {**SMALL, "supersample": 1, "movers": "one"}
-    known = [make_scene("tower", {**small, "motion_seed": seed}) for seed in range(24)]
-    assert all(len(scene.world.moving_bodies) == 1 for scene in known)
-    people = [len(scene.world.moving_bodies[0].parts) != len(known[0].world.moving_bodies[0].parts) for scene in known]
-    assert 6 <= sum(people) <= 18
-    both, alone = make_scene("tower", {**SMALL, "motion_seed": 0}), known[0].world.moving_bodies[0]
-    like = [body for body in both.world.moving_bodies if len(body.parts) == len(alone.parts)]
-    assert [np.allclose(body.matrices(0.7), alone.matrices(0.7)) for body in like] == [True]
-    with pytest.raises(ValueError, match=r"movers: expected .*one of both, one, person"):
-        make_scene("tower", {"movers": "none"})
-
-
 def test_a_person_alone_in_the_tower_walks_on_any_of_four_sides_clear_of_all_that_stands_there():
     sides = set()
+    with pytest.raises(ValueError, match=r"movers: expected .*one of both, person"):
+        make_scene("tower", {"movers": "none"})
     for seed in range(24):
         scene = make_scene("tower", {**SMALL, "supersample": 1, "movers": "person", "motion_seed": seed})
         (person,) = scene.world.moving_bodies
