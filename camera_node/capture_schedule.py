@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Sequence
 from fractions import Fraction
 from typing import Protocol, runtime_checkable
@@ -40,10 +39,16 @@ class ScheduledSource(Protocol):
     def schedule(self, start_ns: int) -> CaptureSchedule: ...
 
 
-class _Endless:
-    """Captures without an end. A node that is late continues with the newest due tick."""
+class RateSchedule:
+    """Tick k is due ``phase_ns`` after k / fps since the epoch. A node that is late continues with the newest due
+    tick."""
 
     lossless = False
+
+    def __init__(self, fps: Fraction, phase_ns: int = 0) -> None:
+        self._rate = fps.numerator
+        self._per_tick = fps.denominator * 1_000_000_000
+        self._phase_ns = phase_ns
 
     def first(self, now_ns: int) -> int:
         return self._latest(now_ns) + 1
@@ -52,39 +57,11 @@ class _Endless:
         latest = self._latest(now_ns)
         return max(tick + 1, latest), max(0, latest - tick - 1)
 
-    def _latest(self, now_ns: int) -> int:
-        raise NotImplementedError
-
-
-class RateSchedule(_Endless):
-    """Tick k is due ``phase_ns`` after k / fps since the epoch."""
-
-    def __init__(self, fps: Fraction, phase_ns: int = 0) -> None:
-        self._rate = fps.numerator
-        self._per_tick = fps.denominator * 1_000_000_000
-        self._phase_ns = phase_ns
-
     def due_ns(self, tick: int) -> int:
         return tick * self._per_tick // self._rate + self._phase_ns
 
     def _latest(self, now_ns: int) -> int:
         return (now_ns - self._phase_ns) * self._rate // self._per_tick
-
-
-class LoopSchedule(_Endless):
-    """Captures at ``times_ns`` within every period since the epoch, so that nodes replaying one recording
-    stay synchronized. times_ns: ascending, from 0 to below ``period_ns``."""
-
-    def __init__(self, times_ns: Sequence[int], period_ns: int) -> None:
-        self._times, self._period = times_ns, period_ns
-
-    def due_ns(self, tick: int) -> int:
-        loop, place = divmod(tick, len(self._times))
-        return loop * self._period + self._times[place]
-
-    def _latest(self, now_ns: int) -> int:
-        loop, since = divmod(now_ns, self._period)
-        return loop * len(self._times) + bisect_right(self._times, since) - 1
 
 
 class OnceSchedule:

@@ -235,11 +235,10 @@ class ColmapConfig(RecordedConfig, frozen=True, kw_only=True):
 
 class McapConfig(SourceConfig, frozen=True, kw_only=True):
     """A session that ``edge-server run --record`` wrote, replayed message by message: the same bytes and
-    poses, stamps shifted to now. loop: from first to last, after which the node ends, or over and over, in step
-    with nodes elsewhere. fps, codec and quality are the recording's own."""
+    poses, stamps shifted to now, from first to last, after which the node ends. fps, codec and quality are the
+    recording's own."""
 
     file: Annotated[str, about("the recording")] = ""
-    loop: Literal["once", "restart"] = "once"
     assignment: Annotated[dict[str, str], about("scenario camera -> the recording's")] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

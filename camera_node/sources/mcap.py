@@ -10,13 +10,13 @@ import logging
 import math
 from collections.abc import Sequence
 from fractions import Fraction
-from itertools import accumulate, pairwise
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from camera_node.capture_schedule import CaptureSchedule, LoopSchedule, OnceSchedule
+from camera_node.capture_schedule import CaptureSchedule, OnceSchedule
 from camera_node.config import McapConfig, errors_of, find_data
 from camera_node.sources.assignment import assign_cameras
 from camera_node.sources.base import Shot, Source
@@ -35,31 +35,20 @@ class ReplaySource(Source):
     """One camera of a session.
 
     times_ns: capture times of its frames since the session's first frame, strictly increasing.
-    period_ns: length of one round of a replay that loops; None plays it once.
     """
 
-    def __init__(
-        self,
-        camera: str,
-        session: Session,
-        frames: Sequence[SessionFrame],
-        times_ns: Sequence[int],
-        period_ns: int | None,
-    ) -> None:
+    def __init__(self, camera: str, session: Session, frames: Sequence[SessionFrame], times_ns: Sequence[int]) -> None:
         self.camera = camera
         self.contents = len(frames)
         self.codec = CODEC_NAMES[frames[0].header.codec]
         self.intrinsics: Pinhole = pose_and_lens(frames[0].header)[1]
         usual_ns = float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 1e9
         self.fps = Fraction(1e9 / usual_ns).limit_denominator(1001)
-        self._session, self._frames = session, frames
-        self._times, self._period = times_ns, period_ns
+        self._session, self._frames, self._times = session, frames, times_ns
 
     def schedule(self, start_ns: int) -> CaptureSchedule:
-        """Once from ``start_ns`` on, or looping in periods counted from the epoch."""
-        if self._period is None:
-            return OnceSchedule(self._times, start_ns)
-        return LoopSchedule(self._times, self._period)
+        """Once from ``start_ns`` on."""
+        return OnceSchedule(self._times, start_ns)
 
     def content(self, tick: int) -> int:
         return tick % len(self._frames)
@@ -85,18 +74,13 @@ def open_replay(scenario: Scenario, config: McapConfig, cameras: Sequence[str], 
         raise DatasetError(f"{path}: holds no frames of any camera")
     times = {name: _times(frames) for name, frames in session.frames.items()}
     first = min(t[0] for t in times.values())
-    last = max(t[-1] for t in times.values())
-    # Between the last frame and the first one of the next round: the median interval.
-    gaps = [b - a for t in times.values() for a, b in pairwise(t)]
-    period = last - first + (round(float(np.median(gaps))) if gaps else 10**9)
     names = assign_cameras(scenario, config.assignment, cameras, list(session.frames))
     sources: dict[str, Source] = {}
     for camera, name in names.items():
         frames, kept = _in_order(name, session.frames[name], times[name])
         if len({frame.header.codec for frame in frames}) != 1 or frames[0].header.codec not in CODEC_NAMES:
             raise DatasetError(f"{path}: {name}: its frames are not all of one known codec")
-        loop_ns = period if config.loop == "restart" else None
-        sources[camera] = ReplaySource(camera, session, frames, [t - first for t in kept], loop_ns)
+        sources[camera] = ReplaySource(camera, session, frames, [t - first for t in kept])
     return sources
 
 

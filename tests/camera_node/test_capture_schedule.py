@@ -1,15 +1,14 @@
-"""When captures are due: by frame rate, once through a recording, and round and round in step."""
+"""When captures are due: by frame rate, and once through a recording."""
 
 from __future__ import annotations
 
 from fractions import Fraction
 from itertools import pairwise
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_node.capture_schedule import LoopSchedule, OnceSchedule, RateSchedule
+from camera_node.capture_schedule import OnceSchedule, RateSchedule
 
 NOW_NS = 1_763_000_000_123_456_789
 TIMES = [0, 33_000_000, 66_000_001, 250_000_000]
@@ -46,25 +45,6 @@ def test_a_recording_is_played_once_whole_however_late():
         assert found == [(k, NOW_NS + t) for k, t in enumerate(TIMES)] and missed == 0
 
 
-@given(st.integers(0, 2**61))
-def test_rounds_are_in_step_wherever_they_begin(now_ns):
-    period = 300_000_007
-    schedule = LoopSchedule(TIMES, period)
-    found, missed = walk(schedule, now_ns, 9)
-    assert found[0][1] > now_ns >= schedule.due_ns(found[0][0] - 1) and missed == 0
-    assert all(due_ns % period == TIMES[tick % 4] for tick, due_ns in found)
-    assert [tick for tick, _ in found] == list(range(found[0][0], found[0][0] + 9))
-
-
-def test_a_late_node_goes_on_with_the_newest_of_a_round():
-    schedule = LoopSchedule(TIMES, 300_000_000)
-    tick = schedule.first(300_000_000 * 7 - 1)
-    assert tick == 28 and schedule.due_ns(tick) == 300_000_000 * 7
-    assert schedule.next(tick, 300_000_000 * 9 + 70_000_000) == (38, 9)
-    assert schedule.next(28, schedule.due_ns(28)) == (29, 0)
-
-
-@pytest.mark.parametrize("schedule", [RateSchedule(Fraction(30)), LoopSchedule([0], 10**9)])
-def test_nothing_is_captured_twice(schedule):
-    found, _ = walk(schedule, NOW_NS, 50, late_ns=40_000_000)
+def test_nothing_is_captured_twice():
+    found, _ = walk(RateSchedule(Fraction(30)), NOW_NS, 50, late_ns=40_000_000)
     assert all(b > a for a, b in pairwise(found))

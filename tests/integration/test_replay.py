@@ -6,7 +6,6 @@ import asyncio
 import json
 import logging
 import threading
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -140,23 +139,6 @@ def test_a_cut_recording_replays_what_is_whole(session, tmp_path, caplog):
     assert 10 < len(got) < len(sent)
 
 
-def test_a_replay_goes_round_in_step_with_the_clock(session):
-    file, sent = session
-    got = sent_by(replay_scenario(file, loop="restart"), ["cam01"], seconds=3.5)
-    mine = [r for r in sent if r.header.camera_id == "cam01"]
-    begin = min(r.header.generated_ns for r in sent)
-    places = {r.header.generated_ns - begin: k for k, r in enumerate(mine)}
-    span = max(r.header.generated_ns for r in sent) - begin
-    assert len(got) > len(mine), "more than one round"
-    # The next round begins a usual interval after the last frame.
-    gaps = sorted(b - a for a, b in pairwise(places))
-    period = next(p for g in gaps for p in (span + g,) if got[0].header.generated_ns % p in places)
-    for request in got:
-        place = places[request.header.generated_ns % period]
-        assert said(request) == said(mine[place])
-    assert all(b.header.generated_ns > a.header.generated_ns for a, b in pairwise(got))
-
-
 def test_cameras_may_be_renamed_or_wrong(session, tmp_path):
     file, _ = session
     scenario = replay_scenario(file, assignment={"cam00": "cam00", "cam01": "cam02", "cam02": "cam01"})
@@ -196,9 +178,9 @@ def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
 
 
 @pytest.mark.slow
-def test_a_whole_edge_server_records_what_it_decides(session, tmp_path):
+def test_a_whole_edge_server_records_what_it_decides(tmp_path):
     """Decisions, and their scores when these are known, beside the frames they were made on."""
-    file, _ = session
+    played = photo_scenario(write_photos(tmp_path / "data", 24), 3, fps=25)
     port = free_port()
     top = {"name": "edge", "seed": 3, "cameras": CAMERAS, "edge": EDGE}
     edge = parse(top, tmp_path / "e.yaml")
@@ -208,7 +190,7 @@ def test_a_whole_edge_server_records_what_it_decides(session, tmp_path):
     thread.start()
 
     async def scene() -> None:
-        node = node_of(replay_scenario(file, loop="restart"), f"127.0.0.1:{port}")
+        node = node_of(played, f"127.0.0.1:{port}")
         running = asyncio.ensure_future(node.run())
         async with asyncio.timeout(90):
             while not any(p.psnr_db is not None for p in server.state.publications()):
