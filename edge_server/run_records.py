@@ -7,7 +7,7 @@ file, unreadable.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct, field
 
@@ -147,24 +147,53 @@ class ChannelStatus(Struct):
     delay_error_ms: Delays | None = None
 
 
-class FrontierPoint(Struct):
-    """What one setting reached: milliseconds of an update, and PSNR shown."""
+class FrontierPoint(Struct, frozen=True):
+    """A measured setting of updates, and the fidelity with it.
+
+    effort, options: name and field options of the setting.
+    speed_m_per_s: speed of what moves in the scene it was measured on.
+    update_ms: time from decision to publication; for a field in layers, from one update to the next.
+    psnr_db, psnr_moving_db: PSNR of the whole image, and of the pixels where the scene moves.
+    error_db: upper bound of the standard error of their mean; 0 with one seed.
+    measured: what the PSNR was measured on, what was "shown" or (earlier versions) what was "published".
+    """
 
     effort: str
     update_ms: Number
     psnr_db: Number
     psnr_moving_db: Number
+    speed_m_per_s: Number = 1.0
+    options: dict[str, Any] = {}
+    error_db: Number = 0.0
+    measured: str = "shown"
+
+    @property
+    def mean_db(self) -> float:
+        """Mean of both: the whole image of a mostly static scene alone would hide what age costs."""
+        return 0.5 * (self.psnr_db + self.psnr_moving_db)
 
 
-class MeasuredFrontier(Struct):
-    """frontier.json: what accuracy costs in time, as measured before the run. about: where and how."""
+class Frontier(Struct):
+    """frontier.json: what accuracy costs in time, as measured before the run for its field.
+
+    points: those measured at the speed nearest to ``speed_m_per_s``, the speed of the run's scene.
+    about: which file they come from, or why there are none.
+    """
 
     points: list[FrontierPoint]
     about: str
+    speed_m_per_s: Number = 1.0
 
 
 class MeshDistances(Struct):
-    """A mesh compared with the true surface, see ``surface.metrics.Comparison``, and the targets."""
+    """A mesh compared with the true surface; distances in millimeters, and the project's targets, from 0.3 m.
+
+    accuracy: from the mesh to the surface (mean, median, 95th percentile).
+    completeness: mean from the surface that two cameras see to the mesh.
+    chamfer: the mean of the two means.
+    complete: share of that surface within ``within_mm`` of the mesh.
+    precise: share of the mesh within ``within_mm`` of the surface.
+    """
 
     chamfer_mm: Number
     accuracy_mm: Number
@@ -173,9 +202,9 @@ class MeshDistances(Struct):
     completeness_mm: Number
     complete: Number
     precise: Number
-    within_mm: Number
-    target_chamfer_mm: Number
-    target_complete: Number
+    within_mm: Number = 3.0
+    target_chamfer_mm: Number = 1.5
+    target_complete: Number = 0.95
 
 
 class MeshFacts(Struct):

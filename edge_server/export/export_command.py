@@ -39,7 +39,7 @@ a grid from the depth that the cameras see; what no camera saw stays open, or is
 
 
 # scenario -> (mesh, views) -> (distances to the true surface or None, a sentence to print).
-Comparison = Callable[[str], Callable[[Any, Any], tuple[dict[str, Any] | None, str]]]
+Comparison = Callable[[str], Callable[[Any, Any], tuple[MeshDistances | None, str]]]
 
 
 def main(argv: Sequence[str] | None = None, compare: Comparison | None = None) -> int:
@@ -88,13 +88,6 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="use the field's depth as it is, without refining it by "
         "multi-view consistency: faster, works for moving scenes, less accurate",
-    )
-    mesh(
-        "--min-weight",
-        type=float,
-        default=0.2,
-        metavar="W",
-        help="minimum fused weight of a voxel; a view at normal incidence counts 1 [%(default)g]",
     )
     mesh(
         "--measure",
@@ -185,7 +178,6 @@ class Export:
             voxel_m=None if a.voxel is None else 1e-3 * a.voxel,
             bounds=box,
             watertight=a.watertight,
-            min_weight=a.min_weight,
         )
 
     def _mesh(self, path: Path) -> None:
@@ -216,7 +208,7 @@ class Export:
             cameras=len(self.source.views),
             seconds=round(spent_s, 3),
             stages_s={name: round(end - start, 3) for name, (start, end) in self._stages.items()},
-            measured=None if found is None else MeshDistances(**found),
+            measured=found,
         )
         write_json(self.args.json, to_builtins(facts), indent=1)
 

@@ -5,44 +5,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from edge_server.config import EdgeConfig
+from edge_server.run_records import Frontier, FrontierPoint
 from freshfield.scenario import Scenario
 from freshfield.untrusted import read_json
 
 # Assumed of a scene whose speed is not given: a person walking.
 USUAL_SPEED_M_PER_S = 1.0
-
-
-@dataclass(frozen=True)
-class FrontierPoint:
-    """A measured setting of updates, and the fidelity with it.
-
-    effort, options: name and field options of the setting.
-    speed_m_per_s: speed of what moves in the scene it was measured on.
-    update_ms: time from decision to publication; for a field in layers, from one update to the next.
-    psnr_db, psnr_moving_db: PSNR of the whole image, and of the pixels where the scene moves.
-    error_db: upper bound of the standard error of their mean; 0 with one seed.
-    measured: what the PSNR was measured on, what was "shown" or (earlier versions) what was "published".
-    """
-
-    effort: str
-    options: dict[str, Any]
-    speed_m_per_s: float
-    update_ms: float
-    psnr_db: float
-    psnr_moving_db: float
-    error_db: float = 0.0
-    measured: str = "shown"
-
-    @property
-    def mean_db(self) -> float:
-        """Mean of both: the whole image of a mostly static scene alone would hide what age costs."""
-        return 0.5 * (self.psnr_db + self.psnr_moving_db)
 
 
 def read_frontier(path: Path | None, representation: str, layers: bool = False) -> list[FrontierPoint]:
@@ -115,19 +88,6 @@ def _at_nearest_speed(points: Sequence[FrontierPoint], speed_m_per_s: float) -> 
     return [p for p in points if distance(p) == nearest]
 
 
-@dataclass(frozen=True)
-class Frontier:
-    """What accuracy costs in time, as measured for the field of a run.
-
-    points: points at the measured speed nearest to ``speed_m_per_s``, the speed of the run's scene.
-    about: which file they come from, or why there are none.
-    """
-
-    points: tuple[FrontierPoint, ...]
-    speed_m_per_s: float
-    about: str
-
-
 def open_frontier(scenario: Scenario, config: EdgeConfig) -> Frontier:
     """The frontier that a scenario names, else the shipped one. Raises ValueError if the named one cannot be
     read or has no points for the scenario's field."""
@@ -138,8 +98,8 @@ def open_frontier(scenario: Scenario, config: EdgeConfig) -> Frontier:
     except ValueError as error:
         if path is not None:
             raise
-        return Frontier((), speed, str(error))
+        return Frontier([], str(error), speed)
     points = _at_nearest_speed(points, speed)
     file = config.frontier or "the shipped frontier.json, of room"
     first = points[0]
-    return Frontier(tuple(points), speed, f"{file}, at {first.speed_m_per_s:g} m/s, as {first.measured}")
+    return Frontier(points, f"{file}, at {first.speed_m_per_s:g} m/s, as {first.measured}", speed)

@@ -12,7 +12,7 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -183,7 +183,7 @@ class EdgeServer:
             decision=lambda: self.updater.policy.last_decision,
         )
         log.info("%s", self.state.chosen)
-        write_json(options.out / "frontier.json", asdict(self.frontier))
+        write_json(options.out / "frontier.json", msgspec.to_builtins(self.frontier))
         self.journal = Journal(options.out, self.status)
 
     # --- running ----------------------------------------------------------------------------------
@@ -300,7 +300,7 @@ class EdgeServer:
         log.info("%s", self.state.chosen)
         with contextlib.suppress(ValueError):  # the file that a scenario names may know the first choice only
             self.frontier = self.state.frontier = open_frontier(self.scenario, config)
-            write_json(self.options.out / "frontier.json", asdict(self.frontier))
+            write_json(self.options.out / "frontier.json", msgspec.to_builtins(self.frontier))
 
     def _save_snapshot(self) -> Path:
         if not self.state.started:

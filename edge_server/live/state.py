@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from edge_server.fidelity.scorer import SELECTED, Score
 from edge_server.fields import Snapshot
-from edge_server.live.frontier import Frontier
+from edge_server.run_records import Frontier
 from freshfield.frame import Frame
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned

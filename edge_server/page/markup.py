@@ -10,9 +10,10 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from edge_server.fidelity.scorer import SELECTED
-from edge_server.live.frontier import Frontier, best_point
+from edge_server.live.frontier import best_point
 from edge_server.live.state import CameraView
 from edge_server.page.colors import AGAINST, FOR, FRESH_MS, HELD_OUT, RGB, STALE_MS, age_color, css, scale_color
+from edge_server.run_records import Frontier
 from freshfield.scenario import NOTHING_HELD_OUT
 
 if TYPE_CHECKING:  # loaded only with a learned policy

@@ -9,16 +9,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from edge_server.run_records import (
-    AgesRow,
-    ChannelStatus,
-    EdgeStatus,
-    MeasuredFrontier,
-    MeshFacts,
-    Number,
-    ShownRow,
-    UpdateRow,
-)
+from edge_server.run_records import AgesRow, ChannelStatus, EdgeStatus, Frontier, MeshFacts, Number, ShownRow, UpdateRow
 
 T = TypeVar("T")
 
@@ -45,7 +36,7 @@ class RunFiles:
     shown: list[ShownRow] = field(default_factory=list)
     ages: list[AgesRow] = field(default_factory=list)
     processes: list[dict[str, Any]] = field(default_factory=list)
-    frontier: MeasuredFrontier | None = None
+    frontier: Frontier | None = None
     mesh: MeshFacts | None = None
     images: dict[str, Path] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -64,7 +55,7 @@ def read_run_files(out: Path) -> RunFiles:
         ages=_read_rows(out / "ages.jsonl", AgesRow, notes),
         # Not of a fit.
         shown=_read_rows(out / "shown.jsonl", ShownRow, notes, optional=True),
-        frontier=_read(out / "frontier.json", MeasuredFrontier, notes, optional=True),
+        frontier=_read(out / "frontier.json", Frontier, notes, optional=True),
         # Only where the scenario asks for one.
         mesh=_read(out / "mesh.json", MeshFacts, notes, optional=True),
         # Only where one command started all of them.

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.run_records import MeshDistances
 from edge_server.surface import SurfaceError
 from edge_server.surface.mesh import Mesh
 
@@ -22,8 +23,6 @@ STEEPEST_DEG = 75.0
 SEEN_BY = 2
 WITHIN_M = 0.003
 SAMPLES = 200_000
-# The project's targets, from 0.3 m.
-TARGET_CHAMFER_MM, TARGET_COMPLETE = 1.5, 0.95
 
 
 @dataclass(frozen=True)
@@ -32,26 +31,6 @@ class Truth:
 
     points: Points
     cameras: NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Distances in millimeters.
-
-    accuracy: from the mesh to the surface (mean, median, 95th percentile).
-    completeness: mean from the surface that two cameras see to the mesh.
-    chamfer: the mean of the two means.
-    complete: share of that surface within ``WITHIN_M`` of the mesh.
-    precise: share of the mesh within ``WITHIN_M`` of the surface.
-    """
-
-    chamfer_mm: float
-    accuracy_mm: float
-    accuracy_median_mm: float
-    accuracy_p95_mm: float
-    completeness_mm: float
-    complete: float
-    precise: float
 
 
 def thin_points(points: Points, spacing_m: float) -> NDArray[np.int64]:
@@ -85,7 +64,7 @@ def sample_mesh(mesh: Mesh, count: int = SAMPLES, seed: int = 0) -> Points:
     return points
 
 
-def compare(mesh: Mesh, truth: Truth, samples: int = SAMPLES) -> Comparison:
+def compare(mesh: Mesh, truth: Truth, samples: int = SAMPLES) -> MeshDistances:
     """Measure ``mesh``. SurfaceError: one of the two has no surface."""
     from scipy.spatial import cKDTree
 
@@ -95,7 +74,7 @@ def compare(mesh: Mesh, truth: Truth, samples: int = SAMPLES) -> Comparison:
     points = sample_mesh(mesh, samples)
     to_truth, _ = cKDTree(truth.points).query(points)
     to_mesh, _ = cKDTree(points).query(asked)
-    return Comparison(
+    return MeshDistances(
         chamfer_mm=500.0 * float(to_truth.mean() + to_mesh.mean()),
         accuracy_mm=1e3 * float(to_truth.mean()),
         accuracy_median_mm=1e3 * float(np.median(to_truth)),
@@ -103,4 +82,5 @@ def compare(mesh: Mesh, truth: Truth, samples: int = SAMPLES) -> Comparison:
         completeness_mm=1e3 * float(to_mesh.mean()),
         complete=float((to_mesh <= WITHIN_M).mean()),
         precise=float((to_truth <= WITHIN_M).mean()),
+        within_mm=1e3 * WITHIN_M,
     )

@@ -1,4 +1,4 @@
-"""Mesh extraction from a renderer and its cameras, for the export command, the page and the bench."""
+"""Mesh extraction from a renderer and its cameras."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from edge_server.fields import Renderer, View
-from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import SOLID, DepthMap, render_depth_maps
 from edge_server.surface.mesh import Mesh, extract_mesh, remove_small_components
 from edge_server.surface.refine_depth import refine_depth
-from edge_server.surface.settings import MeshSettings
+from edge_server.surface.settings import MIN_WEIGHT, MeshSettings
 from edge_server.surface.volume import TRUNCATION, Grid, bounding_box, fuse_maps
 
 GUESS = 0.5  # minimum opacity of a surface as initial depth for refinement
@@ -25,13 +24,12 @@ def silent(what: str, share: float) -> None:
 
 
 def make_depth_maps(
-    renderer: Renderer, views: Sequence[View], settings: MeshSettings, say: Say = silent, pool: Pool | None = None
+    renderer: Renderer, views: Sequence[View], settings: MeshSettings, say: Say = silent
 ) -> list[DepthMap]:
     """Make the depth maps that ``mesh_from_depth_maps`` fuses.
 
     renderer: renders the field. views: the cameras, with their images.
     say: called with each stage and its completed share.
-    pool: threads; None: the shared ones.
     Raises SurfaceError if there are no views.
     """
     if not views:
@@ -42,22 +40,20 @@ def make_depth_maps(
     maps = list(render_depth_maps(renderer, cameras, solid, lambda done: say("depth", done / len(views))))
     if not settings.sharpen or len(maps) < 2:
         return maps
-    return refine_depth(maps, [v.image for v in views], pool, lambda share: say("sharpen", share))
+    return refine_depth(maps, [v.image for v in views], None, lambda share: say("sharpen", share))
 
 
-def mesh_from_depth_maps(
-    maps: Sequence[DepthMap], settings: MeshSettings, say: Say = silent, pool: Pool | None = None
-) -> Mesh:
+def mesh_from_depth_maps(maps: Sequence[DepthMap], settings: MeshSettings, say: Say = silent) -> Mesh:
     """Extract the surface of ``maps``. say: called with each stage and its completed share. SurfaceError:
     there is no surface, or the settings do not allow it."""
     grid = grid_for(maps, settings)
     if settings.method == "sdf":
         from edge_server.surface.sdf import fit_sdf  # imports torch
 
-        volume = fit_sdf(grid, maps, settings.memory_mb, say, pool)
+        volume = fit_sdf(grid, maps, say)
     else:
-        volume = fuse_maps(grid, maps, settings.memory_mb, pool, lambda done: say("fuse", done / len(maps)))
-    mesh = remove_small_components(extract_mesh(volume, settings.min_weight, settings.watertight))
+        volume = fuse_maps(grid, maps, on_map=lambda done: say("fuse", done / len(maps)))
+    mesh = remove_small_components(extract_mesh(volume, MIN_WEIGHT, settings.watertight))
     say("extract", 1.0)
     return mesh
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.fuse import CELLS, SIDE
@@ -29,19 +28,16 @@ MAX_NODES = 1 << 24
 def fit_sdf(
     grid: Grid,
     maps: Sequence[DepthMap],
-    memory_mb: float = 2048.0,
     say: Callable[[str, float], None] | None = None,
-    pool: Pool | None = None,
     settings: SdfSettings | None = None,
 ) -> Volume:
     """Fit a function to ``maps`` and return its distances as a volume.
 
-    memory_mb, pool: as in ``fuse_maps``.
     say: called with the stage and its completed share.
     Raises SurfaceError if torch is missing, the grid is too fine, or there is nothing to fit.
     """
     settings = settings or SdfSettings()
-    volume = fuse_maps(grid, maps, memory_mb, pool)
+    volume = fuse_maps(grid, maps)
     samples = _Samples.of(maps, grid)
     if not len(samples.points):
         raise SurfaceError("no camera sees anything solid within the bounds")

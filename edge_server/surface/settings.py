@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from edge_server.surface import SurfaceError
 
 METHODS = ("tsdf", "sdf")
+MIN_WEIGHT = 0.2  # of a known voxel; a camera at normal incidence counts 1
+MEMORY_MB = 2048.0  # largest size of a volume
 Corner = tuple[float, float, float]
 
 
@@ -19,9 +21,7 @@ class MeshSettings:
     voxel_m: None: the size of a pixel at the surface.
     bounds: lower and upper corner, meters; None: from the depth maps.
     watertight: close the surface in unobserved space.
-    min_weight: known voxels have more weight than this (a camera at normal incidence counts 1).
-    memory_mb: largest size of the volume.
-    Raises SurfaceError for an unknown method or a weight out of range.
+    Raises SurfaceError for an unknown method.
     """
 
     method: str = "tsdf"
@@ -29,14 +29,10 @@ class MeshSettings:
     voxel_m: float | None = None
     bounds: tuple[Corner, Corner] | None = None
     watertight: bool = False
-    min_weight: float = 0.2
-    memory_mb: float = 2048.0
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise SurfaceError(f"method must be one of {', '.join(METHODS)}, not {self.method!r}")
-        if not 0.0 <= self.min_weight <= 1e6:
-            raise SurfaceError(f"min_weight must be in 0..1e+06, not {self.min_weight:g}")
 
 
 @dataclass(frozen=True)

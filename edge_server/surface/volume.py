@@ -18,6 +18,7 @@ from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.fuse import CELLS, FAR, SIDE, Blocks, KernelDepth, fuse
+from edge_server.surface.settings import MEMORY_MB
 
 BLOCK_BYTES = CELLS * 4 * (1 + 1 + 4)  # per block
 MAX_BLOCKS = 1 << 24  # in the table of blocks: 24 bytes each during fusion
@@ -94,7 +95,7 @@ def bounding_box(
 def fuse_maps(
     grid: Grid,
     maps: Iterable[DepthMap],
-    memory_mb: float = 2048.0,
+    memory_mb: float = MEMORY_MB,
     pool: Pool | None = None,
     on_map: Callable[[int], None] | None = None,
 ) -> Volume:

@@ -3,10 +3,8 @@ scenes."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,16 +15,9 @@ from camera_node.synthetic.render import cast_rays, surface_properties
 from camera_node.synthetic.scene import Scene
 from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.fields import View
+from edge_server.run_records import MeshDistances
 from edge_server.surface.mesh import Mesh
-from edge_server.surface.metrics import (
-    STEEPEST_DEG,
-    TARGET_CHAMFER_MM,
-    TARGET_COMPLETE,
-    WITHIN_M,
-    Truth,
-    compare,
-    thin_points,
-)
+from edge_server.surface.metrics import STEEPEST_DEG, WITHIN_M, Truth, compare, thin_points
 from freshfield.geometry import world_rays
 from freshfield.scenario import load
 
@@ -37,20 +28,20 @@ _FINE = 3  # rays per pixel side for the truth, so that they are closer than its
 _SAME = 2e-3  # share of the distance: a ray that ends this near to its target has reached it
 
 
-def compare_with_scene(scenario: str) -> Callable[[Mesh, Sequence[View]], tuple[dict[str, Any] | None, str]]:
+def compare_with_scene(scenario: str) -> Callable[[Mesh, Sequence[View]], tuple[MeshDistances | None, str]]:
     """The function with which ``edge-server export --measure`` measures a mesh: it returns ``distances`` and
     one line of text. Raises ScenarioError immediately, before there is a mesh."""
     return partial(_compare, still_scene(scenario))
 
 
-def _compare(scene: Scene | None, mesh: Mesh, views: Sequence[View]) -> tuple[dict[str, Any] | None, str]:
+def _compare(scene: Scene | None, mesh: Mesh, views: Sequence[View]) -> tuple[MeshDistances | None, str]:
     if scene is None:
         return None, "not measured: the true surface is known of synthetic scenes that stand still"
     found = distances(mesh, scene, views)
     return found, (
-        f"chamfer {found['chamfer_mm']:.2f} mm (target {found['target_chamfer_mm']:g}), "
-        f"{100 * found['complete']:.1f} % of the surface within {found['within_mm']:g} mm "
-        f"(target {100 * found['target_complete']:g})"
+        f"chamfer {found.chamfer_mm:.2f} mm (target {found.target_chamfer_mm:g}), "
+        f"{100 * found.complete:.1f} % of the surface within {found.within_mm:g} mm "
+        f"(target {100 * found.target_complete:g})"
     )
 
 
@@ -65,16 +56,10 @@ def still_scene(scenario: str) -> Scene | None:
     return None if scene.moving else scene
 
 
-def distances(mesh: Mesh, scene: Scene, views: Sequence[View]) -> dict[str, Any]:
-    """The ``surface.metrics.Comparison`` of a mesh with the surface that cameras see of a scene, and the
-    targets. Raises SurfaceError if one of the two is empty."""
-    found = compare(mesh, surface_truth(scene, views))
-    return {
-        **dataclasses.asdict(found),
-        "within_mm": 1e3 * WITHIN_M,
-        "target_chamfer_mm": TARGET_CHAMFER_MM,
-        "target_complete": TARGET_COMPLETE,
-    }
+def distances(mesh: Mesh, scene: Scene, views: Sequence[View]) -> MeshDistances:
+    """A mesh compared with the surface that cameras see of a scene. Raises SurfaceError if one of the two is
+    empty."""
+    return compare(mesh, surface_truth(scene, views))
 
 
 def surface_truth(scene: Scene, views: Sequence[View], spacing_m: float = SPACING_M) -> Truth:

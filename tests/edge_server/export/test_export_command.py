@@ -15,7 +15,7 @@ from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.export import ExportError
 from edge_server.export.run_source import open_source, poses_of
 from edge_server.fields import Budget, checkpoint
-from edge_server.fields.registry import field_names, make_field
+from edge_server.fields.registry import make_field
 from freshfield.geometry import Pose, look_at
 from tests.work import MOST_MS, work_ms
 
@@ -35,7 +35,7 @@ def saved(folder, name: str, steps: int = 30):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    saved(folder, "splat", steps=120)
+    saved(folder, "splat", steps=60)
     return folder
 
 
@@ -63,8 +63,6 @@ def test_everything_at_once(run, tmp_path, capsys):
         10,
         "--count",
         500,
-        "--min-weight",
-        0,
     )
     said = capsys.readouterr().out
     assert status == 0, said
@@ -78,7 +76,7 @@ def test_everything_at_once(run, tmp_path, capsys):
 def test_a_mesh_of_a_known_scene_is_measured_against_it(run, tmp_path, capsys):
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
     mesh, about = tmp_path / "m.ply", tmp_path / "m.json"
-    wanted = (run, "--mesh", mesh, "--voxel", 10, "--min-weight", 0, "--no-sharpen", "--json", about)
+    wanted = (run, "--mesh", mesh, "--voxel", 10, "--no-sharpen", "--json", about)
     assert export(*wanted, "--measure", "tile") == 0
     said = capsys.readouterr().out
     assert "mm (target 1.5)" in said and "% of the surface within 3 mm (target 95)" in said
@@ -94,31 +92,9 @@ def test_a_mesh_of_a_known_scene_is_measured_against_it(run, tmp_path, capsys):
     assert "--measure and --json are for --mesh" in capsys.readouterr().err
 
 
-def test_a_mesh_of_exact_depth_is_measured_as_nearly_exact():
-    pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
-    from edge_server.experiments.scenes.mesh_truth import distances, still_scene
-    from edge_server.surface.depth import depth_map
-    from edge_server.surface.reconstruct import mesh_from_depth_maps
-    from edge_server.surface.settings import MeshSettings
-    from tests.edge_server.surface.tile_scan import exact_depth, scan
-
-    near = scan(64, ((-0.065, 0.0, 0.03), (0.065, 0.0, 0.03)))
-    maps = [
-        depth_map(exact_depth(near.scene, v).astype(np.float32), v.image, v.camera_to_world, v.intrinsics)
-        for v in near.views
-    ]
-    scene = still_scene("tile")
-    assert scene is not None
-    found = distances(mesh_from_depth_maps(maps, MeshSettings(voxel_m=0.004)), scene, near.views)
-    assert found["chamfer_mm"] < 3.0 and found["complete"] > 0.7
-
-
-# nerfacto and tensorf are written as ngp is, and take the longest.
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ("nerfacto", "tensorf"))) for n in field_names()]
-)
-def test_every_representation_comes_back_as_it_was(tmp_path, name):
-    field = saved(tmp_path, name)
+@pytest.mark.parametrize("name", ["splat", "ngp"])  # nerfacto and tensorf are written as ngp is
+def test_a_field_comes_back_as_it_was(tmp_path, name):
+    field = saved(tmp_path, name, steps=2)
     source = open_source(tmp_path)
     assert source.name == name and len(source.views) == 8
     view = source.views[0]
@@ -165,7 +141,6 @@ def test_a_run_writes_down_where_its_cameras_were(tmp_path):
         (("--mesh", "m.obj"), "--mesh m.obj: expected a file that ends in .ply or .glb"),
         (("--mesh", "m.ply", "--voxel", "0"), "--voxel 0: expected more than 0 mm"),
         (("--mesh", "m.ply", "--method", "poisson"), "method must be one of tsdf, sdf"),
-        (("--mesh", "m.ply", "--min-weight", "-1"), "min_weight must be in 0..1e+06"),
         (("--points", "p.ply", "--count", "0"), "--count 0"),
         (("--mesh", "m.ply", "--voxel", "10", "--bounds", *["1", "1", "1", "0", "0", "0"]), "lower corner"),
     ],

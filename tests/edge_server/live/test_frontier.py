@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
-from edge_server.live.frontier import FrontierPoint, best_point, read_frontier
+from edge_server.live.frontier import best_point, read_frontier
+from edge_server.run_records import FrontierPoint
 
 
 def frontier_point(effort, speed, update_ms, whole, moving) -> FrontierPoint:
-    return FrontierPoint(effort, {"effort": effort}, speed, update_ms, whole, moving)
+    return FrontierPoint(effort, update_ms, whole, moving, speed)
 
 
 POINTS = [

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from edge_server.live.frontier import Frontier, FrontierPoint
 from edge_server.live.state import CameraView, Publication
 from edge_server.page import markup
 from edge_server.page.colors import HELD_OUT, STALE, css, scale_color
 from edge_server.page.panel import age_parts_ms
+from edge_server.run_records import Frontier, FrontierPoint
 
 
 def summary(**changes) -> markup.Summary:
@@ -52,17 +52,14 @@ def test_the_age_of_what_is_shown_is_split_into_its_parts():
 
 
 def test_the_frontier_stands_beside_the_present_or_says_how_to_measure_it():
-    points = tuple(
-        FrontierPoint(e, {}, 1.0, ms, db, db - 4.0)
-        for e, ms, db in (("low", 50.0, 20.0), ("low", 800.0, 24.0), ("high", 200.0, 28.0))
-    )
-    found = Frontier(points, 1.0, "f.json, at <1> m/s")
+    settings = (("low", 50.0, 20.0), ("low", 800.0, 24.0), ("high", 200.0, 28.0))
+    found = Frontier([FrontierPoint(e, ms, db, db - 4.0) for e, ms, db in settings], "f.json, at <1> m/s")
     html = markup.frontier(found, None)
     assert html.count("<polyline") == 4 and html.count('stroke-width="1.8"') == 2 and "<circle" not in html
     assert "50 ms an update" in html and "800 ms" in html and "at &lt;1&gt; m/s" in html
     html = markup.frontier(found, (200.0, 28.0, None))
     assert html.count("<circle") == 1 and 'cx="170.0" cy="8.0"' in html, "at the best point, half way"
-    unknown = Frontier((), 1.0, "run `edge-server frontier --field x`")
+    unknown = Frontier([], "run `edge-server frontier --field x`")
     assert "edge-server frontier --field x" in markup.frontier(unknown, None)
 
 

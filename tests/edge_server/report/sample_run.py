@@ -12,6 +12,10 @@ import numpy as np
 from edge_server.fidelity.scorer import Score
 from edge_server.live.output.journal import Journal
 from edge_server.live.state import Publication
+from edge_server.report.build_report import assemble
+from edge_server.report.page import render_page
+from edge_server.report.run_files import read_run_files
+from freshfield.files import write_json
 from tests.edge_server.report.ledgers import write
 
 CAMERAS = ("cam00", "cam01", "cam02", "cam03")
@@ -69,6 +73,13 @@ def publication(number: int) -> Publication:
         scored_on="cam00" if scored else None,
         refused=("cam02",) if number % 20 == 5 else (),
     )
+
+
+def page_of(out: Path) -> tuple[dict, str]:
+    """The report of a run and its page, without the figures, which take seconds; report.json is written."""
+    report = assemble(read_run_files(out))
+    write_json(out / "report.json", report)
+    return report, render_page(report, {})
 
 
 def write_run(out: Path, publications: int = 49, ages: int = 200) -> None:

@@ -321,7 +321,7 @@ def test_lines_lost_to_a_full_disk_are_no_contradiction_and_do_not_close(tmp_pat
 
 
 def test_a_long_run_is_joined_in_little_memory(tmp_path):
-    frames = 50_000
+    frames = 8_000
     files = {"node": ("captured", "sent", "answered"), "emulator": ("received", "forwarded"), "edge": ("delivered",)}
     for role, events in files.items():
         path = write(tmp_path, role, [], closed=False)

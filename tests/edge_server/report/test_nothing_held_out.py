@@ -15,12 +15,13 @@ from edge_server.experiments.fitting.evaluate import Scored
 from edge_server.fidelity.scorer import SELECTED, Score
 from edge_server.page import markup, timelines
 from edge_server.report import figures
-from edge_server.report.build_report import build_report
+from edge_server.report.build_report import assemble
+from edge_server.report.run_files import read_run_files
 from freshfield.scenario import NOTHING_HELD_OUT
 from freshfield_up.display import _edge_line
 from freshfield_up.summary import summarize
 from tests.edge_server.page.test_markup import summary
-from tests.edge_server.report.sample_run import publication, write_run
+from tests.edge_server.report.sample_run import page_of, publication, write_run
 
 
 def run_of(folder: Path, scored_on: str) -> Path:
@@ -51,14 +52,14 @@ def page_chart(folder: Path, on: str) -> str:
 
 
 def report_page(folder: Path, on: str) -> str:
-    build_report(run_of(folder, on))
-    return (folder / "report.html").read_text().split("<h2>Age")[0]
+    return page_of(run_of(folder, on))[1].split("<h2>Age")[0]
 
 
 def report_figure(folder: Path, on: str, monkeypatch: pytest.MonkeyPatch) -> str:
     titles: list[str] = []
     monkeypatch.setattr(figures, "label_lines", lambda *_, title="", **__: titles.append(title))
-    build_report(run_of(folder, on))
+    files = read_run_files(run_of(folder, on))
+    figures.draw_fidelity(assemble(files), files, folder / "fidelity.png")
     return titles[0]
 
 
@@ -67,7 +68,7 @@ def console_table(folder: Path, on: str) -> str:
 
 
 def console_summary(folder: Path, on: str) -> str:
-    build_report(run_of(folder, on))
+    page_of(run_of(folder, on))
     return summarize(folder)
 
 

@@ -16,11 +16,11 @@ from edge_server.config import ExportConfig
 from edge_server.live.state import Publication
 from edge_server.report.build_report import METRICS, SERIES, assemble, build_report, fidelity, updates
 from edge_server.report.figures import draw_frontier
-from edge_server.report.page import counts, number, render_page
+from edge_server.report.page import counts, number
 from edge_server.report.run_files import continuous, read_run_files
 from edge_server.run_records import EdgeStatus, UpdateCounts, UpdateRow
 from freshfield_up.summary import summarize
-from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, SECONDS, publication, write_run
+from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, SECONDS, page_of, publication, write_run
 
 
 @pytest.fixture(scope="module")
@@ -120,10 +120,10 @@ def test_updates_are_counted_as_the_edge_counted_them(run):
 
 def test_the_page_shows_frames_that_were_left_out_and_images_that_were_cut(tmp_path):
     write_run(tmp_path)
-    assert "cut out of" not in (build_report(tmp_path) and (tmp_path / "report.html").read_text())
+    assert "cut out of" not in page_of(tmp_path)[1]
     cut = {"masked": 41, "not_detected": 3, "empty_box": 0, "empty_mask": 0, "full_mask": 1, "ms_per_image": 2.4}
     edit_edge(tmp_path, updates={"count": 50, "shed": 17, "without_step": 3}, foreground=cut)
-    report, page = build_report(tmp_path), (tmp_path / "report.html").read_text()
+    report, page = page_of(tmp_path)
     assert report["foreground"] == cut and report["updates"]["shed"] == 17
     assert "left out for lack of time: 17" in page and "without time for a step: 3" in page
     assert "The object was cut out of 41 images, 2 ms each; used whole: 3 (nothing was found in it)" in page
@@ -185,8 +185,8 @@ def test_a_mesh_is_reported_where_there_is_one(run, tmp_path):
     for found in (measured, None):
         mesh = {**facts, "seconds": 11.6, "stages_s": {"fuse": 0.4}, "measured": found}
         (tmp_path / "mesh.json").write_text(json.dumps(mesh))
-        assert build_report(tmp_path)["mesh"] == mesh
-        page, last = (tmp_path / "report.html").read_text(), summarize(tmp_path)
+        (report, page), last = page_of(tmp_path), summarize(tmp_path)
+        assert report["mesh"] == mesh
         assert ("6.93 mm" in page and "60.7 %" in page) == (found is not None)
         assert ("chamfer 6.93 mm (target 1.5), 61 % of the" in last) == (found is not None)
         assert "tile.ply: 19,794 triangles, made in 12 s" in last
@@ -281,11 +281,9 @@ DEEP = "[" * 100_000
 def test_what_should_be_something_else_adds_a_note(tmp_path, file, text, note):
     write_run(tmp_path, publications=2, ages=2)
     (tmp_path / file).write_text(text)
-    files = read_run_files(tmp_path)
-    report = assemble(files)
-    render_page(report, {})
+    report, _ = page_of(tmp_path)
     json.dumps(report, allow_nan=False)
-    assert any(note in each for each in files.notes), files.notes
+    assert any(note in each for each in report["notes"]), report["notes"]
 
 
 @pytest.mark.stability
@@ -294,14 +292,13 @@ def test_hostile_names_do_not_reach_the_page_as_markup(tmp_path):
     evil = "<script>alert(1)</script>"
     edit_edge(tmp_path, scenario=evil, field=evil, lpips_missing=evil)
     (tmp_path / "ages.jsonl").write_text(json.dumps({"t_s": 1, "age_ms": {evil: 3}}) + "\n")
-    build_report(tmp_path)
-    page = (tmp_path / "report.html").read_text()
+    page = page_of(tmp_path)[1]
     assert "<script" not in page and page.count("&lt;script&gt;alert(1)") == 5
 
 
 def test_the_run_stands_beside_the_measured_frontier(tmp_path, monkeypatch):
     write_run(tmp_path)
-    report, path = build_report(tmp_path), tmp_path / "figure-frontier.png"
+    report, path = assemble(read_run_files(tmp_path)), tmp_path / "figure-frontier.png"
     assert not draw_frontier(report, read_run_files(tmp_path), path), "a run without one"
     point = {"effort": "low", "update_ms": 50.0, "psnr_db": 20.0, "psnr_moving_db": 16.0}
     for points, drawn in (([point], True), ([], False), ([{}], False), (3, False)):
@@ -317,9 +314,8 @@ def test_the_run_stands_beside_the_measured_frontier(tmp_path, monkeypatch):
 
 
 def test_what_was_chosen_and_why_is_said(tmp_path):
-    write_run(tmp_path)
-    assert build_report(tmp_path)["chosen"] is None
-    edge = json.loads((tmp_path / "edge.json").read_text())
-    (tmp_path / "edge.json").write_text(json.dumps({**edge, "chosen": "splat in layers: no <camera> moves"}))
-    assert build_report(tmp_path)["chosen"] == "splat in layers: no <camera> moves"
-    assert "no &lt;camera&gt; moves" in (tmp_path / "report.html").read_text()
+    write_run(tmp_path, publications=2, ages=2)
+    assert page_of(tmp_path)[0]["chosen"] is None
+    edit_edge(tmp_path, chosen="splat in layers: no <camera> moves")
+    report, page = page_of(tmp_path)
+    assert report["chosen"] == "splat in layers: no <camera> moves" and "no &lt;camera&gt; moves" in page

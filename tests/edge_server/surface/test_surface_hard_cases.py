@@ -59,7 +59,7 @@ def test_noise_averages_out():
 def test_one_camera_that_contradicts_all_others_is_outvoted():
     maps = ball_maps(30)
     liar = with_depth(maps[7], np.where(maps[7].seen, maps[7].depth - 0.06, maps[7].depth))
-    found = radii([*maps[:7], liar, *maps[8:]], min_weight=0.2)
+    found = radii([*maps[:7], liar, *maps[8:]])
     assert np.percentile(np.abs(found - RADIUS_M), 99) < 0.004
 
 
