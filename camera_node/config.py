@@ -20,7 +20,6 @@ from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_STAMP_S
 from freshfield.scenario import Scenario
 from freshfield.settings import ScenarioError, Settings, about, read_settings, within
 
-ROBOTS = ("ur3e",)
 Background = Literal["white", "black", "keep"]
 FPS_RANGE = (0.01, 1000.0)
 """Bounds of a rate of captures or of a recording, frames a second."""

@@ -37,8 +37,8 @@ def open_configured(path: Path, config: RecordedConfig) -> Dataset:
     """Open the data set of a scenario's ``source:`` section. path: located ``data``. Raises DatasetError."""
     shared = {*RecordedConfig.__struct_fields__, "background", "trajectory"}
     keys = {name: getattr(config, name) for name in config.__struct_fields__ if name not in shared}
-    if isinstance(config, VideoConfig) and config.trajectory is not None:
-        keys["posed_elsewhere"] = [config.assignment.get(camera, camera) for camera in config.trajectory.files]
+    if isinstance(config, VideoConfig):
+        keys["require_poses"] = False  # a trajectory may give them
     options = ImageOptions(config.scale, getattr(config, "background", "keep"))
     return reader(config.kind).load_dataset(path, options, **keys)
 

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
+
 from camera_node.config import FPS_RANGE, RecordedConfig, TrajectoryConfig, VideoConfig, errors_of, find_data
 from camera_node.pose.providers import PoseProvider, read_tum
 from camera_node.sources.assignment import assign_cameras
@@ -20,7 +22,7 @@ from camera_node.sources.datasets.formats import open_configured
 from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
 from freshfield import payload
 from freshfield.geometry import Pose
-from freshfield.scenario import Scenario
+from freshfield.scenario import Scenario, ScenarioError
 
 HOLD_OUT_EVERY = 8
 PHOTO_FPS = 10.0
@@ -70,6 +72,11 @@ def open_recorded(
     sources: dict[str, Source] = {}
     for camera, fps in recorded.items():
         count = len(shown[camera])
+        if camera not in poses and np.isnan(shown[camera][0].camera_to_world).any():
+            raise ScenarioError(
+                f"{scenario.path}: source.trajectory.files.{camera}: missing, and the calibration has no pose for "
+                f"{shown[camera][0].camera}"
+            )
         playback = Playback(count, rate(config.fps) if config.fps else fps, fps, config.loop == "back-and-forth")
         sources[camera] = ImageSource(camera, shown[camera], playback, config.codec, poses.get(camera))
     return sources
@@ -129,8 +136,9 @@ class ImageSource(Source):
 
     def read(self, content: int) -> Shot:
         shown = self._images[content]
-        pose, gap_ns = Pose.from_matrix(shown.camera_to_world), 0
-        if self._poses is not None:
+        if self._poses is None:
+            pose, gap_ns = Pose.from_matrix(shown.camera_to_world), 0
+        else:
             pose, gap_ns = self._poses.at(round((shown.time_s or 0.0) * 1e9))
         return Shot(self._as_stored(shown) or shown.read(), pose, shown.intrinsics, gap_ns)
 

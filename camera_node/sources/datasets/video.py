@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
@@ -33,16 +33,13 @@ _BLOCK = 12
 
 
 def load_dataset(
-    path: Path,
-    options: ImageOptions = FULL_SIZE,
-    files: Mapping[str, str] | None = None,
-    posed_elsewhere: Collection[str] = (),
+    path: Path, options: ImageOptions = FULL_SIZE, files: Mapping[str, str] | None = None, require_poses: bool = True
 ) -> Dataset:
     """Every frame of the videos of a calibration JSON, or of the only one in a folder; cameras without a video are
     left out.
 
     files: camera to video file, relative to the JSON, for videos that are not at ``_PLACES``.
-    posed_elsewhere: cameras that need no pose in the JSON.
+    require_poses: False gives NaN as the pose of a camera that has none in the JSON.
     Raises DatasetError.
     """
     calibration = path if path.is_file() else _find_calibration(path)
@@ -64,19 +61,16 @@ def load_dataset(
             raise DatasetError(f"{calibration.parent / places[0]}: no such video (camera {name})")
     if not found:
         raise DatasetError(f"{calibration}: none of its cameras has a video at {' or '.join(_PLACES)}")
-    return rig_dataset({name: (cameras[name], Clip(found[name])) for name in found}, path, options, posed_elsewhere)
+    return rig_dataset({name: (cameras[name], Clip(found[name])) for name in found}, path, options, require_poses)
 
 
 def rig_dataset(
-    rig: Mapping[str, tuple[CalibratedCamera, Clip]],
-    path: Path,
-    options: ImageOptions,
-    posed_elsewhere: Collection[str] = (),
+    rig: Mapping[str, tuple[CalibratedCamera, Clip]], path: Path, options: ImageOptions, require_poses: bool = True
 ) -> Dataset:
     """Every frame of every video as an image that is read on demand, one camera after the other.
 
     All videos are cut to the length of the shortest: played back and forth, they would else drift apart.
-    path: for error messages. posed_elsewhere: as in ``load_dataset``.
+    path: for error messages. require_poses: as in ``load_dataset``.
     Raises DatasetError if a pose is missing, or a video has another size than its calibration or another rate.
     """
     count = min(clip.count for _, clip in rig.values())
@@ -93,10 +87,10 @@ def rig_dataset(
             raise DatasetError(
                 f"{clip.path}: video is {clip.width} x {clip.height}, calibrated for {lens.width} x {lens.height}"
             )
-        if camera.pose is None and name not in posed_elsewhere:
+        if camera.pose is None and require_poses:
             raise DatasetError(f"{path}: {name}: R_world_to_cam is missing")
         small = shrink(lens, options.scale)
-        matrix = np.eye(4) if camera.pose is None else camera.pose.matrix()
+        matrix = np.full((4, 4), np.nan) if camera.pose is None else camera.pose.matrix()
         for index in range(count):
             images.append(
                 PosedImage(

@@ -159,3 +159,15 @@ def test_what_does_not_fit_is_named(tmp_path):
     file.write_text(json.dumps(rig))
     with pytest.raises(DatasetError, match=r"cam00.mp4: OpenCV cannot open"):
         opened(video_scenario(file))
+
+
+def test_a_camera_without_a_pose_is_missed_only_where_it_is_used(tmp_path):
+    file = write_rig(tmp_path)
+    rig = json.loads(file.read_text())
+    rig["cam01"].pop("R_world_to_cam")
+    file.write_text(json.dumps(rig))
+    assert opened(video_scenario(file), ["cam00"])["cam00"].read(0).pose.translation_m == pytest.approx((3, 0, 1))
+    with pytest.raises(ScenarioError, match=r"trajectory.files.cam01: missing, and the calibration has no pose"):
+        opened(video_scenario(file))
+    with pytest.raises(DatasetError, match="cam01: R_world_to_cam is missing"):
+        load_dataset(file)
