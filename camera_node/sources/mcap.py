@@ -18,8 +18,7 @@ import numpy as np
 
 from camera_node.capture_schedule import CaptureSchedule, OnceSchedule
 from camera_node.config import McapConfig, errors_of, find_data
-from camera_node.sources.assignment import assign_cameras
-from camera_node.sources.base import Shot, Source
+from camera_node.sources.base import Shot, Source, assign_cameras
 from camera_node.sources.datasets.records import DatasetError
 from freshfield.frame import CODEC_NAMES, pose_and_lens
 from freshfield.geometry import Pinhole

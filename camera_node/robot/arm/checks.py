@@ -63,8 +63,4 @@ def path(scenario: Scenario, arm: ArmConfig, tour_path: PathConfig) -> str:
     summary = f"the arm reaches {tour.reached} of {count} viewpoints"
     if tour.reached >= _LEAST_REACHED * count:
         return summary
-    rings = ", ".join(
-        f"{elevation_deg:g} degrees {reached} of {count // len(tour_path.elevations_deg)}"
-        for elevation_deg, reached in zip(tour_path.elevations_deg, tour.reached_by_ring(tour_path))
-    )
-    raise ValueError(f"{summary} ({rings}): change radius_m, elevations_deg, azimuths_deg or where the base stands")
+    raise ValueError(f"{summary}: change radius_m, elevations_deg, azimuths_deg or where the base stands")

@@ -37,22 +37,15 @@ class PathError(ValueError):
 def viewpoints(path: PathConfig) -> list[Array]:
     """Camera-to-world (4, 4) of every viewpoint: down from the highest ring, up again at the next azimuth,
     and so on."""
-    target = np.array(path.target_m)
-    poses = []
-    for elevation_deg, a in _places(path):
-        e = math.radians(elevation_deg)
-        away = np.array([math.cos(e) * math.sin(a), -math.cos(e) * math.cos(a), math.sin(e)])
-        poses.append(look_at(target + path.radius_m * away, target))
-    return poses
-
-
-def _places(path: PathConfig) -> list[tuple[float, float]]:
-    """Elevation (degrees) and azimuth (radians) of every viewpoint."""
     first, last = path.azimuths_deg
     count = max(2, round(abs(last - first) / path.step_deg) + 1)
-    down = sorted(path.elevations_deg, reverse=True)
-    azimuths = np.deg2rad(np.linspace(first, last, count))
-    return [(e, float(a)) for k, a in enumerate(azimuths) for e in (down if k % 2 == 0 else down[::-1])]
+    target, down = np.array(path.target_m), np.deg2rad(sorted(path.elevations_deg, reverse=True))
+    poses = []
+    for k, a in enumerate(np.deg2rad(np.linspace(first, last, count))):
+        for e in down if k % 2 == 0 else down[::-1]:
+            away = np.array([math.cos(e) * math.sin(a), -math.cos(e) * math.cos(a), math.sin(e)])
+            poses.append(look_at(target + path.radius_m * away, target))
+    return poses
 
 
 def _roll(angle_deg: float) -> Array:
@@ -78,12 +71,6 @@ class Tour:
     def reached(self) -> int:
         """Number of viewpoints visited."""
         return len(self.places)
-
-    def reached_by_ring(self, path: PathConfig) -> list[int]:
-        """Number of viewpoints visited in each ring, in the order of ``path.elevations_deg``."""
-        elevations_deg = [elevation_deg for elevation_deg, _ in _places(path)]
-        visited_deg = [elevations_deg[place] for place in self.places]
-        return [visited_deg.count(elevation_deg) for elevation_deg in path.elevations_deg]
 
 
 def plan_tour(arm: ArmModel, base: Array, mount: Array, path: PathConfig, start: ArrayLike | None = None) -> Tour:
