@@ -96,9 +96,9 @@ types: .venv/.ok-test  ## mypy
 	$(PY) -m mypy
 	MYPYPATH=proto:deploy $(PY) -m mypy deploy/check_report.py deploy/freshfield_up
 
-bench: .venv/.ok-test  ## measure this machine, hours: runs/bench, docs/results; DATA=FOLDER BENCH=--quick
+bench: .venv/.ok-test  ## how cost grows on this machine: runs/bench, docs/results; BENCH=--quick
 	@mkdir -p runs
-	$(if $(DATA),FRESHFIELD_DATA=$(DATA)) $(PY) -m edge_server.cli bench --out runs/bench $(BENCH)
+	$(PY) -m edge_server.cli bench --out runs/bench $(BENCH)
 	$(if $(findstring --quick,$(BENCH)),,cp runs/bench/*.json runs/bench/*.md runs/bench/*.png docs/results)
 	$(PY) -m tests.tools.message_through_proxy | tee runs/bench-emulator.txt
 

@@ -90,7 +90,7 @@ _COMMANDS = {
         "choose where a camera goes next around an object, within a budget of views or meters",
     ),
     "study": ("experiments.studies.command", "reproduce the thesis's figures, each with a verdict"),
-    "bench": ("experiments.bench.command", "measure speed and quality on this machine: field, track, growth and more"),
+    "bench": ("experiments.bench.command", "measure how cost grows with cameras, image size, speed and people"),
     "explain": ("report.explain_command", "explain a policy's decision: shares of state parts, cameras, image regions"),
     "export": (
         "export.export_command",

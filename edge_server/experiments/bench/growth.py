@@ -13,8 +13,8 @@ from typing import Any
 
 import msgspec
 
-from edge_server.experiments.bench.run import BenchRun
 from edge_server.experiments.common.tables import markdown_table, mean_or_none, number
+from edge_server.experiments.engine import Engine
 from edge_server.experiments.virtual.costs import UpdateCosts, beside_s
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
@@ -69,13 +69,13 @@ class Point:
     scored_s: float = SCORED_S
 
 
-def measure(run: BenchRun) -> dict[str, Any]:
+def measure(engine: Engine, quick: bool) -> dict[str, Any]:
     """Measure {FACTOR: {POINT: figures}}; a point that is in several factors is measured once."""
-    seconds = (1.0, 0.2, 0.5) if run.quick else (FREE_S, SETTLING_S, SCORED_S)
+    seconds = (1.0, 0.2, 0.5) if quick else (FREE_S, SETTLING_S, SCORED_S)
     room = dict(zip(_FACTORS, _ROOM))
     points = {factor: [Point(room | point, *seconds) for point in of] for factor, of in POINTS.items()}
     every = [point for of in points.values() for point in of]
-    found = iter(run.engine.run(measure_point, every, "growth", describe=_describe))
+    found = iter(engine.run(measure_point, every, "growth", describe=_describe))
     return {
         factor: {", ".join(f"{v:g}" for v in point.values.values()): next(found) for point in of}
         for factor, of in points.items()

@@ -25,11 +25,6 @@ def number(value: float | None, digits: int = 2, sign: str = "") -> str:
     return "-" if value is None or not math.isfinite(value) else f"{value:{sign}.{digits}f}"
 
 
-def grouped(value: float | None, digits: int = 2) -> str:
-    """As ``number``, but from 1000 on whole and with commas between thousands."""
-    return f"{value:,.0f}" if value is not None and abs(value) >= 1000 else number(value, digits)
-
-
 def median_or_none(values: Iterable[float | None]) -> float | None:
     """The median of the values that are not None; None if there are none."""
     known = [v for v in values if v is not None]

@@ -58,13 +58,6 @@ def open_still(scene: str, size: int = 128, holdout: str = "8", scale: float = 1
     return MultiviewStill(data.file.resolve().parent.name, data.training, data.held_out or data.training[:8], WHITE)
 
 
-def smallest_angle_deg(still: MultiviewStill) -> float:
-    """The smallest angle between the viewing directions of a held-out and a training camera: how far a field
-    must extrapolate from its training views."""
-    forward = [np.stack([v.camera_to_world[:3, 2] for v in views]) for views in (still.held_out, still.training)]
-    return float(np.rad2deg(np.arccos(np.clip(forward[0] @ forward[1].T, -1.0, 1.0)).min()))
-
-
 def mean_baselines(training: Sequence[View], held_out: Sequence[View], color: Color = BLACK) -> dict[str, float | None]:
     """PSNR of the baselines without a field, as means over the held-out views; None without any. color: the
     background."""

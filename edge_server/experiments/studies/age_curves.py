@@ -9,10 +9,10 @@ import numpy as np
 
 from edge_server.experiments.common.seed_table import Curve, Row, SeedTable
 from edge_server.experiments.common.statistics import optimum
-from edge_server.experiments.studies.drawing import draw_curve, draw_metrics, draw_trials
+from edge_server.experiments.studies.drawing import curves, draw_curve, instants, several
 from edge_server.experiments.studies.findings import interior, optimum_falls, optimum_grows
 from edge_server.experiments.studies.study import METRICS, Claim, Study, StudyRequest
-from edge_server.experiments.studies.trial import Point, recording, run_points, scenes_here, sweep, usual_trial
+from edge_server.experiments.studies.trial import Point, recording, run_points, scenes_here, sweep
 from edge_server.report.style import CYCLE, figure, label_lines
 
 GAMMAS = (15.0, 21.0, 30.0, 45.0, 51.0, 60.0, 75.0, 90.0, 105.0, 120.0, 150.0, 200.0, 300.0, 400.0)
@@ -36,35 +36,6 @@ def _mat_cases(request: StudyRequest) -> list[Point]:
     return found
 
 
-def _draw_mat(request: StudyRequest, table: SeedTable) -> None:
-    for (scene,) in table.distinct("scene"):
-        channels = [c for s, c in table.distinct("scene", "channel") if s == scene]
-        draw_metrics(
-            request.out / f"mat-{scene}.png",
-            table,
-            "gamma_ms",
-            "maximum age (ms)",
-            MAT_METRICS,
-            [(c, {"scene": scene, "channel": c, "policy": "threshold"}) for c in channels],
-            f"{scene}: threshold on age, from scratch",
-            [("no delay", {"scene": scene, "policy": "no delay"})],
-        )
-    draw_instants(request, "mat", "threshold", SHOWN, {"preset": "ch5"})
-
-
-def draw_instants(
-    request: StudyRequest, name: str, policy: str, values: tuple[float, ...], channel: Row, **settings: Any
-) -> None:
-    """Draw one instant of each scene under three values of a policy (figures 5.7, 6.4), to OUT/NAME-pictures.png."""
-    own = next(iter(request.channels({"": channel}).values()))
-    common: Row = {"seed": 3, "channel": own, "lpips": False, "policy": policy, **settings}
-    rows = [
-        (scene, [usual_trial(request, scene, value=v, **common) for v in values])
-        for scene in scenes_here(request, ("room", "kitchen"))
-    ]
-    draw_trials(request.out / f"{name}-pictures.png", request, rows)
-
-
 MAT = Study(
     "mat",
     "Fidelity against the maximum age of used views (figures 5.6, 5.7)",
@@ -80,7 +51,10 @@ MAT = Study(
         ),
     ),
     ("scene", "channel"),
-    _draw_mat,
+    several(
+        curves("mat", "gamma_ms", "maximum age (ms)", MAT_METRICS, "channel", policy="threshold"),
+        instants("mat", ("room", "kitchen"), "threshold", SHOWN, {"preset": "ch5"}),
+    ),
 )
 
 # --- figure 5.8 ----------------------------------------------------------------------------------------------

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from edge_server.experiments.common.seed_table import Curve, SeedTable
+from edge_server.experiments.common.seed_table import Curve, Row, SeedTable
 from edge_server.experiments.common.statistics import interval
+from edge_server.experiments.studies.findings import NO_DELAY, USE_ALL
 from edge_server.experiments.studies.study import METRICS, StudyRequest
-from edge_server.experiments.studies.trial import Trial, last_images
+from edge_server.experiments.studies.trial import last_images, scenes_here, usual_trial
 from edge_server.report.style import CYCLE, GRAY, figure, label_lines
 
 Image = NDArray[np.uint8]
@@ -40,41 +42,86 @@ def draw_curve(axes: Axes, curve: Curve, label: str, place: int) -> None:
         axes.fill_between(xs, [y.low for y in ys], [y.high for y in ys], color=color, alpha=0.15, linewidth=0)
 
 
-def draw_metrics(
-    path: Path,
-    table: SeedTable,
-    x: str,
-    axis: str,
-    metrics: Sequence[str],
-    lines: Sequence[tuple[str, dict]],
-    title: str,
-    levels: Sequence[tuple[str, dict]] = (),
-) -> None:
-    """Draw a panel for each of ``metrics`` that was measured, to ``path`` (PNG).
+Draw = Callable[[StudyRequest, SeedTable], None]
+"""Draws a study's figures into the request's folder."""
 
-    x, axis: label of the points, and its text.
-    lines: (text, labels of the points) of each curve.
-    levels: the same of each horizontal line.
+
+def curves(
+    name: str, x: str, axis: str, metrics: Sequence[str], by: str, per: Sequence[str] = ("scene",), **where: Any
+) -> Draw:
+    """Makes a drawing of OUT/NAME-SCENE-N.png for each combination of the labels ``per``: a panel for each measured
+    metric against label ``x``, a line for each value of label ``by``, and the levels of use-all and of no delay.
+
+    axis: text of x. where: further labels of the points.
     """
-    measured = [m for m in metrics if any(row.get(m) is not None for row in table.rows)]
-    with figure(path, len(measured), height_inch=2.3 if len(measured) < 6 else 1.8, sharex=True) as (_, axes):
-        for at, metric in zip(axes[:, 0], measured):
-            for k, (label, labels) in enumerate(lines):
-                curve = table.curve(x, metric, **labels)
-                if curve:
-                    draw_curve(at, curve, label, k)
-            for k, (label, labels) in enumerate(levels):
-                level = interval(table.values(metric, **labels).values())
-                if level.count:
-                    style = (":", "--", "-.")[k % 3]
-                    at.axhline(level.mean, color=GRAY, linestyle=style, linewidth=1.2, label=label)
-            last = metric == measured[-1]
-            label_lines(
-                at,
-                METRICS[metric].label.replace(", ", ",\n"),
-                axis if last else None,
-                title if metric == measured[0] else None,
-            )
+
+    def draw(request: StudyRequest, table: SeedTable) -> None:
+        measured = [m for m in metrics if any(row.get(m) is not None for row in table.rows)]
+        for number, values in enumerate(table.distinct(*per)):
+            here = dict(zip(per, values))
+            lines = [(str(v), {**where, **here, by: v}) for (v,) in table.distinct(by)]
+            lines = [(v, labels) for v, labels in lines if any(row.get(x) is not None for row in table.where(**labels))]
+            if not lines:
+                continue
+            path, height_inch = request.out / f"{name}-{here['scene']}-{number}.png", 2.3 if len(measured) < 6 else 1.8
+            with figure(path, len(measured), height_inch=height_inch, sharex=True) as (_, axes):
+                for at, metric in zip(axes[:, 0], measured):
+                    for k, (label, labels) in enumerate(lines):
+                        draw_curve(at, table.curve(x, metric, **labels), label, k)
+                    for policy, style in ((NO_DELAY, ":"), (USE_ALL, "--")):
+                        if (level := _level(table, metric, policy, here)) is not None:
+                            at.axhline(level, color=GRAY, linestyle=style, linewidth=1.2, label=policy)
+                    text = METRICS[metric].label.replace(", ", ",\n")
+                    label_lines(at, text, axis if metric == measured[-1] else None)
+                axes[0, 0].set_title(", ".join(map(str, values)))
+
+    return draw
+
+
+def _level(table: SeedTable, metric: str, policy: str, here: Row) -> float | None:
+    """The mean of a policy without a value, by those of the labels that its rows have; None if it was not measured
+    there, or under several conditions."""
+    rows = table.where(policy=policy)
+    known = {k: v for k, v in here.items() if k != "policy" and any(k in row for row in rows)}
+    found = table.where(policy=policy, **known)
+    values = interval(row.get(metric) for row in found)
+    return values.mean if values.count == len({row["seed"] for row in found}) > 0 else None
+
+
+def instants(
+    name: str, scenes: Sequence[str], policy: str, values: Sequence[float], channel: Row, **settings: Any
+) -> Draw:
+    """Makes a drawing of one instant of each scene under some values of a policy, to OUT/NAME-pictures.png: the truth
+    and the last rendering of each trial.
+
+    values: in milliseconds. settings: further arguments of ``Trial``.
+    """
+
+    def draw(request: StudyRequest, table: SeedTable) -> None:
+        own = next(iter(request.channels({"": channel}).values()))
+        common: Row = {"seed": 3, "channel": own, "lpips": False, "policy": policy, **settings}
+        shown = []
+        for scene in scenes_here(request, scenes):
+            images: list[tuple[str, Image]] = []
+            for value in values:
+                truth, rendering, row = last_images(usual_trial(request, scene, value=value, **common), request.folders)
+                if not images:
+                    images.append(("truth at the present", truth))
+                images.append((f"{value:g} ms: {row['views']:.0f} views, {row['psnr_db']:.1f} dB", rendering))
+            shown.append((scene, images))
+        draw_images(request.out / f"{name}-pictures.png", shown)
+
+    return draw
+
+
+def several(*drawings: Draw) -> Draw:
+    """Makes a drawing of all of them."""
+
+    def draw(request: StudyRequest, table: SeedTable) -> None:
+        for one in drawings:
+            one(request, table)
+
+    return draw
 
 
 def draw_images(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, Image]]]]) -> None:
@@ -91,22 +138,3 @@ def draw_images(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, Image]
             line[0].text(
                 -0.06, 0.5, title, rotation=90, va="center", ha="right", fontsize=9, transform=line[0].transAxes
             )
-
-
-def draw_trials(path: Path, request: StudyRequest, rows: Sequence[tuple[str, Sequence[Trial]]]) -> None:
-    """Draw the truth and the last rendering of each trial, one row of images for each (title, trials).
-
-    The values of the trials' policies must be in milliseconds.
-    """
-    shown = []
-    for title, trials in rows:
-        images: list[tuple[str, Image]] = []
-        for trial in trials:
-            truth, rendering, row = last_images(trial, request.folders)
-            if not images:
-                images.append(("truth at the present", truth))
-            text = f"{trial.value:g} ms: {row['views']:.0f} views, {row['psnr_db']:.1f} dB"
-            images.append((text, rendering))
-        shown.append((title, images))
-    if shown:
-        draw_images(path, shown)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from edge_server.experiments.common.seed_table import Row, SeedTable
-from edge_server.experiments.studies.age_curves import draw_instants
-from edge_server.experiments.studies.drawing import draw_metrics
+from edge_server.experiments.studies.drawing import curves, instants, several
 from edge_server.experiments.studies.findings import better, interior, plateau, trend
 from edge_server.experiments.studies.study import Claim, Study, StudyRequest
 from edge_server.experiments.studies.trial import Point, recording, run_points, scenes_here, sweep, usual_trial
@@ -36,6 +35,7 @@ NEAR = {
     "lpips": 0.01,
 }
 FRESHNESS = ("f_w", "f_w_corrected")
+SHOWN = (30.0, 60.0, 120.0)
 BEST_OMEGA = {"best": "omega_ms"}
 
 
@@ -49,24 +49,6 @@ def _omega_cases(request: StudyRequest) -> list[Point]:
         conditions = [({"channel": name}, {"channel": channel, "every_ms": 2400.0}) for name, channel in some]
         found += sweep(request, scene, request.repeats(6 if ours else 3, 40), conditions, "omega_ms", omegas)
     return found
-
-
-def _draw_omega(request: StudyRequest, table: SeedTable) -> None:
-    for number, (scene, channel) in enumerate(table.distinct("scene", "channel")):
-        here = {"scene": scene, "channel": channel}
-        draw_metrics(
-            request.out / f"omega-{scene}-{number}.png",
-            table,
-            "omega_ms",
-            "omega (ms)",
-            OMEGA.metrics,
-            [(p, {**here, "policy": p}) for p in ("threshold", *WAITS)],
-            f"{scene}, {channel}: from scratch",
-            [("use all", {**here, "policy": "all"}), ("no delay", {"scene": scene, "policy": "no delay"})],
-        )
-    for policy in ("threshold", "wait"):
-        shown = (30.0, 60.0, 120.0)
-        draw_instants(request, f"omega-{policy}", policy, shown, {"preset": "ch6-high"}, every_ms=2400.0)
 
 
 def _plateau(table: SeedTable, metric: str, labels: Row) -> Any:
@@ -118,7 +100,13 @@ OMEGA = Study(
         ),
     ),
     ("scene", "channel"),
-    _draw_omega,
+    several(
+        curves("omega", "omega_ms", "omega (ms)", (*NEAR, *FRESHNESS), "policy", ("scene", "channel")),
+        *(
+            instants(f"omega-{policy}", ("room", "kitchen"), policy, SHOWN, {"preset": "ch6-high"}, every_ms=2400.0)
+            for policy in ("threshold", "wait")
+        ),
+    ),
 )
 
 # --- figures 6.5 and 6.6 -------------------------------------------------------------------------------------
@@ -126,6 +114,7 @@ OMEGA = Study(
 COUNTS = (2, 3, 4, 6, 8, 10, 12, 14, 16, 18)
 QUICK_COUNTS = (3, 6, 10, 14, 18)
 # The thesis's representations: of cameras that look in (6.5) and that look out (6.6).
+IMAGE_METRICS = ("lpips", "psnr_db", "psnr_moving_db", "aaoi_ms")
 IMAGE_FIELDS = {"room": "nerfacto", "tower": "splat"}
 
 
@@ -144,25 +133,12 @@ def _image_cases(request: StudyRequest) -> list[Point]:
     return found
 
 
-def _draw_images(request: StudyRequest, table: SeedTable) -> None:
-    for (scene,) in table.distinct("scene"):
-        draw_metrics(
-            request.out / f"images-{scene}.png",
-            table,
-            "images",
-            "images, the freshest",
-            (*IMAGES.metrics, "ssim"),
-            [("freshest-k", {"scene": scene, "policy": "freshest-k"})],
-            scene,
-        )
-
-
 IMAGES = Study(
     "images",
     "Perceptual distance and age against the number of images (figures 6.5, 6.6)",
     _image_cases,
     run_points,
-    ("lpips", "psnr_db", "psnr_moving_db", "aaoi_ms"),
+    IMAGE_METRICS,
     (
         Claim(
             "more images are better (thesis: LPIPS .323 to .101 looking in, .472 to .214 looking out).",
@@ -185,13 +161,14 @@ IMAGES = Study(
         ),
     ),
     ("scene", "field", "channel"),
-    _draw_images,
+    curves("images", "images", "images, the freshest", (*IMAGE_METRICS, "ssim"), "policy"),
 )
 
 # --- figure 6.7 ----------------------------------------------------------------------------------------------
 
 # Steps of one update, such that it takes about as long as one of splat on two cores.
 FIELDS = {"splat": 400, "ngp": 250, "nerfacto": 150, "tensorf": 150}
+FIELD_METRICS = ("psnr_db", "psnr_moving_db", "lpips", "f_w")
 QUICK_FIELDS = {"splat": 150, "ngp": 80}
 
 
@@ -206,26 +183,12 @@ def _field_cases(request: StudyRequest) -> list[Point]:
     return [p for s in scenes for p in sweep(request, s, seeds, traffic, "omega_ms", omegas, ideals)]
 
 
-def _draw_fields(request: StudyRequest, table: SeedTable) -> None:
-    for (scene,) in table.distinct("scene"):
-        for policy in ("threshold", "wait"):
-            draw_metrics(
-                request.out / f"representations-{scene}-{policy}.png",
-                table,
-                "omega_ms",
-                "omega (ms)",
-                REPRESENTATIONS.metrics,
-                [(f, {"scene": scene, "field": f, "policy": policy}) for (f,) in table.distinct("field")],
-                f"{scene}, {policy}: from scratch",
-            )
-
-
 REPRESENTATIONS = Study(
     "representations",
     "Threshold and wait, by representation (figure 6.7)",
     _field_cases,
     run_points,
-    ("psnr_db", "psnr_moving_db", "lpips", "f_w"),
+    FIELD_METRICS,
     tuple(
         Claim(
             f"the trade shows: {policy} has an optimum inside (6.5.2: with every representation).",
@@ -236,5 +199,5 @@ REPRESENTATIONS = Study(
         for policy in ("threshold", "wait")
     ),
     ("scene", "field"),
-    _draw_fields,
+    curves("representations", "omega_ms", "omega (ms)", FIELD_METRICS, "field", ("scene", "policy")),
 )

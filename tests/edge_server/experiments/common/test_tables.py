@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-from edge_server.experiments.common.tables import (
-    grouped,
-    markdown_table,
-    mean_or_none,
-    median_or_none,
-    number,
-    over_seeds,
-)
+from edge_server.experiments.common.tables import markdown_table, mean_or_none, median_or_none, number, over_seeds
 
 
 def test_numbers_and_cells():
     assert markdown_table(("a", "b"), [(1, None)]) == "| a | b |\n| --- | --- |\n| 1 |  |"
     assert number(None) == number(float("nan")) == "-" and number(1.0, 1, "+") == "+1.0"
-    assert grouped(1234.5) == "1,234" and grouped(12.345) == "12.35" and grouped(None) == "-"
 
 
 def test_averages_leave_out_what_is_missing():
