@@ -122,7 +122,7 @@ class FieldUpdater:
             return
         if self.embedder is None:
             raise ValueError(f"{policy.name} decides by what cameras see: it needs an edge.embedding section")
-        if dim not in (None, self.embedder.dim) or (name and name != self.embedder.name):
+        if dim != self.embedder.dim or (name and name != self.embedder.name):
             raise ValueError(
                 f"{policy.name} was trained with {name or 'embeddings'} of {dim} numbers, edge.embedding "
                 f"is {self.embedder.name} of {self.embedder.dim}"

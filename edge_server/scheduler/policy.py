@@ -72,14 +72,14 @@ class Policy:
     parameter: name and unit of the one value a user may set, such as ``omega_ms`` or the count ``k``; None if
     there is none.
     value: that value.
-    embedding: width of the embeddings it decides by (0: it needs none; None: any) and the name of their
-    embedder (empty: any).
+    embedding: width of the embeddings it decides by (0: it needs none) and the name of their embedder (empty:
+    any).
     """
 
     name: str
     parameter: str | None = None
     value: float | None = None
-    embedding: tuple[int | None, str] = (0, "")
+    embedding: tuple[int, str] = (0, "")
 
     def __init__(self, value: float | None, rng: np.random.Generator) -> None:
         """value: value of ``parameter``; None keeps the default. rng: for policies that draw. Raises

@@ -49,16 +49,6 @@ _NEVER_MS = 1e11
 
 
 @dataclass(frozen=True)
-class Arrival:
-    """A frame that reached the buffer. generated_ns: instant of its capture on the edge's clock."""
-
-    camera: str
-    sequence: int
-    generated_ns: int
-    received_ns: int
-
-
-@dataclass(frozen=True)
 class Choice:
     """A policy's choice: the newest frames of ``cameras`` at ``at_ns``."""
 
@@ -99,10 +89,10 @@ class DecisionPoint:
     now_ns: int
     until_ns: int
     cameras: tuple[str, ...]
-    arrivals: tuple[Arrival, ...]
+    arrivals: tuple[Frame, ...]
     state: State
 
-    def newest(self, at_ns: int) -> dict[str, Arrival]:
+    def newest(self, at_ns: int) -> dict[str, Frame]:
         """Omega(t) of (5.6): the newest arrival of each camera at ``at_ns``, in the cameras' order."""
         return _newest(self.arrivals, at_ns, self.cameras)
 
@@ -111,15 +101,15 @@ class DecisionPoint:
         return next((a.received_ns for a in self.arrivals if a.received_ns > after_ns), None)
 
 
-def _newest(arrivals: Iterable[Arrival], at_ns: int, cameras: Sequence[str]) -> dict[str, Arrival]:
+def _newest(arrivals: Iterable[Frame], at_ns: int, cameras: Sequence[str]) -> dict[str, Frame]:
     """Youngest arrival of each camera received by ``at_ns``, in the cameras' order; cameras without one are
     left out. arrivals: in order of reception."""
-    found: dict[str, Arrival] = {}
+    found: dict[str, Frame] = {}
     for arrival in arrivals:
         if arrival.received_ns > at_ns:
             break
         known = found.get(arrival.camera)
-        if known is None or arrival.generated_ns > known.generated_ns:
+        if known is None or arrival.generated_edge_ns > known.generated_edge_ns:
             found[arrival.camera] = arrival
     return {c: found[c] for c in cameras if c in found}
 
@@ -266,7 +256,6 @@ class Episode:
         at = np.sort(rng.integers(round(lead), round(lead + span), setting.decisions))
         self.instants_ns = [int(tick) * GRID_MS * 10**6 for tick in at]
         self._until_ns = self.instants_ns[-1] + round(setting.horizon_ms * 1e6)
-        self._frames: dict[tuple[str, int], Frame] = {}
         self._deployment, self._record = self._recorded()
         self._views: dict[tuple[str, int], View | None] = {}
         self._warm: list[dict[str, NDArray[Any]]] = []
@@ -274,7 +263,7 @@ class Episode:
         self.points = tuple(self._point(number) for number in range(setting.decisions))
         self._scored: dict[tuple[int, Choice, tuple[str, ...]], dict[str, Outcome]] = {}
 
-    def _recorded(self) -> tuple[VirtualDeployment, list[Arrival]]:
+    def _recorded(self) -> tuple[VirtualDeployment, list[Frame]]:
         """Run the deployment to the end of the record; returns it and all arrivals."""
         factory, setting = self._factory, self._factory.setting
         scenario, stage = factory.scenario(self.seed), factory.stage(self.seed)
@@ -291,9 +280,7 @@ class Episode:
         recorder = _Recorder([c for c in scenario.training if c in heard])
         deployment.updates.buffer = recorder
         deployment.run(self._until_ns / 1e9)
-        record = recorder.record
-        self._frames = {(b.camera, b.sequence): b for b in record}
-        return deployment, [Arrival(b.camera, b.sequence, b.generated_edge_ns, b.received_ns) for b in record]
+        return deployment, recorder.record
 
     def evaluate(self, number: int, choice: Choice, cameras: tuple[str, ...] | None = None) -> dict[str, Outcome]:
         """Fit the choice at a decision and score it at publication: an outcome from each of ``cameras`` (None:
@@ -340,20 +327,17 @@ class Episode:
         state = self.state(reported, now_ns)
         return DecisionPoint(self.seed, number, now_ns, self._until_ns, cameras, tuple(arrivals), state)
 
-    def state(self, newest: Mapping[str, Arrival], at_ns: int) -> State:
+    def state(self, newest: Mapping[str, Frame], at_ns: int) -> State:
         """The state of the buffer (6.33) that holds the frames of ``newest``, by camera, at an instant."""
         setting = self._factory.setting
-        items = self._exposed(sorted(newest.values(), key=lambda a: a.received_ns))
+        items = self._deployment.with_images(sorted(newest.values(), key=lambda a: a.received_ns))
         by_camera = {item.camera: item for item in items}
         return observe(setting.scenario.training, by_camera, at_ns, self._embeddings, setting.parts)
 
-    def _exposed(self, arrivals: Sequence[Arrival]) -> tuple[Frame, ...]:
-        return self._deployment.with_images([self._frames[a.camera, a.sequence] for a in arrivals])
-
-    def _decoded(self, arrivals: Sequence[Arrival]) -> list[View]:
+    def _decoded(self, arrivals: Sequence[Frame]) -> list[View]:
         """Views in the given order, each decoded once; undecodable frames are left out."""
         missing = [a for a in arrivals if (a.camera, a.sequence) not in self._views]
-        for item in self._exposed(missing):
+        for item in self._deployment.with_images(missing):
             views = ViewDecoder().views([item])
             self._views[item.camera, item.sequence] = views[0] if views else None
         found = [self._views.get((a.camera, a.sequence)) for a in arrivals]

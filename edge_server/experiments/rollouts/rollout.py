@@ -111,8 +111,8 @@ def choose(policy: Policy, episode: Episode, number: int) -> Choice:
 
     def epoch(at_ns: int) -> Epoch:
         newest = point.newest(at_ns)
-        generated = {c: arrival.generated_ns for c, arrival in newest.items()}
-        received = {c: arrival.received_ns for c, arrival in newest.items()}
+        generated = {c: frame.generated_edge_ns for c, frame in newest.items()}
+        received = {c: frame.received_ns for c, frame in newest.items()}
         known = at_ns == point.now_ns
         return Epoch(
             at_ns, number, generated, lambda parts=(): point.state if known else episode.state(newest, at_ns), received

@@ -17,7 +17,6 @@ class RunSettings:
     """How a deployment runs in virtual time.
 
     steps: optimizer steps of an update.
-    first_steps: those of the first update; 0: as the others.
     compute: cost of an update in virtual time.
     epoch_ms: least time between two decisions.
     grace_ms: how long the first update waits for cameras that have not reported.
@@ -30,7 +29,6 @@ class RunSettings:
     """
 
     steps: int
-    first_steps: int = 0
     compute: Compute = _FREE
     epoch_ms: float = 0.0
     grace_ms: float = 3000.0
@@ -40,8 +38,8 @@ class RunSettings:
     scratch: bool = False
 
     def __post_init__(self) -> None:
-        if self.steps < 1 or self.first_steps < 0:
-            raise ValueError("steps: expected at least 1, of the first update at least 0")
+        if self.steps < 1:
+            raise ValueError("steps: expected at least 1")
         waits = (self.epoch_ms, self.grace_ms, self.score_every_ms or 0.0)
         if not all(0.0 <= ms < 1e12 for ms in waits):
             raise ValueError("epoch_ms, grace_ms and score_every_ms: expected finite numbers of at least 0")

@@ -311,14 +311,12 @@ class VirtualDeployment:
     def _run_edge(self) -> Generator[WakeCondition, None, None]:
         """The edge's loop; it yields the condition on which it continues."""
         updates, settings = self.updates, self.settings
-        steps = settings.first_steps
         if settings.first_ms is None:
             yield from self._await_cameras()
         else:  # with the cameras that have reported by then: the instants are given
             yield WakeCondition(self._origin_ns + round(settings.first_ms * 1e6))
         while True:
             settings = self.settings
-            steps = steps or settings.steps
             # The first update takes in all frames that have arrived; later ones are limited.
             most_new = settings.most_new if self.publications else None
             if self.next_policy is not None:
@@ -332,12 +330,11 @@ class VirtualDeployment:
                 yield WakeCondition(plan.wait_until_ns) if waits else _AT_ARRIVAL
             if settings.scratch:
                 updates.field.reset()
-            fitted = updates.fit(self._selection_with_images(selection), Budget(steps=steps))
+            fitted = updates.fit(self._selection_with_images(selection), Budget(steps=settings.steps))
             if fitted is None:
                 yield _AT_ARRIVAL  # every selected frame is damaged: newer ones will come
                 continue
             views, report = fitted
-            steps = 0
             charged_ns = settings.compute.charge_ns(report.steps, selection.arrivals)
             yield WakeCondition(self.clock.now_ns() + charged_ns)
             published_ns = self.clock.now_ns()

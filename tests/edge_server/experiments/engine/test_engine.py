@@ -90,15 +90,6 @@ def test_after_an_error_the_file_has_what_was_finished(jobs, tmp_path):
     assert set(kept) <= {0, 1, 2} and (jobs == 2 or kept == [0, 1, 2])
 
 
-def test_progress_names_what_is_left_and_what_each_result_is(tmp_path):
-    lines: list[str] = []
-    engine = Engine(tmp_path / "r.jsonl", say=lines.append)
-    engine.run(measure, POINTS[:1], "points")
-    engine.run(measure, POINTS[:3], "points", describe=lambda p, row: f"seed {p.seed}: {row['mean']:.3f}")
-    assert lines[0] == "points: 1 to compute, 0 known" and lines[2] == "points: 2 to compute, 1 known"
-    assert lines[3] == "[1/2] seed 1: -0.074"
-
-
 PARENT = """
 import sys
 from functools import partial

@@ -179,12 +179,6 @@ def test_what_a_scene_of_ours_cannot_do_is_refused_in_one_line(tmp_path, capsys,
     assert message in said and said.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
-def test_an_instant_before_the_first_is_refused(tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        fit("room", tmp_path / "out", "--frame", "-1")
-    assert "--frame: '-1': expected a whole number from 0" in capsys.readouterr().err
-
-
 def test_marks_end_with_the_whole_and_leave_a_long_last_slice():
     assert marks_s(60.0) == [1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 60.0]
     assert marks_s(0.5) == [0.5]

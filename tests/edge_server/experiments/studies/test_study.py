@@ -167,32 +167,6 @@ def test_the_sign_of_ssim_in_f_w_can_turn_what_is_better(tmp_path: Path):
     assert answers(found, "F_w with w_s = -0.2", "arrive meanwhile") == {"holds"}
 
 
-def test_images_judges_both_directions_and_finds_an_optimum_between_few_and_stale(tmp_path: Path):
-    for sign, answer in ((1, "holds"), (-1, "does not hold")):
-
-        def rule(trial, sign=sign):
-            count = trial.value or 18.0
-            return figures(sign * math.log(count) + noise(trial.seed, count), 30.0 * count**sign)
-
-        assert answers(verdicts("images", tmp_path, rule), "more images") == {answer}
-    for best, answer in ((8.0, "holds"), (18.0, "does not hold")):
-
-        def peaked(trial, best=best):
-            count = trial.value or 18.0
-            return figures(2.0 - abs(math.log(count / best)) + noise(trial.seed, count), 30.0 * count)
-
-        assert answers(verdicts("images", tmp_path, peaked), "better than all") == {answer}
-
-
-def test_representations_are_judged_each_for_itself(tmp_path: Path):
-    def rule(trial):
-        return peak(75.0 if trial.field == "splat" else 9000.0)(trial)
-
-    found = verdicts("representations", tmp_path, rule)
-    assert answers(found, "splat, threshold, PSNR (dB)") == {"holds"}
-    assert answers(found, "ngp, threshold, PSNR (dB)") == {"does not hold"}
-
-
 # --- verdicts ------------------------------------------------------------------------------------------------
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +30,17 @@ def _mean_psnr(field: Any, cameras: int, size: int, steps: int, update_ms: float
         "edge": {"updates": "cycle"},
     }
     settings = RunSettings(
-        steps,
-        first_steps=150,
+        150,  # of the first update
         compute=Compute(ms_per_update=0.9 * update_ms),
         epoch_ms=update_ms,
         score_every_ms=200.0,
         grace_ms=500.0,
     )
-    deployment = build_deployment(parse(room, Path("short")), settings, field=field)
+
+    def published(publication: Any) -> None:
+        deployment.settings = replace(settings, steps=steps)
+
+    deployment = build_deployment(parse(room, Path("short")), settings, field=field, on_published=published)
     scores = [p.psnr_db for p in deployment.run(END_S) if p.t_s > SETTLED_S]
     return float(np.mean([s for s in scores if s is not None]))
 

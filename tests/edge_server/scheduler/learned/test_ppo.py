@@ -107,50 +107,49 @@ def test_deciding_needs_no_torch(tmp_path):
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def damaged(path, what):
-    """A checkpoint that is wrong in one way."""
-    if what == "cut":
-        path.write_bytes(path.read_bytes()[:-200])
-    elif what == "text":
-        path.write_text("weights: all of them")
-    elif what == "empty":
-        path.write_bytes(b"")
-    elif what == "array":
-        with path.open("wb") as file:
-            np.save(file, np.zeros(3))
-    elif what == "field":
-        checkpoint.save(path, {"a": np.zeros(3)})
-    elif what == "pickle":
-        with path.open("wb") as file:
-            np.savez(file, __facts__=np.array([print], dtype=object))
-    else:
+def _edited(change):
+    """Writes the checkpoint anew, with its arrays and metadata changed."""
+
+    def edit(path):
         arrays, about = checkpoint.load(path, kind="scheduler")
-        if what == "nan":
-            arrays["actor.in"][0, 0] = np.nan
-        elif what == "shape":
-            arrays["actor.in"] = arrays["actor.in"][:, 1:]
-        elif what == "words":
-            arrays["actor.in"] = arrays["actor.in"].astype(str)
-        elif what == "lacks":
-            del arrays["actor.out"]
-        elif what == "spec":
-            about["spec"]["action"] = "guess"
-        elif what == "key":
-            about["spec"]["depth"] = 3
+        change(arrays, about)
         checkpoint.save(path, arrays, about, kind="scheduler")
-    return path
+
+    return edit
 
 
-@pytest.mark.parametrize(
-    "what", ["cut", "text", "empty", "array", "field", "pickle", "nan", "shape", "words", "lacks", "spec", "key"]
-)
+def _written(write):
+    def edit(path):
+        with path.open("wb") as file:
+            write(file)
+
+    return edit
+
+
+DAMAGES = {
+    "cut": lambda path: path.write_bytes(path.read_bytes()[:-200]),
+    "text": lambda path: path.write_text("weights: all of them"),
+    "empty": lambda path: path.write_bytes(b""),
+    "array": _written(lambda file: np.save(file, np.zeros(3))),
+    "pickle": _written(lambda file: np.savez(file, __facts__=np.array([print], dtype=object))),
+    "field": lambda path: checkpoint.save(path, {"a": np.zeros(3)}),
+    "nan": _edited(lambda arrays, about: arrays["actor.in"].__setitem__((0, 0), np.nan)),
+    "shape": _edited(lambda arrays, about: arrays.update({"actor.in": arrays["actor.in"][:, 1:]})),
+    "words": _edited(lambda arrays, about: arrays.update({"actor.in": arrays["actor.in"].astype(str)})),
+    "lacks": _edited(lambda arrays, about: arrays.pop("actor.out")),
+    "spec": _edited(lambda arrays, about: about["spec"].update(action="guess")),
+    "key": _edited(lambda arrays, about: about["spec"].update(depth=3)),
+}
+
+
+@pytest.mark.parametrize("what", DAMAGES)
 def test_a_file_that_is_no_whole_checkpoint_is_refused_in_one_line(tmp_path, what):
-    path = damaged(save(Learner(select(), 0), tmp_path / "policy.npz"), what)
+    path = save(Learner(select(), 0), tmp_path / "policy.npz")
+    DAMAGES[what](path)
     for load in (Learner.load, Actor.load):
         with pytest.raises(checkpoint.CheckpointError) as refused:
             load(path)
-        assert str(refused.value).startswith(str(path))
-        assert "\n" not in str(refused.value)
+        assert str(refused.value).startswith(str(path)) and "\n" not in str(refused.value)
 
 
 LARGE = {
@@ -223,9 +222,7 @@ def test_what_a_learner_cannot_have_saved_is_refused(tmp_path, change):
     learner = Learner(select(), 0)
     teach(learner, FreshOnes(), 1)
     path = save(learner, tmp_path / "policy.npz")
-    arrays, about = checkpoint.load(path, kind="scheduler")
-    change(arrays, about)
-    checkpoint.save(path, arrays, about, kind="scheduler")
+    _edited(change)(path)
     with pytest.raises(checkpoint.CheckpointError, match="damaged") as refused:
         Learner.load(path)
     assert str(refused.value).count(str(path)) == 1 and "\n" not in str(refused.value)
