@@ -30,7 +30,7 @@ from edge_server.scheduler import parse_policy
 from freshfield.scenario import Scenario, parse
 
 # Seconds of virtual time in which costs are measured, and until what is shown counts.
-_COSTS_S, _LEAD_S = 1.0, 8.0
+_COSTS_S, _LEAD_S = 1.0, 5.0
 # Steps per second of the static field of layers, which run on another core.
 _STATIC_STEPS_PER_S = 250.0
 MEDIUM, LAYERS = "medium", "layers"

@@ -13,6 +13,7 @@ import pytest
 from camera_node.config import source_config
 from camera_node.synthetic.effects import NAMES
 from channel_emu.model.config import channel_from_mapping
+from channel_emu.model.link import EventKind
 from channel_emu.virtual.simulate import simulate
 from edge_server.experiments.virtual.from_scenario import build_deployment, exact_scene, training_cameras
 from edge_server.experiments.virtual.run_settings import Compute, RunSettings
@@ -111,7 +112,7 @@ def test_the_links_decide_as_the_simulation_does(channel):
     deployment = run(what, RunSettings(steps=1, compute=Compute(ms_per_update=500.0)), seconds=2.0)
     config = channel_from_mapping(what.channel)
     alone = simulate(config, list(what.training), 2.0, what.seed, frame_period_ms=1e3 / 15)
-    expected = {r.camera: r.count("delivered") for r in alone.runs}
+    expected = {r.camera: r.link.counts[EventKind.DELIVERED] for r in alone.runs}
     assert dict(deployment.delivered) == expected
 
 
