@@ -156,11 +156,8 @@ class TrainedField(SteppedField[RaySnapshot]):
         """Give the encoding the size and sampling it has at ``self.step``; called after every step."""
 
     @abstractmethod
-    def _gather(self, levels: int, scale: float) -> None:
-        """Add the encoding's gradient of ``self._batch`` to ``self._table_g`` and set ``self._dirty``.
-
-        scale: factor that Adam will multiply the gradient by.
-        """
+    def _gather(self, levels: int) -> None:
+        """Add the encoding's gradient of ``self._batch`` to ``self._table_g`` and set ``self._dirty``."""
 
     def _add_depth_guide(
         self, views: Sequence[View], data: Views, box: SceneBox, step_budget: StepBudget, fresh: bool
@@ -281,7 +278,7 @@ class TrainedField(SteppedField[RaySnapshot]):
             self._bins,
         )
         rays = max(int(batch.rays.sum()), 1)
-        self._gather(levels, NOMINAL_RAYS / rays)
+        self._gather(levels)
         if batch.dropped.any():
             self._repair()
         self._updates += 1

@@ -107,8 +107,8 @@ class HashGridSettings(TrainerSettings, frozen=True):
     """What representations with a hash grid add.
 
     Tuned: cells a side of the coarsest and of the finest level (None: about a pixel); learning rate of the
-    tables at the start of a fit; weight ``smooth`` of the total variation of the levels that are not hashed;
-    ``levels_start`` levels are in use at the start, and one more is switched on each ``levels_every`` steps.
+    tables at the start of a fit; ``levels_start`` levels are in use at the start, and one more is switched on each
+    ``levels_every`` steps.
     """
 
     levels: Annotated[int, within(1, 24, "levels of the hash grid, coarse to fine")] = 8
@@ -116,7 +116,6 @@ class HashGridSettings(TrainerSettings, frozen=True):
     base_resolution: int = 16
     finest_resolution: int | None = None
     rate_net: float = 3e-2
-    smooth: float = 1.5e-3
     levels_start: int = 4
     levels_every: int = 30
     samples_start: int = 32

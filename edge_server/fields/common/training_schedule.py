@@ -16,9 +16,6 @@ BETA1, BETA2 = 0.9, 0.99
 # Of encodings and their networks: a first fit has a hundred steps or so, and with .9 a tenth of them pass
 # before Adam forgets the gradients of fog that is gone.
 BETA1_FIELD = 0.65
-# The smoothness prior visits whole levels: applied now and then, and stronger for it, it does as well.
-SMOOTH_EVERY = 4
-SMOOTH_AT = 2  # never in a step that also samples densities
 LATE = 1.1  # times a budget in seconds: a fit may end so late rather than make no step
 NOMINAL_RAYS = 4096.0  # gradients are scaled as if a step had so many rays: Adam's epsilon keeps its meaning
 
@@ -33,11 +30,6 @@ def active_levels(settings: HashGridSettings, step: int) -> int:
     if settings.levels_every == 0:
         return settings.levels
     return min(settings.levels, settings.levels_start + step // settings.levels_every)
-
-
-def smoothing(settings: HashGridSettings, step: int) -> float:
-    """The weight of the smoothness prior at a step, 0 for most of them."""
-    return SMOOTH_EVERY * settings.smooth if step % SMOOTH_EVERY == SMOOTH_AT else 0.0
 
 
 def step_length(settings: TrainerSettings, step: int) -> float:

@@ -86,8 +86,8 @@ class NerfactoField(NgpField):
             decay=np.float32(s.proposal_decay),
         )
 
-    def _gather(self, levels: int, scale: float) -> None:
-        super()._gather(levels, scale)
+    def _gather(self, levels: int) -> None:
+        super()._gather(levels)
         bins = self._bins
         self.pool.run(scatter_proposal, self._encoding, bins.cell, bins.grad, bins.counts, self._table_g, self._dirty)
 

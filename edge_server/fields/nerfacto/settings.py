@@ -32,7 +32,6 @@ class NerfactoSettings(HashGridSettings, frozen=True):
     proposal_decay: float = 3e-2
     even: float = 0.4
     anneal: int = 40
-    smooth: float = 3e-3
 
     def __post_init__(self) -> None:
         if self.appearance and self.exposure:

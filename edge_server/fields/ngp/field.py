@@ -10,12 +10,12 @@ from typing import Any, ClassVar
 import msgspec
 import numpy as np
 
-from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter, smooth_grid
+from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.model_layout import init_net, make_grid
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.trained_field import DIRTY, TINY, TrainedField
-from edge_server.fields.common.training_schedule import active_levels, smoothing
+from edge_server.fields.common.training_schedule import active_levels
 from edge_server.fields.ngp.settings import STATE_SHAPE, NgpSettings
 
 assert SEGMENT * FEATURES == DIRTY, "scatter and adam must use the same segments"
@@ -45,11 +45,9 @@ class NgpField(TrainedField):
     def _levels(self) -> int:
         return active_levels(self.settings, self.step)
 
-    def _gather(self, levels: int, scale: float) -> None:
+    def _gather(self, levels: int) -> None:
         batch, grid = self._batch, self._grid()
         self.pool.run(scatter, grid, levels, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty)
-        if weight := smoothing(self.settings, self.step):
-            self.pool.run(smooth_grid, grid, levels, np.float32(weight / scale), self._table_g, self._dirty)
 
 
 make = NgpField

@@ -1,14 +1,297 @@
-"""The Gaussian field that a scenario asks for."""
+"""3D Gaussian splatting on CPUs (Kerbl et al. 2023): tile kernels in numba, forward and backward.
+
+One step: the Gaussians are projected into a camera (``kernels.project``) and listed by tile, front to back
+(``kernels.bin_tiles``); tiles are rendered, compared and differentiated in parallel (``kernels.rasterize``,
+strip by strip in ``kernels.composite``); every Gaussian gathers the gradients of its tiles in a fixed order,
+backpropagates them through the projection (``kernels.project_backward``) and makes an Adam step
+(``kernels.optimizer_step``). From time to time Gaussians are split and pruned (``densification``).
+"""
 
 from __future__ import annotations
 
-from edge_server.fields import Field
-from edge_server.fields.splat.settings import SplatSettings
-from edge_server.fields.splat.still_field import StillField
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import Budget, Field, View
+from edge_server.fields.common.camera_rows import camera_rows
+from edge_server.fields.common.kernels.rays import Views
+from edge_server.fields.common.scene_box import UNIT_BOX
+from edge_server.fields.common.stepped_field import Step, SteppedField
+from edge_server.fields.common.supervision import supervising_views
+from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.fields.common.training_schedule import StepBudget, StepTimer
+from edge_server.fields.common.view_store import Arrays, same_views
+from edge_server.fields.splat.buffers import RasterBuffers
+from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune
+from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_corrections, clamp_gaussians
+from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, TILE
+from edge_server.fields.splat.kernels.rasterize import Targets
+from edge_server.fields.splat.seeding import seed_gaussians
+from edge_server.fields.splat.settings import (
+    ALIGN_EVERY,
+    RATE_COLOR,
+    RATE_HARMONICS,
+    RATE_OPACITY,
+    RATE_POSITION,
+    RATE_ROTATION,
+    RATE_SCALE,
+    SplatSettings,
+)
+from edge_server.fields.splat.snapshot import SplatSnapshot
+from freshfield.geometry import Pinhole
+
+
+class StillField(SteppedField[SplatSnapshot]):
+    """Gaussians that do not move, and learn while they are in use. See ``SteppedField``.
+
+    Where things move, it learns what the newest view of each camera shows.
+    """
+
+    name = "splat"
+    shape = ("harmonics",)
+    settings: SplatSettings
+
+    def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
+        super().__init__(settings or SplatSettings(), pool)
+
+    # --- the protocol -------------------------------------------------------------------------
+
+    @property
+    def step_time(self) -> StepTimer:
+        """How long a step takes."""
+        return self._step_time
+
+    def take_in(self, views: Sequence[View]) -> None:
+        """Take ``views`` as what to learn. ValueError: one is invalid."""
+        with self._lock:
+            self._ingest(views)
+
+    def train_step(self, progress: float, grow: bool) -> tuple[float, int, int]:
+        """One optimizer step at ``progress``, in [0, 1], of a schedule. grow: whether Gaussians may be split and
+        pruned. Returns the mean squared error, pixels, and pairs of a Gaussian and a tile."""
+        with self._lock:
+            loss, pixels, pairs, lost = self._one_step(progress, grow)
+            self.dropped += lost
+        return loss, pixels, pairs
+
+    def set_params(self, params: NDArray[np.float32]) -> None:
+        """Replace the parameters, float32 (N, P), of all Gaussians."""
+        with self._lock:
+            self.cloud.params[:] = params
+            self._snapshot = None
+
+    def _begin_fit(self, views: Sequence[View], step_budget: StepBudget, budget: Budget) -> tuple[Step, int, int]:
+        self.take_in(views)
+        return self._one_step, 0, 0
+
+    def _live(self) -> SplatSnapshot:
+        return SplatSnapshot(
+            box=self.view_store.box or UNIT_BOX,
+            gaussians=self.cloud.gaussians(),
+            background=self.view_store.background(),
+            cameras=self.view_store.views,
+            pool=self.pool,
+            step=self.step,
+            planar=self.settings.planar,
+        )
+
+    def _run_kernels(self, pool: Pool) -> None:
+        tiny = msgspec.structs.replace(
+            self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False
+        )
+        camera = Pinhole.from_fov(32, 32, 60.0)
+        pose = np.eye(4)
+        pose[2, 3] = -3.0
+        for channels in (3, 4):
+            field = StillField(tiny, pool)
+            image = np.full((32, 32, channels), 128, np.uint8)
+            image[8:16, 8:16, :3] = 255  # or there would be no Gaussians
+            field.fit([View("warm-up", image, pose, camera)], Budget(steps=2))
+            field.render(pose, camera)
+
+    # --- state --------------------------------------------------------------------------------
+
+    def _counters(self) -> dict[str, Any]:
+        return {"step": self.step, "grown": self._grown, "dropped": self.dropped}
+
+    def _arrays(self) -> Arrays:
+        return {f.name: getattr(self.cloud, f.name) for f in fields(self.cloud)}
+
+    def _load(self, meta: dict[str, Any], state: Arrays) -> None:
+        self.cloud = _gaussians_of(self.settings, state)
+        self._grown = int(meta["grown"])
+
+    # --- inside -------------------------------------------------------------------------------
+
+    def _forget_parameters(self) -> None:
+        self.step = 0
+        self._grown = 0  # step of the last splitting and pruning
+        self._step_time = StepTimer()
+        self.cloud = GaussianCloud.empty(self.settings)
+        self._raster, self._render_raster = RasterBuffers(self.pool), RasterBuffers(self.pool)
+        self._snapshot = None
+        self._views: tuple[View, ...] = ()
+        self._epoch = -1
+
+    def _rng(self, purpose: int) -> np.random.Generator:
+        return np.random.default_rng(np.random.SeedSequence([self.settings.seed, self.step, purpose]))
+
+    def _ingest(self, views: Sequence[View]) -> None:
+        """Take new views in; seed the Gaussians if there are none."""
+        if not same_views(views, self._views):
+            intake = self.view_store.add(views)
+            if intake.box_changed:
+                self._forget_parameters()
+            assert self.view_store.box is not None
+            self._cams = camera_rows(
+                [v.camera_to_world for v in views], [v.intrinsics for v in views], self.view_store.box
+            )
+            self._data: Views = intake.data
+            # All of them, where every weight is 0.
+            self._targets = Targets(
+                self._data.first,
+                self._data.size,
+                self._data.pixels,
+                self._data.weight,
+                np.zeros((0, 3), np.float32),
+                self.view_store.background(),
+            )
+            self._asked = supervising_views(self._data) or list(range(len(views)))
+            self._views, self._epoch = tuple(views), -1
+        if len(self.cloud) == 0:
+            self._seed()
+        self._snapshot = None
+
+    def _next_view(self) -> int:
+        """The view of this step: all take turns, in an order that is drawn anew for each pass."""
+        count = len(self._asked)
+        if self._epoch != self.step // count:
+            self._epoch = self.step // count
+            drawn = np.random.default_rng(np.random.SeedSequence([self.settings.seed, self._epoch, 4]))
+            self._order = drawn.permutation(count)
+        return self._asked[self._order[self.step % count]]
+
+    def _one_step(self, progress: float, grow: bool = True) -> tuple[float, int, int, int]:
+        """One optimizer step at ``progress`` of the fit, in [0, 1]. grow: see ``train_step``.
+
+        Returns the mean squared error, pixels, pairs of a Gaussian and a tile, and how many tiles and
+        gradients were not finite.
+        """
+        view = self._next_view()
+        camera, cloud, raster = self._cams[[view]], self.cloud, self._raster
+        gaussians = cloud.gaussians()
+        raster.project_and_bin(camera, gaussians)
+        losses = raster.train(self._targets, view)
+        dropped = raster.step(camera, gaussians, cloud.optimizer_state(), self.adam_parameters(progress))
+        if self.settings.planar:
+            self._planar_step(view)
+        square, broken = losses.sum(axis=0).tolist()
+        if broken:
+            self._repair()
+        self.step += 1
+        # Not before every view has had a step.
+        if grow and self.step - self._grown >= max(self.settings.densify_every, len(self._asked)):
+            self._grow()
+        pixels = TILE * TILE * len(losses)
+        pairs = min(int(raster.lists.needed[0]), raster.lists.pair.shape[1])
+        return square / (3 * pixels), pixels, pairs, int(broken) + dropped
+
+    def _planar_step(self, view: int) -> None:
+        """Flatten the Gaussians, and align them with the normals that ``view`` shows."""
+        from edge_server.fields.splat.planar import align, flatten
+
+        s = self.settings
+        flatten(self.cloud, s.flatten)
+        if s.align and self.step % ALIGN_EVERY == 0:
+            camera = self._cams[[view]]
+            self._render_raster.project_and_bin(camera, self.cloud.gaussians(), differentiate=False)
+            align(self.cloud, s.align, self._render_raster, camera[0], self._views[view].intrinsics)
+
+    def adam_parameters(self, progress: float) -> AdamParameters:
+        """Parameters of an optimizer step at ``progress``, in [0, 1], of a fit."""
+        s, box = self.settings, self.view_store.box
+        assert box is not None
+        rates = np.full(BASE + 3 * (s.harmonics - 1), RATE_HARMONICS)
+        rates[:SCALE] = RATE_POSITION * box.pixel_m / box.radius_m
+        rates[SCALE:QUATERNION] = RATE_SCALE
+        rates[QUATERNION:OPACITY] = RATE_ROTATION
+        rates[OPACITY], rates[COLOR:BASE] = RATE_OPACITY, RATE_COLOR
+        return AdamParameters(
+            (rates * s.rate_end**progress).astype(np.float32), age_corrections(), np.float32(s.epsilon)
+        )
+
+    def _grow(self) -> None:
+        self._protect_unsupervised()
+        densify_and_prune(self.cloud, self.settings.gaussians, float(self._data.size[:, 0].mean()), self._rng(5))
+        self._grown = self.step
+        if len(self.cloud) == 0:  # everything was pruned: start again
+            self._seed()
+
+    def _protect_unsupervised(self) -> None:
+        """Count as seen what is visible in tiles with pixels of weight 0, or in the last view of a camera
+        without a current view: that a Gaussian has no gradient there does not mean that it is not needed."""
+        cloud, box = self.cloud, self.view_store.box
+        assert box is not None
+        data = self._data
+        slots = [k for k in range(len(data.size)) if (self._weight_of(k) == 0).any()]
+        given = {view.camera for view in self._views}
+        others = [view for view in self.view_store.views if view.camera not in given]
+        if not slots and not others:
+            return
+        cams = np.concatenate(
+            [self._cams[slots], camera_rows([v.camera_to_world for v in others], [v.intrinsics for v in others], box)]
+        )
+        raster, count = self._render_raster, len(cloud)
+        raster.project_and_bin(cams, cloud.gaussians(), differentiate=False)
+        shows = (raster.lists.own_count[len(slots) : len(cams), :count] > 0).any(axis=0)
+        for b, k in enumerate(slots):
+            shows |= raster.reaching(b, count, self._weight_of(k) == 0)
+        cloud.looks[shows] = np.maximum(cloud.looks[shows], 1.0)
+
+    def _weight_of(self, view: int) -> NDArray[np.float32]:
+        """How much each pixel of a view counts, (H, W); (0,) where all count in full."""
+        (w, h), first, weight = self._data.size[view], self._data.first[view], self._data.weight
+        return weight[first : first + w * h].reshape(h, w) if weight.size else weight
+
+    def _seed(self) -> None:
+        """Seed the first Gaussians from the current views."""
+        assert self.view_store.box is not None
+        s = self.settings
+        first, weight = min(s.start, s.gaussians), self._data.weight
+        self.cloud = GaussianCloud.new(
+            seed_gaussians(s, self.pool, self.view_store.box, self._views, None, weight, first, self._rng(1))
+        )
+
+    def _repair(self) -> None:
+        """Replace what is not finite; such Gaussians become invisible and are pruned."""
+        clamp_gaussians(self.cloud.params)
+        for array in (self.cloud.m, self.cloud.v):
+            np.nan_to_num(array, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _gaussians_of(settings: SplatSettings, state: Arrays) -> GaussianCloud:
+    """The Gaussians in ``state``. ValueError: they do not fit ``settings``."""
+    empty = GaussianCloud.empty(settings)
+    count = len(state["params"]) if "params" in state else 0
+    arrays = {}
+    for f in fields(GaussianCloud):
+        mine = getattr(empty, f.name)
+        shape = (count, *mine.shape[1:])
+        if f.name not in state or state[f.name].shape != shape or state[f.name].dtype != mine.dtype:
+            raise ValueError(f"the state lacks {f.name!r}, {mine.dtype} of shape {shape}")
+        arrays[f.name] = np.array(state[f.name])
+    if count > settings.gaussians:
+        raise ValueError(f"the state has {count} Gaussians, this field holds {settings.gaussians} at most")
+    return GaussianCloud(**arrays)
 
 
 def make(settings: SplatSettings) -> Field:
-    """A field in layers, or one of still Gaussians alone."""
+    """The Gaussian field that a scenario asks for: in layers, or of still Gaussians alone."""
     if settings.layers:
         from edge_server.fields.splat.layers.layered_field import LayeredField  # imported only where used
 

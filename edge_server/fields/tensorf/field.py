@@ -69,7 +69,7 @@ class TensorfField(TrainedField):
         self._take_table(tables[0])
         self._table_m, self._table_v = tables[1:]
 
-    def _gather(self, levels: int, scale: float) -> None:
+    def _gather(self, levels: int) -> None:
         batch, planes = self._batch, self._encoding
         self.pool.run(scatter_planes, planes, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty)
 

@@ -125,6 +125,6 @@ def test_updates_of_a_moving_scene_keep_their_budget(name: str, each_s: float) -
     for frame, steps in enumerate((0.2, 1.6, 4.6, 0.2, 2.2, 8.6), start=5):
         budget_s = first_s + steps * step_s
         report = field.fit(_moving(frame), Budget(seconds=budget_s))
-        # Every so many steps densities are sampled, and every so many the grid is smoothed: never in one step.
+        # Every so many steps densities are sampled: one kernel more.
         assert budget_s - 2.0 * step_s < report.seconds <= budget_s + 1.01 * each_s
     assert report.steps > 5

@@ -29,7 +29,7 @@ _POSES = {"refine_m": 0.05, "refine_deg": 2.0}
 _FEW = {"batch_samples": 8192, "rays": 9}
 # Of each kind, settings that together go through all of its kernels.
 THROUGH_ALL: dict[str, tuple[dict[str, Any], ...]] = {
-    "ngp": ({}, {"smooth": 0.1, "harmonics": 4, **_PLAIN}, _FEW),
+    "ngp": ({}, {"harmonics": 4, **_PLAIN}, _FEW),
     "tensorf": ({"upsample": (4, 8)}, {"harmonics": 4, **_PLAIN}, {"exposure": True, **_POSES}, _FEW),
     "nerfacto": (
         {"exposure": True, **_POSES},

@@ -131,12 +131,6 @@ def _mark(dirty, i, j):
 
 
 @part
-def _add_pair(table, row, weight, a, b):
-    table[row, 0] += weight * a
-    table[row, 1] += weight * b
-
-
-@part
 def _scatter_level(dense, res, mask, x, d0, d1, gradient, dirty):
     zero = np.float32(0.0)
     for s in range(d0.size):
@@ -146,20 +140,12 @@ def _scatter_level(dense, res, mask, x, d0, d1, gradient, dirty):
         ix, fx = _corner(x[0, s], res)
         iy, fy = _corner(x[1, s], res)
         iz, fz = _corner(x[2, s], res)
-        i0, i1, i2, i3, i4, i5, i6, i7 = _corners(dense, res, mask, ix, iy, iz)
-        w0, w1, w2, w3, w4, w5, w6, w7 = _weights(fx, fy, fz)
-        _add_pair(gradient, i0, w0, g0, g1)
-        _add_pair(gradient, i1, w1, g0, g1)
-        _add_pair(gradient, i2, w2, g0, g1)
-        _add_pair(gradient, i3, w3, g0, g1)
-        _add_pair(gradient, i4, w4, g0, g1)
-        _add_pair(gradient, i5, w5, g0, g1)
-        _add_pair(gradient, i6, w6, g0, g1)
-        _add_pair(gradient, i7, w7, g0, g1)
-        _mark(dirty, i0, i1)
-        _mark(dirty, i2, i3)
-        _mark(dirty, i4, i5)
-        _mark(dirty, i6, i7)
+        rows, weights = _corners(dense, res, mask, ix, iy, iz), _weights(fx, fy, fz)
+        for k in range(8):
+            gradient[rows[k], 0] += weights[k] * g0
+            gradient[rows[k], 1] += weights[k] * g1
+        for k in range(0, 8, 2):
+            _mark(dirty, rows[k], rows[k + 1])
 
 
 @kernel
@@ -185,38 +171,6 @@ def scatter(counter, worker, grid, levels, x, d_features, counts, gradient, dirt
                 _scatter_level(True, res, mask, x[c], d0, d1, level_gradient, level_dirty)
             else:
                 _scatter_level(False, res, mask, x[c], d0, d1, level_gradient, level_dirty)
-
-
-@kernel
-def smooth_grid(counter, worker, grid, levels, smooth, gradient, dirty):
-    """Add the gradient of half the squared differences between neighboring vertices, times ``smooth``
-    (float32), to what is about to be updated; a task is a level.
-
-    Only levels that are stored densely: in a hashed one, neighbors in the table are not neighbors in space.
-    Only segments that are dirty already: what no ray reaches stays as it is.
-    """
-    while True:
-        level = fetch_add(counter, 1)
-        if level >= levels:
-            return
-        if not grid.dense[level]:
-            continue
-        side, first = np.int64(grid.resolution[level]) + 1, grid.first[level]
-        plane = side * side
-        for row in range(side * plane):
-            if not dirty[(first + row) // SEGMENT]:
-                continue
-            i, j, k = row % side, (row // side) % side, row // plane
-            at = first + row
-            x0, x1 = at - 1 if i > 0 else at, at + 1 if i < side - 1 else at
-            y0, y1 = at - side if j > 0 else at, at + side if j < side - 1 else at
-            z0, z1 = at - plane if k > 0 else at, at + plane if k < side - 1 else at
-            for c in range(FEATURES):
-                p = grid.table[at, c]
-                apart = (p - grid.table[x0, c]) + (p - grid.table[x1, c])
-                apart += (p - grid.table[y0, c]) + (p - grid.table[y1, c])
-                apart += (p - grid.table[z0, c]) + (p - grid.table[z1, c])
-                gradient[at, c] += smooth * apart
 
 
 @overload(query_density)

@@ -27,6 +27,7 @@ from edge_server.fields.common.field_state import all_or_nothing
 from edge_server.fields.common.supervision import check_view
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool, compile_kernels, shared_pool
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
+from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import COLOR, Gaussians
 from edge_server.fields.splat.layers.exposures import equalize_exposures
 from edge_server.fields.splat.layers.layered_state import pack, unpack
@@ -58,7 +59,6 @@ from edge_server.fields.splat.layers.static_layer import PlateImage, StaticLayer
 from edge_server.fields.splat.layers.tracker import MotionTracker, PartTimes
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.snapshot import SplatSnapshot
-from edge_server.fields.splat.still_field import StillField
 from freshfield.geometry import Pinhole
 
 log = logging.getLogger(__name__)

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.field_state import unpack_meta
 from edge_server.fields.common.supervision import check_view
+from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.layers.motion import ViewRow
 from edge_server.fields.splat.layers.observations import FRAMES_KNOWN, FixedCamera, Observation, Observations
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
 from edge_server.fields.splat.layers.static_layer import StaticLayer
-from edge_server.fields.splat.still_field import StillField
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Budget, Rendering, View
 from edge_server.fields.common.training_schedule import StepBudget
+from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.layers.settings import (
     CHANGED,
@@ -33,7 +34,6 @@ from edge_server.fields.splat.layers.settings import (
 )
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.snapshot import SplatSnapshot
-from edge_server.fields.splat.still_field import StillField
 
 Arrays = dict[str, NDArray]
 

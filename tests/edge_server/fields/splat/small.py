@@ -3,9 +3,9 @@
 import numpy as np
 
 from edge_server.fields import Rendering
+from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
 from edge_server.fields.splat.settings import ASPECT, POSITION_LIMIT, RAW_OPACITY_LIMIT, SplatSettings
-from edge_server.fields.splat.still_field import StillField
 
 FIELD = StillField
 SMALL = SplatSettings(gaussians=1500, start=800, seed_cells=32, densify_every=20, threads=2)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget
+from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
-from edge_server.fields.splat.still_field import StillField
 from tests.edge_server.fields.bounds import run_with_bounds_checks
 from tests.edge_server.fields.scenes import mean_psnr, ring
 from tests.edge_server.fields.small import healthy

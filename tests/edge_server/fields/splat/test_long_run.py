@@ -11,8 +11,8 @@ from camera_node.synthetic import make_scene
 from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, View
+from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.settings import SplatSettings
-from edge_server.fields.splat.still_field import StillField
 
 pytestmark = pytest.mark.stability
 

@@ -12,6 +12,7 @@ from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud
+from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import (
     ALPHA,
     ALPHA_MIN,
@@ -36,7 +37,6 @@ from edge_server.fields.splat.planar import (
     plane_depth,
 )
 from edge_server.fields.splat.settings import ALPHA_MAX, SplatSettings
-from edge_server.fields.splat.still_field import StillField
 from edge_server.surface.depth import render_depth_maps
 from freshfield.geometry import Pinhole, look_at, matrix_to_quaternion, world_rays
 from tests.edge_server.fields.scenes import ring

@@ -18,11 +18,11 @@ from msgspec import structs
 
 from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
+from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.layers import layered_field
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.layers.layered_state import VERSION
 from edge_server.fields.splat.settings import SplatSettings
-from edge_server.fields.splat.still_field import StillField
 from tests.edge_server.fields.scenes import picture, psnr, ring
 
 SMALL = SplatSettings(gaussians=1200, start=700, seed_cells=32, densify_every=20, threads=2)

@@ -16,8 +16,8 @@ from edge_server.fields.common.kernels.plane_sweep import NOT_SEEN, SEES, UNMARK
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.supervision import pack_cameras
 from edge_server.fields.common.threads.thread_pool import CallerPool
+from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.seeding import seed_gaussians
-from edge_server.fields.splat.still_field import StillField
 from tests.edge_server.fields.scenes import picture
 from tests.edge_server.fields.small import HELD, SEEN, VIEWS, score
 from tests.edge_server.fields.splat.small import SMALL
@@ -94,7 +94,7 @@ def test_warming_up_compiles_every_kernel() -> None:
     code = """
 from edge_server.fields.common.kernels import plane_sweep
 from edge_server.fields.splat.kernels import bin_tiles, optimizer_step, project, rasterize
-from edge_server.fields.splat.still_field import StillField
+from edge_server.fields.splat.field import StillField
 StillField().warm_up()
 for module in (plane_sweep, project, rasterize, bin_tiles, optimizer_step):
     for name, thing in vars(module).items():
