@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -17,6 +16,7 @@ from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import SceneBox, plain_background
 from edge_server.fields.common.supervision import pack_cameras, supervising_views
 from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.fields.common.trainer_settings import FieldSettings
 
 TOLERANCE = 0.08  # between colors, summed over channels: with more, walls are found where there are none
 GUIDE_CELLS = 96  # a side: finer cells hardly guide better, and cost their cube
@@ -26,16 +26,7 @@ LEAST_VIEWS = 3  # fewest views that must see a cell: two agree on a color too o
 _PLAIN, _CLEAR = 0.06, 16  # distance of a color, summed over channels, and alpha below which a pixel is empty
 
 
-class SweepSettings(Protocol):
-    """The options that are read here."""
-
-    @property
-    def background(self) -> str: ...
-    @property
-    def min_views(self) -> int: ...
-
-
-def empty_color(settings: SweepSettings, views: Sequence[View]) -> NDArray[np.float32] | None:
+def empty_color(settings: FieldSettings, views: Sequence[View]) -> NDArray[np.float32] | None:
     """The pictures' plain background color (3,), if they have one and the field renders it where nothing is.
     With another background, which the user chose, a plain sky has to be learned like everything else."""
     return plain_background(views) if settings.background == "auto" and views else None
@@ -51,7 +42,7 @@ def foreground_mask(image: NDArray[np.uint8], plain: NDArray[np.float32] | None)
 
 
 def score_grid(
-    settings: SweepSettings,
+    settings: FieldSettings,
     pool: Pool,
     box: SceneBox,
     views: Sequence[View],
@@ -136,7 +127,7 @@ def sweep_depths(
 
 
 def depth_guide(
-    settings: SweepSettings, pool: Pool, box: SceneBox, views: Sequence[View], data: Views
+    settings: FieldSettings, pool: Pool, box: SceneBox, views: Sequence[View], data: Views
 ) -> NDArray[np.float32]:
     """The probable distance in scene units of what each pixel of ``data`` shows: float32 (N,), 0: unknown;
     (0,) if too few views supervise."""

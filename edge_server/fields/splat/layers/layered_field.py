@@ -55,7 +55,7 @@ from edge_server.fields.splat.layers.settings import (
     STEP_PROGRESS,
 )
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
-from edge_server.fields.splat.layers.static_layer import PlateImage, StaticLayer, gaussians
+from edge_server.fields.splat.layers.static_layer import PlateImage, StaticLayer
 from edge_server.fields.splat.layers.tracker import MotionTracker, PartTimes
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.snapshot import SplatSnapshot
@@ -487,5 +487,5 @@ class LayeredField:
         if self._exposed is None or self._exposed[0] != key:
             params = shown.gaussians.params.copy()
             params[:, COLOR:] *= np.tile(gain, (params.shape[1] - COLOR) // 3)
-            self._exposed = (key, gaussians(params, self.settings))
+            self._exposed = (key, Gaussians(params, self.settings.harmonics))
         return self._exposed[1]

@@ -32,7 +32,6 @@ from edge_server.fields.splat.layers.settings import (
     SCHEDULE,
     SHOWN_AFTER,
 )
-from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.snapshot import SplatSnapshot
 
 Arrays = dict[str, NDArray]
@@ -213,7 +212,7 @@ class StaticLayer:
         if self.shown is None or self.shown.step != self.field.step:
             snapshot = self.field.snapshot()
             if self._mean is not None:
-                snapshot = replace(snapshot, gaussians=gaussians(self._mean.copy(), self.field.settings))
+                snapshot = replace(snapshot, gaussians=Gaussians(self._mean.copy(), self.field.settings.harmonics))
             self.shown = snapshot
 
     def render(self, views: Iterable[View]) -> None:
@@ -249,8 +248,3 @@ class StaticLayer:
         if known:
             views = self.field.view_store.views
             self.field.take_in([replace(v, weight=known[v.camera]) for v in views if v.camera in known])
-
-
-def gaussians(params: NDArray[np.float32], settings: SplatSettings) -> Gaussians:
-    """The Gaussians of parameters float32 (N, P)."""
-    return Gaussians(params, settings.harmonics)

@@ -217,7 +217,7 @@ def _interlevel_oracle(values: torch.Tensor, cell, length, group, of, w) -> tupl
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_interlevel_loss_and_gradient_equal_the_oracle_and_finite_differences(seed: int) -> None:
+def test_interlevel_loss_and_gradient_equal_the_oracle(seed: int) -> None:
     encoding, cell, length, depth, group, of, w = _interlevel_case(seed)
     weight, grad = np.empty(14, F), np.full(14, 7.0, F)
     bin_weights(depth, 2, 12, weight)
@@ -244,12 +244,6 @@ def test_interlevel_loss_and_gradient_equal_the_oracle_and_finite_differences(se
     assert values.grad is not None
     np.testing.assert_allclose(grad[2:], values.grad.numpy()[cell], rtol=2e-3, atol=3e-5)
     assert (grad[:2] == 7.0).all() and np.abs(grad[2:]).max() > 1e-3
-    for k in range(0, 12, 3):
-        step = torch.zeros_like(values)
-        step[cell[k]] = 1e-5
-        with torch.no_grad():
-            above, below = (_interlevel_oracle(values + sign * step, *rest)[1] for sign in (1, -1))
-        assert (above - below).item() / 2e-5 == pytest.approx(grad[2 + k], rel=2e-3, abs=2e-5)
 
 
 def test_the_proposals_gradient_is_added_up_once() -> None:

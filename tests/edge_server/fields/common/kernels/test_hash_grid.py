@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from edge_server.fields.common.kernels.hash_grid import SEGMENT, Grid, encode, scatter, smooth_grid
+from edge_server.fields.common.kernels.hash_grid import SEGMENT, encode, scatter
 from edge_server.fields.common.model_layout import make_grid
 from edge_server.fields.ngp.settings import NgpSettings
 from tests.edge_server.fields import torch_model
@@ -60,44 +58,3 @@ def test_table_gradient_equals_the_oracle() -> None:
     np.testing.assert_allclose(gradient, oracle.table.grad.numpy(), atol=1e-4)
     touched = (gradient.reshape(len(dirty), -1) != 0).any(axis=1)
     assert (dirty >= touched).all() and not dirty.all()
-
-
-def _variation(grid: Grid, levels: int, table: Tensor) -> Tensor:
-    """Half the squared differences between neighboring vertices of the levels that are stored densely."""
-    total = table.sum() * 0.0
-    for l in range(levels):
-        side = int(grid.resolution[l]) + 1
-        if grid.dense[l]:
-            first = int(grid.first[l])
-            cube = table[first : first + side**3].view(side, side, side, 2)
-            for axis in range(3):
-                total = total + 0.5 * cube.diff(dim=axis).square().sum()
-    return total
-
-
-def _smoothed(grid: Grid, levels: int, dirty: NDArray[np.bool_]) -> NDArray[np.float32]:
-    gradient = np.zeros_like(grid.table)
-    smooth_grid(np.zeros(1, np.int64), 0, grid, levels, np.float32(0.3), gradient, dirty)
-    return gradient
-
-
-def test_gradient_of_the_variation_equals_the_oracle() -> None:
-    grid, _, _ = _case(2)
-    everywhere = np.ones(len(grid.table) // SEGMENT, np.bool_)
-    gradient = _smoothed(grid, 4, everywhere)
-    table = torch.as_tensor(grid.table, dtype=torch.float64).requires_grad_(True)
-    (0.3 * _variation(grid, 4, table)).backward()
-    assert table.grad is not None
-    np.testing.assert_allclose(gradient, table.grad.numpy(), atol=1e-5)
-    assert not gradient[grid.first[np.flatnonzero(~grid.dense)[0]] :].any(), "a hashed level was smoothed"
-    assert not _smoothed(grid, 1, everywhere)[grid.first[1] :].any(), "a level that is off was smoothed"
-
-
-def test_variation_is_smoothed_only_where_something_is_learnt() -> None:
-    grid, _, _ = _case(2)
-    dirty = np.zeros(len(grid.table) // SEGMENT, np.bool_)
-    dirty[2] = True
-    gradient = _smoothed(grid, 4, dirty)
-    rows = np.flatnonzero(gradient.any(axis=1))
-    assert rows.min() == 2 * SEGMENT and rows.max() < 3 * SEGMENT
-    np.testing.assert_array_equal(gradient[rows], _smoothed(grid, 4, ~dirty | dirty)[rows])

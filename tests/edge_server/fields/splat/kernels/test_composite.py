@@ -138,24 +138,3 @@ def test_a_broken_row_leaves_light_and_the_others_sums_finite(column: int, broke
     slopes, sums = np.ones(4 * PIXELS, np.float32), np.zeros((3, SUMS), np.float32)
     _composite_backward(strip_pairs, laid, strip_pairs, rows, slopes, saved, sums)
     assert np.isfinite(sums[[0, 2]]).all()
-
-
-def test_each_strip_of_a_tile_has_its_own_light() -> None:
-    """``first`` says where a strip lies: the others of the tile are left alone, forward and back."""
-
-    @njit
-    def second(strip_pairs, owner, projected, tile, slopes, saved, sums):
-        composite(strip_pairs, 1, owner, projected, np.float32(0.0), np.float32(2.0), tile, STRIP, saved, 0)
-        composite_backward(
-            strip_pairs, 1, owner, projected, np.float32(0.0), np.float32(2.0), slopes, STRIP, saved, sums
-        )
-
-    rows, strip_pairs, sums = _row(0.6)[None], np.zeros(1, np.int32), np.zeros((2, 1, SUMS), np.float32)
-    inside = np.zeros((4, STRIPS, STRIP), np.float32)
-    inside[:, 1] = 1.0
-    for n, slopes in enumerate((inside, 1.0 - inside)):
-        tile, saved = _dark_tile(), np.zeros(SAVED, np.float32)
-        second(strip_pairs, strip_pairs, rows, tile, slopes.reshape(-1), saved, sums[n])
-    assert sums[0].all() and not sums[1].any()
-    changed = (tile != _dark_tile()).reshape(5, STRIPS, STRIP).any(axis=(0, 2))
-    assert changed.tolist() == [False, True, False, False]

@@ -110,18 +110,6 @@ def test_a_gaussians_gradient_does_not_depend_on_its_place_in_a_block() -> None:
         assert not part.any()
 
 
-def test_cameras_add_up() -> None:
-    params = random_params(COUNT, seed=3)
-    raster, cams = _raster(params)
-    both = _gradient(params, raster, cams)
-    kept, parts = raster.lists.own_count.copy(), []
-    for b in (0, 1):
-        raster.lists.own_count[:] = kept
-        raster.lists.own_count[1 - b] = 0
-        parts.append(_gradient(params, raster, cams))
-    np.testing.assert_allclose(parts[0] + parts[1], both, rtol=1e-4, atol=1e-7)
-
-
 @pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("column", [1, 7])
 def test_what_is_not_finite_is_dropped_and_counted(column: int, broken: float) -> None:
