@@ -1,7 +1,7 @@
 """Representations by name. A package is imported only when its representation is asked for.
 
-A package has ``field.make(settings)`` and, in ``settings``, the settings class ``SETTINGS`` and ``EFFORTS``,
-presets of its options.
+A package has, in ``settings``, the settings class ``SETTINGS``, which names the module with ``make(settings)``, and
+``EFFORTS``, presets of its options.
 """
 
 from __future__ import annotations
@@ -46,8 +46,9 @@ def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 
     Raises ValueError for an unknown representation or option (the message lists the known ones), or for a
     value that it cannot have.
     """
-    make: Callable[[Any], Field] = _module(name, "field").make
-    return make(settings_of(name, options, seed))
+    settings = settings_of(name, options, seed)
+    make: Callable[[Any], Field] = import_module(f"edge_server.fields.{settings.module}").make
+    return make(settings)
 
 
 def settings_of(name: str, options: Mapping[str, Any] | None = None, seed: int = 0) -> Any:

@@ -54,6 +54,11 @@ class FieldSettings(Settings, frozen=True):
     rate_end: float = 0.1
     epsilon: float = 5e-3
 
+    @property
+    def module(self) -> str:
+        """The module within ``edge_server.fields`` whose ``make`` makes the field."""
+        return f"{self.name}.field"
+
     def __post_init__(self) -> None:
         if not re.fullmatch("auto|white|black|#[0-9a-fA-F]{6}", self.background):
             raise ValueError(

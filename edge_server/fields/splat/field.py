@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Budget, Field, View
+from edge_server.fields import Budget, View
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import UNIT_BOX
@@ -290,10 +290,4 @@ def _gaussians_of(settings: SplatSettings, state: Arrays) -> GaussianCloud:
     return GaussianCloud(**arrays)
 
 
-def make(settings: SplatSettings) -> Field:
-    """The Gaussian field that a scenario asks for: in layers, or of still Gaussians alone."""
-    if settings.layers:
-        from edge_server.fields.splat.layers.layered_field import LayeredField  # imported only where used
-
-        return LayeredField(settings)
-    return StillField(settings)
+make = StillField

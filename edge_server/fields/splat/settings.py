@@ -65,6 +65,11 @@ class SplatSettings(FieldSettings, frozen=True):
     ] = False
 
     @property
+    def module(self) -> str:
+        """Layers are imported only where they are asked for."""
+        return "splat.layers.layered_field" if self.layers else "splat.field"
+
+    @property
     def planar(self) -> bool:
         """Whether Gaussians are made flat, so that depth is rendered from their planes."""
         return self.flatten > 0.0 or self.align > 0.0

@@ -489,3 +489,6 @@ class LayeredField:
             params[:, COLOR:] *= np.tile(gain, (params.shape[1] - COLOR) // 3)
             self._exposed = (key, Gaussians(params, self.settings.harmonics))
         return self._exposed[1]
+
+
+make = LayeredField
