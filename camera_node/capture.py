@@ -6,31 +6,18 @@ import contextlib
 import ctypes
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 from camera_node.capture_schedule import CaptureSchedule, RateSchedule, ScheduledSource
 from camera_node.clocks import ClockError, NodeClock
 from camera_node.config import SourceConfig
-from camera_node.sources.base import Source
+from camera_node.sources.base import Shot, Source
 from camera_node.sources.registry import open_sources
 from camera_node.sources.with_effects import camera_effects
 from freshfield import payload
 from freshfield.clock import Clock
-from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import Scenario
-
-
-@dataclass(frozen=True)
-class EncodedShot:
-    """A compressed shot: the part of a frame that does not depend on its due instant. Fields as in
-    ``Shot``."""
-
-    payload: bytes
-    pose: Pose
-    intrinsics: Pinhole
-    pose_gap_ns: int
-    captured_ns: int | None = None
 
 
 class ShotCache:
@@ -43,13 +30,13 @@ class ShotCache:
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = max_bytes
         self.bytes = 0
-        self._shots: dict[tuple[str, int], EncodedShot] = {}
+        self._shots: dict[tuple[str, int], Shot] = {}
         self._lock = threading.Lock()
 
-    def get(self, camera: str, content: int) -> EncodedShot | None:
+    def get(self, camera: str, content: int) -> Shot | None:
         return self._shots.get((camera, content))
 
-    def put(self, camera: str, content: int, shot: EncodedShot) -> None:
+    def put(self, camera: str, content: int, shot: Shot) -> None:
         """Keep a shot if it fits."""
         with self._lock:
             fits = self.bytes + len(shot.payload) <= self.max_bytes
@@ -91,13 +78,13 @@ class Camera:
         """The multiples of 1 / fps, shifted by the camera's phase."""
         return RateSchedule(self.fps, self.source.phase_ns)
 
-    def cached(self, tick: int) -> EncodedShot | None:
+    def cached(self, tick: int) -> Shot | None:
         """The tick's shot if it is cached, else None."""
         if self.source.contents is None:
             return None
         return self._cache.get(self.name, self.source.content(tick))
 
-    def capture(self, tick: int) -> EncodedShot:
+    def capture(self, tick: int) -> Shot:
         """The tick's shot, from the cache or newly made. Making it takes milliseconds: do not call this on
         the event loop.
 
@@ -105,7 +92,7 @@ class Camera:
         """
         return self.shot(self.source.content(tick))
 
-    def shot(self, content: int) -> EncodedShot:
+    def shot(self, content: int) -> Shot:
         """The source's shot number ``content``, from the cache or newly made; a repeating shot is cached
         while there is room. Raises as ``capture``."""
         if self.source.contents is None:
@@ -127,13 +114,13 @@ class Camera:
             return False
         return self._cache.bytes + (contents - 1) * len(shot.payload) <= self._cache.max_bytes
 
-    def _encode(self, content: int) -> EncodedShot:
+    def _encode(self, content: int) -> Shot:
         shot = self.source.read(content)
         data = shot.image
         if not isinstance(data, bytes):
             data = payload.encode(data, self.codec, self._quality)
         payload.check(data, self.codec, shot.intrinsics.width, shot.intrinsics.height)
-        return EncodedShot(data, shot.pose, shot.intrinsics, shot.pose_gap_ns, shot.captured_ns)
+        return replace(shot, image=data)
 
 
 def build_cameras(

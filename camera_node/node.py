@@ -16,11 +16,12 @@ from typing import Any
 
 import grpc.aio
 
-from camera_node.capture import Camera, EncodedShot, prepare
+from camera_node.capture import Camera, prepare
 from camera_node.clock_offset import ClockSync
 from camera_node.clocks import NodeClock
 from camera_node.outbox import Outbox
 from camera_node.sender import Sender
+from camera_node.sources.base import Shot
 from freshfield.clock import Clock, WallClock
 from freshfield.files import write_json
 from freshfield.frame import Frame
@@ -192,7 +193,7 @@ class Node:
             tick, missed = schedule.next(tick, self._clock.now_ns())
             trouble["missed"] += missed
 
-    def _frame(self, camera: Camera, shot: EncodedShot, sequence: int, generated_ns: int) -> Frame:
+    def _frame(self, camera: Camera, shot: Shot, sequence: int, generated_ns: int) -> Frame:
         return Frame(
             camera=camera.name,
             session=self.session,

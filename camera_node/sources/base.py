@@ -31,6 +31,12 @@ class Shot:
     pose_gap_ns: int = 0
     captured_ns: int | None = None
 
+    @property
+    def payload(self) -> bytes:
+        """The image of an encoded shot."""
+        assert isinstance(self.image, bytes)
+        return self.image
+
 
 def rate(fps: float) -> Fraction:
     """A frame rate as a fraction with a denominator up to 1001: 29.97 is 2997/100, 33.3333 is 100/3."""

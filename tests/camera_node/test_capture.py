@@ -6,9 +6,10 @@ import asyncio
 
 import pytest
 
-from camera_node.capture import EncodedShot, ShotCache, build_cameras, prepare
+from camera_node.capture import ShotCache, build_cameras, prepare
 from camera_node.config import source_config
 from camera_node.outbox import Outbox
+from camera_node.sources.base import Shot
 from freshfield import ledger
 from freshfield.clock import VirtualClock
 from freshfield.frame import Frame
@@ -20,7 +21,7 @@ POSE, LENS = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Pinhole.from_fov(8, 8,
 
 def test_the_cache_never_exceeds_its_bound_and_keeps_what_it_has():
     cache = ShotCache(100)
-    shots = [EncodedShot(bytes(30), POSE, LENS, 0) for _ in range(5)]
+    shots = [Shot(bytes(30), POSE, LENS, 0) for _ in range(5)]
     for k in (0, 1, 2, 3, 4, 0):
         cache.put("a", k, shots[k])
     assert [cache.get("a", k) for k in range(5)] == [*shots[:3], None, None] and cache.bytes == 90

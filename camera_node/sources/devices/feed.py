@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from freshfield.geometry import Pinhole
-from freshfield.scenario import Scenario
 
 Image = NDArray[np.uint8]
 
@@ -30,10 +28,6 @@ class Feed(ABC):
     intrinsics: Pinhole | None = None
     no_intrinsics: str = ""
     stamped_by: str = ""
-
-    @classmethod  # noqa: B027
-    def check(cls, scenario: Scenario, config: Any, cameras: Sequence[str]) -> None:
-        """Find errors before any camera is opened. Raises ScenarioError or CameraError."""
 
     @abstractmethod
     def grab(self, timeout_s: float) -> tuple[int, Image] | None:

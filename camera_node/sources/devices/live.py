@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from camera_node.config import LiveConfig
 from camera_node.pose.providers import Closable, FixedPose, PoseProvider
@@ -38,14 +37,12 @@ _DRIVERS = {"camera": ("opencv", "OpenCvFeed"), "oak": ("oak", "OakFeed"), "real
 def open_feed(camera: str, config: LiveConfig, fps: Fraction, clock: Clock) -> Feed:
     """Open a camera of the scenario. clock: of its time stamps. Raises CameraError for any driver error."""
     try:
-        return _driver(config.kind)(camera, config.devices.get(camera), config, fps, clock)
+        module, name = _DRIVERS[config.kind]
+        driver = getattr(importlib.import_module(f"camera_node.sources.devices.{module}"), name)
+        opened: Feed = driver(camera, config.devices.get(camera), config, fps, clock)
+        return opened
     except Exception as error:
         raise as_camera_error(camera, error) from None
-
-
-def _driver(kind: str) -> Any:
-    module, name = _DRIVERS[kind]
-    return getattr(importlib.import_module(f"camera_node.sources.devices.{module}"), name)
 
 
 def _close_quietly(feed: Feed) -> None:
@@ -170,7 +167,6 @@ class LiveSource(Source):
 
 def open_live(scenario: Scenario, config: LiveConfig, cameras: Sequence[str]) -> dict[str, Source]:
     """See ``camera_node.sources.registry.open_sources``. Raises ScenarioError, CameraError or ArmError."""
-    _driver(config.kind).check(scenario, config, cameras)  # before connecting to an arm
     if len(cameras) > 1:
         for camera in cameras:
             if camera not in config.devices:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import datetime
 import logging
 import os
-from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any, cast
 
@@ -27,7 +26,6 @@ from camera_node.sources.devices.feed import (
 from camera_node.sources.devices.lens_coefficients import fit_opencv_distortion
 from freshfield.clock import Clock
 from freshfield.geometry import Pinhole
-from freshfield.scenario import Scenario, ScenarioError
 
 log = logging.getLogger("camera-node")
 
@@ -70,16 +68,11 @@ class OakFeed(Feed):
 
     stamped_by = "the device, at the middle of the exposure"
 
-    @classmethod
-    def check(cls, scenario: Scenario, config: OakConfig, cameras: Sequence[str]) -> None:
-        sockets = library().CameraBoardSocket.__members__
-        if config.socket not in sockets:
-            raise ScenarioError(f"{scenario.path}: source.socket: expected one of {', '.join(sockets)}")
-        for camera in cameras:
-            find(camera, config.devices.get(camera))
-
     def __init__(self, camera: str, device: str | None, config: OakConfig, fps: Fraction, clock: Clock) -> None:
         dai = library()
+        sockets = dai.CameraBoardSocket.__members__
+        if config.socket not in sockets:
+            raise CameraError(f"{camera}: source.socket: expected one of {', '.join(sockets)}")
         self._device: Any = None
         self._pipeline: Any = None
         try:

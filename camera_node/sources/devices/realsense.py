@@ -8,7 +8,6 @@ frame's metadata tell the middle of the exposure, that is used instead.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any, cast
 
@@ -27,7 +26,6 @@ from camera_node.sources.devices.feed import (
 from camera_node.sources.devices.lens_coefficients import fit_opencv_distortion
 from freshfield.clock import Clock, SystemClock
 from freshfield.geometry import Pinhole
-from freshfield.scenario import Scenario
 
 _LONGEST_EXPOSURE_US = 200_000  # the color sensors of the series expose at most 165 ms
 
@@ -70,11 +68,6 @@ class RealsenseFeed(Feed):
     """A running pipeline of one camera's color stream."""
 
     stamped_by = "the device, at the middle of the exposure where it tells that"
-
-    @classmethod
-    def check(cls, scenario: Scenario, config: RealsenseConfig, cameras: Sequence[str]) -> None:
-        for camera in cameras:
-            find(camera, config.devices.get(camera))
 
     def __init__(self, camera: str, device: str | None, config: RealsenseConfig, fps: Fraction, clock: Clock) -> None:
         rs = library()

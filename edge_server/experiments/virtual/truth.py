@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.capture import Camera, EncodedShot
+from camera_node.capture import Camera
+from camera_node.sources.base import Shot
 from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from freshfield import payload
@@ -106,7 +107,7 @@ def _instant_ns(camera: Camera, tick: int) -> int:
     return tick * 10**9 * camera.fps.denominator // camera.fps.numerator
 
 
-def _image(camera: Camera, shot: EncodedShot) -> NDArray[np.uint8]:
+def _image(camera: Camera, shot: Shot) -> NDArray[np.uint8]:
     return payload.decode(shot.payload, camera.codec, shot.intrinsics.width, shot.intrinsics.height)
 
 

@@ -13,15 +13,14 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node.capture import build_cameras
 from camera_node.config import source_config
 from camera_node.pose.providers import FixedPose
 from camera_node.sources.devices import oak
 from camera_node.sources.devices.feed import CameraError
-from camera_node.sources.devices.live import LiveSource
+from camera_node.sources.devices.live import LiveSource, open_feed
 from freshfield.clock import WallClock
 from freshfield.geometry import Pose
-from freshfield.scenario import ScenarioError, parse
+from freshfield.scenario import parse
 
 try:
     dai = oak.library()
@@ -178,14 +177,14 @@ def test_without_a_device_one_clear_line_within_three_seconds():
     begin = time.monotonic()
     scenario = plan()
     with pytest.raises(CameraError, match="eye: no OAK camera found: is it plugged in"):
-        build_cameras(scenario, source_config(scenario), ["eye"])
+        open_feed("eye", source_config(scenario), Fraction(15), WallClock())
     assert time.monotonic() - begin < 3.0
 
 
 def test_an_unknown_socket_is_refused():
     scenario = plan(socket="CAM_Q")
-    with pytest.raises(ScenarioError, match=r"source.socket: expected one of .*CAM_A"):
-        build_cameras(scenario, source_config(scenario), ["eye"])
+    with pytest.raises(CameraError, match=r"source.socket: expected one of .*CAM_A"):
+        open_feed("eye", source_config(scenario), Fraction(15), WallClock())
 
 
 def test_the_library_leaves_the_processs_signals_alone():

@@ -11,9 +11,9 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from camera_node.capture import build_cameras
 from camera_node.config import source_config
 from camera_node.sources.devices.feed import CameraError
+from camera_node.sources.devices.live import open_feed
 from freshfield.clock import VirtualClock, WallClock
 from freshfield.scenario import parse
 
@@ -127,7 +127,7 @@ def test_without_a_device_one_clear_line_within_three_seconds():
     scenario = parse({"cameras": {"ids": ["eye"]}, "source": {"kind": "realsense"}}, Path("scenario.yaml"))
     begin = time.monotonic()
     with pytest.raises(CameraError, match="eye: no RealSense camera found: is it plugged in"):
-        build_cameras(scenario, source_config(scenario), ["eye"])
+        open_feed("eye", source_config(scenario), Fraction(15), WallClock())
     assert time.monotonic() - begin < 3.0
 
 
