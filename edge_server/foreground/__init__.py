@@ -20,7 +20,7 @@ from freshfield.settings import Settings, about, read_settings, within
 MODELS = Path(__file__).parent / "models"
 # The segmentation models that we ship, by the name of the object: the file in ``MODELS``.
 SHIPPED = {"tile": "tile_int8.onnx"}
-# Why an image is used whole, by the name of its count in ``foreground.Counts``.
+# Why an image is used whole, by the name of its count (``foreground.Foreground``).
 WHY = {
     "not_detected": "nothing was found in it",
     "empty_box": "the box has no area within it",

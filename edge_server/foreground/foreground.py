@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from dataclasses import dataclass
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,25 +24,15 @@ Box = tuple[int, int, int, int]
 """Left, top, right, bottom: whole pixels within the image, not empty."""
 
 
-@dataclass
-class Counts:
-    """Images per result: masked, or unchanged because nothing was detected, the box or the mask had no area,
-    the mask covered everything, or the model failed."""
-
-    masked: int = 0
-    not_detected: int = 0
-    empty_box: int = 0
-    empty_mask: int = 0
-    full_mask: int = 0
-    failed: int = 0
-
-
 class Foreground:
-    """Applied once to every decoded image. ``seconds``: total run time, for reports only."""
+    """Applied once to every decoded image.
+
+    counts: images masked, and used whole by reason (``WHY``). seconds: total run time, for reports only.
+    """
 
     def __init__(self, config: ForegroundConfig, detector: Detector) -> None:
         self.config, self.detector = config, detector
-        self.counts = Counts()
+        self.counts: Counter[str] = Counter(dict.fromkeys(("masked", *WHY), 0))
         self.seconds = 0.0
         self._said: set[tuple[str, str]] = set()
 
@@ -57,7 +47,7 @@ class Foreground:
             found = "failed"
         self.seconds += time.perf_counter() - begun
         counted = found if isinstance(found, str) else "masked"
-        setattr(self.counts, counted, getattr(self.counts, counted) + 1)
+        self.counts[counted] += 1
         if isinstance(found, str):
             self._say(camera, found)
             return image
@@ -73,7 +63,7 @@ class Foreground:
             log.warning("camera %s: an image is used whole: %s (further ones: edge.json)", camera, WHY[why])
 
     def _mask(self, image: Image) -> NDArray[np.bool_] | str:
-        """Object mask (H, W); if the image passes unchanged, why: a name of ``Counts``."""
+        """Object mask (H, W); if the image passes unchanged, why: a name in ``WHY``."""
         c = self.config
         found = [d for d in self.detector.detect(image, c.confidence) if not c.kinds or d.kind in c.kinds]
         if not found:
@@ -92,8 +82,8 @@ class Foreground:
 
     def status(self) -> dict[str, Any]:
         """Counts, and milliseconds per image."""
-        images = sum(vars(self.counts).values())
-        return {**vars(self.counts), "ms_per_image": 1e3 * self.seconds / images if images else None}
+        images = self.counts.total()
+        return {**self.counts, "ms_per_image": 1e3 * self.seconds / images if images else None}
 
 
 def clipped(box: tuple[float, float, float, float], width: int, height: int) -> Box | None:

@@ -32,7 +32,7 @@ def build_report(out_dir: str | Path) -> dict[str, Any]:
     """
     # Lazy: only the figures need matplotlib.
     from edge_server.report.figures import draw_all
-    from edge_server.report.page import render_page
+    from edge_server.report.report_page import render_page
 
     out = Path(out_dir)
     files = read_run_files(out)

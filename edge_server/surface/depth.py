@@ -93,35 +93,14 @@ def depth_map(
 
 def incidence_cosine(depth: NDArray[np.float32], intrinsics: Pinhole) -> NDArray[np.float32]:
     """Cosine between each ray and the surface normal, float32 (H, W); 0 if a neighbor that the normal needs
-    has no depth."""
-    rays = intrinsics.rays()
-    points = rays * depth[..., None].astype(np.float64)
-    right, down = (_slope(points, depth > 0, axis) for axis in (1, 0))
-    normal = np.cross(right, down)
+    has no depth. Every side of the image has two pixels or more."""
+    rays, known = intrinsics.rays(), depth > 0
+    points = np.where(known[..., None], rays * depth[..., None].astype(np.float64), np.nan)
+    normal = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
     length = np.linalg.norm(normal, axis=-1)
     along = np.abs((normal * rays).sum(axis=-1))
-    return np.where(length > 0, along / np.where(length > 0, length, 1.0), 0.0).astype(np.float32)
-
-
-def _slope(points: NDArray[np.float64], known: NDArray[np.bool_], axis: int) -> NDArray[np.float64]:
-    """Difference of points (H, W, 3) along an axis, from both neighbors, or one at the border; 0 if a
-    neighbor is unknown."""
-    step = np.diff(points, axis=axis)
-    both = np.take(known, range(1, known.shape[axis]), axis) & np.take(known, range(known.shape[axis] - 1), axis)
-    out = np.zeros_like(points)
-    count = np.zeros(known.shape)
-    after = [slice(None)] * 2
-    before = [slice(None)] * 2
-    after[axis], before[axis] = slice(1, None), slice(None, -1)
-    for where in (tuple(after), tuple(before)):
-        out[where] += step
-        count[where] += both
-    needed = np.full(known.shape, 2)
-    edge = [slice(None)] * 2
-    for end in (0, -1):
-        edge[axis] = end  # type: ignore[call-overload]
-        needed[tuple(edge)] = 1
-    return np.where((count == needed)[..., None], out, 0.0)
+    sure = known & (length > 0)
+    return np.where(sure, along / np.where(sure, length, 1.0), 0.0).astype(np.float32)
 
 
 def render_depth_maps(

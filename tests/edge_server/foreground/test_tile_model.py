@@ -1,4 +1,4 @@
-"""The shipped segmentation model of the tile, on views it was not trained on: near, cut off, far away, and none."""
+"""The shipped segmentation model of the tile, on views it was not trained on: near, far away, and none."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.edge_server.foreground.pictures import iou
 for module in ("onnx", "onnxruntime"):
     pytest.importorskip(module, reason="needs ONNX Runtime: pip install -e '.[embed]'")
 
-WIDE, NARROW = 75.0, 40.0
+WIDE = 75.0
 
 
 @pytest.fixture(scope="module")
@@ -25,18 +25,10 @@ def tile() -> Foreground:
     return make_foreground(ForegroundConfig("tile"))
 
 
-def seen(
-    distance_m: float,
-    azimuth: float,
-    elevation: float,
-    fov_deg: float,
-    bench: bool = True,
-    aim=(0.0, 0.0, 0.03),
-    size=(128, 128),
-):
+def seen(distance_m: float, azimuth: float, elevation: float, fov_deg: float, bench: bool = True):
     """(image, true mask) of the tile from somewhere."""
     scene = make_scene("tile", {"count": 1, "bench": bench})
-    lens, pose = Pinhole.from_fov(*size, fov_deg), on_sphere(aim, distance_m, azimuth, elevation)
+    lens, pose = Pinhole.from_fov(128, 128, fov_deg), on_sphere((0.0, 0.0, 0.03), distance_m, azimuth, elevation)
     return scene.view(lens, pose).image(0.0), scene.object_mask(lens, pose)
 
 
@@ -56,25 +48,6 @@ def test_the_tile_is_cut_out_as_a_hand_sees_it(tile, bench):
     assert np.mean(found) > (0.85 if bench else 0.94) and min(found) > (0.75 if bench else 0.9), found
 
 
-def test_the_tile_is_cut_out_of_its_own_scene(tile):
-    scene, found = make_scene("tile", {"count": 7}), []
-    for name, (lens, pose) in scene.cameras.items():
-        found.append(iou(mask_of(tile, scene.render(name, 0.0)), scene.object_mask(lens, pose)))
-    assert np.mean(found) > 0.9 and min(found) > 0.8, found
-
-
-def test_larger_pictures_of_another_shape_are_cut_too(tile):
-    image, truth = seen(0.8, 30, 45, 60.0, size=(320, 200))
-    assert iou(mask_of(tile, image), truth) > 0.8
-
-
-@pytest.mark.parametrize("aim", [(0.30, 0.0, 0.03), (0.0, 0.26, 0.0), (-0.25, -0.2, 0.0)])
-def test_a_tile_that_the_edge_of_the_picture_cuts_off_is_found(tile, aim):
-    image, truth = seen(0.55, 20, 50, NARROW, aim=aim)
-    assert truth[[0, -1]].any() or truth[:, [0, -1]].any()
-    assert iou(mask_of(tile, image), truth) > 0.75
-
-
 @pytest.mark.parametrize("azimuth", [-60, 10, 100])
 def test_a_tile_far_away_is_found(tile, azimuth):
     image, truth = seen(2.0, azimuth, 45, 60.0)
@@ -91,4 +64,4 @@ def test_a_picture_without_the_tile_is_used_whole():
     for azimuth in (-30, 60, 150):
         image = empty.view(Pinhole.from_fov(128, 128, WIDE), on_sphere((0, 0, 0.03), 0.5, azimuth, 40)).image(0)
         assert foreground.apply("hand", image) is image, "nothing is lost"
-    assert foreground.counts.not_detected == 3 == sum(vars(foreground.counts).values())
+    assert +foreground.counts == {"not_detected": 3}

@@ -211,15 +211,6 @@ class Browser:
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=float(x), y=float(y), button="left", clickCount=1)
 
-    def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 10) -> None:
-        """Press at ``start``, move to ``end``, release: turns the view."""
-        self.call("Input.dispatchMouseEvent", type="mousePressed", x=start[0], y=start[1], button="left", clickCount=1)
-        for i in range(1, steps + 1):
-            x, y = (a + (b - a) * i / steps for a, b in zip(start, end))
-            self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, button="left", buttons=1)
-            time.sleep(0.03)
-        self.call("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1], button="left", clickCount=1)
-
     def click_text(self, wanted: str) -> None:
         """Click in the middle of the smallest visible thing that shows ``wanted``."""
         at = self.wait_for(lambda: self.evaluate(f"({_FIND})({json.dumps(wanted)})"), f"a {wanted!r}")

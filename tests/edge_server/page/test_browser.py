@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
 from edge_server.page import start_page
-from edge_server.page.scene import FRUSTUM_OF_RADIUS
-from edge_server.page.viewpoint import initial_viewpoint, visitor_camera
-from freshfield.geometry import quaternion_to_matrix, se3_inverse
 from tests.edge_server.page.browser import Browser
 from tests.edge_server.page.preview import Preview
 
@@ -112,51 +107,6 @@ def test_reset_and_snapshot(shown):
     browser.wait_for_text("preview-snapshot.json")
     assert (preview._folder / "preview-snapshot.json").exists()
     browser.close_notices()
-
-
-def test_turning_the_view_renders_from_the_new_place(shown):
-    _, page, browser = shown
-    (client,) = page._server.get_clients().values()
-    before, at = browser.screenshot(), np.array(client.camera.position)
-    browser.drag((790, 300), (640, 260))
-    browser.wait_for(lambda: np.linalg.norm(client.camera.position - at) > 0.5, "the movement")
-    time.sleep(2.0)  # the finer image
-    after = browser.screenshot()
-    assert np.abs(_center(before).astype(float) - _center(after)).mean() > 3
-
-
-def test_clicking_a_camera_looks_through_it(shown):
-    preview, page, browser = shown
-    (client,) = page._server.get_clients().values()
-    frames = [c.newest for c in preview.cameras() if c.newest]
-    poses = np.stack([frame.pose.matrix() for frame in frames])
-    # A picture stands in the middle of its frustum's base; viewer and page scale frustums by their volume.
-    k = frames[0].intrinsics
-    up = k.height / 2 / k.fy
-    size = initial_viewpoint(poses).radius_m * FRUSTUM_OF_RADIUS
-    middles = poses @ [0, 0, size / np.cbrt(up * up * k.width / k.height / 3), 1]
-    # In the page's own pixels: the viewer draws fewer of them where it is slow.
-    box = "document.querySelector('canvas[data-engine]').getBoundingClientRect()"
-    left, top, width, height = browser.evaluate(f"(b => [b.x, b.y, b.width, b.height])({box})")
-    view = client.camera
-    window, lens = visitor_camera(view.position, view.wxyz, view.fov, width, height, rows=height)
-    pixels = lens.project((middles @ se3_inverse(window).T)[:, :3])
-    # The one that stands freest: no other frustum in front of it, no edge of the window near.
-    others = np.linalg.norm(pixels[:, None] - pixels[None], axis=2) + 1e9 * np.eye(len(pixels))
-    borders = np.minimum(pixels, np.array([width, height]) - pixels).min(axis=1)
-    i = int(np.nanargmax(np.minimum(np.nanmin(others, axis=1), borders)))
-    at = pixels[i] + (left, top)
-    browser.hover(*at)
-    time.sleep(1.0)  # the viewer notes what is under the pointer at its next image
-    browser.click(*at)
-    browser.wait_for(
-        lambda: np.allclose(client.camera.position, poses[i, :3, 3], atol=1e-3), f"standing at {frames[i].camera}"
-    )
-    # The viewer reports the position first, while it still looks at where it looked before.
-    browser.wait_for(
-        lambda: np.allclose(quaternion_to_matrix(client.camera.wxyz)[:, 2], poses[i, :3, 2], atol=1e-2),
-        f"looking the way {frames[i].camera} does",
-    )
 
 
 def _center(image: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ from edge_server.page.scene import Scene, thumbnail
 from freshfield import payload
 from freshfield.geometry import Pinhole
 from tests.edge_server.frames import frame
-from tests.edge_server.page.preview import BallScene, Preview
+from tests.edge_server.page.preview import LENS, BallScene, Preview
 from tests.edge_server.page.visitor import Visitor
 from tests.waiting import wait_until
 
@@ -295,6 +295,19 @@ def test_the_page_outlives_a_broken_field(tmp_path, field):
             visitor.wait_for(lambda: visitor.images and _decode(visitor).std() > 20, "the ball")
     finally:
         page.stop()
+
+
+def test_who_clicks_a_camera_looks_through_it(tmp_path):
+    with preview_page(tmp_path) as (preview, page), Visitor(page.port) as visitor:
+        visitor.wait_for(lambda: visitor.counts["CameraFrustumMessage"] >= 9, "the frustums")
+        (client,) = page._server.get_clients().values()
+        click = {"instance_index": None, "screen_pos": [0.5, 0.5], "modifier": None}
+        visitor.send("SceneNodeClickMessage", name="/cameras/cam02", ray_origin=[0] * 3, ray_direction=[1] * 3, **click)
+        pose = preview._poses["cam02"]
+        wait_until(lambda: np.allclose(client.camera.position, pose[:3, 3]), "not at the camera")
+        ahead = client.camera.look_at - pose[:3, 3]
+        assert np.allclose(ahead / np.linalg.norm(ahead), pose[:3, 2], atol=1e-6)
+        assert client.camera.fov == pytest.approx(2 * np.arctan(0.5 * LENS.height / LENS.fy))
 
 
 def test_cameras_that_never_report_stand_in_the_table_only(tmp_path):

@@ -16,7 +16,7 @@ from edge_server.config import ExportConfig
 from edge_server.live.state import Publication
 from edge_server.report.build_report import METRICS, SERIES, assemble, build_report, fidelity, updates
 from edge_server.report.figures import draw_frontier
-from edge_server.report.page import counts, number
+from edge_server.report.report_page import counts, number
 from edge_server.report.run_files import continuous, read_run_files
 from edge_server.run_records import EdgeStatus, UpdateCounts, UpdateRow
 from freshfield_up.summary import summarize
