@@ -93,7 +93,9 @@ def depth_map(
 
 def incidence_cosine(depth: NDArray[np.float32], intrinsics: Pinhole) -> NDArray[np.float32]:
     """Cosine between each ray and the surface normal, float32 (H, W); 0 if a neighbor that the normal needs
-    has no depth. Every side of the image has two pixels or more."""
+    has no depth."""
+    if min(depth.shape) < 2:
+        return np.zeros_like(depth)
     rays, known = intrinsics.rays(), depth > 0
     points = np.where(known[..., None], rays * depth[..., None].astype(np.float64), np.nan)
     normal = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
