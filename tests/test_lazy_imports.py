@@ -53,7 +53,13 @@ import channel_emu.virtual.simulate
                 "torch",
             ),
         ),
-        (NODE, ("camera_node.robot.teleop", "camera_node.robot.calibration.hand_eye.samples", "scipy", "mcap")),
+        (
+            NODE,
+            (
+                *("camera_node.robot.teleop", "camera_node.robot.calibration.hand_eye.samples", "scipy", "mcap"),
+                *("torch", "numba", "matplotlib", "edge_server", "channel_emu", "depthai", "pyrealsense2", "rtde"),
+            ),
+        ),
         (
             NODE_WITHOUT_ARM,
             (

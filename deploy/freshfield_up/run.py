@@ -13,10 +13,9 @@ from types import FrameType
 from freshfield.scenario import Scenario
 from freshfield_up import folder, mesh, net
 from freshfield_up.commands import ProcessSet, process_set, program
-from freshfield_up.display import status_line
 from freshfield_up.processes import GRACE_S, Child, kill, stop
 from freshfield_up.resources import ResourceMonitor
-from freshfield_up.status import read_json, read_status
+from freshfield_up.status import read_json, status_line
 from freshfield_up.summary import summarize
 
 TICK_S = 0.25
@@ -125,8 +124,8 @@ class Launcher:
             resources.sample(now_s - self._began_s, self.processes.children)
             if now_s >= next_line_s:
                 next_line_s = now_s + LINE_EVERY_S
-                status = read_status(self.options.out, self.scenario.cameras)
-                _say(f"[{self._headline(now_s)}] {status_line(status)}")
+                line = status_line(self.options.out, len(self.scenario.cameras))
+                _say(f"[{self._headline(now_s)}] {line}")
             if self._ready_s and self.options.duration_s and now_s - self._ready_s >= self.options.duration_s:
                 return
 

@@ -1,39 +1,30 @@
 """Reads the status files that the processes of a run keep up to date in its folder.
 
 The edge writes ``edge.json``, the emulator ``channel.json`` and the nodes ``node-*.json``. A file that is
-missing or unexpected leaves a gap in the display and has no other effect.
+missing or unexpected leaves a gap in the line and has no other effect.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from freshfield.scenario import NOTHING_HELD_OUT
 
 Status = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class RunStatus:
-    """The newest status of all processes. cameras: one mapping a camera, merged from its node and the
-    edge."""
-
-    cameras: tuple[Status, ...]
-    channel: Status
-    edge: Status
-
-
-def read_status(out: Path, cameras: tuple[str, ...]) -> RunStatus:
-    """The newest status of every process."""
+def status_line(out: Path, cameras: int) -> str:
+    """Cameras, field and channel of the run in ``out`` in one line. cameras: their number."""
     edge = read_json(out / "edge.json")
-    merged: dict[str, Status] = {camera: {"camera": camera} for camera in cameras}
-    for file in sorted(out.glob("node-*.json")):
-        for camera, status in _by_camera(read_json(file)).items():
-            merged.setdefault(camera, {}).update(status)
-    for camera, status in _by_camera(edge).items():
-        merged.setdefault(camera, {}).update(status)
-    return RunStatus(tuple(merged.values()), read_json(out / "channel.json"), edge)
+    listed = edge.get("cameras")
+    each = [camera for camera in listed if isinstance(camera, dict)] if isinstance(listed, list) else []
+    ages = sorted(age for camera in each if (age := number(camera, "age_ms")) is not None)
+    median = f", age {ages[len(ages) // 2]:.0f} ms (median)" if ages else ""
+    return (
+        f"{len(ages)}/{cameras} cameras{median}; {_edge_line(edge)}; {_channel_line(read_json(out / 'channel.json'))}"
+    )
 
 
 def number(status: Status, *path: str) -> float | None:
@@ -49,14 +40,6 @@ def fmt(value: float | None, spec: str) -> str:
     return "-" if value is None else format(value, spec)
 
 
-def _by_camera(status: Status) -> dict[str, Status]:
-    """The ``cameras`` of a status file: a mapping by name, or a list of mappings with a key ``camera``."""
-    cameras = status.get("cameras", {})
-    if isinstance(cameras, dict):
-        return {name: {"camera": name, **w} for name, w in cameras.items() if isinstance(w, dict)}
-    return {w["camera"]: w for w in cameras if isinstance(w, dict) and isinstance(w.get("camera"), str)}
-
-
 def read_json(path: Path) -> Status:
     """The contents of a status file; {} if it cannot be read."""
     try:
@@ -64,3 +47,35 @@ def read_json(path: Path) -> Status:
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
+
+
+def _channel_line(channel: Status) -> str:
+    if not channel:
+        return "no channel yet"
+    parts = [str(channel.get("preset") or "custom")]
+    state = channel.get("state")
+    share = number(channel, "state_share", str(state))
+    if state:
+        parts.append(f"state {state}" + (f" ({share:.0%} of the time)" if share is not None else ""))
+    parts.append(f"forwarded {fmt(number(channel, 'counts', 'forwarded'), '.0f')}")
+    for fate in ("dropped_busy", "superseded", "skipped", "lost", "broken"):
+        if count := number(channel, "counts", fate):
+            parts.append(f"{fate.replace('_', ' ')} {count:.0f}")
+    parts.append(f"delay error p99 {fmt(number(channel, 'delay_error_ms', 'p99'), '.2f')} ms")
+    return ", ".join(parts)
+
+
+def _edge_line(edge: Status) -> str:
+    updates = number(edge, "updates", "count")
+    if not updates:
+        return str(edge.get("doing") or "no update yet")
+    views = f" on {NOTHING_HELD_OUT}" if (edge.get("scores") or {}).get("on") == "selected" else ""
+    parts = [
+        f"{updates:.0f} updates",
+        f"{fmt(number(edge, 'updates', 'ms_p50'), '.0f')} ms each",
+        f"PSNR {fmt(number(edge, 'scores', 'psnr_db'), '.2f')} dB{views}",
+        f"moving {fmt(number(edge, 'scores', 'psnr_moving_db'), '.2f')} dB",
+        f"aAoI {fmt(number(edge, 'last', 'aaoi_ms'), '.0f')} ms",
+        f"policy {edge.get('policy', '-')}",
+    ]
+    return ", ".join(parts) + (" (paused)" if edge.get("paused") else "")

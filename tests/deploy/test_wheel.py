@@ -6,9 +6,7 @@ import json
 import os
 import subprocess
 import sys
-import time
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -53,24 +51,6 @@ def _environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "MYPYPATH")}
 
 
-@pytest.fixture
-def started(tmp_path: Path) -> Iterator:
-    """Starts a command in the background; all of them are stopped at the end, the first started last."""
-    running: list[subprocess.Popen] = []
-
-    def start(*command: str) -> subprocess.Popen:
-        log = (tmp_path / f"log-{len(running)}.txt").open("wb")
-        running.append(
-            subprocess.Popen(command, cwd=tmp_path, env=_environment(), stdout=log, stderr=subprocess.STDOUT)
-        )
-        return running[-1]
-
-    yield start
-    for process in reversed(running):
-        process.terminate()
-        process.wait(30)
-
-
 def test_the_wheel_carries_scenarios_models_and_launcher(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     scenarios = ROOT / "deploy/scenarios"
@@ -80,33 +60,6 @@ def test_the_wheel_carries_scenarios_models_and_launcher(wheel: Path) -> None:
     assert shipped <= names and models <= names
     assert {"freshfield_up/cli.py", "edge_server/frontier.json"} <= names
     assert not [name for name in names if name.startswith(("tests/", "deploy/", "docs/"))]
-
-
-def test_several_machines_start_from_an_empty_folder(machine: Path, started, tmp_path: Path) -> None:
-    where = run([str(machine / "python"), "-c", "import freshfield; print(freshfield.__file__)"], tmp_path)
-    assert str(machine.parent) in where.stdout, "the checkout was imported, not the wheel"
-    edge, emulator = (f"127.0.0.1:{free_port()}" for _ in range(2))
-    started(str(machine / "edge-server"), "run", "compose", "--listen", edge, "--out", "runs/edge")
-    started(
-        str(machine / "channel-emu"), "run", "compose", "--listen", emulator, "--to", edge, "--out", "runs/emulator"
-    )
-    for camera in ("cam00", "cam01", "cam02"):
-        started(
-            str(machine / "camera-node"),
-            "run",
-            "compose",
-            "--camera",
-            camera,
-            "--to",
-            emulator,
-            "--out",
-            f"runs/{camera}",
-        )
-    status, end_s = tmp_path / "runs/edge/edge.json", time.monotonic() + 180
-    while not (status.exists() and json.loads(status.read_text())["updates"]["count"] >= 3):
-        logs = "\n".join(log.read_text()[-1500:] for log in sorted(tmp_path.glob("log-*.txt")))
-        assert time.monotonic() < end_s, f"no three updates in time:\n{logs}"
-        time.sleep(0.5)
 
 
 def test_the_launcher_runs_a_shipped_scenario_by_name(machine: Path, tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -114,39 +113,3 @@ def test_sigterm_ends_cleanly_with_the_last_answer(tmp_path):
     (file,) = ledger.read_all(tmp_path / "out")
     assert file.events and file.closed and not file.torn
     assert all(c["sent"] == c["answered"] for c in books(tmp_path / "out").values())
-
-
-def test_a_node_needs_no_torch_and_imports_no_effect_that_is_not_listed(tmp_path):
-    program = """
-import sys
-from camera_node.cli import main
-code = main(["run", sys.argv[1], "--all", "--to", sys.argv[2], "--seconds", "0.5", "-q"])
-heavy = {
-    "torch", "numba", "scipy", "edge_server", "channel_emu", "matplotlib", "depthai", "pyrealsense2",
-    "rtde_receive", "rtde_control", "camera_node.robot.arm.kinematics", "camera_node.robot.arm.joint_states",
-    "camera_node.pose.pairing", "camera_node.robot.simulated_controller",
-    "camera_node.sources.devices.live", "camera_node.doctor",
-} & set(sys.modules)
-world = [m for m in sys.modules if m.startswith("camera_node.synthetic")]
-print(code, sorted(heavy), sorted(world))
-"""
-
-    async def scene():
-        peer = await Peer().start()
-        start_node(tmp_path, peer.address).kill()  # for its files
-        for effects in ({}, {"sensor_noise": None}):
-            file = tmp_path / "photos.yaml"
-            scenario = yaml.safe_load(file.read_text())
-            scenario["source"]["effects"] = effects
-            file.write_text(yaml.safe_dump(scenario))
-            run = [sys.executable, "-c", program, str(file), peer.address]
-            out = await asyncio.to_thread(subprocess.check_output, run, env={**os.environ}, timeout=60)
-            yield_lines.append(out.decode().strip())
-        await peer.stop()
-        return len(peer.frames)
-
-    yield_lines: list[str] = []
-    assert asyncio.run(scene()) > 10
-    assert yield_lines[0] == "0 [] []"  # recorded data, no effects: not even the world is imported
-    assert yield_lines[1].startswith("0 []") and "camera_node.synthetic.effects.sensor_noise" in yield_lines[1]
-    assert "clock_drift" not in yield_lines[1] and "motion_blur" not in yield_lines[1]
