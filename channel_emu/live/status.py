@@ -12,9 +12,6 @@ from channel_emu.live.live_link import DelayStats
 from channel_emu.model.channel import Channel
 from channel_emu.model.link import EventKind
 
-_SERIES_S = 60.0
-_SERIES_MOST = 600
-
 
 def snapshot(
     channel: Channel,
@@ -33,7 +30,7 @@ def snapshot(
     priority: see ``priority.raise_priority``.
     final: whether the emulator is ending.
 
-    ``state`` and ``series`` are of the shared chain; with one chain a camera, ``by_camera`` has the states.
+    ``state`` is that of the shared chain; with one chain a camera, ``by_camera`` has the states.
     ``counts`` are sums over all cameras; ``broken`` counts frames broken by a reset or a missing edge.
     """
     now = max(now_ns, 0)
@@ -60,7 +57,6 @@ def snapshot(
         "states": names,
         "state": None if chain is None else names[chain.state(now)],
         "state_share": _shares(channel, flows, now),
-        "series": _series(channel, now),
         "drawn_delay_ms": _figures(stats.drawn, shape=True),
         "delay_error_ms": _figures(stats.error, shape=final),
         "counts": dict(totals),
@@ -92,15 +88,6 @@ def _shares(channel: Channel, flows: Sequence[CameraStream], now_ns: int) -> dic
     return {
         name: round(sum(s[i] for s in shares) / len(shares), 6) for i, name in enumerate(channel.config.state_names)
     }
-
-
-def _series(channel: Channel, now_ns: int) -> list[tuple[float, str]]:
-    """(seconds, state entered) of the shared chain over the last minute."""
-    if channel.chain is None:
-        return []
-    names = channel.config.state_names
-    recent = channel.chain.recent(max(0, now_ns - int(_SERIES_S * 1e9)), now_ns)
-    return [(round(start / 1e9, 4), names[state]) for start, state in recent[-_SERIES_MOST:]]
 
 
 def _figures(histogram: Histogram, shape: bool) -> dict[str, Any]:

@@ -119,12 +119,6 @@ def _recurrent(q: NDArray[np.float64]) -> list[int]:
     return [int(state) for state in closed.pop()]
 
 
-def leaving(transitions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Probability (M,) of leaving each state in one step of the transition matrix (M, M): the sum of the
-    row's other entries, because one minus the diagonal would lose digits."""
-    return np.minimum((transitions - np.diag(np.diag(transitions))).sum(1), 1.0)
-
-
 class Chain:
     """A path of the chain, extended on demand. Instants may be queried in any order until forgotten.
 
@@ -152,17 +146,16 @@ class Chain:
                 raise ChainError(f"a slot lasts at least a nanosecond, got {slot_ms:g} ms")
             q = transition_matrix(q, self.slot_ns / 1e6)
         off = q - np.diag(np.diag(q))
-        leave = leaving(q) if self.slot_ns else off.sum(1)
+        # The sum of the other entries, because one minus the diagonal would lose digits.
+        leave = off.sum(1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            jumps = np.cumsum(off / off.sum(1)[:, None], 1)
+            jumps = np.cumsum(off / leave[:, None], 1)
             # Parameter of the sojourn time by state: the leaving rate in 1/ms or, with slots, the logarithm
             # of the probability to stay for one more slot.
-            self.sojourn_rate = np.log1p(-leave) if self.slot_ns else leave
+            self._sojourn_rates = (np.log1p(-np.minimum(leave, 1.0)) if self.slot_ns else leave).tolist()
         # Cumulative jump probabilities; the last possible target gets 1 exactly, so rounding cannot miss it.
         last = np.array([np.flatnonzero(row)[-1] if row.any() else i for i, row in enumerate(off)])
-        self.jumps = np.where(np.arange(self.states) >= last[:, None], 1.0, jumps)
-        self._jump_lists = self.jumps.tolist()
-        self._sojourn_rates = [float(r) for r in self.sojourn_rate]
+        self._jumps = np.where(np.arange(self.states) >= last[:, None], 1.0, jumps).tolist()
         if not self.slot_ns:
             self._refuse_too_fast()
         self.initial = self._draw_initial() if initial is None else initial
@@ -232,7 +225,7 @@ class Chain:
                         "boundaries (sampled: slots)"
                     )
                 mark, mark_ns = self._number, start
-            target = bisect_right(self._jump_lists[self._visited[-1]], self._rng.pair(self._number)[1])
+            target = bisect_right(self._jumps[self._visited[-1]], self._rng.pair(self._number)[1])
             self._number += 1
             self._starts.append(start)
             self._visited.append(target)

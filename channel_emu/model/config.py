@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_type_hints
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta, field
@@ -222,14 +222,10 @@ def from_notation(key: Any, value: Any, where: str = "channel", folder: Path = P
 
     Other values are returned unchanged. Raises ScenarioError.
     """
-    kinds: dict[Any, tuple[str, Any]] = {"arrivals": ("process", ArrivalsConfig), "service": ("law", ServiceConfig)}
-    names = {key: (name, get_args(get_type_hints(kind)[name])) for key, (name, kind) in kinds.items()}
-    names["chain"] = ("", ())
-    if key not in names or not isinstance(value, str):
+    if key not in ("arrivals", "service", "chain") or not isinstance(value, str):
         return value
-    kind, known = names[key]
     try:
-        return {kind: value} if value in known else section(key, value, folder)
+        return section(key, value, folder)
     except ValueError as error:
         raise ScenarioError(f"{where}.{key}: {error}") from None
 

@@ -92,8 +92,8 @@ def arrivals(text: str) -> dict[str, Any]:
     """Parse ``as-offered``, ``periodic:30ms``, ``poisson:1/30ms`` or, with one rate a chain state,
     ``mmpp:1/120ms,1/30ms``. Bare ``mmpp`` has these two rates, the thesis's (6.4.2). Raises NotationError."""
     kind, _, rest = text.partition(":")
-    if kind == "as-offered" and not rest:
-        return {"process": "as-offered"}
+    if text in ("as-offered", "periodic", "poisson"):
+        return {"process": text}
     if kind == "periodic" and rest:
         return {"process": "periodic", "period_ms": span_ms(rest)}
     if text == "mmpp":
@@ -110,6 +110,8 @@ def service(text: str, folder: Path) -> dict[str, Any]:
 
     folder: what FILE is relative to. Raises NotationError.
     """
+    if text in _DISTRIBUTIONS.values():
+        return {"law": text}
     short, _, rest = text.partition(":")
     law = _DISTRIBUTIONS.get(short)
     if law == "trace" and rest:
@@ -122,8 +124,6 @@ def service(text: str, folder: Path) -> dict[str, Any]:
             raise NotationError(f"{text!r}: expected distributions with a mean")
         return {**parts[0], "mean_ms": [part["mean_ms"] for part in parts]}
     words = rest.split(":")
-    if law == "none":
-        return {"law": "none"}
     if law in ("exponential", "deterministic") and len(words) == 1 and rest:
         return {"law": law, "mean_ms": span_ms(rest)}
     if law in _PARAMETER and len(words) == 2:

@@ -83,19 +83,6 @@ def rss_mb(pid: int | str = "self") -> float | None:
     return round(pages * resource.getpagesize() / 1e6, 1)
 
 
-def peak_rss_mb() -> float:
-    """The most memory this process has had resident, in MB (10^6 bytes)."""
-    try:
-        line = next(w for w in (_PROC / "self" / "status").read_text().splitlines() if w.startswith("VmHWM:"))
-        return round(int(line.split()[1]) * 1024 / 1e6, 1)
-    except (OSError, ValueError, IndexError, StopIteration):
-        pass
-    # Only the fallback: on Linux a process inherits this value from its parent.
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    # Linux counts kibibytes, macOS bytes.
-    return round(peak * (1 if os.uname().sysname == "Darwin" else 1024) / 1e6, 1)
-
-
 def cpu_s(pid: int) -> float | None:
     """Processor time that a process has used, in core-seconds; None if it cannot be read."""
     try:

@@ -7,12 +7,12 @@ import os
 import numpy as np
 import pytest
 
-from freshfield.machine_load import cpu_s, outside_load, peak_rss_mb, rss_mb
+from freshfield.machine_load import cpu_s, outside_load, rss_mb
 
 
 def test_memory_and_processor_time_of_a_process():
     block = np.ones(8 * 2**20)  # 64 MB that are touched
-    assert rss_mb() > 60.0 and peak_rss_mb() >= rss_mb() * 0.9
+    assert rss_mb() > 60.0
     assert cpu_s(os.getpid()) > 0.0 and block[0] == 1.0
 
 

@@ -46,7 +46,6 @@ def test_a_mapping_becomes_a_struct():
         ({"share": float("nan")}, r"s: x\.share: expected a number"),
         ({"share": float("inf")}, r"s: x\.share: expected a number"),
         ({"share": 10**400}, r"s: x\.share: expected a number"),
-        ({"share": -(10**400)}, r"s: x\.share: expected a number"),
         ({"size": [1, 2, 3]}, r"s: x\.size: expected a list of 2 values"),
         ({"size": [1, "b"]}, r"s: x\.size\[1\]: expected a whole number"),
         ({"inner": {}}, r"s: x\.inner\.rate: missing"),
