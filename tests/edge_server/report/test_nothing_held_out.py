@@ -18,7 +18,7 @@ from edge_server.report import figures
 from edge_server.report.build_report import assemble
 from edge_server.report.run_files import read_run_files
 from freshfield.scenario import NOTHING_HELD_OUT
-from freshfield_up.display import _edge_line
+from freshfield_up.status import _edge_line
 from freshfield_up.summary import summarize
 from tests.edge_server.page.test_markup import summary
 from tests.edge_server.report.sample_run import page_of, publication, write_run
