@@ -83,13 +83,6 @@ def parse_policy(text: str) -> tuple[str, float | None]:
         raise ValueError(f"{text}: {value!r} is not a number") from None
 
 
-def policy_label(policy: Policy) -> str:
-    """The policy as people type it; the inverse of ``parse_policy``."""
-    if policy.name.startswith(BANDIT) or policy.value is None:
-        return policy.name
-    return f"{policy.name}:{policy.value:g}"
-
-
 def short_name(name: str) -> str:
     """A policy's name for people to read: of ``bandit:FILE`` without the file's folder."""
     return BANDIT + Path(name.removeprefix(BANDIT)).name if name.startswith(BANDIT) else name

@@ -29,7 +29,7 @@ def write_output(out: Path, data: Row) -> str:
     text = [table(rows)]
     if updates:
         write_csv(out / "updates.csv", _flat(updates))
-        draw_updates(out / "updates.png", updates, data)
+        draw_updates(out / "updates.png", updates)
         text.append(updates_table(updates))
     return "\n\n".join(["", *text])
 
@@ -99,7 +99,7 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
         _seconds_axis(axes[-1, 0], [row["planned_s"] for row in rows])
 
 
-def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
+def draw_updates(path: Path, rows: Sequence[Row]) -> None:
     """Draw the shown fidelity against seconds per update: a column for each speed, a color for each
     representation, a line style for each setting, the best of all encircled."""
     speeds = list(dict.fromkeys(row["speed_m_per_s"] for row in rows))

@@ -30,7 +30,6 @@ from edge_server.scheduler import BANDIT, Epoch, Policy, make_policy, parse_poli
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.decision import Decision
-from edge_server.scheduler.learned.learner_spec import Spec
 
 # Period of the instants at which the shown image is scored, in a running deployment.
 SHOWN_EVERY_MS = 125.0
@@ -185,18 +184,6 @@ def learned(actor: Actor, explore: bool = False) -> PolicyMaker:
 
 def _make_learned(actor: Actor, explore: bool, rng: np.random.Generator) -> Policy:
     return BanditPolicy(actor, "learned", rng, explore=explore)
-
-
-def choice_of_action(spec: Spec, action: Any, episode: Episode, number: int) -> Choice:
-    """The choice of a learner's action: (N,) bool, or an index into the specification's omegas. An empty set uses the
-    first frame that arrives."""
-    point = episode.points[number]
-    if spec.action != "select":
-        policy = make_policy(spec.action, spec.omegas_ms[int(action)], np.random.default_rng(0))
-        return choose(policy, episode, number)
-    cameras = tuple(c for c, chosen in zip(point.cameras, action) if chosen)
-    use_all = make_policy("all", None, np.random.default_rng(0))
-    return Choice(cameras, point.now_ns) if cameras else choose(use_all, episode, number)
 
 
 # --- on the engine -----------------------------------------------------------------------------------------

@@ -98,11 +98,6 @@ def own_rig(name: str, camera: str, side: int) -> Shot:
     return Shot(scene.world, *scene.cameras[camera], tuple(KINDS.index(k) for k in kinds))
 
 
-def scene_of(seed: int, purpose: str) -> str:
-    """Name of the shipped scene that ``variation`` varies."""
-    return _base_scene(seed, purpose)[0]
-
-
 def _base_scene(seed: int, purpose: str) -> tuple[str, np.random.Generator]:
     rng = np.random.default_rng(np.random.SeedSequence([seed, *purpose.encode()]))
     return str(rng.choice(list(_SHARES), p=list(_SHARES.values()))), rng

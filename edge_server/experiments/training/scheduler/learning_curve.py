@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.report.style import CYCLE, GRAY, figure, label_lines
+from edge_server.report.style import CYCLE, figure, label_lines
 
 # Number of batches averaged in a point of the smoothed curve.
 _SMOOTH = 9
 
 
-def draw_curve(path: Path, rows: Sequence[dict[str, Any]], levels: dict[str, float] | None = None) -> None:
+def draw_curve(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Draw the learning curve (figures 5.9, 6.8) and the terms of the reward.
 
     path: the PNG file.
     rows: rows of the log, one per batch.
-    levels: label -> reward of a policy without learning, on the test seeds.
     """
     terms = [name for name in rows[0] if name.startswith("term_")]
     episodes = [row["episodes"] for row in rows]
@@ -28,8 +27,6 @@ def draw_curve(path: Path, rows: Sequence[dict[str, Any]], levels: dict[str, flo
         rewards = _numbers(rows, "reward")
         top.plot(episodes, rewards, color=CYCLE[0], alpha=0.3, linewidth=0.9)
         top.plot(episodes, smoothed(rewards), color=CYCLE[0], label="reward in training")
-        for k, (label, level) in enumerate((levels or {}).items()):
-            top.axhline(level, color=GRAY, linestyle=(":", "--", "-.")[k % 3], linewidth=1.1, label=label)
         label_lines(top, "reward", None, "Learning, explored actions included")
         for k, term in enumerate(terms):
             values = smoothed(_numbers(rows, term))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.rollouts.episode import Choice, EpisodeFactory
-from edge_server.experiments.rollouts.rollout import choice_of_action, choose, named
+from edge_server.experiments.rollouts.rollout import choose, named
 from edge_server.experiments.rollouts.setting import PURPOSES, seeds
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import Compute, RunSettings
@@ -116,18 +116,6 @@ def test_a_state_has_ages_and_poses_of_who_reported(factory):
     poses = point.state.poses[point.state.reported]
     assert np.isfinite(poses).all() and len(np.unique(poses, axis=0)) == len(poses)
     assert point.state.embeddings is None
-
-
-def test_actions_of_a_learner_mean_what_the_live_policies_do(factory):
-    episode = factory.episode(4)
-    point = episode.points[0]
-    spec = Spec("threshold", omegas_ms=(40.0, 90.0))
-    live = choose(named("threshold:90")(np.random.default_rng(0)), episode, 0)
-    assert choice_of_action(spec, 1, episode, 0) == live
-    wait = choice_of_action(Spec("wait", omegas_ms=(0.0, 50.0)), 1, episode, 0)
-    assert wait.at_ns >= point.now_ns + 50 * 10**6
-    picked = choice_of_action(Spec("select"), np.array([True, False, True, False]), episode, 0)
-    assert picked.cameras == (point.cameras[0], point.cameras[2]) and picked.at_ns == point.now_ns
 
 
 def test_where_nothing_arrives_all_there_is_is_used_at_the_end(factory):

@@ -170,7 +170,7 @@ def test_the_curve_is_drawn_with_gaps(tmp_path: Path):
         {"episodes": 10 * k, "reward": None if k == 2 else 0.1 * k, "term_psnr": 0.3, "term_age": None}
         for k in range(5)
     ]
-    draw_curve(tmp_path / "curve.png", rows, {"random": 0.1})
+    draw_curve(tmp_path / "curve.png", rows)
     assert (tmp_path / "curve.png").stat().st_size > 5_000
 
 
