@@ -69,7 +69,7 @@ class Scene:
 
     cameras: name -> (Pinhole, camera-to-world (4, 4)); cam00 is held out.
     target: (3,), the point that cameras look at, or away from.
-    bounds: (2, 3), lower and upper corner in meters of everything that can be seen, except an occluder.
+    bounds: (2, 3), lower and upper corner in meters of everything that can be seen.
     period_s: time after which frames repeat, a multiple of 0.6 s.
     moving: False if all instants look the same.
     object_parts: number of static parts, from the first, that form the object of interest; None: all.
@@ -127,11 +127,9 @@ class Scene:
         count = len(placed.parts) if self.object_parts is None else self.object_parts
         return np.asarray(((which >= 0) & (which < count)).reshape(camera.height, camera.width))
 
-    def with_world(self, world: World, period_s: float | None = None, moving: bool | None = None) -> Scene:
-        """The same cameras in another world, as effects need it. period_s, moving: None keeps them."""
-        period_s = self.period_s if period_s is None else period_s
-        moving = self.moving if moving is None else moving
-        return dataclasses.replace(self, world=world, period_s=period_s, moving=moving, static_key=None, _renderers={})
+    def with_world(self, world: World) -> Scene:
+        """The same cameras in another world that repeats after the same time, as effects need it."""
+        return dataclasses.replace(self, world=world, static_key=None, _renderers={})
 
     def with_cameras(self, cameras: PosedCameras) -> Scene:
         """The same world with other cameras, as effects on lenses need it."""

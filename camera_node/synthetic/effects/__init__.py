@@ -2,7 +2,7 @@
 
 The kinds, by where they act:
 
-* ``world``    changes the scene: bodies, fog (rendered ahead and cached; free while streaming);
+* ``world``    changes the scene, such as its air (rendered ahead and cached; free while streaming);
 * ``lens``     changes a camera's lens, and the lens that its frames report (likewise);
 * ``exposure`` changes how an instant becomes an image (likewise);
 * ``image``    changes each frame as it is streamed, recorded ones too (costs time a frame);
@@ -12,7 +12,7 @@ The kinds, by where they act:
 To add one, write a file here with a dataclass of the same name (the effect's parameters and ``kind``) and add
 it to ``NAMES``. An effect that draws from a camera's random stream does so in ``start``.
 
-The held-out camera measures: it shows the sharp, noise-free, unobstructed scene at the true time. Effects
+The held-out camera measures: it shows the sharp, noise-free scene at the true time. Effects
 apply to it only if they are listed with ``in_truth: true``.
 """
 
@@ -38,7 +38,6 @@ NAMES = (
     "hot_pixels",
     "lens_distortion",
     "motion_blur",
-    "occluder",
     "pose_noise",
     "sensor_noise",
 )

@@ -33,7 +33,7 @@ def test_a_ball_appears_where_opencv_projects_it():
         ball = np.eye(4)
         ball[:3, 3] = (pose @ [*in_camera, 1.0])[:3]
         world = World((Part(Sphere(0.03), Plain((1.0, 1.0, 1.0)), ball),), (), FLAT)
-        image = made(**LENS).extend(scene.with_world(world, 0.6, False)).render("cam00", 0.0)[..., 0]
+        image = made(**LENS).extend(scene.with_world(world)).render("cam00", 0.0)[..., 0]
         v, u = np.mgrid[0:192, 0:256]
         centroid = np.array([(u * image).sum(), (v * image).sum()]) / image.astype(float).sum()
         points, _ = cv2.projectPoints(in_camera[None], np.zeros(3), np.zeros(3), matrix, np.array(list(LENS.values())))

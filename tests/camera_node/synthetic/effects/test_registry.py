@@ -106,7 +106,7 @@ def test_every_file_is_registered_and_follows_the_protocol():
 
 
 def test_the_held_out_camera_shows_the_truth_unless_in_truth():
-    listed = {"sensor_noise": {}, "occluder": {"in_truth": True}, "clock_drift": None}
+    listed = {"sensor_noise": {}, "fog": {"in_truth": True}, "clock_drift": None}
     asked: list[str] = []
 
     def rng_for(name: str) -> np.random.Generator:
@@ -114,7 +114,7 @@ def test_the_held_out_camera_shows_the_truth_unless_in_truth():
         return np.random.default_rng(0)
 
     held_out = fx.load_effects(listed, rng_for, held_out=True)
-    assert asked == ["occluder"]
+    assert asked == ["fog"]
     assert len(held_out.world) == 1 and not held_out.image and not held_out.clock
     assert fx.load_effects({"sensor_noise": {}}, rng_for, held_out=True) is fx.NO_EFFECTS
     training = fx.load_effects(listed, rng_for)
@@ -141,7 +141,7 @@ def test_an_invalid_effect_is_refused_in_one_line(listed, message):
     assert "\n" not in str(error.value)
 
 
-# Parameters with which an effect changes nothing. An occluder's arm is always there.
+# Parameters with which an effect changes nothing.
 NEUTRAL: dict[str, dict] = {
     "clock_drift": {},
     "exposure_drift": {"amplitude_stops": 0.0, "offset_spread_stops": 0.0},
@@ -197,7 +197,7 @@ def test_each_effect_has_its_own_random_stream():
     assert np.array_equal(alone.apply(image, 0, 0.0), among.apply(image, 0, 0.0))
 
 
-@pytest.mark.parametrize("name", ["fog", "lens_distortion", "occluder"])
+@pytest.mark.parametrize("name", ["fog", "lens_distortion"])
 def test_an_effect_leaves_the_original_scene_as_it_is(name):
     scene = make_scene("room", {"width": 32, "height": 32, "supersample": 1})
     world, cameras, before = scene.world, scene.cameras, scene.render("cam01", 0.4)
