@@ -14,7 +14,7 @@ from edge_server.scheduler import Policy, resolve_checkpoint
 from freshfield.limits import LONGEST_MS
 from freshfield.scenario import Scenario
 from freshfield.settings import ScenarioError, Settings, about, read_settings, within
-from freshfield.untrusted import read_json
+from freshfield.untrusted import read_json, read_text
 
 if TYPE_CHECKING:
     from edge_server.embed import EmbeddingConfig
@@ -171,7 +171,7 @@ def _read_json(scenario: Scenario, key: str, name: str, model: type | None = Non
         raise ScenarioError(f"{scenario.path}: edge.{key}: expected the name of a file, got {name!r}")
     path = scenario.path.parent / name
     try:
-        found = read_json(path.read_text())
+        found = read_json(read_text(path))
         if not isinstance(found, dict):
             raise ValueError("expected a JSON object")
         if model is not None:

@@ -17,6 +17,7 @@ import numpy as np
 
 from freshfield.geometry import GeometryError, Pose, quaternion_normalize
 from freshfield.limits import MAX_STAMP_S
+from freshfield.untrusted import read_text
 
 T = TypeVar("T")
 
@@ -134,7 +135,7 @@ def read_samples(path: Path) -> tuple[list[int], list[Pose]]:
     (``t,x,...``) are skipped. Raises TrajectoryError naming file and line.
     """
     try:
-        lines = path.read_text().splitlines()
+        lines = read_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise TrajectoryError(f"{path}: cannot be read: {error}") from None
     times: list[int] = []

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from channel_emu.model import trace
 from channel_emu.model.link import EventKind
 from channel_emu.model.nanoseconds import NEVER_NS
+from freshfield.untrusted import read_text
 
 # Longer than any stream lives. Longer delays are left out; a row with one counts as not delivered.
 MAX_DELAY_MS = 1e9
@@ -93,7 +94,7 @@ def read_recording(path: Path, discipline: str | None = None) -> Recording:
     Raises RecordingError or TraceError.
     """
     try:
-        begin = path.read_text()[:1]
+        begin = read_text(path)[:1]
     except (OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: cannot be read: {error}") from None
     if begin == "{":
@@ -130,7 +131,7 @@ def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:
 
 
 def _from_rows(path: Path, discipline: str) -> Recording:
-    lines = [line for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
     separator = next((mark for mark in "\t;" if lines and mark in lines[0]), ",")
     rows: dict[str, list[tuple[float, float]]] = {}
     for row in csv.DictReader(lines, delimiter=separator, skipinitialspace=True):

@@ -27,7 +27,7 @@ from msgspec import Meta
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from channel_emu.model.link import MAX_SIZE_BYTES, EventKind, Transit
 from channel_emu.model.nanoseconds import NEVER_NS
-from freshfield.untrusted import read_json
+from freshfield.untrusted import read_json, read_text
 
 VERSION = 2
 Instant = Annotated[int, Meta(ge=0, le=NEVER_NS)]
@@ -112,7 +112,7 @@ def read(path: Path) -> Trace:
     """Read a trace, without an incomplete last line. Raises TraceError or ScenarioError if it is unreadable or
     invalid."""
     try:
-        lines = path.read_text().split("\n")
+        lines = read_text(path).split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise TraceError(f"{path}: cannot be read: {error}") from None
     try:

@@ -15,6 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from freshfield.limits import MAX_MODEL_BYTES
+from freshfield.untrusted import check_file
+
 _FORMAT = "freshfield-{kind}-1"
 # RuntimeError: a zip file of a later version, encrypted, or packed in another way.
 _UNREADABLE = (OSError, ValueError, TypeError, EOFError, RuntimeError, struct.error, zlib.error, zipfile.BadZipFile)
@@ -66,6 +69,7 @@ def load(
     """
     path, expected = Path(path), _FORMAT.format(kind=kind)
     try:
+        check_file(path, MAX_MODEL_BYTES)
         if most_bytes is not None:
             with zipfile.ZipFile(path) as packed:
                 size = sum(entry.file_size for entry in packed.infolist())

@@ -12,7 +12,7 @@ from typing import Any
 from edge_server.config import EdgeConfig
 from edge_server.run_records import Frontier, FrontierPoint
 from freshfield.scenario import Scenario
-from freshfield.untrusted import read_json
+from freshfield.untrusted import read_json, read_text
 
 # Assumed of a scene whose speed is not given: a person walking.
 USUAL_SPEED_M_PER_S = 1.0
@@ -28,7 +28,7 @@ def read_frontier(path: Path | None, representation: str, layers: bool = False) 
     """
     source = path if path is not None else resources.files("edge_server").joinpath("frontier.json")
     try:
-        data = read_json(source.read_text())
+        data = read_json(source.read_text() if path is None else read_text(path))
         rows = [
             row
             for row in data["updates"]

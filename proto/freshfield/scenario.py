@@ -25,7 +25,7 @@ import numpy as np
 from freshfield.frame import valid_id
 from freshfield.limits import MAX_CAMERAS, MAX_IMAGE_SIDE_PX
 from freshfield.settings import ScenarioError, Settings, about, read_settings, within
-from freshfield.untrusted import UntrustedError, read_yaml
+from freshfield.untrusted import UntrustedError, read_text, read_yaml
 
 # Label of every fidelity of a run without held-out cameras: on page, report, console and in metrics.
 NOTHING_HELD_OUT = "training views, nothing is held out"
@@ -124,7 +124,7 @@ def load(path: str | Path, seed: int | None = None) -> Scenario:
     if not file.exists() and file.suffix == "" and (SCENARIO_FOLDER / f"{file}.yaml").exists():
         file = SCENARIO_FOLDER / f"{file}.yaml"
     try:
-        data = read_yaml(file.read_text())
+        data = read_yaml(read_text(file))
     except OSError as error:
         shipped = ", ".join(sorted(p.stem for p in SCENARIO_FOLDER.glob("*.yaml")))
         raise ScenarioError(f"{file}: {error.strerror}; shipped scenarios: {shipped or 'none'}") from None

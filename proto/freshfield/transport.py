@@ -29,6 +29,7 @@ from freshfield.limits import (
     MAX_PEER_TEXT_CHARS,
     TLS_HANDSHAKE_TIMEOUT_S,
 )
+from freshfield.untrusted import read_bytes
 
 log = logging.getLogger(__name__)
 
@@ -305,7 +306,7 @@ def _tokens(path: Path) -> dict[str, str]:
 
 def _read(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_bytes(path)
     except OSError as error:
         raise TransportError(f"cannot read {path}: {error.strerror}") from None
 

@@ -1,4 +1,4 @@
-"""Reads YAML and JSON files that an attacker may have written.
+"""Reads files that an attacker may have written or named: of YAML and JSON, no more than they hold.
 
 A few hundred bytes of YAML or pickle can refer to themselves so often that they expand to gigabytes.
 Expansion is therefore bounded by the file's size: an honest file has fewer values than bytes, even with
@@ -7,8 +7,10 @@ references. A repeated key in a mapping is refused, because either value may hav
 
 from __future__ import annotations
 
+import errno
 import json
 import re
+import stat
 from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -21,6 +23,7 @@ from freshfield.limits import MAX_YAML_CHARS
 LEAST_VALUES = 100_000  # allowed in any YAML file, however short: anchors may well repeat cameras and lenses
 
 
+MAX_FILE_BYTES = 2**30  # of any file that is read whole, unless a reader says otherwise
 MOST_NESTED = 50  # depth of nested collections; the parser's work for every token grows with it
 
 
@@ -90,6 +93,28 @@ def refuse_expansion(value: Any, most: int, parts: Callable[[Any], Iterable[Any]
         waiting.extend(parts(waiting.pop()))
         if seen + len(waiting) > most:
             raise UntrustedError(f"its references stand for more than {most} values")
+
+
+def check_file(path: Path, most_bytes: int = MAX_FILE_BYTES) -> None:
+    """Refuse what cannot be read to its end: a pipe hangs in silence, and a device never ends. Raises OSError: there
+    is no such file, it is no regular one, or it is larger than ``most_bytes``."""
+    about = path.stat()
+    if not stat.S_ISREG(about.st_mode):
+        raise OSError(errno.EINVAL, "a folder, a device or a pipe, not a file")
+    if about.st_size > most_bytes:
+        raise OSError(errno.EFBIG, f"larger than {most_bytes >> 20} MB")
+
+
+def read_bytes(path: Path, most_bytes: int = MAX_FILE_BYTES) -> bytes:
+    """Contents of a file that somebody has named. Raises OSError, also as ``check_file``."""
+    check_file(path, most_bytes)
+    with path.open("rb") as file:
+        return file.read(most_bytes)
+
+
+def read_text(path: Path) -> str:
+    """Text of a file in UTF-8 that somebody has named. Raises OSError as ``read_bytes``, and UnicodeDecodeError."""
+    return read_bytes(path).decode().replace("\r\n", "\n")
 
 
 def stored_bytes(path: Path) -> int:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 import tracemalloc
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +14,17 @@ import yaml
 
 from freshfield.limits import MAX_ERROR_CHARS, MAX_YAML_CHARS
 from freshfield.scenario import ScenarioError, load
-from freshfield.untrusted import UntrustedError, YamlWriter, read_json, read_yaml, refuse_expansion, stored_bytes
+from freshfield.untrusted import (
+    UntrustedError,
+    YamlWriter,
+    check_file,
+    read_bytes,
+    read_json,
+    read_text,
+    read_yaml,
+    refuse_expansion,
+    stored_bytes,
+)
 from tests.work import work_ms
 
 LEVELS = "abcdefghijklmnop"
@@ -145,3 +157,24 @@ def test_an_uncompressed_archive_holds_no_more_than_its_size(tmp_path):
     np.savez(tmp_path / "a.npz", a=np.zeros(1000))
     assert 8000 < stored_bytes(tmp_path / "a.npz") < 9000 and stored_bytes(tmp_path / "none") == 0
     assert work_ms(lambda: stored_bytes(tmp_path / "a.npz")) < 5
+
+
+@pytest.mark.parametrize("read", [check_file, read_bytes, read_text])
+def test_what_has_no_end_is_not_read(tmp_path, read):
+    """A pipe would hang for ever, a device fill the memory."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for path in (Path("/dev/zero"), pipe, tmp_path):
+        with pytest.raises(OSError, match="a folder, a device or a pipe, not a file"):
+            read(path)
+    with pytest.raises(FileNotFoundError):
+        read(tmp_path / "nothing")
+
+
+def test_a_file_is_read_up_to_its_bound(tmp_path):
+    file = tmp_path / "file"
+    file.write_bytes(b"a\r\nb" + bytes(2**20))
+    assert read_bytes(file, 2**20 + 4) == file.read_bytes()
+    assert read_text(file).startswith("a\nb")
+    with pytest.raises(OSError, match="larger than 1 MB"):
+        read_bytes(file, 2**20)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from camera_node.pose.providers import Closable, FixedPose, PoseProvider
 from freshfield.geometry import GeometryError, Pose
-from freshfield.untrusted import UntrustedError, read_yaml
+from freshfield.untrusted import UntrustedError, read_text, read_yaml
 
 MAX_OFFSET_S = 1e6
 """Bound of the time offset: a larger one is the difference between two clocks' epochs."""
@@ -75,7 +75,7 @@ class MountedCameraPoses:
 def read_hand_eye(path: Path) -> HandEye:
     """Read a hand-eye calibration. Raises HandEyeError."""
     try:
-        data = read_yaml(path.read_text())
+        data = read_yaml(read_text(path))
     except (OSError, UnicodeDecodeError, UntrustedError) as error:
         raise HandEyeError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from None
     if not isinstance(data, dict) or "transform" not in data:

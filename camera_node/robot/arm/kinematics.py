@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from freshfield.geometry import se3_inverse, so3_log
+from freshfield.untrusted import read_text
 
 Array = NDArray[np.float64]
 Six = tuple[float, float, float, float, float, float]
@@ -189,7 +190,7 @@ def apply_calibration(model: ArmModel, file: Path) -> ArmModel:
     """
     parser = configparser.ConfigParser(inline_comment_prefixes=("#", ";"), interpolation=None, strict=False)
     try:
-        parser.read_string(file.read_text())
+        parser.read_string(read_text(file))
     except (OSError, UnicodeDecodeError, configparser.Error) as error:
         raise KinematicsError(f"{file}: cannot be read: {' '.join(str(error).split())}") from None
     deltas: dict[str, Six] = {}

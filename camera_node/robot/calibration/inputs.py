@@ -18,7 +18,7 @@ from camera_node.sources.datasets.imaging import decode_file
 from camera_node.sources.datasets.records import read_json
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import Pinhole, se3, so3_exp
-from freshfield.untrusted import read_yaml
+from freshfield.untrusted import read_text, read_yaml
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
@@ -46,7 +46,7 @@ def read_visp_pose(file: Path) -> Array:
     """Pose (4, 4) from ViSP's YAML: rows 6, cols 1, data [tx ty tz, theta u] in meters and radians. Raises
     CalibrationError."""
     try:
-        values = np.array(read_yaml(file.read_text())["data"], dtype=np.float64).ravel()
+        values = np.array(read_yaml(read_text(file))["data"], dtype=np.float64).ravel()
         if values.shape != (6,) or not np.isfinite(values).all():
             raise ValueError(f"{values.size} numbers")
     except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:

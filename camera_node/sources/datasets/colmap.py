@@ -24,6 +24,7 @@ from camera_node.sources.datasets.records import (
     path_within,
 )
 from freshfield.geometry import quaternion_to_matrix
+from freshfield.untrusted import read_bytes, read_text
 
 _PLACES = ("", "sparse/0/", "sparse/", "colmap/sparse/0/")
 # At each place binary files are preferred, as COLMAP does.
@@ -151,7 +152,7 @@ def _text(file: Path) -> tuple[dict[int, Lens], list[_Image]]:
 
 def _lines(file: Path) -> list[tuple[int, str]]:
     try:
-        return [(k + 1, line.strip()) for k, line in enumerate(file.read_text().split("\n"))]
+        return [(k + 1, line.strip()) for k, line in enumerate(read_text(file).split("\n"))]
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{file}: cannot be read: {error}") from None
 
@@ -165,7 +166,7 @@ class _Bytes:
     def __init__(self, file: Path) -> None:
         self.file = file
         try:
-            self._data = file.read_bytes()
+            self._data = read_bytes(file)
         except OSError as error:
             raise DatasetError(f"{file}: cannot be read: {error}") from None
         self._at = 0

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
-from freshfield.untrusted import refuse_expansion
+from freshfield.untrusted import read_bytes, refuse_expansion
 
 
 class _Dtype:
@@ -106,7 +106,7 @@ def load_object(file: Path) -> Any:
     """Load the single Python object that ``numpy.save`` wrote; arrays of objects in it become lists. Raises
     DatasetError."""
     try:
-        stream = io.BytesIO(file.read_bytes())
+        stream = io.BytesIO(read_bytes(file))
         version = np.lib.format.read_magic(stream)
         head = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = head(stream)

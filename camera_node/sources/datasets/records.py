@@ -131,7 +131,7 @@ def errors_at(where: str) -> Iterator[None]:
 def read_json(file: Path) -> Any:
     """The contents of a JSON file. Raises DatasetError."""
     try:
-        return untrusted.read_json(file.read_text())
+        return untrusted.read_json(untrusted.read_text(file))
     except FileNotFoundError:
         raise DatasetError(f"{file}: no such file") from None
     except (OSError, ValueError) as error:

@@ -7,7 +7,7 @@ from typing import Any
 
 from channel_emu.model.config import channel_from_mapping
 from freshfield.scenario import ScenarioError
-from freshfield.untrusted import UntrustedError, read_yaml
+from freshfield.untrusted import UntrustedError, read_text, read_yaml
 
 
 def read_channel(text: str) -> tuple[dict[str, Any], str]:
@@ -21,7 +21,7 @@ def read_channel(text: str) -> tuple[dict[str, Any], str]:
     section: Any = {"preset": text}
     if path.suffix or path.is_file():
         try:
-            found = read_yaml(path.read_text())
+            found = read_yaml(read_text(path))
         except (OSError, UnicodeDecodeError, UntrustedError) as error:
             raise ScenarioError(f"--channel {text}: {error}") from None
         section = found["channel"] if isinstance(found, dict) and "channel" in found else found

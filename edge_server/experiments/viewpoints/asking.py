@@ -26,6 +26,7 @@ from edge_server.viewpoints.policy import CandidatePolicy, PolicyConfig, train_p
 from edge_server.viewpoints.preference_session import PERSON, PreferenceSession
 from freshfield.files import write_json
 from freshfield.transport import Transport
+from freshfield.untrusted import read_bytes
 
 ANSWERS = "answers.json"
 SHOWN_S = 10.0  # time that the page has to fetch the plan, before the server ends
@@ -73,7 +74,7 @@ def compare(
     path = about.out / ANSWERS
     if path.exists():
         try:
-            session = session.imported(path.read_bytes())
+            session = session.imported(read_bytes(path))
         except (OSError, ViewpointError) as error:
             raise ViewpointError(f"{path}: {error}; move it away, or name another --out") from None
     if who == PERSON:
