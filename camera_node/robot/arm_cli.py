@@ -32,13 +32,6 @@ def add_commands(commands: Any) -> None:
         "127.0.0.3 [127.0.0.2]",
     )
     add("--joints", metavar="DEG,...", help="initial joint angles: six, in degrees [a home pose]")
-    add(
-        "--drift-ppm",
-        type=float,
-        default=0.0,
-        metavar="PPM",
-        help="frequency error of its clock, positive: fast [%(default)g]",
-    )
 
     drive = commands.add_parser(
         "drive-arm",
