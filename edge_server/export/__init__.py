@@ -21,13 +21,12 @@ class ExportError(ValueError):
 @dataclass(frozen=True)
 class PosedImage:
     """An image with its pose. name: file name without folder and extension. image: uint8 (H, W, 3 or 4).
-    camera_to_world: (4, 4), OpenCV axes, meters. t_s: capture time, seconds."""
+    camera_to_world: (4, 4), OpenCV axes, meters."""
 
     name: str
     image: NDArray[np.uint8]
     camera_to_world: NDArray[np.float64]
     intrinsics: Pinhole
-    t_s: float = 0.0
 
 
 def file_names(cameras: list[str]) -> list[str]:

@@ -36,7 +36,7 @@ class Source:
         """The views as images to write."""
         names = file_names([v.camera for v in self.views])
         return [
-            PosedImage(name, v.image, np.asarray(v.camera_to_world, np.float64), v.intrinsics, v.generated_ns / 1e9)
+            PosedImage(name, v.image, np.asarray(v.camera_to_world, np.float64), v.intrinsics)
             for name, v in zip(names, self.views)
         ]
 

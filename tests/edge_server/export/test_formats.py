@@ -30,7 +30,7 @@ def shots(count: int = 4) -> list[PosedImage]:
     maps = ball_maps(count)
     lenses = [LENS, DISTORTED_LENS]
     pictures = RNG.integers(0, 255, (count, 64, 64, 3), dtype=np.uint8)
-    return [PosedImage(f"view{k}", pictures[k], m.camera_to_world, lenses[k % 2], float(k)) for k, m in enumerate(maps)]
+    return [PosedImage(f"view{k}", pictures[k], m.camera_to_world, lenses[k % 2]) for k, m in enumerate(maps)]
 
 
 def cloud(of: list[PosedImage]) -> Cloud:

@@ -44,14 +44,6 @@ def test_golden_blurs_of_a_photograph(network):
     assert distances == pytest.approx(GOLDEN_BLUR[network], rel=0.1)
 
 
-@pytest.mark.parametrize("network", GOLDEN)
-def test_a_batch_gives_what_single_pairs_give(network):
-    lpips = metric(network)
-    a = np.stack([example("p0"), example("p1"), example("ref")]) / 255.0
-    b = np.stack([example("ref")] * 3) / 255.0
-    assert lpips.batch(a, b) == pytest.approx([lpips(x, y) for x, y in zip(a, b)], abs=1e-6)
-
-
 def test_it_computes_with_one_thread_whatever_torch_may_use(monkeypatch):
     """Two that spin for each other take forty times as long on a busy machine, and may round otherwise."""
     import torch

@@ -231,17 +231,6 @@ def test_one_damaged_held_out_frame_costs_only_its_own_publication():
     assert len(calls) == 1  # it has left the history: nobody decodes it again
 
 
-def test_a_bad_rendering_loses_no_other_score():
-    scorer = Scorer(period_ms=30.0)
-    image = np.full((32, 32, 3), 90, np.uint8)
-    good = image.astype(np.float32) / 255
-    scorer.held_out("cam00", image, 0)
-    scorer.publish("cam00", good, 10)
-    scorer.publish("cam00", np.full_like(good, np.nan), 20)
-    scorer.publish("cam00", good, 30)
-    assert [s.published_ns for s in scorer.held_out("cam00", image, 40)] == [10, 30]
-
-
 def test_what_was_shown_at_the_newest_truth_is_scored_once_the_period_is_known():
     scorer = Scorer()
     assert scorer.newest("h", lambda taken_ns: truth_at(0)) is None

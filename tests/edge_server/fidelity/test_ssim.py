@@ -34,18 +34,6 @@ def test_equals_the_definition(shape):
     assert ssim(a, b) == pytest.approx(reference_ssim(a, b), abs=1e-9)
 
 
-def test_is_symmetric_and_one_for_equal_images():
-    rng = np.random.default_rng(1)
-    a, b = rng.random((20, 20, 3)), rng.random((20, 20, 3))
-    assert ssim(a, b) == pytest.approx(ssim(b, a), abs=1e-12)
-    assert ssim(a, a) == pytest.approx(1.0, abs=1e-12)
-
-
-def test_an_inverted_image_scores_below_zero():
-    a = np.random.default_rng(2).random((32, 32, 3))
-    assert -1.0 <= ssim(1.0 - a, a) < -0.5
-
-
 def test_an_image_smaller_than_the_window_is_refused():
     with pytest.raises(ImageError, match="at least 11 x 11"):
         ssim(np.zeros((10, 40, 3)), np.zeros((10, 40, 3)))
