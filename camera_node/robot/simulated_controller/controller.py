@@ -39,17 +39,15 @@ class Controller:
 
     start_ns: the instant of step 0.
     joints: initial joint angles (6,), radians.
-    drift_ppm: how much faster the controller's clock runs than true time.
     """
 
-    def __init__(self, arm: ArmModel, start_ns: int, joints: ArrayLike = HOME_RAD, drift_ppm: float = 0.0) -> None:
+    def __init__(self, arm: ArmModel, start_ns: int, joints: ArrayLike = HOME_RAD) -> None:
         self.motion = JointMotion(arm, joints)
         self.inputs: dict[str, Any] = {}
         self.answer = 0
         self.runtime_state = STOPPED
         self.steps = 0
         self._start_ns = start_ns
-        self._drift = 1.0 + drift_ppm * 1e-6
         self._busy = False
         self._watchdog_steps: int | None = None
         self._watchdog_reset_step = 0
@@ -90,7 +88,7 @@ class Controller:
         """Current values of the output variables that are not zero."""
         running = self.runtime_state == PLAYING
         return {
-            "timestamp": self.steps * STEP_S * self._drift,
+            "timestamp": self.steps * STEP_S,
             "actual_q": self.motion.q,
             "robot_mode": 7,
             "safety_mode": 1,

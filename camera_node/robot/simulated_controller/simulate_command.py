@@ -27,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
         host, arm = args.host or config.host, arm_model(scenario, config)
     joints = np.array(HOME_RAD) if args.joints is None else read_joints(args.joints)
     clock = WallClock()
-    controller = Controller(arm, clock.now_ns(), joints, args.drift_ppm)
+    controller = Controller(arm, clock.now_ns(), joints)
     server = ControllerServer(controller, host, clock)
 
     async def serve() -> None:

@@ -114,12 +114,12 @@ def test_a_state_that_stands_still_is_not_believed():
 
 
 @pytest.mark.slow
-def test_poses_follow_a_moving_arm_whose_clock_drifts():
+def test_poses_follow_a_moving_arm():
     """Against the truth, which only a simulated controller knows: the stamps are mapped well."""
     from rtde_control import RTDEControlInterface
 
     host, clock = own_address(), WallClock()
-    with simulated_arm(host, "--drift-ppm", "300") as _, running(host, clock, max_gap_ms=500.0) as stream:
+    with simulated_arm(host), running(host, clock, max_gap_ms=500.0) as stream:
         control, truth = RTDEControlInterface(host), TruthClient(host)
         goal = [2.0, *HOME_RAD[1:]]
         control.moveJ(goal, 1.0, 8.0, True)

@@ -39,9 +39,3 @@ def test_cameras_differ_by_the_spread_and_begin_anywhere():
     assert offsets.std() == pytest.approx(0.4, rel=0.06) and abs(offsets.mean()) < 0.04
     assert np.histogram(phases, 10, (0, 1))[0] == pytest.approx(200, abs=60)
     assert make(3).phase == drifts[3].phase
-
-
-def test_transparency_stays():
-    image = np.full((4, 4, 4), 100, np.uint8)
-    out = make(amplitude_stops=2.0, offset_spread_stops=1.0).apply(image, 0, 0.3)
-    assert (out[..., 3] == 100).all() and (out[..., :3] != 100).all()

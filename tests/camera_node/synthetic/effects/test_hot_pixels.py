@@ -59,9 +59,3 @@ def test_it_adds_up_to_white_and_leaves_the_rest_of_the_image_alone():
     assert (out >= image).all() and 0 < changed.sum() < 300
     assert (out[changed] == 255).sum() >= 20
     assert np.array_equal(make().apply(image, 0, 0.0), image)
-
-
-def test_transparency_is_no_pixel():
-    image = np.zeros((100, 100, 4), np.uint8)
-    out = make(hot_ppm=1e6, hot_counts=1e6).apply(image, 0, 0.0)
-    assert (out[..., 3] == 0).all() and (np.count_nonzero(out[..., :3], axis=2) == 1).all()
