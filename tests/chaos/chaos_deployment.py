@@ -12,13 +12,13 @@ from __future__ import annotations
 import os
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from math import inf, nan
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from camera_node.capture import Camera
 from channel_emu.live.camera_stream import CREDITS

@@ -17,6 +17,22 @@ from tests.chaos.fault_plan import FAULTS_OVER_S, Fault, draw_faults, scenario_o
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 
 
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Seeds of --seeds: ``A..B``, or numbers separated by commas."""
+    if metafunc.definition.get_closest_marker("chaos") is not None:
+        text = metafunc.config.getoption("--seeds")
+        first, dots, last = text.partition("..")
+        seeds = range(int(first), int(last) + 1) if dots else [int(word) for word in text.split(",")]
+        metafunc.parametrize("seed", seeds)
+
+
+@pytest.fixture
+def faults(request: pytest.FixtureRequest) -> list[int] | None:
+    """Numbers of the faults to carry out; None: all."""
+    words = request.config.getoption("--faults")
+    return None if words is None else [int(word) for word in words.split(",") if word != "none"]
+
+
 @pytest.mark.chaos
 def test_a_seed_holds(seed: int, faults: list[int] | None) -> None:
     found = seeds.run_seed(seed, faults)
