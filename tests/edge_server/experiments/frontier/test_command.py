@@ -12,15 +12,18 @@ from edge_server.cli import main as edge_server
 from edge_server.experiments.frontier import command, from_scratch
 from edge_server.experiments.frontier.output import recommendation
 from edge_server.experiments.frontier.update_time import (
+    Charged,
     MovingRun,
     MovingScene,
     Variant,
     mean_over_seeds,
+    measure_compute,
     run_updates,
     static_steps,
     steps_for,
     variants,
 )
+from edge_server.experiments.virtual import costs
 from edge_server.experiments.virtual.run_settings import Compute
 from edge_server.live.frontier import read_frontier
 from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
@@ -41,6 +44,13 @@ def test_an_update_time_point_is_the_same_bit_for_bit_whatever_ran_before():
     assert longer["aaoi_ms"] - first["aaoi_ms"] == pytest.approx(300, abs=90)
     at_arrivals = run_updates(replace(run, variant=layers, update_s=0.04, compute=Compute(0.0, 1.0)))
     assert (at_arrivals["steps"], at_arrivals["update_s"]) == (10, 0.04) and at_arrivals["aaoi_ms"] < first["aaoi_ms"]
+
+
+@pytest.mark.parametrize(("name", "charged"), [("layers", (0.5, 20.0, 2.0)), ("medium", (0.5, 26.0, 0.0))])
+def test_a_cycle_is_charged_a_frame_of_each_camera_and_layers_every_frame(name, charged, monkeypatch):
+    measured = {"ms_per_step": 0.5, "ms_per_update": 20.0, "ms_per_view": 2.0}
+    monkeypatch.setattr(costs, "measure", lambda scenario, seconds: {"compute": measured})
+    assert tuple(measure_compute(Charged(TINY, 1.0, Variant("splat", name, {}))).values()) == charged
 
 
 def test_the_front_is_what_nothing_beats_in_both():
