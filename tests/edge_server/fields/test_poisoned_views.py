@@ -1,4 +1,4 @@
-"""One camera sends what cannot be: 50 updates later the field is as good as one that never saw it.
+"""One camera sends what cannot be: 30 updates later the field is as good as one that never saw it.
 
 A striped ball at 64 x 64, a ring of cameras, one of them poisoned for one update or for ten.
 """
@@ -20,7 +20,7 @@ from edge_server.fields.common.scene_box import scene_box
 from tests.edge_server.fields.scenes import psnr, ring
 from tests.edge_server.fields.small import every_field, small
 
-STEPS, WARM, AFTER = 4, 40, 50  # of an update; updates before and after the poison
+STEPS, WARM, AFTER = 4, 40, 30  # of an update; updates before and after the poison
 WITHIN_DB = 0.5
 VIEWS = ring(13, size=64)
 HELD, SEEN, BAD = VIEWS[6], VIEWS[:6] + VIEWS[7:], 3
