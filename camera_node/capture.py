@@ -11,7 +11,7 @@ from pathlib import Path
 
 from camera_node.capture_schedule import CaptureSchedule, RateSchedule, ScheduledSource
 from camera_node.clocks import ClockError, NodeClock
-from camera_node.config import SourceConfig
+from camera_node.settings import SourceConfig
 from camera_node.sources.base import Shot, Source
 from camera_node.sources.registry import open_sources
 from camera_node.sources.with_effects import camera_effects

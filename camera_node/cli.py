@@ -145,7 +145,7 @@ def _add_doctor(doctor: argparse.ArgumentParser) -> None:
 def _open(args: argparse.Namespace, cache_mb: float) -> tuple[Scenario, list[Camera]]:
     """The scenario and the chosen cameras, opened. Raises UsageError or ScenarioError."""
     from camera_node.capture import build_cameras
-    from camera_node.config import source_config
+    from camera_node.settings import source_config
 
     arm_cli.log_to_stderr(logging.WARNING if args.quiet else logging.INFO)
     scenario = load(args.scenario, args.seed)

@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from camera_node.config import ArmConfig, LiveConfig, RecordedConfig, SourceConfig, find_data, source_config
+from camera_node.settings import ArmConfig, LiveConfig, RecordedConfig, SourceConfig, find_data, source_config
 from camera_node.sources.base import rate
 from freshfield import transport
 from freshfield.clock import WallClock

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 
-from camera_node.config import MODELS, ArmConfig, PathConfig, SourceConfig
+from camera_node.settings import MODELS, ArmConfig, PathConfig, SourceConfig
 from freshfield.settings import describe
 
 

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from channel_emu.model import faults, notation
-from channel_emu.model.config import ChannelConfig, channel_from_mapping, from_notation
 from channel_emu.model.link import DISCIPLINES, FITTED_DISCIPLINES
 from channel_emu.model.presets import PRESETS
+from channel_emu.model.settings import ChannelConfig, channel_from_mapping, from_notation
 from freshfield import scenario, transport
 from freshfield.files import format_table, out_file, out_folder
 

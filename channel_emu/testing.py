@@ -48,7 +48,7 @@ from channel_emu.live.priority import SWITCH_INTERVAL_S
 from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.live.report import Report, show
 from channel_emu.model import trace as traces
-from channel_emu.model.config import ChannelConfig, channel_from_mapping
+from channel_emu.model.settings import ChannelConfig, channel_from_mapping
 from freshfield.transport import Transport
 
 T = TypeVar("T")

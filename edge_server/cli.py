@@ -163,10 +163,10 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from edge_server.config import PolicyConfig, read_config
     from edge_server.fidelity.lpips_weights import weights_folder
     from edge_server.live.server import EdgeServer, ServerOptions
     from edge_server.scheduler import parse_policy
+    from edge_server.settings import PolicyConfig, read_config
 
     for option, seconds in (("seconds", args.seconds), ("checkpoint-every", args.checkpoint_every)):
         if seconds is not None and not 0.0 <= seconds <= 1e9:  # a timer's most is 9.2e9

@@ -10,7 +10,7 @@ import pytest
 EDGE = """
 import edge_server.page, edge_server.live.server, edge_server.report.build_report
 import edge_server.experiments.virtual.from_scenario
-from edge_server.config import read_config
+from edge_server.settings import read_config
 from freshfield.scenario import load
 read_config(load("room"))
 """
@@ -20,7 +20,7 @@ import camera_node.robot.arm.hand_eye_mount, camera_node.pose.pairing
 """
 NODE_WITHOUT_ARM = """
 from camera_node.capture import build_cameras
-from camera_node.config import source_config
+from camera_node.settings import source_config
 from freshfield.scenario import load
 build_cameras(load("tile"), source_config(load("tile")), ["cam00"])
 """

@@ -16,12 +16,12 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.config import ArmConfig
 from camera_node.pose.providers import Closable, PoseGapError, PoseProvider
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, camera_poses, load_hand_eyes
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.simulated_controller import TRUTH_PORT
 from camera_node.robot.simulated_controller.joint_motion import STEP_S
+from camera_node.settings import ArmConfig
 from camera_node.sources.base import Shot, Source
 from camera_node.synthetic import Scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from camera_node.capture_schedule import CaptureSchedule, OnceSchedule
-from camera_node.config import McapConfig, errors_of, find_data
+from camera_node.settings import McapConfig, errors_of, find_data
 from camera_node.sources.base import Shot, Source, assign_cameras
 from camera_node.sources.datasets.records import DatasetError
 from freshfield.frame import CODEC_NAMES, pose_and_lens

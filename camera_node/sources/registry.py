@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from camera_node.config import LiveConfig, McapConfig, RecordedConfig, SourceConfig, WorldConfig
+from camera_node.settings import LiveConfig, McapConfig, RecordedConfig, SourceConfig, WorldConfig
 from camera_node.sources.base import Source
 from freshfield.scenario import Scenario, ScenarioError
 

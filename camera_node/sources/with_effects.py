@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from camera_node.config import SourceConfig, errors_of
+from camera_node.settings import SourceConfig, errors_of
 from camera_node.sources.base import Shot, Source
 from freshfield import payload
 from freshfield.scenario import Scenario, ScenarioError

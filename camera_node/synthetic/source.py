@@ -12,7 +12,7 @@ from typing import cast
 
 import numpy as np
 
-from camera_node.config import SourceConfig, WorldConfig, errors_of
+from camera_node.settings import SourceConfig, WorldConfig, errors_of
 from camera_node.sources.base import Shot, Source, rate
 from camera_node.synthetic import Scene, make_scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects

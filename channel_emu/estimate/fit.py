@@ -25,7 +25,7 @@ from channel_emu.estimate.recording import (
     transmissions,
 )
 from channel_emu.estimate.two_states import Segments, TwoStates
-from channel_emu.model.config import channel_from_mapping
+from channel_emu.model.settings import channel_from_mapping
 from freshfield.scenario import ScenarioError
 
 MIN_DELAYS = 20

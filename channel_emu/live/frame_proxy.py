@@ -23,8 +23,8 @@ from channel_emu.live.camera_stream import PUSH, CameraStream
 from channel_emu.live.live_link import Flips
 from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.live.status import snapshot
-from channel_emu.model.config import ChannelConfig
 from channel_emu.model.counter_rng import stream_key
+from channel_emu.model.settings import ChannelConfig
 from freshfield.files import write_json
 from freshfield.frame import FrameRejected, counted_ids, parse, valid_id
 from freshfield.ledger import Ledger

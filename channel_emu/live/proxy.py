@@ -29,8 +29,8 @@ from channel_emu.live.live_link import STREAM_ENDED, ByteBudget, DelayStats, Fli
 from channel_emu.live.replay_link import ReplayLink
 from channel_emu.live.report import Report, figures_of
 from channel_emu.model.channel import Channel
-from channel_emu.model.config import ChannelConfig
 from channel_emu.model.link import EventKind, Link
+from channel_emu.model.settings import ChannelConfig
 from channel_emu.model.trace import Trace, TraceWriter
 from freshfield.clock import WallClock
 from freshfield.streams import ServedCall

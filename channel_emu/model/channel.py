@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from channel_emu.model import faults
 from channel_emu.model.chain import Chain
-from channel_emu.model.config import ChannelConfig
 from channel_emu.model.counter_rng import CounterRng
 from channel_emu.model.faults import per_state
 from channel_emu.model.link import Link
 from channel_emu.model.queue_server import QueueServer
 from channel_emu.model.service_time import ServiceTime, WorkSampler, exponential, gamma, lognormal, replayed
+from channel_emu.model.settings import ChannelConfig
 from channel_emu.model.traffic import PoissonArrivals
 
 

@@ -24,9 +24,9 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from channel_emu.model.link import MAX_SIZE_BYTES, EventKind, Transit
 from channel_emu.model.nanoseconds import NEVER_NS
+from channel_emu.model.settings import ChannelConfig, channel_from_mapping
 from freshfield.untrusted import read_json, read_text
 
 VERSION = 2

@@ -12,8 +12,8 @@ import numpy as np
 
 from channel_emu.model.ages import RunningAge, mean_of_known
 from channel_emu.model.channel import Channel
-from channel_emu.model.config import ChannelConfig
 from channel_emu.model.link import MAX_SIZE_BYTES, EventKind, Link, Transit
+from channel_emu.model.settings import ChannelConfig
 from channel_emu.model.traffic import PeriodicArrivals, PoissonArrivals
 from freshfield.files import write_csv
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.config import ComputeConfig, read_config
 from edge_server.experiments.common.arguments import add_folders, at_least, command_parser, folders_of, run_command
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.common.folders import Folders
@@ -23,6 +22,7 @@ from edge_server.experiments.rollouts.rollout import run_rollouts
 from edge_server.experiments.rollouts.setting import Setting, seeds
 from edge_server.report.machine import commit, machine
 from edge_server.scheduler import STATE_PARTS, short_name
+from edge_server.settings import ComputeConfig, read_config
 from freshfield.files import out_file, write_json
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario, ScenarioError, load

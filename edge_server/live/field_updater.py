@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edge_server.config import EdgeConfig, embedding_for, open_embedder
 from edge_server.fields import Budget, Field, FitReport, View
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.camera_motion import CameraMotion
 from edge_server.live.state import Publication
 from edge_server.live.view_decoder import ViewDecoder
 from edge_server.scheduler import STATE_PARTS, Epoch, Policy, SelectionWindow
+from edge_server.settings import EdgeConfig, embedding_for, open_embedder
 from freshfield.frame import Frame
 from freshfield.scenario import Scenario, ScenarioError
 

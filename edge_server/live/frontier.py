@@ -9,8 +9,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from edge_server.config import EdgeConfig
 from edge_server.run_records import Frontier, FrontierPoint
+from edge_server.settings import EdgeConfig
 from freshfield.scenario import Scenario
 from freshfield.untrusted import read_json, read_text
 

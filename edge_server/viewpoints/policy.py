@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import networks
-from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import State, StateLayout
 from edge_server.viewpoints.candidates import Candidates, ViewpointError
 from edge_server.viewpoints.features import GEOMETRY, StepFeatures
@@ -42,7 +42,7 @@ class PolicyConfig:
     updates: number of updates. episodes: number of episodes for each update.
     way: cost of a way as long as the candidates' mean distance from the target, in standard deviations of
         the reward of a step: the same plan for a large scene as for a small one.
-    gamma: discount of (4.14). Others as in ``learner_spec.Spec``.
+    gamma: discount of (4.14). Others as in ``settings.Spec``.
     """
 
     views: int = 8

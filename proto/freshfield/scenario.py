@@ -6,9 +6,9 @@ The file is YAML::
     description: one line for people
     seed: 7
     cameras: {count: 13, held_out: [cam00]}     # or ids: [a, b, c]; phase: spread
-    source:  {...}     # camera_node.config reads this
-    channel: {...}     # channel_emu.model.config
-    edge:    {...}     # edge_server.config
+    source:  {...}     # camera_node.settings reads this
+    channel: {...}     # channel_emu.model.settings
+    edge:    {...}     # edge_server.settings
 
 Sections are ``freshfield.settings``.
 """

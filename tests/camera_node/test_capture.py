@@ -7,8 +7,8 @@ import asyncio
 import pytest
 
 from camera_node.capture import ShotCache, build_cameras, prepare
-from camera_node.config import source_config
 from camera_node.outbox import Outbox
+from camera_node.settings import source_config
 from camera_node.sources.base import Shot
 from freshfield import ledger
 from freshfield.clock import VirtualClock

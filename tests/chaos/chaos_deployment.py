@@ -23,11 +23,10 @@ from msgspec.structs import replace
 from camera_node.capture import Camera
 from channel_emu.live.camera_stream import CREDITS
 from channel_emu.model.channel import Channel
-from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.faults.corruption import damage
 from channel_emu.model.link import Event, EventKind
 from channel_emu.model.nanoseconds import NEVER_NS
-from edge_server.config import read_config
+from channel_emu.model.settings import channel_from_mapping
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment, WakeCondition
 from edge_server.fields import Field, checkpoint
@@ -36,6 +35,7 @@ from edge_server.fields.registry import make_field, settings_of
 from edge_server.live.field_updater import FieldUpdater, open_updater
 from edge_server.live.ingest import FrameAdmission
 from edge_server.scheduler import make_policy, parse_policy
+from edge_server.settings import read_config
 from freshfield.frame import Frame, FrameRejected, checksum, from_request, to_request, valid_id
 from freshfield.ledger import Ledger
 from freshfield.scenario import Scenario, seed_sequence

@@ -9,12 +9,12 @@ import subprocess
 
 import pytest
 
-from camera_node.config import source_config
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
 from camera_node.robot.arm.viewpoint_tour import plan_tour, viewpoints
-from channel_emu.model.config import channel_from_mapping
-from edge_server.config import read_config
+from camera_node.settings import source_config
+from channel_emu.model.settings import channel_from_mapping
 from edge_server.fields.registry import make_field
+from edge_server.settings import read_config
 from freshfield.scenario import load
 from tests.conftest import ROOT
 from tests.deploy.test_docs import help_of

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from camera_node.config import source_config
+from camera_node.settings import source_config
 from camera_node.sources.registry import open_sources
-from channel_emu.model.config import channel_from_mapping
-from edge_server.config import read_config
+from channel_emu.model.settings import channel_from_mapping
 from edge_server.fields.registry import make_field
 from edge_server.scheduler import make_policy
+from edge_server.settings import read_config
 from freshfield.scenario import SCENARIO_FOLDER, load
 from tests.conftest import data_dir
 

@@ -15,15 +15,15 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from camera_node.config import source_config
+from camera_node.settings import source_config
 from camera_node.sources.datasets import colmap, transforms
 from camera_node.sources.datasets.records import Dataset, DatasetError
 from channel_emu.live.frame_proxy import damage_payload
-from channel_emu.model.config import channel_from_mapping
-from edge_server.config import read_config
+from channel_emu.model.settings import channel_from_mapping
 from edge_server.fields import checkpoint
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.ingest import Ingest
+from edge_server.settings import read_config
 from freshfield import payload, scenario
 from freshfield.clock import VirtualClock
 from freshfield.frame import FrameRejected, checksum, counted_ids, parse, to_request

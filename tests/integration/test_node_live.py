@@ -7,8 +7,8 @@ import dataclasses
 import json
 
 from camera_node.capture import build_cameras
-from camera_node.config import source_config
 from camera_node.node import Node, NodeOptions
+from camera_node.settings import source_config
 from freshfield.clock import WallClock
 from freshfield.scenario import load, parse
 from freshfield.transport import Transport

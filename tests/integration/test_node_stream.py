@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from camera_node.capture import build_cameras
-from camera_node.config import source_config
 from camera_node.node import Node, NodeOptions
+from camera_node.settings import source_config
 from freshfield import ledger, payload
 from freshfield.clock import WallClock
 from freshfield.limits import MAX_CAPTURE_AGE_NS

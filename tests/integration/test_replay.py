@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from camera_node.capture import build_cameras
-from camera_node.config import source_config
 from camera_node.node import Node, NodeOptions
-from edge_server.config import read_config
+from camera_node.settings import source_config
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.ingest import Ingest
 from edge_server.live.output.recorder import Recorder
 from edge_server.live.server import EdgeServer, ServerOptions
+from edge_server.settings import read_config
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.frame import Frame, to_request

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.config import PathConfig, errors_of
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, mount_on_flange, require_arm
 from camera_node.robot.arm.control import (
     STOP_RAD_S2,
@@ -31,6 +30,7 @@ from camera_node.robot.arm.control import (
 )
 from camera_node.robot.arm.joint_states import ArmError, ArmStream
 from camera_node.robot.arm.viewpoint_tour import FARTHEST_RAD, Tour, plan_tour
+from camera_node.settings import PathConfig, errors_of
 from freshfield.scenario import ScenarioError, load
 
 _ARRIVED_RAD = 1e-3

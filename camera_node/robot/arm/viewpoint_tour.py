@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from camera_node.config import PathConfig
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.settings import PathConfig
 from freshfield.geometry import look_at, se3_inverse
 
 Array = NDArray[np.float64]

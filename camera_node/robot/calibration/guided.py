@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.config import ArmConfig, source_config
 from camera_node.robot.arm.camera_poses import base_matrix
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.refinement import refine
@@ -30,6 +29,7 @@ from camera_node.robot.calibration.hand_eye.samples import (
     rotation_vectors,
 )
 from camera_node.robot.calibration.targets import Target, estimate_pose, to_gray
+from camera_node.settings import ArmConfig, source_config
 from camera_node.sources.base import Source
 from camera_node.sources.registry import open_sources
 from freshfield import payload, scenario

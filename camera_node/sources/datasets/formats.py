@@ -1,6 +1,6 @@
 """The data set formats, and how to recognize the format of a folder or file.
 
-Formats are the kinds of ``camera_node.config`` whose dataclass is a ``RecordedConfig``. To add one, add a
+Formats are the kinds of ``camera_node.settings`` whose dataclass is a ``RecordedConfig``. To add one, add a
 reader module here, named like the kind, and a dataclass there, whose fields are the reader's arguments.
 """
 
@@ -10,7 +10,7 @@ import importlib
 from pathlib import Path
 from typing import Any, Protocol, cast
 
-from camera_node.config import MODELS, RecordedConfig, VideoConfig
+from camera_node.settings import MODELS, RecordedConfig, VideoConfig
 from camera_node.sources.datasets.photo import ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, find_files, read_json
 

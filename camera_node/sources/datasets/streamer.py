@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node.config import FPS_RANGE, RecordedConfig, TrajectoryConfig, VideoConfig, errors_of, find_data
 from camera_node.pose.providers import PoseProvider, read_tum
+from camera_node.settings import FPS_RANGE, RecordedConfig, TrajectoryConfig, VideoConfig, errors_of, find_data
 from camera_node.sources.base import Shot, Source, assign_cameras, rate
 from camera_node.sources.datasets.formats import open_configured
 from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage

@@ -15,7 +15,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from camera_node.config import Background
+from camera_node.settings import Background
 from camera_node.sources.datasets.imaging import read_image
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo

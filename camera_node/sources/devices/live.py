@@ -15,8 +15,8 @@ from fractions import Fraction
 from functools import partial
 from pathlib import Path
 
-from camera_node.config import LiveConfig
 from camera_node.pose.providers import Closable, FixedPose, PoseProvider
+from camera_node.settings import LiveConfig
 from camera_node.sources.base import Shot, Source, rate
 from camera_node.sources.devices.feed import CameraError, Feed, Image, as_camera_error
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration

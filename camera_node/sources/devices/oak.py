@@ -14,7 +14,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from camera_node.config import OakConfig
+from camera_node.settings import OakConfig
 from camera_node.sources.devices.feed import (
     CameraError,
     Feed,

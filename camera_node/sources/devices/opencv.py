@@ -17,7 +17,7 @@ from typing import cast
 import cv2
 import numpy as np
 
-from camera_node.config import CameraConfig
+from camera_node.settings import CameraConfig
 from camera_node.sources.devices.feed import CameraError, Feed, Image
 from freshfield.clock import Clock
 

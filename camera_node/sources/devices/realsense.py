@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from camera_node.clocks import ArrivalClock
-from camera_node.config import RealsenseConfig
+from camera_node.settings import RealsenseConfig
 from camera_node.sources.devices.feed import (
     CameraError,
     Feed,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from channel_emu.model.config import channel_from_mapping
+from channel_emu.model.settings import channel_from_mapping
 from freshfield.scenario import ScenarioError
 from freshfield.untrusted import UntrustedError, read_text, read_yaml
 

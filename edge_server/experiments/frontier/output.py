@@ -8,11 +8,11 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from edge_server.config import LEAST_UPDATE_MS
 from edge_server.experiments.common.tables import markdown_table, number
 from edge_server.experiments.frontier.update_time import best
 from edge_server.live.frontier import best_point, points_of
 from edge_server.report.style import CYCLE, INK, figure
+from edge_server.settings import LEAST_UPDATE_MS
 from freshfield.files import write_csv
 
 Row = dict[str, Any]

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.config import LEAST_UPDATE_MS
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none, over_seeds
 from edge_server.experiments.rollouts.episode import EpisodeFactory
@@ -27,6 +26,7 @@ from edge_server.experiments.virtual import costs
 from edge_server.experiments.virtual.run_settings import Compute
 from edge_server.fields.registry import option_help
 from edge_server.scheduler import parse_policy
+from edge_server.settings import LEAST_UPDATE_MS
 from freshfield.scenario import Scenario, parse
 
 # Seconds of virtual time in which costs are measured, and until what is shown counts.

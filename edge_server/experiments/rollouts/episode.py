@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.capture import Camera
-from camera_node.config import WorldConfig, source_config
+from camera_node.settings import WorldConfig, source_config
 from camera_node.synthetic.effects import NO_EFFECTS
-from edge_server.config import read_config
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.rollouts.setting import GRID_MS, Setting
@@ -35,6 +34,7 @@ from edge_server.live.buffer import FrameBuffer
 from edge_server.live.view_decoder import ViewDecoder
 from edge_server.scheduler.learned.observation import FrameEmbeddings, observe
 from edge_server.scheduler.learned.state import State
+from edge_server.settings import read_config
 from freshfield.frame import Frame
 from freshfield.scenario import Scenario, ScenarioError
 

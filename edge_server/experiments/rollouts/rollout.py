@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.config import read_config
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.engine import Engine
@@ -30,6 +29,7 @@ from edge_server.scheduler import BANDIT, Epoch, Policy, make_policy, parse_poli
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.decision import Decision
+from edge_server.settings import read_config
 
 # Period of the instants at which the shown image is scored, in a running deployment.
 SHOWN_EVERY_MS = 125.0

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
-from edge_server.config import ComputeConfig, open_embedder, read_config
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.scheduler.learned.rewards import Reward, make_reward, without_missing_lpips
 from edge_server.scheduler.learned.state import StateLayout
+from edge_server.settings import ComputeConfig, open_embedder, read_config
 from freshfield.scenario import Scenario, ScenarioError
 
 # Rendering a truth costs ten times a score. Instants lie on a grid that contains the lags of moving pixels

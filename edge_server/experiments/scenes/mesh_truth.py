@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.config import WorldConfig, source_config
+from camera_node.settings import WorldConfig, source_config
 from camera_node.synthetic.placement import PlacedParts, place_static
 from camera_node.synthetic.render import cast_rays, surface_properties
 from camera_node.synthetic.scene import Scene

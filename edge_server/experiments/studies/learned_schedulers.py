@@ -18,7 +18,7 @@ from edge_server.experiments.studies.learning import (
 )
 from edge_server.experiments.studies.study import Claim, Statistic, Study, StudyRequest
 from edge_server.experiments.training.scheduler.evaluation import BASELINE_POLICIES
-from edge_server.scheduler.learned.learner_spec import Action
+from edge_server.scheduler.learned.settings import Action
 
 LEARNED, RANDOM, ALL = {"policy": "learned"}, {"policy": "random"}, {"policy": "all"}
 THRESHOLD, WAIT, WAIT_ARRIVED = ({"policy": p, "best": "value"} for p in ("threshold", "wait", "wait-arrived"))

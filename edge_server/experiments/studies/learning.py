@@ -22,7 +22,7 @@ from edge_server.experiments.training.scheduler.evaluation import Candidate, eva
 from edge_server.experiments.training.scheduler.learning_curve import draw_curve
 from edge_server.experiments.training.scheduler.trainer import TrainingConfig, read_log, train
 from edge_server.scheduler.learned.actor import Actor
-from edge_server.scheduler.learned.learner_spec import Action, Spec
+from edge_server.scheduler.learned.settings import Action, Spec
 
 FIELD_OPTIONS = {"effort": "low"}
 SIZE = 64

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.capture import Camera
-from camera_node.config import source_config
-from edge_server.config import read_config
+from camera_node.settings import source_config
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row
 from edge_server.experiments.common.tables import mean_or_none
@@ -32,6 +31,7 @@ from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SHOWN, Scorer
 from edge_server.live.state import Publication
 from edge_server.scheduler.learned.rewards import W_S, f_w
+from edge_server.settings import read_config
 from freshfield.scenario import Scenario, ScenarioError, load, parse, seed_sequence
 
 # Synthetic scenes use the thesis's capture period of 30 ms.

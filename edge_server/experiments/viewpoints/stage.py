@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from camera_node.config import RecordedConfig, SourceConfig, WorldConfig, find_data, source_config
+from camera_node.settings import RecordedConfig, SourceConfig, WorldConfig, find_data, source_config
 from camera_node.synthetic.scene import Scene
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
 from edge_server.experiments.scenes.multiview_still import WHITE, known_options, score_views

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.config import ComputeConfig, EdgeConfig, read_config
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.view_decoder import ViewDecoder
 from edge_server.report.machine import machine, versions
+from edge_server.settings import ComputeConfig, EdgeConfig, read_config
 from freshfield.files import out_file, write_json
 from freshfield.frame import Frame
 from freshfield.scenario import Scenario, ScenarioError, load

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from edge_server.config import ComputeConfig
 from edge_server.live.field_updater import LEAST_TAKEN
+from edge_server.settings import ComputeConfig
 
 # Cost of an update in virtual time.
 Compute = ComputeConfig

@@ -19,9 +19,9 @@ import numpy as np
 
 from camera_node.capture import Camera
 from channel_emu.model.channel import Channel
-from channel_emu.model.config import ChannelConfig
 from channel_emu.model.link import Event, EventKind, Link
 from channel_emu.model.nanoseconds import NEVER_NS
+from channel_emu.model.settings import ChannelConfig
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Budget, Snapshot

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.jit import part
+from edge_server.fields.common.kernels.jit import device_function
 from edge_server.surface.kernels.lens import distort
 
 
@@ -66,7 +66,7 @@ class Search(NamedTuple):
     geometric: float
 
 
-@part
+@device_function
 def project(images, s, x, y, z):
     """Project a world point to image s; -1e9 if behind the camera or far outside."""
     x, y, z = x - images.origin[s, 0], y - images.origin[s, 1], z - images.origin[s, 2]
@@ -82,19 +82,19 @@ def project(images, s, x, y, z):
     return lens[s, 0] * u + lens[s, 2], lens[s, 1] * v + lens[s, 3]
 
 
-@part
+@device_function
 def within(images, s, u, v, margin):
     """Whether (u, v) lies in image s, ``margin`` pixels from its border or more."""
     return u >= margin and v >= margin and u < images.size[s, 0] - margin and v < images.size[s, 1] - margin
 
 
-@part
+@device_function
 def depth_shown(images, s, u, v):
     """Depth of image s at the pixel of (u, v)."""
     return np.float64(images.depth[images.first[s] + np.int64(v) * images.size[s, 0] + np.int64(u)])
 
 
-@part
+@device_function
 def offset_to(images, s, x, y, z):
     """Direction (not unit) from camera s to a point, and distance."""
     x, y, z = x - images.origin[s, 0], y - images.origin[s, 1], z - images.origin[s, 2]

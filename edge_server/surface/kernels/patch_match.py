@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, uniform
 from edge_server.surface.kernels.patch_images import depth_shown, offset_to, project, within
 
@@ -84,7 +84,7 @@ def choose_sources(counter, worker, images, view, planes, visible):
                 view.chosen[row, column, i] = index[i]
 
 
-@part
+@device_function
 def _pattern(across, down, fade):
     """Write the taps' offsets, pixels, and weights by distance, float32 (LANES,) each."""
     t = 0
@@ -98,7 +98,7 @@ def _pattern(across, down, fade):
         across[k] = down[k] = fade[k] = 0.0
 
 
-@part
+@device_function
 def _take_patch(gray, row, column, across, down, fade, patch, weight):
     """Write a pixel's patch, less its weighted mean, and its weights; returns sum of weights, mean and
     variance. Taps similar to the middle weigh more, taps outside nothing."""
@@ -120,7 +120,7 @@ def _take_patch(gray, row, column, across, down, fade, patch, weight):
     return total, mean, spread / total
 
 
-@part
+@device_function
 def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, weight, facts, geometric):
     """Cost of the plane through depth d with a normal: mean of the two images that differ least; and how many
     of these there are: 0 (the cost is WORST), 1 or 2. facts: what ``_take_patch`` returned for the pixel."""
@@ -189,7 +189,7 @@ def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, we
     return one, 1 if one < WORST else 0
 
 
-@part
+@device_function
 def _way_back(images, k, s, row, column, u, v, x, y, z):
     """Pixels between a pixel of image k and where the depth of image s, in which its point (x, y, z) is at
     (u, v), leads back to; MOST_PX at most."""
@@ -204,7 +204,7 @@ def _way_back(images, k, s, row, column, u, v, x, y, z):
     return min(MOST_PX, np.sqrt(u * u + v * v))
 
 
-@part
+@device_function
 def _neighbor(planes, row, column, way):
     """The cheapest pixel of the other color in one of 8 ways, four near and four far; -1: none."""
     height, width = planes.depth.shape

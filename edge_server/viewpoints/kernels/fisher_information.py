@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.fields.common.kernels.camera import SIZE, load_camera
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import fetch_add, is_finite
 from edge_server.fields.splat.kernels.composite import ALPHA_MAX, SAVED, STRIP, STRIPS, bin_strips, composite
 from edge_server.fields.splat.kernels.project import BLOCK, COLOR, MEAN_X, MEAN_Y, RED, TILE
@@ -46,7 +46,7 @@ _PRODUCT = (
 _F0, _F1, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 
 
-@part
+@device_function
 def _add_moments(store, count, pairs, owner, projected, x0, y0, width, height, behind, square, sums):
     """Add a strip's moments to those of its Gaussians, back to front.
 
@@ -102,7 +102,7 @@ def _add_moments(store, count, pairs, owner, projected, x0, y0, width, height, b
         into[WEIGHTS] += weights
 
 
-@part
+@device_function
 def _fold(cam, b, base, here, gaussians, ids, projected, lists, pair_sums, sums, s, by_phi, information):
     """Write the information about a block's parameters, information[b, base : base + here], from its moments.
     by_phi: float32 (_PHI, COLOR, BLOCK), scratch."""

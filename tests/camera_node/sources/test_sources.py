@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from camera_node.capture import build_cameras, prepare
-from camera_node.config import source_config
+from camera_node.settings import source_config
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.registry import open_sources
 from camera_node.synthetic import make_scene

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from camera_node.capture import Camera, build_cameras
-from camera_node.config import source_config
+from camera_node.settings import source_config
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects import NAMES
 from freshfield import payload

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from channel_emu.model.config import channel_from_mapping
+from channel_emu.model.settings import channel_from_mapping
 from channel_emu.model.trace import TraceWriter
 from channel_emu.virtual.simulate import simulate
 

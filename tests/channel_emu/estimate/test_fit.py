@@ -13,8 +13,8 @@ import yaml
 from channel_emu.cli import main
 from channel_emu.estimate import recording as recordings
 from channel_emu.estimate.fit import Fit, IntervalEstimate, fit
-from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.link import FITTED_DISCIPLINES
+from channel_emu.model.settings import channel_from_mapping
 from freshfield import scenario
 from tests.channel_emu.estimate.recordings import write_rows, write_trace
 

@@ -17,7 +17,7 @@ import numpy as np
 from channel_emu.live.camera_stream import CameraStream
 from channel_emu.live.frame_proxy import FrameProxy
 from channel_emu.live.proxy import ProxyOptions
-from channel_emu.model.config import channel_from_mapping
+from channel_emu.model.settings import channel_from_mapping
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.grpc_services import ClockService
 from edge_server.live.ingest import Ingest

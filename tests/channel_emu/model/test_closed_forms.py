@@ -11,7 +11,7 @@ pytest.importorskip("scipy", reason="the closed forms need scipy")
 from scipy import stats
 
 from channel_emu.model.ages import RunningAge
-from channel_emu.model.config import channel_from_mapping
+from channel_emu.model.settings import channel_from_mapping
 from channel_emu.virtual.simulate import simulate
 from tests.channel_emu.model import exact_forms as exact
 

@@ -7,10 +7,10 @@ import pytest
 
 from channel_emu.model.chain import Chain, ChainError, two_state_generator
 from channel_emu.model.channel import Channel
-from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.counter_rng import CounterRng
 from channel_emu.model.link import DISCIPLINES, EventKind
 from channel_emu.model.nanoseconds import NEVER_NS
+from channel_emu.model.settings import channel_from_mapping
 from channel_emu.virtual.simulate import simulate
 
 MS = 10**6

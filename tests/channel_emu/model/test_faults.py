@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from channel_emu.model.channel import Channel
-from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.faults.corruption import damage
 from channel_emu.model.link import EventKind, Link
+from channel_emu.model.settings import channel_from_mapping
 
 MS = 10**6
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from channel_emu.model.channel import Channel
-from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.link import DISCIPLINES, Event, EventKind, Link
 from channel_emu.model.nanoseconds import NEVER_NS
+from channel_emu.model.settings import channel_from_mapping
 
 MS = 10**6
 

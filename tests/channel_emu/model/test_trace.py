@@ -9,8 +9,8 @@ import pytest
 from channel_emu.live.replay_link import ReplayLink
 from channel_emu.model import trace
 from channel_emu.model.channel import Channel
-from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from channel_emu.model.link import Event, EventKind
+from channel_emu.model.settings import ChannelConfig, channel_from_mapping
 from channel_emu.model.trace import TraceError, TraceWriter
 from tests.channel_emu.decided_again import compare
 

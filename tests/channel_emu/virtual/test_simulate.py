@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from channel_emu.model.channel import Channel
-from channel_emu.model.config import channel_from_mapping
+from channel_emu.model.settings import channel_from_mapping
 from channel_emu.virtual.simulate import OUTCOMES, LinkRun, SimulationError, offer_all, simulate
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from edge_server.config import read_config
 from edge_server.embed import EmbeddingConfig, model_path
+from edge_server.settings import read_config
 from freshfield.scenario import Scenario, ScenarioError, load, parse
 
 FILE = Path("/somewhere/room.yaml")

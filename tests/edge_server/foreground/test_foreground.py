@@ -9,12 +9,12 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from edge_server.config import read_config
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.foreground import ForegroundConfig, ForegroundError, read_foreground
 from edge_server.foreground.detector import Detection, Detector, decode
 from edge_server.foreground.foreground import Foreground, clipped, make_foreground
+from edge_server.settings import read_config
 from freshfield.scenario import ScenarioError, load, parse
 from tests.edge_server.foreground.pictures import disc, iou, save_endless_loop, save_memory_bomb, save_orange_detector
 

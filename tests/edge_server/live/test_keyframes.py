@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from edge_server.config import KeyframesConfig
 from edge_server.fields import Budget, View
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.keyframes import Keyframes
 from edge_server.scheduler import make_policy
+from edge_server.settings import KeyframesConfig
 from freshfield.geometry import Pinhole, Pose, look_at
 from tests.edge_server.fields_for_tests import tiny_field
 from tests.edge_server.frames import frame

@@ -10,13 +10,13 @@ import pytest
 pytest.importorskip("onnxruntime", reason="the extra embed is not installed")
 pytest.importorskip("onnx", reason="the extra embed is not installed")
 
-from edge_server.config import read_config
 from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.report.explain_command import main as explain
 from edge_server.scheduler.learned.decision_record import read_decision
-from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
+from edge_server.settings import read_config
 from freshfield import scenario
 from tests.edge_server.embed.graphs import CHANNELS, detector
 from tests.edge_server.fields_for_tests import TINY

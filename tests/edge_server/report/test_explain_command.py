@@ -11,8 +11,8 @@ import pytest
 from edge_server.report.explain_command import main
 from edge_server.scheduler.learned.decision import Decision
 from edge_server.scheduler.learned.decision_record import DecisionWriter
-from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, state
 from tests.edge_server.scheduler.learned.test_decision_record import a_decision

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.config import ExportConfig
 from edge_server.live.state import Publication
 from edge_server.report.build_report import METRICS, SERIES, assemble, build_report, fidelity, updates
 from edge_server.report.figures import draw_frontier
 from edge_server.report.report_page import counts, number
 from edge_server.report.run_files import continuous, read_run_files
 from edge_server.run_records import EdgeStatus, UpdateCounts, UpdateRow
+from edge_server.settings import ExportConfig
 from freshfield_up.summary import summarize
 from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, SECONDS, page_of, publication, write_run
 

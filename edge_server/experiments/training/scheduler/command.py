@@ -9,7 +9,6 @@ import sys
 from collections.abc import Sequence
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.config import read_config
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of, run_command
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
@@ -29,8 +28,9 @@ from edge_server.experiments.training.scheduler.trainer import REPORTS, Training
 from edge_server.fields.registry import field_names
 from edge_server.scheduler import BANDIT, STATE_PARTS
 from edge_server.scheduler.learned.actor import Actor
-from edge_server.scheduler.learned.learner_spec import ACTIONS, Spec
 from edge_server.scheduler.learned.rewards import REWARDS
+from edge_server.scheduler.learned.settings import ACTIONS, Spec
+from edge_server.settings import read_config
 from freshfield.files import out_folder, write_csv, write_json
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario, ScenarioError, load

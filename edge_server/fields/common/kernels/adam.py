@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edge_server.fields.common.kernels.hash_grid import SEGMENT
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import fetch_add, is_finite
 
 PART = 512  # segments a task
@@ -30,7 +30,7 @@ class Rule(NamedTuple):
     correct2: np.float32
 
 
-@part
+@device_function
 def _update(rule, p, g, m, v):
     """One step on equal-length float32 arrays; clears g. Returns how many gradients were not finite.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
-from edge_server.fields.common.kernels.jit import part
+from edge_server.fields.common.kernels.jit import device_function
 
 # Columns: the rotation's nine numbers first. LENS: fx, fy, cx, cy, k1, k2, p1, p2. LIMITS: lowest and highest
 # x / z, then y / z. SIZE: width, height.
@@ -14,14 +14,14 @@ ORIGIN, LENS, LIMITS, NEAR, SIZE, CAMERA = 9, 12, 20, 24, 25, 27
 _F1, _F2 = np.float32(1.0), np.float32(2.0)
 
 
-@part
+@device_function
 def load_camera(cams, b):
     """Camera b's columns as a tuple of CAMERA numbers. From a tuple, a loop that writes to arrays need not
     read the camera again for every Gaussian, which would keep LLVM from vectorizing it."""
     return to_fixed_tuple(cams[b], CAMERA)
 
 
-@part
+@device_function
 def distort(cam, x, y):
     """Distorted normalized coordinates of (x, y), their Jacobian (symmetric: distortion is a gradient) and
     its derivatives xxx, xxy, xyy, yyy. cam: see ``load_camera``."""

@@ -12,7 +12,7 @@ import numpy as np
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.mlp import backward, forward
 from edge_server.fields.common.kernels.radiance_model import is_a, query_backward, query_color, query_density
 from edge_server.fields.common.kernels.simd import fetch_add
@@ -36,7 +36,7 @@ class Grid(NamedTuple):
     table: NDArray[np.float32]
 
 
-@part
+@device_function
 def _corner(x, res):
     """Lower vertex (uint32) and fraction of coordinate x in [0, 1] on a grid of res cells."""
     scaled = x * np.float32(res)
@@ -44,7 +44,7 @@ def _corner(x, res):
     return np.uint32(i), scaled - np.float32(i)
 
 
-@part
+@device_function
 def _corners(level_dense, res, mask, ix, iy, iz):
     """The eight vertices' places in the level's table, x fastest, as uint32."""
     one = np.uint32(1)
@@ -72,7 +72,7 @@ def _corners(level_dense, res, mask, ix, iy, iz):
     )
 
 
-@part
+@device_function
 def _weights(fx, fy, fz):
     one = np.float32(1.0)
     gx, gy, gz = one - fx, one - fy, one - fz
@@ -80,7 +80,7 @@ def _weights(fx, fy, fz):
     return gx * a, fx * a, gx * b, fx * b, gx * c, fx * c, gx * d, fx * d
 
 
-@part
+@device_function
 def _interpolate(table, rows, weights):
     """Weighted sum of eight rows of a table, two float32."""
     a, b = np.float32(0.0), np.float32(0.0)
@@ -90,7 +90,7 @@ def _interpolate(table, rows, weights):
     return a, b
 
 
-@part
+@device_function
 def _encode_level(dense, res, mask, x, y, z, table, out0, out1):
     for s in range(out0.size):
         ix, fx = _corner(x[s], res)
@@ -100,7 +100,7 @@ def _encode_level(dense, res, mask, x, y, z, table, out0, out1):
         out0[s], out1[s] = _interpolate(table, rows, _weights(fx, fy, fz))
 
 
-@part
+@device_function
 def encode(grid, levels, x, a, b, features):
     """Features of points a to b: x float32 (3, N) in the unit cube -> features float32 (>= 2 L, N).
 
@@ -121,7 +121,7 @@ def encode(grid, levels, x, a, b, features):
             _encode_level(False, res, mask, x[0, a:b], x[1, a:b], x[2, a:b], table, out0, out1)
 
 
-@part
+@device_function
 def _mark(dirty, i, j):
     """Flag the segments of two vertices that are neighbors along x, and so mostly share one."""
     a, b = i >> np.uint32(4), j >> np.uint32(4)
@@ -130,7 +130,7 @@ def _mark(dirty, i, j):
         dirty[b] = True
 
 
-@part
+@device_function
 def _scatter_level(dense, res, mask, x, d0, d1, gradient, dirty):
     zero = np.float32(0.0)
     for s in range(d0.size):

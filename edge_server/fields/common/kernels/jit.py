@@ -70,7 +70,7 @@ def borrowed(typingctx: Any, value: Any) -> Any:
 _compiled = partial(njit, nogil=True, fastmath=FAST, error_model="numpy", no_cfunc_wrapper=True)
 
 
-def part(function: Callable[..., Any]) -> Any:
+def device_function(function: Callable[..., Any]) -> Any:
     """A function that kernels call, always inlined.
 
     Otherwise every caller's object code has a copy, and the copy that a process happens to load first serves

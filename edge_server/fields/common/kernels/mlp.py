@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.jit import part
+from edge_server.fields.common.kernels.jit import device_function
 
 BLOCK = 256
 
@@ -30,7 +30,7 @@ def param_count(widths: NDArray[np.int64]) -> int:
     return int(sum(o * i + o for i, o in pairwise(widths)))
 
 
-@part
+@device_function
 def _combine(w, first, p, q, n_out, n_in, x, x_row, y, y_row, a, b):
     """y[y_row + o] += sum_i w[first + o p + i q] x[x_row + i], samples a to b: four outputs by four inputs at once."""
     for o in range(0, n_out, 4):
@@ -55,7 +55,7 @@ def _combine(w, first, p, q, n_out, n_in, x, x_row, y, y_row, a, b):
                 y3[s] += d0 * r + d1 * u + d2 * v + d3 * z
 
 
-@part
+@device_function
 def _weight_gradient(d_w, first, n_out, n_in, d_y, y_row, x, x_row, a, b):
     """d_w[o, i] += sum_s d_y[o, s] x[i, s], four by two dot products at a time."""
     zero = np.float32(0.0)
@@ -86,7 +86,7 @@ def _weight_gradient(d_w, first, n_out, n_in, d_y, y_row, x, x_row, a, b):
             d_w[base + 3 * n_in + i + 1] += d1
 
 
-@part
+@device_function
 def forward(net, acts, start, end):
     """Run samples start to end through the net.
 
@@ -113,7 +113,7 @@ def forward(net, acts, start, end):
             row = y_row
 
 
-@part
+@device_function
 def backward(net, acts, d_acts, n, d_params):
     """Gradients of n samples after ``forward``.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.radiance_model import query_density
 from edge_server.fields.common.kernels.rays import COARSE
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite, uniform
@@ -13,7 +13,7 @@ from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
 CELLS_A_TASK = 2048  # at most train.CHUNK: they share its scratch
 
 
-@part
+@device_function
 def cell_centre(index, cells, contracted):
     """Center of a cell in scene units (contraction undone) and how much longer a step is there."""
     i, j, k = index % cells, (index // cells) % cells, index // (cells * cells)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, distort, load_camera
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.rays import HORIZON, pixel_direction
 from edge_server.fields.common.kernels.simd import fetch_add
 
@@ -21,13 +21,13 @@ _EMPTY_VIEWS = 2  # a cell is empty if this many views see plain background ther
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
-@part
+@device_function
 def _spread(u):
     """A coordinate of contracted space [-2, 2] whose largest is m -> factor to scene units."""
     return _F1 / ((np.float32(2.0) - u) * u) if u > _F1 else _F1
 
 
-@part
+@device_function
 def _pixels_of_row(cam, first, width, height, nowhere, row, pixels):
     """Which pixel shows each cell of a row: pixels, int32 (cells,), receives its number, or ``nowhere``.
 
@@ -47,7 +47,7 @@ def _pixels_of_row(cam, first, width, height, nowhere, row, pixels):
         pixels[k] = first + line * width + column if sees else nowhere
 
 
-@part
+@device_function
 def _hidden_cells(cams, size, first, flags, nowhere, row, pixels, tally, hidden):
     """Find the pixels that show each cell of a row, and the cells that are hidden: those that most of the
     cameras seeing them see unmarked. Returns whether all are hidden; ``pixels`` is then filled only in part.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.jit import part
+from edge_server.fields.common.kernels.jit import device_function
 
 COARSE = 4  # cells of the occupancy grid a side of one cell of its coarse copy
 NEVER = np.float32(1e30)
@@ -64,7 +64,7 @@ class Views(NamedTuple):
     guide: NDArray[np.float32] = np.zeros(0, np.float32)
 
 
-@part
+@device_function
 def pixel_direction(lens, rotation, u, v):
     """Unit direction in world axes of image point (u, v): ``Pinhole.rays``, rotated, for one pixel."""
     x0, y0 = (u - lens[2]) / lens[0], (v - lens[3]) / lens[1]
@@ -86,7 +86,7 @@ def pixel_direction(lens, rotation, u, v):
     )
 
 
-@part
+@device_function
 def slab(o, d, half, enter, leave):
     if abs(d) < np.float32(1e-9):
         return (enter, leave) if abs(o) <= half else (enter, np.float32(-1.0))
@@ -94,14 +94,14 @@ def slab(o, d, half, enter, leave):
     return max(enter, min(a, b)), min(leave, max(a, b))
 
 
-@part
+@device_function
 def origin_of(views, v):
     """The origin of view v as three float32."""
     o = views.origin[v]
     return np.float32(o[0]), np.float32(o[1]), np.float32(o[2])
 
 
-@part
+@device_function
 def interval(space, o, d):
     """Where the ray from o along d (three float32 each) enters and leaves the scene; leave <= enter if it misses
     it or is not finite: undistortion may diverge for an impossible lens, and NaN must not become the number of
@@ -117,7 +117,7 @@ def interval(space, o, d):
     return slab(oz, dz, half, enter, leave)
 
 
-@part
+@device_function
 def _exit(u, d, blocks):
     """Distance, in units of u, to the far side of u's block along one axis."""
     i = np.floor(u * blocks)
@@ -128,7 +128,7 @@ def _exit(u, d, blocks):
     return np.float32(1e9)
 
 
-@part
+@device_function
 def unit_cube(contracted, px, py, pz):
     """Map a point in scene units to the encoding's unit cube, [0, 1)."""
     scale, top = np.float32(0.5), np.float32(0.9999999)
@@ -145,7 +145,7 @@ def unit_cube(contracted, px, py, pz):
     )
 
 
-@part
+@device_function
 def march(space, o, d, t, leave, x, ts, dts, n, limit, most):
     """Append the samples of the ray from o along d (three float32 each) in occupied cells from distance t on.
 

@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from edge_server.fields.common.kernels.jit import part
+from edge_server.fields.common.kernels.jit import device_function
 
 
 @intrinsic
@@ -23,7 +23,7 @@ def fetch_add_at(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
     return types.int64(array, types.int64, types.int64), codegen
 
 
-@part
+@device_function
 def fetch_add(array, value):
     """``fetch_add_at`` the first element."""
     return fetch_add_at(array, 0, value)
@@ -33,7 +33,7 @@ def fetch_add(array, value):
 COUNTER = 8
 
 
-@part
+@device_function
 def draw(counter, worker, tasks):
     """The number of a task that no worker has drawn yet; ``tasks`` or more if none is left.
 
@@ -96,7 +96,7 @@ _P3, _P4, _P5 = _F(4.1665795894e-2), _F(1.6666665459e-1), _F(5.0000001201e-1)
 _HALF, _ONE, _LOWEST, _HIGHEST = _F(0.5), _F(1.0), _F(-87.0), _F(88.0)
 
 
-@part
+@device_function
 def exp32(x):
     """exp in float32, argument clamped to [-87, 88], relative error below 2e-7; NaN stays NaN.
 
@@ -117,7 +117,7 @@ _L3, _L4, _L5 = _F(-1.2420140846e-1), _F(1.4249322787e-1), _F(-1.6668057665e-1)
 _L6, _L7, _L8 = _F(2.0000714765e-1), _F(-2.4999993993e-1), _F(3.3333331174e-1)
 
 
-@part
+@device_function
 def log32(x):
     """The natural logarithm of a normal positive float32, relative error below 2e-7 but for arguments within
     .001 of 1 (absolute error below 1e-8 there). For other arguments the result is undefined, maybe NaN.
@@ -132,13 +132,13 @@ def log32(x):
     return m + (p * m * square + e * _LN2_LOW - _HALF * square) + e * _LN2_HIGH
 
 
-@part
+@device_function
 def is_finite(x):
     """Whether float x is a number. np.isfinite subtracts x from itself, which fast mathematics folds to 0."""
     return abs(x) <= np.float32(3.4e38)
 
 
-@part
+@device_function
 def random_bits(key, n):
     """64 random bits: the n-th output (uint64) of the splitmix64 stream ``key`` (uint64)."""
     z = np.uint64(key + np.uint64(n) * np.uint64(0x9E3779B97F4A7C15))
@@ -147,7 +147,7 @@ def random_bits(key, n):
     return np.uint64(z ^ (z >> np.uint64(31)))
 
 
-@part
+@device_function
 def uniform(key, n):
     """A float32 in [0, 1): the n-th number of stream ``key``."""
     return np.float32(random_bits(key, n) >> np.uint64(40)) * np.float32(5.9604645e-08)

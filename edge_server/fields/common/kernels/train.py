@@ -8,7 +8,7 @@ import numpy as np
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.radiance_model import (
     fill_chunk,
     has_own_sampling,
@@ -117,7 +117,7 @@ class RaySampling(NamedTuple):
     embeddings: NDArray[np.float32]
 
 
-@part
+@device_function
 def _view_of(first, pixel):
     """The last k with first[k] <= pixel. (np.searchsorted would compile seconds of string handling.)"""
     low, high = 0, first.size - 1
@@ -130,7 +130,7 @@ def _view_of(first, pixel):
     return low
 
 
-@part
+@device_function
 def draw_ray(views, ray_sampling, n, ray):
     """Draw the n-th ray of the step: fills ray (12,), returns its view's number."""
     key, k = ray_sampling.key, np.uint64(n) * np.uint64(8)
@@ -146,7 +146,7 @@ def draw_ray(views, ray_sampling, n, ray):
     return take_pixel(views, ray_sampling.background, pixel, ray)
 
 
-@part
+@device_function
 def take_pixel(views, background, pixel, ray):
     """Fill ray (12,) from a pixel (see ``Scratch``). Returns the view's number."""
     view = _view_of(views.first, pixel)
@@ -175,7 +175,7 @@ def take_pixel(views, background, pixel, ray):
 AT, LEAVE, _DEPTH = 0, 1, 2  # columns of ``Scratch.travel``
 
 
-@part
+@device_function
 def begin_rays(views, ray_sampling, space, chunk, first, end, ray, travel):
     """Draw the chunk's rays first to end: fills ray and travel (``Scratch``)."""
     for r in range(first, end):
@@ -186,7 +186,7 @@ def begin_rays(views, ray_sampling, space, chunk, first, end, ray, travel):
         travel[r, AT], travel[r, LEAVE], travel[r, _DEPTH] = enter, leave, _F0
 
 
-@part
+@device_function
 def _march_chunk(views, ray_sampling, space, encoding, net, chunk, x, line, acts, ray, travel, span):
     """Fill a chunk with rays (``fill_chunk``). Returns rays drawn, columns and spans.
 
@@ -265,7 +265,7 @@ def _learn_sampling(encoding, bins, chunk, worker, r, w, line, a, b, good):
     return lambda encoding, bins, chunk, worker, r, w, line, a, b, good: None
 
 
-@part
+@device_function
 def add_appearance(out, row, embedding, a, b):
     """Add the effect of an appearance embedding to the raw colors of samples a to b, rows 1 to 3 of out.
 
@@ -279,7 +279,7 @@ def add_appearance(out, row, embedding, a, b):
                 base[s] += embedding[k] * share[s]
 
 
-@part
+@device_function
 def add_appearance_backward(out, d_out, row, embedding, a, b, d_embedding):
     """Backward of ``add_appearance``: writes rows ``row`` on of d_out and adds to d_embedding."""
     for k in range(embedding.size):
@@ -292,7 +292,7 @@ def add_appearance_backward(out, d_out, row, embedding, a, b, d_embedding):
         d_embedding[k] += total
 
 
-@part
+@device_function
 def sort_by_ray(drawn, spans, span, ray, travel, column, ray_first):
     """Number the rays that have ended anew and sort their samples by ray (``column``, ``ray_first``).
     Returns how many rays there are. Their rows of ``ray`` move up; spans of the others get ray -1.
@@ -325,7 +325,7 @@ def sort_by_ray(drawn, spans, span, ray, travel, column, ray_first):
     return rays
 
 
-@part
+@device_function
 def clear_columns(rows, column, first, end):
     """Set to zero the columns ``column[first:end]`` of ``rows``."""
     for k in range(rows.shape[0]):
@@ -333,7 +333,7 @@ def clear_columns(rows, column, first, end):
             rows[k, column[p]] = _F0
 
 
-@part
+@device_function
 def gather_by_ray(out, line, column, n, by_ray):
     """Copy density, color, distance and length of n samples into the order of their rays."""
     for k in range(4):
@@ -344,7 +344,7 @@ def gather_by_ray(out, line, column, n, by_ray):
             by_ray[8 + k, s] = line[k, column[s]]
 
 
-@part
+@device_function
 def scatter_to_columns(by_ray, column, n, d_out):
     """Copy the gradients of n samples back to the columns in which they were found."""
     for k in range(4):
@@ -352,7 +352,7 @@ def scatter_to_columns(by_ray, column, n, d_out):
             d_out[k, column[s]] = by_ray[4 + k, s]
 
 
-@part
+@device_function
 def add_exposure_sums(out, w, dts, first, end, ray, sums):
     """Add one ray to the sums of ``camera_refinement.Exposures.learn``, after ``ray_loss``: number, target t,
     t^2, error e and e t per channel; sums: float64 (views, 3, 5)."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge_server.fields.common.kernels.jit import part
+from edge_server.fields.common.kernels.jit import device_function
 from edge_server.fields.common.kernels.simd import exp32, is_finite
 
 # Raw density is clamped before the exponential, forward and backward alike: the largest density makes one
@@ -40,7 +40,7 @@ class Weights(NamedTuple):
     guide: np.float32 = np.float32(0.0)
 
 
-@part
+@device_function
 def harmonic(k, x, y, z):
     """Real spherical harmonics 1 to 8 of a unit direction, float32; harmonic 0 is the color itself."""
     if k == 1:
@@ -60,14 +60,14 @@ def harmonic(k, x, y, z):
     return np.float32(0.5462742) * (x * x - y * y)
 
 
-@part
+@device_function
 def activate(out, a, b):
     """``activate_density`` and ``activate_color``."""
     activate_density(out, a, b)
     activate_color(out, a, b)
 
 
-@part
+@device_function
 def activate_density(out, a, b):
     """Raw density -> density, in place, samples a to b of row 0."""
     sigma = out[0, a:b]
@@ -75,7 +75,7 @@ def activate_density(out, a, b):
         sigma[s] = exp32(min(max(sigma[s], np.float32(RAW_LOW)), np.float32(RAW_HIGH)))
 
 
-@part
+@device_function
 def activate_color(out, a, b):
     """Raw colors -> colors in [0, 1], in place, samples a to b of rows 1 to 3."""
     for c in range(1, 4):
@@ -84,7 +84,7 @@ def activate_color(out, a, b):
             row[s] = _F1 / (_F1 + exp32(-row[s]))
 
 
-@part
+@device_function
 def samples_until_opaque(out, dts, first, end):
     """How many samples of a ray there are until it is opaque. Density is in row 0 of out."""
     depth = _F0
@@ -95,7 +95,7 @@ def samples_until_opaque(out, dts, first, end):
     return end - first
 
 
-@part
+@device_function
 def add_harmonics(out, harmonics, first, end, dx, dy, dz):
     """Add the harmonics of direction (dx, dy, dz) to the raw colors, rows 1 to 3 of out, of samples first to
     end."""
@@ -107,7 +107,7 @@ def add_harmonics(out, harmonics, first, end, dx, dy, dz):
                 base[s] += y * share[s]
 
 
-@part
+@device_function
 def add_harmonics_backward(d_out, harmonics, first, end, dx, dy, dz):
     """The gradient of ``add_harmonics``: rows 4 on from rows 1 to 3 of d_out."""
     for k in range(1, harmonics):
@@ -118,7 +118,7 @@ def add_harmonics_backward(d_out, harmonics, first, end, dx, dy, dz):
                 share[s] = y * base[s]
 
 
-@part
+@device_function
 def ray_loss(out, d_out, ts, dts, w, first, end, target, background, guide, weights):
     """Squared color error of one ray (3.22) and its gradient.
 

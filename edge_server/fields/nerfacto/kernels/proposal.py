@@ -18,7 +18,7 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.hash_grid import Grid
-from edge_server.fields.common.kernels.jit import part
+from edge_server.fields.common.kernels.jit import device_function
 from edge_server.fields.common.kernels.radiance_model import (
     is_a,
     query_backward,
@@ -67,19 +67,19 @@ class ProposalGrid(NamedTuple):
     sampling: ProposalSampling
 
 
-@part
+@device_function
 def proposal_cells_of(encoding):
     """The proposal's cells as a flat array."""
     return encoding.table[encoding.first[encoding.first.size - 1] :].reshape(-1)
 
 
-@part
+@device_function
 def _cell(cells, ux, uy, uz):
     f, n = np.float32(cells), np.int32(cells)
     return np.int32(np.int32(ux * f) + n * np.int32(np.int32(uy * f) + n * np.int32(uz * f)))
 
 
-@part
+@device_function
 def warp(contracted, o, d, enter, leave):
     """Spacing of bins: linear in distance up to the end of the box of interest, then linear in disparity.
 
@@ -98,13 +98,13 @@ def warp(contracted, o, d, enter, leave):
     return knee, slope, knee + (_F1 - _F1 / (_F1 + (leave - knee) * slope)) / slope
 
 
-@part
+@device_function
 def unwarp(u, knee, slope):
     """Distance along the ray at warped distance u, the inverse of ``warp``."""
     return u if u <= knee else knee + (_F1 / (_F1 - (u - knee) * slope) - _F1) / slope
 
 
-@part
+@device_function
 def make_bins(space, encoding, bins, o, d, enter, leave, shift, first, cell, depth, edges, at):
     """Divide a ray into bins and keep those in occupied cells, up to optical depth CUTOFF_DEPTH.
 
@@ -150,7 +150,7 @@ def make_bins(space, encoding, bins, o, d, enter, leave, shift, first, cell, dep
     return count, finite
 
 
-@part
+@device_function
 def bin_weights(depth, first, count, weight):
     """Volume rendering weights (3.21) of bins from their optical depths, both float32 from ``first`` on."""
     total, before = _F0, _F1
@@ -161,7 +161,7 @@ def bin_weights(depth, first, count, weight):
         before = after
 
 
-@part
+@device_function
 def allocate_samples(weight, first, count, samples, even, shift, group, share):
     """Inverse-CDF sampling: allocate a ray's samples to its bins.
 
@@ -199,14 +199,14 @@ def allocate_samples(weight, first, count, samples, even, shift, group, share):
     return g + (1 if pending > _F0 else 0)
 
 
-@part
+@device_function
 def _dilated(weight, k, first, end):
     w = weight[k]
     left, right = weight[max(k - 1, first)], weight[min(k + 1, end - 1)]
     return _HALF * (max(left, w) + max(w, right))
 
 
-@part
+@device_function
 def place_samples(contracted, o, d, edges, group, first, count, share, shift, n, x, line):
     """Append a ray's samples, of equal length within a group, from column n on.
 
@@ -239,19 +239,19 @@ def place_samples(contracted, o, d, edges, group, first, count, share, shift, n,
     return n
 
 
-@part
+@device_function
 def bin_memory(size):
     """Memory for the bins of rays, ``size`` of them: see ``sample_ray``."""
     return (np.empty(size, np.int32), np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.int32))
 
 
-@part
+@device_function
 def bin_scratch(size):
     """Scratch of ``sample_ray`` for a ray of ``size`` bins."""
     return np.empty((2, size + 1), np.float32), np.empty((2, size), np.int32), np.empty(size, np.int64)
 
 
-@part
+@device_function
 def sample_ray(space, encoding, o, d, shift, within, bins, first, scratch, n, x, line):
     """Bins of the ray from o along d (three float32 each), from ``first`` on, and its samples from column n on.
 
@@ -293,7 +293,7 @@ def _sample_rays(encoding, space, o, travel, active, count, x, line, first):
     return run
 
 
-@part
+@device_function
 def _grid(e):
     return Grid(e.resolution, e.first, e.dense, e.table)
 

@@ -9,7 +9,7 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.radiance_model import fill_chunk, is_a, learn_sampling, query_density
 from edge_server.fields.common.kernels.rays import origin_of
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, uniform
@@ -48,7 +48,7 @@ class ProposalBins(NamedTuple):
     slope: NDArray[np.float32]
 
 
-@part
+@device_function
 def compact_columns(rows, a, b, to):
     """Move columns a to b of every row to column ``to`` <= a."""
     for k in range(rows.shape[0]):
@@ -57,7 +57,7 @@ def compact_columns(rows, a, b, to):
             row[to + s] = row[a + s]
 
 
-@part
+@device_function
 def _sample_chunk(views, ray_sampling, space, encoding, net, chunk, worker, x, line, acts, ray, travel, span, bins):
     """``fill_chunk``: hidden samples are removed, and further rays fill their place."""
     dts, out = line[1], acts[acts.shape[0] - net.widths[-1] :]
@@ -116,7 +116,7 @@ def _fill_chunk(encoding, views, ray_sampling, space, net, chunk, worker, x, lin
     return run
 
 
-@part
+@device_function
 def interlevel_loss(encoding, cell, depth, weight, group, first, count, w, group_of, start, stop, slope, grad):
     """The proposal's loss on one ray (eq. 13) and its gradient: a group of bins must not weigh less than its
     samples.

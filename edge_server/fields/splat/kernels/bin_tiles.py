@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import count_bits, draw, lowest_bit
 from edge_server.fields.splat.kernels.project import DEPTH_BITS, DEPTH_KEY, TILE_BITS
 
@@ -43,7 +43,7 @@ class TileLists(NamedTuple):
     binned: NDArray[np.int32]
 
 
-@part
+@device_function
 def _sort(keys, order, n):
     """Stable radix sort of order[0, :n] by keys[0, :n]; the result is in row 0."""
     counts = np.zeros((2, RADIX + 1), np.int64)
@@ -67,21 +67,21 @@ def _sort(keys, order, n):
         order[0, to] = order[1, k]
 
 
-@part
+@device_function
 def _tile_bits(tiles, b, i):
     """The two TILE_BITS columns of a Gaussian as one 64-bit number."""
     low, high = np.uint64(np.uint32(tiles[b, i, TILE_BITS])), np.uint64(np.uint32(tiles[b, i, TILE_BITS + 1]))
     return low | (high << np.uint64(32))
 
 
-@part
+@device_function
 def _low_bits(bits, n):
     """``bits`` with all but the lowest n (n >= 0) cleared."""
     mask = (np.uint64(1) << np.uint64(n & 63)) - np.uint64(1)
     return bits & (mask if n < 64 else ~np.uint64(0))
 
 
-@part
+@device_function
 def _count_tiles(bits, n):
     """How many of the first n tiles of its bounding box a Gaussian touches: it is taken to touch all from the 65th
     on."""

@@ -15,7 +15,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from edge_server.fields.common.kernels.jit import part
+from edge_server.fields.common.kernels.jit import device_function
 from edge_server.fields.common.kernels.simd_vectors import (
     LANES,
     Vector,
@@ -54,7 +54,7 @@ _F0, _HALF = np.float32(0.0), np.float32(0.5)
 _LAST, _SLACK = np.float32(TILE - 1), np.float32(1e-3)  # pixels
 
 
-@part
+@device_function
 def bin_strips(lists, b, begin, end, projected, y0, strip_pairs, count):
     """Split a tile's list lists.pair[b, begin:end] into one list a strip, front to back. y0: the tile's
     first row of pixels. strip_pairs: int32 (STRIPS, N) and count: int64 (STRIPS,), both written."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.camera import SIZE, load_camera
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import draw, is_finite, log32
 from edge_server.fields.common.training_schedule import BETA1, BETA2
 from edge_server.fields.splat.kernels.project import BASE, BLOCK, COLOR, OPACITY, POSITION, QUATERNION, RADIUS, SCALE
@@ -83,7 +83,7 @@ def age_corrections() -> NDArray[np.float32]:
     return np.stack([1.0 / (1.0 - BETA1**age), 1.0 / (1.0 - BETA2**age), decay], axis=-1).astype(np.float32)
 
 
-@part
+@device_function
 def clamp_gaussian(params, i):
     """Clamp Gaussian i to its bounds: finite, not a needle, not a giant."""
     row = params[i]
@@ -125,7 +125,7 @@ def clamp_gaussians(params):
         clamp_gaussian(params, i)
 
 
-@part
+@device_function
 def _gather_gradients(base, here, touched, params, moments, rule, s, g):
     """Write a block's gradients (NaN: leave the parameter as it is), rates and second bias corrections to the
     thirds of ``g``, a Gaussian's parameters side by side. Returns how many gradients are not finite."""
@@ -150,7 +150,7 @@ def _gather_gradients(base, here, touched, params, moments, rule, s, g):
     return lost
 
 
-@part
+@device_function
 def _adam(first, size, params, moments, rule, g):
     """An Adam step for parameters first, ..., first + size - 1 of the flattened arrays; g: see
     ``_gather_gradients``. A block at once: the fourteen parameters of one Gaussian do not fill a register."""

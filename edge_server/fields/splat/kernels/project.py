@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.camera import LENS, LIMITS, NEAR, ORIGIN, SIZE, distort, load_camera
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import bits_of_float, draw, exp32, is_finite, log32
 from edge_server.fields.common.kernels.volume_rendering import harmonic
 from edge_server.fields.splat.settings import ALPHA_MIN, LOG_SCALE_HIGH, LOG_SCALE_LOW, RAW_OPACITY_LIMIT
@@ -60,7 +60,7 @@ class Gaussians(NamedTuple):
     harmonics: int
 
 
-@part
+@device_function
 def unit_quaternion(w, x, y, z):
     """The normalized quaternion and 1 / length; (1, 0, 0, 0) and 0 for one without a direction."""
     square = w * w + x * x + y * y + z * z
@@ -75,7 +75,7 @@ def unit_quaternion(w, x, y, z):
     )
 
 
-@part
+@device_function
 def rotation(w, x, y, z):
     """The rotation matrix of a unit quaternion, row by row."""
     return (
@@ -91,13 +91,13 @@ def rotation(w, x, y, z):
     )
 
 
-@part
+@device_function
 def exp_scale(raw):
     """The scale of a raw parameter, which is clamped first."""
     return exp32(min(max(raw, np.float32(LOG_SCALE_LOW)), np.float32(LOG_SCALE_HIGH)))
 
 
-@part
+@device_function
 def rotate_to_camera(cam, x, y, z):
     """A vector in world axes -> in camera axes."""
     return (
@@ -107,7 +107,7 @@ def rotate_to_camera(cam, x, y, z):
     )
 
 
-@part
+@device_function
 def lens_terms(cam, x, y, z):
     """The projection of a camera point through the lens, and what the Jacobian J and its gradient need:
     x / z, y / z, both clamped, projected u, v, the lens's first and second derivatives, 1 / z. J is taken at
@@ -123,7 +123,7 @@ def lens_terms(cam, x, y, z):
     return a, c, ta, tc, u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse
 
 
-@part
+@device_function
 def rotate_to_world(cam, j0, j1, j2):
     """A row vector in camera axes -> in world axes."""
     return (
@@ -133,7 +133,7 @@ def rotate_to_world(cam, j0, j1, j2):
     )
 
 
-@part
+@device_function
 def _load_block(gaussians, base, count, s):
     """Load what is the same for all cameras of Gaussians base, ..., base + count - 1 into the rows of ``s``:
     position, axes of the ellipsoid times their lengths, opacity, and the Gaussian's extent in
@@ -161,7 +161,7 @@ def _load_block(gaussians, base, count, s):
         s[_REACH + j] = _F2 * log32(alpha * np.float32(1.0 / ALPHA_MIN)) if shows else _F0
 
 
-@part
+@device_function
 def _project_block(cam, s):
     """Project the Gaussians in the rows of ``s`` into a camera: mean, depth, conic, and the edges of the box
     they cover, in tiles (LEFT > RIGHT: not in the image). cam: see ``load_camera``."""
@@ -200,7 +200,7 @@ def _project_block(cam, s):
         s[_TOP + j], s[_BOTTOM + j] = max(py - ry, _F0) * over, min(py + ry, height - _HALF) * over
 
 
-@part
+@device_function
 def _touched_tiles(px, py, a, b, c, reach, x0, x1, y0, y1):
     """Bits of the tiles of a box that an ellipse touches: those in which a dx^2 + 2 b dx dy + c dy^2 is at
     most ``reach`` somewhere. The box of a slanting needle is twice as large as its ellipse, and a tile that
@@ -228,7 +228,7 @@ def _touched_tiles(px, py, a, b, c, reach, x0, x1, y0, y1):
     return bits
 
 
-@part
+@device_function
 def _write_projected(cam, gaussians, i, s, j, row, edges):
     """Fill row (PROJECTED,) and edges (FOOTPRINT,) of Gaussian i from column j of ``s``. The conic is the
     upper triangle of the inverse of the projected covariance."""

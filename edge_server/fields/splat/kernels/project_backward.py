@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.fields.common.kernels.camera import LENS, ORIGIN
-from edge_server.fields.common.kernels.jit import part
+from edge_server.fields.common.kernels.jit import device_function
 from edge_server.fields.common.kernels.volume_rendering import harmonic
 from edge_server.fields.splat.kernels.project import (
     ALPHA,
@@ -41,13 +41,13 @@ _ROWS = 26
 _F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
 
 
-@part
+@device_function
 def block_scratch(width):
     """Memory for a block of Gaussians with ``width`` parameters each."""
     return np.zeros((_ROWS + width) * BLOCK, np.float32)
 
 
-@part
+@device_function
 def load_block(gaussians, ids, count, s):
     """Load Gaussians ids[:count] into the rows of ``s`` and set their gradients to 0."""
     params = gaussians.params
@@ -63,7 +63,7 @@ def load_block(gaussians, ids, count, s):
         s[k] = _F0
 
 
-@part
+@device_function
 def gather_sums(b, ids, count, projected, own_first, own_count, pair_sums, s):
     """Add up the sums of each Gaussian's pairs in camera slot b, in a fixed order. Returns how many Gaussians
     of the block have pairs there."""
@@ -88,7 +88,7 @@ def gather_sums(b, ids, count, projected, own_first, own_count, pair_sums, s):
     return seen
 
 
-@part
+@device_function
 def project_backward(cam, s):
     """Add one camera's gradients to the rows from GRADIENT on. cam: see ``load_camera``.
 
@@ -190,7 +190,7 @@ def project_backward(cam, s):
         s[SLOPE + j] = np.sqrt(du * du + dv * dv) if seen else _F0
 
 
-@part
+@device_function
 def _harmonic_slope(h, x, y, z):
     """Derivatives of harmonic h by x, y and z."""
     a, b, c = np.float32(0.4886025), np.float32(1.0925485), np.float32(0.3153916)
@@ -212,7 +212,7 @@ def _harmonic_slope(h, x, y, z):
     return d * x, -d * y, _F0
 
 
-@part
+@device_function
 def harmonics_backward(cam, gaussians, ids, count, s):
     """Add the gradient by way of the view-dependent color, which ``project_backward`` leaves out."""
     params, harmonics = gaussians.params, gaussians.harmonics

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import draw, fetch_add, is_finite
 from edge_server.fields.splat.kernels.bin_tiles import TileLists
 from edge_server.fields.splat.kernels.composite import (
@@ -72,7 +72,7 @@ class Raster(NamedTuple):
     saved: NDArray[np.float32]
 
 
-@part
+@device_function
 def clear_tile(s):
     """Reset the tile memory ``s``: full light, no color."""
     for k in range(PIXELS):
@@ -80,7 +80,7 @@ def clear_tile(s):
         s[_R + k] = s[_G + k] = s[_B + k] = s[_Z + k] = _F0
 
 
-@part
+@device_function
 def strip_scratch(lists):
     """Arrays for ``bin_strips`` that fit the longest tile list: strip_pairs and count."""
     longest = np.int64(1)
@@ -90,7 +90,7 @@ def strip_scratch(lists):
     return np.empty((STRIPS, longest), np.int32), np.empty(STRIPS, np.int64)
 
 
-@part
+@device_function
 def begin_tile(raster, t, s, strip_pairs, count):
     """Reset the tile memory ``s`` and list the Gaussians of each strip of tile t. Returns the tile's first pixel, x and
     y, and where its list begins and ends."""
@@ -101,7 +101,7 @@ def begin_tile(raster, t, s, strip_pairs, count):
     return x0, y0, begin, end
 
 
-@part
+@device_function
 def composite_strips(raster, strip_pairs, count, x0, y0, s, store, size, step, composited):
     """``composite`` all strips of a tile whose first pixel is (x0, y0). s: the tile's memory. store: float32, of which
     each strip gets ``size``, and each of its Gaussians ``step``. composited: int64 (STRIPS,), written."""
@@ -120,7 +120,7 @@ def composite_strips(raster, strip_pairs, count, x0, y0, s, store, size, step, c
         )
 
 
-@part
+@device_function
 def _load_tile(targets, view, x0, y0, target, behind, share):
     """Fill target and behind, (3, PIXELS), and share (PIXELS,), the pixels' weights, 0 outside the image. Returns
     whether any pixel counts."""

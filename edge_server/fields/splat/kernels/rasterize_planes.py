@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import fetch_add
 from edge_server.fields.splat.kernels.composite import PIXELS, STOP, STRIP, STRIPS, composite
 from edge_server.fields.splat.kernels.project import TILE
@@ -18,7 +18,7 @@ CHECK_EVERY = 8  # Gaussians composited between two tests whether any light is l
 _F0 = np.float32(0.0)
 
 
-@part
+@device_function
 def composite_next(raster, s, strip_pairs, n, j, x0, y0, store):
     """Composite the j-th Gaussian of strip n alone; ``store`` then has its alphas and the light before it.
     Returns False, and composites nothing, if no light was left at the last test."""

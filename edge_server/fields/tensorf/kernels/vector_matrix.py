@@ -16,7 +16,7 @@ from numba import types
 from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.mlp import backward, forward
 from edge_server.fields.common.kernels.radiance_model import is_a, query_backward, query_color, query_density
 from edge_server.fields.common.kernels.simd import fetch_add
@@ -108,7 +108,7 @@ def store_products_backward(typingctx: Any, table: Any, rows: Any, weights: Any,
     return types.void(table, rows, weights, d, types.uint32, gradient), codegen
 
 
-@part
+@device_function
 def _vertex(x, size):
     """Lower vertex (uint32) and fraction of coordinate x in [0, 1] among ``size`` vertices."""
     scaled = x * np.float32(size - 1)
@@ -116,7 +116,7 @@ def _vertex(x, size):
     return np.uint32(i), scaled - np.float32(i)
 
 
-@part
+@device_function
 def _neighbors(size, u, v, w):
     """Rows within a group and weights: the plane's four vertices around (u, v), the line's two around w."""
     one = np.uint32(1)
@@ -132,7 +132,7 @@ def _neighbors(size, u, v, w):
     return rows, (gu * gv, fu * gv, gu * fv, fu * fv, _F1 - fw, fw)
 
 
-@part
+@device_function
 def _axes(x, group):
     """Coordinates along the two axes of a group's plane and along its line."""
     mode = group % MODES
@@ -144,7 +144,7 @@ def _axes(x, group):
     return u, v, w
 
 
-@part
+@device_function
 def group_components(table, size, x, group, a, count, tile):
     """Components of one group at samples a to a + count (at most TILE) into tile, float32 (TILE, 8).
     table: the group's rows."""
@@ -154,7 +154,7 @@ def group_components(table, size, x, group, a, count, tile):
         store_products(table, rows, weights, tile, np.uint32(s))
 
 
-@part
+@device_function
 def raw_density(planes, x, start, end, out):
     """Raw density (eq. 6) of samples start to end into ``out``, float32 (N,)."""
     tile = np.empty((TILE, CHANNELS), np.float32)
@@ -173,7 +173,7 @@ def raw_density(planes, x, start, end, out):
                 raw[s] += total
 
 
-@part
+@device_function
 def color_components(planes, x, start, end, acts):
     """Components of the color groups at samples start to end into the first rows of acts."""
     tile = np.empty((TILE, CHANNELS), np.float32)
@@ -189,7 +189,7 @@ def color_components(planes, x, start, end, acts):
                     row[s] = tile[s, c]
 
 
-@part
+@device_function
 def _flag_segments(dirty, a, b):
     """Flag the segments of two neighboring vertices."""
     i, j = a >> np.uint32(2), b >> np.uint32(2)

@@ -11,11 +11,11 @@ import pytest
 import yaml
 
 from camera_node.cli import main
-from camera_node.config import source_config
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
 from camera_node.robot.arm.viewpoint_tour import plan_tour
 from camera_node.robot.flange_camera import TruthClient
 from camera_node.robot.simulated_controller.controller import HOME_RAD
+from camera_node.settings import source_config
 from freshfield.clock import WallClock
 from freshfield.scenario import load
 from tests.camera_node.robot.arm.simulated import simulated_arm, start_cli, wait_until_moving, write_cell

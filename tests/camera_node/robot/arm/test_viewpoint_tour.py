@@ -2,7 +2,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from camera_node.config import PathConfig, source_config
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import UR3E, apply_calibration
@@ -16,6 +15,7 @@ from camera_node.robot.arm.viewpoint_tour import (
     viewpoints,
 )
 from camera_node.robot.simulated_controller.controller import HOME_RAD
+from camera_node.settings import PathConfig, source_config
 from freshfield.scenario import ScenarioError, load, parse
 from tests.camera_node.robot.arm.test_kinematics import CALIBRATION
 

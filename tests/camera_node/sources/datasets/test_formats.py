@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node.config import source_config
+from camera_node.settings import source_config
 from camera_node.sources.datasets import colmap, dynerf, eyeful, zju
 from camera_node.sources.datasets.formats import FORMATS, open_dataset
 from camera_node.sources.datasets.lens import Lens, exact, pinhole, undistort

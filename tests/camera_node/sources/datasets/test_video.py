@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node.config import source_config
+from camera_node.settings import source_config
 from camera_node.sources.datasets.photo import ImageOptions
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.datasets.video import Clip, load_dataset

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from camera_node.capture import build_cameras
-from camera_node.config import CameraConfig, source_config
 from camera_node.pose.providers import FixedPose
+from camera_node.settings import CameraConfig, source_config
 from camera_node.sources.devices import opencv as opencv_camera
 from camera_node.sources.devices.feed import CameraError, select_device
 from camera_node.sources.devices.live import LiveSource, open_live

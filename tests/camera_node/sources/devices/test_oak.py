@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node.config import source_config
 from camera_node.pose.providers import FixedPose
+from camera_node.settings import source_config
 from camera_node.sources.devices import oak
 from camera_node.sources.devices.feed import CameraError
 from camera_node.sources.devices.live import LiveSource, open_feed

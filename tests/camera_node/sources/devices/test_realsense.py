@@ -11,7 +11,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from camera_node.config import source_config
+from camera_node.settings import source_config
 from camera_node.sources.devices.feed import CameraError
 from camera_node.sources.devices.live import open_feed
 from freshfield.clock import VirtualClock, WallClock

@@ -16,8 +16,8 @@ from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fields.registry import make_field
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.bandit import BanditPolicy
-from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from freshfield.scenario import ScenarioError
 from tests.edge_server.experiments.rollouts.small import FIELD, NOTHING, scenario, setting

@@ -9,15 +9,15 @@ from functools import partial
 import numpy as np
 import pytest
 
-from edge_server.config import ComputeConfig
 from edge_server.experiments.engine import Engine
 from edge_server.experiments.rollouts import rollout as rollout_module
 from edge_server.experiments.rollouts.episode import EpisodeFactory
 from edge_server.experiments.rollouts.rollout import Job, learned, named, rollout, run_rollouts
 from edge_server.experiments.rollouts.setting import Setting, seeds
-from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
+from edge_server.settings import ComputeConfig
 from tests.edge_server.experiments.rollouts.small import NOTHING, reported, setting
 
 SELECT = Spec("select", StateLayout(("age", "pose")), hidden=8)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import yaml
 
-from edge_server.config import ComputeConfig, read_config
 from edge_server.experiments.virtual import costs
 from edge_server.experiments.virtual.costs import fitted
 from edge_server.experiments.virtual.costs import main as costs_main
@@ -20,9 +19,10 @@ from edge_server.experiments.virtual.simulate import main
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.report.explain_command import main as explain
 from edge_server.scheduler.learned.decision_record import read_decision
-from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
+from edge_server.settings import ComputeConfig, read_config
 from freshfield.scenario import ScenarioError, load, parse
 from tests.edge_server.experiments.sets import SMALL, write_photos
 

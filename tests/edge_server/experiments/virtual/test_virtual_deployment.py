@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from camera_node.config import source_config
+from camera_node.settings import source_config
 from camera_node.synthetic.effects import NAMES
-from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.link import EventKind
+from channel_emu.model.settings import channel_from_mapping
 from channel_emu.virtual.simulate import simulate
 from edge_server.experiments.virtual.from_scenario import build_deployment, exact_scene, training_cameras
 from edge_server.experiments.virtual.run_settings import Compute, RunSettings

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.config import read_config
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.scheduler import Epoch, make_live_policy, make_policy, parse_policy, policy_help
 from edge_server.scheduler.learned.bandit import BanditPolicy
-from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import State, StateLayout
+from edge_server.settings import read_config
 from freshfield import scenario
 from tests.edge_server.fields_for_tests import tiny_field
 from tests.edge_server.frames import frame

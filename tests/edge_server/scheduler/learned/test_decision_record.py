@@ -9,8 +9,8 @@ import pytest
 
 from edge_server.scheduler.learned.decision import Decision
 from edge_server.scheduler.learned.decision_record import FOLDER, DecisionWriter, read_decision
-from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from tests.edge_server.frames import frame
 from tests.edge_server.scheduler.learned.problems import state

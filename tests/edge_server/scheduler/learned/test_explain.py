@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from edge_server.scheduler.learned.explain import action_logit, explain, occlusion_map
-from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, FreshOnes, Waits, state, teach
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from edge_server.scheduler.learned import networks
-from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, state
 

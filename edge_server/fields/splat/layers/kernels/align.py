@@ -19,7 +19,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.camera import LENS, NEAR, load_camera
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import draw
 from edge_server.fields.common.kernels.simd_vectors import (
     LANES,
@@ -193,7 +193,7 @@ def _multiply(typingctx: Any, slopes: Any, a0: Any, a1: Any, b0: Any, b1: Any, o
     return types.void(slopes, i64, i64, i64, i64, out), codegen
 
 
-@part
+@device_function
 def _prepare(cam, places, anchor, share, scale, across):
     """What the picture's slopes are multiplied by.
 
@@ -222,7 +222,7 @@ def _prepare(cam, places, anchor, share, scale, across):
                 across[a, k, d] = cam[3 * k + d] - ratio * cam[6 + d]
 
 
-@part
+@device_function
 def _lift(flat, flat_vector, across, matrix, vector):
     """From U and V, flat (2, 2, K + 1, K + 1) of which anchors a <= b are filled, to three axes."""
     for a in range(across.shape[0]):
@@ -238,7 +238,7 @@ def _lift(flat, flat_vector, across, matrix, vector):
                     matrix[3 * b + e, 3 * a + d] = value
 
 
-@part
+@device_function
 def _compare(s, image, weight, x0, y0, behind, rest, shown, opacity):
     """Show a composited tile, and fill the roots of its weights (last row of ``behind``) and weighted errors,
     rest (3 * PIXELS,)."""
@@ -260,7 +260,7 @@ def _compare(s, image, weight, x0, y0, behind, rest, shown, opacity):
             rest[c * PIXELS + k] = rest[c * PIXELS + k] * root if root > _F0 else _F0
 
 
-@part
+@device_function
 def _heaviest(image, plate, weight, x0, y0, behind):
     """Load the plate of a tile into ``behind``; returns the largest weight."""
     heaviest = _F0

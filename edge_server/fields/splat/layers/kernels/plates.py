@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import fetch_add
 from edge_server.fields.splat.layers.settings import (
     BRIGHT,
@@ -58,7 +58,7 @@ class PlateArrays(NamedTuple):
     known: NDArray[np.bool_]
 
 
-@part
+@device_function
 def _difference(a, b, k, y, x):
     """Largest difference of a channel between a[y, x] and b[k, y, x]."""
     d0, d1, d2 = abs(a[y, x, 0] - b[k, y, x, 0]), abs(a[y, x, 1] - b[k, y, x, 1]), (abs(a[y, x, 2] - b[k, y, x, 2]))
@@ -99,7 +99,7 @@ def compare_with_plate(counter, worker, blurred, plate, earlier, earlier_count, 
                 )
 
 
-@part
+@device_function
 def _swap_modes(plate, y, x, a, b):
     w, u = plate.weight[a, y, x], plate.weight[b, y, x]
     plate.weight[a, y, x], plate.weight[b, y, x] = u, w
@@ -110,7 +110,7 @@ def _swap_modes(plate, y, x, a, b):
         plate.blurred[a, y, x, c], plate.blurred[b, y, x, c] = n, m
 
 
-@part
+@device_function
 def _join(plate, y, x, image, blurred):
     """Add a vote to the nearest mode, or replace the lightest mode where none is near."""
     best, nearest = -1, np.float32(1e9)
@@ -140,7 +140,7 @@ def _join(plate, y, x, image, blurred):
                 _swap_modes(plate, y, x, k, k - 1)
 
 
-@part
+@device_function
 def _join_plate(plate, y, x, image, blurred):
     """Add a vote to the plate, where there is no other mode: the usual case."""
     weight = plate.weight[0, y, x] + _F1
@@ -151,7 +151,7 @@ def _join_plate(plate, y, x, image, blurred):
         plate.blurred[0, y, x, c] += rate * (blurred[y, x, c] - plate.blurred[0, y, x, c])
 
 
-@part
+@device_function
 def _is_known(weight, total):
     """A plate needs KNOWN_VOTES, or nearly all of fewer arrivals, and a share of all arrivals."""
     enough = min(np.float32(KNOWN_VOTES), np.float32(EARLY_SHARE) * total)

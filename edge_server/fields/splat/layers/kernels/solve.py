@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import draw
 from edge_server.fields.splat.layers.settings import MOST_ITERATIONS, TOLERANCE
 
@@ -77,7 +77,7 @@ def add_span(counter, worker, base, blocks, right, band, total):
             pair += 1
 
 
-@part
+@device_function
 def _multiply_band(band, x, y, first):
     """y += band times x; knots before ``first`` are 0 in x and not wanted in y."""
     knots, n = x.shape
@@ -93,7 +93,7 @@ def _multiply_band(band, x, y, first):
                         y[k + q, j] += band[k, q, i, j] * own
 
 
-@part
+@device_function
 def _multiply_prior(x, y, differences, steady, alike, laplacian):
     """y += prior times x, from differences of x: they cancel what is large."""
     knots, n = x.shape
@@ -114,7 +114,7 @@ def _multiply_prior(x, y, differences, steady, alike, laplacian):
                     y[k - 1, d * anchors + b] -= v
 
 
-@part
+@device_function
 def _factorize(band, fixed, differences, steady, alike, laplacian):
     """Cholesky factors (m, m, K) of each anchor's own block, m = 3 free knots; 1 / the diagonal on it."""
     knots, n = band.shape[0], band.shape[2]
@@ -161,7 +161,7 @@ def _factorize(band, fixed, differences, steady, alike, laplacian):
     return c
 
 
-@part
+@device_function
 def _precondition(c, r, z, fixed):
     """z = preconditioner times r, from the factors ``c``."""
     anchors, free = c.shape[2], r.shape[0] - fixed
@@ -187,7 +187,7 @@ def _precondition(c, r, z, fixed):
                 z[q, e + a] -= c[i, j, a] * z[k, d + a]
 
 
-@part
+@device_function
 def _dot(a, b):
     total = 0.0
     for k in range(a.shape[0]):

@@ -12,7 +12,6 @@ import pytest
 import yaml
 
 from camera_node.cli import main
-from camera_node.config import source_config
 from camera_node.robot.arm.camera_poses import base_matrix, camera_poses
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
 from camera_node.robot.calibration import guided
@@ -20,6 +19,7 @@ from camera_node.robot.calibration.guided import HandEyeSession, missing_turn
 from camera_node.robot.calibration.hand_eye.calibrate import calibrate
 from camera_node.robot.calibration.hand_eye.samples import angle_deg, distance_mm
 from camera_node.robot.calibration.targets import parse_target
+from camera_node.settings import source_config
 from camera_node.sources.base import Shot
 from freshfield.geometry import Pose, se3, se3_inverse, so3_exp
 from freshfield.scenario import load

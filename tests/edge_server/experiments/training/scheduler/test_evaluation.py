@@ -19,9 +19,9 @@ from edge_server.experiments.training.scheduler.evaluation import (
     fixed_candidates,
     summary,
 )
-from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward, make_reward
+from edge_server.scheduler.learned.settings import Spec
 from tests.edge_server.experiments.rollouts.small import NOTHING, reported
 
 OMEGAS = (20, 40, 60, 80, 100, 120, 150, 200, 300, 500)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from camera_node.config import WorldConfig, find_data, source_config
+from camera_node.settings import WorldConfig, find_data, source_config
 from freshfield.scenario import ScenarioError, load, parse
 
 VIDEO = {"kind": "video", "data": "x"}

@@ -7,9 +7,9 @@ import msgspec
 import pytest
 import yaml
 
-from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.faults import NAMES
 from channel_emu.model.presets import PRESETS
+from channel_emu.model.settings import channel_from_mapping
 
 
 def read(text: str):
