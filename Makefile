@@ -72,7 +72,7 @@ ARM := $(if $(shell grep -ls '^ *arm:' $(SCENARIO) deploy/scenarios/$(SCENARIO).
 # Marching cubes, where it asks for a mesh.
 MESH := $(if $(shell grep -ls '^ *export:' $(SCENARIO) deploy/scenarios/$(SCENARIO).yaml),.venv/.ok-mesh)
 
-demo: .venv/.ok-run $(ARM) $(MESH)  ## run a scenario: SCENARIO=FILE FOR=60s OUT=runs/demo PORT=8080 DATA=FOLDER
+demo: .venv/.ok-run .venv/.ok-kernels $(ARM) $(MESH)  ## run a scenario: SCENARIO=FILE FOR=60s OUT=runs/demo PORT=8080 DATA=FOLDER
 	@$(PY) -m freshfield_up.cli $(SCENARIO) --for=$(FOR) --out $(OUT) --port $(PORT) $(if $(DATA),--data $(DATA))
 
 # Two passes: what only computes on all cores, then what meets clocks and ports. 5: nothing was selected.
@@ -177,9 +177,10 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 	@touch $@
 
 # The field's kernels are compiled at their first use, which takes some ten seconds: better beside the
-# installation of everything else than after it. Should it fail here, the edge server tries again.
-.venv/.ok-kernels: .venv/.ok-numba
-	@PYTHONPATH=proto:. $(PY) -c '$(WARM_UP)' >.venv/kernels.log 2>&1 || \
+# installation of everything else than after it, and again where they have changed. Should it fail here, the edge
+# server tries again.
+.venv/.ok-kernels: .venv/.ok-numba $(wildcard edge_server/fields/*/kernels/*.py edge_server/fields/*/*/kernels/*.py)
+	@echo "compiling the field's kernels"; PYTHONPATH=proto:. $(PY) -c '$(WARM_UP)' >.venv/kernels.log 2>&1 || \
 	  echo "the kernels were not compiled ahead (.venv/kernels.log): the edge server will do it at its start"
 	@touch $@
 
