@@ -25,6 +25,11 @@ sys.path.insert(0, str(ROOT / "deploy"))
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+# Kernels stay where the user's lie, also for tests that give processes a cache of their own: compiling all of them
+# takes minutes.
+_CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+os.environ.setdefault("NUMBA_CACHE_DIR", str(_CACHE / "freshfield"))
+
 # A shell that runs a script in the background has it ignore Ctrl-C, and Python goes along with that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -14,7 +14,7 @@ from channel_emu.cli import main
 from channel_emu.model import notation
 from channel_emu.model.presets import PRESETS
 from freshfield import ledger
-from tests.ports import free_port
+from tests.support import free_port
 
 SCENARIO = {"name": "t", "seed": 3, "cameras": {"count": 2}, "channel": {"preset": "ch5"}}
 

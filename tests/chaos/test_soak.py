@@ -26,7 +26,7 @@ from freshfield_up.net import free_ports, is_serving
 from freshfield_up.processes import Child, kill, stop
 from freshfield_up.status import read_json
 from tests.chaos.tcp_fault_proxy import FAULTS, TcpFaultProxy
-from tests.waiting import wait_until
+from tests.support import wait_until
 
 SMALL = """
 name: small

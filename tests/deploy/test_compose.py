@@ -15,7 +15,7 @@ import yaml
 
 from freshfield.scenario import load
 from tests.conftest import ROOT
-from tests.waiting import wait_until
+from tests.support import wait_until
 
 FILE = ROOT / "deploy" / "compose.yaml"
 COMPOSE = yaml.safe_load(FILE.read_text())

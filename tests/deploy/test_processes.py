@@ -12,7 +12,7 @@ import pytest
 
 from freshfield_up import processes
 from freshfield_up.processes import Child
-from tests.waiting import wait_until
+from tests.support import wait_until
 
 
 def python(tmp_path: Path, code: str, name: str = "one") -> Child:

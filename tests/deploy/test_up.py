@@ -18,7 +18,7 @@ import pytest
 
 from freshfield_up.folder import EARLIER, prepare
 from freshfield_up.status import read_json
-from tests.ports import free_port
+from tests.support import free_port
 
 SMALL = """
 name: small

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
-from tests.ports import free_port
+from tests.support import free_port
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 

@@ -16,7 +16,7 @@ from freshfield.frame import Frame, FrameRejected, checksum, counted_ids, from_r
 from freshfield.geometry import Pinhole, Pose, quaternion_normalize
 from freshfield.v1 import frames_pb2 as pb
 from tests.conftest import data_dir
-from tests.work import MOST_MS, work_ms
+from tests.support import MOST_MS, work_ms
 
 IMAGE = np.arange(16 * 12 * 3, dtype=np.uint8).reshape(12, 16, 3)
 DATA = {codec: payload.encode(IMAGE, codec) for codec in payload.CODECS}

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from freshfield.geometry import Pinhole
 from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_PAYLOAD_BYTES
 from freshfield.payload import CODECS, PayloadError, check, decode, encode
-from tests.work import MOST_MS, work_ms
+from tests.support import MOST_MS, work_ms
 
 # --- what is encoded comes back ----------------------------------------------------------------
 

@@ -17,7 +17,7 @@ from freshfield import payload
 from freshfield.geometry import Pinhole, Pose, look_at
 from freshfield.limits import MAX_CHUNK_BYTES
 from freshfield.session import DECISIONS, SessionError
-from tests.work import MOST_MS, work_ms
+from tests.support import MOST_MS, work_ms
 
 pytest.importorskip("mcap", reason="MCAP is not installed (extra mcap)")
 

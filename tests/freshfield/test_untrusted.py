@@ -25,7 +25,7 @@ from freshfield.untrusted import (
     refuse_expansion,
     stored_bytes,
 )
-from tests.work import work_ms
+from tests.support import work_ms
 
 LEVELS = "abcdefghijklmnop"
 

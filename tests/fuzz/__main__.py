@@ -20,7 +20,7 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from tests.work import work_ms
+from tests.support import work_ms
 
 MOST_INPUT_BYTES = 2**14
 MOST_GROWTH_MB, MOST_NEW_BLOCKS = 48, 50_000

@@ -9,7 +9,7 @@ import pytest
 
 from freshfield.session import SessionError
 from tests.fuzz.targets import MOST_FILE_MS, MOST_MS, TARGETS, seeds
-from tests.work import work_ms
+from tests.support import work_ms
 
 HONEST = {
     "request": 2,

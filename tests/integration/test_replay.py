@@ -30,7 +30,7 @@ from freshfield.v1 import frames_pb2 as pb
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 from tests.edge_server.fields_for_tests import TINY
 from tests.integration.peer import Peer
-from tests.ports import free_port
+from tests.support import free_port
 
 pytest.importorskip("mcap", reason="MCAP is not installed (extra mcap)")
 

@@ -30,7 +30,7 @@ from freshfield.machine_load import rss_mb
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
 from tests.channel_emu.live.emulator import frame_of
-from tests.ports import free_port
+from tests.support import free_port
 
 PUSH = "/freshfield.v1.FrameStreamService/Push"
 _START_S = 60.0

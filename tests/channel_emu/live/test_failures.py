@@ -18,7 +18,7 @@ from freshfield.ledger import read_all
 from freshfield.transport import Transport
 from tests.channel_emu.live.emulator import make, offer, run
 from tests.integration.peer import Peer
-from tests.ports import free_port
+from tests.support import free_port
 
 SLOW = {"service": {"law": "deterministic", "mean_ms": 1e9}}
 SHORT = {"service": {"law": "deterministic", "mean_ms": 300.0}}

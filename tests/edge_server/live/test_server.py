@@ -28,7 +28,7 @@ from freshfield.transport import Transport, TransportError
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2_grpc
 from tests.edge_server.fields_for_tests import TINY
 from tests.edge_server.frames import CAMERA
-from tests.ports import free_port
+from tests.support import free_port
 
 
 def tiny_scenario(tmp_path, held_out=("cam00",), **edge):

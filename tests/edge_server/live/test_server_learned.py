@@ -21,7 +21,7 @@ from freshfield import scenario
 from tests.edge_server.embed.graphs import CHANNELS, detector
 from tests.edge_server.fields_for_tests import TINY
 from tests.edge_server.live.test_server import Feed, until
-from tests.ports import free_port
+from tests.support import free_port
 
 
 def server_of(tmp_path, layout, embedding=True, port=None):

@@ -28,9 +28,8 @@ from freshfield.limits import MAX_SCRAPES, MAX_VISITOR_MESSAGE_BYTES
 from freshfield.transport import Transport, TransportError
 from tests.edge_server.page.test_page import bare_state
 from tests.edge_server.page.visitor import Visitor
-from tests.ports import free_port
 from tests.role_table import TOKENS, cells_of
-from tests.waiting import wait_until
+from tests.support import free_port, wait_until
 
 # Without TLS the login is the same, and easier to talk to.
 LOGIN = Transport(tokens=TOKENS, insecure=True)

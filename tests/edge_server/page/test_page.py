@@ -29,7 +29,7 @@ from freshfield.geometry import Pinhole
 from tests.edge_server.frames import frame
 from tests.edge_server.page.preview import LENS, BallScene, Preview
 from tests.edge_server.page.visitor import Visitor
-from tests.waiting import wait_until
+from tests.support import wait_until
 
 
 @contextlib.contextmanager

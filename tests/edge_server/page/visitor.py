@@ -17,7 +17,7 @@ import viser
 import websocket
 import zstandard
 
-from tests.waiting import wait_until
+from tests.support import wait_until
 
 
 class Visitor:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_server.scheduler import OFFERED, POLICIES, Epoch, LivePolicies, make_live_policy, make_policy, policy_help
-from tests.work import MOST_MS, work_ms
+from tests.support import MOST_MS, work_ms
 
 MS = 1_000_000
 

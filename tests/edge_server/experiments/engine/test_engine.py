@@ -16,7 +16,7 @@ import pytest
 from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.engine.engine import _compute
 from tests.edge_server.experiments.engine.jobs import Point, fail, measure, note
-from tests.waiting import wait_until
+from tests.support import wait_until
 
 POINTS = [Point(seed, scene=scene) for scene in ("room", "tower") for seed in range(4)]
 

@@ -1,0 +1,38 @@
+"""Free ports, waits for other threads and processes, and the time that a refusal takes."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable
+from typing import Any
+
+MOST_MS = 50.0
+"""Of the work before a refusal: ingest answers every camera on one thread."""
+
+
+def free_port() -> int:
+    """A TCP port that was free a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], timeout_s: float = 20.0) -> Any:
+    """The first true value of ``condition``. Fails with ``what`` if there is none within ``timeout_s``."""
+    end = time.monotonic() + timeout_s
+    while not (value := condition()):
+        assert time.monotonic() < end, what if isinstance(what, str) else what()
+        time.sleep(0.02)
+    return value
+
+
+def work_ms(call: Callable[[], Any]) -> float:
+    """Milliseconds of this thread's processor time in ``call``: the least of three, because others compute
+    on the same cores."""
+    times = []
+    for _ in range(3):
+        begun = time.thread_time()
+        call()
+        times.append((time.thread_time() - begun) * 1e3)
+    return min(times)
