@@ -48,7 +48,8 @@ PY := .venv/bin/python
 export PYTHONPYCACHEPREFIX := $(abspath .venv)/byte-code
 unexport PYTHONDONTWRITEBYTECODE
 INSTALL := $(PY) -m pip --disable-pip-version-check -q install --no-compile
-WARM_UP := from edge_server.fields.registry import make_field; make_field("splat", {"layers": True}).warm_up()
+WARM_UP = PYTHONPATH=proto:. $(PY) -c 'from edge_server.fields.registry import make_field; make_field("$(1)", $(2)).warm_up()'
+KERNELS := $(wildcard edge_server/fields/*/kernels/*.py edge_server/fields/*/*/kernels/*.py)
 # The line of pyproject.toml that starts with a name.
 wanted = $(shell sed -n 's/^ *"\($(1)[^"]*\)",*$$/\1/p' pyproject.toml | head -n 1)
 TORCH := $(shell sed -n 's/^\(torch==[^ ]*\).*/\1/p' deploy/locks/torch-cuda.txt)
@@ -77,7 +78,7 @@ demo: .venv/.ok-run .venv/.ok-kernels $(ARM) $(MESH)  ## run a scenario: SCENARI
 
 # Two passes: what only computes on all cores, then what meets clocks and ports. 5: nothing was selected.
 CHOSEN = ($(SELECT))$(if $(BROWSER),, and not browser)
-test: .venv/.ok-test  ## all tests but the slow ones (the browser's too, where there is one)
+test: .venv/.ok-all-kernels  ## all tests but the slow ones (the browser's too, where there is one)
 	@echo "tests that compute, side by side"; $(PY) -m pytest -n logical --dist worksteal \
 	  -m "$(CHOSEN) and side_by_side" $(PYTEST); first=$$?; \
 	echo "tests that need the machine to themselves"; $(PY) -m pytest \
@@ -179,8 +180,8 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 # The field's kernels are compiled at their first use, which takes some ten seconds: better beside the
 # installation of everything else than after it, and again where they have changed. Should it fail here, the edge
 # server tries again.
-.venv/.ok-kernels: .venv/.ok-numba $(wildcard edge_server/fields/*/kernels/*.py edge_server/fields/*/*/kernels/*.py)
-	@echo "compiling the field's kernels"; PYTHONPATH=proto:. $(PY) -c '$(WARM_UP)' >.venv/kernels.log 2>&1 || \
+.venv/.ok-kernels: .venv/.ok-numba $(KERNELS)
+	@echo "compiling the field's kernels"; $(call WARM_UP,splat,{"layers": True}) >.venv/kernels.log 2>&1 || \
 	  echo "the kernels were not compiled ahead (.venv/kernels.log): the edge server will do it at its start"
 	@touch $@
 
@@ -200,6 +201,12 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 .venv/.ok-test: .venv/.ok-run pyproject.toml
 	@echo "test tools"
 	@$(INSTALL) -e '.[edge,embed,test,dev]'
+	@touch $@
+
+# The other fields' kernels, at once in two processes: two processes of tests would compile all of them twice.
+.venv/.ok-all-kernels: .venv/.ok-test .venv/.ok-kernels
+	@echo "compiling the other fields' kernels"
+	@{ $(call WARM_UP,nerfacto,{}) & $(call WARM_UP,ngp,{}) && $(call WARM_UP,tensorf,{}); wait; } >>.venv/kernels.log 2>&1
 	@touch $@
 
 # What slow tests need besides: Ray, some 240 MB; scikit-image and pycolmap for surfaces; and what tests of cameras and arms skip without, 200 MB.
