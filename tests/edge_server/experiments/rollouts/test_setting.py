@@ -47,8 +47,8 @@ def test_every_episode_has_a_motion_of_its_own_and_its_cameras_see_the_same_one(
         scene = make_scene("room", {**params, "motion_seed": seed})
         images[seed] = stage.truths["cam00"].view("cam00", 10**9)[0]
         assert np.array_equal(images[seed], scene.render("cam00", 1.0))
-        frames = stage.cameras[0].source._frames
-        assert np.array_equal(frames.scene.render("cam01", 1.0), scene.render("cam01", 1.0))
+        source = stage.cameras[0].source
+        assert np.array_equal(source.scene.render("cam01", 1.0), scene.render("cam01", 1.0))
     assert len({image.tobytes() for image in images.values()}) == 3
     # What it was: one walk for all seeds, of training and of testing.
     same = EpisodeFactory(setting(motions=False), NOTHING)
