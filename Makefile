@@ -170,7 +170,7 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 	@touch $@
 
 .venv/.ok-numba: .venv/.ok-venv pyproject.toml
-	@$(INSTALL) --no-warn-conflicts '$(call wanted,numba)' '$(call wanted,opencv)'
+	@$(INSTALL) --no-warn-conflicts '$(call wanted,numba)' '$(call wanted,opencv)' '$(call wanted,msgspec)'
 	@touch $@
 
 .venv/.ok-edge: .venv/.ok-torch .venv/.ok-numba
@@ -206,7 +206,8 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 # The other fields' kernels, at once in two processes: two processes of tests would compile all of them twice.
 .venv/.ok-all-kernels: .venv/.ok-test .venv/.ok-kernels
 	@echo "compiling the other fields' kernels"
-	@{ $(call WARM_UP,nerfacto,{}) & $(call WARM_UP,ngp,{}) && $(call WARM_UP,tensorf,{}); wait; } >>.venv/kernels.log 2>&1
+	@{ $(call WARM_UP,nerfacto,{}) & $(call WARM_UP,ngp,{}) && $(call WARM_UP,tensorf,{}) && wait $$!; } >>.venv/kernels.log 2>&1 || \
+	  echo "they were not compiled ahead (.venv/kernels.log): tests will do it"
 	@touch $@
 
 # What slow tests need besides: Ray, some 240 MB; scikit-image and pycolmap for surfaces; and what tests of cameras and arms skip without, 200 MB.

@@ -131,10 +131,18 @@ def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:
 
 
 def _from_rows(path: Path, discipline: str) -> Recording:
-    lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
+    lines = [
+        line
+        for line in read_text(path).removeprefix("\ufeff").splitlines()
+        if line.strip() and not line.startswith("#")
+    ]
     separator = next((mark for mark in "\t;" if lines and mark in lines[0]), ",")
     rows: dict[str, list[tuple[float, float]]] = {}
-    for row in csv.DictReader(lines, delimiter=separator, skipinitialspace=True):
+    try:
+        given_rows = list(csv.DictReader(lines, delimiter=separator, skipinitialspace=True))
+    except csv.Error as error:
+        raise RecordingError(f"{path}: cannot be read as CSV: {error}") from None
+    for row in given_rows:
         try:
             offered, delivered = float(row["offered_ms"]), float(row["delivered_ms"] or math.nan)
             if abs(offered) > _MAX_ROWS_MS or delivered < offered or math.isnan(offered):

@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from freshfield import untrusted
 from freshfield.untrusted import UntrustedError, read_yaml
 
 _UNITS_MS = {"": 1.0, "us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
@@ -158,8 +159,7 @@ def read_text(path: Path) -> str:
     """Read a file named on the command line or in a scenario. Raises NotationError if it cannot be read or is
     too long."""
     try:
-        with path.open() as file:
-            text = file.read(_MAX_CHARS + 1)
+        text = untrusted.read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise NotationError(f"{path}: cannot be read: {error}") from None
     if len(text) > _MAX_CHARS:

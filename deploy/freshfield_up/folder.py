@@ -10,6 +10,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import IO, Any
 
+from freshfield.untrusted import read_json, read_text
+
 MARKER = "run.json"
 """Written first into every run's folder. Only a folder that holds one, with the key KEY in it, may be replaced."""
 KEY = "freshfield_run"
@@ -74,16 +76,19 @@ def _refuse_a_strangers(out: Path) -> None:
     elsewhere = "name an empty or a new folder with --out"
     if MARKER not in found:
         raise FolderError(f"{out} holds files that are not an earlier run's (no {MARKER} in it); {elsewhere}")
+    kept = {MARKER, EARLIER, f".{EARLIER}"}
     try:
-        marker = json.loads((out / MARKER).read_text() or "{}")
-        known = (*WRITTEN, *marker[KEY], MARKER, EARLIER, f".{EARLIER}")
+        text = read_text(out / MARKER)
+        # A start that was killed before it wrote its marker leaves an empty one.
+        adds = read_json(text)[KEY] if text or not found <= kept else []
+        if not all(isinstance(name, str) for name in adds):
+            raise ValueError
     except (ValueError, TypeError, KeyError):
-        # A start that was killed before it wrote its marker leaves an empty one, and nothing else.
-        if found == {MARKER} and not (out / MARKER).stat().st_size:
-            return
         raise FolderError(
-            f"{out}: {MARKER} is not of a run of this version of freshfield, so its files stay; {elsewhere}"
+            f"{out}: {MARKER} is not of a run of this version of freshfield, so its files stay; delete the folder, or "
+            f"{elsewhere}"
         ) from None
+    known = (*WRITTEN, *adds, *kept)
     if strange := sorted(name for name in found if not any(fnmatchcase(name, pattern) for pattern in known)):
         raise FolderError(f"{out} holds {strange[0]}, which no run wrote; move it, or {elsewhere}")
 

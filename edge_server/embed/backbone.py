@@ -26,6 +26,7 @@ from onnx import TensorProto, helper
 from onnx.utils import Extractor
 
 from edge_server.embed import EmbeddingError, SizeError
+from freshfield.untrusted import read_bytes
 
 OUTPUT = "pooled"
 # Twice the largest detectors of the family, 230 MB.
@@ -156,13 +157,11 @@ def load_backbone(path: Path, tap: str | None = None, size: int | None = None) -
 
 def _read(path: Path) -> bytes:
     try:
-        if not path.is_file():
-            raise EmbeddingError(f"{path}: no such file; name a YOLO detection model in ONNX format")
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise EmbeddingError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MB, which no YOLO detector is")
-        return path.read_bytes()
+        return read_bytes(path, MAX_FILE_BYTES)
     except OSError as error:
-        raise EmbeddingError(f"{path}: cannot be read: {error.strerror}") from None
+        raise EmbeddingError(
+            f"{path}: cannot be read: {error.strerror}; name a YOLO detection model in ONNX format"
+        ) from None
 
 
 def parse_model(data: bytes, path: Path) -> onnx.ModelProto:

@@ -18,6 +18,7 @@ from edge_server.embed.backbone import MAX_FILE_BYTES, MAX_SIDE, exported_size, 
 from edge_server.embed.embedder import open_session, reason_of
 from edge_server.embed.letterbox import blob, checked
 from edge_server.foreground import MODELS, SHIPPED, ForegroundError
+from freshfield.untrusted import read_bytes
 
 Array = NDArray[np.float64]
 
@@ -133,9 +134,7 @@ def decode(output: NDArray[np.floating], confidence: float, name: str, coefficie
 def open_model(file: Path) -> Any:
     """Open the ONNX model in ``file``. Raises ForegroundError."""
     try:
-        if file.stat().st_size > MAX_FILE_BYTES:
-            raise ForegroundError(f"{file}: larger than {MAX_FILE_BYTES >> 20} MB")
-        data = file.read_bytes()
+        data = read_bytes(file, MAX_FILE_BYTES)
         parse_model(data, file)
         return open_session(data, "auto", 1, str(file))[0]
     except OSError as error:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from edge_server.fields.splat.layers.layered_field import LayeredField
 from freshfield.scenario import load
 from tests.conftest import ROOT
 from tests.support import wait_until
@@ -96,6 +97,14 @@ def test_an_image_runs_as_nobody_in_particular(name: str) -> None:
     sources = re.findall(r"^COPY (?!--from)(.+) \S+$", text, re.M)
     for path in " ".join(sources).split():
         assert (ROOT / path).exists(), f"{name}.Dockerfile copies {path}, which is gone"
+
+
+def test_the_edges_image_compiles_the_kernels_of_a_field_that_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    (line,) = re.findall(r"^RUN python -c '(.*)'$", (ROOT / "deploy" / "edge.Dockerfile").read_text(), re.MULTILINE)
+    compiled = list[str]()
+    monkeypatch.setattr(LayeredField, "warm_up", lambda field: compiled.append("layers"))
+    exec(line, {})
+    assert compiled == ["layers"]
 
 
 def test_the_camera_image_has_no_torch() -> None:

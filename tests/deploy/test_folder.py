@@ -60,6 +60,7 @@ def test_a_link_in_an_earlier_run_is_removed_and_not_followed(tmp_path: Path) ->
     [
         (None, "not an earlier run's"),
         ('{"accuracy": 0.9}', "not of a run of this version"),
+        (json.dumps({KEY: [1]}), "not of a run of this version"),
         ("[1]", "not of a run of this version"),
         ("", "not of a run of this version"),
         (json.dumps({KEY: []}), "holds thesis.tex, which no run wrote"),
@@ -78,6 +79,7 @@ def test_anything_else_is_refused_and_left_alone(tmp_path: Path, marker: str | N
 
 def test_a_start_that_was_killed_before_its_marker_was_written(tmp_path: Path) -> None:
     (tmp_path / MARKER).touch()
+    (tmp_path / EARLIER).mkdir()
     prepare(tmp_path, {}).close()
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from camera_node.sources.base import rate
 from camera_node.sources.datasets.imaging import as_image, resize, shrink
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import (
@@ -74,11 +75,11 @@ def rig_dataset(
     Raises DatasetError if a pose is missing, or a video has another size than its calibration or another rate.
     """
     count = min(clip.count for _, clip in rig.values())
-    rates = sorted({clip.fps for _, clip in rig.values()})
+    rates = sorted({rate(clip.fps) for _, clip in rig.values()})
     if len(rates) != 1:
         raise DatasetError(
-            f"{path}: the videos differ in frame rate: {', '.join(f'{fps:g}' for fps in rates)}; re-encode them at one "
-            "(ffmpeg -fps_mode cfr)"
+            f"{path}: the videos differ in frame rate: {', '.join(f'{float(fps):g}' for fps in rates)}; re-encode them "
+            "at one (ffmpeg -fps_mode cfr)"
         )
     images: list[PosedImage] = []
     for name, (camera, clip) in rig.items():
@@ -103,7 +104,7 @@ def rig_dataset(
                     release=clip.close,
                 )
             )
-    return Dataset(tuple(images), 0, rates[0])
+    return Dataset(tuple(images), 0, float(rates[0]))
 
 
 def _find_calibration(folder: Path) -> Path:

@@ -136,6 +136,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
         (HEAD + "".join(f"{30 * n},\n" for n in range(100)), "none of its 100 frames came through"),
         (HEAD + "0,5\n30,20\n", "expected columns offered_ms, delivered_ms .* got '30,20'"),
         (HEAD + "0,5\nrain\n", "expected columns offered_ms"),
+        (HEAD + '"' + 140_000 * "0", "cannot be read as CSV: field larger than"),
         ("0,5\n30,40\n", "expected columns offered_ms"),
         ("offered_ms;delivered_ms\n0;7,5\n", "numbers with a point, got '0;7,5'"),
     ],
@@ -152,7 +153,7 @@ def test_nothing_to_fit_is_said_in_one_line(tmp_path: Path, capsys, rows: str, w
 
 def test_constant_delays_are_one_state_of_constant_delays(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
-    path.write_text(HEAD + "".join(f"{30 * n}, {30 * n + 12.5}\n" for n in range(200)))
+    path.write_text("\ufeff" + HEAD + "".join(f"{30 * n}, {30 * n + 12.5}\n" for n in range(200)))
     found = fit(path)
     assert found.states == 1 and found.channel["service"] == {"law": "deterministic", "mean_ms": 12.5}
     assert "hardly vary" in found.warnings[0]

@@ -32,7 +32,7 @@ def node(kind: str, read: list[str], write: str, **attributes):
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04not an onnx", b"\x00" * 4096, b"\xff" * 64])
 def test_not_onnx(tmp_path, content):
     path = tmp_path / "a.onnx"
-    refused(path, "a.onnx: no such file")
+    refused(path, "a.onnx: cannot be read: No such file")
     path.write_bytes(content)
     refused(path, "a.onnx: not an ONNX")
     path.write_bytes(detector(tmp_path / "whole.onnx").read_bytes()[: -len(content) - 1])

@@ -138,11 +138,13 @@ class LayeredField:
         if not self.layered:
             return self._fit_still(views, budget, pace)
         if self.tracker is not None and self.tracker.moving.box is not self.still.view_store.box:
-            self._begin_again()
+            self._begin_again("another camera has changed the box of the scene")
         taken = self._take_in(views)
         if wandering := [name for name, camera in self.cameras.items() if camera.moves > MOST_MOVES]:
             self._give_up_layers(f"{wandering[0]} moves")
             return self._fit_still(views, budget, pace)
+        if self.tracker is not None and not len(self.observations):
+            self._begin_again("no camera stands where it stood")
         if self.tracker is None:
             if not self._plates_are_known():
                 return self._fit_still(views, budget, pace)
@@ -298,7 +300,7 @@ class LayeredField:
             self.refused = refused
             return
         self.refused -= {view.camera}
-        if camera.moves and camera.rendered_step < 0:
+        if camera.anew:
             return  # against an empty plate nothing is foreground
         self.observations.add(
             Observation(
@@ -312,10 +314,9 @@ class LayeredField:
     def _move_camera(self, view: View) -> FixedCamera:
         """Begin a camera anew where it stands now, at the exposure that it had; the others go on."""
         log.info("%s stands somewhere else: its plate begins anew", view.camera)
-        self.static.stop()
-        self.static.rendered.pop(view.camera, None)
+        self.static.forget_camera(view.camera)
         before, camera = self.cameras[view.camera], FixedCamera.begin(view, self.caller)
-        camera.taken, camera.moves = before.taken, before.moves
+        camera.taken, camera.moves, camera.anew = before.taken, before.moves, True
         camera.correct_exposure(before.plate.gain)
         self.cameras[view.camera] = camera
         self.observations.forget_camera(view.camera)
@@ -356,16 +357,16 @@ class LayeredField:
         self.tracker.anchors_s = self.plates_s
         return self.tracker
 
-    def _begin_again(self) -> None:
+    def _begin_again(self, why: str) -> None:
         """Begin the layers anew: a camera that came late has changed the scene's box, in which all is
-        measured. Plates stay."""
-        log.info("layers begin again: another camera has changed the box of the scene")
+        measured, or nothing is observed any more. Plates stay."""
+        log.info("layers begin again: %s", why)
         self.static.forget()
         self.tracker = None
         self.exposure_rounds = 0
         self.observations = Observations()
         for camera in self.cameras.values():
-            camera.row, camera.depth_m, camera.rendered_step = None, None, -1
+            camera.row, camera.depth_m, camera.rendered_step, camera.anew = None, None, -1, False
 
     def _begin_anew(self) -> None:
         """Have the still field forget what it has learned, and begin with the plates as they are; what it showed is

@@ -43,6 +43,7 @@ def pack(field: Any) -> Arrays:
                 "newest_s": _number(camera.newest_s),
                 "rendered_step": camera.rendered_step,
                 "moves": camera.moves,
+                "anew": camera.anew,
                 "intrinsics": asdict(view.intrinsics),
             }
         )
@@ -108,7 +109,17 @@ def unpack(field: Any, state: Arrays) -> None:
         taken = deque(facts["taken"], maxlen=FRAMES_KNOWN)
         away = np.array(arrays["away"]) if "away" in arrays else None
         field.cameras[view.camera] = FixedCamera(
-            view, plate, None, depth_m, facts["rendered_step"], newest_s, taken, fine, away, facts["moves"]
+            view,
+            plate,
+            None,
+            depth_m,
+            facts["rendered_step"],
+            newest_s,
+            taken,
+            fine,
+            away,
+            facts["moves"],
+            facts["anew"],
         )
     for k, facts in enumerate(meta["frames"]):
         field.observations.add(_observation(field, facts, _under(f"frame_{k}.", state)))

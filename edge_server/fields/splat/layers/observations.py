@@ -39,6 +39,7 @@ class FixedCamera:
     fine: the plate at the full resolution; None where the frames taken in have it.
     away: float64 (4, 4), pose of the newest frame, where that was taken elsewhere.
     moves: number of places other than its own from which frames came, since it last stood still.
+    anew: whether it began anew where it stands, and its plate says little yet.
     """
 
     view: View
@@ -51,6 +52,7 @@ class FixedCamera:
     fine: FinePlate | None = None
     away: NDArray[np.float64] | None = None
     moves: int = 0
+    anew: bool = False
 
     @classmethod
     def begin(cls, view: View, pool: Pool) -> FixedCamera:
@@ -65,7 +67,7 @@ class FixedCamera:
             return False
         self.away = None
         if self.plate.count > STANDS_FRAMES:
-            self.moves = 0
+            self.moves, self.anew = 0, False
         return True
 
     def leaves_for(self, view: View) -> bool:
@@ -89,7 +91,7 @@ class FixedCamera:
 
     def take_rendering(self, step: int, rendering: Rendering) -> None:
         """Take over what the static field shows from here, and the step at which it does."""
-        self.depth_m, self.rendered_step = rendering.depth, step
+        self.depth_m, self.rendered_step, self.anew = rendering.depth, step, False
         self.plate.fill_unknown(rendering.color)
 
     def correct_exposure(self, ratio: NDArray[np.float32]) -> None:

@@ -72,6 +72,12 @@ class StaticLayer:
         self._learned: dict[str, tuple[NDArray, NDArray]] = {}  # camera -> plate, known: as learned
         self._begin_rounds(ROUNDS_FIRST, RATE_FIRST)
 
+    def forget_camera(self, camera: str) -> None:
+        """Forget what a camera's plate was when it was learned, and renderings from its place."""
+        self.stop()
+        self.rendered.pop(camera, None)
+        self._learned.pop(camera, None)
+
     def _begin_rounds(self, wanted: int, rate: float) -> None:
         self.rounds, self._rounds_wanted, self._rate = 0, wanted, rate
         self._round_step = 0  # steps of this round

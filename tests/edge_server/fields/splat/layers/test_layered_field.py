@@ -426,6 +426,22 @@ def test_one_wrong_pose_is_left_out_and_a_camera_that_shows_new_places_moves() -
         assert field.layered == (frame < 6)  # the fourth place from which it showed something
 
 
+def test_where_all_cameras_are_knocked_layers_begin_again() -> None:
+    """Two cameras on one stand: then nothing is observed from a place that is known."""
+    field = LayeredField(SMALL)
+    for frame in range(60):
+        views = [_frame(k, frame, True) for k in (0, 5)]
+        if frame >= 30:
+            for k, view in enumerate(views):
+                pose = view.camera_to_world.copy()
+                pose[:3, 3] += 0.05
+                views[k] = replace(view, camera_to_world=pose)
+        field.fit(views, Budget(steps=1))
+        assert frame != 29 or field.tracker is not None
+        assert frame != 31 or field.tracker is None
+    assert field.layered and field.tracker is not None and not any(camera.anew for camera in field.cameras.values())
+
+
 def _small(camera: int, frame: int) -> View:
     """A frame at half its size, as the decoder gives it; its whole is there when asked for."""
     whole = _frame(camera, frame, True)
