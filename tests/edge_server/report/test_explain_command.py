@@ -57,7 +57,7 @@ def test_regions_are_found_with_what_embedded_the_frames(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("embedding", "says"),
     [
-        ({"model": "/nowhere/d.onnx", "dim": 3, "provider": "cpu"}, "no such file"),
+        ({"model": "/nowhere/d.onnx", "dim": 3, "provider": "cpu"}, "No such file"),
         ({"model": "d.onnx", "shutter": "rolling"}, "of another version"),
         (None, "does not say what embedded its frames"),
     ],
