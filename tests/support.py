@@ -28,10 +28,10 @@ def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], time
 
 
 def work_ms(call: Callable[[], Any]) -> float:
-    """Milliseconds of this thread's processor time in ``call``: the least of three, because others compute
+    """Milliseconds of this thread's processor time in ``call``: the least of seven, because others compute
     on the same cores."""
     times = []
-    for _ in range(3):
+    for _ in range(7):
         begun = time.thread_time()
         call()
         times.append((time.thread_time() - begun) * 1e3)
