@@ -1,10 +1,12 @@
-"""Free ports, waits for other threads and processes, and the time that a refusal takes."""
+"""Free ports, waits for other threads and processes, and the work that a refusal takes."""
 
 from __future__ import annotations
 
 import socket
+import sys
 import time
 from collections.abc import Callable
+from types import FrameType
 from typing import Any
 
 MOST_MS = 50.0
@@ -36,3 +38,21 @@ def work_ms(call: Callable[[], Any]) -> float:
         call()
         times.append((time.thread_time() - begun) * 1e3)
     return min(times)
+
+
+def lines_run(call: Callable[[], Any]) -> int:
+    """Lines of Python that ``call`` runs: the same on every machine."""
+    count = 0
+
+    def trace(_frame: FrameType, event: str, _arg: Any) -> Any:
+        nonlocal count
+        count += event == "line"
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        call()
+    finally:
+        sys.settrace(before)
+    return count
