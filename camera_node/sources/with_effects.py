@@ -26,9 +26,9 @@ def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Eff
         effects = load_effects(
             config.effects, lambda name: scenario.rng(f"effect {name}", camera), held_out=camera in scenario.held_out
         )
-    if config.kind != "world" and (effects.world or effects.lens or effects.exposure):
+    if config.kind != "world" and (effects.lens or effects.exposure):
         raise ScenarioError(
-            f"{scenario.path}: source.effects: effects of the kinds world, lens and exposure need source kind world"
+            f"{scenario.path}: source.effects: effects of the kinds lens and exposure need source kind world"
         )
     return effects
 

@@ -1,9 +1,8 @@
-"""Light on surfaces, diffuse reflection and contact shadows, and the protocol of the medium that an effect may add."""
+"""Light on surfaces: diffuse reflection and contact shadows."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,19 +29,6 @@ class Light:
     ambient_below: Color
     ambient_above: Color
     tint: Color = (1.0, 1.0, 1.0)
-
-
-class Medium(Protocol):
-    """A homogeneous medium between surfaces and cameras."""
-
-    @property
-    def airlight(self) -> Color:
-        """Color of the medium itself, in [0, 1]."""
-        ...
-
-    def transmittance(self, distance_m: Array) -> NDArray[np.float32]:
-        """Share (N,) of a surface's light that arrives from this distance; 0 from infinity."""
-        ...
 
 
 def shade_diffuse(light: Light, albedo: Array, points: Array, normals: Array, visible: Array | None = None) -> Array:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
 
@@ -27,7 +26,6 @@ _UPPER_ARM_M, _FOREARM_M = 0.29, 0.25
 # Bounds of a randomly drawn walk relative to the scene's own: shift of the center, factors of radii and
 # speed. Within them it stays clear of the furniture.
 _SHIFT_M, _RADIUS_FACTORS, _SPEED_FACTORS = 0.2, (0.75, 1.15), (0.7, 1.4)
-Course = Literal["loop", "stops", "reverses", "jumps"]
 
 
 @dataclass(frozen=True)
@@ -39,9 +37,6 @@ class Walk:
     still: the person stands still.
     direction: 1.0 is counterclockwise from above, -1.0 clockwise.
     start_s: time into the loop at instant 0.
-    course: loop: round and round; stops: a rest of PERIOD_UNIT_S after each
-        PERIOD_UNIT_S; reverses: half a loop and backwards again; jumps: half a loop, then a jump back to its
-        start.
     """
 
     center: tuple[float, float]
@@ -51,26 +46,10 @@ class Walk:
     still: bool = False
     direction: float = 1.0
     start_s: float = 0.0
-    course: Course = "loop"
-
-    @property
-    def repeats_s(self) -> float:
-        """Time after which the motion repeats."""
-        return 2.0 * self.period_s if self.course == "stops" else self.period_s
 
     def phase(self, t_s: float) -> float:
         """Phase in [0, 1) of an instant."""
-        return motion.phase_of(self._walked_s(t_s) + self.start_s, self.period_s)
-
-    def _walked_s(self, t_s: float) -> float:
-        """Time of walking the plain loop after which one is where the course is at an instant."""
-        if self.course == "stops":
-            stops, rest_s = divmod(t_s, 2.0 * PERIOD_UNIT_S)
-            return stops * PERIOD_UNIT_S + min(rest_s, PERIOD_UNIT_S)
-        if self.course == "reverses":
-            rest_s = t_s % self.period_s
-            return min(rest_s, self.period_s - rest_s)
-        return t_s % (0.5 * self.period_s) if self.course == "jumps" else t_s
+        return motion.phase_of(t_s + self.start_s, self.period_s)
 
     def at(self, phase: float) -> tuple[float, float]:
         """Position on the floor at a phase, in meters."""

@@ -3,8 +3,6 @@
 Static parts are cast, textured, lit and shadowed once per camera and kept. A frame then costs only the rays
 within the moving parts' bounding spheres. Shading is Lambertian under a soft light and a sky-to-ground
 ambient term: it depends only on the surface point, not on the viewer.
-
-Effects may add a medium (camera_node.synthetic.effects), which is computed only then.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.lighting import Light, Medium, contact_shadow, shade_diffuse
+from camera_node.synthetic.lighting import Light, contact_shadow, shade_diffuse
 from camera_node.synthetic.placement import MovingBody, Part, PlacedParts, place_parts, place_static
 from camera_node.synthetic.shapes import nearest_hit
 from camera_node.synthetic.textures import Color
@@ -31,16 +29,12 @@ _SHADOW_BIAS = 2e-3
 
 @dataclass(frozen=True)
 class World:
-    """Everything that can be seen, without cameras. background: color in [0, 1] of rays that hit nothing.
-
-    medium: set by an effect; see ``lighting``.
-    """
+    """Everything that can be seen, without cameras. background: color in [0, 1] of rays that hit nothing."""
 
     static_parts: tuple[Part, ...]
     moving_bodies: tuple[MovingBody, ...]
     light: Light
     background: Color = (0.0, 0.0, 0.0)
-    medium: Medium | None = None
 
 
 def cast_rays(origin: Array, directions: Array, placed: PlacedParts, limit: Array) -> tuple[Array, NDArray[np.int16]]:
@@ -134,7 +128,7 @@ class CameraRenderer:
         self._origin, directions = world_rays(fine, camera_to_world)
         self._directions = np.ascontiguousarray(directions.reshape(-1, 3).T)
         self._render_static()
-        self._static_image = self._to_image(self._through_medium(self._static_colors, self._transmittance))
+        self._static_image = self._to_image(self._static_colors)
 
     def for_world(self, world: World) -> CameraRenderer:
         """A renderer of ``world``, which may differ from this one's world only in its moving bodies. Static
@@ -148,14 +142,13 @@ class CameraRenderer:
         if not self.world.moving_bodies:
             return self._static_image.copy()
         colors, limit = self._static_colors.copy(), self._distance
-        transmittance = None if self._transmittance is None else self._transmittance.copy()
         moving = [place_parts(body.parts, body.matrices(t_s)) for body in self.world.moving_bodies]
         for body, placed in zip(self.world.moving_bodies, moving):  # before one of them hides the floor
             near, left = contact_shadow(body, placed, self._floor_points)
             colors[self._floor[near]] *= left[:, None]
         for placed in moving:
-            limit = self._draw(placed, colors, limit, transmittance)
-        return self._to_image(self._through_medium(colors, transmittance))
+            limit = self._draw(placed, colors, limit)
+        return self._to_image(colors)
 
     def distance(self) -> Array:
         """Distance along each ray to the nearest static part, inf without one, at the supersampled
@@ -175,15 +168,12 @@ class CameraRenderer:
         colors = shade_diffuse(world.light, albedo, points, normals, light_visibility(world, points))
         colors += albedo * np.array([p.glow for p in world.static_parts] or [0.0])[which[hit]]
         self._static_colors[hit] = colors.T
-        self._transmittance = None if world.medium is None else world.medium.transmittance(self._distance)
         takes = np.array([p.takes_contact for p in world.static_parts] or [False])
         on_floor = takes[which[hit]] & (normals[2] > 0.5)
         self._floor = hit[on_floor]
         self._floor_points = np.ascontiguousarray(points[:, on_floor])
 
-    def _draw(
-        self, placed: PlacedParts, colors: Colors, limit: Array, transmittance: NDArray[np.float32] | None
-    ) -> Array:
+    def _draw(self, placed: PlacedParts, colors: Colors, limit: Array) -> Array:
         """Draw one moving body over ``colors`` (N, 3) of all rays. Returns the distance (N,) to the nearest surface
         so far along each ray."""
         chosen = rays_near_sphere(self._origin, self._directions, *placed.bounding_sphere())
@@ -198,19 +188,10 @@ class CameraRenderer:
         at = chosen[hit]
         # No shadows fall on moving parts: for them the light is one point at its center.
         colors[at] = shade_diffuse(self.world.light, albedo, points, normals).T
-        if transmittance is not None and self.world.medium is not None:
-            transmittance[at] = self.world.medium.transmittance(t[hit])
         if len(self.world.moving_bodies) > 1:  # the next body may pass in front or behind
             limit = limit.copy()
             limit[at] = t[hit]
         return limit
-
-    def _through_medium(self, colors: Colors, transmittance: NDArray[np.float32] | None) -> Colors:
-        """Colors (N, 3) seen through the medium: attenuated, plus airlight."""
-        if transmittance is None or self.world.medium is None:
-            return colors
-        air = np.array(self.world.medium.airlight, dtype=np.float32)
-        return np.asarray(air + (colors - air) * transmittance[:, None], dtype=np.float32)
 
     def _to_image(self, colors: Colors) -> Image:
         image: NDArray = colors.reshape(-1, self._shape[1], 3)

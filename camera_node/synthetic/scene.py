@@ -21,14 +21,14 @@ from camera_node.synthetic.placement import place_static
 from camera_node.synthetic.render import CameraRenderer, Image, World, cast_rays
 from freshfield.geometry import Array, Pinhole, world_rays
 from freshfield.limits import MAX_IMAGE_SIDE_PX
-from freshfield.settings import ScenarioError, Settings, about, as_mapping, read_settings, within
+from freshfield.settings import ScenarioError, Settings, as_mapping, read_settings, within
 
 SCENES = ("room", "tile", "tower")
 HELD_OUT = "cam00"
 MAX_CAMERAS = 19
 Fov = Annotated[float, within(5.0, 150.0, "horizontal field of view of the cameras")]
 # Parameters that do not change static parts.
-_MOTION_PARAMETERS = ("speed_m_per_s", "motion_seed", "course", "people")
+_MOTION_PARAMETERS = ("speed_m_per_s", "motion_seed", "people")
 # Number of renderers kept for scenes with the same static parts: enough for two sets of cameras.
 _MAX_STATIC_RENDERERS = 2 * MAX_CAMERAS
 _STATIC_RENDERERS: dict[tuple[str, str], CameraRenderer] = {}
@@ -46,9 +46,6 @@ class BaseParams(Settings, frozen=True, kw_only=True):
     height: Annotated[int, within(8, MAX_IMAGE_SIDE_PX, "pixels")] = 128
     horizontal_fov_deg: Fov = 60.0
     supersample: Annotated[int, within(1, 8, "rays per pixel side")] = 2
-    distortion: Annotated[tuple[float, float, float, float], about("OpenCV's k1, k2, p1, p2 of every lens")] = (
-        0.0,
-    ) * 4
 
 
 class MovingParams(BaseParams, frozen=True, kw_only=True):
@@ -156,5 +153,4 @@ def make_scene(name: str, params: Mapping[str, Any] | None = None) -> Scene:
 
 def pinhole(params: BaseParams) -> Pinhole:
     """The lens that ``params`` describe."""
-    camera = Pinhole.from_fov(params.width, params.height, params.horizontal_fov_deg)
-    return dataclasses.replace(camera, distortion=params.distortion)
+    return Pinhole.from_fov(params.width, params.height, params.horizontal_fov_deg)

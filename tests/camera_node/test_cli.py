@@ -49,7 +49,7 @@ def test_lists_say_what_there_is(capsys):
     assert all(word in said for word in ("kind: world", "kind: transforms", "kind: video", "background", "fps"))
     assert main(["effects"]) == 0
     said = capsys.readouterr().out
-    assert all(word in said for word in ("sensor_noise", "motion_blur", "fog", "clock_drift", "offset_ms"))
+    assert all(word in said for word in ("sensor_noise", "motion_blur", "clock_drift", "offset_ms"))
 
 
 def test_help_teaches_with_examples(capsys):

@@ -35,10 +35,7 @@ INTRINSICS = """Estimates a camera's intrinsics and their uncertainty from 10 to
 every corner: ten are enough if the target has been everywhere and tilted by 30 degrees between them.
 """
 
-BOARD = (
-    "target: charuco:7x5:30mm:22mm[:4X4_50], chessboard:9x6:23.6mm (inner corners), apriltag:36h11:0:80mm, "
-    "qr:60mm[:TEXT]"
-)
+BOARD = "target: charuco:7x5:30mm:22mm[:4X4_50], chessboard:9x6:23.6mm (inner corners)"
 
 # Option -> the inputs that use it. With any other input it is an error.
 _GOES_WITH = {

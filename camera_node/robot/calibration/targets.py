@@ -2,8 +2,6 @@
 
     charuco:7x5:30mm:22mm[:4X4_50]     squares across x down, their side, the markers' side, dictionary
     chessboard:9x6:23.6mm              inner corners across x down, side of a square
-    apriltag:36h11:0:80mm              family (16h5, 25h9, 36h10, 36h11), tag id, side of the black square
-    qr:60mm[:TEXT]                     side of the code; its text (default: any)
 
 Target axes: origin at the top left corner of the printed pattern (of a chessboard: the first inner corner),
 x to the right, y down, z away from the viewer, meters.
@@ -13,25 +11,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.square_corners import square_corners
 from freshfield.geometry import Pinhole, se3
 
 Array = NDArray[np.float64]
 GrayImage = NDArray[np.uint8]
 
-NOTATIONS = "charuco:7x5:30mm:22mm, chessboard:9x6:23.6mm, apriltag:36h11:0:80mm or qr:60mm"
+NOTATIONS = "charuco:7x5:30mm:22mm or chessboard:9x6:23.6mm"
 # With fewer corners of a board, its orientation is too uncertain.
 _MIN_CORNERS = 6
 # Ratio of reprojection errors above which the second of the two poses of a flat target is ruled out.
 _AMBIGUOUS = 1.5
-_FAMILIES = ("16h5", "25h9", "36h10", "36h11")
 _SUBPIX = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
 
 
@@ -169,60 +164,7 @@ def _chessboard(name: str, corners: str, square: str) -> Target:
     return Target(name, size, find, draw, across + 3, pattern)
 
 
-def _apriltag(name: str, family: str, number: str, size: str) -> Target:
-    if family.lower() not in _FAMILIES:
-        raise ValueError(f"the families are {', '.join(_FAMILIES)}")
-    side, wanted = _meters(size), int(number)
-    dictionary = _dictionary(f"DICT_APRILTAG_{family.upper()}")
-    if not 0 <= wanted < len(dictionary.bytesList):
-        raise ValueError(f"family {family} has numbers 0 to {len(dictionary.bytesList) - 1}")
-    detector = cv2.aruco.ArucoDetector(dictionary)
-
-    def find(image: GrayImage) -> Corners | None:
-        pixels, numbers, _ = detector.detectMarkers(image)
-        at = [] if numbers is None else np.flatnonzero(numbers.ravel() == wanted)
-        if len(at) != 1:  # absent, or ambiguous because the tag appears twice
-            return None
-        return _refined_square(image, pixels[int(at[0])], side)
-
-    def draw(width: int) -> GrayImage:
-        return np.asarray(cv2.aruco.generateImageMarker(dictionary, wanted, width), dtype=np.uint8)
-
-    return Target(name, (side, side), find, draw, dictionary.markerSize + 2, (side, side))
-
-
-def _qr(name: str, size: str, *text: str) -> Target:
-    side, wanted = _meters(size), ":".join(text)
-    detector = cv2.QRCodeDetector()
-
-    def find(image: GrayImage) -> Corners | None:
-        said, pixels, _ = detector.detectAndDecode(image)
-        if not said or pixels is None or (wanted and said != wanted):
-            return None
-        return _refined_square(image, pixels, side)
-
-    code = cv2.QRCodeEncoder.create().encode(wanted or "freshfield")
-    # Remove the encoder's quiet zone of two modules: it does not belong to the code's size.
-    dark = np.flatnonzero((code == 0).any(axis=0))
-    code = code[dark[0] : dark[-1] + 1, dark[0] : dark[-1] + 1]
-
-    def draw(width: int) -> GrayImage:
-        return np.asarray(cv2.resize(code, (width, width), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
-
-    return Target(name, (side, side), find, draw, len(code), (side, side))
-
-
-_MAKERS: dict[str, Callable[..., Target]] = {
-    "charuco": _charuco,
-    "chessboard": _chessboard,
-    "apriltag": _apriltag,
-    "qr": _qr,
-}
-
-
-def _refined_square(image: GrayImage, pixels: NDArray[Any], side: float) -> Corners:
-    points = np.array([[0, 0, 0], [side, 0, 0], [side, side, 0], [0, side, 0]], dtype=np.float64)
-    return Corners(square_corners(image, pixels.reshape(4, 2).astype(np.float64)) + 0.5, points)
+_MAKERS: dict[str, Callable[..., Target]] = {"charuco": _charuco, "chessboard": _chessboard}
 
 
 def _mean_level(image: GrayImage, at: Array) -> float:

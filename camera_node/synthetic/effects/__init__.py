@@ -2,8 +2,7 @@
 
 The kinds, by where they act:
 
-* ``world``    changes the scene, such as its air (rendered ahead and cached; free while streaming);
-* ``lens``     changes a camera's lens, and the lens that its frames report (likewise);
+* ``lens``     changes a camera's lens, and the lens that its frames report (rendered ahead; free while streaming);
 * ``exposure`` changes how an instant becomes an image (likewise);
 * ``image``    changes each frame as it is streamed, recorded ones too (costs time a frame);
 * ``clock``    changes the node's clock and so its time stamps;
@@ -31,16 +30,7 @@ from camera_node.synthetic.scene import Scene
 from freshfield.geometry import Pinhole, Pose
 from freshfield.settings import ScenarioError, Settings, about, read_settings
 
-NAMES = (
-    "clock_drift",
-    "exposure_drift",
-    "fog",
-    "hot_pixels",
-    "lens_distortion",
-    "motion_blur",
-    "pose_noise",
-    "sensor_noise",
-)
+NAMES = ("clock_drift", "exposure_drift", "lens_distortion", "motion_blur", "pose_noise", "sensor_noise")
 
 
 class EffectError(ScenarioError):
@@ -70,12 +60,6 @@ def effect_class(name: str) -> type[EffectParameters]:
 def frame_rng(key: NDArray[np.uint64], index: int) -> np.random.Generator:
     """Random stream of frame number ``index`` under a key (2,), independent of the order of the frames."""
     return np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, index]))
-
-
-class WorldEffect(Protocol):
-    def extend(self, scene: Scene) -> Scene:
-        """The scene with this effect."""
-        ...
 
 
 class LensEffect(Protocol):
@@ -131,7 +115,6 @@ class PoseEffect(Protocol):
 class Effects:
     """The effects of one camera, by kind and in the order listed."""
 
-    world: tuple[WorldEffect, ...] = ()
     lens: tuple[LensEffect, ...] = ()
     exposure: tuple[ExposureEffect, ...] = ()
     image: tuple[ImageEffect, ...] = ()
@@ -140,9 +123,7 @@ class Effects:
     rendered: tuple[tuple[str, Any], ...] = ()  # name and parameters of the effects within cached frames
 
     def extend(self, scene: Scene) -> Scene:
-        """The scene with effects of the kinds world and lens. Raises EffectError."""
-        for effect in self.world:
-            scene = effect.extend(scene)
+        """The scene with effects of the kind lens. Raises EffectError."""
         if self.lens:
             scene = scene.with_cameras({c: (self._lens(k), p) for c, (k, p) in scene.cameras.items()})
         return scene
@@ -225,7 +206,7 @@ def load_effects(
         if held_out and not effect.in_truth:
             continue
         found.setdefault(effect.kind, []).append(effect.start(rng_for(name)))
-        if effect.kind in ("world", "exposure"):
+        if effect.kind == "exposure":
             rendered.append((name, effect))
     if not found:
         return NO_EFFECTS

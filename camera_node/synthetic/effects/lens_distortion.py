@@ -17,8 +17,7 @@ from freshfield.settings import about, within
 class LensDistortion(EffectParameters, frozen=True):
     """OpenCV's model, without units. Rendered ahead at no extra cost; free while streaming.
 
-    Raises EffectError if the distortion cannot be inverted over the whole image, or if the scene's lenses have a
-    distortion already.
+    Raises EffectError if the distortion cannot be inverted over the whole image.
     """
 
     k1: Annotated[float, within(-10.0, 10.0, "radial")] = -0.15
@@ -30,8 +29,6 @@ class LensDistortion(EffectParameters, frozen=True):
     kind: ClassVar[str] = "lens"
 
     def rendered(self, camera: Pinhole) -> Pinhole:
-        if camera.distorted:
-            raise EffectError("effect lens_distortion: the scene's params have a distortion already: drop one")
         lens = dataclasses.replace(camera, distortion=(self.k1, self.k2, self.p1, self.p2))
         if not invertible(lens):
             raise EffectError(

@@ -14,7 +14,7 @@ import numpy as np
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
 from camera_node.synthetic.lighting import Light
-from camera_node.synthetic.person import Course, make_walk, walking_person
+from camera_node.synthetic.person import make_walk, walking_person
 from camera_node.synthetic.placement import Part, at
 from camera_node.synthetic.render import World
 from camera_node.synthetic.scene import Fov, MovingParams, Scene, pinhole
@@ -35,17 +35,15 @@ _LOOP_CENTER, _LOOP_RADII_M = (0.0, 0.95), (0.74, 0.54)
 
 
 class Params(MovingParams, frozen=True, kw_only=True):
-    """speed_m_per_s: of the person's parts. course: how the person walks the loop (``person.Walk``)."""
+    """speed_m_per_s: of the person's parts."""
 
     horizontal_fov_deg: Fov = 64.0
-    course: Course = "loop"
     people: Annotated[int, within(0, 4, "evenly along the loop")] = 1
 
 
 def build(params: Params) -> Scene:
     """The room as a scene."""
     walk = make_walk(_LOOP_CENTER, _LOOP_RADII_M, params.speed_m_per_s, params.motion_seed)
-    walk = replace(walk, course=params.course)
     starts_s = (walk.start_s + k / params.people * walk.period_s for k in range(params.people))
     walks = [replace(walk, start_s=start_s) for start_s in starts_s]
     grid = np.stack(np.meshgrid([-0.8, 0.2, 1.2], [-1.0, 0.0, 1.0], [2.95]), axis=-1).reshape(-1, 3)
@@ -64,7 +62,7 @@ def build(params: Params) -> Scene:
         target=_TARGET,
         world=World((*_shell(), *_furniture()), tuple(map(walking_person, walks)), light),
         bounds=np.array([[-3.0, -3.0, 0.0], [3.0, 3.0, 3.0]]),
-        period_s=walk.repeats_s,
+        period_s=walk.period_s,
         moving=bool(walks) and not walk.still,
     )
 

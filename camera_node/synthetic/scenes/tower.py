@@ -1,14 +1,12 @@
 """Scene ``tower``: cameras on a mast look outward into a workshop of 10 x 10 x 4 m (Eyeful-like).
 
 Each camera sees a different part of the surroundings, with little overlap. A person walks on one side and a
-loaded cart drives on the other; or a person walks on one of four sides, drawn at random. cam00 is held out
-and more than 15 degrees from every other.
+loaded cart drives on the other. cam00 is held out and more than 15 degrees from every other.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 import numpy as np
 
@@ -38,31 +36,19 @@ _ANGLES_DEG = [(0.0, 3.0)] + [
 _HALF_M, _HEIGHT_M = 5.0, 4.0
 _WALK_CENTER, _WALK_RADII_M = (0.2, -2.75), (1.35, 0.75)
 _DRIVE_CENTER, _DRIVE_RADII_M = (0.0, 2.9), (1.9, 0.8)
-# Where a person alone may walk: the sides that cameras tell apart: south, east, north, west.
-_SIDES = ((0.0, -2.9), (2.6, 0.0), (0.0, 2.9), (-2.6, 0.0))
-_SIDE_RADII_M = (0.5, 0.25)  # between the pillars
-_MOVERS_STREAM = 5  # random stream that draws the side
 _STILL_PHASE = 0.62  # where the cart stands at speed 0, as the person does
 
 
 class Params(MovingParams, frozen=True, kw_only=True):
-    """speed_m_per_s: mean speed of the person's parts and of the cart; 0 stands still. movers: ``both``, or ``person``,
-    alone on one of four sides; motion_seed draws which. Camera positions then do not tell where something moves, but
-    images do."""
+    """speed_m_per_s: mean speed of the person's parts and of the cart; 0 stands still."""
 
     horizontal_fov_deg: Fov = 90.0
-    movers: Literal["both", "person"] = "both"
 
 
 def build(params: Params) -> Scene:
     """The workshop as a scene."""
-    # A separate stream: the walk's phase does not depend on the side.
-    drawn = float(np.random.default_rng([_MOVERS_STREAM, params.motion_seed or 0]).random())
-    alone = params.movers == "person"
-    center, radii = (_SIDES[int(4 * drawn)], _SIDE_RADII_M) if alone else (_WALK_CENTER, _WALK_RADII_M)
-    walk = make_walk(center, radii, params.speed_m_per_s, params.motion_seed)
-    person = walking_person(walk)
-    bodies = (person,) if alone else (person, _cart(walk, params.speed_m_per_s))
+    walk = make_walk(_WALK_CENTER, _WALK_RADII_M, params.speed_m_per_s, params.motion_seed)
+    bodies = (walking_person(walk), _cart(walk, params.speed_m_per_s))
     grid = np.stack(np.meshgrid([-2.6, 0.0, 2.6], [-2.6, 0.0, 2.6], [3.9]), axis=-1).reshape(-1, 3)
     light = Light(
         points=grid,

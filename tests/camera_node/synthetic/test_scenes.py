@@ -106,30 +106,6 @@ def test_the_share_of_moving_pixels():
     assert shares[0.5] < shares[1.0] < shares[4.0]
 
 
-def test_a_person_alone_in_the_tower_walks_on_any_of_four_sides_clear_of_all_that_stands_there():
-    sides = set()
-    with pytest.raises(ValueError, match=r"movers: expected .*one of both, person"):
-        make_scene("tower", {"movers": "none"})
-    for seed in range(24):
-        scene = make_scene("tower", {**SMALL, "supersample": 1, "movers": "person", "motion_seed": seed})
-        (person,) = scene.world.moving_bodies
-        path = np.stack([person.matrices(t)[:, :3, 3].mean(axis=0) for t in np.linspace(0, scene.period_s, 25)])
-        angle = np.rad2deg(np.arctan2(*path[:, 1::-1].T))
-        side = round(float(np.rad2deg(np.angle(np.exp(1j * np.deg2rad(angle)).mean())) / 90.0)) % 4
-        sides.add(side)
-        away = np.abs(np.rad2deg(np.angle(np.exp(1j * np.deg2rad(angle - 90.0 * side)))))
-        assert away.max() < 25.0, "it stays on its side"
-        boxes = [part for part in scene.world.static_parts if isinstance(part.shape, Box)]
-        for t in np.linspace(0, scene.period_s, 9):
-            for part, m in zip(person.parts, person.matrices(t)):
-                at = m[:3, :3] @ part.shape.bounding_sphere()[0] + m[:3, 3]
-                for box in boxes:
-                    local = np.linalg.inv(box.matrix) @ np.append(at, 1.0)
-                    outside = np.maximum(np.abs(local[:3]) - box.shape.half, 0.0)
-                    assert np.linalg.norm(outside) > 0.1, "nothing is walked through"
-    assert sides == {0, 1, 2, 3}
-
-
 def test_the_share_of_moving_pixels_of_the_tower():
     tower = {"width": 64, "height": 64, "supersample": 1}
     shares = {v: moving_share(make_scene("tower", {**tower, "speed_m_per_s": v}), 8) for v in (1.0, 4.0)}
@@ -163,6 +139,7 @@ def test_the_same_instant_gives_the_same_bytes_in_another_process():
     ("name", "params", "message"),
     [
         ("rooom", {}, "valid scenes: room, tile, tower"),
+        ("room", {"people": 5}, "people: expected .*0 to 4"),
         ("room", {"speed": 1.0}, "unknown key; expected one of"),
         ("tile", {"speed_m_per_s": 1.0}, "speed_m_per_s: unknown key"),
         ("room", {"count": 20}, "count: expected .*1 to 19"),
@@ -173,7 +150,6 @@ def test_the_same_instant_gives_the_same_bytes_in_another_process():
         ("room", {"speed_m_per_s": -1.0}, "speed_m_per_s: expected .*0 to 8"),
         ("tower", {"speed_m_per_s": 9.0}, "speed_m_per_s: expected .*0 to 8"),
         ("room", {"speed_m_per_s": float("nan")}, "expected a number"),
-        ("room", {"distortion": [0.0]}, "4 values"),
     ],
 )
 def test_an_invalid_scene_is_refused_in_one_line(name, params, message):
@@ -185,13 +161,6 @@ def test_an_invalid_scene_is_refused_in_one_line(name, params, message):
 def test_an_unknown_camera_is_refused_by_name():
     with pytest.raises(SceneError, match="no camera 'cam13'; it has cam00, cam01"):
         make_scene("room", SMALL).render("cam13", 0.0)
-
-
-def test_distortion_reaches_the_cameras():
-    scene = make_scene("tile", {**SMALL, "distortion": [-0.2, 0.05, 0.0, 0.0]})
-    straight = make_scene("tile", SMALL)
-    assert scene.cameras["cam00"][0].distortion == (-0.2, 0.05, 0.0, 0.0)
-    assert not np.array_equal(scene.render("cam00", 0.0), straight.render("cam00", 0.0))
 
 
 @pytest.mark.parametrize("name", ["room", "tower"])
@@ -219,31 +188,17 @@ def test_motions_that_are_drawn_differ_in_speed_direction_start_and_path():
     assert np.ptp([w.center[0] for w in walks]) > 0.3 and np.ptp([w.radii[1] for w in walks]) > 0.15
 
 
-def test_a_walk_may_stop_reverse_or_jump_and_two_may_walk_it():
+def test_several_may_walk_the_loop():
     def seen(t_s: float, **params):
         return make_scene("room", {**SMALL, "supersample": 1, **params}).render("cam00", t_s)
 
     def same(a, b) -> bool:
         return np.abs(a.astype(int) - b).max() <= 1
 
-    loop = make_scene("room", SMALL)
-    assert not same(seen(0.5), seen(0.9))
-    assert same(seen(0.5, course="stops"), seen(0.5)) and same(seen(1.3, course="stops"), seen(0.7))
-    assert same(seen(0.7, course="stops"), seen(1.1, course="stops"))
-    assert make_scene("room", {**SMALL, "course": "stops"}).period_s == 2 * loop.period_s
-    back_s = 0.5 * loop.period_s + 0.4
-    assert same(seen(back_s, course="reverses"), seen(loop.period_s - back_s))
-    assert same(seen(back_s, course="jumps"), seen(0.4)) and not same(seen(back_s), seen(0.4))
-    two, one, other = seen(0.4, people=2), seen(0.4), seen(0.4 + 0.5 * loop.period_s)
+    two, one, other = seen(0.4, people=2), seen(0.4), seen(0.4 + 0.5 * make_scene("room", SMALL).period_s)
     still = np.abs(one.astype(int) - other).max(axis=2) <= 1
     assert np.mean(two[still] == one[still]) > 0.95 and not same(two, one) and not same(two, other)
     assert same(seen(0.4, people=0), seen(0.9, people=0)) and not make_scene("room", {"people": 0}).moving
-    for params, message in (
-        ({"course": "hops"}, "course: expected one of loop"),
-        ({"people": 5}, "people: expected .*0 to 4"),
-    ):
-        with pytest.raises(SceneError, match=message):
-            make_scene("room", params)
 
 
 def test_a_person_on_a_clockwise_walk_faces_forward():

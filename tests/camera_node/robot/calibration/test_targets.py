@@ -15,13 +15,7 @@ from tests.camera_node.robot.calibration.rendered import render
 LENS = Pinhole(400, 300, 330.0, 332.0, 203.0, 148.0, (-0.05, 0.02, 0.001, -0.001))
 # Where a picture's own origin lies in its target's axes: a chessboard's is its first inner corner.
 ORIGIN = {"chessboard": 2 * 0.02}
-# (spec, degrees, mm) allowed: boards have dozens of corners, tags four.
-KINDS = [
-    ("charuco:7x5:24mm:18mm", 0.1, 0.1),
-    ("chessboard:7x4:20mm", 0.1, 0.1),
-    ("apriltag:36h11:3:80mm", 0.2, 0.5),
-    ("qr:80mm:here", 0.2, 0.5),
-]
+KINDS = ["charuco:7x5:24mm:18mm", "chessboard:7x4:20mm"]
 
 
 def cameras(target) -> list[np.ndarray]:
@@ -36,8 +30,8 @@ def cameras(target) -> list[np.ndarray]:
     return out
 
 
-@pytest.mark.parametrize(("spec", "deg", "mm"), KINDS)
-def test_a_rendered_target_is_found_where_it_is(spec, deg, mm):
+@pytest.mark.parametrize("spec", KINDS)
+def test_a_rendered_target_is_found_where_it_is(spec):
     target = parse_target(spec)
     for camera in cameras(target):
         picture = render(target, LENS, camera, 2)
@@ -46,26 +40,15 @@ def test_a_rendered_target_is_found_where_it_is(spec, deg, mm):
         found = estimate_pose(corners, LENS)
         truth = se3_inverse(camera)
         truth[:3, 3] += truth[:3, :3] @ ([ORIGIN.get(spec.split(":")[0], 0.0)] * 2 + [0.0])
-        assert angle_deg(found, truth) < deg
-        assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) * 1e3 < mm
+        assert angle_deg(found, truth) < 0.1
+        assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) * 1e3 < 0.1
 
 
-@pytest.mark.parametrize(("spec", "deg", "mm"), KINDS)
-def test_nothing_is_found_where_nothing_is(spec, deg, mm):
+@pytest.mark.parametrize("spec", KINDS)
+def test_nothing_is_found_where_nothing_is(spec):
     noise = np.random.default_rng(0).integers(0, 256, (120, 160)).astype(np.uint8)
     for picture in (np.zeros((120, 160), np.uint8), np.full((120, 160), 255, np.uint8), noise):
         assert parse_target(spec).find(picture) is None
-
-
-def test_the_wrong_tag_and_the_wrong_text_are_not_taken():
-    printed = np.pad(parse_target("apriltag:36h11:3:80mm").draw(200), 40, constant_values=255)
-    assert parse_target("apriltag:36h11:3:80mm").find(printed) is not None
-    assert parse_target("apriltag:36h11:4:80mm").find(printed) is None
-    twice = np.hstack([printed, printed])
-    assert parse_target("apriltag:36h11:3:80mm").find(twice) is None
-    printed = np.pad(parse_target("qr:80mm:here").draw(400), 60, constant_values=255)
-    assert parse_target("qr:80mm:here").find(printed) is not None and parse_target("qr:80mm").find(printed) is not None
-    assert parse_target("qr:80mm:there").find(printed) is None
 
 
 @pytest.mark.parametrize("turn", [None, cv2.ROTATE_90_CLOCKWISE, cv2.ROTATE_180, cv2.ROTATE_90_COUNTERCLOCKWISE])
@@ -104,9 +87,7 @@ def test_a_small_tag_seen_straight_on_may_be_tilted_either_way():
         ("charuco:7x5:30mm:20mm:9X9_50", "no dictionary 9X9_50"),
         ("chessboard:9x6:23.6", "needs a unit"),
         ("chessboard:8x6:20mm", "odd and the other even"),
-        ("apriltag:99h9:0:80mm", "families are"),
-        ("apriltag:36h11:9999:80mm", "has numbers 0 to 586"),
-        ("qr:90m", "not within"),
+        ("chessboard:9x6:90m", "not within"),
     ],
 )
 def test_specs_that_are_none_say_what_is_one(spec, why):

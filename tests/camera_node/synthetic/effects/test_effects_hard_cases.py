@@ -22,16 +22,6 @@ EXTREMES: dict[str, list[dict]] = {
         {"amplitude_stops": 8.0, "offset_spread_stops": 8.0, "period_s": 0.01},
         {"amplitude_stops": 0.0, "offset_spread_stops": 0.0, "period_s": 1e6},
     ],
-    "fog": [
-        {"visibility_m": 0.01, "contrast_threshold": 1e-6},
-        {"visibility_m": 1e6, "contrast_threshold": 0.5},
-        {"airlight": [0.0, 0.0, 0.0]},
-        {"airlight": [1.0, 1.0, 1.0]},
-    ],
-    "hot_pixels": [
-        {"hot_ppm": 1e6, "hot_counts": 1e6, "hits_per_megapixel": 1e6, "hit_counts": 1e6},
-        {"hot_ppm": 0.0, "hits_per_megapixel": 0.0, "hot_counts": 0.0, "hit_counts": 0.0},
-    ],
     "lens_distortion": [{"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}, {"k1": 10.0}, {"k1": -1e-9}],
     "pose_noise": [
         {"translation_mm": 1e5, "rotation_deg": 180.0},
@@ -73,7 +63,7 @@ def test_the_ends_of_the_ranges_give_sound_frames_in_every_scene(name, parameter
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 7, 3), (7, 1, 4), (64, 3, 4)])
 @pytest.mark.filterwarnings("error")
 def test_image_effects_take_any_image(level, shape):
-    for name in ("exposure_drift", "hot_pixels", "sensor_noise"):
+    for name in ("exposure_drift", "sensor_noise"):
         for parameters in EXTREMES.get(name, [{}]):
             out = load(name, parameters).apply(np.full(shape, level, np.uint8), 2**62, 1e12)
             assert out.shape == shape and out.dtype == np.uint8
@@ -98,15 +88,4 @@ def test_no_number_may_be_nonsense(name, parameter, value):
 
 
 def test_there_are_numbers_to_refuse():
-    assert len(numbers()) >= 18
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_camera_within_a_fog_of_a_thousand_suns():
-    """A medium where every ray starts inside a shape and where nothing is hit at all."""
-    made = load("fog", {"visibility_m": 0.05})
-    scene = made.extend(make_scene("tile", {"width": 12, "height": 12, "supersample": 1}))
-    inside = np.eye(4)
-    inside[:3, 3] = 0.0, 0.0, 0.03
-    for pose in (inside, np.diag([1.0, -1.0, -1.0, 1.0])):
-        assert scene.view(scene.cameras["cam00"][0], pose).image(0.0).shape == (12, 12, 3)
+    assert len(numbers()) >= 15

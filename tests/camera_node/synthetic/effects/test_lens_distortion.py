@@ -62,9 +62,3 @@ def test_a_lens_that_cannot_be_undone_is_refused_in_one_line():
     with pytest.raises(EffectError, match=r"lens_distortion: k1 -0.5, .* cannot be undone") as error:
         made(k1=-0.5).extend(scene)
     assert "\n" not in str(error.value)
-
-
-def test_two_distortions_are_refused():
-    scene = make_scene("room", {"width": 32, "height": 32, "distortion": [-0.1, 0.0, 0.0, 0.0]})
-    with pytest.raises(EffectError, match="have a distortion already: drop one"):
-        made().extend(scene)

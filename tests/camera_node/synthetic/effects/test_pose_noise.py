@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from camera_node.synthetic.effects.pose_noise import PoseNoise
-from freshfield.geometry import Pose, look_at, so3_log
+from freshfield.geometry import Pose, look_at
 
 POSE = Pose.from_matrix(look_at([1.0, -2.0, 1.5], [0.3, 0.2, 0.4]))
 NONE = {"translation_mm": 0.0, "rotation_deg": 0.0}
@@ -20,7 +21,7 @@ def errors(poses: list[Pose]) -> tuple[np.ndarray, np.ndarray]:
     """Translations (N, 3) in mm and rotation vectors (N, 3) in degrees, in camera axes."""
     true = POSE.matrix()
     moved = np.array([p.translation_m for p in poses]) - true[:3, 3]
-    turned = np.array([so3_log(true[:3, :3].T @ p.matrix()[:3, :3]) for p in poses])
+    turned = Rotation.from_matrix([true[:3, :3].T @ p.matrix()[:3, :3] for p in poses]).as_rotvec()
     return 1e3 * moved, np.rad2deg(turned)
 
 
