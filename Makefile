@@ -19,9 +19,6 @@ PORT ?= 8080
 # Folder of recorded data, for scenarios that stream it (fox, lego, kitchen).
 DATA ?=
 
-# Options of `make bench`, for edge-server bench, such as --quick.
-BENCH ?=
-
 # Options of `make figures`: studies (names, or groups as edge-server study has them), processes, and more for each
 # study, such as --quick or --seeds 40.
 FIGURES ?= all viewpoints preferences learning
@@ -97,10 +94,8 @@ types: .venv/.ok-test  ## mypy
 	$(PY) -m mypy
 	MYPYPATH=proto:deploy $(PY) -m mypy deploy/check_report.py deploy/freshfield_up
 
-bench: .venv/.ok-test  ## how cost grows on this machine: runs/bench, docs/results; BENCH=--quick
+bench: .venv/.ok-test  ## how much later the emulator hands a message on: runs/bench-emulator.txt
 	@mkdir -p runs
-	$(PY) -m edge_server.cli bench --out runs/bench $(BENCH)
-	$(if $(findstring --quick,$(BENCH)),,cp runs/bench/*.json runs/bench/*.md runs/bench/*.png docs/results)
 	$(PY) -m tests.tools.message_through_proxy | tee runs/bench-emulator.txt
 
 figures: .venv/.ok-test  ## the thesis's figures, hours to days: docs/results/thesis; DATA=FOLDER JOBS=2 STUDY=--quick
@@ -212,5 +207,5 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 
 # What slow tests need besides: Ray, some 240 MB; scikit-image and pycolmap for surfaces; and what tests of cameras and arms skip without, 200 MB.
 .venv/.ok-slow: .venv/.ok-test
-	@$(INSTALL) -e '.[cluster,detector,surface,colmap,ur,oak,realsense,kinematics,mcap]'
+	@$(INSTALL) -e '.[cluster,surface,colmap,ur,oak,realsense,kinematics,mcap]'
 	@touch $@

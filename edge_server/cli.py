@@ -70,10 +70,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 # Commands with options and a main of their own, imported only when called: command -> (module, help).
 _COMMANDS = {
-    "fit": ("experiments.fitting.command", "fit a recorded data set without a network and report fidelity over time"),
-    "frontier": ("experiments.frontier.command", "sweep the time of fits and updates, plot fidelity against seconds"),
+    "fit": (
+        "experiments.fitting.fit_command",
+        "fit a recorded data set without a network and report fidelity over time",
+    ),
+    "frontier": (
+        "experiments.frontier.frontier_command",
+        "sweep the time of fits and updates, plot fidelity against seconds",
+    ),
     "train-scheduler": (
-        "experiments.training.scheduler.command",
+        "experiments.training.train_command",
         "learn when to update the field and from which views, rewarded by real field fits",
     ),
     "compare": ("experiments.compare", "compare what policies show in a scenario, over seeds, with intervals"),
@@ -86,19 +92,14 @@ _COMMANDS = {
         "measure the time that a scenario's updates take on this machine, for virtual time",
     ),
     "viewpoints": (
-        "experiments.viewpoints.command",
+        "experiments.viewpoints.viewpoints_command",
         "choose where a camera goes next around an object, within a budget of views or meters",
     ),
-    "study": ("experiments.studies.command", "reproduce the thesis's figures, each with a verdict"),
-    "bench": ("experiments.bench.command", "measure how cost grows with cameras, image size, speed and people"),
+    "study": ("experiments.studies.study_command", "reproduce the thesis's figures, each with a verdict"),
     "explain": ("report.explain_command", "explain a policy's decision: shares of state parts, cameras, image regions"),
     "export": (
         "export.export_command",
         "write a run's mesh, splats, points, cameras and poses as files for other programs",
-    ),
-    "train-detector": (
-        "experiments.training.detector.command",
-        "train the small detector whose backbone makes the default embeddings",
     ),
     "keys": ("live.keys", "make a development CA, certificates and tokens for a scenario's processes"),
     "fetch-lpips": ("fidelity.fetch_lpips", "fetch LPIPS weights with the public package and convert them for --lpips"),

@@ -14,7 +14,7 @@ def test_a_room_gets_edits_in_proportion_to_its_lines():
     assert _shares({"a": 50, "b": 30, "c": 20}, 10) == {"a": 5, "b": 3, "c": 2}
     assert _shares({"a": 7, "b": 2, "c": 1}, 4) == {"a": 3, "b": 1, "c": 0}
     assert room("edge_server/fields/ngp/field.py") == "edge_server/fields"
-    assert room("edge_server/experiments/bench/run.py") == "edge_server/experiments/bench"
+    assert room("edge_server/experiments/studies/run.py") == "edge_server/experiments/studies"
 
 
 def test_an_edit_changes_one_line_of_what_is_computed(monkeypatch, tmp_path):

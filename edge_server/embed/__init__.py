@@ -2,7 +2,7 @@
 
 A frame's embedding z = F_e(frame) is the detector's last backbone feature map, averaged over the image and
 projected to ``dim`` numbers. Any detection ONNX exported from YOLOv8 or YOLO11 works; the default is a small
-detector trained on our own scenes (``edge-server train-detector``). The scenario key ``edge.embedding``
+detector trained on our own scenes (``edge-server train-detector`` of tag v0.1-all). The scenario key ``edge.embedding``
 enables it; without that key this package is not imported.
 """
 

@@ -36,7 +36,7 @@ MAX_ELEMENTS = 2**26
 MAX_SIDE = 2048
 # The training size of these detectors, unless the file states another.
 USUAL_SIDE = 640
-# Written by experiments.training.detector.export: mean (C,) and axes (C, K) of the pooled features.
+# Written by edge-server train-detector of tag v0.1-all: mean (C,) and axes (C, K) of the pooled features.
 PROJECTION_KEY = "freshfield.projection"
 
 _ENLARGE = ("Resize", "Upsample")

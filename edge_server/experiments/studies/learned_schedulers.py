@@ -17,7 +17,7 @@ from edge_server.experiments.studies.learning import (
     room,
 )
 from edge_server.experiments.studies.study import Claim, Statistic, Study, StudyRequest
-from edge_server.experiments.training.scheduler.evaluation import BASELINE_POLICIES
+from edge_server.experiments.training.evaluation import BASELINE_POLICIES
 from edge_server.scheduler.learned.settings import Action
 
 LEARNED, RANDOM, ALL = {"policy": "learned"}, {"policy": "random"}, {"policy": "all"}

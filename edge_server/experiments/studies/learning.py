@@ -18,9 +18,9 @@ from edge_server.experiments.rollouts import rollout
 from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
 from edge_server.experiments.studies.study import StudyRequest, open_engine
 from edge_server.experiments.studies.trial import Trial
-from edge_server.experiments.training.scheduler.evaluation import Candidate, evaluate, fixed_candidates
-from edge_server.experiments.training.scheduler.learning_curve import draw_curve
-from edge_server.experiments.training.scheduler.trainer import TrainingConfig, read_log, train
+from edge_server.experiments.training.evaluation import Candidate, evaluate, fixed_candidates
+from edge_server.experiments.training.learning_curve import draw_curve
+from edge_server.experiments.training.trainer import TrainingConfig, read_log, train
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.settings import Action, Spec
 

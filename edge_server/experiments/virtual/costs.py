@@ -23,12 +23,9 @@ from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
-from edge_server.live.field_updater import FieldUpdater
-from edge_server.live.view_decoder import ViewDecoder
 from edge_server.report.machine import machine, versions
 from edge_server.settings import ComputeConfig, EdgeConfig, read_config
 from freshfield.files import out_file, write_json
-from freshfield.frame import Frame
 from freshfield.scenario import Scenario, ScenarioError, load
 from freshfield.settings import as_mapping
 
@@ -101,48 +98,10 @@ def fitted(rows: NDArray[np.float64]) -> ComputeConfig:
     return ComputeConfig(ms_per_step=a_step, ms_per_update=an_update, ms_per_view=a_view)
 
 
-def beside_s(field: Any) -> float:
+def _beside_s(field: Any) -> float:
     """Seconds that updates of ``field`` have spent so far on parts that live run beside them."""
     parts: dict[str, float] = getattr(field, "part_s", {})
     return sum(parts.get(part, 0.0) for part in _BESIDE)
-
-
-class UpdateCosts:
-    """Measures the processor time (of this thread) of the updates of a field in layers."""
-
-    def __init__(self) -> None:
-        self._rows: list[tuple[int, float]] = []  # frames and milliseconds of each update
-        self._seen, self._spent_s = 0, 0.0
-        self._most_pixels: int | None = None
-
-    def watch(self, field: Any) -> None:
-        """Make the field measure its parts by this thread's processor time, which other load affects
-        little."""
-        if hasattr(field, "part_s"):
-            field.now = field.part_s.now = time.thread_time
-
-    def published(self, updates: FieldUpdater, counts: bool) -> None:
-        """Record an update. counts: False leaves it out of the costs."""
-        parts: dict[str, float] = getattr(updates.field, "part_s", {})
-        spent_s = sum(parts.values()) - beside_s(updates.field)
-        if counts:
-            self._rows.append((updates.buffer.arrivals - self._seen, 1e3 * (spent_s - self._spent_s)))
-        self._most_pixels = updates.decoder.most_pixels
-        self._seen, self._spent_s = updates.buffer.arrivals, spent_s
-
-    def measured(self, items: Sequence[Frame]) -> dict[str, float]:
-        """Milliseconds of an update (update_ms) and of each frame that arrived (view_ms): least squares over
-        the updates, plus the time to decode a frame of ``items``."""
-        frames, spent_ms = np.array(self._rows, float).reshape(-1, 2).T
-        if not spent_ms.any():
-            return {"update_ms": 0.0, "view_ms": 0.0}
-        slope = np.cov(frames, spent_ms)[0, 1] / max(np.var(frames, ddof=1), 1e-9)
-        view_ms = float(np.clip(slope, 0.0, spent_ms.mean() / max(frames.mean(), 1.0)))
-        begun = time.thread_time()
-        ViewDecoder(most_pixels=self._most_pixels).views(items)
-        decoding_ms = 1e3 * (time.thread_time() - begun) / len(items)
-        update_ms = float(spent_ms.mean() - view_ms * frames.mean())
-        return {"update_ms": update_ms, "view_ms": view_ms + decoding_ms}
 
 
 def _timed(scenario: Scenario, share: float, seconds: float, data: Path | None) -> NDArray[np.float64]:
@@ -161,9 +120,9 @@ def _timed(scenario: Scenario, share: float, seconds: float, data: Path | None) 
     updates, fit = deployment.updates, deployment.updates.fit
 
     def timed(selection: Any, budget: Any) -> Any:
-        before_s, began_s = beside_s(updates.field), time.perf_counter()
+        before_s, began_s = _beside_s(updates.field), time.perf_counter()
         done = fit(selection, budget)
-        spent_s = time.perf_counter() - began_s - (beside_s(updates.field) - before_s)
+        spent_s = time.perf_counter() - began_s - (_beside_s(updates.field) - before_s)
         if done is not None:
             rows.append((done[1].steps, selection.arrivals, 1e3 * spent_s))
         return done

@@ -96,8 +96,6 @@ class VirtualDeployment:
         self.shown: list[Score] = []
         """Scores of the image shown at random instants: the newest publication, extrapolated to the
         instant."""
-        self.shown_age_ms: list[float] = []
-        """Mean age of the views in the image shown, at the same instants."""
         self.captured: Counter[str] = Counter()
         self.delivered: Counter[str] = Counter()
         self.rejected: Counter[str] = Counter()
@@ -401,5 +399,3 @@ class VirtualDeployment:
         score = self.truth.score(self._shown.at(now_ns), now_ns)
         if score is not None:
             self.shown.append(score)
-            newest = self.publications[-1]
-            self.shown_age_ms.append(newest.aaoi_ms + (now_ns - newest.published_ns) / 1e6)

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edge_server.experiments.fitting.command import progress_line
 from edge_server.experiments.fitting.evaluate import Scored
+from edge_server.experiments.fitting.fit_command import progress_line
 from edge_server.fidelity.scorer import SELECTED, Score
 from edge_server.page import markup, timelines
 from edge_server.report import figures

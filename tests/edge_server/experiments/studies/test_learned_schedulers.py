@@ -17,7 +17,7 @@ from edge_server.experiments.studies.learned_schedulers import CHANGES, LEFT_OUT
 from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT, TRAININGS, room
 from edge_server.experiments.studies.registry import LEARNING, STUDIES
 from edge_server.experiments.studies.study import StudyRequest, judge, run_study
-from edge_server.experiments.training.scheduler.evaluation import BASELINE_POLICIES
+from edge_server.experiments.training.evaluation import BASELINE_POLICIES
 from tests.edge_server.experiments.rollouts.small import FIELD
 from tests.edge_server.experiments.studies.invented import answers
 

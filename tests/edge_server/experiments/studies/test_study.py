@@ -12,9 +12,9 @@ import pytest
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.common.statistics import Interval
-from edge_server.experiments.studies.command import main
 from edge_server.experiments.studies.registry import ON_A_CHANNEL, STUDIES
 from edge_server.experiments.studies.study import Claim, Finding, Study, StudyRequest, judge, run_study
+from edge_server.experiments.studies.study_command import main
 from edge_server.scheduler import make_policy
 from tests.edge_server.experiments.studies.invented import answers, figures, noise, peak, request, verdicts
 

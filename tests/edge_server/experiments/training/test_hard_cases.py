@@ -13,8 +13,8 @@ from edge_server.experiments.engine import Engine
 from edge_server.experiments.rollouts.episode import EpisodeFactory
 from edge_server.experiments.rollouts.rollout import named, rollout
 from edge_server.experiments.rollouts.setting import Setting, seeds
-from edge_server.experiments.training.scheduler.evaluation import evaluate, fixed_candidates
-from edge_server.experiments.training.scheduler.trainer import TrainingConfig, TrainingError, read_log, train
+from edge_server.experiments.training.evaluation import evaluate, fixed_candidates
+from edge_server.experiments.training.trainer import TrainingConfig, TrainingError, read_log, train
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout

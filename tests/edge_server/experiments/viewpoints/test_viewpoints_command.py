@@ -10,9 +10,9 @@ import pytest
 
 from edge_server.cli import main
 from edge_server.experiments.common.arguments import OptionError
-from edge_server.experiments.viewpoints.command import read_budget
 from edge_server.experiments.viewpoints.reconstructions import viewing_path
 from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
+from edge_server.experiments.viewpoints.viewpoints_command import read_budget
 from edge_server.page.preferences import PreferencePage
 from edge_server.viewpoints.candidates import half_hemisphere
 from edge_server.viewpoints.capture_planner import Budget

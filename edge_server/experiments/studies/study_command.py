@@ -14,7 +14,7 @@ from edge_server.experiments.rollouts.setting import SEEDS_A_PURPOSE
 from edge_server.experiments.studies.registry import CAPTURING, CASED, LEARNING, ON_A_CHANNEL, STUDIES
 from edge_server.experiments.studies.study import StudyError, StudyRequest, run_study
 from edge_server.experiments.studies.trial import scenario_of
-from edge_server.experiments.training.scheduler.trainer import TrainingError
+from edge_server.experiments.training.trainer import TrainingError
 from edge_server.fields.registry import field_names
 from edge_server.viewpoints.candidates import ViewpointError
 from freshfield.files import out_folder

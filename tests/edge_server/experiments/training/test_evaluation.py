@@ -12,13 +12,7 @@ from edge_server.experiments.common.statistics import Interval
 from edge_server.experiments.engine import Engine
 from edge_server.experiments.rollouts.episode import Outcome
 from edge_server.experiments.rollouts.setting import seeds
-from edge_server.experiments.training.scheduler.evaluation import (
-    Candidate,
-    Evaluation,
-    evaluate,
-    fixed_candidates,
-    summary,
-)
+from edge_server.experiments.training.evaluation import Candidate, Evaluation, evaluate, fixed_candidates, summary
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.settings import Spec

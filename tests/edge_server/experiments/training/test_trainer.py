@@ -16,16 +16,10 @@ from edge_server.experiments.engine import Engine
 from edge_server.experiments.rollouts.episode import Outcome
 from edge_server.experiments.rollouts.rollout import Decided, Run
 from edge_server.experiments.rollouts.setting import Setting, reward_of, seeds
-from edge_server.experiments.training.scheduler.command import main
-from edge_server.experiments.training.scheduler.evaluation import Candidate, evaluate, fixed_candidates
-from edge_server.experiments.training.scheduler.learning_curve import draw_curve
-from edge_server.experiments.training.scheduler.trainer import (
-    TrainingConfig,
-    TrainingError,
-    read_log,
-    sibling_advantages,
-    train,
-)
+from edge_server.experiments.training.evaluation import Candidate, evaluate, fixed_candidates
+from edge_server.experiments.training.learning_curve import draw_curve
+from edge_server.experiments.training.train_command import main
+from edge_server.experiments.training.trainer import TrainingConfig, TrainingError, read_log, sibling_advantages, train
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward, make_reward
@@ -135,7 +129,7 @@ def test_only_a_first_batch_without_a_reward_ends_a_training(tmp_path: Path, mon
 
     def log_of(out: Path, *runs: Run) -> list[dict]:
         given = iter(runs)
-        module = "edge_server.experiments.training.scheduler.trainer.run_rollouts"
+        module = "edge_server.experiments.training.trainer.run_rollouts"
         monkeypatch.setattr(module, lambda *a, **more: {"learner": {0: [[next(given)]]}})
         trained(out, config=config)
         return read_log(out)

@@ -15,7 +15,7 @@ from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.common.tables import number
 from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
-from edge_server.experiments.training.scheduler.evaluation import (
+from edge_server.experiments.training.evaluation import (
     BASELINE_POLICIES,
     LEARNED,
     Candidate,
@@ -23,8 +23,8 @@ from edge_server.experiments.training.scheduler.evaluation import (
     fixed_candidates,
     summary,
 )
-from edge_server.experiments.training.scheduler.learning_curve import draw_curve
-from edge_server.experiments.training.scheduler.trainer import REPORTS, TrainingConfig, TrainingError, read_log, train
+from edge_server.experiments.training.learning_curve import draw_curve
+from edge_server.experiments.training.trainer import REPORTS, TrainingConfig, TrainingError, read_log, train
 from edge_server.fields.registry import field_names
 from edge_server.scheduler import BANDIT, STATE_PARTS
 from edge_server.scheduler.learned.actor import Actor

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.experiments.frontier import command, from_scratch
+from edge_server.experiments.frontier import from_scratch, frontier_command
 from edge_server.experiments.frontier.output import recommendation
 from edge_server.experiments.frontier.update_time import (
     Charged,
@@ -110,9 +110,15 @@ def test_the_last_line_recommends_an_update_time_at_a_persons_speed():
 @pytest.fixture
 def tiny_sweep(monkeypatch):
     sweep = replace(
-        command.QUICK, planned_s=(0.2, 0.4), speeds=(1.0,), update_s=(0.1, 0.4), run_s=0.8, size=32, moving=TINY
+        frontier_command.QUICK,
+        planned_s=(0.2, 0.4),
+        speeds=(1.0,),
+        update_s=(0.1, 0.4),
+        run_s=0.8,
+        size=32,
+        moving=TINY,
     )
-    monkeypatch.setattr(command, "QUICK", sweep)
+    monkeypatch.setattr(frontier_command, "QUICK", sweep)
     monkeypatch.setattr("edge_server.experiments.frontier.update_time._COSTS_S", 0.3)
     return sweep
 

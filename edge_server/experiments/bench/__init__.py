@@ -1,1 +1,0 @@
-"""``edge-server bench``: measurements on this machine, one file per part."""
