@@ -94,7 +94,7 @@ class EdgeConfig(Settings, frozen=True):
         default_factory=ComputeConfig
     )
     grace_ms: Annotated[float, within(0.0, LONGEST_MS, "the first update waits for cameras without a report")] = 3000.0
-    lpips: Annotated[Literal["alex", "squeeze", "none"], about("network to score with, where it is installed")] = "alex"
+    lpips: Annotated[Literal["alex", "none"], about("network to score with, where its weights are")] = "alex"
     noisy_truth: Annotated[bool, about("held-out frames are noisy video")] = False
     embedding: Annotated[Any, about("for policies that look at what cameras see")] = None
     keyframes: Annotated[KeyframesConfig | None, about("earlier viewpoints of moving cameras go on supervising")] = None

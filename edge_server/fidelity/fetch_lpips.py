@@ -6,11 +6,11 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
-from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, Network, open_lpips
+from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, open_lpips
 from freshfield.files import out_folder
 
 DESCRIPTION = f"""\
@@ -20,11 +20,9 @@ Fetch the weights of LPIPS with its authors' package and convert them to the fol
   edge-server fetch-lpips --out ~/lpips
   export {FOLDER_VARIABLE}=~/lpips            # or --lpips ~/lpips where a command takes it
 
-The package lpips holds the learned channel weights; torchvision fetches the ImageNet backbones from the
-network at this command's first call (240 MB for alex, 5 MB for squeeze).
+The package lpips holds the learned channel weights; torchvision fetches AlexNet, trained on ImageNet, from the
+network at this command's first call (240 MB).
 """
-# torchvision's model of each network.
-_BACKBONES = {"alex": "alexnet", "squeeze": "squeezenet1_1"}
 
 
 class FetchError(ValueError):
@@ -36,45 +34,40 @@ def main(argv: Sequence[str] | None = None) -> int:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("edge-server fetch-lpips", description=DESCRIPTION, formatter_class=raw)
     parser.add_argument("--out", type=out_folder, required=True, metavar="DIR", help="folder to write")
-    parser.add_argument(
-        "--network", choices=get_args(Network), action="append", help="backbone; may be repeated [both]"
-    )
     args = parser.parse_args(argv)
     try:
-        for network in args.network or get_args(Network):
-            features, lins = _fetch(network)
-            for path in convert(network, features, lins, args.out):
-                print(path)
+        for path in convert(*_fetch(), args.out):
+            print(path)
     except FetchError as error:
         print(f"edge-server fetch-lpips: {error}", file=sys.stderr)
         return 2
     return 0
 
 
-def _fetch(network: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """State dictionaries of the backbone's features and of the learned weights."""
+def _fetch() -> tuple[dict[str, Any], dict[str, Any]]:
+    """State dictionaries of AlexNet's features and of the learned weights."""
     try:
         import lpips
         import torch
         import torchvision
     except ImportError as error:
         raise FetchError(f"needs {error.name}: pip install 'freshfield[edge,lpips]'") from None
-    file = Path(lpips.__file__).parent / "weights" / "v0.1" / f"{network}.pth"
+    file = Path(lpips.__file__).parent / "weights" / "v0.1" / "alex.pth"
     try:
         lins = torch.load(file, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, ValueError) as error:
         raise FetchError(f"{file}: the package lpips has no such weights ({error}): install lpips 0.1.4") from None
     try:
-        backbone = getattr(torchvision.models, _BACKBONES[network])(weights="IMAGENET1K_V1")
+        backbone = torchvision.models.alexnet(weights="IMAGENET1K_V1")
     except (OSError, RuntimeError) as error:  # no network, or a download that was cut short
-        raise FetchError(f"torchvision cannot fetch {_BACKBONES[network]}: {error}; is there a network?") from None
+        raise FetchError(f"torchvision cannot fetch AlexNet: {error}; is there a network?") from None
     return backbone.features.state_dict(), lins
 
 
-def convert(network: str, features: Mapping[str, Any], lins: Mapping[str, Any], out: Path) -> list[Path]:
-    """Write the two files of ``network`` into ``out`` and check that they load; returns their paths.
+def convert(features: Mapping[str, Any], lins: Mapping[str, Any], out: Path) -> list[Path]:
+    """Write the two files into ``out``, check that they load and return their paths.
 
-    features: torchvision's ``features`` of the backbone, "0.weight" and so on.
+    features: torchvision's ``features`` of AlexNet, "0.weight" and so on.
     lins: the package's "lin0.model.1.weight" (1, C, 1, 1) and so on.
     Raises FetchError if they do not make a working LPIPS.
     """
@@ -82,15 +75,15 @@ def convert(network: str, features: Mapping[str, Any], lins: Mapping[str, Any], 
     for k in range(len(lins)):
         name = f"lin{k}.model.1.weight"
         if name not in lins:
-            raise FetchError(f"the learned weights of {network} have no {name}: another version of lpips?")
+            raise FetchError(f"the learned weights have no {name}: another version of lpips?")
         learned[f"lin{k}"] = np.asarray(lins[name], dtype=np.float32).reshape(-1)
     arrays = {f"features.{name}": np.asarray(value, dtype=np.float32) for name, value in features.items()}
     out.mkdir(parents=True, exist_ok=True)
-    paths = [out / name for name in FILES[network]]
+    paths = [out / name for name in FILES]
     for path, content in zip(paths, (arrays, learned)):
         with path.open("wb") as file:
             np.savez(file, **content)  # type: ignore[arg-type]  # arrays by name, not its one option
-    metric, missing = open_lpips(out, network)  # type: ignore[arg-type]
+    metric, missing = open_lpips(out)
     if metric is None:
         raise FetchError(str(missing))
     return paths

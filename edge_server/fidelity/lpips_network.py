@@ -1,4 +1,4 @@
-"""The two frozen networks behind LPIPS, in torch: apart from ``lpips``, so that an edge with weights starts
+"""The frozen network behind LPIPS, in torch: apart from ``lpips``, so that an edge with weights starts
 without torch, which takes two seconds to import."""
 
 from __future__ import annotations
@@ -22,17 +22,13 @@ Parameters = dict[str, Tensor]
 
 
 class Network:
-    """Distances by one network. Stateless once built, so that threads may share it.
+    """Distances by AlexNet. Stateless once built, so that threads may share it.
 
-    name: "alex" or "squeeze".
     parameters: its arrays by name.
     lin: one vector of channel weights (C,) per slice.
     """
 
-    def __init__(
-        self, name: str, parameters: Mapping[str, NDArray[np.float32]], lin: Sequence[NDArray[np.float32]]
-    ) -> None:
-        self._slices = {"alex": _alex_slices, "squeeze": _squeeze_slices}[name]
+    def __init__(self, parameters: Mapping[str, NDArray[np.float32]], lin: Sequence[NDArray[np.float32]]) -> None:
         self._parameters = {key: torch.from_numpy(array) for key, array in parameters.items()}
         self._lin = [torch.from_numpy(each) for each in lin]
 
@@ -44,7 +40,7 @@ class Network:
             pixels = torch.from_numpy(np.ascontiguousarray(x)) * 2.0 - 1.0
             pixels = (pixels - torch.tensor(SHIFT).view(1, 3, 1, 1)) / torch.tensor(SCALE).view(1, 3, 1, 1)
             total = torch.zeros(n, dtype=torch.float64)
-            for features, lin in zip(self._slices(self._parameters, pixels), self._lin):
+            for features, lin in zip(_slices(self._parameters, pixels), self._lin):
                 unit = features / (features.square().sum(1, keepdim=True).sqrt() + EPSILON)
                 weighted = (unit[:n] - unit[n:]).square() * lin.view(1, -1, 1, 1)
                 total += weighted.double().sum(1).mean((1, 2))
@@ -52,7 +48,7 @@ class Network:
         return found
 
 
-def _alex_slices(p: Parameters, x: Tensor) -> list[Tensor]:
+def _slices(p: Parameters, x: Tensor) -> list[Tensor]:
     """AlexNet after each of its five rectified convolutions; x (N, 3, H, W)."""
 
     def conv(name: str, x: Tensor, stride: int, padding: int) -> Tensor:
@@ -64,26 +60,3 @@ def _alex_slices(p: Parameters, x: Tensor) -> list[Tensor]:
     d = conv("8", c, 1, 1)
     e = conv("10", d, 1, 1)
     return [a, b, c, d, e]
-
-
-def _squeeze_slices(p: Parameters, x: Tensor) -> list[Tensor]:
-    """SqueezeNet 1.1 after modules 1, 4, 7, 9, 10, 11 and 12; x (N, 3, H, W)."""
-
-    def conv(name: str, x: Tensor, stride: int = 1, padding: int = 0) -> Tensor:
-        return F.relu(F.conv2d(x, p[f"{name}.weight"], p[f"{name}.bias"], stride, padding))
-
-    def fire(name: str, x: Tensor) -> Tensor:
-        s = conv(f"{name}.squeeze", x)
-        return torch.cat([conv(f"{name}.expand1x1", s), conv(f"{name}.expand3x3", s, 1, 1)], 1)
-
-    def pool(x: Tensor) -> Tensor:
-        return F.max_pool2d(x, 3, 2, ceil_mode=True)
-
-    a = conv("0", x, 2)
-    b = fire("4", fire("3", pool(a)))
-    c = fire("7", fire("6", pool(b)))
-    d = fire("9", pool(c))
-    e = fire("10", d)
-    f = fire("11", e)
-    g = fire("12", f)
-    return [a, b, c, d, e, f, g]

@@ -1,8 +1,7 @@
 """Finds LPIPS weights, or says what to do where there are none.
 
-A weights folder holds, for each network, the backbone's convolutions and the learned channel weights as
-plain npz arrays: ``alexnet_features.npz`` with ``lin_alex_v0.1.npz``, ``squeezenet1_1_features.npz``
-with ``lin_squeeze_v0.1.npz`` (torchvision's names, without and with the prefix ``features.``).
+A weights folder holds AlexNet's convolutions and the learned channel weights as plain npz arrays:
+``alexnet_features.npz`` (torchvision's names, with or without the prefix ``features.``) and ``lin_alex_v0.1.npz``.
 """
 
 from __future__ import annotations
@@ -11,17 +10,13 @@ import os
 import zipfile
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from edge_server.fidelity.lpips import Lpips
 
-Network = Literal["alex", "squeeze"]
 FOLDER_VARIABLE = "FRESHFIELD_LPIPS"
-FILES: dict[str, tuple[str, str]] = {
-    "alex": ("alexnet_features.npz", "lin_alex_v0.1.npz"),
-    "squeeze": ("squeezenet1_1_features.npz", "lin_squeeze_v0.1.npz"),
-}
+FILES = ("alexnet_features.npz", "lin_alex_v0.1.npz")
 
 
 def weights_folder(given: Path | None = None, data: Path | None = None) -> Path | None:
@@ -35,31 +30,28 @@ def weights_folder(given: Path | None = None, data: Path | None = None) -> Path 
     return base / "lpips" if base is not None and (base / "lpips").is_dir() else None
 
 
-def open_lpips(folder: str | Path | None = None, network: Network = "alex") -> tuple[Lpips | None, str | None]:
+def open_lpips(folder: str | Path | None = None) -> tuple[Lpips | None, str | None]:
     """(metric, None), or (None, reason) where the weights are missing or unusable.
 
     folder: folder with the weights; None takes that of ``weights_folder``.
     The reason, one line for people, says what was looked for, where, and what to do; reports print it as
-    ``lpips_missing``. Raises ValueError for an unknown network.
+    ``lpips_missing``.
     """
-    if network not in FILES:
-        raise ValueError(f"no LPIPS network {network!r}: choose one of {', '.join(FILES)}")
     place = weights_folder(Path(folder) if folder else None)
     if place is None:
         return None, (
-            f"no weights folder given: pass --lpips DIR or set {FOLDER_VARIABLE} to a folder with "
-            f"{' and '.join(FILES[network])}"
+            f"no weights folder given: pass --lpips DIR or set {FOLDER_VARIABLE} to a folder with {' and '.join(FILES)}"
         )
-    paths = [place / name for name in FILES[network]]
+    paths = [place / name for name in FILES]
     absent = [p.name for p in paths if not p.is_file()]
     if absent:
         return None, (
-            f"LPIPS-{network}: {' and '.join(absent)} not found in {place}: put the weights there, or point "
+            f"LPIPS: {' and '.join(absent)} not found in {place}: put the weights there, or point "
             f"--lpips or {FOLDER_VARIABLE} to the folder that has them"
         )
     from edge_server.fidelity.lpips import Lpips
 
     try:
-        return Lpips(network, paths[0], paths[1]), None
+        return Lpips(*paths), None
     except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        return None, f"LPIPS-{network}: the weights in {place} cannot be used ({error}): replace the files"
+        return None, f"LPIPS: the weights in {place} cannot be used ({error}): replace the files"

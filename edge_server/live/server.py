@@ -127,7 +127,7 @@ class EdgeServer:
         lpips, self.lpips_missing = (
             (None, "turned off by the scenario (edge.lpips: none)")
             if config.lpips == "none"
-            else open_lpips(options.lpips_folder, config.lpips)  # type: ignore[arg-type]
+            else open_lpips(options.lpips_folder)
         )
         scorer = Scorer(lpips, config.noisy_truth)
         self.scoring = ScoringThread(scenario.held_out, scorer, self._scored, self._shown, scenario.seed)

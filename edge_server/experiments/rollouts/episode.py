@@ -178,7 +178,7 @@ class EpisodeFactory:
             self._moving = scene.moving and setting.motions and hasattr(scene.params, "motion_seed")
             if scene.moving and effects is NO_EFFECTS and not self._moving:
                 self._period_ns = round(scene.period_s * 1e9)
-        lpips = None if edge.lpips == "none" else open_lpips(folders.lpips, edge.lpips)[0]  # type: ignore[arg-type]
+        lpips = None if edge.lpips == "none" else open_lpips(folders.lpips)[0]
         self._scorer = Scorer(lpips, edge.noisy_truth)
         self.setting, self.folders = setting, folders
         self._shared = None if self._moving else self._stage(scenario)

@@ -159,7 +159,7 @@ def reward_of(
         return dataclasses.replace(reward, distance=0.0), None
     missing: str | None = "the scenario's edge.lpips is none"
     if network != "none":
-        _, missing = open_lpips(lpips_folder, network)  # type: ignore[arg-type]
+        _, missing = open_lpips(lpips_folder)
     found = without_missing_lpips(reward, missing)
     return found, None if found == reward else f"the reward has no term of distance: {missing}"
 

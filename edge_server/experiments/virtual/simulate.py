@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from edge_server.experiments.engine import processor
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
-from edge_server.fidelity.lpips_weights import Network, open_lpips
+from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SHOWN, Scorer
 from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.state import Publication
@@ -62,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         chosen = described(scenario, config, "a camera" if cameras_move(scenario) else "")
         metric, missing = None, None
         if config.lpips != "none":
-            metric, missing = open_lpips(folders.lpips, cast(Network, config.lpips))
+            metric, missing = open_lpips(folders.lpips)
         scorer = Scorer(metric, config.noisy_truth)
         decisions: DecisionLog | None = None
 

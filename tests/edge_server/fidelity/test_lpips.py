@@ -9,13 +9,13 @@ from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, open_lpip
 from tests.conftest import data_dir
 
 # Values published with the weights: (reference, p0) and (reference, p1) of the authors' example images.
-GOLDEN = {"alex": (0.7219, 0.1376), "squeeze": (0.7110, 0.1479)}
+GOLDEN = (0.7219, 0.1376)
 # On a fox photograph at 270 x 480, Gaussian blur of sigma 0.5, 1, 2, 4 and 8.
-GOLDEN_BLUR = {"alex": (0.022, 0.186, 0.388, 0.593, 0.748), "squeeze": (0.020, 0.146, 0.348, 0.621, 0.824)}
+GOLDEN_BLUR = (0.022, 0.186, 0.388, 0.593, 0.748)
 
 
-def metric(network):
-    lpips, reason = open_lpips(data_dir("lpips"), network)
+def metric():
+    lpips, reason = open_lpips(data_dir("lpips"))
     assert lpips is not None, reason
     return lpips
 
@@ -24,24 +24,21 @@ def example(name):
     return cv2.imread(str(data_dir("lpips") / f"ex_{name}.png"))[..., ::-1]
 
 
-@pytest.mark.parametrize("network", GOLDEN)
-def test_golden_values(network):
-    lpips = metric(network)
-    assert lpips.network == network
-    first, second = GOLDEN[network]
+def test_golden_values():
+    lpips = metric()
+    first, second = GOLDEN
     assert lpips(example("p0"), example("ref")) == pytest.approx(first, abs=1e-4)
     assert lpips(example("p1"), example("ref")) == pytest.approx(second, abs=1e-4)
     assert lpips(example("ref"), example("ref")) == 0.0
 
 
-@pytest.mark.parametrize("network", GOLDEN_BLUR)
-def test_golden_blurs_of_a_photograph(network):
+def test_golden_blurs_of_a_photograph():
     photo = cv2.imread(str(data_dir("fox") / "images_2" / "0001.jpg"))[..., ::-1]
     photo = cv2.resize(photo, (270, 480), interpolation=cv2.INTER_AREA)
     blurred = np.stack([cv2.GaussianBlur(photo, (0, 0), s) for s in (0.5, 1, 2, 4, 8)]) / 255.0
-    distances = metric(network).batch(blurred, np.stack([photo / 255.0] * 5))
+    distances = metric().batch(blurred, np.stack([photo / 255.0] * 5))
     # The photograph and its resampling are not recorded to the digit, hence 10 % and not 1e-3.
-    assert distances == pytest.approx(GOLDEN_BLUR[network], rel=0.1)
+    assert distances == pytest.approx(GOLDEN_BLUR, rel=0.1)
 
 
 def test_it_computes_with_one_thread_whatever_torch_may_use(monkeypatch):
@@ -50,7 +47,7 @@ def test_it_computes_with_one_thread_whatever_torch_may_use(monkeypatch):
 
     from edge_server.fidelity import lpips_network
 
-    lpips, used, conv2d = metric("alex"), [], torch.nn.functional.conv2d
+    lpips, used, conv2d = metric(), [], torch.nn.functional.conv2d
 
     def noted(*args):
         used.append(torch.get_num_threads())
@@ -66,12 +63,11 @@ def test_it_computes_with_one_thread_whatever_torch_may_use(monkeypatch):
         torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("network", GOLDEN)
-def test_the_smallest_image_works_and_a_smaller_one_is_refused_with_the_limit(network):
-    lpips = metric(network)
+def test_the_smallest_image_works_and_a_smaller_one_is_refused_with_the_limit():
+    lpips = metric()
     side = lpips.minimum_side
     assert np.isfinite(lpips(np.zeros((side, side, 3)), np.ones((side, side, 3))))
-    with pytest.raises(ImageError, match=f"LPIPS-{network} needs .* {side} x {side}"):
+    with pytest.raises(ImageError, match=r"LPIPS needs .* 31 x 31"):
         lpips(np.zeros((side - 1, 64, 3)), np.ones((side - 1, 64, 3)))
 
 
@@ -84,14 +80,9 @@ def test_missing_weights_give_a_reason_that_says_what_to_do(tmp_path, monkeypatc
     assert lpips is None and "alexnet_features.npz" in reason and str(tmp_path) in reason
 
 
-def test_an_unknown_network_is_refused():
-    with pytest.raises(ValueError, match=r"vgg.*alex, squeeze"):
-        open_lpips(network="vgg")
-
-
 def test_torn_and_wrong_weights_give_a_reason_and_no_metric(tmp_path):
     source = data_dir("lpips")
-    features, lin = FILES["alex"]
+    features, lin = FILES
     (tmp_path / lin).write_bytes((source / lin).read_bytes())
     (tmp_path / features).write_bytes((source / features).read_bytes()[:100_000])
     lpips, reason = open_lpips(tmp_path)
