@@ -1,10 +1,10 @@
 """Scores publications, and what is shown between them, on a thread of its own, so that neither ingest nor
 the field waits for it.
 
-A publication's renderer is kept until the held-out capture nearest to its present has arrived; it then
-renders that capture's pose, and the two images are compared. If scoring falls behind, publications stay
-unscored (nulls in the series) and nothing queues up. The thread's own computing, without the
-rendering in the field's workers, is a bounded share of the machine's.
+Each held-out camera compares publications with its captures (``held_out``). If scoring falls behind, publications
+stay unscored (nulls in the series) and nothing queues up: a snapshot is as large as the field, so that only those
+are kept which a capture that is still to come may ask for. The thread's own computing, without the rendering in the
+field's workers, is a bounded share of the machine's.
 
 What was shown is scored at random captures of each held-out camera: the publication that was the newest one
 at that instant, extrapolated to it (``Snapshot.at``), as the page renders it for a visitor who moves.
@@ -18,16 +18,15 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fidelity.baselines import BaselineMean, baseline
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
-from edge_server.fields import View
-from edge_server.live.state import Comparison, Publication, Snapshot
-from freshfield import payload
+from edge_server.fields import Snapshot, View
+from edge_server.live.held_out import HeldOutCamera, Scored
+from edge_server.live.state import Comparison, Publication
 from freshfield.frame import Frame
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import seed_sequence
@@ -36,27 +35,16 @@ log = logging.getLogger(__name__)
 
 # Niceness: scoring serves observers and gives way to the field's updates.
 _NICE = 5
-# Items that wait while one publication is scored; older ones are no longer needed.
-_INBOX = 256
+_WAITING_FRAMES = 256  # held-out frames that wait while one publication is scored; older ones are not needed
+_WAITING_PUBLICATIONS = 2
 _OPEN_PUBLICATIONS = 16
-_KEPT_FRAMES = 128
 _BASELINE_EVERY = 5
-_KEPT_RENDERINGS = 32
-# A held-out frame may arrive late; the publication that was shown at its capture must still be kept then.
-_KEPT_PUBLICATIONS = 32
+_MOST_SNAPSHOTS = 16  # kept for held-out frames that arrive late
 _SHOWN_EVERY_S = 0.4  # largest mean time between two scores of what a held-out camera is shown
 _FULL_EVERY = 4  # one in this many scores of what is shown has all metrics, the others only PSNR
 # This thread may use a share of the cores' time, refilling an allowance of CPU seconds. What is shown may use
 # its part of that share; publications are scored only while the reserve, CPU seconds, is left for it.
 _SHARE, _SHOWN_SHARE, _ALLOWANCE_S, _RESERVE_S = 0.03, 0.02, 1.0, 0.1
-
-
-@dataclass
-class _OpenPublication:
-    """A publication of which some held-out cameras are still to be scored."""
-
-    publication: Publication
-    scores: list[Score]
 
 
 class ScoringThread:
@@ -68,6 +56,7 @@ class ScoringThread:
     on_shown(score, publication): ``score`` rates what was shown at ``score.published_ns``, ``publication``
     extrapolated to that instant. Called on this thread.
     seed: determines the random instants.
+    noisy: held-out frames are real video (``HeldOutCamera``).
     """
 
     def __init__(
@@ -77,24 +66,24 @@ class ScoringThread:
         on_scored: Callable[[Publication, Comparison | None, bool], None],
         on_shown: Callable[[Score, Publication], None],
         seed: int = 0,
+        noisy: bool = False,
     ) -> None:
-        self._held_out = tuple(held_out)
+        self._held_out = {camera: HeldOutCamera(camera, scorer, noisy) for camera in held_out}
         self._scorer = scorer
         self._on_scored = on_scored
         self._on_shown = on_shown
         self._rng = np.random.default_rng(seed_sequence(seed, "shown"))
-        self._recent: deque[tuple[Publication, Snapshot]] = deque(maxlen=_KEPT_PUBLICATIONS)
+        self._recent: deque[tuple[Publication, Snapshot]] = deque(maxlen=_MOST_SNAPSHOTS)
+        self._left_out_ns = 0  # instant of the newest publication that went by unseen
         self._next_shown_ns = dict.fromkeys(self._held_out, 0)
         self._shown_count, self._shown_cost_s = 0, np.inf  # cost of the last score of what is shown, CPU s
         self._allowance_s, self._asked_s, self._used_s = _ALLOWANCE_S, time.monotonic(), 0.0
-        self._inbox: deque[Frame | tuple[Publication, Snapshot, list[View]]] = deque(maxlen=_INBOX)
+        self._new_frames: deque[Frame] = deque(maxlen=_WAITING_FRAMES)
+        self._new_publications: deque[tuple[Publication, Snapshot, list[View]]] = deque()
         self._wake = threading.Condition()
         self._ending = False
-        self._frames: dict[str, deque[Frame]] = {c: deque(maxlen=_KEPT_FRAMES) for c in self._held_out}
-        self._open: dict[int, _OpenPublication] = {}
+        self._open: dict[int, list[Score]] = {}  # publications of which some cameras are still to be scored
         self._views: list[View] = []
-        self._rendered: dict[tuple[str, int], NDArray[np.float32]] = {}
-        self.undecodable = 0
         self.baselines = BaselineMean()
         self._thread = threading.Thread(target=self._main, name="scoring", daemon=True)
 
@@ -109,16 +98,24 @@ class ScoringThread:
         if self._thread.is_alive():
             self._thread.join(timeout_s)
 
+    @property
+    def undecodable(self) -> int:
+        """Number of damaged held-out frames."""
+        return sum(camera.undecodable for camera in self._held_out.values())
+
     def held_out_frame(self, frame: Frame) -> None:
         """A held-out frame has arrived; it is decoded when it is compared with. Never blocks."""
-        self._put(frame)
+        with self._wake:
+            self._new_frames.append(frame)
+            self._wake.notify()
 
     def published(self, publication: Publication, renderer: Snapshot, views: list[View]) -> None:
-        self._put((publication, renderer, views))
-
-    def _put(self, item: Frame | tuple[Publication, Snapshot, list[View]]) -> None:
+        """An update was published. Never blocks."""
         with self._wake:
-            self._inbox.append(item)
+            self._new_publications.append((publication, renderer, views))
+            if len(self._new_publications) > _WAITING_PUBLICATIONS:
+                left_out, _, _ = self._new_publications.popleft()
+                self._left_out_ns = left_out.published_ns
             self._wake.notify()
 
     def _main(self) -> None:
@@ -134,19 +131,17 @@ class ScoringThread:
         self._asked_s, self._used_s = time.monotonic(), time.thread_time()
         while True:
             with self._wake:
-                self._wake.wait_for(lambda: self._inbox or self._ending)
-                if not self._inbox:
-                    return
-                item = self._inbox.popleft()
+                self._wake.wait_for(lambda: self._new_frames or self._new_publications or self._ending)
+                published = self._new_publications.popleft() if self._new_publications else None
+                frame = self._new_frames.popleft() if published is None and self._new_frames else None
+            if published is None and frame is None:
+                return
             try:
-                if isinstance(item, Frame):
-                    self._score_with(item)
-                elif self._held_out:
-                    self._recent.append(item[:2])
-                    if self._affordable(_RESERVE_S):
-                        self._score_later(*item)
-                else:
-                    self._score_selected(*item)
+                if frame is not None:
+                    self._finish(self._held_out[frame.camera].take(frame))
+                    self._score_shown(frame)
+                elif published is not None:
+                    (self._score_later if self._held_out else self._score_selected)(*published)
             except Exception:  # one bad image must not end all scoring; it is logged with its traceback
                 log.exception("a publication could not be scored")
 
@@ -166,84 +161,59 @@ class ScoringThread:
         found = next(((p, s) for p, s in reversed(self._recent) if p.published_ns <= taken_ns), None)
         if found is None or taken_ns < self._next_shown_ns[frame.camera] or not self._affordable():
             return
+        if found[0].published_ns < self._left_out_ns <= taken_ns:  # another one was shown
+            return
         every_s = self._shown_cost_s * len(self._held_out) / (_SHOWN_SHARE * usable_cores())
         gap_s = self._rng.exponential(min(every_s, _SHOWN_EVERY_S))
         self._next_shown_ns[frame.camera] = taken_ns + round(gap_s * 1e9)
         publication, snapshot = found
         begun_s, full = time.thread_time(), self._shown_count % _FULL_EVERY == 0
-        score = self._scorer.newest(
-            frame.camera,
-            lambda at_ns: snapshot.at(at_ns).render(frame.pose.matrix(), frame.intrinsics).color,
-            psnr_only=not full,
-        )
+        score = self._held_out[frame.camera].score_newest(snapshot.at(taken_ns), psnr_only=not full)
         self._shown_cost_s = time.thread_time() - begun_s
         self._shown_count += 1
         if score is not None:
             self._on_shown(score, publication)
 
     def _score_later(self, publication: Publication, renderer: Snapshot, views: list[View]) -> None:
-        self._open[publication.number] = _OpenPublication(publication, [])
+        self._recent.append((publication, renderer))
+        self._forget_snapshots()
+        if not self._affordable(_RESERVE_S):
+            return
+        self._open[publication.number] = []
         while len(self._open) > _OPEN_PUBLICATIONS:
             del self._open[min(self._open)]
         self._views = views
-        for camera in self._held_out:
-            render = self._render_later(camera, renderer, publication.published_ns)
-            self._finish(self._scorer.publish(camera, render, publication.published_ns))
+        for camera in self._held_out.values():
+            self._finish(camera.publish(publication, renderer))
 
-    def _render_later(self, camera: str, renderer: Snapshot, published_ns: int) -> Callable[[int], NDArray[np.float32]]:
-        def render(generated_ns: int) -> NDArray[np.float32]:
-            frame = next(f for f in self._frames[camera] if f.generated_edge_ns == generated_ns)
-            image = renderer.render(frame.pose.matrix(), frame.intrinsics).color
-            self._rendered[(camera, published_ns)] = image
-            while len(self._rendered) > _KEPT_RENDERINGS:  # their publication's scoring failed afterwards
-                self._rendered.pop(next(iter(self._rendered)))
-            return image
+    def _forget_snapshots(self) -> None:
+        """Drop those that were replaced before the next capture at which what is shown is scored."""
+        next_ns = min(
+            max(self._next_shown_ns[name], camera.truths[-1].taken_ns if camera.truths else 0)
+            for name, camera in self._held_out.items()
+        )
+        while len(self._recent) > 1 and self._recent[1][0].published_ns <= next_ns:
+            self._recent.popleft()
 
-        return render
-
-    def _score_with(self, frame: Frame) -> None:
-        self._frames[frame.camera].append(frame)
-        scores = self._scorer.held_out(frame.camera, lambda: self._decode(frame), frame.generated_edge_ns, frame.pose)
-        self._finish(scores)
-        self._score_shown(frame)
-
-    def _decode(self, frame: Frame) -> NDArray[np.uint8]:
-        k = frame.intrinsics
-        try:
-            return payload.decode(frame.payload, frame.codec, k.width, k.height)
-        except payload.PayloadError:
-            self.undecodable += 1
-            raise
-
-    def _finish(self, scores: Sequence[Score]) -> None:
-        for score in scores:
-            image = self._rendered.pop((score.camera, score.published_ns), None)
-            entry = next((o for o in self._open.values() if o.publication.published_ns == score.published_ns), None)
-            if entry is None:
+    def _finish(self, found: Sequence[Scored]) -> None:
+        for each in found:
+            publication = each.publication
+            if publication.number not in self._open:
                 continue
-            entry.scores.append(score)
-            comparison = None
-            if image is not None:
-                comparison = self._compare(score, image, entry.publication.number)
-            final = len(entry.scores) == len(self._held_out)
-            self._on_scored(entry.publication.scored(mean_score(entry.scores)), comparison, final)
+            scores = self._open[publication.number]
+            scores.append(each.score)
+            truth = each.truth.image()
+            if publication.number % _BASELINE_EVERY == 0 and self._views:
+                self.baselines.add(baseline(self._views, truth, each.truth.frame.pose.matrix()))
+            comparison = Comparison(each.score.camera, truth[..., :3], to_bytes(each.rendered), publication.number)
+            final = len(scores) == len(self._held_out)
+            self._on_scored(publication.scored(mean_score(scores)), comparison, final)
             if final:
-                self._open.pop(entry.publication.number, None)
-
-    def _compare(self, score: Score, image: NDArray[np.float32], number: int) -> Comparison | None:
-        assert score.truth_gap_ms is not None
-        generated_ns = score.published_ns + round(score.truth_gap_ms * 1e6)
-        frames = self._frames[score.camera]
-        frame = min(frames, key=lambda f: abs(f.generated_edge_ns - generated_ns))
-        truth = self._decode(frame)
-        if number % _BASELINE_EVERY == 0 and self._views:
-            self.baselines.add(baseline(self._views, truth, frame.pose.matrix()))
-        return Comparison(score.camera, truth[..., :3], to_bytes(image), number)
+                del self._open[publication.number]
 
     def _score_selected(self, publication: Publication, renderer: Snapshot, views: list[View]) -> None:
-        with self._wake:
-            if any(isinstance(i, tuple) for i in self._inbox):
-                return  # a newer publication is waiting: this one stays unscored
+        if self._new_publications:  # a newer one is waiting: this one stays unscored
+            return
         whole = [(v if v.whole is None else v.whole() or v) for v in views]
         renderings = [(v.camera, renderer.render(v.camera_to_world, v.intrinsics).color, v.image) for v in whole]
         score = self._scorer.score_selected(renderings, publication.published_ns)

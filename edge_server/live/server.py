@@ -129,8 +129,9 @@ class EdgeServer:
             if config.lpips == "none"
             else open_lpips(options.lpips_folder)
         )
-        scorer = Scorer(lpips, config.noisy_truth)
-        self.scoring = ScoringThread(scenario.held_out, scorer, self._scored, self._shown, scenario.seed)
+        self.scoring = ScoringThread(
+            scenario.held_out, Scorer(lpips), self._scored, self._shown, scenario.seed, config.noisy_truth
+        )
         try:
             self.policies = LivePolicies(config.policy.name, config.policy.value, partial(scenario.rng, "policy"))
         except ValueError as error:

@@ -179,7 +179,7 @@ class EpisodeFactory:
             if scene.moving and effects is NO_EFFECTS and not self._moving:
                 self._period_ns = round(scene.period_s * 1e9)
         lpips = None if edge.lpips == "none" else open_lpips(folders.lpips)[0]
-        self._scorer = Scorer(lpips, edge.noisy_truth)
+        self._scorer = Scorer(lpips)
         self.setting, self.folders = setting, folders
         self._shared = None if self._moving else self._stage(scenario)
         self._last: tuple[int, Stage] | None = None

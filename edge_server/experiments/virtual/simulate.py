@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         metric, missing = None, None
         if config.lpips != "none":
             metric, missing = open_lpips(folders.lpips)
-        scorer = Scorer(metric, config.noisy_truth)
+        scorer = Scorer(metric)
         decisions: DecisionLog | None = None
 
         def published(publication: Publication) -> None:

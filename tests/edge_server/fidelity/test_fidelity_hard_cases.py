@@ -73,7 +73,7 @@ def test_poison_is_refused_by_name_and_never_scored(poison, which):
 def test_tiny_images_are_scored_as_far_as_the_metrics_go(size):
     lpips, _ = open_lpips(data_dir("lpips"))
     image = RNG.random((*size, 3))
-    score = Scorer(lpips=lpips, noisy_truth=True).score("h", image, 0, image, 0, [1 - image])
+    score = Scorer(lpips).score("h", image, 0, image, 0, [1 - image])
     assert score.psnr_db == PSNR_CEILING_DB
     assert (score.ssim is None) == (min(size) < 11)
     assert (score.lpips is None) == (min(size) < 31)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import weakref
 from typing import Any
 
 import numpy as np
@@ -83,6 +84,40 @@ def test_the_newest_publication_is_shown_carried_on_to_the_capture(monkeypatch: 
 
 def test_nothing_was_shown_before_the_first_publication() -> None:
     assert _run([500 * MS], [k * 10 * MS for k in range(50)]) == []
+
+
+def test_a_thread_that_falls_behind_keeps_no_snapshots() -> None:
+    """Each is as large as the field."""
+    alive = weakref.WeakSet[Brightness]()
+    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
+
+    for k in range(100):
+        alive.add(snapshot := Brightness(k * 20 * MS))
+        thread.published(_publication(k, snapshot.at_ns), snapshot, [])
+    del snapshot
+    assert len(alive) == scoring_thread._WAITING_PUBLICATIONS
+
+
+def test_snapshots_replaced_before_the_next_scored_capture_are_dropped() -> None:
+    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
+    thread._next_shown_ns["cam00"] = 500 * MS
+    for k in range(1, 30):
+        thread._score_later(_publication(k, k * 20 * MS), Brightness(k * 20 * MS), [])
+    assert [p.published_ns // MS for p, _ in thread._recent] == [500, 520, 540, 560, 580]
+
+
+def test_an_instant_whose_publication_went_by_unseen_is_not_scored(monkeypatch: Any) -> None:
+    shown: list[tuple[Score, Publication]] = []
+    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *of: shown.append(of))
+    monkeypatch.setattr(thread, "_affordable", lambda *_: True)
+    for k, at_ms in enumerate((10, 110, 120, 130)):  # that of 110 finds no room
+        thread.published(_publication(k, at_ms * MS), Brightness(at_ms * MS), [])
+    thread._score_later(_publication(0, 10 * MS), Brightness(10 * MS), [])
+    for k, at_ms in enumerate((50, 100, 115)):
+        thread._held_out["cam00"].take(frame := _frame(k, at_ms * MS))
+        thread._next_shown_ns["cam00"] = 0
+        thread._score_shown(frame)
+    assert [score.published_ns // MS for score, _ in shown] == [100]
 
 
 def test_what_is_shown_is_scored_as_often_as_its_share_affords_and_before_publications(monkeypatch: Any) -> None:
