@@ -147,7 +147,6 @@ def _add_simulate(commands: Any) -> None:
         "age, frames delivered and dropped, time shares of the states, and delays.",
     )
     _add_channel_options(sub)
-    sub.add_argument("--spread", action="store_true", help="spread periodic cameras' frames evenly over the period")
     sub.add_argument("--cameras", type=int, default=1, metavar="N", help="number of cameras [%(default)s]")
     sub.add_argument("--seconds", type=float, default=600.0, metavar="S", help="seconds to simulate [%(default)g]")
     sub.add_argument("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
@@ -205,7 +204,7 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
         "--chain",
         metavar="SPEC",
         help="Markov chain of states: mu1=1/30,mu2=1/30 (rates per "
-        "ms), states=low/high, scope=per-camera, initial=low, slots=1ms, or "
+        "ms), states=low/high, scope=per-camera, initial=low, or "
         "{generator_per_ms: [[..]]}",
     )
     sub.add_argument(
@@ -265,8 +264,6 @@ def _config_of(args: argparse.Namespace) -> ChannelConfig:
             section["faults"] |= notation.fault(text)
     if args.shared_server:
         section["server"] = {"shared": True}
-    if vars(args).get("spread"):  # only simulate has it
-        section["arrivals"] = {**(from_notation("arrivals", section.get("arrivals")) or {}), "spread": True}
     return channel_from_mapping(section, "channel", folder)
 
 

@@ -56,15 +56,40 @@ _PATIENCE_S = 30.0
 
 
 class EmulatedLink:
-    """A running proxy in front of one service, with an event loop in its own thread.
+    """A running proxy in front of one service, with an event loop in its own thread. Close it after use.
 
-    address: HOST:PORT to which clients connect.
+    channel: a preset's name, a ``channel:`` section, or a configuration.
+    to: HOST:PORT of the service.
+    seed: of the link's decisions.
+    direction: the messages that pass the link: up (to the service), down (its answers) or both.
+    shared: one link for all methods of a direction, instead of one each.
+    listen: HOST:PORT of the link; port 0 takes any free one.
+    trace: record to this file.
+    replay: repeat the decisions of a trace file.
+    transport: TLS and tokens of both sides; None: plain text.
+    Raises ScenarioError, TraceError or TransportError (all ValueErrors) with one line that says what to change.
+
+    ``address`` is HOST:PORT to which clients connect.
     """
 
-    def __init__(self, config: ChannelConfig, seed: int, options: ProxyOptions) -> None:
-        self.config = config
+    def __init__(
+        self,
+        channel: str | dict[str, Any] | ChannelConfig,
+        *,
+        to: str,
+        seed: int = 0,
+        direction: str = "up",
+        shared: bool = False,
+        listen: str = "127.0.0.1:0",
+        trace: Path | None = None,
+        replay: Path | None = None,
+        transport: Transport | None = None,
+    ) -> None:
+        section: Any = {"preset": channel} if isinstance(channel, str) else channel
+        self.config = section if isinstance(section, ChannelConfig) else channel_from_mapping(section)
         self.seed = seed
-        self.options = options
+        replayed = traces.read(replay) if replay is not None else None
+        self.options = ProxyOptions(listen, to, transport or Transport(), direction, shared, trace, replayed)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="channel", daemon=True)
         self._thread.start()
@@ -74,7 +99,7 @@ class EmulatedLink:
         except BaseException:
             self._end()
             raise
-        host = options.listen.rpartition(":")[0] or "127.0.0.1"
+        host = listen.rpartition(":")[0] or "127.0.0.1"
         self.address = f"{host}:{self._proxy.port}"
 
     def report(self) -> Report:
@@ -137,49 +162,16 @@ class EmulatedLink:
 ChannelFactory = Callable[..., EmulatedLink]
 
 
-def put_behind(
-    channel: str | dict[str, Any] | ChannelConfig,
-    *,
-    to: str,
-    seed: int = 0,
-    direction: str = "up",
-    shared: bool = False,
-    listen: str = "127.0.0.1:0",
-    trace: Path | None = None,
-    replay: Path | None = None,
-    transport: Transport | None = None,
-) -> EmulatedLink:
-    """Start a link in front of the service at ``to``; ``close`` it after use. The fixture calls this.
-
-    channel: a preset's name, a ``channel:`` section, or a configuration.
-    to: HOST:PORT of the service.
-    seed: of the link's decisions.
-    direction: the messages that pass the link: up (to the service), down (its answers) or both.
-    shared: one link for all methods of a direction, instead of one each.
-    listen: HOST:PORT of the link; port 0 takes any free one.
-    trace: record to this file.
-    replay: repeat the decisions of a trace file.
-    transport: TLS and tokens of both sides; None: plain text.
-    Raises ScenarioError, TraceError or TransportError (all ValueErrors) with one line that says what to
-    change.
-    """
-    section: Any = {"preset": channel} if isinstance(channel, str) else channel
-    config = section if isinstance(section, ChannelConfig) else channel_from_mapping(section)
-    replayed = traces.read(replay) if replay is not None else None
-    options = ProxyOptions(listen, to, transport or Transport(), direction, shared, trace, replayed)
-    return EmulatedLink(config, seed, options)
-
-
 @pytest.fixture
 def channel(request: pytest.FixtureRequest) -> Iterator[ChannelFactory]:
     """Fixture that makes links in front of gRPC services: ``link = channel("ch5", to="localhost:50051")``.
 
-    Arguments as in ``put_behind``. All links are closed at the end of the test.
+    Arguments as of ``EmulatedLink``. All links are closed at the end of the test.
     """
     links: list[EmulatedLink] = []
 
     def make(channel: str | dict[str, Any] | ChannelConfig, **options: Any) -> EmulatedLink:
-        links.append(put_behind(channel, **options))
+        links.append(EmulatedLink(channel, **options))
         return links[-1]
 
     before = sys.getswitchinterval()

@@ -16,7 +16,6 @@ import grpc.aio
 
 from channel_emu.live.event_queue import EventQueue
 from channel_emu.live.histogram import Histogram
-from channel_emu.live.replay_link import ReplayLink
 from channel_emu.model.ages import RunningAge
 from channel_emu.model.link import Event, EventKind, Link, Transit
 from channel_emu.model.trace import TraceWriter
@@ -91,7 +90,7 @@ class LiveLink:
     def __init__(
         self,
         name: str,
-        model: Link | ReplayLink,
+        model: Link,
         events: EventQueue,
         stats: DelayStats,
         damage: Callable[[bytes, Flips], bytes],

@@ -203,11 +203,12 @@ class Proxy(grpc.GenericRpcHandler):
         """The link of this name, made at the first call. damage: see ``LiveLink``; None damages any byte."""
         if name in self.links:
             return self.links[name]
-        model: Link | ReplayLink = self.channel.link(name)
         if name in self._replayed:
-            model = ReplayLink(name, self._replayed[name])
-        elif self.options.replay is not None:
-            log.info("%s: not in the replayed trace (held out?); its link decides anew", name)
+            model: Link = ReplayLink(name, self._replayed[name])
+        else:
+            model = self.channel.link(name)
+            if self.options.replay is not None:
+                log.info("%s: not in the replayed trace (held out?); its link decides anew", name)
         link = self.links[name] = LiveLink(
             name, model, self.events, DelayStats(self.stats), damage or _damage_any_byte, self._trace, self._budget
         )

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import heapq
-from collections import Counter
-from typing import Any
 
-from channel_emu.model.link import Event, EventKind, Transit
+from channel_emu.model.link import EventKind, Link, Transit
 from channel_emu.model.nanoseconds import NEVER_NS
+from channel_emu.model.service_time import ServiceTime, replayed
 from channel_emu.model.trace import Record, TraceError
 
 
-class ReplayLink:
-    """A link that repeats a recording, with the interface of ``model.link.Link``.
+class ReplayLink(Link):
+    """A link that repeats a recording instead of making decisions.
 
     Offer ``n`` gets the recorded outcome of offer ``n``, with the recorded delay after its offer. Offers at
     the recorded instants reproduce the recording exactly. After the last record it continues with the first.
@@ -23,71 +22,49 @@ class ReplayLink:
     def __init__(self, camera: str, records: list[Record]) -> None:
         if not records:
             raise TraceError(f"the trace holds no frame of {camera}")
-        self.camera = camera
-        self.counts: Counter[str] = Counter()
-        self.offered = 0
-        self.clock_backwards = 0
-        self.resets = 0
-        self.now_ns = 0
-        self.chain = None
+        super().__init__(camera, "parallel", ServiceTime(replayed([0.0]), [0.0], None))
         self._records = records
-        self._events: list[tuple[int, int, EventKind, Transit]] = []
-        self._inside: set[int] = set()
-        self._order = 0
 
-    @property
-    def in_flight(self) -> int:
-        return len(self._inside)
-
-    @property
-    def next_event_ns(self) -> int:
-        return self._events[0][0] if self._events else NEVER_NS
-
-    def offer(self, at_ns: int, item: Any = None, size_bytes: int = 0) -> tuple[Transit, list[Event]]:
-        events = self.advance(at_ns)
-        at_ns = self.now_ns
-        record = self._records[self.offered % len(self._records)]
-        shift = at_ns - record.offered_ns
-        transit = Transit(self.offered, item, size_bytes, at_ns, state=record.state, flips=record.flips)
-        self.offered += 1
-        self._inside.add(transit.number)
-        if record.arrived_ns is not None:
-            transit.arrived_ns = record.arrived_ns + shift
-        if record.started_ns is not None and record.due_ns is not None:
+    def _arrive(self, transit: Transit, at_ns: int) -> None:
+        record, shift = self._record_of(transit)
+        transit.state, transit.flips = record.state, record.flips
+        transit.arrived_ns = None if record.arrived_ns is None else record.arrived_ns + shift
+        self.server.busy += 1
+        if record.started_ns is None or record.due_ns is None:
+            self._next_at(transit, self._end_of(transit)[1])
+        else:
             transit.due_ns = min(record.due_ns + shift, NEVER_NS)
-            self._schedule(record.started_ns + shift, EventKind.STARTED, transit)
-        outcome, ended_ns = record.outcome, record.ended_ns
-        if outcome is None or ended_ns is None:
-            # The outcome was not recorded. The due instant was recorded if transmission had started.
-            outcome = EventKind.SUPERSEDED if record.due_ns is None else EventKind.DELIVERED
-            ended_ns = record.due_ns if record.due_ns is not None else record.offered_ns
-        self._schedule(ended_ns + shift, EventKind(outcome), transit)
-        if record.duplicated:
-            self._schedule(ended_ns + shift, EventKind.DUPLICATED, transit)
-        return transit, events + self.advance(at_ns)
+            self._next_at(transit, record.started_ns + shift)
 
-    def advance(self, to_ns: int) -> list[Event]:
-        if to_ns < self.now_ns:
-            self.clock_backwards += 1
-        self.now_ns = max(self.now_ns, to_ns)
-        events = []
-        while self._events and self._events[0][0] <= self.now_ns and self._events[0][0] < NEVER_NS:
-            at_ns, _, kind, transit = heapq.heappop(self._events)
-            if kind is EventKind.STARTED:
-                transit.started_ns = at_ns
-            else:
-                self.counts[kind] += 1
-                if kind is not EventKind.DUPLICATED:
-                    transit.outcome, transit.ended_ns = kind, at_ns
-                    self._inside.discard(transit.number)
-            events.append(Event(kind, at_ns, transit))
-        return events
+    def _complete(self, at_ns: int) -> None:
+        """A frame starts, or ends."""
+        transit = heapq.heappop(self._serving)[2]
+        if transit.started_ns is None and transit.due_ns is not None:
+            transit.started_ns = at_ns
+            self._record(EventKind.STARTED, at_ns, transit)
+            self._next_at(transit, self._end_of(transit)[1])
+            return
+        self._update_next_event()
+        self.server.busy -= 1
+        self._end(transit, self._end_of(transit)[0], at_ns)
+        if self._record_of(transit)[0].duplicated:
+            self._duplicate(transit, at_ns)
 
-    def pending(self) -> list[Transit]:
-        """The messages inside the link, oldest first."""
-        inside = {t.number: t for _, _, _, t in self._events if t.number in self._inside}
-        return [inside[number] for number in sorted(inside)]
+    def _next_at(self, transit: Transit, at_ns: int) -> None:
+        heapq.heappush(self._serving, (min(at_ns, NEVER_NS), transit.number, transit))
+        self._update_next_event()
 
-    def _schedule(self, at_ns: int, kind: EventKind, transit: Transit) -> None:
-        self._order += 1
-        heapq.heappush(self._events, (min(at_ns, NEVER_NS), self._order, kind, transit))
+    def _record_of(self, transit: Transit) -> tuple[Record, int]:
+        """The record of an offer, and how much later the offer is than the recorded one."""
+        record = self._records[transit.number % len(self._records)]
+        return record, transit.offered_ns - record.offered_ns
+
+    def _end_of(self, transit: Transit) -> tuple[EventKind, int]:
+        """Outcome and instant."""
+        record, shift = self._record_of(transit)
+        if record.outcome is not None and record.ended_ns is not None:
+            return EventKind(record.outcome), record.ended_ns + shift
+        # The recording ended before. The due instant was recorded if transmission had started.
+        if record.due_ns is None:
+            return EventKind.SUPERSEDED, transit.offered_ns
+        return EventKind.DELIVERED, record.due_ns + shift

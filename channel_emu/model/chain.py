@@ -1,13 +1,11 @@
 """The network's state: a continuous-time Markov chain of M states, sampled exactly (thesis 6.2.5).
 
 Every jump has its own instant, so sampling is exact even if the chain switches many times during a frame's
-transit. With ``slot_ms`` the state is drawn at slot boundaries and kept in between, as in the thesis (6.27):
-the same distribution at the boundaries, without the jumps between them.
+transit, and states u apart are distributed as exp(Q u) says (6.27).
 """
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_right
 
 import numpy as np
@@ -49,43 +47,6 @@ def check_generator(generator_per_ms: NDArray[np.float64]) -> NDArray[np.float64
     return off - np.diag(rates)
 
 
-def transition_matrix(generator_per_ms: NDArray[np.float64], span_ms: float) -> NDArray[np.float64]:
-    """Transition probabilities exp(Q u), (M, M), over u = ``span_ms`` (6.27).
-
-    Closed form for two states, else uniformisation and squaring. Uniformisation adds only non-negative terms,
-    so nothing cancels; rows are renormalised after each squaring, so a stiff chain keeps its probabilities.
-    Raises ChainError for an invalid generator or a negative span.
-    """
-    q = check_generator(generator_per_ms)
-    if span_ms < 0:
-        raise ChainError(f"a span of time is not negative, got {span_ms} ms")
-    if q.shape == (2, 2):
-        a, b = q[0, 1], q[1, 0]
-        if a + b == 0.0:
-            return np.eye(2)
-        moved = -math.expm1(-(a + b) * span_ms) / (a + b)
-        kept = math.exp(-(a + b) * span_ms)
-        # Sums, not one minus the others: small probabilities keep their digits.
-        return np.array([[(b + a * kept) / (a + b), a * moved], [b * moved, (a + b * kept) / (a + b)]])
-    fastest = float(-q.diagonal().min())
-    if fastest * span_ms == 0.0:
-        return np.eye(len(q))
-    halvings = max(0, math.ceil(math.log2(fastest * span_ms)))
-    mass = fastest * span_ms * 2.0**-halvings
-    step = np.eye(len(q)) + q / fastest
-    term = np.eye(len(q)) * math.exp(-mass)
-    total = term.copy()
-    for k in range(1, 40):
-        term = term @ step * (mass / k)
-        total += term
-    for _ in range(halvings + 1):
-        total /= total.sum(1, keepdims=True)
-        if halvings:
-            halvings -= 1
-            total = total @ total
-    return total
-
-
 def stationary(generator_per_ms: NDArray[np.float64]) -> NDArray[np.float64]:
     """Stationary distribution, (M,): for two states (mu2, mu1)/(mu1 + mu2). Raises ChainError if not unique.
 
@@ -124,40 +85,23 @@ class Chain:
 
     generator_per_ms: (M, M), in 1/ms.
     initial: index of the first state; None draws it from the stationary distribution.
-    slot_ms: None follows every jump; a number draws the state at multiples of it. A sojourn is then one
-        geometric number of slots, equal in distribution to one draw a slot.
-    Raises ChainError for an invalid generator or slot, or a chain that jumps too often to be followed.
+    Raises ChainError for an invalid generator, or a chain that jumps too often to be followed.
     """
 
-    def __init__(
-        self,
-        generator_per_ms: NDArray[np.float64],
-        rng: CounterRng,
-        initial: int | None = None,
-        slot_ms: float | None = None,
-    ) -> None:
+    def __init__(self, generator_per_ms: NDArray[np.float64], rng: CounterRng, initial: int | None = None) -> None:
         q = check_generator(generator_per_ms)
         self.generator_per_ms = q
         self.states = len(q)
         self._rng = rng
-        self.slot_ns = 0 if slot_ms is None else round(slot_ms * 1e6)
-        if slot_ms is not None:
-            if self.slot_ns < 1:
-                raise ChainError(f"a slot lasts at least a nanosecond, got {slot_ms:g} ms")
-            q = transition_matrix(q, self.slot_ns / 1e6)
         off = q - np.diag(np.diag(q))
-        # The sum of the other entries, because one minus the diagonal would lose digits.
         leave = off.sum(1)
+        self._leaving_rates = leave.tolist()
         with np.errstate(invalid="ignore", divide="ignore"):
             jumps = np.cumsum(off / leave[:, None], 1)
-            # Parameter of the sojourn time by state: the leaving rate in 1/ms or, with slots, the logarithm
-            # of the probability to stay for one more slot.
-            self._sojourn_rates = (np.log1p(-np.minimum(leave, 1.0)) if self.slot_ns else leave).tolist()
         # Cumulative jump probabilities; the last possible target gets 1 exactly, so rounding cannot miss it.
         last = np.array([np.flatnonzero(row)[-1] if row.any() else i for i, row in enumerate(off)])
         self._jumps = np.where(np.arange(self.states) >= last[:, None], 1.0, jumps).tolist()
-        if not self.slot_ns:
-            self._refuse_too_fast()
+        self._refuse_too_fast()
         self.initial = self._draw_initial() if initial is None else initial
         self._starts = [0]
         self._visited = [self.initial]
@@ -183,13 +127,6 @@ class Chain:
 
     def state(self, at_ns: int) -> int:
         return self.segment(at_ns)[0]
-
-    def recent(self, since_ns: int, until_ns: int) -> list[tuple[int, int]]:
-        """(start in ns, state) of the sojourns that overlap [since, until], as far as the path is kept."""
-        self.segment(until_ns)
-        first = max(0, bisect_right(self._starts, since_ns) - 1)
-        last = bisect_right(self._starts, until_ns)
-        return list(zip(self._starts[first:last], self._visited[first:last]))
 
     def occupancy(self, until_ns: int) -> list[float]:
         """Share of [0, until) spent in each state."""
@@ -220,10 +157,7 @@ class Chain:
             if self._number - mark == _CHECK_EVERY:
                 # The constructor's check misses this rate: e.g. fast jumps before an absorbing state.
                 if (start - mark_ns) * MAX_JUMPS_PER_MS * 10 < _CHECK_EVERY * 10**6:
-                    raise ChainError(
-                        "the chain switches more than 10000 times a ms: slow it down, or sample it at slot "
-                        "boundaries (sampled: slots)"
-                    )
+                    raise ChainError("the chain switches more than 10000 times a ms: slow it down")
                 mark, mark_ns = self._number, start
             target = bisect_right(self._jumps[self._visited[-1]], self._rng.pair(self._number)[1])
             self._number += 1
@@ -232,16 +166,10 @@ class Chain:
             self._until = self._sojourn_end(start, target)
 
     def _sojourn_end(self, start_ns: int, state: int) -> int:
-        rate = self._sojourn_rates[state]
+        rate = self._leaving_rates[state]
         if rate == 0.0:
             return NEVER_NS
-        logarithm = math.log(self._rng.pair(self._number)[0])
-        if not self.slot_ns:
-            return saturating_add(start_ns, saturating_round(-logarithm / rate * 1e6))
-        slots = logarithm / rate
-        if slots * self.slot_ns >= NEVER_NS:
-            return NEVER_NS
-        return saturating_add(start_ns, (int(slots) + 1) * self.slot_ns)
+        return saturating_add(start_ns, saturating_round(self._rng.exponential(self._number) / rate * 1e6))
 
     def _draw_initial(self) -> int:
         shares = np.cumsum(stationary(self.generator_per_ms))
@@ -259,5 +187,5 @@ class Chain:
         if jumps_per_ms > MAX_JUMPS_PER_MS:
             raise ChainError(
                 f"the chain would switch {jumps_per_ms:.3g} times a ms; at most {MAX_JUMPS_PER_MS:g} are "
-                "followed: slow it down, or sample it at slot boundaries (sampled: slots)"
+                "followed: slow it down"
             )

@@ -80,4 +80,4 @@ class Channel:
         assert config is not None
         initial = None if config.initial is None else config.names().index(config.initial)
         rng = CounterRng(self.seed, camera, "channel.chain")
-        return Chain(config.generator(), rng, initial, config.slot_ms)
+        return Chain(config.generator(), rng, initial)

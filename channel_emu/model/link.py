@@ -326,9 +326,12 @@ class Link:
                 transit.flips += fault.flips(transit)
             self._end(transit, EventKind.DELIVERED, at_ns)
             if self._faults and any(fault.duplicates(transit) for fault in self._faults):
-                self.counts[EventKind.DUPLICATED] += 1
-                self._record(EventKind.DUPLICATED, at_ns, transit)
+                self._duplicate(transit, at_ns)
         self.server.start_next(at_ns)
+
+    def _duplicate(self, transit: Transit, at_ns: int) -> None:
+        self.counts[EventKind.DUPLICATED] += 1
+        self._record(EventKind.DUPLICATED, at_ns, transit)
 
     def _reset(self, at_ns: int) -> None:
         self._break_all(at_ns)

@@ -137,7 +137,7 @@ def service(text: str, folder: Path) -> dict[str, Any]:
 
 def chain(text: str) -> dict[str, Any]:
     """Parse ``mu1=1/30,mu2=1/30``, optionally with ``states=low/high``, ``scope=per-camera``,
-    ``initial=low``, ``slots=1ms``. Raises NotationError."""
+    ``initial=low``. Raises NotationError."""
     found: dict[str, Any] = {}
     for word in text.split(","):
         key, _, value = (part.strip() for part in word.partition("="))
@@ -147,11 +147,8 @@ def chain(text: str) -> dict[str, Any]:
             found[key] = value
         elif key == "states" and value:
             found["states"] = value.split("/")
-        elif key == "slots" and value:
-            found |= {"sampled": "slots", "slot_ms": span_ms(value)}
         else:
-            expected = "mu1=1/30,mu2=1/30 (and scope=per-camera, initial=s1, slots=1ms)"
-            raise NotationError(f"{text!r}: expected {expected}")
+            raise NotationError(f"{text!r}: expected mu1=1/30,mu2=1/30 (and scope=per-camera, initial=s1)")
     return found
 
 

@@ -38,13 +38,10 @@ class ArrivalsConfig(Settings, frozen=True):
     process: Literal["as-offered", "periodic", "poisson"] = "as-offered"
     period_ms: Annotated[float, within(1e-3, math.inf, "of periodic arrivals")] | None = None
     rate_per_ms: Annotated[NotNegative | list[NotNegative] | None, about("of poisson; one, or one a state")] = None
-    spread: Annotated[bool, about("in simulations: captures evenly over the period, not at one instant")] = False
 
     def __post_init__(self) -> None:
         _belongs("period_ms", self.period_ms, self.process == "periodic", "process periodic")
         _belongs("rate_per_ms", self.rate_per_ms, self.process == "poisson", "process poisson")
-        if self.spread and self.process == "poisson":
-            raise ValueError("spread: belongs to process periodic or as-offered only")
         if self.rate_per_ms is not None and not any(per_state(self.rate_per_ms)):
             raise ValueError("rate_per_ms: expected a rate above 0 in at least one state")
 
@@ -54,8 +51,6 @@ class ChainConfig(Settings, frozen=True):
 
     generator_per_ms: instead of the two rates, row by row.
     scope: ``shared`` by all cameras, or ``per-camera``: an independent chain for each.
-    sampled: continuous: every switch at its own instant. slots: the state is drawn at slot boundaries and kept for
-        the slot, as the thesis does.
     """
 
     mu1_per_ms: Annotated[NotNegative | None, about("rate of leaving the first of two states (6.26)")] = None
@@ -64,11 +59,8 @@ class ChainConfig(Settings, frozen=True):
     states: Annotated[list[str], about("names of the states; not given: s1, s2, ...")] = field(default_factory=list)
     initial: Annotated[str | None, about("first state; not given: drawn from the stationary distribution")] = None
     scope: Literal["shared", "per-camera"] = "shared"
-    sampled: Literal["continuous", "slots"] = "continuous"
-    slot_ms: Annotated[float, within(1e-3, 1e9, "length of a slot")] | None = None
 
     def __post_init__(self) -> None:
-        _belongs("slot_ms", self.slot_ms, self.sampled == "slots", "sampled slots")
         pair = (self.mu1_per_ms is not None) + (self.mu2_per_ms is not None)
         if pair != (0 if self.generator_per_ms is not None else 2):
             raise ValueError("expected mu1_per_ms and mu2_per_ms, or generator_per_ms")

@@ -73,10 +73,6 @@ class Trace:
             found.setdefault(record.camera, []).append(record)
         return found
 
-    def offers(self) -> dict[str, list[tuple[int, int]]]:
-        """(instant in ns, bytes) of every offer, by camera."""
-        return {name: [(r.offered_ns, r.bytes) for r in found] for name, found in self.by_camera().items()}
-
 
 class TraceWriter:
     """Writes a trace file, replacing an older one. If the process is killed, only the last lines are lost."""

@@ -1,4 +1,4 @@
-"""Arrivals: periodic, Poisson or Markov-modulated Poisson (thesis 6.23, 6.24).
+"""Arrivals of a Poisson process, Markov-modulated or not (thesis 6.23, 6.24).
 
 A Poisson process, modulated or not, has no memory: given the chain's path, the next arrival after any instant
 is where the integral of the rate reaches a unit-mean exponential. That exponential is looked up by the number
@@ -50,14 +50,3 @@ class PoissonArrivals:
     def next_ns(self, after_ns: int, number: int) -> int:
         """First arrival after ``after_ns``, drawn with the exponential of frame ``number``."""
         return completion_ns(self.rng.exponential(number), self.rates_per_ns, self.chain, after_ns)
-
-
-class PeriodicArrivals:
-    """One arrival every period, for simulations; live cameras set their own period."""
-
-    def __init__(self, period_ms: float, phase_ms: float = 0.0) -> None:
-        self.period_ns = round(period_ms * 1e6)
-        self.phase_ns = round(phase_ms * 1e6)
-
-    def next_ns(self, after_ns: int, number: int) -> int:
-        return saturating_add(self.phase_ns, number * self.period_ns)

@@ -14,7 +14,7 @@ from channel_emu.model.ages import RunningAge, mean_of_known
 from channel_emu.model.channel import Channel
 from channel_emu.model.link import MAX_SIZE_BYTES, EventKind, Link, Transit
 from channel_emu.model.settings import ChannelConfig
-from channel_emu.model.traffic import PeriodicArrivals, PoissonArrivals
+from channel_emu.model.traffic import PoissonArrivals
 from freshfield.files import write_csv
 
 OUTCOMES = tuple(kind for kind in EventKind if kind not in (EventKind.STARTED, EventKind.DUPLICATED))
@@ -138,22 +138,23 @@ def simulate(
         raise SimulationError(f"about {frames:.1e} frames: expected at most {_MOST_FRAMES:.0e} in one run")
     end_ns = round(seconds * 1e9)
     channel = Channel(config, seed)
-    offers: dict[str, list[tuple[int, int]]] = {name: [] for name in names}
+    offers = {}
     for name in names:
-        source: PeriodicArrivals | PoissonArrivals | None
-        if generated:
-            source = channel.arrivals(name, channel.chain_of(name))
-        else:
-            # A camera's rank in the sorted names is its turn within the period.
-            turn = sorted(names).index(name) / count if config.arrivals.spread else 0.0
-            source = PeriodicArrivals(period_ms, turn * period_ms)
-        assert source is not None
-        at_ns = source.next_ns(0, 0)
-        while at_ns <= end_ns:
-            offers[name].append((at_ns, frame_bytes))
-            at_ns = source.next_ns(at_ns, len(offers[name]))
+        source = channel.arrivals(name, channel.chain_of(name)) if generated else None
+        instants = range(0, end_ns + 1, round(period_ms * 1e6)) if source is None else _instants(source, end_ns)
+        offers[name] = [(at_ns, frame_bytes) for at_ns in instants]
     links, transits = offer_all(channel, offers, end_ns, sampled=frame_period_ms is not None)
     return Simulation(config, seed, seconds, [LinkRun(links[name], transits[name], end_ns) for name in names])
+
+
+def _instants(source: PoissonArrivals, end_ns: int) -> list[int]:
+    """The arrivals up to ``end_ns``."""
+    found: list[int] = []
+    at_ns = source.next_ns(0, 0)
+    while at_ns <= end_ns:
+        found.append(at_ns)
+        at_ns = source.next_ns(at_ns, len(found))
+    return found
 
 
 def offer_all(

@@ -9,6 +9,11 @@ from channel_emu.model.trace import Trace
 from channel_emu.virtual.simulate import offer_all
 
 
+def offers(trace: Trace) -> dict[str, list[tuple[int, int]]]:
+    """(instant in ns, bytes) of every offer, by camera."""
+    return {name: [(r.offered_ns, r.bytes) for r in found] for name, found in trace.by_camera().items()}
+
+
 def compare(trace: Trace) -> dict[str, Any]:
     """Offer every recorded message again at its recorded instant, and compare the link's decisions: outcome,
     start, due instant and state.
@@ -17,7 +22,7 @@ def compare(trace: Trace) -> dict[str, Any]:
     difference, at most 20).
     """
     last_ns = max((max(r.offered_ns, r.started_ns or 0, r.ended_ns or 0) for r in trace.records), default=0)
-    _, decided = offer_all(Channel(trace.config, trace.seed), trace.offers(), last_ns)
+    _, decided = offer_all(Channel(trace.config, trace.seed), offers(trace), last_ns)
     different = []
     for camera, records in trace.by_camera().items():
         for record, transit in zip(records, decided[camera]):

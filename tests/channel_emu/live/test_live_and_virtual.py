@@ -14,6 +14,7 @@ from channel_emu.model.channel import Channel
 from channel_emu.model.link import EventKind
 from channel_emu.model.trace import Record
 from channel_emu.virtual.simulate import offer_all
+from tests.channel_emu.decided_again import offers
 from tests.channel_emu.live.emulator import CAMERAS, emulate, run
 from tests.channel_emu.live.test_frame_stream import FAST, frame_account
 
@@ -45,7 +46,7 @@ def test_ages_live_are_those_of_virtual_time_and_the_delay_error(tmp_path: Path,
     run(record(tmp_path, section, 0.005, 100))
     found = trace.read(tmp_path / "t.jsonl")
     end_ns = max(max(r.offered_ns, r.ended_ns or 0, r.actual_ns or 0) for r in found.records)
-    _, virtual = offer_all(Channel(found.config, found.seed), found.offers(), end_ns)
+    _, virtual = offer_all(Channel(found.config, found.seed), offers(found), end_ns)
     for camera, records in found.by_camera().items():
         assert [r.outcome for r in records] == [t.outcome for t in virtual[camera]]
         # A frame that leaves the link while the edge is stalled is broken and has no actual instant.

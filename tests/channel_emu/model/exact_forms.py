@@ -12,27 +12,11 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.special import lambertw
 
 
 def mm1_fcfs(lam: float, mu: float) -> float:
     rho = lam / mu
     return (1 + 1 / rho + rho**2 / (1 - rho)) / mu
-
-
-def md1_fcfs(lam: float, mu: float) -> float:
-    rho = lam / mu
-    return (1 / (2 * (1 - rho)) + 0.5 + (1 - rho) * math.exp(rho) / rho) / mu
-
-
-def dm1_fcfs(period: float, mu: float) -> float:
-    rho = 1 / (period * mu)
-    beta = -rho * float(np.real(lambertw(-math.exp(-1 / rho) / rho)))
-    return (1 / (2 * rho) + 1 / (1 - beta)) / mu
-
-
-def mm1_blocking(lam: float, mu: float) -> float:
-    return 1 / lam + 2 / mu - 1 / (lam + mu)
 
 
 def mm12(lam: float, mu: float) -> float:
@@ -43,10 +27,6 @@ def mm12(lam: float, mu: float) -> float:
 def mm1_newest_waits(lam: float, mu: float) -> float:
     both = lam**2 + lam * mu + mu**2
     return 1 / lam + 2 / mu + lam / (lam + mu) ** 2 + 1 / (lam + mu) - 2 * (lam + mu) / both
-
-
-def mm1_preemptive(lam: float, mu: float) -> float:
-    return 1 / lam + 1 / mu
 
 
 def mg1_blocking(lam: float, mean: float, second_moment: float) -> float:
@@ -65,6 +45,11 @@ def dg1_drop_new(period: float, mean: float, survival: Callable[[np.ndarray], np
     above = survival(period * np.arange(2000))
     first, second = above.sum(), ((2 * np.arange(2000) + 1) * above).sum()
     return mean + period * second / (2 * first), mean + period * first
+
+
+def dm1_drop_new(period: float, mu: float) -> tuple[float, float]:
+    """The same of exponential service, in closed form."""
+    return 1 / mu + period / 2 / math.tanh(mu * period / 2), 1 / mu + period / (1 - math.exp(-mu * period))
 
 
 def shared_mm1_fcfs(lam: float, other: float, mu: float) -> float:
@@ -93,24 +78,11 @@ def shared_mm1_preemptive(lam: float, other: float, mu: float) -> float:
 def shared_mg1_blocking(lam: float, other: float, mean: float, second_moment: float) -> float:
     """A source's deliveries are N server cycles S + X apart, N geometric of mean 1 + other/lam."""
     rate = lam + other
-    cycle, spread = mean + 1 / rate, second_moment - mean**2 + 1 / rate**2
+    cycle, variation = mean + 1 / rate, second_moment - mean**2 + 1 / rate**2
     p = lam / rate
     apart = cycle / p
-    variance = spread / p + (1 - p) / p**2 * cycle**2
+    variance = variation / p + (1 - p) / p**2 * cycle**2
     return mean + (variance + apart**2) / (2 * apart)
-
-
-def dm1_drop_new(period: float, mu: float) -> float:
-    return 1 / mu + period / 2 / math.tanh(mu * period / 2)
-
-
-def dm1_drop_new_peak(period: float, mu: float) -> float:
-    return 1 / mu + period / (1 - math.exp(-mu * period))
-
-
-def dd1_drop_new(period: float, service: float) -> float:
-    k = math.ceil(service / period)
-    return service + period * k / 2
 
 
 def dm1_parallel(period: float, mu: float) -> float:
@@ -135,9 +107,7 @@ def modulated_drop_new(a: float, b: float, mu_good: float, mu_bad: float, period
     big_a, big_b, one, eye = expm(q * period), expm(t * period), np.ones(2), np.eye(2)
     r = np.linalg.inv(eye - big_b)
     m = np.linalg.inv(-t) @ one
-    values, vectors = np.linalg.eig((r @ (big_a - big_b)).T)
-    alpha = np.real(vectors[:, np.argmin(abs(values - 1))])
-    alpha /= alpha.sum()
+    alpha = _stationary(r @ (big_a - big_b))
     mean = alpha @ r @ one
     square = alpha @ (eye + big_b) @ r @ r @ one
     return float((period**2 * square / 2 + period * (alpha @ r @ r @ (big_a - big_b) @ m)) / (period * mean))
@@ -153,8 +123,12 @@ def gilbert_elliott(a: float, b: float, loss: tuple[float, float], period: float
     p = expm(np.array([[-a, a], [b, -b]]) * period)
     f, g = p * np.array(loss), p * (1 - np.array(loss))
     r = np.linalg.inv(np.eye(2) - f)
-    values, vectors = np.linalg.eig((r @ g).T)
-    alpha = np.real(vectors[:, np.argmin(abs(values - 1))])
-    alpha /= alpha.sum()
+    alpha = _stationary(r @ g)
     first, second = alpha @ r @ np.ones(2), alpha @ (np.eye(2) + f) @ r @ r @ np.ones(2)
     return delay + period * second / (2 * first), delay + period * first
+
+
+def _stationary(transition: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eig(transition.T)
+    alpha = np.real(vectors[:, np.argmin(abs(values - 1))])
+    return alpha / alpha.sum()

@@ -73,7 +73,6 @@ def test_keys_beside_a_preset_override_it() -> None:
         ("{chain: {mu1_per_ms: 0, mu2_per_ms: 0}}", "initial: the chain ends in different states"),
         ("{chain: {generator_per_ms: [[-1, 2], [1, -1]]}}", "rows sum to zero"),
         ("{chain: {mu1_per_ms: 1, mu2_per_ms: 1, initial: up}}", "initial: expected one of s1, s2"),
-        ("{chain: {mu1_per_ms: 1, mu2_per_ms: 1, sampled: slots}}", "slot_ms: missing (sampled slots needs"),
         ("{discipline: D/G/1/0}", "discipline: expected one of drop-new"),
         ("{faults: {rain: {}}}", "channel.faults.rain: unknown fault; expected one of loss"),
         ("{faults: {loss: [0.1, 0.2]}}", "channel: faults.loss.probability: expected one number or one a state"),
