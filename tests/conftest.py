@@ -114,7 +114,20 @@ def data_dir(name: str) -> Path:
 
     Looked for in $FRESHFIELD_DATA, then in ../shared/data beside the checkout.
     """
-    for base in (os.environ.get("FRESHFIELD_DATA"), ROOT.parent / "shared" / "data"):
+    return _shared(name, "data", os.environ.get("FRESHFIELD_DATA"))
+
+
+def case_dir(name: str) -> Path:
+    """Folder ``name`` of the inputs that people reported, or skip with the reason.
+
+    Looked for in ``cases`` beside $FRESHFIELD_DATA, then in ../shared/cases beside the checkout.
+    """
+    data = os.environ.get("FRESHFIELD_DATA")
+    return _shared(name, "cases", str(Path(data).parent / "cases") if data else None)
+
+
+def _shared(name: str, kind: str, given: str | None) -> Path:
+    for base in (given, ROOT.parent / "shared" / kind):
         if base and (Path(base) / name).is_dir():
             return Path(base) / name
     pytest.skip(f"real data set {name!r} not found: set FRESHFIELD_DATA to the folder that holds it")

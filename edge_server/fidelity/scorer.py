@@ -76,7 +76,7 @@ class Scorer:
 
     def __init__(self, lpips: PerceptualMetric | None = None, background: Color = BLACK) -> None:
         self._lpips = lpips
-        self._background = background
+        self.background = background
 
     def warm_up(self) -> None:
         """Load what the metrics would load at their first distance; for LPIPS this takes two CPU seconds."""
@@ -104,7 +104,7 @@ class Scorer:
         Raises ImageError for NaN, infinity or a wrong shape in either image.
         """
         a = to_unit(rendering, "rendering")
-        b = to_unit(truth, "held-out frame", self._background)
+        b = to_unit(truth, "held-out frame", self.background)
         moving = moving_mask(b, earlier, bound)
         total = psnr(a, b)
         assert total is not None  # no mask was given

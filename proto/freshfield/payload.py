@@ -83,7 +83,7 @@ def check(payload: bytes, codec: str, width: int, height: int) -> None:
             raise PayloadError("size_mismatch", f"zstd declares {declared} bytes, not {width} x {height} x 3")
         return
     if codec == "jpeg":
-        found = _jpeg_size(payload)
+        found = jpeg_size(payload)
     elif codec == "png":
         found = png_size(payload)
     else:
@@ -150,7 +150,7 @@ def _jpeg_scans(data: bytes) -> int:
     return sum(int(np.count_nonzero(part == 0xDAFF)) for part in words)
 
 
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+def jpeg_size(data: bytes) -> tuple[int, int] | None:
     """Width and height in the start-of-frame segment; None unless exactly one precedes the first scan."""
     if data[:2] != b"\xff\xd8":
         return None

@@ -13,15 +13,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from camera_node.sources.datasets.lens import Lens
-from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, lens_for_image, posed_photo
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
 from camera_node.sources.datasets.records import (
     Dataset,
     DatasetError,
     PosedImage,
     camera_to_world,
     errors_at,
+    file_within,
     find_files,
-    path_within,
+    missing_note,
 )
 from freshfield.geometry import quaternion_to_matrix
 from freshfield.untrusted import read_bytes, read_text
@@ -37,6 +38,8 @@ _MODELS = {
     3: ("RADIAL", 5),
     4: ("OPENCV", 8),
     5: ("OPENCV_FISHEYE", 8),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
 }
 
 
@@ -62,29 +65,37 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
     if file is None:
         raise DatasetError(f"{path}: no COLMAP model: expected cameras and images, .bin or .txt, in it or in sparse/0")
     lenses, entries = (_binary if file.suffix == ".bin" else _text)(file)
-    folder = _images(path if path.is_dir() else path.parent, file, images)
-    sized: dict[int, Lens] = {}
+    root = path if path.is_dir() else path.parent
+    folder = _images(root, file, images)
     found: list[PosedImage] = []
-    missing = 0
+    missing: list[str] = []
     for image in sorted(entries, key=lambda i: i.name):
         where = f"{file.with_stem('images')}: {image.name}"
         if image.camera not in lenses:
             raise DatasetError(f"{where}: its camera {image.camera} is not in {file.name}")
         with errors_at(where):
-            picture = folder / path_within(image.name)
-        if not picture.is_file():
-            missing += 1
+            picture = file_within(folder, image.name)
+            mask = _mask(folder, root, image.name)
+        if picture is None:
+            missing.append(image.name)
             continue
-        if image.camera not in sized:
-            sized[image.camera] = lens_for_image(lenses[image.camera], picture, where)
-        photo = Photo(picture, sized[image.camera], options)
+        photo = Photo(picture, lenses[image.camera], options, ignored=(mask, True) if mask else None)
         with errors_at(where):
             pose = camera_to_world(quaternion_to_matrix(image.pose[:4]), image.pose[4:])
         found.append(posed_photo(photo, image.name, pose, where))
+    note = missing_note(missing, len(entries), folder) if missing else ""
     if not found:
-        raise DatasetError(f"{file}: none of its {missing} images exists in {folder}")
+        raise DatasetError(f"{file}: none of its images exists: {note or 'it lists none'}")
     with errors_at(str(file.with_stem("images"))):
-        return Dataset(tuple(found), missing)
+        return Dataset(tuple(found), len(missing), notes=(note,) if note else ())
+
+
+def _mask(folder: Path, root: Path, name: str) -> Path | None:
+    """The mask of an image in the folder ``masks`` beside that of the images: a.jpg.png, or a.png; zero where nothing
+    may be learned."""
+    beside = folder if folder == root else folder.parent
+    found = file_within(beside, f"masks/{name}", (".png",))
+    return found or file_within(beside, f"masks/{name.rpartition('.')[0] or name}.png")
 
 
 def _images(given: Path, model: Path, images: str | None) -> Path:
@@ -109,7 +120,7 @@ def _lens(model: str, width: int, height: int, p: list[float], where: str) -> Le
     else:
         (fx, cx, cy), rest = p[:3], p[3:]
         fy = fx
-    fisheye = model == "OPENCV_FISHEYE"
+    fisheye = model.endswith("FISHEYE")
     radial = rest[:2] if model == "OPENCV" else rest
     tangential = (rest[2], rest[3]) if model == "OPENCV" else (0.0, 0.0)
     with errors_at(where):

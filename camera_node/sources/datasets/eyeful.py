@@ -19,12 +19,14 @@ from typing import Any
 import numpy as np
 
 from camera_node.sources.datasets.lens import Lens
-from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, lens_for_image, posed_photo
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
 from camera_node.sources.datasets.records import (
     Dataset,
     DatasetError,
     PosedImage,
     errors_at,
+    file_within,
+    missing_note,
     path_within,
     read_array,
     read_json,
@@ -53,24 +55,24 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
     entries = _entries(file)
     held_out = _held_out(folder / "splits.json")
     pictures = _images(folder, images)
-    lenses: dict[Lens, Lens] = {}
     found: list[PosedImage] = []
-    missing = 0
+    missing: list[str] = []
     for name, lens, camera_to_world in entries:
-        image = next((f for s in (".jpg", ".jpeg", ".png") if (f := pictures / f"{name}{s}").is_file()), None)
-        if image is None:
-            missing += 1
-            continue
         where = f"{file}: {name}"
-        if lens not in lenses:
-            lenses[lens] = lens_for_image(lens, image, where)
-        photo = Photo(image, lenses[lens], options)
+        with errors_at(where):
+            image = file_within(pictures, name, (".jpg", ".jpeg", ".png"))
+        if image is None:
+            missing.append(f"{name}.jpg")
+            continue
+        photo = Photo(image, lens, options)
         found.append(posed_photo(photo, name, _UPRIGHT @ camera_to_world, where, name.split("/")[0]))
+    note = missing_note(missing, len(entries), pictures) if missing else ""
     if not found:
-        raise DatasetError(f"{file}: none of its {missing} images exists in {pictures}")
+        raise DatasetError(f"{file}: none of its images exists: {note}")
     held_out &= {image.name for image in found}
     with errors_at(str(file)):
-        return Dataset(tuple(found), missing, held_out=held_out, per_camera=True)
+        notes = (note,) if note else ()
+        return Dataset(tuple(found), len(missing), held_out=held_out, per_camera=True, notes=notes)
 
 
 def _images(folder: Path, images: str | None) -> Path:

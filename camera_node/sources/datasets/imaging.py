@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any, cast
 
@@ -9,30 +10,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.sources.datasets.records import DatasetError, Image
-from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
+from freshfield import payload  # sets OpenCV's size limit before cv2 is imported
 from freshfield.geometry import Pinhole
+from freshfield.untrusted import check_file, read_bytes
 
 import cv2  # isort: skip
 
 
+_HEADER_BYTES = 2**18  # holds the size of nearly every JPEG, behind its EXIF data and thumbnail
+
+
 def decode_file(path: Path, flags: int) -> NDArray[Any] | None:
-    """Like ``cv2.imread``, with its ``flags``, but returns None also for a header that states more pixels
-    than OpenCV's limit, where ``cv2.imread`` raises."""
+    """Like ``cv2.imread``, with its ``flags``, but returns None also for a file that is cut short, of which
+    ``cv2.imread`` returns the rest as gray, and for a header that states more pixels than OpenCV's limit."""
     try:
-        return cv2.imread(str(path), flags)
-    except cv2.error:
+        data = read_bytes(path)
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    except (OSError, cv2.error):
         return None
 
 
-def read_image(path: Path) -> Image:
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file as stored; of JPEG and PNG from the header. Raises DatasetError."""
+    check_file(path)
+    with path.open("rb") as file:
+        head = file.read(_HEADER_BYTES)
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) >= 24:
+        width, height = struct.unpack(">II", head[16:24])
+        return width, height
+    size = payload.jpeg_size(head)
+    if size is None:
+        height, width = read_image(path).shape[:2]
+        return width, height
+    return size
+
+
+def read_image(path: Path, upright: bool = False) -> Image:
     """Read an image as uint8 RGB (H, W, 3) or straight-alpha RGBA (H, W, 4).
 
-    EXIF rotation is ignored, because poses and intrinsics belong to the pixels as stored. Raises
-    DatasetError.
+    upright: rotate it as its EXIF data say; otherwise its pixels are as stored, to which poses and intrinsics belong
+    (``photo.fitted``). Raises DatasetError.
     """
-    image = decode_file(path, cv2.IMREAD_UNCHANGED)
+    image = decode_file(path, cv2.IMREAD_COLOR if upright else cv2.IMREAD_UNCHANGED)
     if image is None:
-        raise DatasetError(f"{path}: not an image that OpenCV can read, or larger than its limit")
+        raise DatasetError(
+            f"{path}: damaged or cut short, not an image that OpenCV can read, or larger than its limit: copy it again"
+        )
     if image.dtype == np.uint16:
         image = (image // 256).astype(np.uint8)
     if image.dtype != np.uint8:

@@ -63,6 +63,8 @@ class Lens:
 
     def resized(self, width: int, height: int) -> Lens:
         """The same lens for images of another size."""
+        if (width, height) == (self.width, self.height):
+            return self
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 

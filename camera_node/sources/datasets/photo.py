@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from camera_node.sources.datasets.imaging import composite, read_image, resize, shrink
+from camera_node.sources.datasets.imaging import composite, image_size, read_image, resize, shrink
 from camera_node.sources.datasets.lens import Lens, exact, pinhole, undistort
 from camera_node.sources.datasets.records import DatasetError, Image, PosedImage, errors_at
+from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
 from freshfield.geometry import Pose
+
+import cv2  # isort: skip
 
 # Tolerated difference of aspect ratio between an image and its original, due to rounding to whole pixels.
 _SAME_SHAPE = 0.02
@@ -33,25 +37,45 @@ FULL_SIZE = ImageOptions()
 
 @dataclass(frozen=True)
 class Photo:
-    """An image file. lens: of the file as stored. mask: image file that is zero in the background."""
+    """An image file.
+
+    lens: of the image as ``read`` finds it before it is undistorted and shrunk.
+    mask: image file that is zero in the background.
+    ignored: image file of pixels that must not be learned from, and whether these are its zeros or the others.
+    upright: rotate the file as its EXIF data say.
+    """
 
     path: Path
     lens: Lens
     options: ImageOptions
     mask: Path | None = None
+    ignored: tuple[Path, bool] | None = None
+    upright: bool = False
 
     def read(self) -> Image:
         """Read it as uint8 RGB or RGBA according to ``options``. Raises DatasetError."""
-        image = undistort(self.lens, self._checked(self.path))
+        image = undistort(self.lens, self._checked(self.path, self.upright))
         if self.mask is not None:
-            # Masks hold labels or 255: every nonzero pixel is kept.
-            kept = np.where(self._checked(self.mask)[..., :3].any(axis=-1), 255, 0).astype(np.uint8)
-            image = np.dstack([image[..., :3], undistort(self.lens, kept)])
+            image = np.dstack([image[..., :3], undistort(self.lens, self._labeled(self.mask))])
         small = shrink(pinhole(self.lens), self.options.scale)
         return resize(composite(image, self.options.background), small.width, small.height)
 
-    def _checked(self, path: Path) -> Image:
-        image = read_image(path)
+    def weight(self) -> NDArray[np.float32]:
+        """How much each pixel of ``read`` may be learned from, (H, W) in [0, 1]. Raises DatasetError."""
+        assert self.ignored is not None
+        path, zeros = self.ignored
+        kept = self._labeled(path)
+        small = shrink(pinhole(self.lens), self.options.scale)
+        kept = undistort(self.lens, kept if zeros else 255 - kept)
+        shrunk = cv2.resize(kept, (small.width, small.height), interpolation=cv2.INTER_AREA)
+        return shrunk.astype(np.float32) / 255.0
+
+    def _labeled(self, path: Path) -> Image:
+        """255 where the image of labels at ``path`` is not zero, else 0; (H, W)."""
+        return np.where(self._checked(path)[..., :3].any(axis=-1), 255, 0).astype(np.uint8)
+
+    def _checked(self, path: Path, upright: bool = False) -> Image:
+        image = read_image(path, upright)
         if image.shape[:2] != (self.lens.height, self.lens.width):
             raise DatasetError(
                 f"{path}: image is {image.shape[1]} x {image.shape[0]}, its camera "
@@ -60,20 +84,22 @@ class Photo:
         return image
 
 
-def lens_for_image(lens: Lens, path: Path, where: str) -> Lens:
-    """The lens scaled to the size of the image at ``path``, which may be a smaller copy.
+def fitted(photo: Photo) -> Photo:
+    """The photo with the lens of its file's size. The camera's size decides how the file is taken: its pixels as
+    stored, possibly of a smaller copy; else as its EXIF data rotate them. Raises DatasetError for another shape."""
+    lens, stored = photo.lens, image_size(photo.path)
+    if _same_shape(lens, stored):
+        return replace(photo, lens=lens.resized(*stored))
+    if _same_shape(lens, stored[::-1]) and read_image(photo.path, upright=True).shape[1::-1] == stored[::-1]:
+        return replace(photo, lens=lens.resized(*stored[::-1]), upright=True)
+    raise DatasetError(
+        f"its camera has {lens.width} x {lens.height} pixels, {photo.path.name} {stored[0]} x {stored[1]}: another "
+        "shape; was it cropped or rotated after its camera was calibrated?"
+    )
 
-    where: beginning of error messages. Raises DatasetError for another aspect ratio, or an unreadable image.
-    """
-    height, width = read_image(path).shape[:2]
-    if (width, height) == (lens.width, lens.height):
-        return lens
-    if abs((width / lens.width) / (height / lens.height) - 1.0) > _SAME_SHAPE:
-        raise DatasetError(
-            f"{where}: its camera has {lens.width} x {lens.height} pixels, {path.name} {width} x {height}: "
-            "another shape"
-        )
-    return lens.resized(width, height)
+
+def _same_shape(lens: Lens, size: tuple[int, int]) -> bool:
+    return abs((size[0] / lens.width) / (size[1] / lens.height) - 1.0) <= _SAME_SHAPE
 
 
 def posed_photo(
@@ -81,12 +107,15 @@ def posed_photo(
 ) -> PosedImage:
     """A photo with its pose, as a data set's image.
 
+    photo: its lens may be that of a larger original (``fitted``).
     name, camera, time_s: as in ``PosedImage``. camera_to_world: (4, 4) or (3, 4), OpenCV axes.
-    where: beginning of error messages. Raises DatasetError for an impossible pose or lens.
+    where: beginning of error messages. Raises DatasetError for an impossible pose or lens, or a file that does not fit.
     """
     with errors_at(where):
+        photo = fitted(photo)
         pose = Pose.from_matrix(camera_to_world).matrix()
         undistorted = pinhole(photo.lens)
+    stored = photo.options.scale == 1 and photo.mask is None and not photo.upright and exact(photo.lens)
     return PosedImage(
         name=name,
         camera=camera,
@@ -94,6 +123,6 @@ def posed_photo(
         camera_to_world=pose,
         intrinsics=shrink(undistorted, photo.options.scale),
         read=photo.read,
-        # The stored file can be sent as it is if it is not scaled, masked or undistorted.
-        path=photo.path if photo.options.scale == 1 and photo.mask is None and exact(photo.lens) else None,
+        path=photo.path if stored else None,
+        weight=photo.weight if photo.ignored is not None else None,
     )

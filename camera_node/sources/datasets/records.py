@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,8 +35,9 @@ class PosedImage:
     intrinsics: of the image as ``read`` returns it.
     read: returns uint8 (H, W, 3) RGB or (H, W, 4) straight-alpha RGBA; raises DatasetError for a file that is
         damaged or has another size.
-    path: the image's own file, if ``read`` does not scale, mask or undistort it; else None.
+    path: the image's own file, if ``read`` does not scale, mask, turn or undistort it; else None.
     release: frees what ``read`` keeps open, such as a decoder.
+    weight: returns float32 (H, W) in [0, 1], how much each pixel of the image may be learned from; None: all fully.
     """
 
     name: str
@@ -46,6 +48,7 @@ class PosedImage:
     read: Callable[[], Image]
     path: Path | None = None
     release: Callable[[], None] = lambda: None
+    weight: Callable[[], NDArray[np.float32]] | None = None
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,7 @@ class Dataset:
     fps: rate of the recording; None if the data set does not tell.
     held_out: names of the data set's own test images.
     per_camera: each image belongs to the camera that took it, although nothing moves.
+    notes: what a user should know of how the files were read, a sentence each.
     """
 
     images: tuple[PosedImage, ...]
@@ -63,6 +67,7 @@ class Dataset:
     fps: float | None = None
     held_out: frozenset[str] = frozenset()
     per_camera: bool = False
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Raises DatasetError if two images have the same name."""
@@ -100,11 +105,14 @@ _LONGEST_PATH = 1000  # characters; systems allow 4096 bytes, including the fold
 
 
 def path_within(name: str) -> Path:
-    """The relative path of a file within a data set's folder. Raises DatasetError if ``name`` leads out of
-    the folder, or cannot be a file name."""
+    """The relative path of a file within a data set's folder; backslashes separate folders, too. Raises DatasetError
+    if ``name`` leads out of the folder, or cannot be a file name."""
+    name = name.replace("\\", "/")
     path = Path(name)
-    if not name or path.is_absolute() or ".." in path.parts:
-        raise DatasetError(f"{name[:200]!r} does not lie within the folder of the data set")
+    if not name or path.is_absolute() or ".." in path.parts or (len(name) > 1 and name[1] == ":"):
+        raise DatasetError(
+            f"{name[:200]!r} does not lie within the folder of the data set: write it relative to that, images/0001.jpg"
+        )
     if (
         "\0" in name
         or len(name) > _LONGEST_PATH
@@ -112,6 +120,30 @@ def path_within(name: str) -> Path:
     ):
         raise DatasetError(f"{name[:200]!r} is not the name of a file")
     return path
+
+
+def file_within(folder: Path, name: str, endings: Sequence[str] = ("",)) -> Path | None:
+    """The file ``name`` of a data set's folder, with the first of ``endings`` that exists; None: there is none. Raises
+    DatasetError as ``path_within``, and for a symbolic link that leads out of the folder."""
+    path = folder / path_within(name)
+    found = next((file for end in endings if (file := path.with_name(path.name + end)).is_file()), None)
+    if found is not None and not found.resolve().is_relative_to(folder.resolve()):
+        raise DatasetError(
+            f"{name[:200]!r} is a symbolic link that leads out of the data set: put the file itself there"
+        )
+    return found
+
+
+def missing_note(names: Sequence[str], count: int, folder: Path) -> str:
+    """A sentence on entries without a file: how many of ``count``, which first, and what was found beside it."""
+    first = folder / names[0].replace("\\", "/")
+    near = next(above for above in first.parents if above.is_dir())
+    there = sorted(each.name for each in near.iterdir())
+    close = [name for name in there if Path(name).stem == first.stem]
+    close = close or difflib.get_close_matches(first.name, there, 3, 0.0)
+    beside = ", ".join(close) or "nothing"
+    more = f" and {len(there) - len(close)} more" if len(there) > len(close) else ""
+    return f"{len(names)} of {count} images are missing, first {names[0]}; {near} holds {beside}{more}"
 
 
 def find_files(folder: Path, patterns: Sequence[str]) -> list[Path]:

@@ -1,18 +1,20 @@
 """Sources that stream a recorded data set of any format as if live.
 
-A recording of several cameras is played back at its own rate. Photos of a static scene are split: every
-eighth goes to the held-out cameras, the others round-robin to the training cameras, and each camera steps
-through its photos back and forth, like a moving camera.
+A recording of several cameras is played back at its own rate. Photos of a static scene are split: the data set's own
+test images, else every eighth, go to the held-out cameras, the others round-robin to the training cameras, and each
+camera steps through its photos back and forth, like a moving camera.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from camera_node.pose.providers import PoseProvider, read_tum
 from camera_node.settings import FPS_RANGE, RecordedConfig, TrajectoryConfig, VideoConfig, errors_of, find_data
@@ -22,6 +24,8 @@ from camera_node.sources.datasets.records import Dataset, DatasetError, PosedIma
 from freshfield import payload
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
+
+log = logging.getLogger("camera-node")
 
 HOLD_OUT_EVERY = 8
 PHOTO_FPS = 10.0
@@ -57,12 +61,20 @@ def open_recorded(
     """See ``camera_node.sources.registry.open_sources``."""
     path = find_data(config.data, scenario, data)
     found = open_configured(path, config)
+    for note in found.notes:
+        log.warning("%s: %s", path, note)
+    if any(image.weight for image in found):
+        raise DatasetError(
+            f"{path}: has masks of pixels that must not be learned from, which a stream cannot carry: use edge-server "
+            "fit, or leave the masks out"
+        )
     if found.moving or found.per_camera:
         names = assign_cameras(scenario, config.assignment, cameras, found.cameras)
         shown = {camera: found.of(name) for camera, name in names.items()}
         recorded = {camera: _recorded_fps(found, shown[camera], path) for camera in cameras}
     else:
-        shares = split_photos(len(found), scenario.training, scenario.held_out)
+        own = [i for i, image in enumerate(found) if image.name in found.held_out]
+        shares = split_photos(len(found), scenario.training, scenario.held_out, own)
         shown = {camera: tuple(found[i] for i in shares[camera]) for camera in cameras}
         recorded = {camera: rate(config.fps or PHOTO_FPS) for camera in cameras}
     poses: dict[str, PoseProvider] = {}
@@ -81,10 +93,13 @@ def open_recorded(
     return sources
 
 
-def split_photos(count: int, training: Sequence[str], held_out: Sequence[str]) -> dict[str, list[int]]:
-    """Image indices of each camera. Images with index % 8 == 0 go to the held-out cameras in turn (if there
-    are any), the others to the training cameras in turn. Raises DatasetError if a camera would get none."""
-    truth = [i for i in range(count) if i % HOLD_OUT_EVERY == 0] if held_out else []
+def split_photos(
+    count: int, training: Sequence[str], held_out: Sequence[str], own: Collection[int] = ()
+) -> dict[str, list[int]]:
+    """Image indices of each camera. The data set's ``own`` test images, else those with index % 8 == 0, go to the
+    held-out cameras in turn (if there are any), the others to the training cameras in turn. Raises DatasetError if a
+    camera would get none."""
+    truth = sorted(own) or ([i for i in range(count) if i % HOLD_OUT_EVERY == 0] if held_out else [])
     rest = [i for i in range(count) if i not in set(truth)]
     shares = {camera: truth[k :: len(held_out)] for k, camera in enumerate(held_out)}
     shares |= {camera: rest[k :: len(training)] for k, camera in enumerate(training)}
@@ -129,6 +144,7 @@ class ImageSource(Source):
         self.contents = len(images)
         self.intrinsics = images[0].intrinsics
         self._images, self._playback, self._codec, self._poses = images, playback, codec, poses
+        self._whole: set[int] = set()
 
     def content(self, tick: int) -> int:
         return self._playback.frame(tick)
@@ -139,7 +155,11 @@ class ImageSource(Source):
             pose, gap_ns = Pose.from_matrix(shown.camera_to_world), 0
         else:
             pose, gap_ns = self._poses.at(round((shown.time_s or 0.0) * 1e9))
-        return Shot(self._as_stored(shown) or shown.read(), pose, shown.intrinsics, gap_ns)
+        image: NDArray[np.uint8] | bytes | None = self._as_stored(shown)
+        if image is None or content not in self._whole:
+            decoded = shown.read()  # once also of what is sent as stored: a file that is cut short is refused by name
+            self._whole.add(content)
+        return Shot(decoded if image is None else image, pose, shown.intrinsics, gap_ns)
 
     def release(self) -> None:
         self._images[0].release()

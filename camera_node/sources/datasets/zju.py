@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.sources.datasets.imaging import read_image
+from camera_node.sources.datasets.imaging import image_size
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.npy import load_object
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
@@ -26,6 +26,8 @@ from camera_node.sources.datasets.records import (
     PosedImage,
     camera_to_world,
     errors_at,
+    file_within,
+    missing_note,
     path_within,
 )
 
@@ -62,7 +64,7 @@ def load_dataset(
     folder = file.parent
     if masks is not None and not (folder / masks).is_dir():
         raise DatasetError(f"{folder / masks}: no such folder of masks")
-    missing = 0
+    missing: list[str] = []
     images: list[PosedImage] = []
     for index in range(count):
         lens: Lens | None = None
@@ -71,22 +73,24 @@ def load_dataset(
         names = [_path(instant[index], where) for instant in instants]
         camera = names[0].parent.name
         for k, name in enumerate(names):
-            if not (folder / name).is_file():
-                missing += 1
+            with errors_at(where):
+                picture = file_within(folder, str(name))
+                mask = None if masks is None else file_within(folder / masks, str(name.with_suffix(".png")))
+            if picture is None:
+                missing.append(str(name))
                 continue
-            if lens is None:  # the annotations do not have the images' size, so the first image is read
-                height, width = read_image(folder / name).shape[:2]
-                lens = _lens(numbers["K"][index], numbers["D"][index], width, height, where)
-            mask = None if masks is None else (folder / masks / name).with_suffix(".png")
-            if mask is not None and not mask.is_file():
-                raise DatasetError(f"{mask}: missing, the mask of {name}")
-            photo = Photo(folder / name, lens, options, mask)
+            if lens is None:  # the annotations do not have the images' size, so the first image tells it
+                lens = _lens(numbers["K"][index], numbers["D"][index], *image_size(picture), where)
+            if masks is not None and mask is None:
+                raise DatasetError(f"{(folder / masks / name).with_suffix('.png')}: missing, the mask of {name}")
+            photo = Photo(picture, lens, options, mask)
             images.append(posed_photo(photo, f"{camera}/{k:06d}", pose, where, camera, k / recorded_fps))
+    note = missing_note(missing, count * len(instants), folder) if missing else ""
     if not images:
-        raise DatasetError(f"{file}: none of its {missing} images exists in {folder}")
+        raise DatasetError(f"{file}: none of its images exists: {note}")
     if len({i.camera for i in images}) != len({(i.camera, i.camera_to_world.tobytes()) for i in images}):
         raise DatasetError(f"{file}: two of its cameras keep their images in one folder")
-    return Dataset(tuple(images), missing, recorded_fps)
+    return Dataset(tuple(images), len(missing), recorded_fps, notes=(note,) if note else ())
 
 
 def _listed(counts: dict[str, int]) -> str:
@@ -94,11 +98,10 @@ def _listed(counts: dict[str, int]) -> str:
 
 
 def _path(name: Any, where: str) -> Path:
-    text = str(name).replace("\\", "/")
     with errors_at(where):
-        path = path_within(text)
+        path = path_within(str(name))
     if len(path.parts) < 2:
-        raise DatasetError(f"{where}: {text[:200]!r} is no path of an image in a camera's folder")
+        raise DatasetError(f"{where}: {str(name)[:200]!r} is no path of an image in a camera's folder")
     return path
 
 

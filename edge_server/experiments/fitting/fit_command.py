@@ -168,8 +168,7 @@ def _data_name(data: Path) -> str:
 
 def _open(request: argparse.Namespace) -> Recorded:
     if not _is_scene(request.data):
-        holdout = "8" if request.holdout is None else request.holdout
-        return load_recorded(request.data, holdout, request.scale, request.frame, request.format)
+        return load_recorded(request.data, request.holdout, request.scale, request.frame, request.format)
     for name in ("format", "holdout"):
         if getattr(request, name) is not None:
             raise OptionError(f"--{name} is for data sets; the scene {request.data} holds out {HELD_OUT}")
@@ -198,9 +197,9 @@ class _Run:
         d, image = self.data, self.data.training[0].image
         held_out = f"{len(d.held_out)} held out" if d.held_out else "none held out: scored on training views"
         instant = f", {d.instant}" if d.instant else ""
-        missing = f" ({d.missing} entries have no image)" if d.missing else ""
         sizes = f"{image.shape[1]} x {image.shape[0]}"
-        return f"{d.file}{missing}: {len(d.training)} views of {sizes}{instant}, {held_out}"
+        notes = "".join(f"note: {note}\n" for note in d.notes)
+        return f"{notes}{d.file}: {len(d.training)} views of {sizes}{instant}, {held_out}"
 
     def load(self) -> None:
         """Load the files that ``finish`` wrote. Raises OptionError if there are none."""

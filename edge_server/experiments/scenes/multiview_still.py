@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from camera_node.synthetic import make_scene
 from camera_node.synthetic.scene import HELD_OUT, SCENES, Scene
 from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.fidelity.baselines import baseline
-from edge_server.fidelity.images import BLACK, Color
+from edge_server.fidelity.images import BLACK, Color, to_unit
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import Field, View
 
@@ -59,9 +60,10 @@ def open_still(scene: str, size: int = 128, holdout: str = "8", scale: float = 1
 
 
 def mean_baselines(training: Sequence[View], held_out: Sequence[View], color: Color = BLACK) -> dict[str, float | None]:
-    """PSNR of the baselines without a field, as means over the held-out views; None without any. color: the
-    background."""
-    found = [baseline(training, v.image, v.camera_to_world, color) for v in held_out]
+    """PSNR of the baselines without a field, as means over the held-out views; None without any, or with masks. color:
+    the background."""
+    masked = any(v.weight is not None for v in held_out)  # the baselines know no masks
+    found = [] if masked else [baseline(training, v.image, v.camera_to_world, color) for v in held_out]
     names = ("mean_colour_db", "nearest_view_db")
     return {name: statistics.fmean(getattr(b, name) for b in found) if found else None for name in names}
 
@@ -82,5 +84,15 @@ def known_options(scene: Scene, nearest_m: float) -> dict[str, Any]:
 def score_views(field: Field, views: Sequence[View], scorer: Scorer) -> tuple[Score, NDArray[np.float32]]:
     """Mean score over ``views``, and the rendering (H, W, 3) of the first."""
     renderings = [field.render(v.camera_to_world, v.intrinsics).color for v in views]
-    scores = [scorer.score(v.camera, image, 0, v.image, 0) for v, image in zip(views, renderings)]
-    return mean_score(scores), renderings[0]
+    return mean_score([_score(scorer, v, image) for v, image in zip(views, renderings)]), renderings[0]
+
+
+def _score(scorer: Scorer, view: View, image: NDArray[np.float32]) -> Score:
+    """The score of the pixels that the view's mask keeps: the others count as right, and not in the mean of PSNR."""
+    if view.weight is None:
+        return scorer.score(view.camera, image, 0, view.image, 0)
+    kept = view.weight > 0.5
+    truth = to_unit(view.image, "held-out view", scorer.background)
+    found = scorer.score(view.camera, np.where(kept[..., None], image, truth), 0, view.image, 0)
+    share = max(float(kept.mean()), 1.0 / kept.size)
+    return replace(found, psnr_db=found.psnr_db + 10.0 * math.log10(share))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from camera_node.sources.datasets.formats import open_dataset
-from camera_node.sources.datasets.records import Dataset, DatasetError
+from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
 from edge_server.fields import View
 
 # Value of --holdout for the split that the data set itself defines.
@@ -21,6 +21,7 @@ class Recorded:
     file: the file that was read.
     instant: the instant as text; empty if nothing moves.
     missing: number of entries of the file whose images do not exist.
+    notes: what a user should know of how the files were read.
     """
 
     file: Path
@@ -28,67 +29,87 @@ class Recorded:
     held_out: tuple[View, ...]
     instant: str = ""
     missing: int = 0
+    notes: tuple[str, ...] = ()
 
 
 def load_recorded(
-    path: Path, holdout: str = "8", scale: float = 1.0, frame: int = 0, name: str | None = None
+    path: Path, holdout: str | None = "8", scale: float = 1.0, frame: int = 0, name: str | None = None
 ) -> Recorded:
     """Load the views of a data set, with decoded images including alpha.
 
     path: the folder of a data set, or the file that describes it.
     holdout: ``8`` holds out every 8th view (the first, the ninth, ...), ``0`` none, ``split`` those that the
-        data set itself keeps for testing; else names of images or cameras, separated by commas.
+        data set itself keeps for testing; else names of images or cameras, separated by commas. None: ``split`` if it
+        keeps any, else ``8``. What it keeps for testing is never trained on.
     scale: divides the image sizes.
     frame: number of the instant of a moving data set, from 0.
     name: name of the format (``sources.datasets.formats``); None recognizes it.
     Raises camera_node's DatasetError.
     """
     file, dataset = open_dataset(path, scale, name)
-    views, instant = _views(dataset, frame)
-    training, held_out = split(views, holdout, dataset.held_out)
-    return Recorded(file, training, held_out, instant, dataset.missing)
+    found, instant = _records(dataset, frame)
+    own = [key for key, record in found.items() if record.name in dataset.held_out]
+    training, held_out = split(list(found), holdout or (OWN_SPLIT if own else "8"), own)
+    views = {key: _view(key, found[key]) for key in (*training, *held_out)}
+    training_views, held_out_views = tuple(views[key] for key in training), tuple(views[key] for key in held_out)
+    return Recorded(file, training_views, held_out_views, instant, dataset.missing, dataset.notes)
 
 
-def split(views: Sequence[View], holdout: str, own: Collection[str] = ()) -> tuple[tuple[View, ...], tuple[View, ...]]:
+def split(names: Sequence[str], holdout: str, own: Collection[str] = ()) -> tuple[list[str], list[str]]:
     """Split views into (training, held out) by ``holdout`` as in ``load_recorded``. own: names of the views
     that the data set itself holds out. Raises DatasetError."""
     every = int(holdout) if holdout.strip().isdigit() else None
     if holdout.strip() == OWN_SPLIT:
         if not own:
             raise DatasetError(f"--holdout {OWN_SPLIT}: this data set does not say what it keeps for testing")
-        out = [view.camera in own for view in views]
+        out = set(own)
     elif every is None:
         wanted = [name.strip() for name in holdout.split(",") if name.strip()]
         for name in wanted:
-            if not any(_is_called(view, name) for view in views):
-                some = ", ".join(v.camera for v in views[:6])
-                raise DatasetError(f"--holdout: no image or camera {name!r} among {len(views)}: {some}, ...")
-        out = [any(_is_called(view, name) for name in wanted) for view in views]
+            if not any(_is_called(view, name) for view in names):
+                some = ", ".join(names[:6])
+                raise DatasetError(f"--holdout: no image or camera {name!r} among {len(names)}: {some}, ...")
+        out = {view for view in names if any(_is_called(view, name) for name in wanted)}
     else:
-        out = [every > 0 and i % every == 0 for i in range(len(views))]
-    training = tuple(v for v, is_out in zip(views, out) if not is_out)
+        out = set(names[::every]) if every else set()
+    training = [name for name in names if name not in out and name not in own]
     if not training:
-        raise DatasetError(f"--holdout {holdout}: all {len(views)} views are held out, none is left to train on")
-    return training, tuple(v for v, is_out in zip(views, out) if is_out)
+        raise DatasetError(f"--holdout {holdout}: all {len(names)} views are held out, none is left to train on")
+    return training, [name for name in names if name in out]
 
 
-def _is_called(view: View, name: str) -> bool:
-    path = Path(view.camera)
-    return name in (view.camera, path.name, path.stem)
+def _is_called(view: str, name: str) -> bool:
+    path = Path(view)
+    return str(Path(name)) in (view, path.name, path.stem)
 
 
-def _views(dataset: Dataset, frame: int) -> tuple[list[View], str]:
-    """One view per camera of a moving data set, else one per record; and the instant as text."""
-    if dataset.moving:
-        cameras = {camera: dataset.of(camera) for camera in dataset.cameras}
-        count = min(len(records) for records in cameras.values())
-        if not 0 <= frame < count:
-            raise DatasetError(f"--frame {frame}: the recording has the frames 0 to {count - 1}")
-        found = {camera: records[frame] for camera, records in cameras.items()}
-        instant = f"frame {frame} of {count}"
-    else:
+def _records(dataset: Dataset, frame: int) -> tuple[dict[str, PosedImage], str]:
+    """One image per camera of a moving data set, else all, by the names of their views; and the instant as text.
+
+    Frame N is that of the slowest camera; of the others it is the image nearest in time. Raises DatasetError."""
+    if not dataset.moving:
+        if frame:
+            raise DatasetError(f"--frame {frame}: this data set has no frames of several cameras: leave it out")
         # Photos of one camera are distinguished by their names, those of a static rig by its cameras.
         rig = len(dataset.cameras) == len(dataset)
-        found = {(r.camera if rig else r.name): r for r in dataset}
-        instant = ""
-    return [View(n, r.read(), r.camera_to_world, r.intrinsics) for n, r in found.items()], instant
+        return {(r.camera if rig else r.name): r for r in dataset}, ""
+    cameras = {camera: dataset.of(camera) for camera in dataset.cameras}
+    slowest = min(cameras.values(), key=len)
+    if not 0 <= frame < len(slowest):
+        raise DatasetError(f"--frame {frame}: the recording has the frames 0 to {len(slowest) - 1}")
+    t_s = slowest[frame].time_s or 0.0
+    times = [record.time_s or 0.0 for record in slowest]
+    apart_s = (times[-1] - times[0]) / max(1, len(times) - 1)
+    found = {
+        camera: min(records, key=lambda record: abs((record.time_s or 0.0) - t_s))
+        for camera, records in cameras.items()
+    }
+    for camera, record in found.items():
+        if abs((record.time_s or 0.0) - t_s) > 0.5 * apart_s + 1e-6:
+            raise DatasetError(f"--frame {frame}: camera {camera} has no image near {t_s:g} s: choose another frame")
+    return found, f"frame {frame} of {len(slowest)}"
+
+
+def _view(name: str, record: PosedImage) -> View:
+    weight = None if record.weight is None else record.weight()
+    return View(name, record.read(), record.camera_to_world, record.intrinsics, weight=weight)

@@ -159,6 +159,8 @@ COLMAP_MODELS = {
     "RADIAL": (3, lambda l: [l.fx, l.cx, l.cy, *l.distortion[:2]]),
     "OPENCV": (4, lambda l: [l.fx, l.fy, l.cx, l.cy, *l.distortion]),
     "OPENCV_FISHEYE": (5, lambda l: [l.fx, l.fy, l.cx, l.cy, -0.02, 0.004, 0.0, 0.0]),
+    "SIMPLE_RADIAL_FISHEYE": (8, lambda l: [l.fx, l.cx, l.cy, -0.02]),
+    "RADIAL_FISHEYE": (9, lambda l: [l.fx, l.cx, l.cy, -0.02, 0.004]),
 }
 
 

@@ -319,15 +319,17 @@ def test_eyeful_damage_is_named(tmp_path):
 @pytest.mark.parametrize("model", list(sets.COLMAP_MODELS))
 def test_colmap_sees_points_where_they_are(tmp_path, model, binary):
     names = list(sets.COLMAP_MODELS)
-    bends = [0, 0, 1, 2, 4, 0][names.index(model)]
-    fy = BENT.fx if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") else BENT.fy
+    bends = [0, 0, 1, 2, 4, 0, 0, 0][names.index(model)]
+    fy = BENT.fy if model in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE") else BENT.fx
     bend = (*BENT.distortion[:bends], 0.0, 0.0, 0.0, 0.0)[:4]
     cameras = sets.rig(3, Pinhole(64, 48, BENT.fx, fy, BENT.cx, BENT.cy, bend))
     file, dataset = open_dataset(sets.write_colmap(tmp_path, cameras, model, binary))
     assert file == tmp_path / f"sparse/0/cameras.{'bin' if binary else 'txt'}"
     assert [r.name for r in dataset] == [f"{camera.name} x.jpg" for camera in cameras]
-    if model == "OPENCV_FISHEYE":
-        assert not dataset[0].intrinsics.distorted
+    if model.endswith("FISHEYE"):
+        radial = (-0.02,) if model.startswith("SIMPLE") else (-0.02, 0.004)
+        lens = Lens(64, 48, BENT.fx, fy, BENT.cx, BENT.cy, radial, fisheye=True)
+        assert dataset[0].intrinsics == pinhole(lens) and not dataset[0].intrinsics.distorted
         return
     agree(list(dataset), cameras)
     shows_the_world(dataset[1])
@@ -371,8 +373,8 @@ def test_colmap_damage_is_named(tmp_path, binary):
             file.write_bytes(whole[file] + b"more")
             fails("4 bytes follow its last entry", colmap.load_dataset, folder)
             file.write_bytes(whole[file])
-        cameras.write_bytes(whole[cameras][:12] + (9).to_bytes(4, "little") + whole[cameras][16:])
-        fails("camera 1: model 9: expected one of", colmap.load_dataset, folder)
+        cameras.write_bytes(whole[cameras][:12] + (10).to_bytes(4, "little") + whole[cameras][16:])
+        fails("camera 1: model 10: expected one of", colmap.load_dataset, folder)
     else:
         text = whole[cameras].decode()
         for old, new, message in (
@@ -394,7 +396,11 @@ def test_colmap_damage_is_named(tmp_path, binary):
     images.write_bytes(whole[images])
     for file in (folder / "images").iterdir():
         file.unlink()
-    fails("none of its 3 images exists", colmap.load_dataset, folder)
+    fails(
+        r"none of its images exists: 3 of 3 images are missing, first cam00 x\.jpg; .*images holds nothing",
+        colmap.load_dataset,
+        folder,
+    )
 
 
 # --- all of them --------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from tests.edge_server.experiments.sets import write_photos, write_recording
 def test_every_kth_view_or_named_ones_or_none_are_held_out(tmp_path, holdout, numbers):
     write_photos(tmp_path, 9)
     found = load_recorded(tmp_path, holdout)
-    assert [v.camera for v in found.held_out] == [f"./images/{n:03d}" for n in numbers]
+    assert [v.camera for v in found.held_out] == [f"images/{n:03d}" for n in numbers]
     assert len(found.training) == 9 - len(numbers) and found.file.name == "transforms_train.json"
 
 
