@@ -12,7 +12,7 @@ from typing import Any
 
 from msgspec import to_builtins
 
-from edge_server.export import ExportError, file_names
+from edge_server.export import ExportError
 from edge_server.run_records import MeshDistances, MeshFacts
 from edge_server.surface import SurfaceError
 from freshfield.files import out_file, out_folder, write_json
@@ -24,14 +24,13 @@ Write the results of a run or fit as files for other programs. RUN is its folder
   edge-server export runs/cell --mesh tile.ply --measure cell      and its distance to the true surface
   edge-server export runs/fit-tile --mesh tile.glb --voxel 1 --watertight
   edge-server export runs/demo/snapshot-000120.npz --splats tile.ply
-  edge-server export runs/demo --colmap out/colmap --transforms out/nerf --trajectory out/path.tum
+  edge-server export runs/demo --colmap out/colmap --transforms out/nerf
 
 --mesh         triangles with colors: .ply or .glb (scikit-image: pip install 'freshfield[surface]')
 --splats       the Gaussians of a splat field, in the layout that splat viewers open (.ply)
 --points       surface points with colors (.ply)
 --colmap       DIR/images and a model in DIR/sparse/0, as text
 --transforms   DIR/transforms.json, DIR/images and DIR/points.ply, for nerfstudio and others
---trajectory   poses in the format of the TUM benchmark; a file for each camera that moved
 
 Several can be given at once. Lengths in the files are meters, and z points up (in GLB: y). A mesh is fused on
 a grid from the depth that the cameras see; what no camera saw stays open, or is closed with --watertight.
@@ -47,7 +46,7 @@ def main(argv: Sequence[str] | None = None, compare: Comparison | None = None) -
     needs the synthetic world, which the edge does not import."""
     parser = _parser()
     args = parser.parse_args(argv)
-    wanted = ("mesh", "splats", "points", "colmap", "transforms", "trajectory")
+    wanted = ("mesh", "splats", "points", "colmap", "transforms")
     if all(getattr(args, name) is None for name in wanted):
         parser.error(f"say what to write: {', '.join(f'--{name}' for name in wanted)}")
     try:
@@ -68,7 +67,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--points", type=out_file, metavar="FILE", help="surface points: .ply")
     add("--colmap", type=out_folder, metavar="DIR", help="COLMAP model with images")
     add("--transforms", type=out_folder, metavar="DIR", help="transforms.json with images and points")
-    add("--trajectory", type=out_file, metavar="FILE", help="camera poses, TUM format")
     add(
         "--count", type=int, default=20000, metavar="N", help="points in --points, --colmap, --transforms [%(default)s]"
     )
@@ -139,7 +137,7 @@ class Export:
         """Check all options, then write every output. Raises ExportError, SurfaceError."""
         args = self.args
         self._check()
-        for name in ("trajectory", "splats", "transforms", "colmap", "points", "mesh"):
+        for name in ("splats", "transforms", "colmap", "points", "mesh"):
             if getattr(args, name) is not None:
                 getattr(self, f"_{name}")(getattr(args, name))
 
@@ -244,22 +242,6 @@ class Export:
         self._points(folder / "points.ply")
         path = write_transforms(folder, self.source.shots, "points.ply")
         print(f"{path}: {len(self.source.shots)} frames", flush=True)
-
-    def _trajectory(self, path: Path) -> None:
-        from edge_server.export.run_source import poses_of
-        from edge_server.export.trajectory import write_tum
-
-        found = poses_of(self.source)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        moved = [camera for camera, rows in found.items() if any(pose != rows[0][1] for _, pose in rows)]
-        if len(moved) <= 1:
-            camera = moved[0] if moved else None
-            rows = found[camera] if camera else [row for rows in found.values() for row in rows]
-            print(f"{path}: {write_tum(path, rows)} poses{f' of {camera}' if camera else ''}", flush=True)
-            return
-        for camera, name in zip(moved, file_names(moved)):
-            file = path.with_name(f"{path.stem}-{name}{path.suffix}")
-            print(f"{file}: {write_tum(file, found[camera])} poses", flush=True)
 
     def _progress(self, what: str, share: float) -> None:
         """Print progress once a second, and when a stage ends."""

@@ -1,4 +1,4 @@
-"""Data to export: a field from a checkpoint, its cameras with their last images, and poses."""
+"""Data to export: a field from a checkpoint, and its cameras with their last images."""
 
 from __future__ import annotations
 
@@ -13,12 +13,10 @@ import numpy as np
 from edge_server.export import ExportError, PosedImage, file_names
 from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.registry import make_field, option_help
-from freshfield.geometry import GeometryError, Pose
 from freshfield.untrusted import stored_bytes
 
 # In order: a run's last checkpoint, a fit's checkpoint.
 NAMES = ("field.npz", "field")
-POSES = "poses.jsonl"
 
 
 @dataclass(frozen=True)
@@ -85,32 +83,6 @@ def find_checkpoint(path: Path) -> Path:
         f"{path}: holds no checkpoint ({' or '.join(NAMES)}); a run writes it when it ends, "
         "with --checkpoint-every S also meanwhile"
     )
-
-
-def poses_of(source: Source) -> dict[str, list[tuple[int, Pose]]]:
-    """Camera -> [(ns, pose)]: all that the run recorded, else the last one. ExportError: a damaged record."""
-    found: dict[str, list[tuple[int, Pose]]] = {}
-    path = source.file.parent / POSES
-    if path.is_file():
-        lines = path.read_text().splitlines()
-        for number, line in enumerate(lines, 1):
-            try:
-                row = json.loads(line)
-                pose = Pose(tuple(row["q"]), tuple(row["t_m"]))
-                found.setdefault(str(row["camera"]), []).append((int(row["ns"]), pose))
-            except (ValueError, KeyError, TypeError):
-                if number == len(lines):
-                    break  # a killed run leaves a partial line
-                raise ExportError(f"{path}: line {number} is not a pose") from None
-        return found
-    for number, view in enumerate(source.views):
-        try:
-            pose = Pose.from_matrix(view.camera_to_world)
-        except GeometryError as error:
-            raise ExportError(f"camera {view.camera}: {error}") from None
-        # A recorded data set has no time: space its views by one second.
-        found[view.camera] = [(view.generated_ns or number * 10**9, pose)]
-    return found
 
 
 def write_images(folder: Path, shots: list[PosedImage]) -> None:

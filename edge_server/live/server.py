@@ -181,7 +181,6 @@ class EdgeServer:
             frontier=self.frontier,
             field_name=config.field,
             chosen=described(scenario, config, self._moving),
-            decision=lambda: self.updater.policy.last_decision,
         )
         log.info("%s", self.state.chosen)
         write_json(options.out / "frontier.json", msgspec.to_builtins(self.frontier))
@@ -266,7 +265,6 @@ class EdgeServer:
         self.state.publish(publication, renderer)
         self.journal.published(publication)
         self._decision_log.record(self.updater.policy, publication.number)
-        self.journal.poses(views)
         if self.recorder is not None:
             self.recorder.published(publication)
         self.scoring.published(publication, renderer, views)

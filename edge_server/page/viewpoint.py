@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edge_server.fields.common.scene_box import converging_point
 from freshfield.geometry import Pinhole, look_at, quaternion_to_matrix
 
 Array = NDArray[np.float64]
@@ -23,9 +24,8 @@ MARGIN = 0.95
 DISTANCES = np.linspace(1.3, 2.2, 37)
 # A shorter mean of unit vectors has no meaning: cameras surround the scene, or roll freely.
 _SCATTERED = 0.25
-# Axes are parallel if the mean of I - d d^T has a smaller eigenvalue (about 3 degrees apart).
-_PARALLEL = 1e-3
-# The same for x axes of cameras that face nearly the same way (about 10 degrees to either side).
+# x axes of cameras that face nearly the same way (about 10 degrees to either side): smallest second eigenvalue of
+# the mean of d d^T that spans a plane.
 _FAN = 0.03
 
 
@@ -58,19 +58,6 @@ def world_up(poses: Array) -> Array:
     return mean / np.linalg.norm(mean)
 
 
-def convergence_point(poses: Array) -> Array | None:
-    """Point (3,) nearest to all optical axes in the least-squares sense. None if the axes do not meet in
-    front of most cameras (parallel, diverging, or a single one)."""
-    eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    mean = across.mean(axis=0)
-    if len(poses) < 2 or np.linalg.eigvalsh(mean)[0] < _PARALLEL:
-        return None
-    point = np.linalg.solve(mean, np.einsum("nij,nj->i", across, eyes) / len(poses))
-    ahead = np.einsum("ni,ni->n", point - eyes, axes)
-    return point if np.median(ahead) > 0 else None
-
-
 def initial_viewpoint(poses: ArrayLike, center: ArrayLike | None = None) -> Viewpoint:
     """A viewpoint behind and above the cameras, looking at what they look at.
 
@@ -80,7 +67,7 @@ def initial_viewpoint(poses: ArrayLike, center: ArrayLike | None = None) -> View
     poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
     eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
     up = world_up(poses)
-    meeting = convergence_point(poses)
+    meeting = converging_point(eyes, axes)
     center = center if meeting is None else meeting
     if center is None:
         spread = float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).mean())

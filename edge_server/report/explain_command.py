@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from edge_server.report.style import BLUE, GRAY, VERMILION, figure
 from edge_server.scheduler.learned.decision_record import RecordedDecision, read_decision
 from edge_server.scheduler.learned.explain import EmbedImages, Explanation, explain, occlusion_map
-from freshfield.files import out_file, write_json
 
 DESCRIPTION = """\
 Explain a decision of a learned policy (bandit:FILE): shares of the state's parts, cameras and image regions.
@@ -42,7 +41,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--camera", metavar="NAME", help="camera whose image regions to explain [that with the largest share]"
     )
-    parser.add_argument("--json", type=out_file, metavar="FILE", help="also write the figures to FILE as JSON")
     args = parser.parse_args(argv)
     try:
         found = read_decision(args.run, args.decision)
@@ -52,8 +50,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         regions = None if camera is None else _regions(found, camera, asked=args.camera is not None)
         picture = args.run / f"decision-{decision.number:06d}.png"
         draw(explanation, picture, camera, found.images.get(camera or ""), regions)
-        if args.json is not None:
-            write_json(args.json, _as_json(found, explanation, camera, regions), indent=1)
     except ValueError as error:
         print(f"edge-server explain: {error}", file=sys.stderr)
         return 2
@@ -119,7 +115,7 @@ def as_text(found: RecordedDecision, e: Explanation, camera: str | None, regions
         row, column = np.unravel_index(int(np.abs(regions).argmax()), regions.shape)
         lines.append(
             f"in the picture of {camera} most by the region in row {row + 1}, column {column + 1} of "
-            f"{regions.shape[0]} x {regions.shape[1]}: {regions[row, column]:+.3f}"
+            f"{regions.shape[0]} x {regions.shape[1]}: {regions[row, column]:+.3g}"
         )
     return "\n".join(lines)
 
@@ -156,20 +152,3 @@ def _bars(axes: Any, names: list[str], shares: NDArray, errors: NDArray | None, 
     axes.axvline(0.0, color=GRAY, linewidth=0.8)
     axes.set_title(title)
     axes.set_xlabel("for (+), against (-)")
-
-
-def _as_json(
-    found: RecordedDecision, e: Explanation, camera: str | None, regions: NDArray[np.float64] | None
-) -> dict[str, Any]:
-    return {
-        "decision": found.decision.number,
-        "action": e.action,
-        "probability": float(np.exp(found.decision.logp)),
-        "logit": e.logit,
-        "logit_of_average_cameras": e.baseline_logit,
-        "parts": e.parts,
-        "cameras": dict(zip(e.names, e.cameras.tolist())),
-        "cameras_standard_error": dict(zip(e.names, e.cameras_error.tolist())),
-        "picture_of": camera,
-        "regions": None if regions is None else regions.tolist(),
-    }

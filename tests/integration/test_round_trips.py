@@ -11,7 +11,6 @@ from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.export import PosedImage
 from edge_server.export.colmap import Cloud, write_model
 from edge_server.export.run_source import write_images
-from edge_server.export.trajectory import write_tum
 from edge_server.export.transforms import write_transforms
 from freshfield.geometry import Pinhole, Pose, se3_inverse
 from tests.camera_node.sources.datasets import sets
@@ -71,7 +70,9 @@ def test_the_sets_own_split_can_be_held_out(tmp_path):
 
 def test_trajectories_are_read_to_the_nanosecond(tmp_path):
     poses = [Pose.from_matrix(c.camera_to_world) for c in sets.rig(3)]
-    write_tum(tmp_path / "path.tum", [(1_000_000_000 * k + 123, pose) for k, pose in enumerate(poses)])
+    rows = [(*pose.translation_m, *np.roll(pose.quaternion, -1)) for pose in poses]  # its quaternions are w-last
+    lines = [f"{k}.000000123 {' '.join(repr(float(v)) for v in row)}" for k, row in enumerate(rows)]
+    (tmp_path / "path.tum").write_text("\n".join(lines))
     track = read_tum(tmp_path / "path.tum", False, 0)
     for k, pose in enumerate(poses):
         found, gap_ns = track.at(1_000_000_000 * k + 123)

@@ -1,10 +1,9 @@
-"""The files of a run, written as it goes: edge.json, series.jsonl, shown.jsonl, ages.jsonl, poses.jsonl.
+"""The files of a run, written as it goes: edge.json, series.jsonl, shown.jsonl, ages.jsonl.
 
 edge.json is replaced about twice a second (live tables read it). series.jsonl gets a line for each
 publication once its scores are final; publications without scores get at most one line per LINE_EVERY_S.
 shown.jsonl gets a line for each instant at which what was shown is scored. ages.jsonl samples every camera's
-age at a fixed rate, so that its mean is a time average. poses.jsonl gets a line for each training view whose
-pose differs from its camera's last one: cameras that stand still leave one line each.
+age at a fixed rate, so that its mean is a time average.
 """
 
 from __future__ import annotations
@@ -14,20 +13,16 @@ import json
 import logging
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from msgspec.structs import asdict
-from numpy.typing import NDArray
 
 from edge_server.fidelity.scorer import SHOWN, Score
-from edge_server.fields import View
 from edge_server.live.state import Publication
 from edge_server.run_records import AgeParts, AgesRow, ShownRow
 from freshfield.files import Lines, write_json
-from freshfield.geometry import Pose
 
 log = logging.getLogger(__name__)
 
@@ -35,8 +30,6 @@ log = logging.getLogger(__name__)
 _FINAL_AFTER = 32  # more than a second of updates at arrivals
 LINE_EVERY_S = 0.08  # on average: there may be fifty publications a second
 _INTERVAL_SHARE = 0.01  # weight of the newest interval in the running mean
-# Some 100 MB: days of an arm that never rests.
-_MOST_POSES = 500_000
 
 
 class Journal:
@@ -53,12 +46,10 @@ class Journal:
         self._status = status
         self._open: OrderedDict[int, Publication] = OrderedDict()
         self._lock = threading.Lock()
-        self._files = {name: Lines(out / f"{name}.jsonl") for name in ("series", "shown", "ages", "poses")}
+        self._files = {name: Lines(out / f"{name}.jsonl") for name in ("series", "shown", "ages")}
         self._last_s: float | None = None  # instant of the last publication
         self._usual_s: float | None = None  # usual time from one publication to the next
         self._without_line = 0  # publications since the last line of the series
-        self._last_pose: dict[str, NDArray[np.floating]] = {}
-        self._poses_left = _MOST_POSES
         self._status_failed = False
 
     @property
@@ -102,18 +93,6 @@ class Journal:
     def ages(self, t_s: float, ages_ms: Mapping[str, float | None]) -> None:
         line = AgesRow(round(t_s, 4), {c: a if a is None else round(a, 3) for c, a in ages_ms.items()})
         self._files["ages"].write(json.dumps(line, default=asdict))
-
-    def poses(self, views: Sequence[View]) -> None:
-        """Write the poses of those views whose cameras have moved."""
-        for view in views:
-            matrix = view.camera_to_world
-            if np.array_equal(self._last_pose.get(view.camera, ()), matrix) or not self._poses_left:
-                continue
-            self._last_pose[view.camera] = matrix
-            self._poses_left -= 1
-            pose = Pose.from_matrix(matrix)
-            line = {"camera": view.camera, "ns": view.generated_ns, "q": pose.quaternion, "t_m": pose.translation_m}
-            self._files["poses"].write(json.dumps(line))
 
     def write_status(self) -> None:
         """Replace edge.json; where that fails, the old one stays."""

@@ -8,12 +8,12 @@ from __future__ import annotations
 import dataclasses
 import logging
 import threading
-import types
-import typing
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from edge_server.live.state import Publication
 from freshfield.session import DECISIONS, SCORES
@@ -49,7 +49,7 @@ class Recorder:
         self._closing = False
         self._failed = False
         self._changed = threading.Condition()
-        self._schema = schema_of(Publication)
+        self._schema = msgspec.json.schema_components([Publication])[1][Publication.__name__]
         self._thread = threading.Thread(target=self._main, name="recorder", daemon=True)
         self._thread.start()
 
@@ -132,20 +132,3 @@ def _free_name(path: Path) -> Path:
         free = path.with_name(f"{path.stem}-{number}{path.suffix}")
         number += 1
     return free
-
-
-_JSON_TYPES = {int: "integer", float: "number", str: "string", bool: "boolean", type(None): "null"}
-
-
-def schema_of(model: type) -> dict[str, Any]:
-    """JSON schema of a dataclass whose fields are numbers, text and tuples of them."""
-    hints = typing.get_type_hints(model)
-    return {"type": "object", "properties": {name: _json_type(hint) for name, hint in hints.items()}}
-
-
-def _json_type(hint: Any) -> dict[str, Any]:
-    if typing.get_origin(hint) is tuple:
-        return {"type": "array", "items": _json_type(typing.get_args(hint)[0])}
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return {"type": [_JSON_TYPES[part] for part in typing.get_args(hint)]}
-    return {"type": _JSON_TYPES[hint]}

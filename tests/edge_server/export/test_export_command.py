@@ -13,10 +13,9 @@ import pytest
 from edge_server.cli import main as edge_server
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.export import ExportError
-from edge_server.export.run_source import open_source, poses_of
+from edge_server.export.run_source import open_source
 from edge_server.fields import Budget, checkpoint
 from edge_server.fields.registry import make_field
-from freshfield.geometry import Pose, look_at
 
 OPTIONS = {"splat": {"gaussians": 512, "start": 256, "seed_cells": 16}}
 SMALL = {"rays": 512, "batch_samples": 4096, "samples": 48}
@@ -56,8 +55,6 @@ def test_everything_at_once(run, tmp_path, capsys):
         tmp_path / "colmap",
         "--transforms",
         tmp_path / "nerf",
-        "--trajectory",
-        tmp_path / "t.tum",
         "--voxel",
         10,
         "--count",
@@ -65,11 +62,10 @@ def test_everything_at_once(run, tmp_path, capsys):
     )
     said = capsys.readouterr().out
     assert status == 0, said
-    for name in ("m.ply", "s.ply", "p.ply", "colmap/sparse/0/images.txt", "nerf/transforms.json", "t.tum"):
+    for name in ("m.ply", "s.ply", "p.ply", "colmap/sparse/0/images.txt", "nerf/transforms.json"):
         assert (tmp_path / name).stat().st_size > 100, name
     assert len(list((tmp_path / "colmap" / "images").glob("*.png"))) == 8
     assert "8 cameras" in said and "triangles" in said and "sharpen" in said
-    assert len((tmp_path / "t.tum").read_text().splitlines()) == 1 + 8  # a rig that stands still: one file
 
 
 def test_a_mesh_of_a_known_scene_is_measured_against_it(run, tmp_path, capsys):
@@ -100,38 +96,6 @@ def test_a_field_comes_back_as_it_was(tmp_path, name):
     before, after = (f.render(view.camera_to_world, view.intrinsics) for f in (field, source.field))
     np.testing.assert_array_equal(before.color, after.color)
     np.testing.assert_array_equal(before.depth, after.depth)
-
-
-def test_a_camera_that_moved_has_its_whole_way(run, tmp_path, capsys):
-    folder = tmp_path / "moved"
-    folder.mkdir()
-    (folder / "field.npz").write_bytes((run / "field.npz").read_bytes())
-    poses = [Pose.from_matrix(look_at((0.3, 0.1 * k, 0.4), (0, 0, 0))) for k in range(4)]
-    rows = [("arm", 10**9 + k, pose) for k, pose in enumerate(poses)] + [("still", 5, poses[0])]
-    (folder / "poses.jsonl").write_text(
-        "\n".join(json.dumps({"camera": c, "ns": t, "q": p.quaternion, "t_m": p.translation_m}) for c, t, p in rows)
-        + '\n{"camera": "ar'
-    )
-    assert poses_of(open_source(folder))["arm"] == [(10**9 + k, pose) for k, pose in enumerate(poses)]
-    assert export(folder, "--trajectory", tmp_path / "arm.tum") == 0
-    assert "4 poses of arm" in capsys.readouterr().out
-
-
-def test_a_run_writes_down_where_its_cameras_were(tmp_path):
-    from edge_server.fields import View
-    from edge_server.live.output.journal import Journal
-    from freshfield.geometry import Pinhole
-
-    lens, picture = Pinhole.from_fov(8, 8, 50), np.zeros((8, 8, 3), np.uint8)
-    places = [(0.3, 0.0, 0.4), (0.3, 0.0, 0.4), (0.3, 0.1, 0.4)]
-    journal = Journal(tmp_path, dict)
-    for k, place in enumerate(places):
-        views = [View("arm", picture, look_at(place, (0, 0, 0)), lens, k), View("wall", picture, np.eye(4), lens, k)]
-        journal.poses(views)
-    journal.close()
-    rows = [json.loads(line) for line in (tmp_path / "poses.jsonl").read_text().splitlines()]
-    assert [(row["camera"], row["ns"]) for row in rows] == [("arm", 0), ("wall", 0), ("arm", 2)]
-    np.testing.assert_allclose(rows[2]["t_m"], places[2])
 
 
 @pytest.mark.parametrize(

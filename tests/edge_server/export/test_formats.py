@@ -10,17 +10,16 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.scenes.recorded import load_recorded
-from edge_server.export import ExportError, PosedImage, file_names, glb, ply
+from edge_server.export import PosedImage, file_names, glb, ply
 from edge_server.export.colmap import Cloud, write_model
 from edge_server.export.point_cloud import sparse_points
 from edge_server.export.run_source import write_images
 from edge_server.export.splats import Y0, write_splats
-from edge_server.export.trajectory import write_tum
 from edge_server.export.transforms import write_transforms
 from edge_server.fields.common.kernels.volume_rendering import harmonic
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.kernels.project import Gaussians
-from freshfield.geometry import Pose, quaternion_to_matrix, se3_inverse
+from freshfield.geometry import quaternion_to_matrix, se3_inverse
 from tests.edge_server.surface.ball import DISTORTED_LENS, LENS, ball_maps
 
 RNG = np.random.default_rng(5)
@@ -105,19 +104,6 @@ def test_transparent_pictures_stay_transparent(tmp_path):
     write_images(tmp_path, [PosedImage("a", picture, np.eye(4), LENS)])
     back = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(cv2.cvtColor(back, cv2.COLOR_BGRA2RGBA), picture)
-
-
-def test_trajectories_keep_nanoseconds(tmp_path):
-    poses = [(1_763_000_000_123_456_789 + k, Pose.from_matrix(s.camera_to_world)) for k, s in enumerate(shots())]
-    assert write_tum(tmp_path / "path.tum", reversed(poses)) == 4
-    rows = [line.split() for line in (tmp_path / "path.tum").read_text().splitlines()[1:]]
-    for row, (t_ns, pose) in zip(rows, poses):
-        seconds, _, rest = row[0].partition(".")
-        assert int(seconds) * 10**9 + int(rest) == t_ns
-        assert tuple(map(float, row[1:4])) == pose.translation_m
-        assert (float(row[7]), *map(float, row[4:7])) == pose.quaternion  # theirs is w-last
-    with pytest.raises(ExportError, match="no pose"):
-        write_tum(tmp_path / "none.tum", [])
 
 
 @pytest.mark.parametrize("harmonics", [1, 4, 9])

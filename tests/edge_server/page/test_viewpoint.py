@@ -7,14 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_server.page.viewpoint import (
-    VERTICAL_FOV_RAD,
-    convergence_point,
-    initial_viewpoint,
-    row_band,
-    visitor_camera,
-    world_up,
-)
+from edge_server.page.viewpoint import VERTICAL_FOV_RAD, initial_viewpoint, row_band, visitor_camera, world_up
 from freshfield.geometry import look_at, matrix_to_quaternion, quaternion_to_matrix, se3_inverse
 from tests.edge_server.page.preview import BallScene
 
@@ -29,21 +22,6 @@ def rig(count: int, spread_deg: float, elevation_deg: float = 20.0, radius_m: fl
         out = np.array([np.cos(azimuth) * np.cos(e), np.sin(azimuth) * np.cos(e), np.sin(e)])
         poses.append(look_at(TARGET + radius_m * out, TARGET))
     return np.stack(poses)
-
-
-def test_axes_meet_where_the_cameras_look():
-    assert np.allclose(convergence_point(rig(7, 120)), TARGET, atol=1e-9)
-
-
-def test_parallel_diverging_and_single_cameras_meet_nowhere():
-    parallel = np.stack([np.eye(4)] * 5)
-    parallel[:, 0, 3] = np.arange(5)
-    assert convergence_point(parallel) is None
-    assert convergence_point(rig(1, 0)) is None
-    outward = rig(6, 90)
-    outward[:, :3, 0] *= -1  # turned half about their y axis: they look away from the center
-    outward[:, :3, 2] *= -1
-    assert convergence_point(outward) is None
 
 
 @pytest.mark.parametrize("elevation_deg", [0, 35, 70])
