@@ -11,8 +11,7 @@ from queue import Empty, Queue
 
 from edge_server.fields import Budget, FitReport, Snapshot, View
 from edge_server.live.field_updater import FieldUpdater, Selection
-from edge_server.live.state import Publication
-from edge_server.scheduler import Policy
+from edge_server.live.state import Controls, Publication
 from freshfield.clock import Clock
 
 log = logging.getLogger(__name__)
@@ -32,14 +31,15 @@ class UpdateLoop:
     on_published(publication, renderer, views): called after each update, on the loop's thread.
     on_status(line): says what the loop is doing.
     on_checkpoint(path): writes the field, between two updates.
+    controls: what operators change; it takes effect with the next decision.
     update_ms: fitting time of an update, however long the rest of it takes.
-    Other threads may change the policy, pause, or reset: it takes effect with the next decision.
     """
 
     def __init__(
         self,
         updater: FieldUpdater,
         clock: Clock,
+        controls: Controls,
         update_ms: float,
         grace_ms: float,
         on_published: Callable[[Publication, Snapshot, list[View]], None],
@@ -48,6 +48,7 @@ class UpdateLoop:
     ) -> None:
         self._updater = updater
         self._clock = clock
+        self._controls = controls
         self.update_ms = update_ms
         self._grace_ns = round(grace_ms * 1e6)
         self._on_published = on_published
@@ -55,12 +56,8 @@ class UpdateLoop:
         self._on_checkpoint = on_checkpoint
         self._checkpoints: Queue[tuple[Path, Future[Path]]] = Queue()
         self._stop = threading.Event()
-        self._lock = threading.Lock()
-        self._next_policy: Policy | None = None
-        self._reset = False
         self._without_steps = 0  # updates in a row
         self._warned_of = (0, 0, clock.now_ns() / 1e9)  # frames shed and arrived, and when
-        self.paused = False
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._main, name="loop", daemon=True)
 
@@ -78,13 +75,9 @@ class UpdateLoop:
     def alive(self) -> bool:
         return self._thread.is_alive()
 
-    def use_policy(self, policy: Policy) -> None:
-        with self._lock:
-            self._next_policy = policy
-
-    def request_reset(self) -> None:
-        with self._lock:
-            self._reset = True
+    @property
+    def _policy_changed(self) -> bool:
+        return self._controls.chosen not in (None, self._updater.policy)
 
     def request_checkpoint(self, path: Path) -> Future[Path]:
         """Ask for a checkpoint at ``path``, written between two updates. The future returns the path, or
@@ -120,7 +113,7 @@ class UpdateLoop:
 
     def _update_once(self) -> None:
         self._apply_controls()
-        if self.paused:
+        if self._controls.paused:
             self._on_status("paused")
             self._stop.wait(_MAX_SLEEP_S)
             return
@@ -141,12 +134,10 @@ class UpdateLoop:
         self._on_published(publication, renderer, views)
 
     def _apply_controls(self) -> None:
-        with self._lock:
-            policy, self._next_policy = self._next_policy, None
-            reset, self._reset = self._reset, False
-        if policy is not None:
-            self._updater.policy = policy
-        if reset:
+        if self._policy_changed:
+            self._updater.policy = self._controls.chosen  # type: ignore[assignment]
+        if self._controls.reset_requested:
+            self._controls.reset_requested = False
             self._updater.reset()
             log.info("the field was reset")
         self._write_checkpoints()
@@ -201,8 +192,8 @@ class UpdateLoop:
             selection = self._updater.select(plan, now_ns, budget)
             if selection is not None:
                 return selection
-            asked = self._reset or self._next_policy or not self._checkpoints.empty()
-            if self.paused or asked:
+            changed = self._controls.paused or self._controls.reset_requested or self._policy_changed
+            if changed or not self._checkpoints.empty():
                 return None
             left_s = (plan.wait_until_ns - now_ns) / 1e9
             if left_s > 0:

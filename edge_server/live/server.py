@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -35,6 +34,7 @@ from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.output.journal import Journal
 from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Snapshot
+from edge_server.run_records import UpdateCounts
 from edge_server.scheduler import LivePolicies, short_name
 from edge_server.settings import EdgeConfig, described, embedding_for, read_config
 from freshfield.clock import Clock, WallClock
@@ -107,8 +107,7 @@ class EdgeServer:
         self.start_ns = self.clock.now_ns()
         self._stopping = threading.Event()
         self._update_ms = RollingPercentiles(_UPDATE_TIMES)
-        self._first_ms: float | None = None
-        self._without_step, self._refused = 0, Counter[str]()
+        self._counts = UpdateCounts()
         self._snapshot_lock = threading.Lock()
         options.out.mkdir(parents=True, exist_ok=True)
 
@@ -159,9 +158,11 @@ class EdgeServer:
             scenario.max_side_px,
         )
         self._decision_log = DecisionLog(options.out, embedding_for(config, policy))
+        controls = Controls(policy.name, policy.value)
         self.loop = UpdateLoop(
             self.updater,
             self.clock,
+            controls,
             config.update_ms,
             config.grace_ms,
             self._published,
@@ -171,7 +172,7 @@ class EdgeServer:
         self.state = EdgeState(
             scenario=scenario.name,
             policies=self.policies.offered,
-            controls=Controls(policy.name, policy.value),
+            controls=controls,
             cameras=self._cameras,
             start_ns=self.start_ns,
             now_ns=self.clock.now_ns,
@@ -235,7 +236,7 @@ class EdgeServer:
         self._stopping.set()
 
     def _watch(self) -> None:
-        """Write status and ages, pass the operator's controls to the loop, and notice if it ends."""
+        """Write status and ages, and notice if the loop ends."""
         ticks, every = 0, round(_STATUS_PERIOD_S / _AGES_PERIOD_S)
         saved_ns = self.clock.now_ns()
         while not self._stopping.wait(_AGES_PERIOD_S) and self.loop.alive:
@@ -244,11 +245,6 @@ class EdgeServer:
             if ticks % every == 0:
                 self.journal.write_status()
             ticks += 1
-            controls = self.state.controls
-            self.loop.paused = controls.paused
-            if controls.reset_requested:
-                controls.reset_requested = False
-                self.loop.request_reset()
             every_s = self.options.checkpoint_s
             if every_s is not None and now_ns - saved_ns > every_s * 1e9:
                 saved_ns = now_ns
@@ -257,11 +253,13 @@ class EdgeServer:
     # --- callbacks -------------------------------------------------------------------------
 
     def _published(self, publication: Publication, renderer: Snapshot, views: list[View]) -> None:
-        if self._first_ms is None:
-            self._first_ms = publication.t_s * 1e3
+        counts = self._counts
+        if counts.first_ms is None:
+            counts.first_ms = publication.t_s * 1e3
         self._update_ms.add(publication.update_ms)
-        self._without_step += publication.steps == 0
-        self._refused.update(publication.refused)
+        counts.without_step += publication.steps == 0
+        for camera in publication.refused:
+            counts.refused[camera] = counts.refused.get(camera, 0) + 1
         self.state.publish(publication, renderer)
         self.journal.published(publication)
         self._decision_log.record(self.updater.policy, publication.number)
@@ -285,8 +283,8 @@ class EdgeServer:
     def _set_policy(self, name: str, value: float | None) -> None:
         policy = self.policies.make(name, value)
         self.updater.check(policy)
-        self.state.controls.policy, self.state.controls.value = policy.name, policy.value
-        self.loop.use_policy(policy)
+        controls = self.state.controls
+        controls.policy, controls.value, controls.chosen = policy.name, policy.value, policy
 
     def _make_field(self, config: EdgeConfig) -> Field:
         return make_field(config.field, {"nice": SERVER_NICE, **config.field_options}, seed=self.scenario.seed)
@@ -361,16 +359,16 @@ class EdgeServer:
             "decisions_lost": self._decision_log.lost,
             "stale_on_arrival": self.buffer.stale_on_arrival,
             "check_ms": {f"p{p}": self.ingest.check_ms.percentile(p) for p in (50, 99)},
-            "updates": {
-                "count": self.updater.number,
-                "ms_p50": self._update_ms.percentile(50),
-                "ms_p95": self._update_ms.percentile(95),
-                "first_ms": self._first_ms,
-                "undecodable": self.updater.decoder.undecodable + self.scoring.undecodable,
-                "shed": self.buffer.shed,
-                "without_step": self._without_step,
-                "refused": dict(self._refused),
-            },
+            "updates": msgspec.to_builtins(
+                msgspec.structs.replace(
+                    self._counts,
+                    count=self.updater.number,
+                    ms_p50=self._update_ms.percentile(50),
+                    ms_p95=self._update_ms.percentile(95),
+                    undecodable=self.updater.decoder.undecodable + self.scoring.undecodable,
+                    shed=self.buffer.shed,
+                )
+            ),
             "foreground": None if (cut := self.updater.decoder.foreground) is None else cut.status(),
             "baseline": msgspec.to_builtins(self.scoring.baselines.mean),
             "lpips_missing": self.lpips_missing,

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from edge_server.fidelity.scorer import SELECTED, Score
 from edge_server.fields import Snapshot
 from edge_server.run_records import Frontier
+from edge_server.scheduler import Policy
 from freshfield.frame import Frame
 
 SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages
@@ -105,12 +106,14 @@ class Comparison:
 
 @dataclass
 class Controls:
-    """What an operator may change during a run; the server passes it on to the update loop."""
+    """What an operator may change during a run; the update loop follows. policy, value: of the policy in force, by
+    name. chosen: the policy to change to; None: none was chosen."""
 
     policy: str
     value: float | None
     paused: bool = False
     reset_requested: bool = False
+    chosen: Policy | None = None
 
 
 @dataclass

@@ -12,6 +12,7 @@ from edge_server.fields import Budget
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.loop import UpdateLoop
+from edge_server.live.state import Controls
 from edge_server.scheduler import make_policy
 from freshfield.clock import WallClock
 from tests.edge_server.fields_for_tests import tiny_field
@@ -134,9 +135,11 @@ class Running:
     def __init__(self, u: FieldUpdater, grace_ms: float = 0.0) -> None:
         self.published, self.lines, self.saved = [], [], []
         self.clock = WallClock()
+        self.controls = Controls(u.policy.name, u.policy.value)
         self.loop = UpdateLoop(
             u,
             self.clock,
+            self.controls,
             100.0,
             grace_ms,
             lambda p, r, v: self.published.append((p, r)),
@@ -179,19 +182,19 @@ def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(running, tm
     shown = renderer.render(np.eye(4), frame().intrinsics)
     assert np.isfinite(shown.color).all()
 
-    run.loop.paused = True
+    run.controls.paused = True
     run.until(lambda: run.lines[-1] == "paused")
     count = len(run.published)
     time.sleep(0.4)
     assert len(run.published) == count
-    run.loop.use_policy(make_policy("threshold", 0.0, np.random.default_rng(0)))
-    run.loop.request_reset()
+    run.controls.chosen = make_policy("threshold", 0.0, np.random.default_rng(0))
+    run.controls.reset_requested = True
     future = run.loop.request_checkpoint(tmp_path / "field.npz")
-    run.loop.paused = False
+    run.controls.paused = False
     assert future.result(30) == tmp_path / "field.npz"
     assert run.saved == [tmp_path / "field.npz"]
     run.until(lambda: len(run.published) > count)
-    assert run.published[-1][0].omega_ms == 0.0
+    assert run.published[-1][0].omega_ms == 0.0 and not run.controls.reset_requested
 
 
 def test_an_update_without_time_to_learn_is_warned_of_once_and_again_if_it_comes_back(running, caplog):
