@@ -11,7 +11,7 @@ from pathlib import Path
 
 from camera_node.capture_schedule import CaptureSchedule, RateSchedule, ScheduledSource
 from camera_node.clocks import ClockError, NodeClock
-from camera_node.settings import SourceConfig
+from camera_node.settings import LiveConfig, SourceConfig
 from camera_node.sources.base import Shot, Source
 from camera_node.sources.registry import open_sources
 from camera_node.sources.with_effects import camera_effects
@@ -48,6 +48,8 @@ class ShotCache:
 class Camera:
     """A source, with compression by the scenario's codec and the process's cache.
 
+    waits: whether a capture may wait for hardware.
+
     config: gives codec and quality. cache: shared by the process's cameras.
     clock_error: makes the camera's clock wrong; None: it is right.
     """
@@ -60,6 +62,9 @@ class Camera:
         self.source = source
         # Replayed frames are compressed already.
         self.codec = source.codec if isinstance(source, ScheduledSource) else config.codec
+        # A camera that waits for a device or an arm must not keep others waiting.
+        arm = getattr(config, "arm", None)
+        self.waits = isinstance(config, LiveConfig) or (arm is not None and source.camera in arm.cameras)
         self._quality = config.quality
         self._cache = cache
         self._clock_error = clock_error

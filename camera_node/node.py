@@ -20,7 +20,7 @@ from camera_node.capture import Camera, prepare
 from camera_node.clock_offset import ClockSync
 from camera_node.clocks import NodeClock
 from camera_node.outbox import Outbox
-from camera_node.sender import Sender
+from camera_node.sender import TAKEN, Sender
 from camera_node.sources.base import Shot
 from freshfield.clock import Clock, WallClock
 from freshfield.files import write_json
@@ -78,7 +78,11 @@ class Node:
         self._trouble: dict[str, Counter[str]] = {c.name: Counter() for c in cameras}
         self._syncs: dict[str, ClockSync] = {}
         self._stopping = asyncio.Event()
+        # What computes shares a thread; each camera that waits has one of its own, so that dead ones cost only theirs.
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="capture")
+        self._own_pools = {
+            c.name: ThreadPoolExecutor(1, thread_name_prefix=f"capture {c.name}") for c in cameras if c.waits
+        }
 
     def stop(self) -> None:
         """Ask ``run`` to end. May be called from the loop's signal handlers, and more than once."""
@@ -108,7 +112,8 @@ class Node:
             await self._work()
         finally:
             self._stopping.set()  # the pool's work checks this
-            self._pool.shutdown(wait=False, cancel_futures=True)
+            for pool in (self._pool, *self._own_pools.values()):
+                pool.shutdown(wait=False, cancel_futures=True)
             await channel.close()
             self._enter("stopped")
             for outbox in self.outboxes.values():
@@ -169,6 +174,7 @@ class Node:
         """Capture with one camera, each time its schedule is due in true time."""
         loop = asyncio.get_running_loop()
         outbox, trouble = self.outboxes[camera.name], self._trouble[camera.name]
+        pool = self._own_pools.get(camera.name, self._pool)
         schedule = camera.schedule(start_ns)
         tick: int | None = schedule.first(self._clock.now_ns())
         sequence = 0
@@ -178,7 +184,7 @@ class Node:
             try:
                 shot = camera.cached(tick)
                 if shot is None:
-                    shot = await loop.run_in_executor(self._pool, camera.capture, tick)
+                    shot = await loop.run_in_executor(pool, camera.capture, tick)
             except (ValueError, OSError) as error:  # OSError: a photo that is gone
                 self._failed(camera.name, error)
             else:
@@ -220,6 +226,20 @@ class Node:
                     await asyncio.sleep(0.01)
         except TimeoutError:
             pass  # those frames are recorded as broken
+
+    def failure(self) -> str | None:
+        """After ``run``: why no frame was taken; None if one was, or there was no time for any."""
+        counts = sum((outbox.counts for outbox in self.outboxes.values()), Counter())
+        failed = sum(trouble["failed"] for trouble in self._trouble.values())
+        if not counts["captured"]:
+            return f"no frame could be captured ({failed} tries)" if failed else None
+        if not any(sender.connections for sender in self.senders.values()):
+            why = next((sender.trouble for sender in self.senders.values() if sender.trouble), "no connection in time")
+            return f"{self._options.to} was never reached: {why}"
+        refused = {name: n for name, n in counts.items() if name.startswith("rejected:")}
+        if refused and not any(counts[outcome] for outcome in TAKEN):
+            return f"all frames were refused: {', '.join(f'{name[9:]} {n}' for name, n in refused.items())}"
+        return None
 
     def _enter(self, phase: str) -> None:
         self.phase = phase

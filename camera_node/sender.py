@@ -43,6 +43,8 @@ _OUTCOMES = {
     pb.OUTCOME_DROPPED_BUSY: "dropped_busy",
     pb.OUTCOME_SUPERSEDED: "superseded",
 }
+TAKEN = tuple(_OUTCOMES.values())
+"""Outcomes of frames that were not refused."""
 
 
 class ProtocolError(RuntimeError):
@@ -180,9 +182,9 @@ class Sender:
         outcome = _OUTCOMES.get(response.outcome)
         if outcome is None:
             reason = response.reason if _REASON.fullmatch(response.reason) else "unspecified"
+            if reason not in self._reasons and len(self._reasons) >= MAX_REASONS:
+                reason = "other"
             if reason not in self._reasons:
-                if len(self._reasons) >= MAX_REASONS:
-                    reason = "other"
                 log.warning("%s: frame refused: %s (%s)", frame.camera, reason, peer_text(response.detail))
             self._reasons[reason] = self._reasons.get(reason, 0) + 1
             outcome = f"rejected:{reason}"

@@ -18,6 +18,7 @@ import subprocess
 import sys
 import threading
 import time
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,9 @@ PROBE_S = 2.0
 """Time for a controller to answer ``probe``."""
 STALE_S = 0.5
 """Default age at which a state counts as stale."""
+READER = (sys.executable, "-m", "camera_node.robot.arm.rtde_process")
+"""The process that reads joint states; host and frequency follow."""
+_LAST_WORDS_BYTES = 4096
 BACKOFF_S = (0.25, 0.5, 1.0, 2.0, 5.0)
 _ROBOT_MODES = {
     -1: "no controller",
@@ -197,16 +201,15 @@ class ArmStream:
 
     def _read(self) -> bool:
         """Read one connection until it ends. Returns whether it received anything."""
-        module = "camera_node.robot.arm.rtde_process"
         child = subprocess.Popen(
-            [sys.executable, "-m", module, self.host, str(self._frequency_hz)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            [*READER, self.host, str(self._frequency_hz)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
         self._child = child
         assert child.stdout is not None and child.stderr is not None
         received, patience_s = False, CONNECT_S
         clock, last_s, pending = ArrivalClock(), -1.0, b""
+        # What the library says is read as it comes: a pipe that is full would stop the process.
+        said = _LastWords(child.stderr)
         try:
             while not self._stop.is_set():
                 if not select.select([child.stdout], [], [], patience_s)[0]:
@@ -215,8 +218,7 @@ class ArmStream:
                 data = os.read(child.stdout.fileno(), 65536)
                 arrived_ns = self._clock.now_ns()
                 if not data:
-                    said = child.stderr.read().decode(errors="replace").strip().split("\n")[-1]
-                    self._set_trouble(said or f"arm at {self.host}: the connection was lost")
+                    self._set_trouble(said.last_line() or f"arm at {self.host}: the connection was lost")
                     return received
                 pending += data
                 whole = len(pending) - len(pending) % SAMPLE.size
@@ -235,6 +237,7 @@ class ArmStream:
         finally:
             self._end_child()
             child.stdout.close()
+            said.last_line()
             child.stderr.close()
 
     def _check_modes(self, mode: int, safety: int) -> None:
@@ -260,6 +263,24 @@ class ArmStream:
             with contextlib.suppress(ProcessLookupError):
                 child.kill()
             child.wait()
+
+
+class _LastWords:
+    """Reads a stream to its end in a thread, and keeps the end of it."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._stream, self._end = stream, b""
+        self._thread = threading.Thread(target=self._read, name="arm's messages", daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        while part := os.read(self._stream.fileno(), 65536):
+            self._end = (self._end + part)[-_LAST_WORDS_BYTES:]
+
+    def last_line(self) -> str:
+        """The last line, once the stream has ended."""
+        self._thread.join(1.0)
+        return self._end.decode(errors="replace").strip().split("\n")[-1]
 
 
 class FlangePoses:

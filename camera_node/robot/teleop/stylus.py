@@ -8,6 +8,8 @@ the datagrams. No stylus knows the arm; ``limits`` makes every sample safe for i
 from __future__ import annotations
 
 import contextlib
+import hmac
+import ipaddress
 import json
 import logging
 import math
@@ -18,6 +20,7 @@ import sys
 import termios
 import tty
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -25,6 +28,7 @@ from numpy.typing import NDArray
 
 from camera_node.robot.teleop import TeleopError
 from freshfield.geometry import matrix_to_quaternion, quaternion_multiply, quaternion_normalize, so3_exp
+from freshfield.untrusted import read_bytes
 
 log = logging.getLogger("camera-node.teleop")
 
@@ -57,6 +61,7 @@ _ESCAPE, _END_OF_FILE, _MAX_BYTES = "\x1b", "\x04", 32
 MAX_BYTES = 2048
 _MAX_MESSAGES = 64  # per poll, so that a flood does not delay the arm
 _OWNED_NS = 1_000_000_000
+_LEAST_KEY_BYTES, _MOST_KEY_BYTES = 16, 4096
 
 
 @dataclass(frozen=True)
@@ -162,13 +167,20 @@ class KeyboardStylus:
 class NetworkStylus:
     """Listens at ``host``:``port``; port 0 takes a free one, which ``port`` then tells. Raises TeleopError.
 
-    Only the first sender counts, until it has been silent for a second. Datagrams are neither authenticated nor
-    encrypted, so the default address is reachable from this machine alone.
+    Only the first sender counts, until it has been silent for a second. With a ``key`` messages must be signed with it,
+    and their times must grow, so that none can be sent again. Addresses that other machines reach need one: whoever
+    sends a datagram moves the arm.
     """
 
     ended = False
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, key: bytes | None = None) -> None:
+        if key is None and not _is_loopback(host):
+            raise TeleopError(
+                f"--stylus network: other machines reach {host}, and a message moves the arm: sign them with a key, "
+                "--stylus-key FILE"
+            )
+        self._key, self._newest_ns = key, -1
         self._owner: tuple[str, int] | None = None
         self._heard_ns = 0
         try:
@@ -192,9 +204,10 @@ class NetworkStylus:
                 break  # nothing there
             if self._owner is not None and sender[:2] != self._owner and now_ns - self._heard_ns < _OWNED_NS:
                 continue
-            sample = parse(data)
-            if sample is None:
+            sample = parse(data, self._key)
+            if sample is None or (self._key is not None and sample.t_ns <= self._newest_ns):
                 continue
+            self._newest_ns = sample.t_ns
             if self._owner != sender[:2]:
                 log.info("stylus: messages come from %s:%d", *sender[:2])
             self._owner, self._heard_ns = sender[:2], now_ns
@@ -205,10 +218,22 @@ class NetworkStylus:
         self._socket.close()
 
 
-def parse(data: bytes) -> StylusSample | None:
-    """Parse a message; None if it is malformed. Its numbers are checked later (``StylusSample.is_valid``)."""
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def parse(data: bytes, key: bytes | None = None) -> StylusSample | None:
+    """Parse a message; None if it is malformed, or not signed with ``key``. Its numbers are checked later
+    (``StylusSample.is_valid``)."""
     if len(data) > MAX_BYTES:
         return None
+    if key is not None:
+        data, _, signature = data.rpartition(b" ")
+        if not hmac.compare_digest(signature, _signature(data, key)):
+            return None
     try:
         message = json.loads(data)
         t_ns, clutch = message["t_ns"], message["clutch"]
@@ -222,15 +247,31 @@ def parse(data: bytes) -> StylusSample | None:
     return StylusSample(t_ns, position, quaternion, clutch)
 
 
-def encode(sample: StylusSample) -> bytes:
-    """The datagram of a sample, for senders in Python."""
+def encode(sample: StylusSample, key: bytes | None = None) -> bytes:
+    """The datagram of a sample, signed if there is a key, for senders in Python."""
     message = {"t_ns": sample.t_ns, "p": sample.position_m, "q": sample.quaternion, "clutch": sample.clutch}
-    return json.dumps(message).encode()
+    data = json.dumps(message).encode()
+    return data if key is None else data + b" " + _signature(data, key)
 
 
-def open_stylus(text: str) -> Stylus:
-    """Open a stylus by its name on the command line: ``keyboard``, ``network:PORT`` or
-    ``network:HOST:PORT``. Raises TeleopError."""
+def _signature(data: bytes, key: bytes) -> bytes:
+    return hmac.new(key, data, "sha256").hexdigest().encode()
+
+
+def read_key(file: Path) -> bytes:
+    """The key in a file, without white space around it. Raises TeleopError."""
+    try:
+        key = read_bytes(file, _MOST_KEY_BYTES).strip()
+    except OSError as error:
+        raise TeleopError(f"--stylus-key: {file}: cannot be read: {error.strerror}") from None
+    if len(key) < _LEAST_KEY_BYTES:
+        raise TeleopError(f"--stylus-key: {file}: expected at least {_LEAST_KEY_BYTES} characters, got {len(key)}")
+    return key
+
+
+def open_stylus(text: str, key_file: Path | None = None) -> Stylus:
+    """Open a stylus by its name on the command line: ``keyboard``, ``network:PORT`` or ``network:HOST:PORT``, whose
+    messages are signed with the key in ``key_file``. Raises TeleopError."""
     kind, _, rest = text.partition(":")
     if kind == "keyboard" and not rest:
         keyboard = KeyboardStylus()
@@ -240,7 +281,8 @@ def open_stylus(text: str) -> Stylus:
         host, _, port = rest.rpartition(":")
         if not port.isdigit() or not 0 < int(port) < 65536:
             raise TeleopError(f"--stylus: expected network:PORT or network:HOST:PORT, got {text!r}")
-        stylus = NetworkStylus(host.strip("[]") or "127.0.0.1", int(port))
+        key = None if key_file is None else read_key(key_file)
+        stylus = NetworkStylus(host.strip("[]") or "127.0.0.1", int(port), key)
         log.info("waiting for a stylus at UDP port %d", stylus.port)
         return stylus
     raise TeleopError(f"--stylus: expected keyboard or network:PORT, got {text!r}")

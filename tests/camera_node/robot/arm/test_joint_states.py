@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 import socket
+import sys
 import threading
 import time
 
@@ -13,6 +14,7 @@ import pytest
 
 from camera_node.clocks import ArrivalClock
 from camera_node.pose.providers import PoseGapError
+from camera_node.robot.arm import joint_states
 from camera_node.robot.arm.joint_states import ArmError, ArmStream, FlangePoses
 from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.flange_camera import TruthClient
@@ -155,3 +157,20 @@ def test_an_arm_that_cannot_move_says_why(mode, safety, says):
     stream = ArmStream("127.0.0.1", WallClock())
     stream._check_modes(mode, safety)
     assert says in stream.trouble and bool(stream.trouble) == bool(says)
+
+
+def test_a_library_that_talks_much_does_not_stop_the_joints(monkeypatch):
+    """More than a pipe holds before every sample, and its last line is the trouble."""
+    talk = f"""
+import os, sys
+sys.path[:0] = {sys.path!r}
+from camera_node.robot.arm.rtde_process import SAMPLE
+for k in range(20):
+    os.write(2, b"x" * 100_000 + b"\\n")
+    os.write(1, SAMPLE.pack(float(k), *range(6), 7, 1))
+os.write(2, b"gone for good\\n")
+"""
+    monkeypatch.setattr(joint_states, "READER", (sys.executable, "-c", talk))
+    stream = ArmStream("127.0.0.1", WallClock())
+    assert stream._read() and stream.received == 20
+    assert stream.trouble == "gone for good"

@@ -1,0 +1,137 @@
+"""A node as a whole: cameras that wait keep no other waiting, and its end says whether anything was taken."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+import subprocess
+import sys
+import threading
+import time
+from fractions import Fraction
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+
+from camera_node.capture import Camera, ShotCache
+from camera_node.cli import main
+from camera_node.node import Node, NodeOptions
+from camera_node.outbox import Outbox
+from camera_node.sender import Sender
+from camera_node.settings import CameraConfig
+from camera_node.sources.base import Shot, Source
+from freshfield.clock import VirtualClock
+from freshfield.frame import Frame
+from freshfield.geometry import Pinhole, Pose
+from freshfield.limits import MAX_REASONS
+from freshfield.scenario import load
+from freshfield.transport import Transport
+from freshfield.v1 import frames_pb2 as pb
+from tests.integration.peer import Answer, Peer, answer, silence
+
+POSE, LENS = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Pinhole.from_fov(8, 8, 60)
+NOBODY = "127.0.0.1:1"
+
+
+class Eye(Source):
+    """A camera that takes a black picture, after ``until`` is set."""
+
+    def __init__(self, camera: str, until: threading.Event | None = None) -> None:
+        self.camera, self.fps, self.intrinsics, self._until = camera, Fraction(50), LENS, until
+
+    def read(self, content: int) -> Shot:
+        if self._until is not None:
+            self._until.wait(10.0)
+            raise ValueError("the camera is gone")
+        return Shot(np.zeros((8, 8, 3), np.uint8), POSE, LENS)
+
+
+def node_of(sources: list[Source], to: str = NOBODY, seconds: float | None = None) -> Node:
+    cameras = [Camera(source, CameraConfig(kind="camera"), ShotCache(0)) for source in sources]
+    return Node(load("room"), cameras, NodeOptions(to=to, transport=Transport(), seconds=seconds))
+
+
+def test_cameras_that_wait_for_their_devices_keep_no_other_waiting():
+    gone = threading.Event()
+
+    async def run() -> int:
+        node = node_of([Eye("cam01", gone), Eye("cam02", gone), Eye("cam03")])
+        running = asyncio.ensure_future(node.run())
+        async with asyncio.timeout(8.0):
+            while not node.outboxes or node.outboxes["cam03"].counts["captured"] < 5:
+                await asyncio.sleep(0.01)
+        waiting = gone.is_set() + sum(node.outboxes[name].counts["captured"] for name in ("cam01", "cam02"))
+        gone.set()
+        node.stop()
+        await running
+        return waiting
+
+    assert asyncio.run(run()) == 0
+
+
+@pytest.mark.parametrize(
+    ("respond", "failure"),
+    [
+        (answer(), None),
+        (answer(pb.OUTCOME_DROPPED_BUSY), None),
+        (answer(pb.OUTCOME_REJECTED, "lens"), "all frames were refused: lens "),
+        (silence, None),
+    ],
+)
+def test_the_end_says_if_every_frame_was_refused(respond: Answer, failure: str | None):
+    async def run() -> str | None:
+        peer = await Peer(respond=respond).start()
+        node = node_of([Eye("cam01")], peer.address)
+        running = asyncio.ensure_future(node.run())
+        await peer.until(3 if respond is not silence else 1)
+        node.stop()
+        await running
+        await peer.stop()
+        return node.failure()
+
+    found = asyncio.run(run())
+    assert found is failure if failure is None else found.startswith(failure)
+
+
+def test_the_end_says_if_nobody_was_reached_or_nothing_was_captured():
+    gone = threading.Event()
+    gone.set()
+
+    def failure(eye: Eye) -> str | None:
+        node = node_of([eye], seconds=0.3)
+        asyncio.run(node.run())
+        return node.failure()
+
+    assert failure(Eye("cam01")).startswith(f"{NOBODY} was never reached: ")
+    assert failure(Eye("cam01", gone)).startswith("no frame could be captured (")
+
+
+def test_reasons_of_refusals_are_logged_once_and_not_without_end(caplog):
+    outbox = Outbox("cam01", "s", None, VirtualClock(0))
+    sender = Sender(outbox, MagicMock(), (), lambda: None, np.random.default_rng(0))
+    frame = Frame("cam01", "s", 0, 0, POSE, LENS, "jpeg", b"")
+    with caplog.at_level(logging.WARNING, "camera-node"):
+        for k in range(3 * MAX_REASONS):
+            for _ in range(2):
+                sender._count(frame, pb.PushResponse(outcome=pb.OUTCOME_REJECTED, reason=f"reason_{k}"))
+    assert len(caplog.records) == MAX_REASONS + 1
+    assert outbox.counts["rejected:other"] == 4 * MAX_REASONS and outbox.counts["rejected:reason_0"] == 2
+
+
+def test_a_node_that_reached_nobody_ends_with_1(capsys):
+    words = ["run", "tile", "--camera", "cam01", "--to", NOBODY, "--seconds", "0.2", "--quiet"]
+    assert main(words) == 1
+    assert f"camera-node: {NOBODY} was never reached: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("after_s", [0.05, 0.3, 0.8])
+def test_ctrl_c_while_it_starts_prints_no_traceback(after_s):
+    words = ["run", "room", "--all", "--to", NOBODY, "--quiet"]
+    code = f"from camera_node.cli import main; print(flush=True); raise SystemExit(main({words}))"
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.readline()  # Python itself has started
+    time.sleep(after_s)
+    process.send_signal(signal.SIGINT)
+    assert b"Traceback" not in process.communicate(timeout=20)[1]
