@@ -15,7 +15,7 @@ EXAMPLES = """examples:
   camera-node calibrate target charuco:7x5:30mm:22mm --out board.png        print it, measure it, fix it flat
   camera-node calibrate intrinsics pictures/ --board charuco:7x5:30mm:22mm --out lens.json
   camera-node calibrate hand-eye handeye/ --board chessboard:9x6:23.6mm     ViSP's layout: pictures and poses
-  camera-node calibrate hand-eye --pairs samples.json --json                MoveIt's: [flange, target] pairs
+  camera-node calibrate hand-eye --pairs samples.yaml --json                saved by MoveIt's panel
   camera-node calibrate hand-eye --live cell.yaml --camera cam00 --board charuco:7x5:30mm:22mm --out hand.yaml
 """
 
@@ -26,7 +26,8 @@ that also estimates the arm's noise. Degenerate motions are refused with the rea
 input, one of:
   FOLDER         pictures NAME-3.png with NAME_3.yaml, the flange's pose (rows: 6, cols: 1, data: [tx ty tz and
                  theta u], meters and radians)
-  --pairs FILE   JSON list of [flange in base, target in camera], 4 x 4 each
+  --pairs FILE   pairs of flange in base and target in camera: a JSON list of two 4 x 4 each, or what MoveIt's panel or
+                 easy_handeye saved
   --live SCENARIO --camera ID   guided session: move the arm, hold still; it says which poses are missing and
                  when there are enough. Flange poses come from the camera's source (without hand_eye)
 """
@@ -68,11 +69,12 @@ def _command(commands: Any, name: str, summary: str, description: str) -> argpar
 def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("folder", type=Path, nargs="?", metavar="FOLDER", help="pictures and flange poses, see above")
-    add("--pairs", type=Path, metavar="FILE", help="pairs of poses, JSON")
+    add("--pairs", type=Path, metavar="FILE", help="pairs of poses, JSON or YAML")
     add("--board", metavar="SPEC", help=BOARD)
     lens = "intrinsics: calibration JSON or ViSP's XML [the folder's XML, the live camera's own]"
     add("--lens", type=Path, metavar="FILE", help=lens)
     add("--eye-to-hand", action="store_true", help="the camera stands still, the flange holds the target")
+    add("--fit-size", action="store_true", help="take the target's size from the arm's motion, if it shows another")
     methods = "tsai, park, horaud, andreff, daniilidis or refined [%(default)s]"
     add("--method", default=DEFAULT_METHOD, metavar="NAME", help=methods)
     add("--json", action="store_true", help="print {transform, residual_mm, residual_deg, method, std_mm, std_deg}")
@@ -124,10 +126,13 @@ def _require_one_input(args: argparse.Namespace) -> None:
 def _hand_eye(args: argparse.Namespace) -> int:
     _require_one_input(args)
     from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, calibrate
+    from camera_node.robot.calibration.targets import parse_target
 
     if args.method not in ALL_METHODS:
         raise CalibrationError(f"--method: expected one of {', '.join(ALL_METHODS)}")
-    found = calibrate(_samples(args), args.method)
+    board = None if args.board is None else parse_target(args.board)
+    square_m = None if board is None else board.square_m
+    found = calibrate(_samples(args, board), args.method, square_m, args.fit_size)
     if args.json:
         for warning in found.warnings:
             print(f"note: {warning}", file=sys.stderr)
@@ -138,17 +143,16 @@ def _hand_eye(args: argparse.Namespace) -> int:
     return 0
 
 
-def _samples(args: argparse.Namespace) -> Any:
+def _samples(args: argparse.Namespace, board: Any) -> Any:
     from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
     from camera_node.robot.calibration import inputs
-    from camera_node.robot.calibration.targets import parse_target
+    from camera_node.robot.calibration.pose_pairs import read_pairs
 
     setup = EYE_TO_HAND if args.eye_to_hand else EYE_IN_HAND
     if args.pairs is not None:
-        return inputs.read_pairs(args.pairs, setup)
-    if args.board is None:
+        return read_pairs(args.pairs, setup)
+    if board is None:
         raise CalibrationError("--board SPEC: say what the target is")
-    board = parse_target(args.board)
     lens = None if args.lens is None else inputs.read_lens(args.lens)
     if args.live is not None:
         from camera_node.robot.calibration.guided import live_samples

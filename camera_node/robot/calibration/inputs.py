@@ -1,4 +1,4 @@
-"""Input of a calibration: images with a target, ViSP's folders, pose pairs as JSON, lenses."""
+"""Input of a calibration: images with a target, ViSP's folders, lenses."""
 
 from __future__ import annotations
 
@@ -10,36 +10,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from camera_node.robot.arm.hand_eye_mount import rigid_transform
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
 from camera_node.robot.calibration.targets import Corners, Target, estimate_pose
 from camera_node.sources.datasets.imaging import decode_file
-from camera_node.sources.datasets.records import read_json
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import Pinhole, se3, so3_exp
 from freshfield.untrusted import read_text, read_yaml
 
+_EXPLAINED = 4  # pictures without the target that are examined for the reason, which takes a second
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-
-
-def read_pairs(file: Path, setup: str) -> Samples:
-    """Samples from a JSON list of [flange in base, target in camera], each 4 x 4. Raises DatasetError and
-    CalibrationError."""
-    data = read_json(file)
-    if not isinstance(data, list):
-        raise CalibrationError(f"{file}: expected a list of pairs of 4 x 4 matrices")
-    flanges, targets = [], []
-    for k, pair in enumerate(data):
-        try:
-            flange, target = pair
-            flanges.append(rigid_transform(flange))
-            targets.append(rigid_transform(target))
-        except (ValueError, TypeError, OverflowError) as error:
-            raise CalibrationError(
-                f"{file}: pair {k + 1}: expected [flange in base, target in camera]: {error}"
-            ) from None
-    return Samples(np.reshape(flanges, (-1, 4, 4)), np.reshape(targets, (-1, 4, 4)), setup)
 
 
 def read_visp_pose(file: Path) -> Array:
@@ -111,16 +91,19 @@ def find_corners(
     found: dict[str, Corners] = {}
     unused: dict[str, str] = {}
     for k, file in enumerate(files):
-        image = decode_file(file, cv2.IMREAD_GRAYSCALE)
+        # As stored, whatever EXIF says of its orientation: what streams pictures ignores it, too.
+        image = decode_file(file, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             raise CalibrationError(f"{file}: cannot be read as a picture, or is larger than OpenCV's limit")
         height, width = image.shape
         size = size or (width, height)
         if (width, height) != size:
             raise CalibrationError(f"{file}: is {width} x {height}, expected {size[0]} x {size[1]}")
-        corners = target.find(np.asarray(image, dtype=np.uint8))
+        gray = np.asarray(image, dtype=np.uint8)
+        corners = target.find(gray)
         if corners is None:
-            unused[file.name] = f"{target.name} not found"
+            why = target.explain(gray) if len(unused) < _EXPLAINED else ""
+            unused[file.name] = f"{target.name} not found{why and f': {why}'}"
         else:
             found[file.name] = corners
         progress(k + 1)

@@ -88,9 +88,10 @@ def calibrate_lens(views: Mapping[str, Corners], size: tuple[int, int], unused: 
     usable = {name: c for name, c in views.items() if len(c.points) >= MIN_CORNERS}
     unused = {**unused, **{name: f"only {len(c.points)} corners" for name, c in views.items() if name not in usable}}
     if len(usable) < MIN_VIEWS:
+        why = next((f"; {name}: {each}" for name, each in unused.items()), "")
         raise CalibrationError(
             f"too few pictures show the target: {len(usable)} of {len(usable) + len(unused)}, "
-            f"at least {MIN_VIEWS} are needed and 10 to 20 are good"
+            f"at least {MIN_VIEWS} are needed and 10 to 20 are good{why}"
         )
     lens, std, normals, errors = _solve(usable, size)
     limit = _OUTLIER * float(np.median(errors))

@@ -1,6 +1,7 @@
 """Calibration targets by name, and a target's pose from one image.
 
-    charuco:7x5:30mm:22mm[:4X4_50]     squares across x down, their side, the markers' side, dictionary
+    charuco:7x5:30mm:22mm[:4X4_50]     squares across x down, their side, the markers' side, dictionary; also as
+                                       OpenCV before 4.6 and calib.io print it, a white square first
     chessboard:9x6:23.6mm              inner corners across x down, side of a square
 
 Target axes: origin at the top left corner of the printed pattern (of a chessboard: the first inner corner),
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.charuco import CharucoPrint, explain_charuco, find_charuco
 from freshfield.geometry import Pinhole, se3
 
 Array = NDArray[np.float64]
@@ -27,6 +29,8 @@ NOTATIONS = "charuco:7x5:30mm:22mm or chessboard:9x6:23.6mm"
 _MIN_CORNERS = 6
 # Ratio of reprojection errors above which the second of the two poses of a flat target is ruled out.
 _AMBIGUOUS = 1.5
+# Corners of a chessboard that was described by its squares, or miscounted by one or two.
+_OTHER_SIZES = ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1), (-2, -2), (2, 2))
 _SUBPIX = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
 
 
@@ -46,17 +50,21 @@ class Target:
     name: its SPEC.
     size_m: width and height of the drawing.
     find: returns the corners in a gray image, or None.
+    explain: says why they are not found in a gray image, as far as it tells; "" if it does not.
     draw: returns a drawing of a given width in pixels, exact at multiples of ``modules`` (its width in
         modules).
     pattern_m: width and height without the white border.
+    square_m: side of a square.
     """
 
     name: str
     size_m: tuple[float, float]
     find: Callable[[GrayImage], Corners | None]
+    explain: Callable[[GrayImage], str]
     draw: Callable[[int], GrayImage]
     modules: int
     pattern_m: tuple[float, float]
+    square_m: float
 
 
 def parse_target(spec: str) -> Target:
@@ -109,23 +117,23 @@ def _charuco(name: str, squares: str, square: str, marker: str, dictionary: str 
     if not inner < side or extra:
         raise ValueError("the markers must be smaller than the squares")
     board = cv2.aruco.CharucoBoard((across, down), side, inner, _dictionary(f"DICT_{dictionary.upper()}"))
-    detector = cv2.aruco.CharucoDetector(board)
     places = np.asarray(board.getChessboardCorners(), dtype=np.float64)
+    printed = CharucoPrint(across, down, inner / side, dictionary.upper())
 
     def find(image: GrayImage) -> Corners | None:
-        pixels, numbers, _, _ = detector.detectBoard(image)
-        if numbers is None or len(numbers) < _MIN_CORNERS:
+        pixels, numbers = find_charuco(image, printed)
+        if len(numbers) < _MIN_CORNERS:
             return None
-        points = places[numbers.ravel()]
+        points = places[numbers]
         if min(len(np.unique(points[:, 0].round(6))), len(np.unique(points[:, 1].round(6)))) < 2:
             return None  # all on one line
-        return Corners(pixels.reshape(-1, 2).astype(np.float64) + 0.5, points)
+        return Corners(pixels + 0.5, points)
 
     def draw(width: int) -> GrayImage:
         return np.asarray(board.generateImage((width, round(width * down / across))), dtype=np.uint8)
 
     size = across * side, down * side
-    return Target(name, size, find, draw, across, size)
+    return Target(name, size, find, lambda image: explain_charuco(image, printed), draw, across, size, side)
 
 
 def _chessboard(name: str, corners: str, square: str) -> Target:
@@ -160,8 +168,15 @@ def _chessboard(name: str, corners: str, square: str) -> Target:
         board = (np.indices((down + 1, across + 1)).sum(axis=0) % 2 * 255).astype(np.uint8)
         return np.pad(np.kron(board, np.ones((cell, cell), np.uint8)), cell, constant_values=255)
 
+    def explain(image: GrayImage) -> str:
+        for wider, taller in _OTHER_SIZES:
+            size = across + wider, down + taller
+            if min(size) >= 3 and cv2.findChessboardCorners(image, size, flags=flags)[0]:
+                return f"a board of {size[0]}x{size[1]} inner corners is seen, not of {across}x{down}"
+        return ""
+
     size, pattern = (((across + n) * side, (down + n) * side) for n in (3, 1))
-    return Target(name, size, find, draw, across + 3, pattern)
+    return Target(name, size, find, explain, draw, across + 3, pattern, side)
 
 
 _MAKERS: dict[str, Callable[..., Target]] = {"charuco": _charuco, "chessboard": _chessboard}

@@ -12,7 +12,7 @@ import yaml
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration import DEFAULT_METHOD, CalibrationError
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, solve
-from camera_node.robot.calibration.hand_eye.refinement import Refinement, refine
+from camera_node.robot.calibration.hand_eye.refinement import Refinement, refine, scale_start
 from camera_node.robot.calibration.hand_eye.samples import (
     Array,
     Diversity,
@@ -34,6 +34,10 @@ _LARGE_RESIDUAL_DEG, _LARGE_RESIDUAL_MM = 3.0, 20.0
 _NOTABLE_DEG, _NOTABLE_MM = 0.5, 1.0
 # Larger values mean wrong input: inverted poses, millimeters, or poses of another body.
 _WORST_DEG, _WORST_MM, _FARTHEST_M = 15.0, 100.0, 5.0
+# The scale of distances to the target is told where it differs from 1 by more than this and by so many standard
+# deviations; a factor beyond the bound is no size of a board. With fewer poses there is nothing left to judge it by.
+_NOTABLE_SCALE, _SURE, _LARGEST_SCALE, _POSES_FOR_SCALE = 0.005, 5.0, 2.0, 5
+_MILLIMETERS = (800.0, 1250.0)  # scale where one of the two is in millimeters
 _ADVICE = "are the poses flange in base and target in camera, not their inverses, in meters, and is the set-up right?"
 
 
@@ -114,10 +118,21 @@ class Calibration:
             raise CalibrationError(f"--out: {path}: {error.strerror}") from None
 
 
-def calibrate(samples: Samples, method: str = REFINED) -> Calibration:
-    """Calibrate with every method; ``method`` names the one that gives the result. Raises CalibrationError if
-    the samples do not determine X."""
-    spread, refined = require_diversity(samples), refine(samples)
+def calibrate(
+    samples: Samples, method: str = REFINED, square_m: float | None = None, fit_size: bool = False
+) -> Calibration:
+    """Calibrate with every method; ``method`` names the one that gives the result.
+
+    square_m: side of the target's squares as said; None: unknown.
+    fit_size: take the target's size from the arm's motion, where that shows another one than was said.
+    Raises CalibrationError if the samples do not determine X.
+    """
+    spread = require_diversity(samples)
+    _require_one_unit(samples)
+    scaled = _refined_with_scale(samples) if fit_size else None
+    if scaled is not None:
+        samples = samples.rescaled(scaled.scale)
+    refined = refine(samples)
     results: dict[str, Array | str] = {}
     for name in METHODS:
         try:
@@ -130,8 +145,42 @@ def calibrate(samples: Samples, method: str = REFINED) -> Calibration:
         raise CalibrationError(chosen)
     off = Residuals.of(samples, chosen)
     _require_plausible(chosen, off)
-    warnings = tuple(_warnings(samples, refined, off, spread))
+    if not fit_size:  # late: what does not fit together at all has been refused
+        scaled = _refined_with_scale(samples)
+    size = () if scaled is None else (_about_size(scaled, refined, square_m, fit_size),)
+    warnings = (*size, *_warnings(samples, refined, off, spread))
     return Calibration(samples, method, chosen, off, results, refined, spread, warnings)
+
+
+def _require_one_unit(samples: Samples) -> None:
+    """Raise CalibrationError where meters and millimeters are mixed."""
+    scale = scale_start(samples)
+    for factor, target, flange in ((scale, "millimeters", "meters"), (1.0 / scale, "meters", "millimeters")):
+        if _MILLIMETERS[0] < factor < _MILLIMETERS[1]:
+            raise CalibrationError(f"targets seem to be in {target}, flanges in {flange}: both must be in meters")
+
+
+def _refined_with_scale(samples: Samples) -> Refinement | None:
+    """The refinement with the target's size, where the arm's motion shows another one than was said."""
+    if len(samples) < _POSES_FOR_SCALE:
+        return None
+    found = refine(samples, with_scale=True)
+    plausible = 1.0 / _LARGEST_SCALE < found.scale < _LARGEST_SCALE
+    sure = abs(found.scale - 1.0) > max(_NOTABLE_SCALE, _SURE * found.scale_std)
+    return found if plausible and sure else None
+
+
+def _about_size(scaled: Refinement, refined: Refinement, square_m: float | None, fit_size: bool) -> str:
+    percent, which = 100 * abs(scaled.scale - 1.0), "large" if scaled.scale > 1.0 else "small"
+    squares = ""
+    if square_m is not None:
+        squares = f"your squares are {1e3 * square_m / scaled.scale:.3g} mm, not {1e3 * square_m:.3g}; "
+    if fit_size:
+        what = "this result is for that size"
+    else:
+        moved_mm = float(distance_mm(scaled.x, refined.x))
+        what = f"measure it, or take it so with --fit-size, which puts the camera {moved_mm:.1f} mm elsewhere"
+    return f"the board's size as said is {percent:.1f} % too {which} (+- {100 * scaled.scale_std:.1f}): {squares}{what}"
 
 
 def _require_plausible(transform: Array, off: Residuals) -> None:

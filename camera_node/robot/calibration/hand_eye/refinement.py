@@ -8,6 +8,9 @@ flange's axes),
 
 with s_rot and s_pos estimated too. Student's t over whole samples, not over single numbers, gives an outlier
 little weight (Lange, Little & Taylor, Journal of the American Statistical Association 84, 1989).
+
+A board of another size than was said makes all distances to it too long or too short by one factor, which the arm's
+own motion tells: it can be estimated beside X and Y.
 """
 
 from __future__ import annotations
@@ -39,6 +42,7 @@ class Refinement:
     x, y: (4, 4).
     std_deg, std_mm: standard deviations of x, each the root of the sum of three variances.
     arm_noise_rad, arm_noise_m: the arm's noise.
+    scale, scale_std: said by true distance to the target, and its standard deviation; 1 and 0 if not estimated.
     weights: (N,), about 1 for a good sample.
     """
 
@@ -49,38 +53,60 @@ class Refinement:
     arm_noise_rad: float
     arm_noise_m: float
     weights: Array
+    scale: float = 1.0
+    scale_std: float = 0.0
 
     @property
     def outliers(self) -> list[int]:
         return [int(i) for i in np.flatnonzero(self.weights < OUTLIER_WEIGHT)]
 
 
-def refine(samples: Samples) -> Refinement:
-    """Maximize the likelihood of X and Y. Raises CalibrationError."""
-    x, y = robust_start(samples)
+def refine(samples: Samples, with_scale: bool = False) -> Refinement:
+    """Maximize the likelihood of X and Y, and of the scale if asked to. Raises CalibrationError."""
+    scale = scale_start(samples) if with_scale else 1.0
+    x, y = robust_start(samples.rescaled(scale))
+    start = np.zeros(13 if with_scale else 12)
 
     def residuals(step: Array) -> Array:
-        return flange_residuals(samples, _retract(x, step[:6]), _retract(y, step[6:]))
+        seen = samples.rescaled(scale * np.exp(step[12])) if with_scale else samples
+        return flange_residuals(seen, _retract(x, step[:6]), _retract(y, step[6:12]))
 
-    noise = _robust_scale(residuals(np.zeros(12)))
+    noise = _robust_scale(residuals(start))
     for _ in range(_ROUNDS):
-        scale = np.repeat(noise, 3)
+        widths = np.repeat(noise, 3)
         solved = least_squares(
-            lambda step, scale=scale: (residuals(step) / scale).ravel(),
-            np.zeros(12),
+            lambda step, widths=widths: (residuals(step) / widths).ravel(),
+            start,
             x_scale="jac",
             loss=_student_t,
             ftol=1e-10,
         )
         e = residuals(solved.x)
-        x, y = _retract(x, solved.x[:6]), _retract(y, solved.x[6:])
+        x, y = _retract(x, solved.x[:6]), _retract(y, solved.x[6:12])
+        scale *= float(np.exp(solved.x[12])) if with_scale else 1.0
         before, noise = noise, _noise(e, noise)
         if np.abs(noise / before - 1.0).max() < _SETTLED:
             break
     covariance = np.linalg.pinv(solved.jac.T @ solved.jac, hermitian=True)
     turn, shift = (float(np.sqrt(np.trace(covariance[k : k + 3, k : k + 3]))) for k in (0, 3))
     deg, mm = float(np.degrees(turn)), shift * 1e3
-    return Refinement(x, y, deg, mm, float(noise[0]), float(noise[1]), _weights(e, noise))
+    scale_std = scale * float(np.sqrt(covariance[12, 12])) if with_scale else 0.0
+    return Refinement(x, y, deg, mm, float(noise[0]), float(noise[1]), _weights(e, noise), scale, scale_std)
+
+
+def scale_start(samples: Samples) -> float:
+    """First estimate of said by true distance to the target: with X's rotation known, G_i X T_i = Y is linear in its
+    inverse and in the translations of X and Y. Samples that fit badly count less. Raises CalibrationError."""
+    turn = robust_start(samples)[0][:3, :3]
+    moved = samples.moved[:, :3, :3]
+    seen = moved @ turn @ samples.target[:, :3, 3:]
+    rows = np.concatenate([seen, moved, np.broadcast_to(-np.eye(3), moved.shape)], axis=2)
+    wanted, weights = -samples.moved[:, :3, 3], np.ones((len(samples), 1))
+    for _ in range(_ROUNDS):
+        found = np.linalg.lstsq((rows * weights[..., None]).reshape(-1, 7), (wanted * weights).ravel(), rcond=None)[0]
+        off = np.linalg.norm(rows @ found - wanted, axis=1)
+        weights = np.sqrt(1.0 / np.maximum(off, np.median(off) + _MIN_NOISE))[:, None]
+    return float(1.0 / found[0]) if found[0] > 0.0 else 1.0
 
 
 def flange_residuals(samples: Samples, x: Array, y: Array) -> Array:

@@ -70,6 +70,12 @@ class Samples:
         names = tuple(self.names[i] for i in at) if self.names else ()
         return replace(self, flange=self.flange[at], target=self.target[at], names=names)
 
+    def rescaled(self, scale: float) -> Samples:
+        """The samples with distances to the target divided by ``scale``."""
+        target = self.target.copy()
+        target[:, :3, 3] /= scale
+        return replace(self, target=target)
+
     def subsample(self, most: int) -> Samples:
         """At most ``most`` samples, evenly spaced over the recording."""
         at = np.linspace(0, len(self) - 1, most).round().astype(np.intp)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
+from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, calibrate
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, robust_start, solve
 from camera_node.robot.calibration.hand_eye.refinement import flange_residuals, refine
 from camera_node.robot.calibration.hand_eye.samples import Samples, angle_deg, distance_mm
 from camera_node.robot.calibration.inputs import read_visp_folder
+from camera_node.robot.calibration.pose_pairs import read_pairs
 from camera_node.robot.calibration.targets import parse_target
 from freshfield.geometry import se3, so3_exp
 from tests.camera_node.robot.calibration import known_truth
@@ -97,6 +101,38 @@ def test_a_few_wrong_samples_are_found_and_hardly_count(setup):
 def test_poses_that_fit_badly_are_warned_about():
     bad = noisy_samples(12, np.random.default_rng(5), 0.1, 0.02)
     assert any("residuals are large" in warning for warning in calibrate(bad).warnings)
+
+
+@pytest.mark.parametrize(
+    ("setup", "factor", "says"),
+    [(EYE_IN_HAND, 20 / 24, "too small .*24 mm, not 20"), (EYE_TO_HAND, 1.05, "too large .*19 mm, not 20")],
+)
+def test_a_board_of_another_size_than_said_is_told_and_its_size_found(setup, factor, says):
+    said = noisy_samples(15, np.random.default_rng(2), 0.0005, 0.0002, setup).rescaled(1.0 / factor)
+    found = calibrate(said, square_m=0.02)
+    assert re.search(says, found.warnings[0]) and "--fit-size" in found.warnings[0]
+    assert distance_mm(found.transform, X) > 5.0
+    fitted = calibrate(said, square_m=0.02, fit_size=True)
+    assert re.search(says, fitted.warnings[0]) and distance_mm(fitted.transform, X) < 1.0
+    assert refine(said, with_scale=True).scale == pytest.approx(factor, abs=0.003)
+    right = said.rescaled(factor)
+    assert calibrate(right, fit_size=True).warnings == calibrate(right).warnings == ()
+
+
+@pytest.mark.parametrize(("file", "percent"), [("pairs-5.json", 5), ("pairs-20.json", 20)])
+def test_real_pairs_with_a_board_of_another_size(file, percent):
+    said = read_pairs(data_dir("../cases/17-board-size-wrong") / file, EYE_IN_HAND)
+    found = calibrate(said, fit_size=True)
+    assert refine(said, with_scale=True).scale == pytest.approx(1 + percent / 100, abs=0.005)
+    assert "too large" in found.warnings[0] and np.linalg.norm(found.transform[:3, 3] - [0.03, -0.06, 0.09]) < 0.0035
+
+
+@pytest.mark.parametrize(
+    ("scale", "says"), [(1e-3, "targets seem to be in millimeters"), (1e3, "flanges in millimeters")]
+)
+def test_meters_and_millimeters_do_not_mix(scale, says):
+    with pytest.raises(CalibrationError, match=says):
+        calibrate(noisy_samples(12, np.random.default_rng(3)).rescaled(scale))
 
 
 def test_a_real_arm_whose_calibration_was_published():
