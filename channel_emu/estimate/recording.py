@@ -7,13 +7,12 @@ other link, one frame a line::
     0.0,41.5,cam00
     33.3,,cam00
 
-A frame that never came has no delivered_ms; the camera may be left out. The separator is a comma, semicolon or tab.
-Lines that start with # are skipped.
+A frame that never came has no delivered_ms; the camera may be left out, and delay_ms may stand for delivered_ms.
+Columns may be in any order, with their units (``channel_emu.model.table``).
 """
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 from channel_emu.model import trace
 from channel_emu.model.link import EventKind
 from channel_emu.model.nanoseconds import NEVER_NS
+from channel_emu.model.table import TableError, read_table
 from freshfield.untrusted import read_text
 
 # Longer than any stream lives. Longer delays are left out; a row with one counts as not delivered.
@@ -131,28 +131,30 @@ def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:
 
 
 def _from_rows(path: Path, discipline: str) -> Recording:
-    lines = [
-        line
-        for line in read_text(path).removeprefix("\ufeff").splitlines()
-        if line.strip() and not line.startswith("#")
-    ]
-    separator = next((mark for mark in "\t;" if lines and mark in lines[0]), ",")
     rows: dict[str, list[tuple[float, float]]] = {}
     try:
-        given_rows = list(csv.DictReader(lines, delimiter=separator, skipinitialspace=True))
-    except csv.Error as error:
-        raise RecordingError(f"{path}: cannot be read as CSV: {error}") from None
-    for row in given_rows:
-        try:
-            offered, delivered = float(row["offered_ms"]), float(row["delivered_ms"] or math.nan)
-            if abs(offered) > _MAX_ROWS_MS or delivered < offered or math.isnan(offered):
-                raise ValueError
-        except (KeyError, TypeError, ValueError):
-            raise RecordingError(
-                f"{path}: expected columns offered_ms, delivered_ms (not earlier, or blank) and perhaps camera, "
-                f"numbers with a point, got {separator.join(str(value) for value in row.values())!r:.100}"
-            ) from None
-        rows.setdefault(row.get("camera") or "cam00", []).append((offered, delivered))
+        read = read_table(read_text(path))
+        offered = read.column("offered", "sent", "send_time")
+        delivered = read.column("delivered", "received", "receive_time", "arrived")
+        delay = read.column("delay", "latency", "one_way_delay")
+        if not read.titles and not read.rows:
+            raise TableError("there is no frame in it")
+        if offered is None or (delivered is None and delay is None):
+            raise TableError(
+                "expected a header with the columns offered_ms, delivered_ms (or delay_ms) and perhaps camera, in any "
+                f"order, with their units; it has {', '.join(read.titles) or 'no header'}"
+            )
+        came = [*read.times_ms(delivered or delay or offered)]
+        camera = read.text("camera")
+        for (line, row), at, then, lost in zip(read.rows, read.times_ms(offered), came, read.lost()):
+            then = math.nan if lost else then if delivered else at + then
+            if math.isnan(at) or abs(at) > _MAX_ROWS_MS or then < at:
+                raise TableError(
+                    f"line {line}: delivered_ms is not earlier than offered_ms, or blank: {', '.join(row):.100}"
+                )
+            rows.setdefault((row[camera] if camera is not None else "") or "cam00", []).append((at, then))
+    except TableError as error:
+        raise RecordingError(f"{path}: {error}") from None
     if not rows:
         raise RecordingError(f"{path}: there is no frame in it")
     tables: dict[str, NDArray[np.float64]] = {}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import re
 from pathlib import Path
 from typing import Any
 
+from channel_emu.model.table import Column, TableError, read_table
 from freshfield import untrusted
 from freshfield.untrusted import UntrustedError, read_yaml
 
@@ -165,15 +165,22 @@ def read_text(path: Path) -> str:
 
 
 def delays_ms(path: Path) -> list[float]:
-    """One-way delays in ms from a file: one number a line, or CSV with a header that names a column ``delay_ms``.
+    """One-way delays in ms from a file: one number a line, or a table (``table``) with a header that names the
+    delay and its unit, such as ``delay_ms``. Rows that a column ``lost`` marks, or without a delay, are left out.
 
-    Lines that start with # are skipped. Raises NotationError.
+    Raises NotationError.
     """
-    lines = (line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#"))
     try:
-        rows = [[word.strip() for word in row] for row in csv.reader(lines)]
-        named = bool(rows) and "delay_ms" in rows[0]
-        column = rows[0].index("delay_ms") if named else 0
-        return [float(row[column]) for row in rows[named:]]
-    except (csv.Error, ValueError, IndexError) as error:
-        raise NotationError(f"{path}: expected a column delay_ms, or one delay in ms a line: {error}") from None
+        table = read_table(read_text(path))
+        column = table.column("delay", "latency", "one_way_delay", "owd")
+        if column is None and table.titles:
+            raise TableError(f"expected a column delay_ms (or delay_s, latency [us]); it has {', '.join(table.titles)}")
+        if any(len(row) != 1 for _, row in table.rows) and column is None:
+            raise TableError("expected one delay in ms a line, with a decimal point, or a header that names delay_ms")
+        times = table.times_ms(column or Column("the delay", 0, 1.0))
+        found = [time for time, lost in zip(times, table.lost()) if not lost and not math.isnan(time)]
+    except TableError as error:
+        raise NotationError(f"{path}: {error}") from None
+    if not found:
+        raise NotationError(f"{path}: holds no delay")
+    return found

@@ -134,11 +134,12 @@ def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
         (HEAD, "there is no frame in it"),
         (HEAD + "0,5\n30,40\n", "2 delays .2 frames, 2 came.; at least 20 are needed"),
         (HEAD + "".join(f"{30 * n},\n" for n in range(100)), "none of its 100 frames came through"),
-        (HEAD + "0,5\n30,20\n", "expected columns offered_ms, delivered_ms .* got '30,20'"),
-        (HEAD + "0,5\nrain\n", "expected columns offered_ms"),
-        (HEAD + '"' + 140_000 * "0", "cannot be read as CSV: field larger than"),
-        ("0,5\n30,40\n", "expected columns offered_ms"),
-        ("offered_ms;delivered_ms\n0;7,5\n", "numbers with a point, got '0;7,5'"),
+        (HEAD + "0,5\n30,20\n", "line 3: delivered_ms is not earlier than offered_ms, or blank: 30, 20"),
+        (HEAD + "0,5\nrain\n", "line 3: offered_ms is 'rain', expected a number"),
+        (HEAD + '"' + 140_000 * "0", "cannot be read as a table: field larger than"),
+        ("0,5\n30,40\n", "expected a header with the columns offered_ms, .* it has no header"),
+        ("offered_ms;delivered_ms\n0.5;7,5\n", "with decimal points and with commas: use one of them"),
+        ("offered;delivered\n0;7\n", "the column 'offered' has no unit that is known: call it offered_ms"),
     ],
 )
 def test_nothing_to_fit_is_said_in_one_line(tmp_path: Path, capsys, rows: str, why: str) -> None:
