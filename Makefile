@@ -92,7 +92,7 @@ format: .venv/.ok-test  ## ruff: apply the format and the safe fixes
 
 types: .venv/.ok-test  ## mypy
 	$(PY) -m mypy
-	MYPYPATH=proto:deploy $(PY) -m mypy deploy/check_report.py deploy/freshfield_up
+	MYPYPATH=proto:deploy $(PY) -m mypy deploy/freshfield_up
 
 bench: .venv/.ok-test  ## how much later the emulator hands a message on: runs/bench-emulator.txt
 	@mkdir -p runs

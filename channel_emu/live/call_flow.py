@@ -106,6 +106,7 @@ class CallFlow:
                     break
                 message = Message(raw, f"call{self._number}", self._read, self)
                 self._read += 1
+                self._call.use()
                 self._messages.append(message)
                 if self._link is None:
                     self.settle(message, EventKind.DELIVERED)

@@ -220,7 +220,7 @@ class Proxy(grpc.GenericRpcHandler):
         """The handler of a method, as gRPC asks for it; None: not served."""
 
         async def carry(_: Any, context: grpc.aio.ServicerContext) -> None:
-            async with ServedCall(context) as call:
+            async with ServedCall.of(context) as call:
                 await self._carry(details.method, context, call)
 
         return grpc.stream_stream_rpc_method_handler(carry)

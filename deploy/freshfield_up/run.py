@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import threading
@@ -10,16 +11,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+from freshfield.machine_load import LoadMeter
 from freshfield.scenario import Scenario
 from freshfield_up import folder, mesh, net
 from freshfield_up.commands import ProcessSet, process_set, program
 from freshfield_up.processes import GRACE_S, Child, kill, stop
-from freshfield_up.resources import ResourceMonitor
 from freshfield_up.status import read_json, status_line
 from freshfield_up.summary import summarize
 
 TICK_S = 0.25
 LINE_EVERY_S = 5.0
+SAMPLE_EVERY_S = 2.0
+"""Of memory and processor time of every process, in ``processes.jsonl``."""
 READY_WITHIN_S = 600.0
 """A first start compiles the field's kernels: a minute, or more on a busy machine."""
 _COMPILING = "compiling"
@@ -112,7 +115,7 @@ class Launcher:
             arm.start()
         if not self.processes.arms:
             self._start_nodes()
-        resources, next_line_s = ResourceMonitor(self.options.out / "processes.jsonl"), 0.0
+        load, next_line_s, next_sample_s = LoadMeter(), 0.0, 0.0
         while not self._stop_requested.wait(TICK_S):
             now_s = time.monotonic()
             if not self._check_alive(now_s):
@@ -121,7 +124,11 @@ class Launcher:
                 self._continue_start(now_s)
                 if self._failures:
                     return
-            resources.sample(now_s - self._began_s, self.processes.children)
+            if now_s >= next_sample_s:
+                next_sample_s = now_s + SAMPLE_EVERY_S
+                running = {child.name: child.pid for child in self.processes.children if child.running and child.pid}
+                with (self.options.out / "processes.jsonl").open("a") as file:
+                    file.write(json.dumps(load.row(now_s - self._began_s, running)) + "\n")
             if now_s >= next_line_s:
                 next_line_s = now_s + LINE_EVERY_S
                 line = status_line(self.options.out, len(self.scenario.cameras))

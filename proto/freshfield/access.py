@@ -14,15 +14,12 @@ from __future__ import annotations
 import base64
 import binascii
 import hmac
-import inspect
 import ipaddress
 import socket
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any
 
-import grpc
 import grpc.aio
 
 from freshfield.frame import valid_id
@@ -40,7 +37,6 @@ CALLS = {
     "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo": LOOK,
 }
 """The action that each gRPC method needs. Others (of a service behind ``channel-emu proxy``) need CHANGE."""
-_OPEN = "/grpc.health.v1.Health/"  # open to everybody: it only tells that the process works
 
 
 @dataclass(frozen=True)
@@ -78,8 +74,8 @@ caller: ContextVar[Caller] = ContextVar("caller", default=ANYBODY)
 """Who makes the gRPC call that the current task serves."""
 
 
-class Access(grpc.aio.ServerInterceptor):
-    """Authenticates callers, and passes a gRPC call to its handler only if the caller may make it.
+class Access:
+    """Authenticates callers.
 
     tokens: token by caller name.
     certificates: whether a client certificate's common name identifies the caller if no token is sent; a
@@ -116,42 +112,8 @@ class Access(grpc.aio.ServerInterceptor):
         found = [known for known, expected in self._tokens if hmac.compare_digest(token, expected)]
         return found[0] if found else None
 
-    async def intercept_service(
-        self,
-        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[grpc.RpcMethodHandler]],
-        handler_call_details: grpc.HandlerCallDetails,
-    ) -> grpc.RpcMethodHandler:
-        method = handler_call_details.method
-        handler = await continuation(handler_call_details)
-        if handler is None or method.startswith(_OPEN):
-            return handler
-        header = dict(handler_call_details.invocation_metadata or ()).get("authorization")
-        serve = handler.unary_unary or handler.unary_stream or handler.stream_unary or handler.stream_stream
-
-        async def admit(request: Any, context: grpc.aio.ServicerContext) -> Any:
-            found = self._of_certificate(context) if header is None else self.of_header(header)
-            action = CALLS.get(method, CHANGE)
-            if found is None:
-                await context.abort(grpc.StatusCode.UNAUTHENTICATED, "no credential, or a wrong one")
-                raise AssertionError("abort raises")
-            if not found.may(action):
-                await context.abort(grpc.StatusCode.PERMISSION_DENIED, f"a {found.role} may not {action}")
-            caller.set(found)
-            answer = serve(request, context)
-            if not inspect.isasyncgen(answer):
-                return await answer
-            async for response in answer:
-                await context.write(response)
-
-        kind = {
-            (False, False): grpc.unary_unary_rpc_method_handler,
-            (False, True): grpc.unary_stream_rpc_method_handler,
-            (True, False): grpc.stream_unary_rpc_method_handler,
-            (True, True): grpc.stream_stream_rpc_method_handler,
-        }[bool(handler.request_streaming), bool(handler.response_streaming)]
-        return kind(admit, handler.request_deserializer, handler.response_serializer)
-
-    def _of_certificate(self, context: grpc.aio.ServicerContext) -> Caller | None:
+    def of_certificate(self, context: grpc.aio.ServicerContext) -> Caller | None:
+        """The caller of a client certificate; None without one, or if it names no caller."""
         names = context.auth_context().get("x509_common_name", []) if self._certificates else []
         try:
             return Caller.named(names[0].decode()) if names else None

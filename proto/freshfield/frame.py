@@ -10,12 +10,13 @@ import re
 import struct
 from collections.abc import Container
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 import google_crc32c
 from google.protobuf.message import DecodeError
 
 from freshfield import limits, payload
-from freshfield.geometry import GeometryError, Pinhole, Pose, invertible, quaternion_normalize
+from freshfield.geometry import Pinhole, Pose, invertible, quaternion_normalize
 from freshfield.v1 import frames_pb2 as pb
 
 OTHER = "?"
@@ -24,6 +25,10 @@ _CODECS = {"jpeg": pb.CODEC_JPEG, "png": pb.CODEC_PNG, "zstd": pb.CODEC_ZSTD}
 CODEC_NAMES = {number: name for name, number in _CODECS.items()}
 _UINT32 = 0xFFFFFFFF  # an enum on the wire may be negative
 _PACKED = struct.Struct("<QqqqqIIII7d8d")
+_COUNTS = attrgetter("sequence", "generated_ns", "clock_offset_ns", "clock_uncertainty_ns", "pose_gap_ns")
+_POSE_FIELDS = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_LENS_FIELDS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+_POSE, _LENS = attrgetter(*_POSE_FIELDS), attrgetter(*_LENS_FIELDS)
 
 
 class FrameRejected(ValueError):
@@ -92,40 +97,15 @@ def counted_ids(header: pb.FrameHeader, cameras: Container[str]) -> tuple[str, s
 def checksum(header: pb.FrameHeader, data: bytes) -> int:
     """CRC32C over the header's fields, packed in a fixed order, and the payload ``data``. It covers the
     header because a flipped bit must not become a wrong pose."""
-    p, k = header.pose, header.intrinsics
-    packed = _PACKED.pack(
-        header.sequence,
-        header.generated_ns,
-        header.clock_offset_ns,
-        header.clock_uncertainty_ns,
-        header.pose_gap_ns,
-        header.codec & _UINT32,
-        header.width,
-        header.height,
-        header.role & _UINT32,
-        p.qw,
-        p.qx,
-        p.qy,
-        p.qz,
-        p.tx_m,
-        p.ty_m,
-        p.tz_m,
-        k.fx,
-        k.fy,
-        k.cx,
-        k.cy,
-        k.k1,
-        k.k2,
-        k.p1,
-        k.p2,
-    )
+    numbers = (*_COUNTS(header), header.codec & _UINT32, header.width, header.height, header.role & _UINT32)
+    packed = _PACKED.pack(*numbers, *_POSE(header.pose), *_LENS(header.intrinsics))
     crc = google_crc32c.value(header.camera_id.encode() + b"\0" + header.session_id.encode() + packed)
     return google_crc32c.extend(crc, data)
 
 
 def to_request(frame: Frame) -> pb.PushRequest:
     """The wire message of a frame, with its checksum."""
-    q, t, k = frame.pose.quaternion, frame.pose.translation_m, frame.intrinsics
+    k = frame.intrinsics
     header = pb.FrameHeader(
         camera_id=frame.camera,
         session_id=frame.session,
@@ -133,18 +113,9 @@ def to_request(frame: Frame) -> pb.PushRequest:
         generated_ns=frame.generated_ns,
         clock_offset_ns=frame.clock_offset_ns,
         clock_uncertainty_ns=frame.clock_uncertainty_ns,
-        pose=pb.Pose(qw=q[0], qx=q[1], qy=q[2], qz=q[3], tx_m=t[0], ty_m=t[1], tz_m=t[2]),
+        pose=pb.Pose(**dict(zip(_POSE_FIELDS, (*frame.pose.quaternion, *frame.pose.translation_m)))),
         pose_gap_ns=frame.pose_gap_ns,
-        intrinsics=pb.Intrinsics(
-            fx=k.fx,
-            fy=k.fy,
-            cx=k.cx,
-            cy=k.cy,
-            k1=k.distortion[0],
-            k2=k.distortion[1],
-            p1=k.distortion[2],
-            p2=k.distortion[3],
-        ),
+        intrinsics=pb.Intrinsics(**dict(zip(_LENS_FIELDS, (k.fx, k.fy, k.cx, k.cy, *k.distortion)))),
         codec=_CODECS[frame.codec],
         width=k.width,
         height=k.height,
@@ -155,9 +126,9 @@ def to_request(frame: Frame) -> pb.PushRequest:
 
 def pose_and_lens(h: pb.FrameHeader) -> tuple[Pose, Pinhole]:
     """Pose and intrinsics of a header, bit for bit and unchecked, for sending them again."""
-    p, k = h.pose, h.intrinsics
-    lens = Pinhole(h.width, h.height, k.fx, k.fy, k.cx, k.cy, (k.k1, k.k2, k.p1, k.p2))
-    return Pose((p.qw, p.qx, p.qy, p.qz), (p.tx_m, p.ty_m, p.tz_m)), lens
+    qw, qx, qy, qz, *translation_m = _POSE(h.pose)
+    fx, fy, cx, cy, *distortion = _LENS(h.intrinsics)
+    return Pose((qw, qx, qy, qz), tuple(translation_m)), Pinhole(h.width, h.height, fx, fy, cx, cy, tuple(distortion))
 
 
 def parse(raw: bytes) -> pb.PushRequest:
@@ -186,13 +157,14 @@ def from_request(request: pb.PushRequest) -> Frame:
         raise FrameRejected("bad_header", "role is neither train nor held-out")
     if h.clock_uncertainty_ns < 0 or h.pose_gap_ns < 0:
         raise FrameRejected("bad_header", "clock uncertainty and pose gap cannot be negative")
+    pose, lens = pose_and_lens(h)
     frame = Frame(
         camera=h.camera_id,
         session=h.session_id,
         sequence=h.sequence,
         generated_ns=h.generated_ns,
-        pose=_pose(h.pose),
-        intrinsics=_intrinsics(h),
+        pose=_checked_pose(pose),
+        intrinsics=_checked_lens(lens),
         codec=codec,
         payload=request.payload,
         held_out=h.role == pb.ROLE_HELD_OUT,
@@ -207,39 +179,33 @@ def from_request(request: pb.PushRequest) -> Frame:
     return frame
 
 
-def _pose(p: pb.Pose) -> Pose:
-    q, t = (p.qw, p.qx, p.qy, p.qz), (p.tx_m, p.ty_m, p.tz_m)
+def _checked_pose(pose: Pose) -> Pose:
+    q, t = pose.quaternion, pose.translation_m
     if not all(math.isfinite(v) for v in (*q, *t)):
         raise FrameRejected("bad_pose", "pose is not finite")
-    if abs(math.sqrt(sum(v * v for v in q)) - 1.0) > limits.MAX_QUATERNION_ERROR:
+    if abs(math.hypot(*q) - 1.0) > limits.MAX_QUATERNION_ERROR:
         raise FrameRejected("bad_pose", "pose quaternion is not of unit length")
     if max(abs(v) for v in t) > limits.MAX_TRANSLATION_M:
         raise FrameRejected("bad_pose", f"camera is more than {limits.MAX_TRANSLATION_M:g} m from the origin")
-    try:
-        unit = quaternion_normalize(q)
-    except GeometryError as error:
-        raise FrameRejected("bad_pose", str(error)) from None
+    unit = quaternion_normalize(q)
     return Pose(tuple(map(float, unit)), t)  # type: ignore[arg-type]
 
 
-def _intrinsics(h: pb.FrameHeader) -> Pinhole:
-    k = h.intrinsics
-    values = (k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2)
-    if not all(math.isfinite(v) for v in values):
+def _checked_lens(k: Pinhole) -> Pinhole:
+    if not all(math.isfinite(v) for v in (k.fx, k.fy, k.cx, k.cy, *k.distortion)):
         raise FrameRejected("bad_intrinsics", "intrinsics are not finite")
-    if not (0 < h.width <= limits.MAX_IMAGE_SIDE_PX and 0 < h.height <= limits.MAX_IMAGE_SIDE_PX):
-        raise FrameRejected("too_large", f"{h.width} x {h.height} is not within 1..{limits.MAX_IMAGE_SIDE_PX}")
-    if min(k.fx, k.fy) < max(h.width, h.height) * limits.MIN_FOCAL_PER_SIDE or max(k.fx, k.fy) > limits.MAX_FOCAL_PX:
+    if not (0 < k.width <= limits.MAX_IMAGE_SIDE_PX and 0 < k.height <= limits.MAX_IMAGE_SIDE_PX):
+        raise FrameRejected("too_large", f"{k.width} x {k.height} is not within 1..{limits.MAX_IMAGE_SIDE_PX}")
+    if min(k.fx, k.fy) < max(k.width, k.height) * limits.MIN_FOCAL_PER_SIDE or max(k.fx, k.fy) > limits.MAX_FOCAL_PX:
         raise FrameRejected("bad_intrinsics", f"focal lengths {k.fx:g}, {k.fy:g} px do not fit the image size")
-    if max(abs(v) for v in (k.k1, k.k2, k.p1, k.p2)) > limits.MAX_DISTORTION:
+    if max(map(abs, k.distortion)) > limits.MAX_DISTORTION:
         raise FrameRejected("bad_intrinsics", "distortion coefficients are beyond any lens")
     sides = limits.MAX_CENTER_OUTSIDE_SIDES
-    x_fits = -sides * h.width <= k.cx <= (1 + sides) * h.width
-    if not (x_fits and -sides * h.height <= k.cy <= (1 + sides) * h.height):
+    x_fits = -sides * k.width <= k.cx <= (1 + sides) * k.width
+    if not (x_fits and -sides * k.height <= k.cy <= (1 + sides) * k.height):
         raise FrameRejected("bad_intrinsics", "principal point is far outside the image")
-    camera = Pinhole(h.width, h.height, k.fx, k.fy, k.cx, k.cy, (k.k1, k.k2, k.p1, k.p2))
-    if not invertible(camera):
+    if not invertible(k):
         raise FrameRejected(
             "bad_intrinsics", "distortion cannot be undone over the whole image: wrong coefficients or sizes?"
         )
-    return camera
+    return k

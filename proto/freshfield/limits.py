@@ -47,12 +47,6 @@ reading as many characters takes 2 s."""
 MAX_ERROR_CHARS = 1000
 """Length of a quotation from a file in an error message."""
 
-MAX_CHUNK_BYTES = 16 * 2**20
-"""Unpacked size of a recording's compressed chunk: writers end one at 1 MB, except for the largest image."""
-
-MAX_UNPACKED_PER_BYTE = 20
-"""Unpacked size of all compressed chunks over the recording's size: images hardly compress."""
-
 MAX_MODEL_BYTES = 4 * 2**30
 """Memory for all ONNX models of a process together: four times the need of the largest YOLO11 for a batch. A
 larger allocation fails, whatever sizes the file states."""
@@ -113,6 +107,13 @@ MAX_QUEUED_BYTES = 256 * 2**20
 
 MAX_CONCURRENT_STREAMS = 1024
 """Streams of a gRPC connection: one for each camera of the largest scenario, and some further calls."""
+
+MAX_CALLS = 3 * MAX_CAMERAS
+"""Open calls of a server, on all its connections: three for each camera of the largest scenario. A new one ends one
+that carried nothing. At 30 kB a call, 90 MB."""
+
+FIRST_MESSAGE_TIMEOUT_S = 10.0
+"""How long a call of a method that takes one message may last without it."""
 
 MAX_SESSIONS_PER_CAMERA = 64
 """Number of sessions remembered for a camera: many, because a forgotten session could be replayed."""

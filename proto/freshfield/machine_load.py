@@ -17,35 +17,42 @@ _PROC = Path("/proc")
 
 
 class LoadMeter:
-    """Measures the cores that this process and the whole machine used since the last call of ``row`` or
+    """Measures the cores that processes and the whole machine used since the last call of ``row`` or
     ``outside_cores``.
 
     name: key of this process in the rows.
     """
 
     def __init__(self, name: str = "bench") -> None:
-        self._name = name
-        self._last = (time.perf_counter(), _own_s(), _busy_s())
+        self._own = {name: os.getpid()}
+        self._last: dict[int, tuple[float, float]] = {}
+        self.row(0.0)
 
-    def row(self, t_s: float) -> dict[str, Any]:
-        """A row of ``processes.jsonl``: ``{"t_s", NAME: {"rss_mb", "cpu", "pid"}, "machine": {"cpu"}}``.
+    def row(self, t_s: float, processes: Mapping[str, int] | None = None) -> dict[str, Any]:
+        """A row of ``processes.jsonl``: ``{"t_s", NAME: {"rss_mb", "cpu", "pid"}, ..., "machine": {"cpu"}}``.
 
-        t_s: time of the row. ``cpu`` is in cores; ``machine`` is missing if the system does not tell.
+        t_s: time of the row. processes: id by name; None: this process alone. ``cpu`` is in cores, 0 in the first
+        row of a process. What the system does not tell, or has ended, is left out.
         """
-        now = (time.perf_counter(), _own_s(), _busy_s())
-        (then_s, own_then, busy_then), self._last = self._last, now
-        wall = max(now[0] - then_s, 1e-6)
-        row: dict[str, Any] = {
-            "t_s": round(t_s, 3),
-            self._name: {"rss_mb": rss_mb(), "cpu": round((now[1] - own_then) / wall, 2), "pid": os.getpid()},
-        }
-        if now[2] is not None and busy_then is not None:
-            row["machine"] = {"cpu": round((now[2] - busy_then) / wall, 2)}
+        row: dict[str, Any] = {"t_s": round(t_s, 3)}
+        for name, pid in (self._own if processes is None else processes).items():
+            used_s = _own_s() if pid == os.getpid() else cpu_s(pid)
+            if used_s is not None:
+                row[name] = {"rss_mb": rss_mb(pid), "cpu": self._cores(pid, used_s), "pid": pid}
+        busy_s = _busy_s()
+        if busy_s is not None:
+            row["machine"] = {"cpu": self._cores(0, busy_s)}
         return row
 
     def outside_cores(self) -> float | None:
         """Cores that other processes kept busy; None if unknown."""
         return outside_cores(self.row(0.0))
+
+    def _cores(self, key: int, used_s: float) -> float:
+        now_s = time.perf_counter()
+        then_s, before_s = self._last.get(key, (now_s, used_s))
+        self._last[key] = now_s, used_s
+        return round((used_s - before_s) / max(now_s - then_s, 1e-6), 2)
 
 
 def outside_cores(row: Mapping[str, Any]) -> float | None:

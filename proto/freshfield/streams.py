@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Iterable, Sequence
+from contextvars import ContextVar
 from typing import Any
 
 import grpc
@@ -33,7 +34,8 @@ async def serve_health(server: grpc.aio.Server, services: Sequence[str]) -> heal
 
 
 class ServedCall:
-    """Async context around the handling of a call, which ``end`` can end from another task.
+    """Async context around the handling of a call, which ``end`` can end from another task. Within another context of
+    the same task it is that one: see ``of``.
 
     open: whether the context has not been left yet.
     """
@@ -47,6 +49,25 @@ class ServedCall:
         self._context = context
         self._status: tuple[grpc.StatusCode, str] | None = None
         self._writing = False
+        self.held_in: list[OpenStreams] = []
+        """Where the call has a place."""
+
+    @staticmethod
+    @contextlib.asynccontextmanager
+    async def of(context: grpc.aio.ServicerContext) -> AsyncIterator[ServedCall]:
+        """The call that the current task serves, within a context of its own if there is none yet."""
+        call = _served.get()
+        if call is not None:
+            yield call
+            return
+        async with ServedCall(context) as call:
+            _served.set(call)
+            yield call
+
+    def use(self) -> None:
+        """Mark the call as used, wherever it is held: it carried a message that was accepted."""
+        for streams in self.held_in:
+            streams.note_use(self)
 
     def end(self, code: grpc.StatusCode, why: str) -> None:
         """End the call. The client receives ``code`` and ``why``, unless an answer that is being written is
@@ -81,6 +102,9 @@ class ServedCall:
                 await self._context.abort(*self._status)
 
 
+_served: ContextVar[ServedCall | None] = ContextVar("served", default=None)
+
+
 class OpenStreams:
     """Admits at most ``most`` streams at once. A new stream is always admitted, so a client that opens idle
     streams cannot shut others out. To make room, the oldest stream that was never used is ended, or else the
@@ -102,8 +126,9 @@ class OpenStreams:
             longest_idle, _ = (self._silent or self._used).popitem(last=False)
             longest_idle.end(grpc.StatusCode.RESOURCE_EXHAUSTED, "ended for a new stream: too many are open")
             self.ended += 1
-        async with ServedCall(context) as call:
+        async with ServedCall.of(context) as call:
             self._silent[call] = None
+            call.held_in.append(self)
             try:
                 yield call
             finally:
@@ -112,6 +137,10 @@ class OpenStreams:
 
     def use(self, call: ServedCall) -> None:
         """Mark a stream as used: it carried a frame that was accepted."""
+        call.use()
+
+    def note_use(self, call: ServedCall) -> None:
+        """See ``ServedCall.use``."""
         if call.open and (call in self._silent or call in self._used):
             self._silent.pop(call, None)
             self._used[call] = None

@@ -21,6 +21,7 @@ import grpc.aio
 import numpy as np
 
 from freshfield.access import Access, is_loopback
+from freshfield.admission import Admission
 from freshfield.limits import (
     GRPC_IDLE_S,
     MAX_CONCURRENT_STREAMS,
@@ -200,7 +201,7 @@ class Transport:
     def aio_server(self) -> grpc.aio.Server:
         """Server without a port yet (see ``bind``); needs a running event loop. Raises TransportError as
         ``access``."""
-        return grpc.aio.server(options=SERVER_OPTIONS, interceptors=[] if self.access.open else [self.access])
+        return grpc.aio.server(options=SERVER_OPTIONS, interceptors=[Admission(self.access)])
 
     def bind(self, server: grpc.aio.Server, address: str) -> int:
         """Listen on ``host:port`` (port 0: any free one) and return the port.

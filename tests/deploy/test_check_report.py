@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-from check_report import problems
 from tests.edge_server.report.ledgers import write
 from tests.edge_server.report.sample_run import write_run
+from tests.tools.check_report import problems
 
 
 def found(out):

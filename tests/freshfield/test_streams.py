@@ -9,10 +9,11 @@ import grpc
 import grpc.aio
 import pytest
 
+from freshfield import admission
 from freshfield.access import ANYBODY
 from freshfield.frame import FrameRejected
 from freshfield.limits import MAX_SESSIONS_PER_CAMERA, SESSION_IDLE_NS
-from freshfield.streams import OpenStreams, SessionStreams
+from freshfield.streams import OpenStreams, SessionStreams, serve_health
 from freshfield.transport import Transport
 
 
@@ -35,12 +36,17 @@ async def echoing(streams: OpenStreams):
                     await call.write(bytes(2000))
                 await asyncio.sleep(0.002)
 
+    async def unary(request, _):
+        return request
+
     handler = {
+        "Unary": grpc.unary_unary_rpc_method_handler(unary),
         "Echo": grpc.stream_stream_rpc_method_handler(answer),
         "Pour": grpc.unary_stream_rpc_method_handler(pour),
     }
     server = Transport().aio_server()
     server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("t", handler),))
+    await serve_health(server, ())
     port = Transport().bind(server, "127.0.0.1:0")
     await server.start()
     async with Transport().aio_channel(f"127.0.0.1:{port}") as channel:
@@ -165,3 +171,55 @@ def test_a_thousand_sessions_leave_no_trace():
     for k in range(1000):
         sessions.claim("cam00", f"s{k}", stream, k)
     assert len(sessions._sent["cam00"]) == MAX_SESSIONS_PER_CAMERA
+
+
+async def ended(call) -> grpc.StatusCode:
+    """How a call ends whose answers are read."""
+    with suppress(grpc.aio.AioRpcError):
+        if hasattr(call, "read"):
+            while await call.read() is not grpc.aio.EOF:
+                pass
+    return await call.code()
+
+
+def test_a_call_of_which_no_message_comes_ends(monkeypatch):
+    monkeypatch.setattr(admission, "FIRST_MESSAGE_TIMEOUT_S", 0.1)
+
+    async def scene():
+        async with echoing(OpenStreams(4)) as channel, asyncio.timeout(20):
+            assert await ended(channel.stream_unary("/t/Unary")()) is grpc.StatusCode.DEADLINE_EXCEEDED
+
+    asyncio.run(scene())
+
+
+def test_calls_that_only_begin_and_watches_of_health_are_bounded(monkeypatch):
+    """Headers without a message reach no handler, Health/Watch never ends: neither shuts a camera out."""
+    most, made = 20, []
+    monkeypatch.setattr(admission, "OpenStreams", lambda _: made.append(OpenStreams(most)) or made[-1])
+
+    async def scene():
+        async with echoing(OpenStreams(4)) as channel:
+            (calls,) = made
+            camera = await opened(channel, b"use")
+            begun, watches = [], []
+            for _ in range(3 * most):
+                begun.append(channel.stream_unary("/t/Unary")())
+                watches.append(channel.unary_stream("/grpc.health.v1.Health/Watch")(b""))
+                await asyncio.sleep(0)
+            async with asyncio.timeout(20):
+                for call in (begun[0], watches[0]):
+                    assert await ended(call) is grpc.StatusCode.RESOURCE_EXHAUSTED
+                while calls.ended < 5 * most:
+                    await asyncio.sleep(0.01)
+            assert len(calls._silent) + len(calls._used) <= most
+            await camera.write(b"still here")
+            assert await camera.read() == b"still here"
+            assert await channel.unary_unary("/t/Unary")(b"new") == b"new"
+            for call in (*begun, *watches):
+                call.cancel()
+            camera.cancel()
+            async with asyncio.timeout(20):
+                while calls._silent or calls._used:
+                    await asyncio.sleep(0.01)
+
+    asyncio.run(scene())

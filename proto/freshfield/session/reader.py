@@ -10,25 +10,20 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
-import zstandard
-
-from freshfield.limits import MAX_CHUNK_BYTES, MAX_UNPACKED_PER_BYTE
 from freshfield.session import HEADER, IMAGE, INSTALL, SessionError
 from freshfield.v1 import frames_pb2 as pb
 
 try:
-    import lz4.frame
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
     from google.protobuf.message import DecodeError
     from mcap.data_stream import ReadDataStream
     from mcap.exceptions import McapError
     from mcap.opcode import Opcode
-    from mcap.records import Channel, Chunk, Message
+    from mcap.records import Channel, Message
     from mcap.writer import MCAP0_MAGIC
 except ImportError:
     raise SessionError(INSTALL) from None
@@ -37,16 +32,13 @@ _IN_CHUNKS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 _RECORD_HEAD = struct.Struct("<BQ")
 # Start and end time, uncompressed size, checksum, length of the compression's name.
 _CHUNK_HEAD = struct.Struct("<QQQII")
-_KEPT_CHUNKS = 4
-# What damaged records raise; lz4's errors are plain RuntimeErrors.
-_UNREADABLE = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError, EOFError, MemoryError)
+# What damaged records raise.
+_UNREADABLE = (McapError, struct.error, ValueError, EOFError)
 
 
 class _Location(NamedTuple):
-    """Location of a message's record: offset in the file, or in the decompressed records of the chunk whose
-    body is at file offset ``chunk``."""
+    """Location of a message's record in the file."""
 
-    chunk: int | None
     offset: int
     size: int
 
@@ -80,8 +72,7 @@ class Session:
         self._file = path.open("rb")
         self._lock = threading.Lock()
         self._size = os.fstat(self._file.fileno()).st_size
-        self._unpacked = 0
-        self._records = lru_cache(maxsize=_KEPT_CHUNKS)(self._decompressed)
+        self._compressed = 0
         if self._file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise SessionError(f"{path}: is no MCAP file")
         end = self._read_all()
@@ -91,23 +82,20 @@ class Session:
             parts.append(where if end < self._size else f"never closed, ends at byte {end}")
         if self._damaged:
             parts.append(f"{self._damaged} damaged chunks or records left out")
+        if self._compressed:
+            parts.append(f"{self._compressed} compressed chunks left out (`mcap decompress` rewrites them)")
         if parts:
             self.cut = f"{path}: {', '.join(parts)}: {sum(self.messages.values())} complete messages are used"
 
     def payload(self, frame: SessionFrame) -> bytes:
         """The payload of one of ``frames``, byte for byte. Raises SessionError if it cannot be read again."""
         try:
-            return bytes(CompressedImage.FromString(_message(self._body(frame.location)).data).data)
+            return bytes(CompressedImage.FromString(_message(self._at(*frame.location)).data).data)
         except (DecodeError, *_UNREADABLE) as error:
             raise SessionError(f"{self.path}: a message cannot be read again: {error}") from None
 
     def close(self) -> None:
         self._file.close()
-
-    def _body(self, location: _Location) -> bytes:
-        if location.chunk is not None:
-            return self._records(location.chunk)[location.offset : location.offset + location.size]
-        return self._at(location.offset, location.size)
 
     def _at(self, offset: int, size: int) -> bytes:
         with self._lock:
@@ -126,7 +114,7 @@ class Session:
                 if opcode == Opcode.CHUNK and wanted is None:
                     self._chunk(at, min(size, self._size - at), whole)
                 elif whole and opcode == (wanted or Opcode.MESSAGE):
-                    self._record(opcode, self._at(at, size), _Location(None, at, size))
+                    self._record(opcode, self._at(at, size), _Location(at, size))
         return end
 
     def _heads(self) -> tuple[list[tuple[int, int, int]], int | None]:
@@ -148,39 +136,19 @@ class Session:
         if size < _CHUNK_HEAD.size:
             return
         data = self._at(at, size)
-        *_, unpacked, crc, name = _CHUNK_HEAD.unpack_from(data)
-        compressed, begin = bool(name), _CHUNK_HEAD.size + name + 8
-        if compressed and not whole:
-            return  # half of a compressed chunk cannot be read
-        if not compressed and whole and crc and zlib.crc32(data[begin:]) != crc:
+        *_, crc, name = _CHUNK_HEAD.unpack_from(data)
+        begin = _CHUNK_HEAD.size + name + 8
+        if name:
+            self._compressed += 1
+            return
+        if whole and crc and zlib.crc32(data[begin:]) != crc:
             self._damaged += 1
             return
-        if compressed:
-            self._unpacked += unpacked
-            try:
-                if self._unpacked > MAX_UNPACKED_PER_BYTE * self._size + MAX_CHUNK_BYTES:
-                    raise ValueError("the chunks before have unpacked to more than the file can hold")
-                data, begin = self._records(at), 0
-            except _UNREADABLE:
-                self._damaged += 1
-                return
         for opcode, offset, length in _framed(data, begin):
             if opcode not in _IN_CHUNKS:
                 self._damaged += 1
                 return
-            place = _Location(at, offset, length) if compressed else _Location(None, at + offset, length)
-            self._record(opcode, data[offset : offset + length], place)
-
-    def _decompressed(self, at: int) -> bytes:
-        """The records of the compressed chunk whose body is at ``at``."""
-        _, size = _RECORD_HEAD.unpack(self._at(at - _RECORD_HEAD.size, _RECORD_HEAD.size))
-        chunk = Chunk.read(ReadDataStream(BytesIO(self._at(at, size))))
-        data = _unpack(chunk)
-        if len(data) != chunk.uncompressed_size:
-            raise ValueError(f"a chunk of {len(data)} bytes says that it has {chunk.uncompressed_size}")
-        if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-            raise ValueError("the checksum of a chunk is wrong")
-        return data
+            self._record(opcode, data[offset : offset + length], _Location(at + offset, length))
 
     def _record(self, opcode: int, body: bytes, location: _Location) -> None:
         try:
@@ -210,22 +178,6 @@ class Session:
                 before = self._headers.pop(camera, None)
                 if before is not None and before[:2] == (message.log_time, message.publish_time):
                     self.frames.setdefault(camera, []).append(SessionFrame(before[2], before[0], location))
-
-
-def _unpack(chunk: Chunk) -> bytes:
-    """Decompress a chunk's records. The size is bounded, because decompressors otherwise allocate whatever
-    the data declares."""
-    size = chunk.uncompressed_size
-    if size > MAX_CHUNK_BYTES:
-        raise ValueError(f"a chunk of {size} bytes, more than {MAX_CHUNK_BYTES}")
-    if chunk.compression == "zstd":
-        asked = zstandard.get_frame_parameters(chunk.data).content_size
-        if asked not in (size, zstandard.CONTENTSIZE_UNKNOWN):
-            raise ValueError(f"a chunk of {asked} bytes says that it has {size}")
-        return zstandard.decompress(chunk.data, max_output_size=size)
-    if chunk.compression == "lz4":
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size))
-    raise ValueError(f"chunks compressed by {chunk.compression[:40]!r} cannot be read")
 
 
 def _framed(data: bytes, at: int) -> Iterator[tuple[int, int, int]]:

@@ -1,4 +1,4 @@
-"""Checks the report of a run: ``python deploy/check_report.py OUT``; exit code 1 if it is wrong.
+"""Checks the report of a run: ``python -m tests.tools.check_report OUT``; exit code 1 if it is wrong.
 
 Continuous integration runs it after a short demo. It checks properties of every healthy run, not how good the
 results are.
