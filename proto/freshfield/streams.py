@@ -1,11 +1,16 @@
-"""The open streams of a server: which one is ended to admit a new one, and which one owns a session."""
+"""The open calls of a server: who may make one, which one is ended to admit a new one, and which one owns a session.
+
+Without ``Admission``, a call whose headers come without a message reaches no handler, and Health/Watch never ends by
+itself: a client could open a thousand of either on each connection, at 4 to 30 kB of memory a call.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import inspect
 from collections import OrderedDict
-from collections.abc import AsyncIterator, Iterable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from contextvars import ContextVar
 from typing import Any
 
@@ -14,12 +19,13 @@ import grpc.aio
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from freshfield.access import caller
+from freshfield.access import CALLS, CHANGE, Access, caller
 from freshfield.frame import FrameRejected
-from freshfield.limits import MAX_SESSIONS_PER_CAMERA, SESSION_IDLE_NS
+from freshfield.limits import FIRST_MESSAGE_TIMEOUT_S, MAX_CALLS, MAX_SESSIONS_PER_CAMERA, SESSION_IDLE_NS
 
 # How long ``end`` waits for the client to take an answer that is being written.
 _TAKEN_S = 0.5
+_HEALTH = "/grpc.health.v1.Health/"  # open to everybody: it only tells that the process works
 
 
 async def serve_health(server: grpc.aio.Server, services: Sequence[str]) -> health.aio.HealthServicer:
@@ -170,3 +176,67 @@ class SessionStreams:
         sessions.move_to_end(session)
         while len(sessions) > MAX_SESSIONS_PER_CAMERA:
             sessions.popitem(last=False)
+
+
+class Admission(grpc.aio.ServerInterceptor):
+    """Passes a gRPC call to its handler if the caller may make it. At most MAX_CALLS are open; a new one ends one that
+    carried no message, or else the one that carried none for longest."""
+
+    def __init__(self, access: Access) -> None:
+        self.calls = OpenStreams(MAX_CALLS)
+        self._access = access
+
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[grpc.RpcMethodHandler]],
+        handler_call_details: grpc.HandlerCallDetails,
+    ) -> grpc.RpcMethodHandler:
+        method = handler_call_details.method
+        header = dict(handler_call_details.invocation_metadata or ()).get("authorization")
+        handler = await continuation(handler_call_details)
+        if handler is None:
+            return handler
+        serve = handler.unary_unary or handler.unary_stream or handler.stream_unary or handler.stream_stream
+
+        async def admit(requests: Any, context: grpc.aio.ServicerContext) -> Any:
+            if not (self._access.open or method.startswith(_HEALTH)):
+                await self._check_caller(method, header, context)
+            async with self.calls.open(context) as call:
+                request = requests if handler.request_streaming else await self._only_message(method, call, context)
+                answer = serve(request, context)
+                if not inspect.isasyncgen(answer):
+                    return await answer
+                async for response in answer:
+                    await call.write(response)
+                return None
+
+        # A stream of requests to gRPC, whatever the method: a handler of a single request is called only after it.
+        kind = (
+            grpc.stream_stream_rpc_method_handler
+            if handler.response_streaming
+            else grpc.stream_unary_rpc_method_handler
+        )
+        return kind(admit, handler.request_deserializer, handler.response_serializer)
+
+    async def _check_caller(self, method: str, header: str | None, context: grpc.aio.ServicerContext) -> None:
+        found = self._access.of_certificate(context) if header is None else self._access.of_header(header)
+        action = CALLS.get(method, CHANGE)
+        if found is None:
+            await context.abort(grpc.StatusCode.UNAUTHENTICATED, "no credential, or a wrong one")
+            raise AssertionError("abort raises")
+        if not found.may(action):
+            await context.abort(grpc.StatusCode.PERMISSION_DENIED, f"a {found.role} may not {action}")
+        caller.set(found)
+
+    async def _only_message(self, method: str, call: ServedCall, context: grpc.aio.ServicerContext) -> Any:
+        message = grpc.aio.EOF
+        try:
+            async with asyncio.timeout(FIRST_MESSAGE_TIMEOUT_S):
+                message = await context.read()
+        except TimeoutError:
+            pass
+        if message is grpc.aio.EOF:
+            await context.abort(grpc.StatusCode.DEADLINE_EXCEEDED, "the call began, but no message came")
+        if not method.startswith(_HEALTH):
+            self.calls.use(call)
+        return message

@@ -21,7 +21,6 @@ import grpc.aio
 import numpy as np
 
 from freshfield.access import Access, is_loopback
-from freshfield.admission import Admission
 from freshfield.limits import (
     GRPC_IDLE_S,
     MAX_CONCURRENT_STREAMS,
@@ -30,6 +29,7 @@ from freshfield.limits import (
     MAX_PEER_TEXT_CHARS,
     TLS_HANDSHAKE_TIMEOUT_S,
 )
+from freshfield.streams import Admission
 from freshfield.untrusted import read_bytes
 
 log = logging.getLogger(__name__)

@@ -10,9 +10,8 @@ import grpc.aio
 import pytest
 
 from freshfield.access import ANYBODY, CALLS, LOOK, Access, Caller, HttpDoor, HttpRefused, caller
-from freshfield.admission import Admission
 from freshfield.frame import FrameRejected
-from freshfield.streams import ServedCall, SessionStreams
+from freshfield.streams import Admission, ServedCall, SessionStreams
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, edge_pb2, frames_pb2
 from tests.role_table import TOKENS, cells_of

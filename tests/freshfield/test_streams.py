@@ -9,7 +9,7 @@ import grpc
 import grpc.aio
 import pytest
 
-from freshfield import admission
+from freshfield import streams as served
 from freshfield.access import ANYBODY
 from freshfield.frame import FrameRejected
 from freshfield.limits import MAX_SESSIONS_PER_CAMERA, SESSION_IDLE_NS
@@ -183,7 +183,7 @@ async def ended(call) -> grpc.StatusCode:
 
 
 def test_a_call_of_which_no_message_comes_ends(monkeypatch):
-    monkeypatch.setattr(admission, "FIRST_MESSAGE_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(served, "FIRST_MESSAGE_TIMEOUT_S", 0.1)
 
     async def scene():
         async with echoing(OpenStreams(4)) as channel, asyncio.timeout(20):
@@ -195,7 +195,7 @@ def test_a_call_of_which_no_message_comes_ends(monkeypatch):
 def test_calls_that_only_begin_and_watches_of_health_are_bounded(monkeypatch):
     """Headers without a message reach no handler, Health/Watch never ends: neither shuts a camera out."""
     most, made = 20, []
-    monkeypatch.setattr(admission, "OpenStreams", lambda _: made.append(OpenStreams(most)) or made[-1])
+    monkeypatch.setattr(served, "OpenStreams", lambda _: made.append(OpenStreams(most)) or made[-1])
 
     async def scene():
         async with echoing(OpenStreams(4)) as channel:
