@@ -182,6 +182,7 @@ class EdgeServer:
             frontier=self.frontier,
             field_name=config.field,
             chosen=described(scenario, config, self._moving),
+            decision=lambda: self.updater.policy.last_decision,
         )
         log.info("%s", self.state.chosen)
         write_json(options.out / "frontier.json", msgspec.to_builtins(self.frontier))

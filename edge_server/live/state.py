@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,9 @@ from edge_server.fields import Snapshot
 from edge_server.run_records import Frontier
 from edge_server.scheduler import Policy
 from freshfield.frame import Frame
+
+if TYPE_CHECKING:  # imported at run time only where a policy is learned
+    from edge_server.scheduler.learned.decision import Decision
 
 SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages
 
@@ -122,6 +126,7 @@ class EdgeState:
 
     start_ns, now_ns: the instant at which the run began, and the present, on the clock of frames.
     channel: the emulator's status (channel.json) where it runs on the same machine, else None.
+    decision: the newest decision of a learned policy, with what it saw; None with other policies.
     frontier: what accuracy costs in time, as measured.
     chosen: how the edge works and why, in one line (``config.described``).
     warnings: what other machines can do here that they should not, in words (--insecure).
@@ -137,6 +142,7 @@ class EdgeState:
     set_policy: Callable[[str, float | None], None]
     save_snapshot: Callable[[], Path]
     channel: Callable[[], dict | None] = lambda: None
+    decision: Callable[[], Decision | None] = lambda: None
     frontier: Frontier | None = None
     field_name: str = ""
     chosen: str = ""

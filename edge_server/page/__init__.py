@@ -144,7 +144,7 @@ class _Refresher:
         cameras = state.cameras()
         channel = state.channel()
         channel = channel if isinstance(channel, dict) else None
-        self._history.sample(state.now_s(), cameras)
+        self._history.sample(state.now_s(), cameras, channel)
         watched = bool(self._server.get_clients())
         self._scene.refresh(cameras, watched)
         if watched:

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.frontier import best_point
 from edge_server.live.state import CameraView
-from edge_server.page.colors import BLUE, FRESH_MS, HELD_OUT, RGB, STALE_MS, VERMILION, age_color, css, scale_color
+from edge_server.page.colors import AGAINST, FOR, FRESH_MS, HELD_OUT, RGB, STALE_MS, age_color, css, scale_color
 from edge_server.run_records import Frontier
 from freshfield.scenario import NOTHING_HELD_OUT
 
+if TYPE_CHECKING:  # loaded only with a learned policy
+    from edge_server.scheduler.learned.explain import Explanation
+
+# Number of cameras in the explanation of a decision.
+EXPLAINED_CAMERAS = 6
 _DIM = "color:var(--mantine-color-dimmed)"
 _CELL = "padding:.1em .35em;text-align:right"
 _CARD = "background:rgba(128,140,160,.10);border-radius:6px"
@@ -117,12 +121,12 @@ def frontier(found: Frontier, present: tuple[float, float, float | None] | None)
         for key, dash in (("psnr_db", ""), ("psnr_moving_db", "4 3")):
             path = " ".join(at(p.update_ms, getattr(p, key)) for p in mine)
             lines += (
-                f'<polyline points="{path}" fill="none" stroke="{css(BLUE)}" stroke-dasharray="{dash}" '
+                f'<polyline points="{path}" fill="none" stroke="{css(FOR)}" stroke-dasharray="{dash}" '
                 f'stroke-width="{1.8 if bold else 0.8}" opacity="{1.0 if bold else 0.45}"/>'
             )
     for ms, db in now:
         x, y = at(ms, db).split(",")
-        lines += f'<circle cx="{x}" cy="{y}" r="4" fill="{css(VERMILION)}"/>'
+        lines += f'<circle cx="{x}" cy="{y}" r="4" fill="{css(AGAINST)}"/>'
     ends = "".join(
         f'<text x="{x}" y="{y}" text-anchor="{anchor}" font-size="9" fill="currentColor">{words}</text>'
         for x, y, anchor, words in (
@@ -135,7 +139,7 @@ def frontier(found: Frontier, present: tuple[float, float, float | None] | None)
     return (
         '<div style="padding:.2em .9em .4em;font-size:.75em">'
         f'<svg viewBox="0 0 320 110" width="100%">{lines}{ends}</svg>'
-        f'<span style="color:{css(VERMILION)}">&#9679;</span> now, shown; lines measured: whole image, '
+        f'<span style="color:{css(AGAINST)}">&#9679;</span> now, shown; lines measured: whole image, '
         f'dashed where it moves<div style="{_DIM}">{escape(found.about)}, by edge-server frontier</div></div>'
     )
 
@@ -212,15 +216,42 @@ def comparison_caption(camera: str, psnr_db: float | None, update: int, held_out
     )
 
 
-def chart_caption(title: str, lines: Sequence[tuple[str, RGB]]) -> str:
-    """A chart's title on the left, the names of its lines in their colors on the right."""
+def chart_caption(title: str, lines: Sequence[tuple[str, RGB]], remark: str = "") -> str:
+    """A chart's title on the left; on the right ``remark``, or the names of its lines in their colors."""
     names = " ".join(
         f'<span style="color:{css(color)};margin-left:.6em;white-space:nowrap">&#9473; {escape(name)}</span>'
         for name, color in lines
     )
+    right = f'<span style="{_DIM}">{escape(remark)}</span>' if remark else names
     return (
         '<div style="padding:.35em .9em .1em;font-size:.78em;display:flex;justify-content:space-between">'
-        f"<span>{escape(title)}</span><span>{names}</span></div>"
+        f"<span>{escape(title)}</span><span>{right}</span></div>"
+    )
+
+
+def decision_explanation(e: Explanation) -> str:
+    """A learned policy's decision: bars of the contributions of parts of the state and of cameras."""
+    largest = sorted(zip(e.names, e.cameras.tolist()), key=lambda pair: -abs(pair[1]))[:EXPLAINED_CAMERAS]
+    widest = max((abs(share) for share in (*e.parts.values(), *(s for _, s in largest))), default=0.0)
+    bars = "".join(_bar(name, share, widest) for name, share in e.parts.items())
+    bars += f'<div style="height:.4em"></div>{"".join(_bar(n, s, widest) for n, s in largest)}'
+    return (
+        f'<div style="padding:.3em .9em;font-size:.78em"><div><b>{escape(e.action)}</b> '
+        f'<span style="{_DIM}">logit {e.logit:+.2f}, of average cameras {e.baseline_logit:+.2f}</span></div>'
+        f"{bars}"
+        f'<div style="{_DIM}"><span style="color:{css(FOR)}">&#9632;</span> for it '
+        f'<span style="color:{css(AGAINST)}">&#9632;</span> against it</div></div>'
+    )
+
+
+def _bar(name: str, share: float, widest: float) -> str:
+    percent = 100.0 * abs(share) / widest if widest > 0 else 0.0
+    bar = f"width:{percent:.0f}%;height:.7em;border-radius:2px;background:{css(FOR if share >= 0 else AGAINST)}"
+    grid = "display:grid;grid-template-columns:6.5em 1fr 3.5em;gap:.4em;align-items:center"
+    return (
+        f'<div style="{grid}"><span style="overflow:hidden;text-overflow:ellipsis">{escape(name)}</span>'
+        f'<div style="{bar}"></div>'
+        f'<span style="text-align:right;font-variant-numeric:tabular-nums">{share:+.2f}</span></div>'
     )
 
 
@@ -230,11 +261,6 @@ def channel_line(channel: dict[str, Any]) -> str:
     delay = channel.get("drawn_delay_ms")
     mean_ms = delay.get("mean") if isinstance(delay, dict) else None
     parts = [str(channel[key]) for key in ("preset", "discipline") if channel.get(key)]
-    if channel.get("state") is not None:
-        parts.append(f"state {channel['state']}")
-    elif isinstance(chains := channel.get("by_camera"), dict):  # one chain a camera
-        states = Counter(str(c["state"]) for c in chains.values() if isinstance(c, dict) and "state" in c)
-        parts += [f"{count} in state {state}" for state, count in states.items()]
     if isinstance(mean_ms, int | float):
         parts.append(f"mean delay {mean_ms:.0f} ms")
     for key in ("forwarded", "dropped_busy", "superseded", "lost"):

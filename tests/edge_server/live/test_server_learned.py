@@ -45,7 +45,7 @@ def test_it_decides_by_what_cameras_see_and_every_decision_can_be_explained(tmp_
     feed.start()
     try:
         until(lambda: server.updater.number >= 4)
-        decided = server.updater.policy.last_decision
+        decided = server.state.decision()
         assert decided is not None and decided.actor.spec.layout.dim == CHANNELS
         with pytest.raises(ValueError, match="chosen at the start"):
             server.state.set_policy(f"bandit:{tmp_path / 'other.npz'}", None)

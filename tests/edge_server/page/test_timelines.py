@@ -8,7 +8,7 @@ import numpy as np
 
 from edge_server.live.state import CameraView, Publication
 from edge_server.page import timelines
-from edge_server.page.timelines import MAX_POINTS, History, _decimate, _forward_fill, _latest_value
+from edge_server.page.timelines import MAX_POINTS, History, _decimate, _forward_fill, _latest_value, _stairs
 
 
 def views(*ages: float | None) -> list[CameraView]:
@@ -19,18 +19,37 @@ def views(*ages: float | None) -> list[CameraView]:
 def test_history_keeps_the_window_and_leaves_the_held_out_camera_aside():
     history = History(window_s=10.0)
     for i in range(1000):
-        history.sample(0.1 * i, views(100.0, 300.0, None))
-    t, mean, worst = history.columns()
+        history.sample(0.1 * i, views(100.0, 300.0, None), {"state": "high"})
+    t, mean, worst, state = history.columns()
     assert t[0] >= t[-1] - 10.0 and len(t) <= 102
-    assert np.allclose(mean, 200.0) and np.allclose(worst, 300.0)
+    assert np.allclose(mean, 200.0) and np.allclose(worst, 300.0) and np.allclose(state, 0.0)
 
 
 def test_history_is_bounded_even_if_time_stands_still_or_goes_back():
     history = History(window_s=1e9, most=50)
     for t in [*range(200), 5, 5, 199]:
-        history.sample(float(t), views(1.0))
+        history.sample(float(t), views(1.0), None)
     t = history.columns()[0]
     assert len(t) == 50 and (np.diff(t) > 0).all()
+
+
+def test_states_are_numbered_by_the_emulators_list_or_as_they_come():
+    history = History()
+    said = [{"state": "high", "states": ["low", "high"]}, {"state": "low"}, {}, None, {"state": 2}]
+    for i, status in enumerate([*said, {"state": [1]}]):
+        history.sample(float(i), views(), status)
+    assert history.state_names == ["low", "high", "2"]
+    state = history.columns()[3]
+    assert state[:2].tolist() == [1, 0] and np.isnan(state[[2, 3, 5]]).all() and state[4] == 2
+    assert np.isnan(history.columns()[1]).all()  # no camera has reported
+
+
+def test_chains_of_each_camera_are_averaged_and_odd_status_files_survived():
+    history = History()
+    chains = {"a": {"state": "low"}, "b": {"state": "high"}, "c": {}, "d": 3}
+    history.sample(0.0, views(), {"state": None, "states": ["low", "high"], "by_camera": chains})
+    history.sample(1.0, views(), {"states": 7, "by_camera": [1], "state": None})
+    assert history.columns()[3][0] == 0.5 and np.isnan(history.columns()[3][1])
 
 
 def test_value_latest_value():
@@ -52,22 +71,28 @@ def test_gaps_are_filled_with_what_was_known():
     assert _forward_fill(np.array([nan, 2.0, nan, nan, 5.0, nan])).tolist() == [2, 2, 2, 2, 5, 5]
 
 
-def test_the_charts_show_ages_scored_updates_of_the_window(monkeypatch):
+def test_a_staircase_holds_each_value():
+    t, y = _stairs(np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 0.0]))
+    assert t.tolist() == [0, 1, 1, 2, 2] and y.tolist() == [0, 0, 1, 1, 0]
+
+
+def test_the_charts_show_ages_scored_updates_of_the_window_and_states_by_name(monkeypatch):
     drawn = []
 
-    def draw(chart, t, *curves):
-        drawn.append((chart.title, t.tolist(), [curve.tolist() for curve in curves]))
+    def draw(chart, t, *curves, remark=""):
+        drawn.append((chart.title, t.tolist(), [curve.tolist() for curve in curves], remark))
 
     monkeypatch.setattr(timelines._Chart, "draw", draw)
     history = History(window_s=1000.0)
     for t in (0.0, 200.0):
-        history.sample(t, views(100.0, 300.0))
+        history.sample(t, views(100.0, 300.0), {"state": "high", "states": ["low", "high"]})
     scores = ((10.0, 15.0), (90.0, 20.0), (190.0, None), (195.0, 22.0))
     publications = [
         Publication(k, t_s, 0, 50.0, (), (), 0.0, 0.0, psnr_db=db, psnr_moving_db=db, scored_on="truth")
         for k, (t_s, db) in enumerate(scores)
     ]
     timelines.Timelines(MagicMock()).refresh(history, publications)
-    (_, t, (mean, worst, omega)), (title, when, (psnr, _)) = drawn
+    (_, t, (mean, worst, omega), _), (title, when, (psnr, _), _), (_, _, (state,), names) = drawn
     assert t == [0.0, 200.0] and mean == [200.0, 200.0] and worst == [300.0, 300.0] and omega[1] == 50.0
     assert (when, psnr) == ([90.0, 195.0], [20.0, 22.0]) and title.endswith(", dB")
+    assert state == [1.0, 1.0] and names == "0 low, 1 high"
