@@ -26,34 +26,7 @@ def test_the_person_joins_up_at_the_end_of_the_loop(phase):
         assert np.allclose(a, b, atol=1e-9)
 
 
-def test_motion_is_continuous():
-    """No part jumps: between phases 1/4000 apart nothing moves faster than 12 loop lengths a loop."""
-    n = 4000
-    starts = np.stack([person.bones(WALK, k / n)[0] for k in range(n + 1)])
-    step = np.linalg.norm(np.diff(starts, axis=0), axis=2).max()
-    assert step < 12 * 4.8 / n
-
-
-def test_limbs_keep_their_lengths():
-    names = person._NAMES
-    for phase in np.linspace(0, 1, 97):
-        start, end, _ = person.bones(WALK, phase)
-        length = np.linalg.norm(end - start, axis=1)
-        for name, expected in (("upper_arm_l", 0.29), ("forearm_r", 0.25)):
-            assert length[names.index(name)] == pytest.approx(expected)
-        # A leg may be stretched a little at the end of a long step, never folded wrongly.
-        assert length[names.index("thigh_l")] == pytest.approx(0.42, rel=0.07)
-        assert length[names.index("shin_r")] == pytest.approx(0.41, rel=0.07)
-
-
-def test_a_foot_rests_during_its_stance_and_moves_during_its_swing():
-    at = [motion.footstep_phase(k / 3000, 3, 0.0) for k in range(1000)]
-    stance = [p for p, swing in at if swing == 0.0]
-    assert len(set(stance)) == 1 and len(stance) == pytest.approx(500, abs=2)
-    assert at[-1][0] - at[0][0] == pytest.approx(1 / 3, rel=1e-2)
-
-
-@pytest.mark.parametrize("speed", [0.05, 0.3, 1.0, 2.5, 4.0, 8.0])
+@pytest.mark.parametrize("speed", [0.05, 1.0, 8.0])
 def test_mean_speed_of_the_parts_is_the_one_asked_for(speed):
     """Measured independently: middles of all parts, by finite differences over one period in seconds."""
     walk = person.make_walk((0.0, 1.0), (0.74, 0.54), speed)

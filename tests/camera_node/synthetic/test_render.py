@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from camera_node.synthetic.lighting import Light
-from camera_node.synthetic.placement import MovingBody, Part, at, place_static
+from camera_node.synthetic.placement import Part, at, place_static
 from camera_node.synthetic.render import CameraRenderer, World, cast_rays, rays_near_sphere
 from camera_node.synthetic.shapes import Box, Quad, Sphere, nearest_hit
 from camera_node.synthetic.textures import Checker, Noise, Plain
@@ -86,60 +86,6 @@ def test_bodies_hide_each_other_by_distance_not_by_order(order):
     assert np.array_equal(
         CameraRenderer(world, CAMERA, POSE).image(0.0), CameraRenderer(still, CAMERA, POSE).image(0.0)
     )
-
-
-def test_color_depends_on_the_place_and_not_on_the_viewer():
-    parts = (
-        Part(Quad((3.0, 3.0)), Noise(Plain((0.6, 0.5, 0.4)), 0.8, 0.3)),
-        Part(Sphere(0.5), Noise(Plain((0.3, 0.5, 0.8)), 0.4, 0.3), at(0.2, 0.1, 0.5)),
-    )
-    world = World(parts, (), SOFT)
-    other = look_at([-1.0, -3.2, 1.6], [0.0, 0.0, 0.3])
-    a, b = (CameraRenderer(world, Pinhole.from_fov(320, 240, 60.0), p) for p in (POSE, other))
-    image_a, image_b = a.image(0.0).astype(int), b.image(0.0).astype(int)
-    origin, d = world_rays(Pinhole.from_fov(320, 240, 60.0), POSE)
-    points = origin + np.where(np.isfinite(a.distance()), a.distance(), 0.0)[..., None] * d
-    inverse = se3_inverse(other)
-    uv = Pinhole.from_fov(320, 240, 60.0).project(points @ inverse[:3, :3].T + inverse[:3, 3])
-    inside = np.isfinite(a.distance()) & (uv > 1).all(axis=-1) & (uv < [319, 239]).all(axis=-1)
-    column, row = (np.floor(uv[inside]).astype(int)).T
-    # Seen by both: the other camera's distance there is the point's own.
-    both = np.abs(b.distance()[row, column] - np.linalg.norm(points[inside] - other[:3, 3], axis=1)) < 0.02
-    assert both.sum() > 5000
-    gap = np.abs(image_a[inside][both] - image_b[row, column][both]).max(axis=1)
-    # One pixel is up to some centimeters: smooth textures differ by little, shadow edges by more.
-    assert np.median(gap) <= 2 and np.mean(gap > 12) < 0.03
-
-
-def test_a_shadow_falls_where_the_light_is_hidden():
-    floor, ball = Part(Quad((3.0, 3.0)), WHITE), Part(Sphere(0.4), RED, at(0.0, 0.0, 1.2))
-    lamp = Light(np.array([[0.0, 0.0, 3.0]]), 0.6, 10.0, (0.2,) * 3, (0.2,) * 3)
-    top = look_at([2.0, -2.0, 2.5], [0.0, 0.0, 0.0])
-    with_ball = CameraRenderer(World((floor, ball), (), lamp), CAMERA, top).image(0.0).astype(int)
-    without = CameraRenderer(World((floor,), (), lamp), CAMERA, top).image(0.0).astype(int)
-    u, v = CAMERA.project((se3_inverse(top) @ [0.0, 0.0, 0.0, 1.0])[:3]).astype(int)
-    assert without[v, u, 0] > 150 and with_ball[v, u, 0] == pytest.approx(0.2 * 255, abs=1)
-    u, v = CAMERA.project((se3_inverse(top) @ [1.2, 0.9, 0.0, 1.0])[:3]).astype(int)
-    assert np.array_equal(with_ball[v, u], without[v, u])
-
-
-def test_a_moving_part_darkens_the_floor_beneath_it_only():
-    floor = Part(Quad((3.0, 3.0)), WHITE, takes_contact=True)
-    ball = Part(Sphere(0.1), RED, at(0.0, 0.0, 0.12))
-    floating = MovingBody((ball,), lambda t: ball.matrix[None], contact=((0, 0.1),))
-    top = look_at([0.0, -1.0, 3.0], [0.0, 0.0, 0.0])
-    image = CameraRenderer(World((floor,), (floating,), FLAT), CAMERA, top).image(0.0)
-    u, v = CAMERA.project((se3_inverse(top) @ [0.16, 0.0, 0.0, 1.0])[:3]).astype(int)
-    assert image[v, u, 1] < 245
-    u, v = CAMERA.project((se3_inverse(top) @ [1.1, 0.0, 0.0, 1.0])[:3]).astype(int)
-    assert (image[v, u] == 255).all()
-
-
-def test_supersampling_averages_the_finer_image():
-    world = World((Part(Quad((3.0, 3.0)), Checker((0.0,) * 3, (1.0,) * 3, 0.11)),), (), FLAT)
-    fine = CameraRenderer(world, CAMERA.scaled(2), POSE).image(0.0).astype(float)
-    mean = fine.reshape(72, 2, 96, 2, 3).mean(axis=(1, 3))
-    assert np.abs(CameraRenderer(world, CAMERA, POSE, 2).image(0.0) - mean).max() <= 1.0
 
 
 def test_an_empty_world_is_its_background():

@@ -75,15 +75,6 @@ def test_hits_lie_on_the_surface_and_nothing_lies_before_them(shape):
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=repr)
-def test_from_inside_every_ray_meets_the_far_side(shape):
-    d = directions(np.random.default_rng(2), 300)
-    origin = np.array([[0.02], [0.03], [0.05]])
-    t = nearest_hit(shape, origin, d)
-    assert np.isfinite(t).all()
-    assert np.abs(signed_distance(shape)(origin + t * d)).max() < TOLERANCE
-
-
-@pytest.mark.parametrize("shape", SHAPES, ids=repr)
 def test_normals_are_the_gradient_of_the_distance(shape):
     rng = np.random.default_rng(3)
     origin = np.array([[0.01], [0.02], [0.03]])
@@ -97,14 +88,6 @@ def test_normals_are_the_gradient_of_the_distance(shape):
     assert np.allclose(np.linalg.norm(normal, axis=0), 1.0)
     # Near an edge of a box or cylinder the difference straddles two faces.
     assert np.quantile(cosine, 0.03) > 0.999
-
-
-@pytest.mark.parametrize("shape", SHAPES, ids=repr)
-def test_distance_counts_in_lengths_of_the_direction(shape):
-    """A linear map that scales must preserve t, so directions need not be unit."""
-    d = directions(np.random.default_rng(5), 100)
-    origin = np.array([[0.05], [0.0], [0.1]])
-    assert np.allclose(nearest_hit(shape, origin, 7.0 * d) * 7.0, nearest_hit(shape, origin, d), rtol=1e-9)
 
 
 def test_quad_is_seen_from_its_front_only():

@@ -85,7 +85,3 @@ def test_no_number_may_be_nonsense(name, parameter, value):
     with pytest.raises(fx.EffectError, match=name) as error:
         load(name, {parameter: value})
     assert "\n" not in str(error.value) and parameter in str(error.value)
-
-
-def test_there_are_numbers_to_refuse():
-    assert len(numbers()) >= 15
