@@ -1,4 +1,4 @@
-"""Pairs live frames with the pose samples of an arm (thesis 4.3.3), which arrive at another rate.
+"""Pairs frames with the pose samples of an arm or a trajectory (thesis 4.3.3), which have another rate.
 
 The thesis takes the sample nearest to the frame. The two samples around it can also be interpolated: linearly
 with slerp, or linearly in joint space. The frame carries the time to the nearest sample, and a frame without a
@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import bisect
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose.providers import sample_at
-
 T = TypeVar("T")
 Interpolate = Callable[[T, T, float], T]
 Joints = NDArray[np.float64]
+
+
+class PoseGapError(ValueError):
+    """No pose sample is near enough to the requested instant."""
 
 
 def interpolate_joints(a: Joints, b: Joints, fraction: float) -> Joints:
@@ -97,3 +99,35 @@ class SampleBuffer(Generic[T]):
         if self._times[0] < self._times[-1] - self._keep_ns * 9 // 8:
             first = bisect.bisect_left(self._times, self._times[-1] - self._keep_ns)
             del self._times[:first], self._samples[:first]
+
+
+def sample_at(
+    times_ns: Sequence[int],
+    samples: Sequence[T],
+    t_ns: int,
+    max_gap_ns: int,
+    interpolate: Callable[[T, T, float], T] | None,
+) -> tuple[T, int]:
+    """The sample for an instant, and the time (ns) from that instant to the nearest sample.
+
+    times_ns: of the samples, increasing.
+    t_ns: the instant.
+    interpolate: makes a sample at a fraction of the way from a first to a second; None takes the nearest.
+    Raises PoseGapError if no sample is within ``max_gap_ns``.
+    """
+    if not times_ns:
+        raise PoseGapError("there is no pose yet")
+    after = bisect.bisect_left(times_ns, t_ns)
+    before = after - 1
+    last = after == len(times_ns)
+    if last or (before >= 0 and t_ns - times_ns[before] <= times_ns[after] - t_ns):
+        nearest = before
+    else:
+        nearest = after
+    gap = abs(times_ns[nearest] - t_ns)
+    if gap > max_gap_ns:
+        raise PoseGapError(f"the nearest pose is {gap / 1e6:.1f} ms away, more than {max_gap_ns / 1e6:g} ms")
+    if interpolate is None or gap == 0 or before < 0 or last:
+        return samples[nearest], gap
+    fraction = (t_ns - times_ns[before]) / (times_ns[after] - times_ns[before])
+    return interpolate(samples[before], samples[after], fraction), gap

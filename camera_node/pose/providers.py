@@ -6,30 +6,24 @@ camera axes, w last in the quaternion (it is first everywhere else in this proje
 
 from __future__ import annotations
 
-import bisect
 import itertools
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from camera_node.pose.pairing import PoseGapError as PoseGapError
+from camera_node.pose.pairing import SampleBuffer
 from freshfield.geometry import GeometryError, Pose, quaternion_normalize
 from freshfield.limits import MAX_STAMP_S
 from freshfield.untrusted import read_text
-
-T = TypeVar("T")
 
 _COLUMN_NAMES = ("t", "time", "timestamp")
 
 
 class TrajectoryError(ValueError):
     """A trajectory file that cannot be used; the message names file and line."""
-
-
-class PoseGapError(ValueError):
-    """No pose sample is near enough to the requested instant."""
 
 
 class PoseProvider(Protocol):
@@ -56,76 +50,25 @@ class FixedPose:
         return self.pose, 0
 
 
-class Trajectory:
-    """A recorded trajectory as a pose provider.
+def read_tum(
+    path: Path, interpolate: bool = True, max_gap_ns: int = 50_000_000, start_ns: int = 0
+) -> SampleBuffer[Pose]:
+    """Read a trajectory file.
 
-    times_ns: of the samples, strictly increasing. poses: one for each time.
-    interpolate: slerp of the rotation and a straight line for the translation between the two samples around
-        the instant; False takes the nearest sample (thesis 4.3.3).
+    interpolate: slerp of the rotation and a straight line for the translation between the two samples around an
+        instant; False takes the nearest sample (thesis 4.3.3).
     max_gap_ns: an instant farther than this from every sample has no pose.
-    Raises TrajectoryError if there are no samples, or times and poses do not match.
-    """
-
-    def __init__(
-        self, times_ns: list[int], poses: list[Pose], interpolate: bool = True, max_gap_ns: int = 50_000_000
-    ) -> None:
-        if not times_ns or len(times_ns) != len(poses):
-            raise TrajectoryError("a trajectory needs at least one sample, and one pose for each time")
-        if any(b <= a for a, b in itertools.pairwise(times_ns)):
-            raise TrajectoryError("the times of a trajectory must increase")
-        self._times = times_ns
-        self._poses = poses
-        self._interpolate = interpolate
-        self._max_gap_ns = max_gap_ns
-
-    def at(self, t_ns: int) -> tuple[Pose, int]:
-        interpolate = Pose.interpolate if self._interpolate else None
-        return sample_at(self._times, self._poses, t_ns, self._max_gap_ns, interpolate)
-
-
-def sample_at(
-    times_ns: Sequence[int],
-    samples: Sequence[T],
-    t_ns: int,
-    max_gap_ns: int,
-    interpolate: Callable[[T, T, float], T] | None,
-) -> tuple[T, int]:
-    """The sample for an instant, and the time (ns) from that instant to the nearest sample.
-
-    times_ns: of the samples, increasing.
-    t_ns: the instant.
-    interpolate: makes a sample at a fraction of the way from a first to a second; None takes the nearest.
-    Raises PoseGapError if no sample is within ``max_gap_ns``.
-    """
-    if not times_ns:
-        raise PoseGapError("there is no pose yet")
-    after = bisect.bisect_left(times_ns, t_ns)
-    before = after - 1
-    last = after == len(times_ns)
-    if last or (before >= 0 and t_ns - times_ns[before] <= times_ns[after] - t_ns):
-        nearest = before
-    else:
-        nearest = after
-    gap = abs(times_ns[nearest] - t_ns)
-    if gap > max_gap_ns:
-        raise PoseGapError(f"the nearest pose is {gap / 1e6:.1f} ms away, more than {max_gap_ns / 1e6:g} ms")
-    if interpolate is None or gap == 0 or before < 0 or last:
-        return samples[nearest], gap
-    fraction = (t_ns - times_ns[before]) / (times_ns[after] - times_ns[before])
-    return interpolate(samples[before], samples[after], fraction), gap
-
-
-def read_tum(path: Path, interpolate: bool = True, max_gap_ns: int = 50_000_000, start_ns: int = 0) -> Trajectory:
-    """Read a trajectory file. interpolate, max_gap_ns: see ``Trajectory``.
-
     start_ns: time in the file that becomes 0.
     Raises TrajectoryError.
     """
     times, poses = read_samples(path)
-    try:
-        return Trajectory([t_ns - start_ns for t_ns in times], poses, interpolate, max_gap_ns)
-    except TrajectoryError as error:
-        raise TrajectoryError(f"{path}: {error}") from None
+    if not times or any(b <= a for a, b in itertools.pairwise(times)):
+        raise TrajectoryError(f"{path}: expected at least one sample, and times that increase")
+    # As long as the recording: nothing is dropped.
+    track = SampleBuffer(Pose.interpolate if interpolate else None, max_gap_ns, times[-1] - times[0] + 1)
+    for t_ns, pose in zip(times, poses):
+        track.add(t_ns - start_ns, pose)
+    return track
 
 
 def read_samples(path: Path) -> tuple[list[int], list[Pose]]:

@@ -2,12 +2,12 @@
 
 The upper arm and the forearm are offset from the lines that the Denavit-Hartenberg parameters connect; their
 offsets along the elbow's axis are those of the manufacturer's description (ur_description, ur3e). Radii are
-read off the data sheet's drawing and rounded up. Parts that share a joint, and those whose distance no joint
-changes, are not compared.
+read off the data sheet's drawing and rounded up.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,25 +18,9 @@ from camera_node.robot.arm.kinematics import ArmModel
 Array = NDArray[np.float64]
 
 PARTS = ("base", "shoulder", "upper arm", "forearm", "wrist 1", "wrist 2", "wrist 3", "tool")
-PAIRS = (
-    (0, 3),
-    (0, 4),
-    (0, 5),
-    (0, 6),
-    (0, 7),
-    (1, 3),
-    (1, 4),
-    (1, 5),
-    (1, 6),
-    (1, 7),
-    (2, 4),
-    (2, 5),
-    (2, 6),
-    (2, 7),
-    (3, 6),
-    (3, 7),
-    (4, 7),
-)
+# Pairs of parts that share a joint, or whose distance no joint changes.
+_TOUCHING = {(0, 1), (0, 2), (1, 2), (2, 3), (3, 4), (3, 5), (4, 5), (4, 6), (5, 6), (5, 7), (6, 7)}
+PAIRS = tuple(pair for pair in itertools.combinations(range(len(PARTS)), 2) if pair not in _TOUCHING)
 ABOVE_FLOOR = (3, 4, 5, 6, 7)
 _UPPER_ARM_M, _FOREARM_M = 0.1198, 0.0273
 _RADII_M = (0.064, 0.055, 0.046, 0.04, 0.036, 0.036, 0.033)

@@ -44,6 +44,7 @@ GOOD_POSES, GOOD_SPREAD_DEG, GOOD_MM = 10, 15.0, 0.5
 NEW_DEG, STILL_MM, STILL_DEG = 8.0, 0.5, 0.1
 KEPT = "kept"
 _MIN_TO_SOLVE = 4
+_EXPLAIN_EVERY = 50  # of the pictures without the target
 
 
 @dataclass(frozen=True)
@@ -142,15 +143,20 @@ class HandEyeSession:
         self._target = target
         self._last: Array | None = None
         self._spread_deg, self._std_mm = 0.0, float("inf")
+        self._missed, self._why = 0, ""
 
     def offer(self, image: Image, lens: Pinhole, flange: Array) -> Step:
         """Process an image (H, W) or (H, W, 3) taken with the flange at ``flange`` (4, 4), in base."""
         last, self._last = self._last, flange
         if last is None or distance_mm(last, flange) > STILL_MM or angle_deg(last, flange) > STILL_DEG:
             return self._step("arm moving", "hold still")
-        corners = self._target.find(to_gray(image))
+        gray = to_gray(image)
+        corners = self._target.find(gray)
         if corners is None:
-            return self._step("target not found", "bring all of it into the picture, well lit")
+            self._missed += 1
+            if self._missed % _EXPLAIN_EVERY == 1:  # it takes a second
+                self._why = self._target.explain(gray)
+            return self._step("target not found", self._why or "bring all of it into the picture, well lit")
         turned_deg = angle_deg(self.samples.flange, flange)
         if len(turned_deg) and turned_deg.min() < NEW_DEG:
             return self._step(f"like pose {int(np.argmin(turned_deg)) + 1}")

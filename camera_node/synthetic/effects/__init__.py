@@ -25,6 +25,7 @@ from typing import Annotated, Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.clocks import ClockError
 from camera_node.synthetic.render import Image
 from camera_node.synthetic.scene import Scene
 from freshfield.geometry import Pinhole, Pose
@@ -94,12 +95,6 @@ class ImageEffect(Protocol):
         ...
 
 
-class ClockEffect(Protocol):
-    def node_ns(self, true_ns: int) -> int:
-        """Time of the node's clock at a true time."""
-        ...
-
-
 class PoseEffect(Protocol):
     @property
     def varies(self) -> bool:
@@ -118,7 +113,7 @@ class Effects:
     lens: tuple[LensEffect, ...] = ()
     exposure: tuple[ExposureEffect, ...] = ()
     image: tuple[ImageEffect, ...] = ()
-    clock: tuple[ClockEffect, ...] = ()
+    clock: tuple[ClockError, ...] = ()
     pose: tuple[PoseEffect, ...] = ()
     rendered: tuple[tuple[str, Any], ...] = ()  # name and parameters of the effects within cached frames
 

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_node.pose.pairing import SampleBuffer, interpolate_joints
-from camera_node.pose.providers import PoseGapError, Trajectory
+from camera_node.pose.pairing import PoseGapError, SampleBuffer, interpolate_joints
 from freshfield.geometry import Pose, matrix_to_quaternion, quaternion_multiply, quaternion_normalize, se3, so3_exp
 
 MS = 1_000_000
@@ -59,7 +58,9 @@ def test_the_order_and_the_number_of_arrivals_do_not_matter(random, stamps_ms):
     added = [buffer.add(t_ms * MS, at(t_ms)) for t_ms in sent]
     distinct = sorted(set(stamps_ms))
     assert sum(added) == len(distinct) and buffer.received == len(sent)
-    track = Trajectory([t * MS for t in distinct], [at(t) for t in distinct], max_gap_ns=30 * MS)
+    track = SampleBuffer(Pose.interpolate, max_gap_ns=30 * MS)
+    for t_ms in distinct:
+        track.add(t_ms * MS, at(t_ms))
     for t_ms in range(0, 400, 13):
         try:
             expected = track.at(t_ms * MS)

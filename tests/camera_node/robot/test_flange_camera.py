@@ -45,6 +45,7 @@ def test_what_it_sees_and_what_it_claims_agree_where_the_arm_stands(host):
     scenario = at(host)
     with simulated_arm(host, f"--joints={','.join(map(str, LOOKING))}"):
         fixed, hand = build_cameras(scenario, source_config(scenario), scenario.cameras)
+        assert hand.waits and not fixed.waits
         shot = take(hand)
         config = source_config(scenario).arm
         mount = load_hand_eyes(scenario, config, ["hand"])["hand"].transform

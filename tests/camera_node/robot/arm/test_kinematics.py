@@ -64,22 +64,6 @@ def test_forward_is_the_product_of_exponentials_and_the_jacobian_its_derivative(
         np.testing.assert_allclose(UR3E.jacobian(q), np.concatenate([linear, angular]), atol=1e-8)
 
 
-def test_forward_and_jacobian_are_pinocchios():
-    pin = pytest.importorskip("pinocchio", reason="needs pin: pip install -e '.[kinematics]'")
-    model, before, parent = pin.Model(), pin.SE3.Identity(), 0
-    for i in range(6):
-        parent = model.addJoint(parent, pin.JointModelRZ(), before, f"joint{i}")
-        before = pin.SE3(pin.utils.rotate("x", UR3E.alpha_rad[i]), np.array([UR3E.a_m[i], 0, UR3E.d_m[i]]))
-    flange = model.addFrame(pin.Frame("flange", parent, 0, before, pin.FrameType.OP_FRAME))
-    data = model.createData()
-    for q in POSTURES:
-        pin.computeJointJacobians(model, data, q)
-        pin.framesForwardKinematics(model, data, q)
-        assert np.abs(data.oMf[flange].homogeneous - UR3E.forward(q)).max() < 1e-14
-        theirs = pin.getFrameJacobian(model, data, flange, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
-        assert np.abs(theirs - UR3E.jacobian(q)).max() < 1e-14
-
-
 def check(q):
     """Every posture that is found reaches the target, and there is one."""
     target = UR3E.forward(q)

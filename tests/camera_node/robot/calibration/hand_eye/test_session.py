@@ -45,8 +45,8 @@ def test_it_waits_for_stillness_keeps_what_is_new_and_says_when_there_is_enough(
     found = calibrate(session.samples)
     assert distance_mm(found.transform, X) < 3 * found.refined.std_mm < 1.5
     assert angle_deg(found.transform, X) < 0.1
-    step = session.offer(np.zeros((240, 320, 3), np.uint8), LENS, flanges[-1])
-    assert step.outcome == "target not found"
+    step = session.offer(np.ascontiguousarray(images[-1][:, ::-1]), LENS, flanges[-1])
+    assert step.outcome == "target not found" and "the picture is mirrored" in step.advice
 
 
 def test_it_asks_for_turns_about_the_axis_that_is_missing():
