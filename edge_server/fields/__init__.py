@@ -88,10 +88,6 @@ class Renderer(Protocol):
         """Render a camera. camera_to_world: (4, 4), OpenCV axes, meters."""
         ...
 
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Up to ``count`` surface points (N, 3) in world meters and colors (N, 3) in [0, 1]."""
-        ...
-
 
 class Snapshot(Renderer, Protocol):
     """An immutable copy of a field."""

@@ -8,12 +8,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Rendering, View
+from edge_server.fields import Rendering
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.rays import Space
 from edge_server.fields.common.kernels.render import BATCH, render_tiles
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.common.stepped_field import surface_points
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool
 from freshfield.geometry import Pinhole
@@ -24,10 +23,10 @@ Pixels = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 @dataclass(frozen=True)
 class RaySnapshot:
-    """Parameters, occupancy and cameras of one instant. Nothing in it is written after it is made.
+    """Parameters and occupancy of one instant. Nothing in it is written after it is made.
 
     settings: of the field. levels: how many levels of the encoding are in use. background: float32 (3,).
-    cameras: the newest view of each camera. step: of the field.
+    step: of the field.
     """
 
     settings: Any
@@ -37,7 +36,6 @@ class RaySnapshot:
     net: Net
     space: Space
     background: NDArray[np.float32]
-    cameras: tuple[View, ...]
     pool: Pool
     step: int
 
@@ -60,10 +58,6 @@ class RaySnapshot:
         pixels = np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=-1)
         color, depth, opacity = self.render_pixels(camera_to_world, intrinsics, pixels)
         return Rendering(color.reshape(h, w, 3), depth.reshape(h, w), opacity.reshape(h, w))
-
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """At most ``count`` points (N, 3) in world meters and colors (N, 3), see ``surface_points``."""
-        return surface_points(self.render, self.cameras, count)
 
     def render_pixels(
         self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]

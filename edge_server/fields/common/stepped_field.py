@@ -23,7 +23,6 @@ from freshfield.geometry import Pinhole
 # A step at a progress of the fit in [0, 1] -> loss (None: none is known), rays, samples, and how many values
 # were not finite and left out.
 Step = Callable[[float], tuple[float | None, int, int, int]]
-SOLID = 0.5  # opacity above which a pixel shows a surface
 
 
 class StepSnapshot(Snapshot, Protocol):
@@ -39,32 +38,14 @@ class StepSnapshot(Snapshot, Protocol):
         ...
 
 
-def surface_points(
-    render: Callable[[NDArray[np.float64], Pinhole], Rendering], cameras: Sequence[View], count: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Up to ``count`` surface points (N, 3) in world meters and their colors (N, 3): the cameras are rendered small,
-    and the solid pixels unprojected by their depth."""
-    positions, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
-    share = max(count // max(len(cameras), 1), 1)
-    for view in cameras:
-        lens, pose = view.intrinsics, np.asarray(view.camera_to_world, dtype=np.float64)
-        small = lens.scaled(min(float(np.sqrt(share / (lens.width * lens.height))), 1.0))
-        out = render(pose, small)
-        solid = (out.opacity > SOLID) & (out.depth > 0)
-        rays = small.rays()[solid] @ pose[:3, :3].T
-        positions.append((pose[:3, 3] + rays * out.depth[solid, None]).astype(np.float32))
-        colors.append(out.color[solid])
-    return np.concatenate(positions)[:count], np.concatenate(colors)[:count]
-
-
 S = TypeVar("S", bound=StepSnapshot)
 
 
 class SteppedField(ABC, Generic[S]):
     """See ``fields.Field`` for the protocol.
 
-    ``fit`` belongs to one thread; ``render``, ``snapshot`` and ``points`` may be called from others
-    meanwhile: they wait for the end of the present step, some milliseconds.
+    ``fit`` belongs to one thread; ``render`` and ``snapshot`` may be called from others meanwhile: they
+    wait for the end of the present step, some milliseconds.
 
     name: of the representation. shape: options in which a state and the field that loads it must agree.
     """
@@ -119,10 +100,6 @@ class SteppedField(ABC, Generic[S]):
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """Render a camera from the present parameters."""
         return self.snapshot().render(camera_to_world, intrinsics)
-
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Surface points in world meters and their colors; none before the first fit."""
-        return self.snapshot().points(count)
 
     def snapshot(self, present_ns: int | None = None) -> S:
         """A copy that renders from any thread and never changes. present_ns: see ``fields.Field``."""

@@ -98,7 +98,6 @@ class TrainedField(SteppedField[RaySnapshot]):
             net=self._net,
             space=self._occupancy.space(step_length(self.settings, self.step)),
             background=self.view_store.background(),
-            cameras=self.view_store.views,
             pool=self.pool,
             step=self.step,
         )

@@ -94,7 +94,6 @@ class StillField(SteppedField[SplatSnapshot]):
             box=self.view_store.box or UNIT_BOX,
             gaussians=self.cloud.gaussians(),
             background=self.view_store.background(),
-            cameras=self.view_store.views,
             pool=self.pool,
             step=self.step,
             planar=self.settings.planar,

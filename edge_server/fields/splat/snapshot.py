@@ -8,10 +8,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Rendering, View
+from edge_server.fields import Rendering
 from edge_server.fields.common.camera_rows import camera_rows, ray_lengths
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.common.stepped_field import surface_points
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.kernels.project import Gaussians
@@ -21,7 +20,7 @@ from freshfield.geometry import Pinhole
 
 @dataclass(frozen=True)
 class SplatSnapshot:
-    """Gaussians and cameras, never written after construction.
+    """Gaussians, never written after construction.
 
     planar: the Gaussians are flat, so ``render_surface`` renders depth from their planes.
     """
@@ -29,7 +28,6 @@ class SplatSnapshot:
     box: SceneBox
     gaussians: Gaussians
     background: NDArray[np.float32]
-    cameras: tuple[View, ...]
     pool: Pool
     step: int
     planar: bool = False
@@ -66,7 +64,3 @@ class SplatSnapshot:
         raster, cams = RasterBuffers(self.pool), camera_rows([pose], [lens], self.box)
         raster.project_and_bin(cams, self.gaussians, differentiate=False)
         return raster, cams
-
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Up to ``count`` points (N, 3) in world meters and colors (N, 3), see ``surface_points``."""
-        return surface_points(self.render, self.cameras if len(self.gaussians.params) else (), count)

@@ -47,7 +47,6 @@ def go_through_all(kind: str) -> None:
         field = tiny(kind, **extra)
         field.fit(VIEWS[:5], Budget(steps=12))
         out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
-        field.points(50)
         assert np.isfinite(out.color).all()
     field.fit([replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS], Budget(steps=9))
     masked = [replace(v, weight=(np.indices((24, 24)).sum(0) % 3 / 2).astype(np.float32)) for v in VIEWS]

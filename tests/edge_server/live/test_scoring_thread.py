@@ -35,9 +35,6 @@ class Brightness:
         color = np.repeat(flat[..., None] * np.float32(self.at_ns / 1e9), 3, axis=-1)
         return Rendering(color, flat, flat)
 
-    def points(self, count: int) -> Any:
-        raise NotImplementedError
-
 
 def _frame(sequence: int, at_ns: int) -> Frame:
     image = np.full((32, 32, 3), round(255 * at_ns / 1e9), np.uint8)

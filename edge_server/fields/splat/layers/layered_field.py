@@ -196,10 +196,6 @@ class LayeredField:
         """Render the scene at the instant of the newest view."""
         return self.snapshot().render(camera_to_world, intrinsics)
 
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Surface points in world meters and their colors; none before the first fit."""
-        return self.snapshot().points(count)
-
     def snapshot(self, present_ns: int | None = None) -> SplatSnapshot:
         """The scene at an instant; None: that of the newest view."""
         published = self._published

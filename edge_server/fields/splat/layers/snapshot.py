@@ -63,7 +63,7 @@ class LayeredSnapshot(SplatSnapshot):
     def of(cls, still: SplatSnapshot, exposed: Gaussians, moving: MovingSnapshot | None) -> LayeredSnapshot:
         """A snapshot of the newest frame's instant. still: what the static field shows. exposed: its Gaussians at the
         exposure to show."""
-        parts = still.box, exposed, still.background, still.cameras, still.pool, still.step
+        parts = still.box, exposed, still.background, still.pool, still.step
         return cls(*parts, planar=still.planar, static=exposed.params, moving=moving)
 
     def at(self, present_ns: int | None) -> LayeredSnapshot:

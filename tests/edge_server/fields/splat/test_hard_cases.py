@@ -106,7 +106,6 @@ for extra, views in (({}, VIEWS), ({"harmonics": 9, "contracted": True}, bent),
     field = StillField(structs.replace(TINY, **extra))
     field.fit(views, Budget(steps=25))
     out = field.render(VIEWS[0].camera_to_world, replace(VIEWS[0].intrinsics, width=37, height=19))
-    field.points(50)
     assert np.isfinite(out.color).all()
 moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS]
 field.fit(moved, Budget(steps=20))
