@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.training_schedule import BETA1, BETA2
+from edge_server.fields.common.trainer_settings import BETA1, BETA2
 
 Array = NDArray[np.float64]
 

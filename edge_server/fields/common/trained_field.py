@@ -30,10 +30,9 @@ from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.scene_box import UNIT_BOX, SceneBox
 from edge_server.fields.common.stepped_field import Step, SteppedField
 from edge_server.fields.common.supervision import supervising_views
-from edge_server.fields.common.trainer_settings import BATCH
+from edge_server.fields.common.trainer_settings import BATCH, BETA2
 from edge_server.fields.common.training_schedule import (
     BETA1_FIELD,
-    BETA2,
     NOMINAL_RAYS,
     StepBudget,
     StepTimer,

@@ -13,6 +13,7 @@ from msgspec import Meta
 
 from freshfield.settings import ScenarioError, Settings, about, read_settings, within
 
+BETA1, BETA2 = 0.9, 0.99  # of Adam, but for encodings and their networks: ``training_schedule``
 BATCH = 2048  # ``kernels.train.CHUNK``, samples; settings do not load kernels
 
 Harmonics = Annotated[Literal[1, 4, 9], about("view dependence of color: 1 (none), 4 or 9 spherical harmonics")]

@@ -12,7 +12,6 @@ import numpy as np
 from edge_server.fields import Budget
 from edge_server.fields.common.trainer_settings import HashGridSettings, TrainerSettings
 
-BETA1, BETA2 = 0.9, 0.99
 # Of encodings and their networks: a first fit has a hundred steps or so, and with .9 a tenth of them pass
 # before Adam forgets the gradients of fog that is gone.
 BETA1_FIELD = 0.65

@@ -24,12 +24,13 @@ FAST = {"contract", "reassoc", "arcp", "nsz"}
 
 def cache_folder(root: Path) -> Path:
     """Where compiled kernels are kept: a folder in $NUMBA_CACHE_DIR, or in the user's cache, for each state of
-    the sources. numba checks only the file that a function stands in, but kernels inline functions of others.
+    the sources. numba checks only the file that a function stands in, but kernels inline functions of others, and
+    numbers of the fields' settings.
 
     root: the package whose folders called ``kernels`` count.
     """
     total = hashlib.sha256()
-    for path in sorted(root.rglob("kernels/*.py")):
+    for path in sorted([*root.rglob("kernels/*.py"), *root.glob("fields/**/*settings.py")]):
         total.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
     user = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     folder = os.environ.get("NUMBA_CACHE_DIR") or f"{user}/freshfield"
