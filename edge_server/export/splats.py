@@ -19,8 +19,8 @@ from edge_server.fields.splat.planar import unit_quaternions
 from edge_server.fields.splat.settings import LOG_SCALE_HIGH, LOG_SCALE_LOW
 
 Y0 = 0.28209479177387814
-# Signs of harmonics 1 to 8: Kerbl et al. negate those of odd order.
-SIGNS = np.array([-1, 1, -1, 1, -1, 1, -1, 1], np.float32)
+# Signs of the harmonics of degree 1: Kerbl et al. negate those of odd order.
+SIGNS = np.array([-1, 1, -1], np.float32)
 
 
 def write_splats(path: Path, gaussians: Gaussians, box: SceneBox) -> int:
@@ -34,7 +34,7 @@ def write_splats(path: Path, gaussians: Gaussians, box: SceneBox) -> int:
 
 def splat_table(gaussians: Gaussians, box: SceneBox) -> NDArray[np.void]:
     """The rows (N,) of the file, in world meters."""
-    p, extra = gaussians.params.astype(np.float64), gaussians.harmonics - 1
+    p, extra = gaussians.params.astype(np.float64), 3 * gaussians.sh_degree
     rest = p[:, BASE:].reshape(len(p), extra, 3) * SIGNS[:extra, None]
     columns = {
         **_three("xyz", p[:, POSITION:SCALE] * box.radius_m + np.array(box.centre_m)),

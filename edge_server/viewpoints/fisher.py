@@ -31,8 +31,8 @@ def information(
     Raises ViewpointError for view-dependent colors.
     """
     gaussians = snapshot.gaussians
-    if gaussians.harmonics > 1:
-        raise ViewpointError("Fisher information is known for splats with harmonics: 1 only")
+    if gaussians.sh_degree > 0:
+        raise ViewpointError("Fisher information is known for splats with sh_degree: 0 only")
     raster = RasterBuffers(snapshot.pool)
     moments = np.zeros((snapshot.pool.threads, len(gaussians.params), MOMENTS))
     for first in range(0, len(poses), _CAMERAS_A_RUN):

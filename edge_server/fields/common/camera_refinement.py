@@ -1,7 +1,7 @@
-"""Camera refinement while a field trains: each camera's exposure or appearance, and small corrections of its pose.
+"""Camera refinement while a field trains: each camera's appearance, and small corrections of its pose.
 
-All are off by default, cost nothing then, and serve every representation of ``trained_field``. Pictures are
-rendered at the mean exposure and appearance and at the given pose.
+Both are off by default, cost nothing then, and serve every representation of ``trained_field``. Pictures are
+rendered at the mean appearance and at the given pose.
 """
 
 from __future__ import annotations
@@ -25,61 +25,12 @@ from freshfield.geometry import so3_exp
 Array = NDArray[np.float64]
 
 START = 40  # steps before anything is corrected: first the scene must take shape
-_SHARE = 0.1  # of the least-squares solution of one step's rays that is applied
-_DAMPING = 0.02  # in least squares: a camera that sees one plain color learns a bias at most
-_GAIN, _BIAS = 3.0, 0.3  # bounds: gain in 1/3..3
-
 EVERY = 2  # steps between corrections of a pose, of one camera after the other
 PIXELS = 384  # compared for one correction
 _STEP_SHARE = 0.8  # of a Gauss-Newton step that is taken
 _LONGEST = 1.0  # pixels, of one step in one parameter
 _PRIOR = 1e-2  # squared error that a correction at its bound costs: without detail, poses stay as given
 _OUTLIER = 0.15  # residual from which on a pixel counts less: something moved, or is hidden
-
-
-class Exposures:
-    """Gain ``a`` and bias ``b`` per camera and channel; a * picture + b has the common exposure. Their means
-    over the cameras are kept at a = 1 (geometric) and b = 0."""
-
-    def __init__(self) -> None:
-        self.known: dict[str, Array] = {}  # camera -> (3, 2)
-
-    def rows(self, cameras: list[str]) -> NDArray[np.float32]:
-        """float32 (V, 3, 2) for the kernels."""
-        unity = np.array([[1.0, 0.0]] * 3)
-        for camera in cameras:
-            self.known.setdefault(camera, unity.copy())
-        return np.array([self.known[camera] for camera in cameras], dtype=np.float32)
-
-    def learn(self, cameras: list[str], sums: Array) -> None:
-        """One step.
-
-        sums: float64 (V, 3, 5); per view and channel, over its rays: their number, and the sums of t, t^2, e
-        and e t, where t is the corrected pixel and e = rendered - t.
-        """
-        n, t, tt, e, et = np.moveaxis(sums, -1, 0)
-        m = np.maximum(n, 1.0)
-        # Damped least squares for e = p t + q, per ray; (V, 3) each.
-        a11, a12, a22 = tt / m + _DAMPING, t / m, 1.0 + _DAMPING
-        determinant = a11 * a22 - a12 * a12
-        p = (a22 * et / m - a12 * e / m) / determinant
-        q = (a11 * e / m - a12 * et / m) / determinant
-        share = _SHARE * np.minimum(n / 32.0, 1.0)  # small where there were few rays
-        for k, camera in enumerate(cameras):
-            now = self.known[camera]
-            step = 1.0 + share[k] * np.clip(p[k], -0.5, 0.5)
-            new = np.stack([step * now[:, 0], step * now[:, 1] + share[k] * q[k]], axis=-1)
-            if np.isfinite(new).all():
-                self.known[camera] = new
-        self._center()
-
-    def _center(self) -> None:
-        both = np.array(list(self.known.values()))
-        both[..., 0] = np.clip(both[..., 0], 1.0 / _GAIN, _GAIN)
-        both[..., 0] /= np.exp(np.log(both[..., 0]).mean(axis=0))
-        both[..., 1] = np.clip(both[..., 1] - both[..., 1].mean(axis=0), -_BIAS, _BIAS)
-        for camera, pair in zip(self.known, both):
-            self.known[camera] = pair
 
 
 @dataclass
@@ -175,7 +126,7 @@ class PoseCorrections:
 
 
 class CameraRefinement:
-    """Exposures, appearances and pose corrections of one field's cameras, each None unless enabled.
+    """Appearances and pose corrections of one field's cameras, each None unless enabled.
 
     embeddings: float32 (V, A), appearances of the views in training; A = 0: none.
     """
@@ -183,7 +134,6 @@ class CameraRefinement:
     def __init__(self, settings: TrainerSettings) -> None:
         s = settings
         self.seed = s.seed
-        self.exposures = Exposures() if s.exposure else None
         self.appearances = AppearanceEmbeddings(s.appearance, s.seed) if s.appearance else None
         self.poses = PoseCorrections(s.refine_m, s.refine_deg) if s.refine_m > 0 or s.refine_deg > 0 else None
         self.embeddings = np.zeros((0, 0), np.float32)
@@ -191,7 +141,7 @@ class CameraRefinement:
     @property
     def enabled(self) -> bool:
         """Whether anything is to be learned."""
-        return not (self.exposures is self.appearances is self.poses is None)
+        return not (self.appearances is self.poses is None)
 
     def corrected(self, views: Sequence[View], data: Views, box: SceneBox) -> Views:
         """``data`` with the corrections known by now; also updates ``embeddings``."""
@@ -199,8 +149,6 @@ class CameraRefinement:
         self.embeddings = np.zeros((len(views), 0), np.float32)
         if self.appearances is not None:
             self.embeddings = self.appearances.rows(cameras)
-        if self.exposures is not None:
-            data = data._replace(exposure=self.exposures.rows(cameras))
         if self.poses is not None:
             poses = np.stack([self.poses.pose(view) for view in views])
             data = data._replace(
@@ -220,18 +168,13 @@ class CameraRefinement:
     ) -> Views:
         """Learn from a step; returns the corrected data.
 
-        step: number of steps made. batch: of the last one; the sums of exposures are cleared.
+        step: number of steps made. batch: of the last one.
         make_renderer: returns a renderer of the field as it is.
         """
         changed, cameras = False, [v.camera for v in views]
         if self.appearances is not None:
             self.appearances.learn(cameras, batch.d_embeddings, int(batch.rays.sum()))
             changed = True
-        if self.exposures is not None:
-            if step >= START:
-                self.exposures.learn(cameras, batch.exposure.sum(axis=0))
-                changed = True
-            batch.exposure[...] = 0.0
         if self.poses is not None and step >= START and step % EVERY == 0:
             view, renderer = views[step // EVERY % len(views)], make_renderer()
 
@@ -249,7 +192,6 @@ class CameraRefinement:
         looks = self.appearances.meta() if self.appearances else {}
         return {
             **looks,
-            "exposures": {c: p.tolist() for c, p in self.exposures.known.items()} if self.exposures else {},
             "poses": {
                 name: [c.given.tolist(), c.rotation.tolist(), c.shift_m.tolist()]
                 for name, c in (self.poses.known.items() if self.poses else ())
@@ -260,8 +202,6 @@ class CameraRefinement:
         """Restore what ``meta`` returned; what is not enabled here is left out."""
         if self.appearances is not None:
             self.appearances.load(meta)
-        if self.exposures is not None:
-            self.exposures.known = {c: np.array(p) for c, p in meta.get("exposures", {}).items()}
         if self.poses is not None:
             known = meta.get("poses", {}).items()
             self.poses.known = {name: _Correction(*map(np.array, parts)) for name, parts in known}

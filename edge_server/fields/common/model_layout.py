@@ -44,7 +44,7 @@ def make_grid(settings: HashGridSettings, box: SceneBox | None, rng: np.random.G
 def init_net(inputs: int, settings: TrainerSettings, rng: np.random.Generator) -> Net:
     """He initialization with a small output: thin gray fog everywhere. Widths are padded to 4: ``inputs`` features in;
     density, color, the color's harmonics and three numbers for each dimension of the appearance out."""
-    outputs = _multiple_of_4(1 + 3 * settings.harmonics + 3 * settings.appearance)
+    outputs = _multiple_of_4(4 + 9 * settings.sh_degree + 3 * settings.appearance)
     hidden = [settings.hidden] * settings.hidden_layers
     widths = np.array([_multiple_of_4(inputs), *hidden, outputs], dtype=np.int64)
     params = np.zeros(param_count(widths), np.float32)

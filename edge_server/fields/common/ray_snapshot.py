@@ -79,7 +79,7 @@ class RaySnapshot:
             self.encoding,
             self.levels,
             self.net,
-            self.settings.harmonics,
+            self.settings.sh_degree,
             self.background,
             scratch,
             out,

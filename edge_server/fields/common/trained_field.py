@@ -73,11 +73,8 @@ class TrainedField(SteppedField[RaySnapshot]):
             box, cameras = self.view_store.box, self._cameras
             data = cameras.corrected(views, update.data, box)
             data = self._add_depth_guide(views, data, box, step_budget, update.has_new_images)
-            chunks, counted = len(self._batch.samples), len(views) if cameras.exposures is not None else 0
-            self._batch = self._batch._replace(
-                exposure=np.zeros((chunks, counted, 3, 5)),
-                d_embeddings=np.zeros((chunks, *cameras.embeddings.shape), np.float32),
-            )
+            shape = len(self._batch.samples), *cameras.embeddings.shape
+            self._batch = self._batch._replace(d_embeddings=np.zeros(shape, np.float32))
 
         def one_step(progress: float) -> tuple[float, int, int, int]:
             nonlocal data
@@ -167,7 +164,7 @@ class TrainedField(SteppedField[RaySnapshot]):
             # With many cameras in a room, a field is as good without a guide, sooner or later.
             plain = self.view_store.background_is_plain and s.background == "auto"
             weight = GUIDE_WEIGHT if plain or len(supervising_views(data)) <= FEW_VIEWS else 0.0
-        # Cameras do not agree while their exposures and poses are still to be learned.
+        # Cameras do not agree while their appearances and poses are still to be learned.
         self._guide_weight = 0.0 if self._cameras.enabled else weight
         if self._present_guide_weight() == 0.0:
             return data
@@ -213,7 +210,6 @@ class TrainedField(SteppedField[RaySnapshot]):
             rays=np.zeros(chunks, np.int64),
             dropped=np.zeros(chunks, np.int64),
             loss=np.zeros(chunks),
-            exposure=np.zeros((chunks, 0, 3, 5)),
             d_embeddings=np.zeros((chunks, 0, 0), np.float32),
         )
         self._scratch = Scratch(
@@ -257,7 +253,7 @@ class TrainedField(SteppedField[RaySnapshot]):
             key=np.uint64(key + np.uint64(1)),
             chunk_rays=max(s.rays // batch.samples.size, 1),
             levels=levels,
-            harmonics=s.harmonics,
+            sh_degree=s.sh_degree,
             changed_share=np.float32(s.changed_share),
             background=self.view_store.background(),
             embeddings=self._cameras.embeddings,

@@ -16,7 +16,7 @@ from freshfield.settings import ScenarioError, Settings, about, read_settings, w
 BETA1, BETA2 = 0.9, 0.99  # of Adam, but for encodings and their networks: ``training_schedule``
 BATCH = 2048  # ``kernels.train.CHUNK``, samples; settings do not load kernels
 
-Harmonics = Annotated[Literal[1, 4, 9], about("view dependence of color: 1 (none), 4 or 9 spherical harmonics")]
+ShDegree = Annotated[Literal[0, 1], about("degree of the spherical harmonics of color; 0: the same from everywhere")]
 
 
 class FieldSettings(Settings, frozen=True):
@@ -79,7 +79,7 @@ class TrainerSettings(FieldSettings, frozen=True):
     ``guide_steps`` steps.
     """
 
-    harmonics: Harmonics = 1
+    sh_degree: ShDegree = 0
     rays: Annotated[int, within(1, 1 << 20, "maximum number of rays in a training step")] = 4096
     batch_samples: Annotated[
         int, within(BATCH, 1 << 22, "maximum number of samples in a training step, a multiple of 2048")
@@ -88,7 +88,6 @@ class TrainerSettings(FieldSettings, frozen=True):
     changed_share: Annotated[float, within(0, 1, "share of rays drawn from pixels that changed in the newest view")] = (
         0.25
     )
-    exposure: Annotated[bool, about("whether to learn each camera's exposure (gain and bias per channel)")] = False
     refine_m: Annotated[float, within(0, 1, "largest correction of a camera's position, meters; 0: none")] = 0.0
     refine_deg: Annotated[float, within(0, 20, "largest correction of a camera's rotation, degrees; 0: none")] = 0.0
     hidden: int = 32

@@ -33,12 +33,6 @@ class NerfactoSettings(HashGridSettings, frozen=True):
     even: float = 0.4
     anneal: int = 40
 
-    def __post_init__(self) -> None:
-        if self.appearance and self.exposure:
-            # Measured: they compensate each other, and the field is worse than with neither.
-            raise ValueError("appearance and exposure explain the same thing: choose one")
-        super().__post_init__()
-
 
 SETTINGS = NerfactoSettings
 _LOW = {"levels": 6, "log2_table": 14, "finest_resolution": 96, "batch_samples": 8192, "samples": 16}

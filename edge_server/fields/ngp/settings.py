@@ -13,7 +13,7 @@ STATE_SHAPE = (
     "finest_resolution",
     "hidden",
     "hidden_layers",
-    "harmonics",
+    "sh_degree",
     "cells",
     "samples",
 )

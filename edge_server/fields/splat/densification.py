@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.splat.kernels.optimizer_step import DEAD, OptimizerState, clamp_gaussians
-from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE, Gaussians
+from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE, SH_COLUMNS, Gaussians
 from edge_server.fields.splat.settings import GROW_SHARE, PRUNE_OPACITY, SHARP_PX, SPLIT_SHRINK, WIDEST, SplatSettings
 from freshfield.geometry import quaternion_to_matrix
 
@@ -40,14 +40,14 @@ class GaussianCloud:
 
     @classmethod
     def empty(cls, settings: SplatSettings) -> GaussianCloud:
-        return cls.new(np.zeros((0, BASE + 3 * (settings.harmonics - 1)), np.float32))
+        return cls.new(np.zeros((0, BASE + SH_COLUMNS * settings.sh_degree), np.float32))
 
     def __len__(self) -> int:
         return len(self.params)
 
     def gaussians(self) -> Gaussians:
         """The arrays that are projected, not copied."""
-        return Gaussians(self.params, (self.params.shape[1] - BASE) // 3 + 1)
+        return Gaussians(self.params, (self.params.shape[1] - BASE) // SH_COLUMNS)
 
     def optimizer_state(self) -> OptimizerState:
         """The arrays that a step updates beside ``params``, not copied."""

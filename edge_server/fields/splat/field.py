@@ -29,17 +29,17 @@ from edge_server.fields.common.view_store import Arrays, same_views
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_corrections, clamp_gaussians
-from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, TILE
+from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, SH_COLUMNS, TILE
 from edge_server.fields.splat.kernels.rasterize import Targets
 from edge_server.fields.splat.seeding import seed_gaussians
 from edge_server.fields.splat.settings import (
     ALIGN_EVERY,
     RATE_COLOR,
-    RATE_HARMONICS,
     RATE_OPACITY,
     RATE_POSITION,
     RATE_ROTATION,
     RATE_SCALE,
+    RATE_SH,
     SplatSettings,
 )
 from edge_server.fields.splat.snapshot import SplatSnapshot
@@ -53,7 +53,7 @@ class StillField(SteppedField[SplatSnapshot]):
     """
 
     name = "splat"
-    shape = ("harmonics",)
+    shape = ("sh_degree",)
     settings: SplatSettings
 
     def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
@@ -215,7 +215,7 @@ class StillField(SteppedField[SplatSnapshot]):
         """Parameters of an optimizer step at ``progress``, in [0, 1], of a fit."""
         s, box = self.settings, self.view_store.box
         assert box is not None
-        rates = np.full(BASE + 3 * (s.harmonics - 1), RATE_HARMONICS)
+        rates = np.full(BASE + SH_COLUMNS * s.sh_degree, RATE_SH)
         rates[:SCALE] = RATE_POSITION * box.pixel_m / box.radius_m
         rates[SCALE:QUATERNION] = RATE_SCALE
         rates[QUATERNION:OPACITY] = RATE_ROTATION

@@ -14,7 +14,7 @@ from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import pack_cameras, supervising_views
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.kernels.optimizer_step import clamp_gaussians
-from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE
+from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, SH_COLUMNS
 from edge_server.fields.splat.settings import SEED_CANDIDATES, SEED_OPACITY, SEED_SCALE, SplatSettings
 
 
@@ -37,7 +37,7 @@ def seed_gaussians(
     rng: draws the pixels.
     moved: for each view bool (H, W), or None; if given, only places where most cameras see motion count.
     """
-    width = BASE + 3 * (settings.harmonics - 1)
+    width = BASE + SH_COLUMNS * settings.sh_degree
     data = pack_cameras(views, box)._replace(weight=weight)
     where = _candidate_pixels(settings, views, data, masks)
     if count <= 0 or where.size == 0:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from edge_server.fields.common.trainer_settings import FieldSettings, Harmonics
+from edge_server.fields.common.trainer_settings import FieldSettings, ShDegree
 from freshfield.settings import about, within
 
 # Seeding: scale of new Gaussians in distances to their neighbors, their opacity, and pixels tried for each,
@@ -17,7 +17,7 @@ SEED_SCALE, SEED_OPACITY, SEED_CANDIDATES = 0.5, 0.3, 4
 # Learning rates at the start of a fit: positions in pixels; logarithms of scales; quaternions; opacities
 # before the sigmoid; colors, and further spherical harmonics.
 RATE_POSITION, RATE_SCALE, RATE_ROTATION, RATE_OPACITY = 0.4, 0.08, 0.02, 0.15
-RATE_COLOR, RATE_HARMONICS = 0.02, 0.002
+RATE_COLOR, RATE_SH = 0.02, 0.002
 # A Gaussian trains at full rates for SETTLE_STEPS steps; then they fall as 1 / steps, down to RATE_SETTLED.
 SETTLE_STEPS, RATE_SETTLED = 300.0, 0.1
 
@@ -48,7 +48,7 @@ class SplatSettings(FieldSettings, frozen=True):
 
     gaussians: Annotated[int, within(1, 1 << 20, "largest number of Gaussians")] = 8192
     start: Annotated[int, within(1, 1 << 20, "number of Gaussians at the start, at most ``gaussians``")] = 4096
-    harmonics: Harmonics = 1
+    sh_degree: ShDegree = 0
     seed_cells: Annotated[int, within(8, 256, "cells a side of the grid that gives initial positions")] = 64
     epsilon: Annotated[float, about("Adam's epsilon, on gradients summed over pixels")] = 1e-3
     densify_every: Annotated[

@@ -34,7 +34,7 @@ class TensorfField(TrainedField):
         "upsample",
         "hidden",
         "hidden_layers",
-        "harmonics",
+        "sh_degree",
         "cells",
         "samples",
     )

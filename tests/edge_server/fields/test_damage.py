@@ -29,11 +29,10 @@ _POSES = {"refine_m": 0.05, "refine_deg": 2.0}
 _FEW = {"batch_samples": 8192, "rays": 9}
 # Of each kind, settings that together go through all of its kernels.
 THROUGH_ALL: dict[str, tuple[dict[str, Any], ...]] = {
-    "ngp": ({}, {"harmonics": 4, **_PLAIN}, _FEW),
-    "tensorf": ({"upsample": (4, 8)}, {"harmonics": 4, **_PLAIN}, {"exposure": True, **_POSES}, _FEW),
+    "ngp": ({}, {"sh_degree": 1, **_PLAIN}, _FEW),
+    "tensorf": ({"upsample": (4, 8)}, {"sh_degree": 1, **_PLAIN}, _POSES, _FEW),
     "nerfacto": (
-        {"exposure": True, **_POSES},
-        {"harmonics": 4, **_PLAIN},
+        {"sh_degree": 1, **_PLAIN},
         {"appearance": 3, **_POSES},
         {**_FEW, "contracted": True, "radius_m": 0.5},
     ),

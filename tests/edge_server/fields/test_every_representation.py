@@ -64,10 +64,10 @@ def test_a_warm_start_follows_what_moved(name: str) -> None:
     ("name", "extra"),
     [
         ("ngp", {}),
-        ("nerfacto", {"exposure": True}),
-        ("nerfacto", {"appearance": 3, "harmonics": 4}),
+        ("nerfacto", {}),
+        ("nerfacto", {"appearance": 3, "sh_degree": 1}),
         ("tensorf", {}),
-        ("tensorf", {"harmonics": 4}),
+        ("tensorf", {"sh_degree": 1}),
         ("splat", {}),
     ],
 )

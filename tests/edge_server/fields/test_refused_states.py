@@ -114,7 +114,7 @@ def test_a_refused_state_leaves_the_field_as_it_was(name: str) -> None:
         ("ngp", {"hidden": 32}, "hidden = 16"),
         ("nerfacto", {"appearance": 2}, "appearance = 0"),
         ("tensorf", {"density_rank": 16}, "density_rank = 8"),
-        ("splat", {"harmonics": 4}, "harmonics = 1"),
+        ("splat", {"sh_degree": 1}, "sh_degree = 0"),
         ("splat", {"gaussians": 100, "start": 100}, "holds 100 at most"),
     ],
 )

@@ -74,20 +74,18 @@ def mlp(widths: Sequence[int], params: Tensor, x: Tensor) -> Tensor:
     return x
 
 
-def harmonics(count: int, d: Tensor) -> Tensor:
-    """Real spherical harmonics 1 .. count - 1 of unit directions (N, 3) -> (N, count - 1)."""
-    x, y, z = d.unbind(-1)
-    values = [0.4886025 * y, 0.4886025 * z, 0.4886025 * x, 1.0925485 * x * y, 1.0925485 * y * z]
-    values += [0.3153916 * (3 * z * z - 1), 1.0925485 * x * z, 0.5462742 * (x * x - y * y)]
-    return torch.stack(values[: count - 1], dim=-1) if count > 1 else d[:, :0]
+def harmonics(d: Tensor) -> Tensor:
+    """Real spherical harmonics of degree 1 of unit directions (N, 3) -> (N, 3)."""
+    return 0.4886025 * d[:, [1, 2, 0]]
 
 
-def shade(raw: Tensor, count: int, d: Tensor) -> tuple[Tensor, Tensor]:
-    """Net output (N, >= 1 + 3 count) and directions (N, 3) -> density (N,), color (N, 3). The clamp has
+def shade(raw: Tensor, sh_degree: int, d: Tensor) -> tuple[Tensor, Tensor]:
+    """Net output (N, >= 4 + 9 sh_degree) and directions (N, 3) -> density (N,), color (N, 3). The clamp has
     no gradient outside its bounds, forward and backward alike."""
     sigma = raw[:, 0].clamp(RAW_LOW, RAW_HIGH).exp()
-    shares = raw[:, 4 : 1 + 3 * count].view(len(raw), count - 1, 3)
-    color = raw[:, 1:4] + (shares * harmonics(count, d)[..., None]).sum(dim=1)
+    color = raw[:, 1:4]
+    if sh_degree:
+        color = color + (raw[:, 4:13].view(len(raw), 3, 3) * harmonics(d)[..., None]).sum(dim=1)
     return sigma, color.sigmoid()
 
 

@@ -44,7 +44,6 @@ class Views(NamedTuple):
     lens: float64 (V, 8), fx fy cx cy k1 k2 p1 p2. rotation: float64 (V, 3, 3), camera to world.
     origin: float64 (V, 3), scene units. pixels: uint8 (N, 3 or 4).
     changed: int64 (M,), pixels that moved since the camera's previous view, none of weight 0.
-    exposure: float32 (V, 3, 2), gain and bias that correct pixels; V = 0: none.
     weight: float32 (N,), of each pixel's loss; size 0: all 1.
     drawn: int64 (K,), the pixels of weight above 0; size 0: all of them.
     guide: float32 (N,), distance in scene units of what a pixel shows (``plane_sweep.depth_guide``), 0:
@@ -58,7 +57,6 @@ class Views(NamedTuple):
     origin: NDArray[np.float64]
     pixels: NDArray[np.uint8]
     changed: NDArray[np.int64]
-    exposure: NDArray[np.float32] = np.zeros((0, 3, 2), np.float32)
     weight: NDArray[np.float32] = np.zeros(0, np.float32)
     drawn: NDArray[np.int64] = np.zeros(0, np.int64)
     guide: NDArray[np.float32] = np.zeros(0, np.float32)

@@ -37,7 +37,7 @@ def _march(encoding, space, o, travel, active, count, x, line, first):
 
 @kernel
 def render_tiles(
-    counter, worker, lens, rotation, origin, pixels, space, encoding, levels, net, harmonics, background, scratch, out
+    counter, worker, lens, rotation, origin, pixels, space, encoding, levels, net, sh_degree, background, scratch, out
 ):
     """Render image points; tasks are runs of TILE of them.
 
@@ -75,10 +75,10 @@ def render_tiles(
             n = first[some]
             query_density(encoding, levels, net, x, start, n, acts)
             query_color(encoding, levels, net, x, start, n, acts)
-            if harmonics > 1:
+            if sh_degree > 0:
                 for k in range(some):
                     r = active[k]
-                    add_harmonics(shaded, harmonics, first[k], first[k + 1], travel[r, 0], travel[r, 1], travel[r, 2])
+                    add_harmonics(shaded, sh_degree, first[k], first[k + 1], travel[r, 0], travel[r, 1], travel[r, 2])
             activate(shaded, start, n)
             left = 0
             for k in range(some):

@@ -52,7 +52,6 @@ class Batch(NamedTuple):
     x: float32 (C, 3, CHUNK), unit cube. d_features: float32 (C, rows, CHUNK). d_params: float32 (C, P).
     columns: int64 (C,), how many columns are in use, not all of them by samples of whole rays.
     samples, rays, dropped: int64 (C,). loss: float64 (C,), squared error summed over rays and channels.
-    exposure: float64 (C, V, 3, 5), see ``add_exposure_sums``; V = 0: exposures are not learned.
     d_embeddings: float32 (C, V, A), dLoss / dembedding of each view.
     """
 
@@ -64,7 +63,6 @@ class Batch(NamedTuple):
     rays: NDArray[np.int64]
     dropped: NDArray[np.int64]
     loss: NDArray[np.float64]
-    exposure: NDArray[np.float64]
     d_embeddings: NDArray[np.float32]
 
 
@@ -102,7 +100,7 @@ class RaySampling(NamedTuple):
     """How a step samples rays.
 
     key: uint64, its random stream. chunk_rays: largest number of rays of a chunk.
-    levels: number of levels that are switched on. harmonics: 1, 4 or 9.
+    levels: number of levels that are switched on. sh_degree: of colors, 0 or 1.
     changed_share: share of the rays that are drawn from ``Views.changed``.
     background: float32 (3,).
     embeddings: float32 (V, A), appearance of each view; A = 0: none.
@@ -111,7 +109,7 @@ class RaySampling(NamedTuple):
     key: np.uint64
     chunk_rays: int
     levels: int
-    harmonics: int
+    sh_degree: int
     changed_share: np.float32
     background: NDArray[np.float32]
     embeddings: NDArray[np.float32]
@@ -162,9 +160,6 @@ def take_pixel(views, background, pixel, ray):
         ray[6 + c] = back
         ray[3 + c] = np.float32(views.pixels[pixel, c]) * np.float32(1.0 / 255.0) * alpha + back * (_F1 - alpha)
     ray[9] = np.float32(view)
-    if views.exposure.shape[0] > 0:
-        for c in range(3):
-            ray[3 + c] = views.exposure[view, c, 0] * ray[3 + c] + views.exposure[view, c, 1]
     if views.weight.size > 0:
         ray[10] = views.weight[pixel]
     if views.guide.size > 0:
@@ -352,31 +347,6 @@ def scatter_to_columns(by_ray, column, n, d_out):
             d_out[k, column[s]] = by_ray[4 + k, s]
 
 
-@device_function
-def add_exposure_sums(out, w, dts, first, end, ray, sums):
-    """Add one ray to the sums of ``camera_refinement.Exposures.learn``, after ``ray_loss``: number, target t,
-    t^2, error e and e t per channel; sums: float64 (views, 3, 5)."""
-    depth, last = _F0, end
-    for s in range(first, end):
-        depth += out[0, s] * dts[s]
-        if depth > np.float32(OPAQUE_DEPTH):
-            last = s + 1
-            break
-    view = np.int64(ray[9])
-    for c in range(3):
-        color, left = _F0, _F1
-        for s in range(first, last):
-            color += w[s] * out[1 + c, s]
-            left -= w[s]
-        t = np.float64(ray[3 + c])
-        e = np.float64(color + left * ray[6 + c]) - t
-        sums[view, c, 0] += 1.0
-        sums[view, c, 1] += t
-        sums[view, c, 2] += t * t
-        sums[view, c, 3] += e
-        sums[view, c, 4] += e * t
-
-
 @kernel
 def train_chunks(counter, worker, views, ray_sampling, space, encoding, net, weights, batch, scratch, bins):
     """Tasks are chunks. Does everything but the encoding's own gradient, which its scatter kernel adds up. bins: see
@@ -385,9 +355,9 @@ def train_chunks(counter, worker, views, ray_sampling, space, encoding, net, wei
     by_ray, column, span = scratch.by_ray[worker], scratch.column[worker], scratch.span[worker]
     ray_first, ray, travel = scratch.ray_first[worker], scratch.ray[worker], scratch.travel[worker]
     ts, dts, w = by_ray[8], by_ray[9], by_ray[10]
-    outputs, harmonics, embeddings = net.widths[-1], ray_sampling.harmonics, ray_sampling.embeddings
+    outputs, sh_degree, embeddings = net.widths[-1], ray_sampling.sh_degree, ray_sampling.embeddings
     out, d_out = acts[acts.shape[0] - outputs :], d_acts[acts.shape[0] - outputs :]
-    by_direction = harmonics > 1 or embeddings.shape[1] > 0
+    by_direction = sh_degree > 0 or embeddings.shape[1] > 0
     while True:
         chunk = fetch_add(counter, 1)
         if chunk >= batch.samples.size:
@@ -403,8 +373,8 @@ def train_chunks(counter, worker, views, ray_sampling, space, encoding, net, wei
             for k in range(spans):
                 r, a, b = span[k, 0], span[k, 1], span[k, 2]
                 if r >= 0:
-                    add_harmonics(out, harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
-                    add_appearance(out, 1 + 3 * harmonics, embeddings[np.int64(ray[r, 9])], a, b)
+                    add_harmonics(out, sh_degree, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
+                    add_appearance(out, 4 + 9 * sh_degree, embeddings[np.int64(ray[r, 9])], a, b)
         activate_color(out, np.int64(0), n)
         gather_by_ray(out, line, column, used, by_ray)
         # Clear unused columns before sums over columns: 0 times NaN is NaN.
@@ -425,8 +395,6 @@ def train_chunks(counter, worker, views, ray_sampling, space, encoding, net, wei
                         for s in range(a, b):
                             by_ray[k, s] *= ray[r, 10]
                 loss += error
-                if batch.exposure.shape[1] > 0:
-                    add_exposure_sums(by_ray, w, dts, a, b, ray[r], batch.exposure[chunk])
             else:
                 dropped += 1
                 clear_columns(acts, column, a, b)
@@ -436,10 +404,10 @@ def train_chunks(counter, worker, views, ray_sampling, space, encoding, net, wei
             for k in range(spans):
                 r, a, b = span[k, 0], span[k, 1], span[k, 2]
                 if r >= 0:
-                    add_harmonics_backward(d_out, harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
+                    add_harmonics_backward(d_out, sh_degree, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
                     v = np.int64(ray[r, 9])
                     d_embedding = batch.d_embeddings[chunk, v]
-                    add_appearance_backward(out, d_out, 1 + 3 * harmonics, embeddings[v], a, b, d_embedding)
+                    add_appearance_backward(out, d_out, 4 + 9 * sh_degree, embeddings[v], a, b, d_embedding)
         batch.d_params[chunk] = _F0
         query_backward(encoding, net, acts, d_acts, n, batch.d_params[chunk], batch.d_features[chunk])
         batch.columns[chunk], batch.samples[chunk], batch.rays[chunk] = n, used, rays

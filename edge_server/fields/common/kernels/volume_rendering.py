@@ -16,6 +16,7 @@ from edge_server.fields.common.kernels.simd import exp32, is_finite
 # Raw density is clamped before the exponential, forward and backward alike: the largest density makes one
 # step opaque many times over, the smallest makes a whole ray transparent.
 RAW_LOW, RAW_HIGH = -12.0, 9.0
+SH_C1 = 0.4886025  # sqrt(3 / 4 pi), of spherical harmonics of degree 1
 OPAQUE_DEPTH = 9.2103404  # optical depth at which a ray ends: a transmittance of 1e-4
 
 # Distance of weight from a guide, as a share of the guide's own distance, at which it costs half of the most.
@@ -42,22 +43,9 @@ class Weights(NamedTuple):
 
 @device_function
 def harmonic(k, x, y, z):
-    """Real spherical harmonics 1 to 8 of a unit direction, float32; harmonic 0 is the color itself."""
-    if k == 1:
-        return np.float32(0.4886025) * y
-    if k == 2:
-        return np.float32(0.4886025) * z
-    if k == 3:
-        return np.float32(0.4886025) * x
-    if k == 4:
-        return np.float32(1.0925485) * x * y
-    if k == 5:
-        return np.float32(1.0925485) * y * z
-    if k == 6:
-        return np.float32(0.3153916) * (np.float32(3.0) * z * z - _F1)
-    if k == 7:
-        return np.float32(1.0925485) * x * z
-    return np.float32(0.5462742) * (x * x - y * y)
+    """Real spherical harmonics of degree 1, k = 1, 2, 3, of a unit direction, float32; that of degree 0 is the color
+    itself."""
+    return np.float32(SH_C1) * (y if k == 1 else (z if k == 2 else x))
 
 
 @device_function
@@ -96,10 +84,10 @@ def samples_until_opaque(out, dts, first, end):
 
 
 @device_function
-def add_harmonics(out, harmonics, first, end, dx, dy, dz):
+def add_harmonics(out, sh_degree, first, end, dx, dy, dz):
     """Add the harmonics of direction (dx, dy, dz) to the raw colors, rows 1 to 3 of out, of samples first to
     end."""
-    for k in range(1, harmonics):
+    for k in range(1, 1 + 3 * sh_degree):
         y = harmonic(k, dx, dy, dz)
         for c in range(3):
             base, share = out[1 + c, first:end], out[1 + 3 * k + c, first:end]
@@ -108,9 +96,9 @@ def add_harmonics(out, harmonics, first, end, dx, dy, dz):
 
 
 @device_function
-def add_harmonics_backward(d_out, harmonics, first, end, dx, dy, dz):
+def add_harmonics_backward(d_out, sh_degree, first, end, dx, dy, dz):
     """The gradient of ``add_harmonics``: rows 4 on from rows 1 to 3 of d_out."""
-    for k in range(1, harmonics):
+    for k in range(1, 1 + 3 * sh_degree):
         y = harmonic(k, dx, dy, dz)
         for c in range(3):
             base, share = d_out[1 + c, first:end], d_out[1 + 3 * k + c, first:end]

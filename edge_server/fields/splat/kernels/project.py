@@ -18,9 +18,10 @@ from edge_server.fields.common.kernels.simd import bits_of_float, draw, exp32, i
 from edge_server.fields.common.kernels.volume_rendering import harmonic
 from edge_server.fields.splat.settings import ALPHA_MIN, LOG_SCALE_HIGH, LOG_SCALE_LOW, RAW_OPACITY_LIMIT
 
-# Columns of a Gaussian's parameters; from BASE on, three for each further spherical harmonic.
+# Columns of a Gaussian's parameters; from BASE on the SH_COLUMNS of the spherical harmonics of degree 1,
+# three for each.
 POSITION, SCALE, QUATERNION, OPACITY, COLOR = 0, 3, 6, 10, 11
-BASE = 14
+BASE, SH_COLUMNS = 14, 9
 # Columns of a projected Gaussian.
 MEAN_X, MEAN_Y, CONIC_A, CONIC_B, CONIC_C, ALPHA, RED, DEPTH = 0, 1, 2, 3, 4, 5, 6, 9
 RADIUS, HALF_HEIGHT, PROJECTED = 10, 11, 12
@@ -52,12 +53,12 @@ _F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.flo
 class Gaussians(NamedTuple):
     """The Gaussians as the kernels read them.
 
-    params: float32 (N, BASE + 3 (harmonics - 1)).
-    harmonics: spherical harmonics of the color: 1, 4 or 9.
+    params: float32 (N, BASE + SH_COLUMNS sh_degree).
+    sh_degree: degree of the color's spherical harmonics, 0 or 1.
     """
 
     params: NDArray[np.float32]
-    harmonics: int
+    sh_degree: int
 
 
 @device_function
@@ -232,17 +233,17 @@ def _touched_tiles(px, py, a, b, c, reach, x0, x1, y0, y1):
 def _write_projected(cam, gaussians, i, s, j, row, edges):
     """Fill row (PROJECTED,) and edges (FOOTPRINT,) of Gaussian i from column j of ``s``. The conic is the
     upper triangle of the inverse of the projected covariance."""
-    params, harmonics = gaussians.params, gaussians.harmonics
+    params = gaussians.params
     row[MEAN_X], row[MEAN_Y], row[DEPTH] = s[_PX + j], s[_PY + j], s[_PZ + j]
     row[CONIC_A], row[CONIC_B], row[CONIC_C] = s[_A + j], s[_B + j], s[_C + j]
     row[ALPHA], row[RADIUS], row[HALF_HEIGHT] = s[_ALPHA + j], s[_WIDE + j], s[_HIGH + j]
     for k in range(3):
         row[RED + k] = params[i, COLOR + k]
-    if harmonics > 1:
+    if gaussians.sh_degree > 0:
         ox, oy, oz = params[i, 0] - cam[ORIGIN], params[i, 1] - cam[ORIGIN + 1], (params[i, 2] - cam[ORIGIN + 2])
         length = _F1 / max(np.sqrt(ox * ox + oy * oy + oz * oz), np.float32(1e-9))
         ox, oy, oz = ox * length, oy * length, oz * length
-        for h in range(1, harmonics):
+        for h in range(1, 4):
             value = harmonic(h, ox, oy, oz)
             for k in range(3):
                 row[RED + k] += value * params[i, BASE + 3 * (h - 1) + k]

@@ -10,7 +10,7 @@ import numpy as np
 
 from edge_server.fields.common.kernels.camera import LENS, ORIGIN
 from edge_server.fields.common.kernels.jit import device_function
-from edge_server.fields.common.kernels.volume_rendering import harmonic
+from edge_server.fields.common.kernels.volume_rendering import SH_C1, harmonic
 from edge_server.fields.splat.kernels.project import (
     ALPHA,
     BASE,
@@ -191,32 +191,10 @@ def project_backward(cam, s):
 
 
 @device_function
-def _harmonic_slope(h, x, y, z):
-    """Derivatives of harmonic h by x, y and z."""
-    a, b, c = np.float32(0.4886025), np.float32(1.0925485), np.float32(0.3153916)
-    if h == 1:
-        return _F0, a, _F0
-    if h == 2:
-        return _F0, _F0, a
-    if h == 3:
-        return a, _F0, _F0
-    if h == 4:
-        return b * y, b * x, _F0
-    if h == 5:
-        return _F0, b * z, b * y
-    if h == 6:
-        return _F0, _F0, np.float32(6.0) * c * z
-    if h == 7:
-        return b * z, _F0, b * x
-    d = np.float32(2.0 * 0.5462742)
-    return d * x, -d * y, _F0
-
-
-@device_function
 def harmonics_backward(cam, gaussians, ids, count, s):
     """Add the gradient by way of the view-dependent color, which ``project_backward`` leaves out."""
-    params, harmonics = gaussians.params, gaussians.harmonics
-    if harmonics == 1:
+    params = gaussians.params
+    if gaussians.sh_degree == 0:
         return
     for j in range(count):
         if s[SEEN + j] == _F0:
@@ -226,15 +204,20 @@ def harmonics_backward(cam, gaussians, ids, count, s):
         length = _F1 / max(np.sqrt(nx * nx + ny * ny + nz * nz), np.float32(1e-9))
         nx, ny, nz = nx * length, ny * length, nz * length
         lx, ly, lz = _F0, _F0, _F0
-        for h in range(1, harmonics):
+        for h in range(1, 4):
             value = harmonic(h, nx, ny, nz)
-            hx, hy, hz = _harmonic_slope(h, nx, ny, nz)
             share = _F0
             for k in range(3):
                 column, given = BASE + 3 * (h - 1) + k, s[SUM + (6 + k) * BLOCK + j]
                 s[at + column * BLOCK] += value * given
                 share += params[i, column] * given
-            lx, ly, lz = lx + share * hx, ly + share * hy, lz + share * hz
+            share *= np.float32(SH_C1)  # each harmonic has a slope by its own axis alone
+            if h == 1:
+                ly += share
+            elif h == 2:
+                lz += share
+            else:
+                lx += share
         along = lx * nx + ly * ny + lz * nz
         s[at] += (lx - along * nx) * length
         s[at + BLOCK] += (ly - along * ny) * length

@@ -484,7 +484,7 @@ class LayeredField:
         if self._exposed is None or self._exposed[0] != key:
             params = shown.gaussians.params.copy()
             params[:, COLOR:] *= np.tile(gain, (params.shape[1] - COLOR) // 3)
-            self._exposed = (key, Gaussians(params, self.settings.harmonics))
+            self._exposed = (key, Gaussians(params, self.settings.sh_degree))
         return self._exposed[1]
 
 

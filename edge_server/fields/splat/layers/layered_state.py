@@ -88,7 +88,7 @@ def pack(field: Any) -> Arrays:
 
 def unpack(field: Any, state: Arrays) -> None:
     """Give ``field`` what ``pack`` took. ValueError, KeyError, TypeError: not a state of such a field."""
-    meta = unpack_meta(field.settings, state, NAME, ("harmonics",), VERSION)
+    meta = unpack_meta(field.settings, state, NAME, ("sh_degree",), VERSION)
     field.still = StillField(field.settings, field.pool)
     field.still.load_state(_under("still.", state))
     field.static = StaticLayer(field.still)

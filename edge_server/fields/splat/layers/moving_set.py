@@ -92,7 +92,7 @@ class MovingSet:
         """The Gaussians of an instant, copied."""
         params = self.cloud.params.copy()
         params[:, :3] = self.places(instant_s)
-        return Gaussians(params, self.settings.harmonics)
+        return Gaussians(params, self.settings.sh_degree)
 
     def distance_m(self, camera: FixedCamera, instant_s: float) -> float:
         """Distance from a camera to the middle of the Gaussians, meters."""

@@ -72,4 +72,4 @@ class LayeredSnapshot(SplatSnapshot):
             return self
         ahead_s = self.moving.ahead_s(present_ns)
         params = np.concatenate([self.static, self.moving.params_at(ahead_s)])
-        return replace(self, gaussians=Gaussians(params, self.gaussians.harmonics))
+        return replace(self, gaussians=Gaussians(params, self.gaussians.sh_degree))

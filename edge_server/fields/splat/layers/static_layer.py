@@ -218,7 +218,7 @@ class StaticLayer:
         if self.shown is None or self.shown.step != self.field.step:
             snapshot = self.field.snapshot()
             if self._mean is not None:
-                snapshot = replace(snapshot, gaussians=Gaussians(self._mean.copy(), self.field.settings.harmonics))
+                snapshot = replace(snapshot, gaussians=Gaussians(self._mean.copy(), self.field.settings.sh_degree))
             self.shown = snapshot
 
     def render(self, views: Iterable[View]) -> None:

@@ -165,7 +165,7 @@ def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_sweep):
         (["--field", "splot"], "no field is called splot; there are: ngp"),
         (["--option", "x"], "expected KEY=VALUE"),
         (["--field", "ngp", "--option", "levels=99"], "levels: expected a whole number"),
-        (["--field", "ngp", "--option", "exposure=maybe"], "exposure: expected"),
+        (["--field", "ngp", "--option", "contracted=maybe"], "contracted: expected"),
         (["--policy", "threshold:soon"], "'soon' is not a number"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Exposure and pose errors of cameras: learned if enabled, harmless where there are none, else absent."""
+"""Pose errors of cameras: learned if enabled, harmless where there are none, else absent."""
 
 from __future__ import annotations
 
@@ -8,17 +8,9 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.common.camera_refinement import Exposures, PoseCorrections
+from edge_server.fields.common.camera_refinement import PoseCorrections
 from freshfield.geometry import so3_exp
 from tests.edge_server.fields.small import SEEN, score, small
-
-
-def _exposed(views: list[View]) -> tuple[list[View], np.ndarray]:
-    """Each camera with its own gain a channel, 1 on average (geometric)."""
-    gains = np.exp(np.random.default_rng(3).normal(0.0, 0.3, (len(views), 3)))
-    gains /= np.exp(np.log(gains).mean(axis=0))
-    images = [np.clip(v.image * g + 0.5, 0, 255).astype(np.uint8) for v, g in zip(views, gains)]
-    return [replace(v, image=image) for v, image in zip(views, images)], gains
 
 
 def _displaced(views: list[View], size_m: float, deg: float) -> list[View]:
@@ -47,19 +39,6 @@ def _pixels_off(poses: list[np.ndarray]) -> float:
     return float(np.mean([np.linalg.norm(a - b, axis=1).mean() for a, b in pairs]))
 
 
-@pytest.mark.parametrize("name", ["ngp", "tensorf"])
-def test_gains_are_found_and_the_held_out_view_gains(name: str) -> None:
-    views, gains = _exposed(SEEN)
-    scores = {}
-    for on in (False, True):
-        field = small(name, exposure=on, background="#80b2e6", contracted=False)
-        field.fit(views, Budget(steps=500))
-        scores[on] = score(field)
-    assert scores[True] > scores[False] + 1.0
-    found = np.array([field._cameras.exposures.known[v.camera][:, 0] for v in views])
-    assert np.corrcoef(np.log(found).ravel(), -np.log(gains).ravel())[0, 1] > 0.65
-
-
 @pytest.mark.slow  # 7 s
 def test_poses_are_improved_and_kept_within_their_bounds() -> None:
     views = _displaced(SEEN, 0.02, 1.5)
@@ -81,9 +60,9 @@ def test_poses_are_improved_and_kept_within_their_bounds() -> None:
         assert np.linalg.norm(known.rotation) <= np.deg2rad(0.1) + 1e-12
 
 
-def test_both_repeat_themselves_and_resume_bit_for_bit() -> None:
-    refined = {"exposure": True, "refine_m": 0.05, "refine_deg": 2.0}
-    views = _exposed(_displaced(SEEN, 0.02, 1.0))[0]
+def test_corrections_repeat_themselves_and_resume_bit_for_bit() -> None:
+    refined = {"refine_m": 0.05, "refine_deg": 2.0}
+    views = _displaced(SEEN, 0.02, 1.0)
     a, b = small("tensorf", **refined), small("tensorf", threads=1, **refined)
     for field in (a, b):
         field.fit(views, Budget(steps=120))
@@ -99,20 +78,7 @@ def test_both_repeat_themselves_and_resume_bit_for_bit() -> None:
     assert any(abs(np.array(t)).max() > 0 for _, t, _ in a._cameras.meta()["poses"].values())
 
 
-def test_nothing_is_allocated_where_nothing_is_asked_for() -> None:
-    field = small("ngp")
-    field.fit(SEEN, Budget(steps=2))
-    assert field._cameras.exposures is None and field._cameras.poses is None
-    assert field._batch.exposure.size == 0
-
-
 def test_what_is_not_finite_or_says_nothing_changes_nothing() -> None:
-    exposures = Exposures()
-    exposures.rows(["a", "b"])
-    exposures.learn(["a", "b"], np.zeros((2, 3, 5)))
-    exposures.learn(["a", "b"], np.full((2, 3, 5), np.nan))
-    exposures.learn(["a", "b"], np.full((2, 3, 5), 1e300))
-    assert all(np.isfinite(pair).all() for pair in exposures.known.values())
     poses, rng = PoseCorrections(0.1, 2.0), np.random.default_rng(0)
     for value in (0.5, np.nan):
         poses.correct(SEEN[0], lambda pose, at, v=value: np.full((len(at), 3), v, np.float32), 0.01, rng, np.zeros(3))

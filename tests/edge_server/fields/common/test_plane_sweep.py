@@ -132,8 +132,8 @@ def test_no_sweep_where_none_is_called_for_or_the_budget_is_too_short(monkeypatc
     monkeypatch.setattr("edge_server.fields.common.plane_sweep.depth_guide", slow)
     room = small("ngp")
     room.fit(synthetic_still("room", cameras=13, size=32).training, Budget(steps=2))
-    exposed = small("ngp", exposure=True)
-    exposed.fit(SEEN, Budget(steps=1))
+    refined = small("ngp", refine_m=0.05)
+    refined.fit(SEEN, Budget(steps=1))
     assert swept == []
     sky = small("ngp")
     sky.now = lambda: clock[0]

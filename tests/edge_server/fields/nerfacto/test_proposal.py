@@ -303,7 +303,7 @@ def test_a_whole_steps_gradients_equal_finite_differences() -> None:
         cells=16,
         proposal_cells=8,
         appearance=2,
-        harmonics=4,
+        sh_degree=1,
         threads=1,
         contracted=True,
     )
@@ -314,7 +314,7 @@ def test_a_whole_steps_gradients_equal_finite_differences() -> None:
     assert field.view_store.box is not None
     data = field._cameras.corrected(views, field.view_store.add(views).data, field.view_store.box)
     looks = field._cameras.embeddings
-    ray_sampling = RaySampling(np.uint64(3), 32, 3, 4, F(0.0), np.full(3, 0.5, F), looks)
+    ray_sampling = RaySampling(np.uint64(3), 32, 3, 1, F(0.0), np.full(3, 0.5, F), looks)
     weights, batch = Weights(F(0.0)), field._batch
     space = OccupancyGrid(settings.cells, 0, field.view_store.box).space(0.1)
     space.occupied[:], space.coarse[:] = 1, 1

@@ -34,7 +34,7 @@ SETTINGS = NerfactoSettings(
     cells=16,
     proposal_cells=16,
     anneal=20,
-    harmonics=4,
+    sh_degree=1,
     threads=1,
 )
 
@@ -63,7 +63,7 @@ def _render(
         snapshot.encoding,
         snapshot.levels,
         snapshot.net,
-        snapshot.settings.harmonics,
+        snapshot.settings.sh_degree,
         snapshot.background,
         (np.empty((1, int(snapshot.net.widths.sum()), BATCH), np.float32), x, line),
         out,
@@ -84,7 +84,7 @@ def test_a_ray_is_what_torch_makes_of_its_samples(snapshot: RaySnapshot) -> None
         way /= np.linalg.norm(way, axis=-1, keepdims=True)
         at, d = torch.as_tensor(places, dtype=torch.float64), torch.as_tensor(way, dtype=torch.float64)
         raw = mlp(snapshot.net.widths.tolist(), params, encode(grid, snapshot.levels, at))
-        sigma, color = shade(raw, snapshot.settings.harmonics, d)
+        sigma, color = shade(raw, snapshot.settings.sh_degree, d)
         weight, left = ray_weights(sigma[None], torch.as_tensor(delta, dtype=torch.float64)[None])
         back = torch.as_tensor(snapshot.background, dtype=torch.float64)
         expected = (weight[0, :, None] * color).sum(dim=0) + left[0] * back

@@ -101,7 +101,7 @@ from msgspec import structs
 from edge_server.fields import Budget
 from tests.edge_server.fields.splat.test_hard_cases import TINY, VIEWS, StillField
 bent = [replace(v, intrinsics=replace(v.intrinsics, distortion=(-.1, .01, .002, .001))) for v in VIEWS]
-for extra, views in (({}, VIEWS), ({"harmonics": 9, "contracted": True}, bent),
+for extra, views in (({}, VIEWS), ({"sh_degree": 1, "contracted": True}, bent),
                      ({"flatten": 0.1, "align": 0.05}, bent)):
     field = StillField(structs.replace(TINY, **extra))
     field.fit(views, Budget(steps=25))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from edge_server.fields.common.kernels.camera import LENS, LIMITS, NEAR, ORIGIN
 from edge_server.fields.splat.kernels.project import COLOR, OPACITY, QUATERNION, SCALE
-from tests.edge_server.fields.torch_model import harmonics as harmonics_of
+from tests.edge_server.fields.torch_model import harmonics
 
 # Written out: an oracle that imported them could not see them change.
 LOW_PASS = 0.3  # pixels squared
@@ -62,7 +62,7 @@ def distort(lens: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     return u, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
 
 
-def flatten(cam: Tensor, params: Tensor, harmonics: int) -> Flat:
+def flatten(cam: Tensor, params: Tensor, sh_degree: int) -> Flat:
     """Project Gaussians (N, P) into camera row ``cam`` (see ``kernels.project``)."""
     view, origin, lens = cam[:ORIGIN].view(3, 3), cam[ORIGIN:LENS], cam[LENS:LIMITS]
     x, y, z = ((params[:, :3] - origin) @ view.T).unbind(-1)
@@ -90,8 +90,9 @@ def flatten(cam: Tensor, params: Tensor, harmonics: int) -> Flat:
     covariance = half @ half.mT + LOW_PASS * torch.eye(2).to(half)
     direction = params[:, :3] - origin
     direction = direction / direction.norm(dim=-1, keepdim=True).clamp(min=1e-9)
-    shares = params[:, COLOR + 3 :].view(len(params), harmonics - 1, 3)
-    color = params[:, COLOR : COLOR + 3] + (shares * harmonics_of(harmonics, direction)[..., None]).sum(1)
+    color = params[:, COLOR : COLOR + 3]
+    if sh_degree:
+        color = color + (params[:, COLOR + 3 :].view(len(params), 3, 3) * harmonics(direction)[..., None]).sum(1)
     alpha = params[:, OPACITY].clamp(-RAW_OPACITY, RAW_OPACITY).sigmoid()
     return Flat(mean, covariance, alpha, color, z, seen)
 

@@ -66,7 +66,7 @@ def _train(
         key=np.uint64(7),
         chunk_rays=rays,
         levels=SETTINGS.levels,
-        harmonics=1,
+        sh_degree=0,
         changed_share=np.float32(0.5),
         background=np.full(3, 0.5, np.float32),
         embeddings=np.zeros((len(VIEWS), 0), np.float32),
@@ -86,7 +86,7 @@ def _oracle(field: NgpField, rays: int, weight: NDArray[np.float32], params: Ten
     column = scratch.column[0, : first[rays]]
     x = torch.as_tensor(batch.x[0][:, column].T.copy(), dtype=torch.float64)
     grid = to_torch(field._encoding, dtype=torch.float64)
-    sigma, color = shade(mlp(field._net.widths.tolist(), params, encode(grid, SETTINGS.levels, x)), 1, x)
+    sigma, color = shade(mlp(field._net.widths.tolist(), params, encode(grid, SETTINGS.levels, x)), 0, x)
     error = loss = torch.zeros((), dtype=torch.float64)
     for r in range(rays):
         a, b = int(first[r]), int(first[r + 1])

@@ -12,9 +12,9 @@ from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATE
 BOX = SceneBox((0.0, 0.0, 0.0), 1.0, 0.05, False, 3.0, 0.05)
 
 
-def random_params(count: int = 12, harmonics: int = 1, seed: int = 0) -> np.ndarray:
+def random_params(count: int = 12, sh_degree: int = 0, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    params = rng.normal(size=(count, BASE + 3 * (harmonics - 1))).astype(np.float32)
+    params = rng.normal(size=(count, BASE + 9 * sh_degree)).astype(np.float32)
     params[:, :3] *= 0.5
     params[:, SCALE:QUATERNION] = np.log(rng.uniform(0.08, 0.4, (count, 3)))
     params[:, OPACITY] = rng.uniform(-1.0, 2.0, count)
@@ -25,7 +25,7 @@ def random_params(count: int = 12, harmonics: int = 1, seed: int = 0) -> np.ndar
 
 def as_gaussians(params: np.ndarray) -> Gaussians:
     """What the kernels read."""
-    return Gaussians(params, (params.shape[1] - BASE) // 3 + 1)
+    return Gaussians(params, (params.shape[1] - BASE) // 9)
 
 
 def binned(cams: np.ndarray, params: np.ndarray, differentiate: bool = True, pool: Pool | None = None) -> RasterBuffers:

@@ -67,9 +67,9 @@ def _gradient(params: NDArray[np.float32], raster: RasterBuffers, cams: NDArray[
     return moments.m / np.float32(1.0 - BETA1)
 
 
-@pytest.mark.parametrize("harmonics", [1, 4])
-def test_a_step_is_adams(harmonics: int) -> None:
-    params = random_params(COUNT, harmonics, 3)
+@pytest.mark.parametrize("sh_degree", [0, 1])
+def test_a_step_is_adams(sh_degree: int) -> None:
+    params = random_params(COUNT, sh_degree, 3)
     raster, cams = _raster(params)
     width = params.shape[1]
     g = _gradient(params, raster, cams).astype(np.float64)
@@ -134,7 +134,7 @@ def test_what_is_not_finite_is_dropped_and_counted(column: int, broken: float) -
 
 
 def test_threads_do_not_change_a_bit() -> None:
-    params = random_params(COUNT, 4, 3)
+    params = random_params(COUNT, 1, 3)
     raster, cams = _raster(params)
     results = []
     for pool in (CallerPool(), Pool(3)):

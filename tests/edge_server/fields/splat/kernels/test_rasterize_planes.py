@@ -59,7 +59,7 @@ def flat(count: int, tilt: np.ndarray, seed: int = 0, thickness: float = -7.0) -
 
 
 def looked(params: np.ndarray) -> tuple[RasterBuffers, Gaussians, np.ndarray]:
-    gaussians = Gaussians(params, 1)
+    gaussians = Gaussians(params, 0)
     raster, cams = RasterBuffers(POOL), camera_rows([POSE], [LENS], BOX)
     raster.project_and_bin(cams, gaussians, differentiate=False)
     return raster, gaussians, cams[0]
