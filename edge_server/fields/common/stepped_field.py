@@ -146,17 +146,18 @@ class SteppedField(ABC, Generic[S]):
     def _live(self) -> S:
         """A snapshot of the arrays in use, not copied, for the holder of the lock."""
 
+    @abstractmethod
     def _tiny(self) -> Any:
         """Small settings, with which ``warm_up`` compiles the kernels."""
-        raise NotImplementedError
 
     def _run_kernels(self, pool: Pool) -> None:
         """Run every kernel once."""
-        tiny, camera, pose = self._tiny(), Pinhole.from_fov(8, 8, 60.0), np.eye(4)
+        tiny, camera, pose = self._tiny(), Pinhole.from_fov(16, 16, 60.0), np.eye(4)
         pose[2, 3] = -3.0
         for channels in (3, 4):
             field = type(self)(msgspec.structs.replace(tiny, min_views=1, contracted=channels == 3), pool)
-            image = np.full((8, 8, channels), 128, np.uint8)
+            image = np.full((16, 16, channels), 128, np.uint8)
+            image[4:8, 4:8, :3] = 255  # or there would be no Gaussians
             views = [View(f"warm-up {k}", image, pose, camera) for k in range(3)]
             field.fit(views, Budget(steps=2))  # with a depth guide, if any is to be expected
             field.render(pose, camera)

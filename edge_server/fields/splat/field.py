@@ -43,7 +43,6 @@ from edge_server.fields.splat.settings import (
     SplatSettings,
 )
 from edge_server.fields.splat.snapshot import SplatSnapshot
-from freshfield.geometry import Pinhole
 
 
 class StillField(SteppedField[SplatSnapshot]):
@@ -99,19 +98,8 @@ class StillField(SteppedField[SplatSnapshot]):
             planar=self.settings.planar,
         )
 
-    def _run_kernels(self, pool: Pool) -> None:
-        tiny = msgspec.structs.replace(
-            self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False
-        )
-        camera = Pinhole.from_fov(32, 32, 60.0)
-        pose = np.eye(4)
-        pose[2, 3] = -3.0
-        for channels in (3, 4):
-            field = StillField(tiny, pool)
-            image = np.full((32, 32, channels), 128, np.uint8)
-            image[8:16, 8:16, :3] = 255  # or there would be no Gaussians
-            field.fit([View("warm-up", image, pose, camera)], Budget(steps=2))
-            field.render(pose, camera)
+    def _tiny(self) -> SplatSettings:
+        return msgspec.structs.replace(self.settings, gaussians=64, start=8, seed_cells=8)
 
     # --- state --------------------------------------------------------------------------------
 
@@ -208,7 +196,7 @@ class StillField(SteppedField[SplatSnapshot]):
         flatten(self.cloud, s.flatten)
         if s.align and self.step % ALIGN_EVERY == 0:
             camera = self._cams[[view]]
-            self._render_raster.project_and_bin(camera, self.cloud.gaussians(), differentiate=False)
+            self._render_raster.project_and_bin(camera, self.cloud.gaussians())
             align(self.cloud, s.align, self._render_raster, camera[0], self._views[view].intrinsics)
 
     def adam_parameters(self, progress: float) -> AdamParameters:

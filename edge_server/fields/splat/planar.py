@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.camera import ORIGIN, SIZE
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud
-from edge_server.fields.splat.kernels.project import QUATERNION, SCALE, Gaussians
-from edge_server.fields.splat.kernels.rasterize_planes import accumulate_normals, render_planes
+from edge_server.fields.splat.kernels.project import DEPTH, QUATERNION, RED, SCALE, Gaussians
+from edge_server.fields.splat.kernels.rasterize import render_tiles
+from edge_server.fields.splat.kernels.sum_over_pixels import sum_over_pixels
 from edge_server.fields.splat.settings import ASPECT
 from freshfield.geometry import Pinhole, quaternion_multiply, quaternion_normalize, quaternion_to_matrix
 
@@ -50,24 +51,35 @@ def unit_quaternions(params: NDArray[np.float32]) -> NDArray[np.float64]:
     return quaternion_normalize(np.where(sound[:, None], given, (1.0, 0.0, 0.0, 0.0)))
 
 
+def blend_planes(
+    raster: RasterBuffers, gaussians: Gaussians, camera: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """The Gaussians' planes, blended as their colors are: normal (H, W, 3), distance (H, W) and opacity (H, W).
+
+    raster: buffers whose last ``project_and_bin`` had this camera first. camera: float32 (CAMERA,), its row.
+    """
+    shape = int(camera[SIZE + 1]), int(camera[SIZE])
+    planes = raster.projected[:1].copy()
+    mine, shown = gaussian_planes(gaussians, camera), planes[0, : len(gaussians.params)]
+    shown[:, RED:DEPTH], shown[:, DEPTH] = 0.5 + 0.5 * mine[:, :3], mine[:, 3]  # colors lie in [0, 1]
+    color, depth, opacity = (np.zeros((*shape, *more), np.float32) for more in ((3,), (), ()))
+    raster.pool.run(
+        render_tiles, raster.first._replace(projected=planes), np.zeros(3, np.float32), color, depth, opacity
+    )
+    two, least = np.float32(2.0), np.float32(1e-3)
+    return two * color - opacity[..., None], depth * np.maximum(opacity, least), opacity
+
+
 def plane_depth(
     raster: RasterBuffers, gaussians: Gaussians, camera: NDArray[np.float32], lens: Pinhole
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Depth (H, W) along the rays, scene units, and opacity (H, W). Depth is 0 where the plane is seen at too
-    flat an angle.
-
-    raster: buffers whose last ``project_and_bin`` had this camera first.
-    camera: float32 (CAMERA,), its row.
-    """
-    width, height = int(camera[SIZE]), int(camera[SIZE + 1])
-    out = np.zeros((height, width, 5), np.float32)
-    raster.pool.run(render_planes, raster.first, gaussian_planes(gaussians, camera), out)
-    rays = lens.rays()
-    along = (out[..., :3] * rays).sum(axis=-1)
-    opacity = np.clip(np.nan_to_num(out[..., 4]), 0.0, 1.0)
-    good = np.isfinite(out).all(axis=-1) & (along < -STEEPEST * opacity) & (opacity > 1e-3)
-    depth = np.where(good, out[..., 3] / np.where(good, along, 1.0), 0.0)
-    return np.where(depth > 0, depth, 0.0).astype(np.float32), opacity.astype(np.float32)
+    flat an angle. raster, camera: see ``blend_planes``."""
+    normal, distance, opacity = blend_planes(raster, gaussians, camera)
+    along = (normal * lens.rays()).sum(axis=-1)
+    good = (along < -STEEPEST * opacity) & (opacity > 1e-3)
+    depth = np.where(good, distance / np.where(good, along, 1.0), 0.0)
+    return np.where(depth > 0, depth, 0.0).astype(np.float32), opacity
 
 
 def flatten(cloud: GaussianCloud, by: float) -> None:
@@ -82,20 +94,17 @@ def align(
     cloud: GaussianCloud, share: float, raster: RasterBuffers, camera: NDArray[np.float32], lens: Pinhole
 ) -> None:
     """Turn the Gaussians that a camera sees by ``share`` of the way to the normals of the depth that they render
-    together. camera: its row; ``raster`` has the whole image of it at slot 0."""
+    together. camera: its row; ``raster`` has the whole image of it at slot 0, ready for gradients."""
     gaussians = cloud.gaussians()
     depth, opacity = plane_depth(raster, gaussians, camera, lens)
-    normal_sums = np.zeros((raster.lists.pair.shape[1], 4), np.float32)
-    raster.pool.run(accumulate_normals, raster.first, depth_normals(depth, opacity, lens), normal_sums)
-    first, count = raster.lists.own_first[0, : len(cloud)], raster.lists.own_count[0, : len(cloud)]
-    which = np.flatnonzero(count > 0)
-    sums = np.concatenate([np.zeros((1, 4)), np.cumsum(normal_sums.astype(np.float64), axis=0)])
-    seen_normals = sums[first[which] + count[which]] - sums[first[which]]
-    valid = seen_normals[:, 3] > 1e-3
-    which, seen_normals = which[valid], seen_normals[valid]
+    normals = depth_normals(depth, opacity, lens)
+    reliable = normals[..., 3:]
+    weight = seen_sums(raster, len(cloud), np.repeat(reliable, 3, axis=2))
+    which = np.flatnonzero(weight[:, 0] > 1e-3)
     if not len(which):
         return
-    wanted = seen_normals[:, :3] / seen_normals[:, 3:] @ camera[:ORIGIN].reshape(3, 3).astype(np.float64)
+    seen_normals = seen_sums(raster, len(cloud), normals[..., :3] * reliable)[which] / weight[which]
+    wanted = seen_normals @ camera[:ORIGIN].reshape(3, 3).astype(np.float64)
     normal = gaussian_normals(cloud.params[which])
     # A normal and its opposite are one plane.
     wanted *= np.where((wanted * normal).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
@@ -103,6 +112,16 @@ def align(
     step = np.concatenate([np.ones((len(half_turn), 1)), half_turn], axis=1)
     part = slice(QUATERNION, QUATERNION + 4)
     cloud.params[which, part] = quaternion_normalize(quaternion_multiply(step, unit_quaternions(cloud.params[which])))
+
+
+def seen_sums(raster: RasterBuffers, count: int, values: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Sums (N, 3) of the pixels' values (H, W, 3), weighed by how much of a pixel is the Gaussian's, for the first
+    ``count`` Gaussians."""
+    raster.pool.run(sum_over_pixels, raster.first, values, raster.sums)
+    lists = raster.lists
+    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(raster.sums[0, :, -3:].astype(np.float64), axis=0)])
+    first, many = lists.own_first[0, :count], lists.own_count[0, :count]
+    return np.where(many[:, None] > 0, sums[first + many] - sums[first * (many > 0)], 0.0)
 
 
 def depth_normals(depth: NDArray[np.float32], opacity: NDArray[np.float32], lens: Pinhole) -> NDArray[np.float32]:

@@ -121,6 +121,29 @@ def composite_strips(raster, strip_pairs, count, x0, y0, s, store, size, step, c
 
 
 @device_function
+def composite_strips_backward(raster, begin, end, strip_pairs, composited, x0, y0, slopes, first, store, size, sums):
+    """``composite_backward`` all strips of a tile, whose list goes from ``begin`` to ``end``: writes the rows of its
+    pairs in ``sums``, float32 (B, P, SUMS). first: where the rows of ``slopes`` begin."""
+    for j in range(begin, end):
+        rest = sums[0, raster.lists.pair[0, j]]
+        for k in range(SUMS):
+            rest[k] = _F0
+    for n in range(STRIPS):
+        composite_backward(
+            strip_pairs[n],
+            composited[n],
+            raster.lists.owner[0],
+            raster.projected[0],
+            np.float32(x0),
+            np.float32(y0 + 2 * n),
+            slopes,
+            first + n * STRIP,
+            store[n * size : (n + 1) * size],
+            sums[0],
+        )
+
+
+@device_function
 def _load_tile(targets, view, x0, y0, target, behind, share):
     """Fill target and behind, (3, PIXELS), and share (PIXELS,), the pixels' weights, 0 outside the image. Returns
     whether any pixel counts."""
@@ -185,25 +208,9 @@ def train_tiles(counter, worker, raster, targets, view, sums, losses):
                 s[_BEHIND + k] += s[_T + k] * behind[c, k] * slope
         finite = is_finite(square)
         losses[t, 0], losses[t, 1] = square if finite else 0.0, 0.0 if finite else 1.0
-        for j in range(begin, end):
-            rest = sums[0, lists.pair[0, j]]
-            for k in range(SUMS):
-                rest[k] = _F0
         if not finite:
-            continue
-        for n in range(STRIPS):
-            composite_backward(
-                strip_pairs[n],
-                composited[n],
-                lists.owner[0],
-                raster.projected[0],
-                np.float32(x0),
-                np.float32(y0 + 2 * n),
-                s,
-                _ER + n * STRIP,
-                store[n * size : (n + 1) * size],
-                sums[0],
-            )
+            composited[0] = composited[1] = composited[2] = composited[3] = 0
+        composite_strips_backward(raster, begin, end, strip_pairs, composited, x0, y0, s, _ER, store, size, sums)
 
 
 @kernel

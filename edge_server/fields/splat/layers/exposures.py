@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from edge_server.fields import Rendering
+from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.observations import FixedCamera
-from edge_server.fields.splat.layers.settings import EXPOSURE_RATE, EXPOSURES_AGREE
 
 
 def equalize_exposures(cameras: Mapping[str, FixedCamera], renderings: Mapping[str, Rendering]) -> bool:
@@ -22,9 +22,9 @@ def equalize_exposures(cameras: Mapping[str, FixedCamera], renderings: Mapping[s
     ratios = {name: camera.plate.exposure_over(renderings[name].color) for name, camera in cameras.items()}
     logs = {name: np.log(ratio) for name, ratio in ratios.items() if ratio is not None}
     spread = np.stack(list(logs.values())) if logs else np.zeros((1, 3), np.float32)
-    if spread.std(axis=0).max() < EXPOSURES_AGREE:
+    if spread.std(axis=0).max() < tuned.EXPOSURES_AGREE:
         return True
     for name, log_ratio in logs.items():
-        ratio = np.exp(EXPOSURE_RATE * (log_ratio - spread.mean(axis=0)))
+        ratio = np.exp(tuned.EXPOSURE_RATE * (log_ratio - spread.mean(axis=0)))
         cameras[name].correct_exposure(ratio.astype(np.float32))
     return False

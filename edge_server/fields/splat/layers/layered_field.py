@@ -29,6 +29,7 @@ from edge_server.fields.common.threads.thread_pool import CallerPool, Pool, comp
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import COLOR, Gaussians
+from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.exposures import equalize_exposures
 from edge_server.fields.splat.layers.layered_state import pack, unpack
 from edge_server.fields.splat.layers.moving_set import MovingSet
@@ -38,21 +39,6 @@ from edge_server.fields.splat.layers.observations import (
     Observations,
     cameras_of,
     newest_of_each,
-)
-from edge_server.fields.splat.layers.settings import (
-    EVIDENCE_S,
-    EXPOSURE_ROUNDS,
-    EXPOSURE_STEPS,
-    FINE_EVERY_S,
-    FINE_FRAMES,
-    LEAST_CAMERAS,
-    MOST_MOVES,
-    MOST_PIXELS,
-    PLATE_FRAMES,
-    PLATE_S,
-    PLATES_EVERY_S,
-    RENDERINGS_A_FIT,
-    STEP_PROGRESS,
 )
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
 from edge_server.fields.splat.layers.static_layer import PlateImage, StaticLayer
@@ -115,7 +101,7 @@ class LayeredField:
     @property
     def most_pixels(self) -> int | None:
         """Largest number of pixels of one image of every camera; None where layers were given up."""
-        return MOST_PIXELS if self.layered else None
+        return tuned.MOST_PIXELS if self.layered else None
 
     @property
     def moving(self) -> MovingSet | None:
@@ -140,14 +126,16 @@ class LayeredField:
         if self.tracker is not None and self.tracker.moving.box is not self.still.view_store.box:
             self._begin_again("another camera has changed the box of the scene")
         taken = self._take_in(views)
-        if wandering := [name for name, camera in self.cameras.items() if camera.moves > MOST_MOVES]:
+        if wandering := [name for name, camera in self.cameras.items() if camera.moves > tuned.MOST_MOVES]:
             self._give_up_layers(f"{wandering[0]} moves")
             return self._fit_still(views, budget, pace)
         if self.tracker is not None and not len(self.observations):
             self._begin_again("no camera stands where it stood")
         if self.tracker is None:
             if not self._plates_are_known():
-                return self._fit_still(views, budget, pace)
+                report = self._fit_still(views, budget, pace)
+                self._take_whole(taken)
+                return report
             if not self._exposures_agree():
                 return FitReport(0, pace.elapsed_s(), 0.0, 0, 0, note="the cameras' exposures are equalized")
             log.info("layers begin: the plates of %d cameras are known", len(self.cameras))
@@ -155,7 +143,7 @@ class LayeredField:
         beside = budget.seconds is not None
         self._compare_plates(beside)
         self._find_rows()
-        parameters = self.still.adam_parameters(STEP_PROGRESS)
+        parameters = self.still.adam_parameters(tuned.STEP_PROGRESS)
         steps, rays, samples = tracker.follow(pace, self._publish, parameters)
         loss = 0.0
         if not beside:
@@ -207,9 +195,7 @@ class LayeredField:
 
     def _run_kernels(self, pool: Pool) -> None:
         """Run every kernel of the layers once, in a small field of its own."""
-        tiny = msgspec.structs.replace(
-            self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False
-        )
+        tiny = msgspec.structs.replace(self.still._tiny(), min_views=1, contracted=False)
         camera, pose = Pinhole.from_fov(32, 32, 60.0), np.eye(4)
         pose[2, 3] = -3.0
         field = LayeredField(tiny, pool)
@@ -271,7 +257,7 @@ class LayeredField:
         if news:
             self._frame_time.add((self.now() - begun) / len(news))
         if len(self.observations):
-            self.observations.forget_before(self.observations.newest_s - EVIDENCE_S)
+            self.observations.forget_before(self.observations.newest_s - tuned.EVIDENCE_S)
         self.part_s.add("plates", begun)
         return list(news.values())
 
@@ -320,14 +306,14 @@ class LayeredField:
 
     def _take_whole(self, taken: Sequence[View]) -> None:
         """Take one of the frames into its camera's fine plate, now and then; the cameras take turns."""
-        begun, now_s = self.now(), self.observations.newest_s
+        begun = self.now()
         views = {v.camera: v for v in taken if v.whole is not None}
         seen = [
             o for o in self.observations if o.camera in views and o.view.generated_ns == views[o.camera].generated_ns
         ]
-        if not seen or now_s - self.fine_s < FINE_EVERY_S:
+        if not seen or self.observations.newest_s - self.fine_s < tuned.FINE_EVERY_S:
             return
-        self.fine_s = now_s
+        self.fine_s = self.observations.newest_s
         o = min(seen, key=lambda o: self.cameras[o.camera].fine_count)
         camera, decode = self.cameras[o.camera], views[o.camera].whole
         if camera.fine is not None and decode is not None and (whole := decode()) is not None:
@@ -336,11 +322,11 @@ class LayeredField:
 
     def _plates_are_known(self) -> bool:
         return (
-            len(self.cameras) >= LEAST_CAMERAS
+            len(self.cameras) >= tuned.LEAST_CAMERAS
             and len(self.observations) > 0
-            and self.observations.newest_s >= PLATE_S
+            and self.observations.newest_s >= tuned.PLATE_S
             # Of a camera that has gone silent nothing more will come.
-            and all(self.cameras[o.camera].plate.count >= PLATE_FRAMES for o in self.observations)
+            and all(self.cameras[o.camera].plate.count >= tuned.PLATE_FRAMES for o in self.observations)
         )
 
     # --- the still field ---------------------------------------------------------------------
@@ -390,7 +376,7 @@ class LayeredField:
         if beside and self.static.training:
             return
         finished = self.static.finished
-        if finished and now_s - self.plates_s < PLATES_EVERY_S:
+        if finished and now_s - self.plates_s < tuned.PLATES_EVERY_S:
             return
         if finished or beside:
             plates = self._plates()
@@ -405,18 +391,18 @@ class LayeredField:
         """Begin with the plates, and correct the cameras' exposures where they differ; the field that shows that they
         agree goes on. One round a call. Returns whether it was the last."""
         begun, views = self.now(), [camera.view for camera in self.cameras.values()]
-        agree = self.exposure_rounds >= EXPOSURE_ROUNDS
+        agree = self.exposure_rounds >= tuned.EXPOSURE_ROUNDS
         self._begin_anew()
         if not agree:
             self.exposure_rounds += 1
-            self.static.train(StepBudget(Budget(steps=EXPOSURE_STEPS), self.now))
+            self.static.train(StepBudget(Budget(steps=tuned.EXPOSURE_STEPS), self.now))
             self.static.publish()
             self.static.render(views)
             renderings = {name: rendering for name, (_, rendering) in self.static.rendered.items()}
             self.static.rendered = {}
             agree = equalize_exposures(self.cameras, renderings)
             if agree:
-                self.exposure_rounds = EXPOSURE_ROUNDS
+                self.exposure_rounds = tuned.EXPOSURE_ROUNDS
         self.part_s.add("exposures", begun)
         return agree
 
@@ -426,7 +412,7 @@ class LayeredField:
     def _fine_plates_are_known(self) -> bool:
         seen = [self.cameras[camera].fine for camera in {o.camera for o in self.observations}]
         fine = [f for f in seen if f is not None]
-        return bool(fine) and all(f.count >= FINE_FRAMES for f in fine)
+        return bool(fine) and all(f.count >= tuned.FINE_FRAMES for f in fine)
 
     def _find_rows(self) -> None:
         for camera in self.cameras.values():
@@ -443,7 +429,7 @@ class LayeredField:
             never = [c for c in stale if c.rendered_step < 0]
             self.static.render([c.view for c in never or stale[:1]])
         rendered = list(self.static.rendered)
-        for name in rendered[:RENDERINGS_A_FIT] if beside else rendered:
+        for name in rendered[: tuned.RENDERINGS_A_FIT] if beside else rendered:
             cameras[name].take_rendering(*self.static.rendered.pop(name))
         self.part_s.add("static renders", begun)
 

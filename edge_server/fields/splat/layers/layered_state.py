@@ -16,17 +16,18 @@ from edge_server.fields.common.field_state import unpack_meta
 from edge_server.fields.common.supervision import check_view
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.layers.motion import ViewRow
-from edge_server.fields.splat.layers.observations import FRAMES_KNOWN, FixedCamera, Observation, Observations
+from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
+from edge_server.fields.splat.layers.settings import FRAMES_KNOWN
 from edge_server.fields.splat.layers.static_layer import StaticLayer
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
-VERSION = 5
+VERSION = 6
 COUNTERS = ("layered", "origin_ns", "plates_s", "fine_s", "fine", "exposure_rounds")  # of the field
-TRACKED = ("anchors_s", "seeded_s", "fits", "left_out")  # and of its tracker
+TRACKED = ("anchors_s", "seeded_s", "fits")  # and of its tracker
 
 
 def pack(field: Any) -> Arrays:

@@ -25,23 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
+from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.kernels.solve import BAND, PAIRS, add_row, add_span, solve_knots
-from edge_server.fields.splat.layers.settings import (
-    ACCELERATION_M_PER_S2,
-    ATTACHED,
-    CLUSTER_ROUNDS,
-    FIXED,
-    FREE,
-    KNOTS_PER_S,
-    LEAST_REACH,
-    NEIGHBOR_M_PER_S,
-    NEIGHBORS,
-    PERSISTENCE,
-)
 
-WINDOW = FREE + FIXED
+WINDOW = tuned.FREE + tuned.FIXED
 # x(k) = x(k-1) + v + r a as differences[0] x(k-3) + ... + differences[3] x(k) = 0
-DIFFERENCES = np.array([-PERSISTENCE, 1.0 + 2.0 * PERSISTENCE, -2.0 - PERSISTENCE, 1.0])
+DIFFERENCES = np.array([-tuned.PERSISTENCE, 1.0 + 2.0 * tuned.PERSISTENCE, -2.0 - tuned.PERSISTENCE, 1.0])
 
 
 class ViewRow(NamedTuple):
@@ -96,17 +85,17 @@ class Motion:
     @property
     def oldest_s(self) -> float:
         """Views before this instant do not bear on free knots."""
-        return (self._first + FIXED - 1) / KNOTS_PER_S
+        return (self._first + tuned.FIXED - 1) / tuned.KNOTS_PER_S
 
     @property
     def newest_s(self) -> float:
         """Views after this instant are too far ahead of the knots: ``slide`` first."""
-        return (self._first + WINDOW) / KNOTS_PER_S
+        return (self._first + WINDOW) / tuned.KNOTS_PER_S
 
     def weights(self, instant_s: float) -> tuple[int, NDArray[np.float64]]:
         """The displacement at an instant is a sum of four knots times weights, float64 (4,); returns the
         first of the four, counted within the window, and the weights."""
-        last, x = WINDOW - 1, max(instant_s * KNOTS_PER_S - self._first, 0.0)
+        last, x = WINDOW - 1, max(instant_s * tuned.KNOTS_PER_S - self._first, 0.0)
         i = min(int(x), last)
         f = x - i
         base = min(max(i - 1, 0), WINDOW - 4)
@@ -130,10 +119,10 @@ class Motion:
         (N, 3), 1 / (distance^2 + (reach / 4)^2) normalized. With fewer anchors the rest have share 0."""
         assert self.anchors is not None
         d2 = _square_distances(points, self.anchors + self.at(instant_s))
-        nearest = np.argsort(d2, axis=1, kind="stable")[:, :ATTACHED]
+        nearest = np.argsort(d2, axis=1, kind="stable")[:, : tuned.ATTACHED]
         share = 1.0 / (np.take_along_axis(d2, nearest, axis=1) + (self._reach / 4) ** 2)
         share /= share.sum(axis=1, keepdims=True)
-        missing = ((0, 0), (0, ATTACHED - nearest.shape[1]))
+        missing = ((0, 0), (0, tuned.ATTACHED - nearest.shape[1]))
         return np.pad(nearest, missing), np.pad(share, missing).astype(np.float32)
 
     def displaced(
@@ -159,7 +148,7 @@ class Motion:
         found = _cluster(points[sound].astype(np.float64), opacity[sound], count, self.rng)
         if self.anchors is None:
             self._knots = np.zeros((WINDOW, len(found), 3))
-            self._first = int(np.floor(instant_s * KNOTS_PER_S)) + 2 - WINDOW
+            self._first = int(np.floor(instant_s * tuned.KNOTS_PER_S)) + 2 - WINDOW
         else:
             now = self.at(instant_s)
             near = 1.0 / (_square_distances(found, self.anchors + now) + (self._reach / 4) ** 2) ** 2
@@ -174,8 +163,8 @@ class Motion:
         count = len(self.anchors)
         d2 = _square_distances(self.anchors, self.anchors)
         np.fill_diagonal(d2, np.inf)
-        self._reach = max(float(np.sqrt(np.median(d2.min(axis=1)))), LEAST_REACH) if count > 1 else 0.3
-        near = np.argsort(d2, axis=1, kind="stable")[:, : min(NEIGHBORS, count - 1)]
+        self._reach = max(float(np.sqrt(np.median(d2.min(axis=1)))), tuned.LEAST_REACH) if count > 1 else 0.3
+        near = np.argsort(d2, axis=1, kind="stable")[:, : min(tuned.NEIGHBORS, count - 1)]
         joined = np.zeros((count, count), np.bool_)
         np.put_along_axis(joined, near, True, axis=1)
         joined |= joined.T
@@ -187,11 +176,11 @@ class Motion:
         """Move the window on until its last knot is the one after an instant. New knots are predicted; after
         a pause longer than the window, what moved is taken to have stopped. An earlier instant changes
         nothing."""
-        ahead = int(np.floor(instant_s * KNOTS_PER_S)) + 2 - WINDOW - self._first
-        for _ in range(min(ahead, FREE)):
+        ahead = int(np.floor(instant_s * tuned.KNOTS_PER_S)) + 2 - WINDOW - self._first
+        for _ in range(min(ahead, tuned.FREE)):
             x = self._knots
             self._knots = np.concatenate([x[1:], -np.einsum("k,kac->ac", DIFFERENCES[:3], x[-3:])[None]])
-        for _ in range(min(ahead - FREE, WINDOW)):
+        for _ in range(min(ahead - tuned.FREE, WINDOW)):
             self._knots = np.concatenate([self._knots[1:], self._knots[-1:]])
         self._first += max(ahead, 0)
 
@@ -209,7 +198,7 @@ class Motion:
         steady, alike = self._prior_weights()
         iterations = np.zeros(1, np.int64)
         self.pool.run(
-            solve_knots, self._band, right, knots, FIXED, DIFFERENCES, steady, alike, self._laplacian, iterations
+            solve_knots, self._band, right, knots, tuned.FIXED, DIFFERENCES, steady, alike, self._laplacian, iterations
         )
         self._knots = np.ascontiguousarray(knots.reshape(WINDOW, 3, count).transpose(0, 2, 1))
         return len(rows) - sum(int(span.used[0]) for span in spans)
@@ -221,7 +210,7 @@ class Motion:
         n, groups = 3 * len(self.anchors), dict[int, list[ViewRow]]()
         for row in rows:
             if self.oldest_s <= row.instant_s <= self.newest_s:
-                i = min(int(row.instant_s * KNOTS_PER_S - self._first), WINDOW - 1)
+                i = min(int(row.instant_s * tuned.KNOTS_PER_S - self._first), WINDOW - 1)
                 groups.setdefault(i, []).append(row)
         before, self._spans = {span.key: span for span in self._spans}, []
         for i, group in sorted(groups.items()):
@@ -239,8 +228,8 @@ class Motion:
 
     def _prior_weights(self) -> tuple[float, float]:
         """1 / variance of the persistence of acceleration, and of neighbors moving alike, in scene units."""
-        dt = 1.0 / KNOTS_PER_S
-        steady, alike = ACCELERATION_M_PER_S2 * dt**2, NEIGHBOR_M_PER_S * dt
+        dt = 1.0 / tuned.KNOTS_PER_S
+        steady, alike = tuned.ACCELERATION_M_PER_S2 * dt**2, tuned.NEIGHBOR_M_PER_S * dt
         return (self.radius_m / steady) ** 2, (self.radius_m / alike) ** 2
 
     def copy(self) -> Motion:
@@ -282,7 +271,7 @@ def _cluster(
         d2 = np.minimum(d2, ((points - centers[-1]) ** 2).sum(axis=1))
         centers.append(points[np.argmax(d2 * np.minimum(opacity, 0.5))])
     found = np.array(centers)
-    for _ in range(CLUSTER_ROUNDS):
+    for _ in range(tuned.CLUSTER_ROUNDS):
         nearest = _square_distances(points, found).argmin(axis=1)
         size = np.bincount(nearest, minlength=count)
         total = np.stack([np.bincount(nearest, points[:, c], count) for c in range(3)], axis=-1)

@@ -16,31 +16,11 @@ from edge_server.fields.splat.densification import GaussianCloud, densify_and_pr
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters
 from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.kernels.rasterize import Targets
+from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.kernels.align import align_view
 from edge_server.fields.splat.layers.kernels.visual_hull import count_foreground
 from edge_server.fields.splat.layers.motion import Motion, ViewRow
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
-from edge_server.fields.splat.layers.settings import (
-    ANCHORS,
-    CAMERA_SHARES,
-    DENSIFY_EVERY,
-    FEW,
-    FOREGROUND_DECAY,
-    GAUSSIANS,
-    GAUSSIANS_AN_ANCHOR,
-    KEEP_DILATION_PX,
-    KEEP_INSIDE,
-    KNOTS_PER_S,
-    LEAST_ALIVE,
-    LOST_BELOW,
-    MISSING_ERROR,
-    MOST_FOREGROUND,
-    SEED_DILATION_PX,
-    SEED_INSIDE,
-    SEEDING_KNOTS,
-    SEEDS_A_PIXEL,
-    USUAL_SHARE,
-)
 from edge_server.fields.splat.seeding import seed_gaussians
 from edge_server.fields.splat.settings import SplatSettings
 
@@ -69,18 +49,17 @@ class MovingSet:
     @property
     def alive(self) -> bool:
         """Whether there are enough Gaussians to be aligned."""
-        return len(self.cloud) >= LEAST_ALIVE
+        return len(self.cloud) >= tuned.LEAST_ALIVE
 
     @property
     def capacity(self) -> int:
         """Largest number of Gaussians."""
-        return round(GAUSSIANS * (1.0 + (self.capacity_factor - 1.0) / 3.0))
+        return round(tuned.GAUSSIANS * (1.0 + (self.capacity_factor - 1.0) / 3.0))
 
     def follow_foreground(self, share: float) -> None:
         """Let the capacity follow the foreground's share of the pixels: up at once, down slowly."""
-        self.capacity_factor = max(
-            FOREGROUND_DECAY * self.capacity_factor, min(max(share / USUAL_SHARE, 1.0), MOST_FOREGROUND)
-        )
+        now = min(max(share / tuned.USUAL_SHARE, 1.0), tuned.MOST_FOREGROUND)
+        self.capacity_factor = max(tuned.FOREGROUND_DECAY * self.capacity_factor, now)
 
     # --- at an instant ------------------------------------------------------------------------
 
@@ -126,7 +105,7 @@ class MovingSet:
 
     def run_kernels(self, camera: FixedCamera, observation: Observation) -> None:
         """Run every kernel once, whatever comes of it."""
-        params = np.zeros((LEAST_ALIVE, self.cloud.params.shape[1]), np.float32)
+        params = np.zeros((tuned.LEAST_ALIVE, self.cloud.params.shape[1]), np.float32)
         self.cloud = GaussianCloud.new(params)
         self.renew_anchors(observation.instant_s)
         observation.weight = np.ones(observation.foreground.shape, np.float32)
@@ -136,7 +115,7 @@ class MovingSet:
         self._inside([params[:, :3]], [observation], {observation.camera: camera}, 1)
         self.motion.pool = self.pool
         assert observation.row is not None
-        self.motion.slide(observation.instant_s + 1.0 / KNOTS_PER_S)
+        self.motion.slide(observation.instant_s + 1.0 / tuned.KNOTS_PER_S)
         self.motion.solve([observation.row])
 
     # --- appearance ---------------------------------------------------------------------------
@@ -154,7 +133,7 @@ class MovingSet:
         cloud.params[:] = gaussians.params
         cloud.params[:, :3] = rest
         self.steps += 1
-        if self.steps - self._grown >= DENSIFY_EVERY:
+        if self.steps - self._grown >= tuned.DENSIFY_EVERY:
             self._grow(camera.view.intrinsics.width)
         return int(raster.lists.needed[0])
 
@@ -169,8 +148,8 @@ class MovingSet:
     def seeding_frames(self, observations: Observations, cameras: int) -> list[Observation]:
         """The frames of the newest knot that most cameras have seen; none if there is no such knot."""
         last = observations.newest_knot
-        for share in CAMERA_SHARES:
-            for knot in range(last, last - SEEDING_KNOTS, -1):
+        for share in tuned.CAMERA_SHARES:
+            for knot in range(last, last - tuned.SEEDING_KNOTS, -1):
                 found = observations.of_knots(knot, knot)
                 if len(found) >= max(1, round(share * cameras)):
                     return found
@@ -181,8 +160,8 @@ class MovingSet:
         them, remove all, with their motion: new ones are then seeded at rest."""
         if len(self.cloud):
             places = [self.places(o.instant_s) for o in frames]
-            keep = self._inside(places, frames, cameras, KEEP_DILATION_PX) >= KEEP_INSIDE
-            if keep.mean() < LOST_BELOW:
+            keep = self._inside(places, frames, cameras, tuned.KEEP_DILATION_PX) >= tuned.KEEP_INSIDE
+            if keep.mean() < tuned.LOST_BELOW:
                 keep[:] = False
                 self.motion.forget()
             self._keep(keep)
@@ -190,9 +169,9 @@ class MovingSet:
     def seed_missing(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:
         """Seed Gaussians in foreground that is rendered wrongly. Where that is follows from the moving set
         as rendered for each frame (``Observation.shown``)."""
-        missing = [o.foreground & _is_wrong(o) if len(self.cloud) > FEW else o.foreground for o in frames]
+        missing = [o.foreground & _is_wrong(o) if len(self.cloud) > tuned.FEW else o.foreground for o in frames]
         pixels = sum(int(mask.sum()) for mask in missing)
-        count = min(int(SEEDS_A_PIXEL * pixels), self.capacity - len(self.cloud))
+        count = min(int(tuned.SEEDS_A_PIXEL * pixels), self.capacity - len(self.cloud))
         if count <= 4:
             return
         instant_s = float(np.mean([o.instant_s for o in frames]))
@@ -213,7 +192,7 @@ class MovingSet:
             shift = self.motion.displaced(np.zeros_like(params[:, :3]), anchor, share, instant_s)
             params[:, :3] -= shift
             places = [self.motion.displaced(params[:, :3], anchor, share, o.instant_s) for o in frames]
-        inside = self._inside(places, frames, cameras, SEED_DILATION_PX) >= SEED_INSIDE
+        inside = self._inside(places, frames, cameras, tuned.SEED_DILATION_PX) >= tuned.SEED_INSIDE
         if not inside.any():
             return
         self.cloud.add(GaussianCloud.new(params[inside]))
@@ -228,7 +207,7 @@ class MovingSet:
         if self.motion.anchors is not None:
             self.cloud.params[:, :3] = self.places(instant_s)
         places = self.cloud.params[:, :3]
-        count = min(round(ANCHORS * self.capacity_factor), max(1, len(places) // GAUSSIANS_AN_ANCHOR))
+        count = min(round(tuned.ANCHORS * self.capacity_factor), max(1, len(places) // tuned.GAUSSIANS_AN_ANCHOR))
         self.motion.choose_anchors(places, opacity(self.cloud.params), count, instant_s)
         self.anchor, self.share = self.motion.attach(places, instant_s)
 
@@ -305,4 +284,4 @@ def _is_wrong(observation: Observation) -> NDArray[np.bool_]:
     if observation.shown is None:
         return np.ones(observation.foreground.shape, bool)
     error = np.abs(observation.shown - observation.view.image[..., :3] * np.float32(1.0 / 255.0))
-    return np.asarray(error.max(axis=2) > MISSING_ERROR)
+    return np.asarray(error.max(axis=2) > tuned.MISSING_ERROR)

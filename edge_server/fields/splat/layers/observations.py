@@ -13,17 +13,9 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Rendering, View
 from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.motion import ViewRow
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
-from edge_server.fields.splat.layers.settings import (
-    BACKGROUND_WEIGHT,
-    FRAMES_KNOWN,
-    KNOTS_PER_S,
-    NEAR_FOREGROUND_PX,
-    OCCLUDED_M,
-    SAME_POSE,
-    STANDS_FRAMES,
-)
 from edge_server.fields.splat.layers.static_layer import PlateImage
 
 
@@ -48,7 +40,7 @@ class FixedCamera:
     depth_m: NDArray[np.float32] | None = None
     rendered_step: int = -1
     newest_s: float = -np.inf
-    taken: deque[int] = field(default_factory=lambda: deque(maxlen=FRAMES_KNOWN))
+    taken: deque[int] = field(default_factory=lambda: deque(maxlen=tuned.FRAMES_KNOWN))
     fine: FinePlate | None = None
     away: NDArray[np.float64] | None = None
     moves: int = 0
@@ -66,7 +58,7 @@ class FixedCamera:
         if not _same_pose(self.view.camera_to_world, view.camera_to_world):
             return False
         self.away = None
-        if self.plate.count > STANDS_FRAMES:
+        if self.plate.count > tuned.STANDS_FRAMES:
             self.moves, self.anew = 0, False
         return True
 
@@ -134,7 +126,7 @@ class Observation:
 def knot_of(instant_s: float) -> int:
     """The number of the knot at or before an instant. A frame taken at a knot counts there, however its
     nanoseconds are rounded."""
-    return int(np.floor(instant_s * KNOTS_PER_S + 1e-3))
+    return int(np.floor(instant_s * tuned.KNOTS_PER_S + 1e-3))
 
 
 class Observations:
@@ -176,7 +168,7 @@ class Observations:
 
 
 def _same_pose(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
-    return bool(np.allclose(a, b, atol=SAME_POSE))
+    return bool(np.allclose(a, b, atol=tuned.SAME_POSE))
 
 
 def pixel_weights(
@@ -188,11 +180,11 @@ def pixel_weights(
     foreground: bool (H, W). depth_m: float32 (H, W), depth of the static field; None: unknown.
     distance_m: distance of the moving set. given: float32 (H, W), ``View.weight``, or None.
     """
-    square = np.ones((NEAR_FOREGROUND_PX, NEAR_FOREGROUND_PX), np.uint8)
+    square = np.ones((tuned.NEAR_FOREGROUND_PX, tuned.NEAR_FOREGROUND_PX), np.uint8)
     near = cv2.dilate(foreground.astype(np.uint8), square)
-    weight = np.where(near > 0, np.float32(1.0), np.float32(BACKGROUND_WEIGHT))
+    weight = np.where(near > 0, np.float32(1.0), np.float32(tuned.BACKGROUND_WEIGHT))
     if depth_m is not None:
-        weight[~foreground & (depth_m > 0.0) & (depth_m < distance_m - OCCLUDED_M)] = 0.0
+        weight[~foreground & (depth_m > 0.0) & (depth_m < distance_m - tuned.OCCLUDED_M)] = 0.0
     return weight if given is None else weight * given
 
 

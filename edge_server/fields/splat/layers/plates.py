@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.kernels.plates import (
     CHANGING,
     FOREGROUND,
@@ -24,22 +25,6 @@ from edge_server.fields.splat.layers.kernels.plates import (
     compare_with_plate,
     count_exposure,
     vote,
-)
-from edge_server.fields.splat.layers.settings import (
-    BRIGHT,
-    CLOSE,
-    COMMON_SHARE,
-    DARK,
-    FINE_KNOWN,
-    FINE_MEMORY,
-    GAIN_MOST,
-    GAIN_SHARE,
-    HELD_ERROR,
-    HELD_OPACITY,
-    HOLE,
-    LAGS,
-    REFUSED_SHARE,
-    SPECK,
 )
 from freshfield.geometry import Pinhole
 
@@ -72,8 +57,8 @@ class Plate:
         )
         self.picture, self.gain, self.count = zeros(3), np.ones(3, np.float32), 0
         # The latest frames, a ring: as taken, their gains since, and blurred.
-        self._frames = np.zeros((max(LAGS), height, width, 3), np.uint8)
-        self._gains = np.ones((max(LAGS), 3), np.float32)
+        self._frames = np.zeros((max(tuned.LAGS), height, width, 3), np.uint8)
+        self._gains = np.ones((max(tuned.LAGS), 3), np.float32)
         self._recent = np.zeros(self._frames.shape, np.float32)
         self._held: NDArray[Any] = np.zeros((height, width), np.uint8)
         self._static, self._has_static = zeros(3), False
@@ -95,8 +80,8 @@ class Plate:
         theirs = color[::2, ::2] * np.float32(255.0)
         use = self.known[::2, ::2]
         for picture in (self.picture[::2, ::2], theirs):
-            use = use & (picture.min(axis=2) > DARK) & (picture.max(axis=2) < BRIGHT)
-        if use.sum() < COMMON_SHARE * use.size:
+            use = use & (picture.min(axis=2) > tuned.DARK) & (picture.max(axis=2) < tuned.BRIGHT)
+        if use.sum() < tuned.COMMON_SHARE * use.size:
             return None
         ours = self.at_common_exposure()[::2, ::2]
         ratio: NDArray[np.float32] = np.median(ours[use] / theirs[use], axis=0).astype(np.float32)
@@ -114,7 +99,7 @@ class Plate:
         before = dict(vars(self))
         self._follow_exposure(image)
         blurred = cv2.boxFilter(image, cv2.CV_32F, (3, 3))
-        earlier = [self._recent[(self.count - lag) % len(self._recent)] for lag in LAGS if lag <= self.count]
+        earlier = [self._recent[(self.count - lag) % len(self._recent)] for lag in tuned.LAGS if lag <= self.count]
         earlier_frames = np.stack(earlier or [blurred])
         self.pool.run(
             compare_with_plate,
@@ -131,7 +116,7 @@ class Plate:
         votes = np.ones_like(foreground)
         if self.count > 0:
             foreground = clean_mask(self._flags & np.uint8(FOREGROUND))
-            if may_refuse and foreground.mean() > REFUSED_SHARE:
+            if may_refuse and foreground.mean() > tuned.REFUSED_SHARE:
                 vars(self).update(before)  # what ``_scale`` has replaced
                 return None
             changing = clean_mask(self._flags & np.uint8(CHANGING)) if self.count > 1 else foreground
@@ -164,7 +149,7 @@ class Plate:
         """
         error = cv2.blur(cv2.absdiff(shown, image * np.float32(1.0 / 255.0)), (3, 3))
         worst = np.maximum(np.maximum(error[..., 0], error[..., 1]), error[..., 2])
-        explained = ((opacity > HELD_OPACITY) & (worst < HELD_ERROR)).astype(np.uint8)
+        explained = ((opacity > tuned.HELD_OPACITY) & (worst < tuned.HELD_ERROR)).astype(np.uint8)
         self._held = cv2.dilate(explained, np.ones((3, 3), np.uint8))
 
     def fill_unknown(self, color: NDArray[np.float32]) -> None:
@@ -217,13 +202,14 @@ class Plate:
         counts = np.zeros((3, 3), np.int64)
         self.pool.run(count_exposure, image, self.arrays, counts)
         used = counts[:, 0]
+        few = used[0] < tuned.GAIN_SHARE * image.shape[0] * image.shape[1] / 4
         # The median is beyond a bound if more than half of the ratios are.
-        if used[0] < GAIN_SHARE * image.shape[0] * image.shape[1] / 4 or (2 * counts[:, 1:] <= used[:, None]).all():
+        if few or (2 * counts[:, 1:] <= used[:, None]).all():
             return
         plate = self.arrays.means[0, ::2, ::2]
-        use = self.known[::2, ::2] & (plate.min(axis=2) > DARK) & (plate.max(axis=2) < BRIGHT)
+        use = self.known[::2, ::2] & (plate.min(axis=2) > tuned.DARK) & (plate.max(axis=2) < tuned.BRIGHT)
         gain = np.median(image[::2, ::2][use] / plate[use], axis=0).astype(np.float32)
-        if ((gain > 1.0 / GAIN_MOST) & (gain < GAIN_MOST)).all():  # no black or broken frame
+        if ((gain > 1.0 / tuned.GAIN_MOST) & (gain < tuned.GAIN_MOST)).all():  # no black or broken frame
             self._scale(gain)
 
     def _scale(self, gain: NDArray[np.float32]) -> None:
@@ -252,7 +238,7 @@ class FinePlate:
     @property
     def known(self) -> NDArray[np.bool_]:
         """bool (H, W), where there is a plate."""
-        return self.frames >= FINE_KNOWN
+        return self.frames >= tuned.FINE_KNOWN
 
     def take(self, image: NDArray[np.uint8], away: NDArray[np.bool_], gain: NDArray[np.float32]) -> None:
         """Take in a frame.
@@ -263,7 +249,7 @@ class FinePlate:
         """
         grown = cv2.dilate(away.astype(np.uint8), np.ones((3, 3), np.uint8))
         use = cv2.resize(grown, image.shape[1::-1], interpolation=cv2.INTER_NEAREST) == 0
-        self.frames += use & (self.frames < FINE_MEMORY)
+        self.frames += use & (self.frames < tuned.FINE_MEMORY)
         rate = use / np.maximum(self.frames, 1).astype(np.float32)
         self.color += (image / gain - self.color) * rate[..., None]
         self.count += 1
@@ -298,11 +284,12 @@ def clean_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     part: NDArray[Any] = (mask[top:bottom, left:right] > 0).astype(np.uint8)
     part = cv2.morphologyEx(part, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     _, label, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=8)
-    keep = (stats[:, cv2.CC_STAT_AREA] >= SPECK).astype(np.uint8)
+    keep = (stats[:, cv2.CC_STAT_AREA] >= tuned.SPECK).astype(np.uint8)
     keep[0] = 0
-    part = cv2.copyMakeBorder(keep[label], CLOSE, CLOSE, CLOSE, CLOSE, cv2.BORDER_CONSTANT, value=0)
-    ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (CLOSE, CLOSE))
-    part = cv2.morphologyEx(part, cv2.MORPH_CLOSE, ellipse)[CLOSE:-CLOSE, CLOSE:-CLOSE]
+    by = tuned.CLOSE
+    part = cv2.copyMakeBorder(keep[label], by, by, by, by, cv2.BORDER_CONSTANT, value=0)
+    ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (by, by))
+    part = cv2.morphologyEx(part, cv2.MORPH_CLOSE, ellipse)[by:-by, by:-by]
     _, label, stats, _ = cv2.connectedComponentsWithStats(1 - part, connectivity=4)
     x0, y0 = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
     x1, y1 = x0 + stats[:, cv2.CC_STAT_WIDTH], y0 + stats[:, cv2.CC_STAT_HEIGHT]
@@ -312,7 +299,7 @@ def clean_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
         | ((x1 == right - left) & (right < width))
         | ((y1 == bottom - top) & (bottom < height))
     )
-    fill = ((stats[:, cv2.CC_STAT_AREA] <= HOLE * mask.size) & ~goes_on).astype(np.uint8)
+    fill = ((stats[:, cv2.CC_STAT_AREA] <= tuned.HOLE * mask.size) & ~goes_on).astype(np.uint8)
     fill[0] = 0
     out[top:bottom, left:right] = part | fill[label]
     return out

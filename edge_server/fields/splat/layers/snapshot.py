@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.splat.kernels.project import Gaussians
+from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.motion import Motion
 from edge_server.fields.splat.layers.moving_set import MovingSet
-from edge_server.fields.splat.layers.settings import MAX_AHEAD_S
 from edge_server.fields.splat.snapshot import SplatSnapshot
 
 
@@ -40,7 +40,7 @@ class MovingSnapshot:
         """How much later than the newest frame to show: no farther than motion can be extrapolated."""
         if present_ns is None:
             return 0.0
-        return min((present_ns - self.origin_ns) / 1e9 - self.newest_s, MAX_AHEAD_S)
+        return min((present_ns - self.origin_ns) / 1e9 - self.newest_s, tuned.MAX_AHEAD_S)
 
     def params_at(self, ahead_s: float) -> NDArray[np.float32]:
         """Parameters, float32 (N, P), so much later than the newest frame."""

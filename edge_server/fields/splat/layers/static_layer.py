@@ -20,18 +20,7 @@ from edge_server.fields import Budget, Rendering, View
 from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import Gaussians
-from edge_server.fields.splat.layers.settings import (
-    CHANGED,
-    CHANGED_PIXELS,
-    RATE_AGAIN,
-    RATE_FIRST,
-    RENDER_EVERY,
-    ROUND,
-    ROUNDS_AGAIN,
-    ROUNDS_FIRST,
-    SCHEDULE,
-    SHOWN_AFTER,
-)
+from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.snapshot import SplatSnapshot
 
 Arrays = dict[str, NDArray]
@@ -68,9 +57,9 @@ class StaticLayer:
         self.stop()
         self.shown: SplatSnapshot | None = None
         self.rendered: dict[str, tuple[int, Rendering]] = {}
-        self.grows_until = SCHEDULE  # step
+        self.grows_until = tuned.SCHEDULE  # step
         self._learned: dict[str, tuple[NDArray, NDArray]] = {}  # camera -> plate, known: as learned
-        self._begin_rounds(ROUNDS_FIRST, RATE_FIRST)
+        self._begin_rounds(tuned.ROUNDS_FIRST, tuned.RATE_FIRST)
 
     def forget_camera(self, camera: str) -> None:
         """Forget what a camera's plate was when it was learned, and renderings from its place."""
@@ -91,15 +80,15 @@ class StaticLayer:
     @property
     def ready(self) -> bool:
         """Whether the field is good enough to be shown, and to say what lies where plates are unknown."""
-        return self.shown is not None and self.shown.step >= SHOWN_AFTER
+        return self.shown is not None and self.shown.step >= tuned.SHOWN_AFTER
 
     # --- plates -------------------------------------------------------------------------------
 
     def begin(self, plates: Sequence[PlateImage]) -> None:
         """``learn`` the first plates, in a schedule that begins now."""
         self.learn(plates)
-        self.grows_until = self.field.step + SCHEDULE
-        self._begin_rounds(ROUNDS_FIRST, RATE_FIRST)
+        self.grows_until = self.field.step + tuned.SCHEDULE
+        self._begin_rounds(tuned.ROUNDS_FIRST, tuned.RATE_FIRST)
 
     def learn(self, plates: Sequence[PlateImage]) -> None:
         """Take plates as what to learn. What is not known has no weight."""
@@ -112,18 +101,18 @@ class StaticLayer:
 
     def learn_again(self, plates: Sequence[PlateImage]) -> bool:
         """``learn`` if the plates have changed since, and begin rounds of training. Returns whether."""
-        if sum(self._changed_pixels(plate) for plate in plates) <= CHANGED_PIXELS * len(plates):
+        if sum(self._changed_pixels(plate) for plate in plates) <= tuned.CHANGED_PIXELS * len(plates):
             return False
         self.learn(plates)
-        self._begin_rounds(ROUNDS_AGAIN, RATE_AGAIN)
+        self._begin_rounds(tuned.ROUNDS_AGAIN, tuned.RATE_AGAIN)
         return True
 
     def refine(self, plates: Sequence[PlateImage]) -> None:
         """``learn`` the same plates at a higher resolution, in what is left of the schedule, or in its second
         half again."""
         self.learn(plates)
-        self.grows_until = max(self.grows_until, self.field.step + SCHEDULE // 2)
-        self._begin_rounds(ROUNDS_FIRST, RATE_FIRST)
+        self.grows_until = max(self.grows_until, self.field.step + tuned.SCHEDULE // 2)
+        self._begin_rounds(tuned.ROUNDS_FIRST, tuned.RATE_FIRST)
 
     def _changed_pixels(self, plate: PlateImage) -> int:
         if plate.view.camera not in self._learned:
@@ -132,7 +121,7 @@ class StaticLayer:
         if was_known.shape != plate.known.shape:
             return int(plate.known.sum())
         both = plate.known & was_known
-        differs = cv2.blur(cv2.absdiff(plate.color, before) * both[..., None], (3, 3)).max(axis=2) > CHANGED
+        differs = cv2.blur(cv2.absdiff(plate.color, before) * both[..., None], (3, 3)).max(axis=2) > tuned.CHANGED
         return int((plate.known & (differs | ~was_known)).sum())
 
     # --- training -----------------------------------------------------------------------------
@@ -144,7 +133,7 @@ class StaticLayer:
         rays = samples = 0
         while not self.finished and pace.begin_step(self.field.step_time) is not None:
             left = self.grows_until - self.field.step
-            progress = 1.0 - left / SCHEDULE if left > 0 else self._round_step / ROUND
+            progress = 1.0 - left / tuned.SCHEDULE if left > 0 else self._round_step / tuned.ROUND
             loss, seen, pairs = self.field.train_step(progress, grow=left > 0)
             if left <= 0:
                 self._finish_round_step()
@@ -155,7 +144,7 @@ class StaticLayer:
 
     def _finish_round_step(self) -> None:
         self._round_step += 1
-        if self._round_step < ROUND:
+        if self._round_step < tuned.ROUND:
             return
         self._round_step = 0
         params = self.field.cloud.params
@@ -201,9 +190,9 @@ class StaticLayer:
                 self.learn_again(plates)
             rendered_step = self.field.step
             while not self.finished and not self._stopping:
-                self.train(StepBudget(Budget(steps=ROUND)))
+                self.train(StepBudget(Budget(steps=tuned.ROUND)))
                 self.publish()
-                due = self.finished or self.field.step - rendered_step >= RENDER_EVERY
+                due = self.finished or self.field.step - rendered_step >= tuned.RENDER_EVERY
                 if due and self.ready:
                     self.render(views)
                     rendered_step = self.field.step
@@ -232,7 +221,7 @@ class StaticLayer:
 
     def state(self) -> Arrays:
         """What is needed, beside the field's own state, to resume bit for bit."""
-        again = int(self._rate == RATE_AGAIN)
+        again = int(self._rate == tuned.RATE_AGAIN)
         counters = [self.rounds, self._rounds_wanted, self._round_step, again, self.grows_until]
         mine: Arrays = {"rounds": np.array(counters, np.int64)}
         if self._mean is not None:
@@ -244,7 +233,7 @@ class StaticLayer:
     def load_state(self, state: Arrays) -> None:
         """Resume from ``state``, with a field that has resumed already. KeyError: it lacks something."""
         self.rounds, self._rounds_wanted, self._round_step, again, self.grows_until = (int(n) for n in state["rounds"])
-        self._rate = RATE_AGAIN if again else RATE_FIRST
+        self._rate = tuned.RATE_AGAIN if again else tuned.RATE_FIRST
         self._mean = np.array(state["mean"]) if "mean" in state else None
         self._learned = {}
         while (key := f"learned_{len(self._learned)}") + ".camera" in state:

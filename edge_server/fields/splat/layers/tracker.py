@@ -13,22 +13,9 @@ import numpy as np
 
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters
+from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations, knot_of, pixel_weights
-from edge_server.fields.splat.layers.settings import (
-    AGAIN_M,
-    ALIGNING_SHARE,
-    ANCHORS_EVERY_S,
-    KNOTS_PER_S,
-    LEAST_ALIGNED,
-    LEAST_FOREGROUND,
-    MOST_ALIGNED,
-    PASSES,
-    SEED_AT_LEAST_EVERY_S,
-    SEED_EVERY_S,
-    STEPS,
-    STRIDE_S,
-)
 
 
 class PartTimes(dict[str, float]):
@@ -49,7 +36,7 @@ class MotionTracker:
     """Keeps a ``MovingSet`` at what the frames show.
 
     anchors_s, seeded_s: instants of the frames at which anchors were last chosen, and Gaussians seeded.
-    fits: number of fits. left_out: number of frames that were not aligned for lack of time.
+    fits: number of fits.
     """
 
     def __init__(
@@ -57,7 +44,7 @@ class MotionTracker:
     ) -> None:
         self.moving, self.observations, self.cameras, self.times = moving, observations, cameras, times
         self.anchors_s = self.seeded_s = -np.inf
-        self.fits = self.left_out = 0
+        self.fits = 0
         self._step_time, self._seed_time = StepTimer(), StepTimer()
 
     def follow(self, pace: StepBudget, publish: Callable[[], None], parameters: AdamParameters) -> tuple[int, int, int]:
@@ -72,25 +59,25 @@ class MotionTracker:
         strides = self._strides()
         for until_s in strides:
             if moving.motion.anchors is not None:
-                moving.motion.slide(until_s + 1.0 / KNOTS_PER_S)
+                moving.motion.slide(until_s + 1.0 / tuned.KNOTS_PER_S)
             if not moving.alive:
                 continue
-            if until_s - self.anchors_s >= ANCHORS_EVERY_S:
+            if until_s - self.anchors_s >= tuned.ANCHORS_EVERY_S:
                 self._renew_anchors(until_s)
-            for _ in range(PASSES):
-                if self._solve(until_s, pace) < AGAIN_M or not pace.within(ALIGNING_SHARE):
+            for _ in range(tuned.PASSES):
+                if self._solve(until_s, pace) < tuned.AGAIN_M or not pace.within(tuned.ALIGNING_SHARE):
                     break
             for o in self.observations:
                 o.fresh &= o.instant_s > until_s
         if moving.alive:
             publish()
         since_s, begun = newest_s - self.seeded_s, self.times.now()
-        has_room = pace.has_room(self._seed_time.seconds, 1.0, 0.0) or since_s >= SEED_AT_LEAST_EVERY_S
-        if not moving.alive or (since_s >= SEED_EVERY_S and has_room):
+        has_room = pace.has_room(self._seed_time.seconds, 1.0, 0.0) or since_s >= tuned.SEED_AT_LEAST_EVERY_S
+        if not moving.alive or (since_s >= tuned.SEED_EVERY_S and has_room):
             self.seeded_s = newest_s
             self._seed()
             self._seed_time.add(self.times.add("seeding", begun) - begun)
-        return self._train_appearance(pace, parameters, STEPS * len(strides))
+        return self._train_appearance(pace, parameters, tuned.STEPS * len(strides))
 
     def _strides(self) -> list[float]:
         """Instants up to which motion is followed, one after the other: the last is the newest frame's, and
@@ -100,7 +87,7 @@ class MotionTracker:
         newest_s = self.observations.newest_s
         fresh_s = np.array([o.instant_s for o in self.observations if o.fresh])
         since_s = max((o.instant_s for o in self.observations if not o.fresh), default=newest_s)
-        count = max(1, int(np.ceil((newest_s - since_s) / STRIDE_S)))
+        count = max(1, int(np.ceil((newest_s - since_s) / tuned.STRIDE_S)))
         ends = np.linspace(since_s, newest_s, count + 1)
         held = [np.any((fresh_s > begin) & (fresh_s <= end)) for begin, end in pairwise(ends)]
         return [float(end) for end, some in zip(ends[1:-1], held) if some] + [newest_s]
@@ -113,8 +100,7 @@ class MotionTracker:
         seen = [o for o in self.observations if motion.oldest_s <= o.instant_s <= until]
         due = [o for o in seen if o.row is None or o.fresh or o.knot >= knot_of(until_s)]
         for k, o in enumerate(reversed(due)):
-            if k >= MOST_ALIGNED or not (k < LEAST_ALIGNED or pace.within(ALIGNING_SHARE)):
-                self.left_out += len(due) - k
+            if k >= tuned.MOST_ALIGNED or not (k < tuned.LEAST_ALIGNED or pace.within(tuned.ALIGNING_SHARE)):
                 break
             self._align(o, exclude=True)
         begun = self.times.add("alignment", begun)
@@ -165,7 +151,7 @@ class MotionTracker:
         if not frames:
             return
         pixels = sum(int(o.foreground.sum()) for o in frames)
-        if pixels < LEAST_FOREGROUND * frames[0].foreground.size * len(self.cameras):
+        if pixels < tuned.LEAST_FOREGROUND * frames[0].foreground.size * len(self.cameras):
             return
         moving.remove_outside(frames, self.cameras)
         if moving.motion.anchors is None:

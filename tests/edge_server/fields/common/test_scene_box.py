@@ -85,7 +85,7 @@ def test_parallel_outward_and_single_cameras_have_a_box_too() -> None:
 
 
 @pytest.mark.parametrize("scene", ["tile", "room", "tower"])
-@pytest.mark.parametrize("off_m", [30.0, 1e3, 1e6])
+@pytest.mark.parametrize("off_m", [30.0, 1e6])
 def test_a_camera_that_is_far_away_does_not_move_the_box(scene: str, off_m: float) -> None:
     """Whichever it is, and in whatever direction: ahead, behind and aside of where it looks among them."""
     views = synthetic_still(scene, cameras=13, size=16).training

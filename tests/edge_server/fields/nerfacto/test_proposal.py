@@ -66,7 +66,7 @@ def _unit(points: np.ndarray, contracted: bool) -> np.ndarray:
 
 
 @pytest.mark.parametrize("contracted", [False, True])
-@pytest.mark.parametrize("shift", [0.0, 0.5, 0.99])
+@pytest.mark.parametrize("shift", [0.0, 0.99])
 def test_bins_cover_the_ray_and_know_their_cells(contracted: bool, shift: float) -> None:
     values = np.random.default_rng(0).normal(-0.3, 0.3, CELLS**3)
     cell, depth, edges, finite = _bins_of(_space(contracted), _encoding(values), shift)
@@ -127,7 +127,7 @@ def _earned(weight: np.ndarray, samples: int, even: float) -> np.ndarray:
     return samples * ((1 - even) * wide / wide.sum() + even * light / light.sum())
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_samples_are_dealt_by_weight_and_leave_no_bin_out(seed: int) -> None:
     rng = np.random.default_rng(seed)
     weight = rng.random(40) ** 6
@@ -158,7 +158,7 @@ def test_even_and_empty_weights_are_dealt_evenly() -> None:
     assert _allocated(np.array([1e-3]), 16, 0.5, 0.3)[1].tolist() == [16]
 
 
-@pytest.mark.parametrize("shift", [0.0, 0.5, 0.999])
+@pytest.mark.parametrize("shift", [0.0, 0.999])
 def test_samples_lie_in_their_groups_and_stand_for_all_of_them(shift: float) -> None:
     values = np.random.default_rng(2).normal(0.0, 0.5, CELLS**3)
     occupied = (np.random.default_rng(3).random(4096) < 0.7).astype(np.uint8)
@@ -216,7 +216,7 @@ def _interlevel_oracle(values: torch.Tensor, cell, length, group, of, w) -> tupl
     return loss, 1.5 * loss + pull
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_interlevel_loss_and_gradient_equal_the_oracle(seed: int) -> None:
     encoding, cell, length, depth, group, of, w = _interlevel_case(seed)
     weight, grad = np.empty(14, F), np.full(14, 7.0, F)

@@ -12,22 +12,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import fetch_add
-from edge_server.fields.splat.layers.settings import (
-    BRIGHT,
-    DARK,
-    DEVIATION_RATE,
-    DEVIATIONS,
-    EARLY_SHARE,
-    GAIN_STEP,
-    KNOWN_SHARE,
-    KNOWN_VOTES,
-    LEAST_WEIGHT,
-    MEMORY,
-    RUN,
-    SLOWEST_RATE,
-    THRESHOLD,
-    THRESHOLD_UNKNOWN,
-)
+from edge_server.fields.splat.layers import settings as tuned
 
 MODES = 3  # colors a pixel remembers
 
@@ -76,7 +61,7 @@ def compare_with_plate(counter, worker, blurred, plate, earlier, earlier_count, 
     flags: uint8 (H, W), written: FOREGROUND, CHANGING (differs from an earlier frame) and LIKE_STATIC.
     """
     height, width = difference.shape
-    least, beyond = np.float32(THRESHOLD), np.float32(THRESHOLD_UNKNOWN)
+    least, beyond = np.float32(tuned.THRESHOLD), np.float32(tuned.THRESHOLD_UNKNOWN)
     while True:
         top = fetch_add(counter, 1) * _ROWS
         if top >= height:
@@ -84,7 +69,7 @@ def compare_with_plate(counter, worker, blurred, plate, earlier, earlier_count, 
         for y in range(top, min(top + _ROWS, height)):
             for x in range(width):
                 d = _difference(blurred, plate.blurred, 0, y, x)
-                limit = max(least, np.float32(DEVIATIONS) * plate.deviation[y, x])
+                limit = max(least, np.float32(tuned.DEVIATIONS) * plate.deviation[y, x])
                 change = _F0
                 for k in range(earlier_count):
                     change = max(change, _difference(blurred, earlier, k, y, x))
@@ -115,11 +100,11 @@ def _join(plate, y, x, image, blurred):
     """Add a vote to the nearest mode, or replace the lightest mode where none is near."""
     best, nearest = -1, np.float32(1e9)
     for k in range(MODES):
-        if plate.weight[k, y, x] > np.float32(LEAST_WEIGHT):
+        if plate.weight[k, y, x] > np.float32(tuned.LEAST_WEIGHT):
             d = _difference(blurred, plate.blurred, k, y, x)
             if d < nearest:
                 nearest, best = d, k
-    if nearest > np.float32(THRESHOLD):
+    if nearest > np.float32(tuned.THRESHOLD):
         best = 0
         for k in range(1, MODES):
             if plate.weight[k, y, x] < plate.weight[best, y, x]:
@@ -128,12 +113,12 @@ def _join(plate, y, x, image, blurred):
     else:
         plate.weight[best, y, x] += _F1
         plate.run[y, x] = 0 if best == 0 else plate.run[y, x] + 1
-        rate = max(_F1 / plate.weight[best, y, x], np.float32(SLOWEST_RATE))
+        rate = max(_F1 / plate.weight[best, y, x], np.float32(tuned.SLOWEST_RATE))
     for c in range(3):
         plate.means[best, y, x, c] += rate * (np.float32(image[y, x, c]) - plate.means[best, y, x, c])
         plate.blurred[best, y, x, c] += rate * (blurred[y, x, c] - plate.blurred[best, y, x, c])
     if best > 0:
-        if plate.run[y, x] >= RUN:
+        if plate.run[y, x] >= tuned.RUN:
             plate.weight[best, y, x], plate.run[y, x] = plate.weight[0, y, x] + _F1, 0
         for k in range(best, 0, -1):
             if plate.weight[k, y, x] > plate.weight[k - 1, y, x]:
@@ -144,7 +129,7 @@ def _join(plate, y, x, image, blurred):
 def _join_plate(plate, y, x, image, blurred):
     """Add a vote to the plate, where there is no other mode: the usual case."""
     weight = plate.weight[0, y, x] + _F1
-    rate = max(_F1 / weight, np.float32(SLOWEST_RATE))
+    rate = max(_F1 / weight, np.float32(tuned.SLOWEST_RATE))
     plate.weight[0, y, x], plate.run[y, x] = weight, 0
     for c in range(3):
         plate.means[0, y, x, c] += rate * (np.float32(image[y, x, c]) - plate.means[0, y, x, c])
@@ -154,8 +139,8 @@ def _join_plate(plate, y, x, image, blurred):
 @device_function
 def _is_known(weight, total):
     """A plate needs KNOWN_VOTES, or nearly all of fewer arrivals, and a share of all arrivals."""
-    enough = min(np.float32(KNOWN_VOTES), np.float32(EARLY_SHARE) * total)
-    return (weight >= enough) & (weight >= np.float32(KNOWN_SHARE) * total)
+    enough = min(np.float32(tuned.KNOWN_VOTES), np.float32(tuned.EARLY_SHARE) * total)
+    return (weight >= enough) & (weight >= np.float32(tuned.KNOWN_SHARE) * total)
 
 
 @kernel
@@ -171,7 +156,7 @@ def vote(counter, worker, image, blurred, difference, foreground, votes, held, p
     picture: float32 (H, W, 3), written: the plate; where that is unknown, the static field.
     """
     height, width = difference.shape
-    decay, rate = np.float32(1.0 - 1.0 / MEMORY), np.float32(DEVIATION_RATE)
+    decay, rate = np.float32(1.0 - 1.0 / tuned.MEMORY), np.float32(tuned.DEVIATION_RATE)
     while True:
         top = fetch_add(counter, 1) * _ROWS
         if top >= height:
@@ -182,15 +167,15 @@ def vote(counter, worker, image, blurred, difference, foreground, votes, held, p
                     plate.run[y, x] = 0
                 else:
                     d, old = difference[y, x], plate.deviation[y, x]
-                    limit = max(np.float32(THRESHOLD), np.float32(DEVIATIONS) * old)
+                    limit = max(np.float32(tuned.THRESHOLD), np.float32(tuned.DEVIATIONS) * old)
                     if (foreground[y, x] == 0) & plate.known[y, x] & (d < np.float32(3.0) * limit):
                         plate.deviation[y, x] = old + (d - old) * rate
                     plate.total[y, x] = plate.total[y, x] * decay + _F1
                     for k in range(MODES):
                         plate.weight[k, y, x] *= decay
-                    least = np.float32(LEAST_WEIGHT)
+                    least = np.float32(tuned.LEAST_WEIGHT)
                     alone = (plate.weight[1, y, x] <= least) & (plate.weight[2, y, x] <= least)
-                    if votes[y, x] and alone and d <= np.float32(THRESHOLD) and plate.weight[0, y, x] > least:
+                    if votes[y, x] and alone and d <= np.float32(tuned.THRESHOLD) and plate.weight[0, y, x] > least:
                         _join_plate(plate, y, x, image, blurred)
                     elif votes[y, x]:
                         _join(plate, y, x, image, blurred)
@@ -213,12 +198,12 @@ def count_exposure(counter, worker, image, plate, counts):
     if fetch_add(counter, 1) > 0:
         return
     counts[:] = 0
-    high, low = np.float32(1.0 + GAIN_STEP), np.float32(1.0 - GAIN_STEP)
+    high, low = np.float32(1.0 + tuned.GAIN_STEP), np.float32(1.0 - tuned.GAIN_STEP)
     for y in range(0, image.shape[0], 2):
         for x in range(0, image.shape[1], 2):
             m = plate.means[0, y, x]
             dark, bright = min(m[0], min(m[1], m[2])), max(m[0], max(m[1], m[2]))
-            if plate.known[y, x] & (dark > np.float32(DARK)) & (bright < np.float32(BRIGHT)):
+            if plate.known[y, x] & (dark > np.float32(tuned.DARK)) & (bright < np.float32(tuned.BRIGHT)):
                 for c in range(3):
                     value = np.float32(image[y, x, c])
                     counts[c, 0] += 1

@@ -19,7 +19,7 @@ from msgspec import structs
 from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
 from edge_server.fields.splat.field import StillField
-from edge_server.fields.splat.layers import layered_field
+from edge_server.fields.splat.layers import settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.layers.layered_state import VERSION
 from edge_server.fields.splat.settings import SplatSettings
@@ -91,7 +91,7 @@ def test_cameras_of_different_exposures_agree_on_one(monkeypatch: pytest.MonkeyP
         alike = begun(np.full(len(CAMERAS), level))
         assert all((camera.plate.gain == 1.0).all() for camera in alike.cameras.values())
         assert score(differing) > score(alike) - 2.0
-    monkeypatch.setattr(layered_field, "EXPOSURE_ROUNDS", 0)
+    monkeypatch.setattr(settings, "EXPOSURE_ROUNDS", 0)
     assert score(differing) > score(begun(level * gains)) + (1.5 if level < 1.0 else -0.5)
 
 
@@ -450,6 +450,16 @@ def _small(camera: int, frame: int) -> View:
     return replace(whole, image=image, intrinsics=whole.intrinsics.halved(1), whole=lambda: whole)
 
 
+def test_fine_plates_are_collected_from_the_first_frame_on() -> None:
+    """One whole frame a fit, of the camera that has the fewest; not only once the plates are known."""
+    field = LayeredField(SMALL)
+    for frame in range(13):
+        field.fit([_small(k, frame) for k in range(len(CAMERAS))], Budget(steps=1))
+        counts = [camera.fine_count for camera in field.cameras.values()]
+        assert sum(counts) == frame + 1 and max(counts) - min(counts) <= 1
+    assert field.tracker is None and not field.fine
+
+
 @pytest.mark.slow
 def test_frames_taken_in_at_half_their_size_still_give_plates_at_full_resolution() -> None:
     def run(field: Any, frames: range, fine: bool) -> None:
@@ -457,16 +467,18 @@ def test_frames_taken_in_at_half_their_size_still_give_plates_at_full_resolution
             views = [_small(k, frame) for k in range(len(CAMERAS))]
             field.fit(views if fine else [replace(v, whole=None) for v in views], Budget(steps=30))
 
-    instants_s = [(110 - k) * FRAME_S for k in range(4)]
+    instants_s = [(80 - k) * FRAME_S for k in range(4)]
     scores = []
     for fine in (False, True):
         field = LayeredField(SMALL)
-        run(field, range(60), fine)
+        run(field, range(30), fine)
         again = LayeredField(SMALL)
         again.load_state(field.state())  # between the coarse and the fine plates
-        for one in (field, again):
-            run(one, range(60, 110), fine)
-        _same_state(field, again)
+        assert not field.fine
+        for one in (field, again) if fine else (field,):
+            run(one, range(30, 80), fine)
+        if fine:
+            _same_state(field, again)
         assert field.fine is fine
         scores.append(np.mean([_score(field.snapshot(round(s * 1e9)), s) for s in instants_s]))
     assert scores[1] > scores[0] + 1.0, scores

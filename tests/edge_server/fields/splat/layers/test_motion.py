@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge_server.fields.splat.layers.motion import DIFFERENCES, FIXED, FREE, KNOTS_PER_S, WINDOW, Motion, ViewRow
+from edge_server.fields.splat.layers.motion import DIFFERENCES, WINDOW, Motion, ViewRow
+from edge_server.fields.splat.layers.settings import FIXED, FREE, KNOTS_PER_S
 
 RADIUS_M = 3.0
 

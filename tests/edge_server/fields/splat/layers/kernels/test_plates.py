@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
-from edge_server.fields.splat.layers.kernels import plates as kernels
 from edge_server.fields.splat.layers.kernels.plates import (
     CHANGING,
     FOREGROUND,
@@ -77,7 +76,7 @@ def _vote_plainly(p: PlateArrays, y: int, x: int, image: np.ndarray, blurred: np
         {"w": p.weight[k, y, x], "m": p.means[k, y, x].copy(), "b": p.blurred[k, y, x].copy(), "first": k == 0}
         for k in range(MODES)
     ]
-    alive = [m for m in modes if m["w"] > kernels.LEAST_WEIGHT]
+    alive = [m for m in modes if m["w"] > 0.05]
     joined = min(alive, key=lambda m: _off(m["b"], blurred[y, x]), default=None)
     if joined is None or _off(joined["b"], blurred[y, x]) > THRESHOLD:
         joined = min(modes, key=lambda m: m["w"])

@@ -27,14 +27,15 @@ from edge_server.fields.splat.kernels.project import (
     SCALE,
     Gaussians,
 )
-from edge_server.fields.splat.kernels.rasterize_planes import accumulate_normals, render_planes
 from edge_server.fields.splat.planar import (
     align,
+    blend_planes,
     depth_normals,
     flatten,
     gaussian_normals,
     gaussian_planes,
     plane_depth,
+    seen_sums,
 )
 from edge_server.fields.splat.settings import ALPHA_MAX, SplatSettings
 from edge_server.surface.depth import render_depth_maps
@@ -61,14 +62,13 @@ def flat(count: int, tilt: np.ndarray, seed: int = 0, thickness: float = -7.0) -
 def looked(params: np.ndarray) -> tuple[RasterBuffers, Gaussians, np.ndarray]:
     gaussians = Gaussians(params, 0)
     raster, cams = RasterBuffers(POOL), camera_rows([POSE], [LENS], BOX)
-    raster.project_and_bin(cams, gaussians, differentiate=False)
+    raster.project_and_bin(cams, gaussians)
     return raster, gaussians, cams[0]
 
 
-def blended(raster: RasterBuffers, planes: np.ndarray) -> np.ndarray:
-    out = np.zeros((24, 24, 5), np.float32)
-    POOL.run(render_planes, raster.first, planes, out)
-    return out
+def blended(raster: RasterBuffers, gaussians: Gaussians, camera: np.ndarray) -> np.ndarray:
+    normal, distance, opacity = blend_planes(raster, gaussians, camera)
+    return np.concatenate([normal, distance[..., None], opacity[..., None]], axis=-1)
 
 
 def tilted(angle: float) -> np.ndarray:
@@ -94,7 +94,7 @@ def test_the_kernel_blends_as_a_loop_over_pixels_does():
     params[:, :3] += rng.normal(0, 0.2, (40, 3))
     raster, gaussians, camera = looked(params)
     planes = gaussian_planes(gaussians, camera)
-    out = blended(raster, planes)
+    out = blended(raster, gaussians, camera)
     lists = raster.lists
     for y, x in [(3, 5), (12, 12), (20, 9)]:
         tile, left, total = (y // 8) * 3 + x // 8, 1.0, np.zeros(5)
@@ -113,16 +113,12 @@ def test_the_kernel_blends_as_a_loop_over_pixels_does():
 
 def test_what_pixels_tell_adds_up_to_what_they_show():
     raster, gaussians, camera = looked(flat(60, tilted(0.3)))
-    normals = np.random.default_rng(2).normal(size=(24, 24, 4)).astype(np.float32)
-    normals[..., 3] = 1.0
-    normal_sums = np.zeros((raster.lists.pair.shape[1], 4), np.float32)
-    POOL.run(accumulate_normals, raster.first, normals, normal_sums)
-    out = blended(raster, gaussian_planes(gaussians, camera))
-    pairs = int(raster.lists.needed[0])
-    np.testing.assert_allclose(normal_sums[:pairs, 3].sum(), out[..., 4].sum(), rtol=1e-4)
-    np.testing.assert_allclose(
-        normal_sums[:pairs, :3].sum(axis=0), (out[..., 4:] * normals[..., :3]).sum(axis=(0, 1)), rtol=2e-3, atol=1e-2
-    )
+    values = np.random.default_rng(2).normal(size=(24, 24, 3)).astype(np.float32)
+    found, opacity = seen_sums(raster, 60, values), blended(raster, gaussians, camera)[..., 4:]
+    np.testing.assert_allclose(found.sum(axis=0), (opacity * values).sum(axis=(0, 1)), rtol=2e-3, atol=1e-2)
+    ones = seen_sums(raster, 60, np.ones_like(values))
+    assert ones[:, 0].sum() == pytest.approx(opacity.sum(), rel=1e-4)
+    assert (ones[raster.lists.own_count[0, :60] == 0] == 0).all()
 
 
 def test_gaussians_turn_to_the_surface_they_show_and_get_flat():
