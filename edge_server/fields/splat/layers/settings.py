@@ -18,7 +18,7 @@ MAX_AHEAD_S = 0.3  # motion is extrapolated no farther than this: people turn
 
 # --- plates at full resolution, where frames are taken in at a lower one ---
 FINE_EVERY_S = 0.05  # least time from a frame that is taken in at its full resolution to the next
-FINE_FRAMES = 6  # frames of each camera before the still field learns from fine plates
+FINE_FRAMES = 4  # frames of each camera before the still field learns from fine plates
 FINE_MEMORY, FINE_KNOWN = 16, 3  # frames that a fine plate is the mean of; fewest that make it known
 
 # --- exposures ---
