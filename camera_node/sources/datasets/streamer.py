@@ -72,24 +72,29 @@ def open_recorded(
         names = assign_cameras(scenario, config.assignment, cameras, found.cameras)
         shown = {camera: found.of(name) for camera, name in names.items()}
         recorded = {camera: _recorded_fps(found, shown[camera], path) for camera in cameras}
+        timeline = Timeline.of(found, path)
+        order = {camera: timeline.nearest(images) for camera, images in shown.items()}
     else:
         own = [i for i, image in enumerate(found) if image.name in found.held_out]
         shares = split_photos(len(found), scenario.training, scenario.held_out, own)
         shown = {camera: tuple(found[i] for i in shares[camera]) for camera in cameras}
         recorded = {camera: rate(config.fps or PHOTO_FPS) for camera in cameras}
+        timeline, order = Timeline(0.0, 0, rate(config.fps or PHOTO_FPS)), {}
     poses: dict[str, PoseProvider] = {}
     if isinstance(config, VideoConfig) and config.trajectory is not None:
         poses = _trajectory_poses(scenario, config.trajectory, cameras, path)
     sources: dict[str, Source] = {}
     for camera, fps in recorded.items():
-        count = len(shown[camera])
         if camera not in poses and np.isnan(shown[camera][0].camera_to_world).any():
             raise ScenarioError(
                 f"{scenario.path}: source.trajectory.files.{camera}: missing, and the calibration has no pose for "
                 f"{shown[camera][0].camera}"
             )
-        playback = Playback(count, rate(config.fps) if config.fps else fps, fps, config.loop == "back-and-forth")
-        sources[camera] = ImageSource(camera, shown[camera], playback, config.codec, poses.get(camera))
+        shots = order.get(camera, range(len(shown[camera])))
+        steps_per_s = timeline.fps if camera in order else fps
+        back_and_forth = config.loop == "back-and-forth"
+        playback = Playback(len(shots), rate(config.fps) if config.fps else fps, steps_per_s, back_and_forth)
+        sources[camera] = ImageSource(camera, shown[camera], shots, playback, config.codec, poses.get(camera))
     return sources
 
 
@@ -109,13 +114,49 @@ def split_photos(
     return shares
 
 
+@dataclass(frozen=True)
+class Timeline:
+    """Evenly spaced instants of a recording at which every camera shows its nearest image, so that cameras of different
+    rates, or that dropped frames, stay together.
+
+    first_s: the first one. count: number of them; 0: each image is an instant of its own. fps: their rate.
+    """
+
+    first_s: float
+    count: int
+    fps: Fraction
+
+    @staticmethod
+    def of(dataset: Dataset, path: Path) -> Timeline:
+        """From the first instant to the last that all cameras have, at the fastest one's rate. Raises DatasetError."""
+        cameras = [dataset.of(camera) for camera in dataset.cameras]
+        fps = max(_recorded_fps(dataset, images, path) for images in cameras)
+        times = [(images[0].time_s, images[-1].time_s) for images in cameras if len(images) > 1]
+        known = [(first, last) for first, last in times if first is not None and last is not None]
+        if not known:
+            return Timeline(0.0, 0, fps)
+        first_s, last_s = max(first for first, _ in known), min(last for _, last in known)
+        return Timeline(first_s, max(1, round((last_s - first_s) * float(fps)) + 1), fps)
+
+    def nearest(self, images: Sequence[PosedImage]) -> Sequence[int]:
+        """Index of the image nearest to each instant."""
+        if not self.count:
+            return range(len(images))
+        instants_s = self.first_s + np.arange(self.count) / float(self.fps)
+        times_s = np.array([image.time_s or 0.0 for image in images])
+        after = np.searchsorted(times_s, instants_s).clip(1, max(1, len(times_s) - 1))
+        before_nearer = instants_s - times_s[after - 1] <= times_s[after.clip(max=len(times_s) - 1)] - instants_s
+        return [int(k) for k in np.where(before_nearer, after - 1, after).clip(max=len(times_s) - 1)]
+
+
 def _recorded_fps(dataset: Dataset, images: Sequence[PosedImage], path: Path) -> Fraction:
     if dataset.fps is not None:
         return _recorded_rate(dataset.fps, path)
     times = [image.time_s for image in images if image.time_s is not None]
     if len(times) < 2 or times[-1] <= times[0]:
         return rate(PHOTO_FPS)
-    return _recorded_rate((len(times) - 1) / (times[-1] - times[0]), path)
+    usual_s = float(np.median(np.diff(times))) or (times[-1] - times[0]) / (len(times) - 1)
+    return _recorded_rate(1.0 / usual_s, path)
 
 
 def _recorded_rate(fps: float, path: Path) -> Fraction:
@@ -130,12 +171,14 @@ def _recorded_rate(fps: float, path: Path) -> Fraction:
 
 
 class ImageSource(Source):
-    """A camera that shows images one after the other. poses: replace those of the images; None: theirs."""
+    """A camera that shows images one after the other. order: indices of those that playback steps through. poses:
+    replace those of the images; None: theirs."""
 
     def __init__(
         self,
         camera: str,
         images: Sequence[PosedImage],
+        order: Sequence[int],
         playback: Playback,
         codec: str,
         poses: PoseProvider | None = None,
@@ -143,11 +186,12 @@ class ImageSource(Source):
         self.camera, self.fps = camera, playback.fps
         self.contents = len(images)
         self.intrinsics = images[0].intrinsics
-        self._images, self._playback, self._codec, self._poses = images, playback, codec, poses
+        self._images, self._order, self._playback = images, order, playback
+        self._codec, self._poses = codec, poses
         self._whole: set[int] = set()
 
     def content(self, tick: int) -> int:
-        return self._playback.frame(tick)
+        return self._order[self._playback.frame(tick)]
 
     def read(self, content: int) -> Shot:
         shown = self._images[content]

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from camera_node.sources.base import rate
 from camera_node.sources.datasets.imaging import as_image, resize, shrink
@@ -70,20 +71,17 @@ def rig_dataset(
 ) -> Dataset:
     """Every frame of every video as an image that is read on demand, one camera after the other.
 
-    All videos are cut to the length of the shortest: played back and forth, they would else drift apart.
+    Times are the videos' own, from the earliest frame of all on: rates may differ, and frames may be missing.
     path: for error messages. require_poses: as in ``load_dataset``.
-    Raises DatasetError if a pose is missing, or a video has another size than its calibration or another rate.
+    Raises DatasetError if a pose is missing, or a video has another size than its calibration.
     """
-    count = min(clip.count for _, clip in rig.values())
-    rates = sorted({rate(clip.fps) for _, clip in rig.values()})
-    if len(rates) != 1:
-        raise DatasetError(
-            f"{path}: the videos differ in frame rate: {', '.join(f'{float(fps):g}' for fps in rates)}; re-encode them "
-            "at one (ffmpeg -fps_mode cfr)"
-        )
+    rates = {rate(clip.fps) for _, clip in rig.values()}
+    first_s = min(float(clip.times_s[0]) for _, clip in rig.values())
     images: list[PosedImage] = []
     for name, (camera, clip) in rig.items():
         lens = camera.intrinsics
+        if (clip.height, clip.width) == (lens.width, lens.height) != (clip.width, clip.height):
+            clip = clip.as_stored()
         if (clip.width, clip.height) != (lens.width, lens.height):
             raise DatasetError(
                 f"{clip.path}: video is {clip.width} x {clip.height}, calibrated for {lens.width} x {lens.height}"
@@ -92,19 +90,19 @@ def rig_dataset(
             raise DatasetError(f"{path}: {name}: R_world_to_cam is missing")
         small = shrink(lens, options.scale)
         matrix = np.full((4, 4), np.nan) if camera.pose is None else camera.pose.matrix()
-        for index in range(count):
+        for index, time_s in enumerate(clip.times_s):
             images.append(
                 PosedImage(
                     name=f"{name}/{index:04d}",
                     camera=name,
-                    time_s=index / clip.fps,
+                    time_s=float(time_s) - first_s,
                     camera_to_world=matrix,
                     intrinsics=small,
                     read=partial(clip.frame, index, small.width, small.height),
                     release=clip.close,
                 )
             )
-    return Dataset(tuple(images), 0, float(rates[0]))
+    return Dataset(tuple(images), 0, float(rates.pop()) if len(rates) == 1 else None)
 
 
 def _find_calibration(folder: Path) -> Path:
@@ -120,23 +118,41 @@ def _find_calibration(folder: Path) -> Path:
 class Clip:
     """Frames 0 to count - 1 of a video file, which is decoded forwards. Its decoder opens with the first frame.
 
-    Attributes: count, fps (30 if the file does not tell), width and height as stored.
+    Attributes: count; times_s, each frame's own stamp; fps, the usual rate (30 if the file does not tell); even,
+    whether the stamps keep to it; width and height of the frames.
+    rotated: as the file's rotation tag says; otherwise as stored.
     Raises DatasetError if the file cannot be opened, or has no frames.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, rotated: bool = True) -> None:
         self.path = path
+        self._rotated = rotated
         capture = self._open()
         self.fps = float(capture.get(cv2.CAP_PROP_FPS)) or 30.0
         self.width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
         self.height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        self._tag = int(capture.get(cv2.CAP_PROP_ORIENTATION_META))
         self.count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         capture.release()
+        self._from_first_ms, first_s = _stamps(path, self.fps)
+        if len(self._from_first_ms) > 1 and bool((np.diff(self._from_first_ms) > 0).all()):
+            self.count = len(self._from_first_ms)
+        else:  # a container without stamps
+            self._from_first_ms = 1e3 / self.fps * np.arange(self.count, dtype=np.float64)
         if self.count < 1:
             raise DatasetError(f"{path}: the video says it has no frames")
+        nominal_ms = np.arange(self.count) * (1e3 / self.fps)
+        self.even = float(np.abs(self._from_first_ms - nominal_ms).max()) < 500.0 / self.fps
+        if not self.even:
+            self.fps = 1e3 / float(np.median(np.diff(self._from_first_ms)))
+        self.times_s = first_s + (nominal_ms if self.even else self._from_first_ms) / 1e3
         self._capture: cv2.VideoCapture | None = None
         self._next, self._last = 0, -1
         self._block: dict[int, Image] = {}
+
+    def as_stored(self) -> Clip:
+        """The same video without the rotation that its tag asks for; itself if it asks for none by a quarter."""
+        return Clip(self.path, rotated=False) if self._tag % 180 else self
 
     def frame(self, index: int, width: int, height: int) -> Image:
         """Frame ``index`` as uint8 RGB, area-averaged to (height, width, 3). Raises DatasetError if there is
@@ -161,9 +177,12 @@ class Clip:
         if self._capture is None:
             self._capture = self._open()
         if not self._next <= index <= self._next + _SKIP_FRAMES:
-            self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
-            self._next = int(self._capture.get(cv2.CAP_PROP_POS_FRAMES))
-            if self._next > index:  # a container without an index: start again and decode forward
+            # OpenCV seeks by the mean rate: where that led, the stamp of the next frame tells.
+            self._capture.set(cv2.CAP_PROP_POS_FRAMES, max(0, index - (1 if self.even else _SKIP_FRAMES)))
+            found = self._capture.grab()
+            stamp_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+            self._next = int(np.abs(self._from_first_ms - stamp_ms).argmin()) + 1
+            if not found or self._next > index:  # too far, or a container without an index: decode forward
                 self._capture.release()
                 self._capture, self._next = self._open(), 0
         while self._next < index and self._capture.grab():
@@ -181,4 +200,16 @@ class Clip:
         capture = cv2.VideoCapture(str(self.path))
         if not capture.isOpened():
             raise DatasetError(f"{self.path}: OpenCV cannot open it as a video")
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(self._rotated))
         return capture
+
+
+def _stamps(path: Path, fps: float) -> tuple[NDArray[np.float64], float]:
+    """The frames' stamps from the first on, ms, and that of the first, s; from the packets, which are not decoded."""
+    packets = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+    stamps: list[tuple[float, float]] = []
+    while packets.grab():
+        stamps.append((packets.get(cv2.CAP_PROP_POS_MSEC), packets.get(cv2.CAP_PROP_PTS)))
+    packets.release()
+    stamps.sort()
+    return np.array([ms for ms, _ in stamps]), stamps[0][1] / fps if stamps else 0.0

@@ -94,20 +94,23 @@ def _records(dataset: Dataset, frame: int) -> tuple[dict[str, PosedImage], str]:
         rig = len(dataset.cameras) == len(dataset)
         return {(r.camera if rig else r.name): r for r in dataset}, ""
     cameras = {camera: dataset.of(camera) for camera in dataset.cameras}
-    slowest = min(cameras.values(), key=len)
+    slowest = max(cameras.values(), key=_apart_s)
     if not 0 <= frame < len(slowest):
         raise DatasetError(f"--frame {frame}: the recording has the frames 0 to {len(slowest) - 1}")
     t_s = slowest[frame].time_s or 0.0
-    times = [record.time_s or 0.0 for record in slowest]
-    apart_s = (times[-1] - times[0]) / max(1, len(times) - 1)
     found = {
         camera: min(records, key=lambda record: abs((record.time_s or 0.0) - t_s))
         for camera, records in cameras.items()
     }
     for camera, record in found.items():
-        if abs((record.time_s or 0.0) - t_s) > 0.5 * apart_s + 1e-6:
+        if abs((record.time_s or 0.0) - t_s) > 0.5 * _apart_s(slowest) + 1e-6:
             raise DatasetError(f"--frame {frame}: camera {camera} has no image near {t_s:g} s: choose another frame")
     return found, f"frame {frame} of {len(slowest)}"
+
+
+def _apart_s(records: Sequence[PosedImage]) -> float:
+    """Mean time between a camera's images."""
+    return ((records[-1].time_s or 0.0) - (records[0].time_s or 0.0)) / max(1, len(records) - 1)
 
 
 def _view(name: str, record: PosedImage) -> View:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,7 @@ from camera_node.sources.registry import open_sources
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import look_at, se3_inverse
 from freshfield.scenario import ScenarioError, parse
-from tests.conftest import data_dir
+from tests.conftest import case_dir, data_dir
 
 FRAMES = 40
 
@@ -133,11 +134,75 @@ def test_the_data_set_lists_every_frame_of_every_camera():
     assert record.read().shape == (record.intrinsics.height, record.intrinsics.width, 3) == (240, 136, 3)
 
 
-def test_videos_of_different_rates_are_refused_streamed_or_not(tmp_path):
-    file = write_rig(tmp_path, faster=10.0)
-    for opens in (load_dataset, lambda path: opened(video_scenario(path))):
-        with pytest.raises(DatasetError, match=r"differ in frame rate: 20, 30; re-encode"):
-            opens(file)
+def restamped(video: Path, runs: list[tuple[int, float]]) -> None:
+    """Give an MP4 file other frame durations: runs of (frames, their durations in those of the file)."""
+    data = bytearray(video.read_bytes().replace(b"edts", b"free"))  # an edit list would cut what gets longer
+    at = data.index(b"stts") - 4
+    size, *_, duration = struct.unpack(">IIIIII", data[at : at + 24])
+    entries = b"".join(struct.pack(">II", count, round(factor * duration)) for count, factor in runs)
+    box = struct.pack(">I4sII", 16 + len(entries), b"stts", 0, len(runs)) + entries
+    data[at : at + size] = box
+    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl"):
+        head = data.rindex(name, 0, at) - 4
+        grown = struct.unpack(">I", data[head : head + 4])[0] + len(box) - size
+        data[head : head + 4] = struct.pack(">I", grown)
+    video.write_bytes(data)
+
+
+UNEVEN = [(9, 1), (1, 40), (30, 1)]
+STAMPS_S = np.concatenate([np.arange(10), np.arange(49, 79)]) / 20
+
+
+def test_frames_have_the_stamps_of_the_file_and_seeking_finds_them(tmp_path):
+    file = write_rig(tmp_path)
+    restamped(tmp_path / "videos/cam01.mp4", UNEVEN)
+    records = load_dataset(file).of("cam01")
+    assert [r.time_s for r in records] == pytest.approx(STAMPS_S)
+    for k in (39, 20, 0, 12, 11, 35, 9, 10, 38):
+        assert round((float(records[k].read().mean()) - 13) / 6) == k
+    lines = [f"{k / 100} {k / 100} 0 0 0 0 0 1" for k in range(500)]
+    (tmp_path / "cam01.txt").write_text("\n".join(lines))
+    source = opened(video_scenario(file, trajectory={"files": {"cam01": "cam01.txt"}}), ["cam01"])["cam01"]
+    assert [source.read(k).pose.translation_m[0] for k in range(FRAMES)] == pytest.approx(STAMPS_S)
+    # The other camera ends after 1.95 s: until then this one shows what is nearest, and waits in its gap.
+    shown = [source.content(tick) for tick in range(40)]
+    assert shown == [*range(10), *[9] * 20, *[10] * 10]
+
+
+def test_cameras_of_different_rates_stay_together(tmp_path):
+    file = write_rig(tmp_path, faster=20.0)
+    dataset = load_dataset(file)
+    assert dataset.fps is None and [float(dataset.of(c)[39].time_s) for c in ("cam00", "cam01")] == [1.95, 0.975]
+    slow, fast = (opened(video_scenario(file, fps=40))[c] for c in ("cam00", "cam01"))
+    seen = [(slow.content(tick), fast.content(tick)) for tick in range(80)]
+    # 0.975 s are common; halves of an interval are nearer to the earlier one, and it goes back and forth.
+    assert seen[:5] == [(0, 0), (0, 1), (1, 2), (1, 3), (2, 4)]
+    assert seen[39] == (19, 39) and seen[40] == (19, 38) and seen[78] == seen[0]
+    assert float(opened(video_scenario(file))["cam01"].fps) == 40
+
+
+def test_a_rotation_tag_is_followed_unless_the_calibration_is_of_the_stored_frames(tmp_path):
+    file = write_rig(tmp_path)
+    video = tmp_path / "videos/cam01.mp4"
+    data = bytearray(video.read_bytes())
+    at = data.index(b"tkhd") + 44
+    data[at : at + 36] = struct.pack(">9i", 0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30)
+    video.write_bytes(data)
+    assert (Clip(video).width, Clip(video).height) == (48, 64)
+    assert load_dataset(file).of("cam01")[3].read().shape == (48, 64, 3)
+    rig = json.loads(file.read_text())
+    rig["cam01"].update(width=48, height=64)
+    file.write_text(json.dumps(rig))
+    assert load_dataset(file).of("cam01")[3].read().shape == (64, 48, 3)
+
+
+def test_reported_videos():
+    uneven = load_dataset(case_dir("01-vfr-video-trajectory")).of("cam01")
+    assert [r.time_s for r in uneven] == pytest.approx(
+        [*(k / 30 for k in range(10)), *(k / 30 + 2 for k in range(10, 20))]
+    )
+    rig = load_dataset(case_dir("04-fit-videos-of-different-rates"))
+    assert [len(rig.of(c)) for c in rig.cameras] == [40, 20, 20] and rig.of("cam01")[30].time_s == pytest.approx(0.5)
 
 
 def test_what_does_not_fit_is_named(tmp_path):

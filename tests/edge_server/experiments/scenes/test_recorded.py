@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from camera_node.sources.datasets.records import DatasetError
+from camera_node.sources.datasets.transforms import load_dataset
+from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.experiments.scenes.recorded import load_recorded
-from tests.conftest import data_dir
+from edge_server.fidelity.scorer import Scorer
+from edge_server.fields import View
+from freshfield.geometry import Pinhole
+from tests.conftest import case_dir, data_dir
 from tests.edge_server.experiments.sets import write_photos, write_recording
 
 
@@ -66,6 +73,60 @@ def test_missing_folder_and_empty_folder_are_said(tmp_path):
     ):
         with pytest.raises(DatasetError, match=said):
             load_recorded(tmp_path / folder)
+
+
+def test_the_datas_own_test_images_are_held_out_and_never_trained_on(tmp_path):
+    file = write_photos(tmp_path, 9)
+    data = json.loads(file.read_text())
+    own = [frame["file_path"] for frame in data["frames"][1:3]]
+    file.write_text(json.dumps({**data, "test_filenames": own}))
+    names = [f"images/{k:03d}" for k in (1, 2)]
+    for holdout in (None, "split"):
+        found = load_recorded(tmp_path, holdout)
+        assert [v.camera for v in found.held_out] == names and len(found.training) == 7
+    for holdout, kept in (("4", 4), ("0", 7), ("images/005", 6)):
+        assert len(load_recorded(tmp_path, holdout).training) == kept
+
+
+def test_an_instant_of_cameras_of_different_rates_is_one_of_time(tmp_path):
+    file = write_recording(tmp_path)
+    data = json.loads(file.read_text())
+    late = [frame for frame in data["frames"] if frame["camera"] == "cam01"]
+    data["frames"].remove(late[0])  # cam01 dropped a frame
+    file.write_text(json.dumps(data))
+    instants = sorted({frame["time"] for frame in data["frames"]})
+    shown = load_recorded(tmp_path, "0", frame=1)
+    (view,) = [v for v in shown.training if v.camera == "cam01"]
+    records = [r for r in load_dataset(file) if r.camera == "cam01" and r.time_s == pytest.approx(instants[1])]
+    assert np.array_equal(view.image, records[0].read())
+    with pytest.raises(DatasetError, match="camera cam01 has no image near 0 s: choose another frame"):
+        load_recorded(tmp_path, "0", frame=0)
+    case = load_recorded(case_dir("04-fit-videos-of-different-rates"), "cam02", frame=15)
+    greens = {v.camera: float(v.image[:, -v.image.shape[1] // 3 :, 1].mean()) for v in (*case.training, *case.held_out)}
+    assert case.instant == "frame 15 of 20"
+    assert {c: round((g - 10) / 8) for c, g in greens.items()} == {"cam01": 30, "cam02": 15, "cam03": 15}
+
+
+def test_masked_pixels_are_not_scored():
+    truth = np.full((24, 32, 3), 100, np.uint8)
+    rendering = np.full((24, 32, 3), 110 / 255, np.float32)
+    rendering[12:] = 0.9
+    weight = np.ones((24, 32), np.float32)
+    weight[12:] = 0.0
+    whole = View("a", truth, np.eye(4), Pinhole(32, 24, 30.0, 30.0, 16.0, 12.0))
+
+    class Renders:
+        def render(self, *_):
+            return SimpleNamespace(color=rendering)
+
+    score, _ = score_views(Renders(), [replace(whole, weight=weight)], Scorer())
+    assert score.psnr_db == pytest.approx(20 * np.log10(255 / 10), abs=0.01)
+
+
+def test_a_frame_of_what_has_none_is_refused(tmp_path):
+    write_photos(tmp_path, 3)
+    with pytest.raises(DatasetError, match="--frame 5: this data set has no frames of several cameras"):
+        load_recorded(tmp_path, "0", frame=5)
 
 
 @pytest.mark.parametrize(
