@@ -96,7 +96,7 @@ class FitData(Struct):
 
 class EdgeStatus(Struct, kw_only=True):
     """What a report takes from edge.json. seconds: of fitting. uptime_s: of a live edge. chosen: how the edge
-    works and why, in one line."""
+    works and why, in one line. last_frames: sequence and capture time of the last frame of each camera's sessions."""
 
     kind: Literal["live", "fit"] = "live"
     scenario: str | None = None
@@ -114,6 +114,7 @@ class EdgeStatus(Struct, kw_only=True):
     data: FitData | None = None
     lpips_missing: str | None = None
     lpips_network: str | None = None
+    last_frames: dict[str, dict[str, tuple[int, int]]] = {}
 
 
 class Histogram(Struct):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 import grpc
@@ -43,6 +43,8 @@ class _Session:
     """Capture time of its last admitted frame, on the edge's clock."""
 
 
+LastFrames = Mapping[str, Mapping[str, tuple[int, int]]]
+
 _SILENT_NS = 3 * 10**9  # a session that has sent nothing for this long is not that of a second node
 
 
@@ -51,10 +53,15 @@ class FrameAdmission:
 
     training, held_out: ids of the cameras in each role.
     max_side_px: longest side of an image, pixels; see ``Scenario.max_side_px``.
+    known: what ``last_frames`` told in an earlier process, so that no frame is taken again after a restart.
     """
 
     def __init__(
-        self, training: Collection[str], held_out: Collection[str], max_side_px: int = MAX_IMAGE_SIDE_PX
+        self,
+        training: Collection[str],
+        held_out: Collection[str],
+        max_side_px: int = MAX_IMAGE_SIDE_PX,
+        known: LastFrames | None = None,
     ) -> None:
         self._max_side_px = max_side_px
         self._roles = {c: False for c in training} | {c: True for c in held_out}
@@ -62,6 +69,16 @@ class FrameAdmission:
         self.doubled: Counter[str] = Counter()
         """Frames admitted while another node sent as the same camera, by camera."""
         self._sessions: dict[str, OrderedDict[str, _Session]] = {c: OrderedDict() for c in self._roles}
+        for camera in self._roles.keys() & (known or {}).keys():
+            sessions = (known or {})[camera].items()
+            self._sessions[camera] = OrderedDict((name, _Session(*last)) for name, last in sessions)
+
+    def last_frames(self) -> LastFrames:
+        """Sequence and capture time (on the node's clock) of the last frame of each camera's sessions."""
+        return {
+            camera: {name: (last.sequence, last.generated_ns) for name, last in sessions.copy().items()}
+            for camera, sessions in self._sessions.items()
+        }
 
     def admit(self, frame: Frame, now_ns: int) -> None:
         """Raises FrameRejected with reason unknown_camera, wrong_role, too_large, replayed_sequence,
@@ -118,7 +135,7 @@ class FrameAdmission:
 class Ingest:
     """FrameStreamService of the edge.
 
-    max_side_px: see ``FrameAdmission``.
+    max_side_px, known: see ``FrameAdmission``.
     on_held_out(frame), on_accepted(request, now_ns): called on the event loop for held-out frames and for
     every accepted one; they must not block.
     Counts are plain numbers; readers see them without a lock.
@@ -133,10 +150,11 @@ class Ingest:
         on_held_out: Callable[[Frame], None],
         on_accepted: Callable[[pb.PushRequest, int], None] | None = None,
         max_side_px: int = MAX_IMAGE_SIDE_PX,
+        known: LastFrames | None = None,
     ) -> None:
         self._clock = clock
         self.buffer = buffer
-        self.admission = FrameAdmission(buffer.cameras, held_out, max_side_px)
+        self.admission = FrameAdmission(buffer.cameras, held_out, max_side_px, known)
         self._ledger = ledger
         self._on_held_out = on_held_out
         self._on_accepted = on_accepted

@@ -20,8 +20,9 @@ log = logging.getLogger(__name__)
 _MAX_SLEEP_S = 0.2
 _TOO_SHORT = 3  # updates in a row without a step, after which a warning is due
 _SHED_EVERY_S = 30.0  # between two warnings that frames are left out
-STOP_S = 10.0
-"""How long the server waits at its end for the update in progress."""
+STOP_S = 5.0
+"""How long the server waits at its end for the update in progress. The launcher kills it after eight seconds, of which
+the checkpoint needs some."""
 
 
 class UpdateLoop:

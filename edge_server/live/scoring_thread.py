@@ -91,7 +91,7 @@ class ScoringThread:
         self._thread.start()
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Score what has arrived, and end."""
+        """Score what has arrived, for ``timeout_s`` at most, and end."""
         with self._wake:
             self._ending = True
             self._wake.notify()

@@ -28,13 +28,13 @@ from edge_server.fields.registry import make_field
 from edge_server.live.field_updater import open_updater
 from edge_server.live.frontier import open_frontier
 from edge_server.live.grpc_services import GrpcThread
-from edge_server.live.ingest import Ingest, RollingPercentiles
+from edge_server.live.ingest import Ingest, LastFrames, RollingPercentiles
 from edge_server.live.loop import STOP_S, UpdateLoop
 from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.output.journal import Journal
 from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Snapshot
-from edge_server.run_records import UpdateCounts
+from edge_server.run_records import EdgeStatus, UpdateCounts
 from edge_server.scheduler import LivePolicies, short_name
 from edge_server.settings import EdgeConfig, described, embedding_for, read_config
 from freshfield.clock import Clock, WallClock
@@ -156,6 +156,7 @@ class EdgeServer:
             self.scoring.held_out_frame,
             None if self.recorder is None else self.recorder.frame,
             scenario.max_side_px,
+            _last_frames(options.out / "edge.json"),
         )
         self._decision_log = DecisionLog(options.out, embedding_for(config, policy))
         controls = Controls(policy.name, policy.value)
@@ -215,10 +216,11 @@ class EdgeServer:
         finally:
             self._stopping.set()
             self.loop.stop()
-            self.scoring.stop()
+            self._write_field()  # first: who asked for the end does not wait for ever
+            self.scoring.stop(1.0)
             if page is not None:
                 page.stop()
-            grpc.join()
+            grpc.join(1.0)
             self._write_final()
         if self.loop.failure is not None:
             raise self.loop.failure
@@ -358,6 +360,7 @@ class EdgeServer:
             "two_nodes": dict(self.ingest.admission.doubled),
             "lines_lost": self.journal.lines_lost + self.ledger.lines_lost,
             "decisions_lost": self._decision_log.lost,
+            "last_frames": self.ingest.admission.last_frames(),
             "stale_on_arrival": self.buffer.stale_on_arrival,
             "check_ms": {f"p{p}": self.ingest.check_ms.percentile(p) for p in (50, 99)},
             "updates": msgspec.to_builtins(
@@ -383,16 +386,21 @@ class EdgeServer:
             else {**_values(scored, "psnr_db", "ssim", "psnr_moving_db", "lpips"), "on": scored.scored_on},
         }
 
+    def _write_field(self) -> None:
+        path = self.options.out / "field.npz"
+        if self.loop.alive:
+            log.error("%s: not written: the last update did not end within %g s", path, STOP_S)
+        elif self.state.started:
+            try:
+                self._write_checkpoint(path)
+            except OSError as error:
+                log.error("%s: not written: %s", path, error)
+
     def _write_final(self) -> None:
         try:
             if (comparison := self.state.comparison) is not None:
                 for name, image in _values(comparison, "truth", "rendered").items():
                     cv2.imwrite(str(self.options.out / f"{name}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-            path = self.options.out / "field.npz"
-            if self.loop.alive:
-                log.error("%s: not written: the last update did not end within %g s", path, STOP_S)
-            elif self.state.started:
-                self._write_checkpoint(path)
         except OSError as error:
             log.error("not everything was written at the end: %s", error)
         finally:
@@ -403,6 +411,14 @@ class EdgeServer:
                 if self.recorder is not None:
                     self.recorder.close()
                 self.journal.close()
+
+
+def _last_frames(path: Path) -> LastFrames:
+    """Of an earlier process, as its status says."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=EdgeStatus).last_frames
+    except (OSError, ValueError, RecursionError):
+        return {}
 
 
 def _values(of: Any, *names: str) -> dict[str, Any]:

@@ -16,6 +16,7 @@ import math
 import secrets
 import ssl
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
@@ -40,6 +41,9 @@ from freshfield.limits import (
 )
 
 log = logging.getLogger(__name__)
+
+SAY_EVERY_S = 60.0
+"""Least time between two lines of the log about one kind of refusal."""
 
 Vector = tuple[float, float, float]
 Process = Callable[[ServerConnection, Request], Response | None]
@@ -115,6 +119,7 @@ class AccessGuard:
     def __init__(self, access: HttpDoor, tls: ssl.SSLContext | None) -> None:
         self.visitors: set[ServerConnection] = set()
         self.refused: Counter[str] = Counter()
+        self._quiet_until_s: dict[str, float] = {}
         self.controls: dict[str, Any] = {}
         self.on_refused: Callable[[ServerConnection], None] = lambda connection: None
         self._access = access
@@ -201,17 +206,20 @@ class AccessGuard:
         return True
 
     def _refuse(self, what: str) -> bool:
-        if not self.refused[what]:
-            log.warning("page: not taken from a visitor: %s (further ones are only counted)", what)
+        """Count what was refused, and log it, once a minute at most."""
         self.refused[what] += 1
+        now_s = time.monotonic()
+        if now_s >= self._quiet_until_s.get(what, 0.0):
+            self._quiet_until_s[what] = now_s + SAY_EVERY_S
+            log.warning("page: refused: %s (%d so far)", what, self.refused[what])
         return False
 
     def _worth_a_line(self, record: logging.LogRecord) -> bool:
-        """Whether websockets may log a record. Unreadable requests, which anybody may send, are only counted;
-        connections that close without a request are ignored."""
+        """Whether websockets may log a record: no line for each visitor and each refused request. Unreadable
+        requests, which anybody may send, are counted; connections that close without a request are ignored."""
         error = record.exc_info[1] if record.exc_info else None
         if error is None:
-            return True
+            return record.levelno >= logging.WARNING
         if not isinstance(error, InvalidMessage):  # a fault of our own, which viser would not report
             log.error("page: %s", record.getMessage(), exc_info=record.exc_info)
         elif not isinstance(error.__cause__, EOFError):
@@ -228,6 +236,7 @@ class AccessGuard:
             known = self._known(request, cookie) if authorization is None else None
             connection.caller = known or self._access.caller(authorization)
         except HttpRefused as error:
+            self._refuse(f"requests with status {error.status}")
             refusal = connection.respond(error.status, f"{error}\n")
             if error.status == 401:
                 refusal.headers["WWW-Authenticate"] = 'Basic realm="freshfield", charset="UTF-8"'
@@ -237,6 +246,7 @@ class AccessGuard:
             return connection.respond(404, "There is no such page.\n")
         if "websocket" in (_one(request, "Upgrade") or "").lower():
             if len(self.visitors) >= MAX_VISITORS:
+                self._refuse(f"visitors beyond {MAX_VISITORS}")
                 return connection.respond(503, f"{MAX_VISITORS} visitors are here already\n")
             self.visitors.add(connection)
         response = process(connection, request)

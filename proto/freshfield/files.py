@@ -75,6 +75,10 @@ def out_file(text: str) -> Path:
 
 def _to_write(text: str, is_folder: bool) -> Path:
     path = Path(text)
+    try:
+        text.encode()
+    except UnicodeEncodeError:  # neither logs nor reports could name it
+        raise argparse.ArgumentTypeError(f"{text!r} is not UTF-8: name another") from None
     there = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
     if there == path and not is_folder:
         if path.is_dir():

@@ -150,7 +150,10 @@ def read_yaml(text: str) -> Any:
 def read_json(text: str) -> Any:
     """The value of a JSON document. Raises UntrustedError if it is invalid or repeats a key."""
     try:
-        return json.loads(text, object_pairs_hook=_object)
+        found = json.loads(text, object_pairs_hook=_object)
+        if "\\u" in text:  # only an escape can stand for half a character
+            _refuse_half_a_character(json.dumps(found, ensure_ascii=False))
+        return found
     except UntrustedError:
         raise
     except RecursionError:
@@ -166,7 +169,17 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
+def _refuse_half_a_character(text: str) -> None:
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        half = text[error.start]
+        raise UntrustedError(f"{half!r} is half of a character: no file can hold it") from None
+
+
 def _node_parts(node: Any) -> Iterable[Any]:
+    if isinstance(node, yaml.ScalarNode):
+        _refuse_half_a_character(node.value)
     if isinstance(node, yaml.MappingNode):
         return (part for pair in node.value for part in pair)
     return node.value if isinstance(node, yaml.SequenceNode) else ()

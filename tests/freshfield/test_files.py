@@ -116,3 +116,11 @@ def test_half_a_line_of_a_killed_writer_does_not_swallow_the_next(tmp_path):
     lines = Lines(path)
     assert lines.write('{"a": 3}')
     assert path.read_text().splitlines()[-1] == '{"a": 3}'
+
+
+def test_a_place_that_is_no_utf_8_is_refused_with_its_option(capsys):
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--out", type=out_folder)
+    with pytest.raises(SystemExit, match="2"):
+        parser.parse_args(["--out", "runs/a\udcff"])
+    assert r"argument --out: 'runs/a\udcff' is not UTF-8: name another" in capsys.readouterr().err

@@ -178,3 +178,13 @@ def test_a_file_is_read_up_to_its_bound(tmp_path):
     assert read_text(file).startswith("a\nb")
     with pytest.raises(OSError, match="larger than 1 MB"):
         read_bytes(file, 2**20)
+
+
+@pytest.mark.parametrize(
+    ("read", "text"), [(read_yaml, r'{a: [x, "\ud800y"]}'), (read_yaml, r'"\uDFFF": 1'), (read_json, r'["\ud800"]')]
+)
+def test_half_a_character_is_refused_where_it_is_read(read, text):
+    """No log, report or message could hold it."""
+    with pytest.raises(UntrustedError, match=r"is half of a character: no file can hold it"):
+        read(text)
+    assert read(r'["\ud83d\ude00"]' if read is read_json else '["\U0001f600"]') == ["\U0001f600"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -206,3 +207,20 @@ def test_percentiles_are_of_the_last_values():
     for value in (9.0, 1.0, 4.0, 3.0, 2.0):  # the first is the one too many
         values.add(value)
     assert [values.percentile(p) for p in (0, 25, 50, 99, 100)] == [1.0, 2.0, 3.0, 4.0, 4.0]
+
+
+def test_after_a_restart_of_the_edge_no_frame_is_taken_again():
+    before = FrameAdmission(["cam01", "cam02"], [])
+    for sequence in (3, 4):
+        before.admit(good(sequence), NOW)
+    told = msgspec.json.decode(msgspec.json.encode(before.last_frames()), type=dict[str, dict[str, tuple[int, int]]])
+    after = FrameAdmission(["cam01"], ["cam00"], known=told)
+    for sequence, reason in ((3, "replayed_sequence"), (4, "replayed_sequence")):
+        with pytest.raises(FrameRejected) as refused:
+            after.admit(good(sequence), NOW)
+        assert refused.value.reason == reason
+    with pytest.raises(FrameRejected) as refused:
+        after.admit(frame(sequence=5, generated_ns=NOW - 51 * MS), NOW)
+    assert refused.value.reason == "time_reversed"
+    after.admit(good(5), NOW)
+    after.admit(good(0, session="another"), NOW)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import json
+import os
+import signal
 import socket
 import threading
 import time
@@ -16,7 +18,7 @@ import pytest
 from edge_server.cli import main as edge_server
 from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
-from edge_server.live.loop import UpdateLoop
+from edge_server.live.loop import STOP_S, UpdateLoop
 from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.settings import read_config
 from freshfield import frame as wire
@@ -26,6 +28,7 @@ from freshfield.ledger import read_all
 from freshfield.limits import MAX_SCRAPES, MAX_SNAPSHOTS, MAX_WATCHERS
 from freshfield.transport import Transport, TransportError
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2_grpc
+from freshfield_up.processes import GRACE_S
 from tests.edge_server.fields_for_tests import TINY
 from tests.edge_server.frames import CAMERA
 from tests.support import free_port
@@ -149,6 +152,10 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
     assert about["updates"] == len(series)
     again, _, _ = serve(resume=out / "field.npz")
     assert again.updater.field.step > 0 and again.updater.number == len(series)
+    known = again.ingest.admission.last_frames()
+    assert {camera: known[camera]["s"][0] for camera in known} == {
+        camera: max(e.sequence for e in delivered if e.camera == camera) for camera in server.scenario.cameras
+    }
     fresh, _, _ = serve()
     assert fresh.updater.number == 0
     kept = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
@@ -352,3 +359,34 @@ def test_a_time_that_no_timer_takes_is_refused(tmp_path, capsys, option, value):
     assert edge_server(["run", "room", f"{option}={value}", "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
     assert f"{option} " in said and "expected 0 to 1e+09" in said and said.count("\n") == 1
+
+
+def test_the_field_is_written_before_anything_that_may_take_long(serve, tmp_path, monkeypatch):
+    server, port, thread = serve()
+    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
+    feed.start()
+    until(lambda: server.state.publications())
+    written, stop = [], server.scoring.stop
+    monkeypatch.setattr(
+        server.scoring, "stop", lambda *given: written.append((tmp_path / "out/field.npz").exists()) or stop(*given)
+    )
+    feed.stop()
+    server.stop()
+    thread.join(20)
+    assert written == [True]
+    assert STOP_S <= GRACE_S - 3.0, "the launcher would kill it before"
+
+
+def test_a_terminal_that_is_closed_ends_the_run_as_ctrl_c_does(tmp_path, monkeypatch):
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+
+    def closed(server):
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert server._stopping.wait(5)
+
+    monkeypatch.setattr(EdgeServer, "run", closed)
+    try:
+        assert edge_server(["run", "room", "--out", str(tmp_path / "out"), "--page-port", "0"]) == 0
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.live.view_decoder import ViewDecoder
+from freshfield import payload
 from tests.edge_server.frames import damaged_frame, frame
 
 
@@ -52,3 +53,12 @@ def test_a_large_image_is_decoded_smaller_and_whole_when_asked_for():
         np.testing.assert_allclose(
             view.intrinsics.rays([[1.0, 2.0]]), whole.intrinsics.rays([[32 / size[1], 2.0 * 24 / size[0]]])
         )
+
+
+def test_a_damaged_png_writes_nothing_to_the_log(capfd):
+    """libpng would, at each decode."""
+    whole = payload.encode(np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8), "png")
+    for k in range(40, len(whole) - 4, 97):
+        for data in (whole[:k], whole[:k] + b"\xff\xd0\x00\x11" + whole[k + 4 :], whole[:k] + whole[k + 1 :]):
+            assert ViewDecoder().views([frame(codec="png", payload=data)]) == []
+    assert capfd.readouterr() == ("", "")

@@ -219,6 +219,33 @@ def test_requests_that_no_page_answers_are_counted_and_logged_once(caplog) -> No
     assert not any(r.exc_info for r in said)
 
 
+def test_a_flood_of_refused_requests_and_visitors_is_counted_and_said_once_a_minute(caplog, monkeypatch) -> None:
+    caplog.set_level("INFO")
+    now_s = [0.0]
+    monkeypatch.setattr(access_guard, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    monkeypatch.setattr(access_guard, "MAX_VISITORS", 1)
+
+    def refused(guard: AccessGuard) -> dict[str, int]:
+        return {what: count for what, count in guard.refused.items() if "status" in what or "visitors" in what}
+
+    with page_of(bare_state(), LOGIN, "0.0.0.0") as page, Visitor(page.port, headers=lines(login("viewer"))):
+        wait_until(lambda: page._server.get_clients(), "the visitor")
+        guard = guard_of(page)
+        for _ in range(10):
+            assert get(page.port)[0] == 401
+            assert get(page.port, Origin="http://evil.example", **login("viewer"))[0] == 403
+            with pytest.raises(websocket.WebSocketBadStatusException):
+                Visitor(page.port, headers=lines(login("viewer")))
+        expected = {"requests with status 401": 10, "requests with status 403": 10, "visitors beyond 1": 10}
+        assert refused(guard) == expected
+        # The first says what is open.
+        said = [r.getMessage() for r in caplog.records if r.name.startswith(("edge_server", "websockets"))]
+        assert said[1:] == [f"page: refused: {what} (1 so far)" for what in expected]
+        now_s[0] = access_guard.SAY_EVERY_S
+        assert get(page.port)[0] == get(page.port)[0] == 401
+        assert caplog.messages[-1] == "page: refused: requests with status 401 (11 so far)"
+
+
 def test_a_port_that_is_none_or_taken_is_refused(metrics: int) -> None:
     for port, said in ((65536, "is not a port"), (metrics, r"\(Address already in use\); see --metrics-port")):
         with pytest.raises(TransportError, match=rf"{port} {said}"):

@@ -125,7 +125,8 @@ def test_the_page_shows_frames_that_were_left_out_and_images_that_were_cut(tmp_p
     edit_edge(tmp_path, updates={"count": 50, "shed": 17, "without_step": 3}, foreground=cut)
     report, page = page_of(tmp_path)
     assert report["foreground"] == cut and report["updates"]["shed"] == 17
-    assert "left out for lack of time: 17" in page and "without time for a step: 3" in page
+    assert "left out for lack of time: 17" in page and "47 updates, median" in page
+    assert "not counted: 3 that had no time for a step of training" in page
     assert "The object was cut out of 41 images, 2 ms each; used whole: 3 (nothing was found in it)" in page
     assert "1 (all of it was found to be the object)" in page
 
@@ -222,7 +223,7 @@ def test_a_killed_run_is_reported_with_notes_on_what_is_torn(tmp_path):
     assert report["scenario"] is None and report["updates"]["count"] > 10
     assert report["fidelity"]["final"]["psnr_db"] is not None
     assert not (tmp_path / "figure-comparison.png").exists()
-    assert "Missing or damaged files" in (tmp_path / "report.html").read_text()
+    assert "<h2>Notes</h2>" in (tmp_path / "report.html").read_text()
 
 
 def test_an_empty_folder_gives_a_report_that_says_so(tmp_path):
