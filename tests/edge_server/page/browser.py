@@ -65,16 +65,6 @@ _FIND = """
   return [r.x + r.width / 2, r.y + r.height / 2];
 }
 """
-_FIND_INPUT = """
-(label) => {
-  const named = [...document.querySelectorAll('label')].find((e) => e.innerText.trim() === label);
-  const input = named && document.getElementById(named.getAttribute('for'));
-  if (!input) return null;
-  input.scrollIntoView({block: 'center'});
-  const r = input.getBoundingClientRect();
-  return [r.x + r.width / 2, r.y + r.height / 2, input.value, input === document.activeElement];
-}
-"""
 
 
 def chromium() -> str:
@@ -216,50 +206,6 @@ class Browser:
         at = self.wait_for(lambda: self.evaluate(f"({_FIND})({json.dumps(wanted)})"), f"a {wanted!r}")
         self.click(*at)
 
-    def input_value(self, label: str) -> str:
-        """What the input with this label holds."""
-        return self._input(label)[2]
-
-    def choose(self, label: str, option: str) -> None:
-        """Open the dropdown with this label and click an option."""
-        self.click(*self._input(label)[:2])
-        query = f"[...document.querySelectorAll('[role=option]')].find(e => e.innerText.trim() == {option!r})"
-        shown = f"!!({query})?.checkVisibility()"  # it may stay in the page while the list is closed
-        self.wait_for(lambda: self.evaluate(shown), f"the option {option!r}")
-        middle = (
-            f"(() => {{const r = {query}.getBoundingClientRect();return [r.x + r.width / 2, r.y + r.height / 2]}})()"
-        )
-        box: list[float] = []
-
-        def rests() -> bool:
-            """The list slides in, and is moved on a slow machine: a click on its way would miss."""
-            nonlocal box
-            before, box = box, self.evaluate(middle)
-            return before == box
-
-        time.sleep(0.3)
-        self.wait_for(rests, f"the rest of the list with {option!r}")
-        self.click(*box)
-        # It fades over the inputs below, and would take their clicks.
-        self.wait_for(lambda: not self.evaluate(shown), f"the end of the list with {option!r}")
-
-    def type_number(self, label: str, text: str) -> None:
-        """Replace what the input holds, and leave it."""
-
-        def focused() -> bool:
-            """What is above it may grow before the click arrives, which then meets something else."""
-            self.click(*self._input(label)[:2])
-            return self._input(label)[3]
-
-        self.wait_for(focused, f"the focus of {label!r}")
-        old = self.input_value(label)
-        self.evaluate("document.activeElement.select()")
-        for _ in range(len(old) + 1):
-            self._key("Backspace", 8)
-        self.call("Input.insertText", text=text)
-        self._key("Enter", 13)
-        self._key("Tab", 9)
-
     def close_notices(self) -> None:
         """Click away every notification, such as the one that WebGL runs in software."""
         self.evaluate("document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())")
@@ -274,11 +220,3 @@ class Browser:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8)
-
-    def _input(self, label: str) -> list[Any]:
-        find = f"({_FIND_INPUT})({json.dumps(label)})"
-        return self.wait_for(lambda: self.evaluate(find), f"an input {label!r}")
-
-    def _key(self, name: str, code: int) -> None:
-        for kind in ("keyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=name, code=name, windowsVirtualKeyCode=code)

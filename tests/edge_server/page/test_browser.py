@@ -1,4 +1,4 @@
-"""The page in a real browser: live values, a picture, and controls that reach the server."""
+"""The page in a real browser: live values, a picture, and nothing that fails."""
 
 from __future__ import annotations
 
@@ -67,46 +67,6 @@ def test_nothing_fails_and_nothing_outside_is_asked_for(shown):
     assert browser.errors == []
     assert browser.requests
     assert all(f":{page.port}" in address for address in browser.requests), browser.requests
-
-
-def test_pause_and_resume(shown):
-    preview, _, browser = shown
-    browser.click_text("pause")
-    browser.wait_for(lambda: preview.state.controls.paused, "the pause")
-    browser.wait_for_text("paused by the operator")
-    browser.click_text("resume")
-    browser.wait_for(lambda: not preview.state.controls.paused, "the resumption")
-    _until_updates(browser, after=len(preview.state.publications()))
-
-
-def test_policy_and_value_reach_the_server_and_mistakes_are_explained(shown):
-    preview, _, browser = shown
-    controls = preview.state.controls
-    browser.choose("policy", "freshest-k")
-    browser.wait_for(lambda: controls.policy == "freshest-k", "the policy")
-    browser.wait_for(lambda: browser.input_value("k") == "6", "the policy's own default")
-    browser.type_number("k", "3")
-    browser.wait_for(lambda: controls.value == 3, "the value")
-    browser.type_number("k", "0")
-    browser.wait_for_text("expected a whole number from 1")
-    browser.wait_for(lambda: browser.input_value("k") == "3", "what is still in force")
-    assert (controls.policy, controls.value) == ("freshest-k", 3)
-    browser.close_notices()
-    preview.state.set_policy("threshold", 400.0)  # by someone else
-    browser.wait_for(lambda: browser.input_value("policy") == "threshold", "the other's policy")
-    browser.wait_for(lambda: browser.input_value("omega, ms") == "400", "the other's value")
-
-
-def test_reset_and_snapshot(shown):
-    preview, _, browser = shown
-    browser.click_text("reset")
-    browser.wait_for_text("starts again")
-    browser.wait_for(lambda: not preview.state.controls.reset_requested, "the reset's execution")
-    browser.close_notices()
-    browser.click_text("snapshot")
-    browser.wait_for_text("preview-snapshot.json")
-    assert (preview._folder / "preview-snapshot.json").exists()
-    browser.close_notices()
 
 
 def _center(image: np.ndarray) -> np.ndarray:
