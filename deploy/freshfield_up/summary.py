@@ -32,9 +32,9 @@ def summarize(out: Path) -> str:
         f"baselines  mean color {fmt(baseline.get('mean_colour_db'), '.1f')} dB, "
         f"nearest view {fmt(baseline.get('nearest_view_db'), '.1f')} dB",
         f"age        mean {fmt(age.get('mean'), '.0f')} ms, p95 {fmt(age.get('p95'), '.0f')} ms",
-        f"updates    {fmt((updates.get('count') or 0) - idle, 'd')} of {fmt(updates.get('ms_p50'), '.0f')} ms "
+        f"updates    {fmt(updates.get('count'), 'd')} of {fmt(updates.get('ms_p50'), '.0f')} ms "
         f"(p95 {fmt(updates.get('ms_p95'), '.0f')} ms), the first after {_seconds(updates.get('first_ms'))}"
-        + (f"; {idle} more had no time for a step of training" if idle else ""),
+        + (f"; {idle} of them had no time for a step of training" if idle else ""),
         f"frames     {fmt(frames.get('captured'), 'd')} captured, {fmt(frames.get('sent'), 'd')} sent, "
         f"{fmt(frames.get('delivered'), 'd')} delivered{shed}, {rejected} rejected; "
         f"{_accounted(frames)}",
