@@ -74,6 +74,26 @@ def save_orange_detector(
     return save(path, nodes, [1, 3, side, side], ("output0", shape), constants, opset=13, meta=meta, further=further)
 
 
+def save_memory_bomb(path: Path, kind: str) -> Path:
+    """A segmentation ONNX with one tensor of 400 TB. kind: Expand or Conv."""
+    from onnx import helper
+
+    from tests.edge_server.embed.graphs import save
+
+    constants = {"shape": np.array([2**33, 3, 64, 64]), "weight": np.ones((1, 3, 1, 1), np.float32)}
+    read = {"Expand": ["images", "shape"], "Conv": ["images", "weight"]}[kind]
+    nodes = [
+        helper.make_node(kind, read, ["large"], **({"pads": [5_000_000] * 4} if kind == "Conv" else {})),
+        helper.make_node("Cast", ["large"], ["floats"], to=1),
+        helper.make_node("ReduceMax", ["floats"], ["most"], keepdims=0),
+        helper.make_node("Mul", ["images", "most"], ["lit"]),
+        helper.make_node("Conv", ["lit", "weight"], ["map"]),
+        helper.make_node("AveragePool", ["images"], ["masks"], kernel_shape=[4, 4], strides=[4, 4]),
+    ]
+    further = (("masks", [1, 3, 16, 16]),)
+    return save(path, nodes, [1, 3, 64, 64], ("map", [1, 1, 64, 64]), constants, opset=13, further=further)
+
+
 def save_endless_loop(path: Path) -> Path:
     """A segmentation ONNX that goes round 2^62 times before it answers."""
     from onnx import TensorProto, helper

@@ -16,7 +16,7 @@ from edge_server.foreground.detector import Detection, Detector, decode
 from edge_server.foreground.foreground import Foreground, clipped, make_foreground
 from edge_server.settings import read_config
 from freshfield.scenario import ScenarioError, load, parse
-from tests.edge_server.foreground.pictures import disc, iou, save_endless_loop, save_orange_detector
+from tests.edge_server.foreground.pictures import disc, iou, save_endless_loop, save_memory_bomb, save_orange_detector
 
 for module in ("onnx", "onnxruntime"):
     pytest.importorskip(module, reason="needs ONNX Runtime: pip install -e '.[embed]'")
@@ -221,3 +221,11 @@ def test_a_model_that_loops_for_ever_is_refused(tmp_path):
     model = save_endless_loop(tmp_path / "loop.onnx")
     with pytest.raises(ForegroundError, match=r"loop\.onnx: holds Loop, which no network"):
         make_foreground(ForegroundConfig(str(model)))
+
+
+@pytest.mark.parametrize("kind", ["Expand", "Conv"])
+def test_a_model_that_takes_terabytes_is_refused(tmp_path, kind):
+    """Neither while it is loaded, where constants would be computed, nor in its first run."""
+    config = ForegroundConfig(str(save_memory_bomb(tmp_path / "bomb.onnx", kind)))
+    with pytest.raises(ForegroundError, match=r"bomb\.onnx: ONNX Runtime .* (may take|more than) 4"):
+        make_foreground(config)
