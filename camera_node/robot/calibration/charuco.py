@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.robot.calibration.settings import MIN_CORNERS, MIN_MARKERS
+
 GrayImage = NDArray[np.uint8]
 Array = NDArray[np.float64]
 
-# Fewer markers of a dictionary may be read into noise.
-_LEAST_MARKERS = 3
-_LEAST_CORNERS = 6
 # The largest dictionaries: each holds the smaller ones of its kind.
 _DICTIONARIES = (
     *(f"{n}X{n}_1000" for n in (4, 5, 6, 7)),
@@ -60,20 +59,20 @@ def find_charuco(image: GrayImage, printed: CharucoPrint) -> tuple[Array, NDArra
 def explain_charuco(image: GrayImage, printed: CharucoPrint) -> str:
     """Why the board is not found, as far as the image tells; "" if it does not."""
     numbers = _markers(image, printed.dictionary)
-    if len(numbers) < _LEAST_MARKERS:
+    if len(numbers) < MIN_MARKERS:
         mirrored = np.ascontiguousarray(image[:, ::-1])
-        if len(_markers(mirrored, printed.dictionary)) >= _LEAST_MARKERS:
+        if len(_markers(mirrored, printed.dictionary)) >= MIN_MARKERS:
             return "the picture is mirrored: switch that off in the camera's settings"
         seen = {name: _markers(image, name) for name in _DICTIONARIES}
         name = max(seen, key=lambda each: len(seen[each]))
-        if len(seen[name]) < _LEAST_MARKERS:
+        if len(seen[name]) < MIN_MARKERS:
             return "no markers are seen: is the board small, blurred, dark, or another one?"
         kind, _, largest = name.rpartition("_")
         if largest.isdigit():
             name = f"{kind}_{next(size for size in _SIZES if seen[name].max() < size)}"
         return f"its markers are of dictionary {name}, not {printed.dictionary}"
     for other in _other_boards(printed, int(numbers.max())):
-        if len(find_charuco(image, other)[1]) >= _LEAST_CORNERS:
+        if len(find_charuco(image, other)[1]) >= MIN_CORNERS:
             swapped = (other.across, other.down) == (printed.down, printed.across)
             what = "its sizes are swapped" if swapped else "it is a board of another size"
             return f"{what}: {other.across}x{other.down} squares, not {printed.across}x{printed.down}"

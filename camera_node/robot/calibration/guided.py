@@ -28,6 +28,16 @@ from camera_node.robot.calibration.hand_eye.samples import (
     diversity,
     rotation_vectors,
 )
+from camera_node.robot.calibration.settings import (
+    EXPLAIN_EVERY,
+    GOOD_MM,
+    GOOD_POSES,
+    GOOD_SPREAD_DEG,
+    MIN_TO_SOLVE,
+    NEW_DEG,
+    STILL_DEG,
+    STILL_MM,
+)
 from camera_node.robot.calibration.targets import Target, estimate_pose, to_gray
 from camera_node.settings import ArmConfig, source_config
 from camera_node.sources.base import Source
@@ -38,13 +48,7 @@ from freshfield.geometry import Pinhole, se3_inverse
 
 Image = NDArray[np.uint8]
 
-# A session ends with so many poses, axes spread so far, and this standard deviation of the translation.
-GOOD_POSES, GOOD_SPREAD_DEG, GOOD_MM = 10, 15.0, 0.5
-# A pose rotated by less from a kept one adds little. Stamps matter beyond these motions between two frames.
-NEW_DEG, STILL_MM, STILL_DEG = 8.0, 0.5, 0.1
 KEPT = "kept"
-_MIN_TO_SOLVE = 4
-_EXPLAIN_EVERY = 50  # of the pictures without the target
 
 
 @dataclass(frozen=True)
@@ -154,7 +158,7 @@ class HandEyeSession:
         corners = self._target.find(gray)
         if corners is None:
             self._missed += 1
-            if self._missed % _EXPLAIN_EVERY == 1:  # it takes a second
+            if self._missed % EXPLAIN_EVERY == 1:  # it takes a second
                 self._why = self._target.explain(gray)
             return self._step("target not found", self._why or "bring all of it into the picture, well lit")
         turned_deg = angle_deg(self.samples.flange, flange)
@@ -169,7 +173,7 @@ class HandEyeSession:
         self.samples = replace(self.samples, flange=flanges, target=targets)
         found = diversity(self.samples)
         self._spread_deg = found.axis_spread_deg
-        if found.reason is None and len(self.samples) >= _MIN_TO_SOLVE:
+        if found.reason is None and len(self.samples) >= MIN_TO_SOLVE:
             self._std_mm = refine(self.samples).std_mm
         return self._step(KEPT)
 

@@ -12,13 +12,13 @@ import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
+from camera_node.robot.calibration.settings import EXPLAINED
 from camera_node.robot.calibration.targets import Corners, Target, estimate_pose
 from camera_node.sources.datasets.imaging import decode_file
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import Pinhole, se3, so3_exp
 from freshfield.untrusted import read_text, read_yaml
 
-_EXPLAINED = 4  # pictures without the target that are examined for the reason, which takes a second
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
@@ -102,7 +102,7 @@ def find_corners(
         gray = np.asarray(image, dtype=np.uint8)
         corners = target.find(gray)
         if corners is None:
-            why = target.explain(gray) if len(unused) < _EXPLAINED else ""
+            why = target.explain(gray) if len(unused) < EXPLAINED else ""
             unused[file.name] = f"{target.name} not found{why and f': {why}'}"
         else:
             found[file.name] = corners

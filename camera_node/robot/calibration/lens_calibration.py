@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array
+from camera_node.robot.calibration.settings import (
+    LONGEST_FOCAL,
+    MIN_CORNERS,
+    MIN_TILT_DEG,
+    MIN_VIEWS,
+    OUTLIER_ERROR,
+    SHORTEST_FOCAL,
+)
 from camera_node.robot.calibration.targets import Corners, opencv_lens
 from freshfield.geometry import Pinhole
 
-MIN_VIEWS = 4
-# With all views parallel to the sensor, focal length and distance cannot be told apart.
-MIN_TILT_DEG = 10.0
-MIN_CORNERS = 6
-_OUTLIER = 4.0
-# Focal lengths over the image's longer side: 136 and 7 degrees of view. The solver diverges beyond them if
-# the images do not determine a lens.
-_SHORTEST, _LONGEST = 0.2, 8.0
 _UNDETERMINED = "the pictures do not determine a lens: show the target larger, tilted, everywhere"
 
 
@@ -94,13 +94,13 @@ def calibrate_lens(views: Mapping[str, Corners], size: tuple[int, int], unused: 
             f"at least {MIN_VIEWS} are needed and 10 to 20 are good{why}"
         )
     lens, std, normals, errors = _solve(usable, size)
-    limit = _OUTLIER * float(np.median(errors))
+    limit = OUTLIER_ERROR * float(np.median(errors))
     bad = [name for name, error in zip(usable, errors) if error > limit]
     if bad and len(usable) - len(bad) >= MIN_VIEWS:
         unused = {**unused, **{name: "does not fit the others, left out" for name in bad}}
         usable = {name: c for name, c in usable.items() if name not in bad}
         lens, std, normals, errors = _solve(usable, size)
-    possible = all(_SHORTEST < f / max(size) < _LONGEST for f in (lens.fx, lens.fy))
+    possible = all(SHORTEST_FOCAL < f / max(size) < LONGEST_FOCAL for f in (lens.fx, lens.fy))
     if not (np.isfinite([lens.fx, lens.fy, *lens.distortion, *std]).all() and possible and std[0] < 0.2 * lens.fx):
         raise CalibrationError(_UNDETERMINED)
     tilt_deg = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))))

@@ -19,16 +19,13 @@ from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.charuco import CharucoPrint, explain_charuco, find_charuco
+from camera_node.robot.calibration.settings import AMBIGUOUS, MIN_CORNERS
 from freshfield.geometry import Pinhole, se3
 
 Array = NDArray[np.float64]
 GrayImage = NDArray[np.uint8]
 
 NOTATIONS = "charuco:7x5:30mm:22mm or chessboard:9x6:23.6mm"
-# With fewer corners of a board, its orientation is too uncertain.
-_MIN_CORNERS = 6
-# Ratio of reprojection errors above which the second of the two poses of a flat target is ruled out.
-_AMBIGUOUS = 1.5
 # Corners of a chessboard that was described by its squares, or miscounted by one or two.
 _OTHER_SIZES = ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1), (-2, -2), (2, 2))
 _SUBPIX = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
@@ -91,7 +88,7 @@ def estimate_pose(corners: Corners, lens: Pinhole) -> Array:
     if not count or not np.isfinite(turns[0]).all() or shifts[0][2] <= 0:
         raise CalibrationError("the target's pose cannot be found from its corners")
     errors = np.ravel(errors)
-    if count > 1 and len(corners.points) < 12 and errors[1] < _AMBIGUOUS * max(float(errors[0]), 0.05):
+    if count > 1 and len(corners.points) < 12 and errors[1] < AMBIGUOUS * max(float(errors[0]), 0.05):
         raise CalibrationError("the target is seen so straight on that it may be tilted either way")
     turn, shift = cv2.solvePnPRefineLM(corners.points, pixels, matrix, distortion, turns[0], shifts[0])
     return se3(cv2.Rodrigues(turn)[0], shift.ravel())
@@ -122,7 +119,7 @@ def _charuco(name: str, squares: str, square: str, marker: str, dictionary: str 
 
     def find(image: GrayImage) -> Corners | None:
         pixels, numbers = find_charuco(image, printed)
-        if len(numbers) < _MIN_CORNERS:
+        if len(numbers) < MIN_CORNERS:
             return None
         points = places[numbers]
         if min(len(np.unique(points[:, 0].round(6))), len(np.unique(points[:, 1].round(6)))) < 2:

@@ -22,22 +22,26 @@ from camera_node.robot.calibration.hand_eye.samples import (
     require_diversity,
     rotation_vectors,
 )
+from camera_node.robot.calibration.settings import (
+    FARTHEST_M,
+    GOOD_POSES,
+    LARGE_RESIDUAL_DEG,
+    LARGE_RESIDUAL_MM,
+    LARGEST_SCALE,
+    MILLIMETERS,
+    NOTABLE_DEG,
+    NOTABLE_MM,
+    NOTABLE_SCALE,
+    POSES_FOR_SCALE,
+    SURE,
+    WORST_DEG,
+    WORST_MM,
+)
 from freshfield import files
 from freshfield.untrusted import YamlWriter
 
 REFINED = DEFAULT_METHOD
 ALL_METHODS = (*METHODS, REFINED)
-# With fewer poses, each method's own scatter is as large as the differences between methods.
-_GOOD_POSES = 10
-_LARGE_RESIDUAL_DEG, _LARGE_RESIDUAL_MM = 3.0, 20.0
-# Of a sample that does not fit the others: less is the detector's noise, beside an arm that has nearly none.
-_NOTABLE_DEG, _NOTABLE_MM = 0.5, 1.0
-# Larger values mean wrong input: inverted poses, millimeters, or poses of another body.
-_WORST_DEG, _WORST_MM, _FARTHEST_M = 15.0, 100.0, 5.0
-# The scale of distances to the target is told where it differs from 1 by more than this and by so many standard
-# deviations; a factor beyond the bound is no size of a board. With fewer poses there is nothing left to judge it by.
-_NOTABLE_SCALE, _SURE, _LARGEST_SCALE, _POSES_FOR_SCALE = 0.005, 5.0, 2.0, 5
-_MILLIMETERS = (800.0, 1250.0)  # scale where one of the two is in millimeters
 _ADVICE = "are the poses flange in base and target in camera, not their inverses, in meters, and is the set-up right?"
 
 
@@ -156,17 +160,17 @@ def _require_one_unit(samples: Samples) -> None:
     """Raise CalibrationError where meters and millimeters are mixed."""
     scale = scale_start(samples)
     for factor, target, flange in ((scale, "millimeters", "meters"), (1.0 / scale, "meters", "millimeters")):
-        if _MILLIMETERS[0] < factor < _MILLIMETERS[1]:
+        if MILLIMETERS[0] < factor < MILLIMETERS[1]:
             raise CalibrationError(f"targets seem to be in {target}, flanges in {flange}: both must be in meters")
 
 
 def _refined_with_scale(samples: Samples) -> Refinement | None:
     """The refinement with the target's size, where the arm's motion shows another one than was said."""
-    if len(samples) < _POSES_FOR_SCALE:
+    if len(samples) < POSES_FOR_SCALE:
         return None
     found = refine(samples, with_scale=True)
-    plausible = 1.0 / _LARGEST_SCALE < found.scale < _LARGEST_SCALE
-    sure = abs(found.scale - 1.0) > max(_NOTABLE_SCALE, _SURE * found.scale_std)
+    plausible = 1.0 / LARGEST_SCALE < found.scale < LARGEST_SCALE
+    sure = abs(found.scale - 1.0) > max(NOTABLE_SCALE, SURE * found.scale_std)
     return found if plausible and sure else None
 
 
@@ -186,28 +190,28 @@ def _about_size(scaled: Refinement, refined: Refinement, square_m: float | None,
 def _require_plausible(transform: Array, off: Residuals) -> None:
     """Raise CalibrationError for a result that cannot be right. Medians ignore a few outliers."""
     median_mm, median_deg = off.medians
-    if median_mm > _WORST_MM or median_deg > _WORST_DEG:
+    if median_mm > WORST_MM or median_deg > WORST_DEG:
         raise CalibrationError(
             f"the poses do not fit together (residuals {median_mm:.0f} mm, {median_deg:.1f} degrees in the "
             f"median): {_ADVICE}"
         )
     distance_m = float(np.linalg.norm(transform[:3, 3]))
-    if distance_m > _FARTHEST_M:
+    if distance_m > FARTHEST_M:
         raise CalibrationError(f"the camera would be {distance_m:.1f} m away: {_ADVICE}")
 
 
 def _warnings(samples: Samples, refined: Refinement, off: Residuals, spread: Diversity) -> list[str]:
     out = []
-    if len(samples) < _GOOD_POSES:
-        out.append(f"{len(samples)} poses: {_GOOD_POSES} to 20 well spread ones are worth their time")
+    if len(samples) < GOOD_POSES:
+        out.append(f"{len(samples)} poses: {GOOD_POSES} to 20 well spread ones are worth their time")
     if spread.half_turns:
         out.append(
             f"{spread.half_turns} of {spread.motions} motions turn by nearly 180 degrees, which upsets Tsai-Lenz"
         )
     median_mm, median_deg = off.medians
-    if median_mm > _LARGE_RESIDUAL_MM or median_deg > _LARGE_RESIDUAL_DEG:
+    if median_mm > LARGE_RESIDUAL_MM or median_deg > LARGE_RESIDUAL_DEG:
         out.append(f"residuals are large ({median_mm:.1f} mm, {median_deg:.1f} degrees in the median): {_ADVICE}")
-    noticed = [i for i in refined.outliers if off.mm[i] > _NOTABLE_MM or off.deg[i] > _NOTABLE_DEG]
+    noticed = [i for i in refined.outliers if off.mm[i] > NOTABLE_MM or off.deg[i] > NOTABLE_DEG]
     for i in noticed[:5]:
         out.append(
             f"{samples.name(i)} does not fit the others (off by {off.mm[i]:.1f} mm, {off.deg[i]:.2f} "

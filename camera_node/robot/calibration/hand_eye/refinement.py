@@ -23,6 +23,7 @@ from scipy.optimize import least_squares
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration.hand_eye.closed_form import robust_start
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, rotation_vectors
+from camera_node.robot.calibration.settings import OUTLIER_WEIGHT
 from freshfield.geometry import se3, se3_inverse
 
 _DEGREES_OF_FREEDOM = 8.0
@@ -30,9 +31,6 @@ _ROUNDS = 20
 _SETTLED = 1e-4  # relative change of the noise
 # Lower bound of the noise: perfect data would make the likelihood infinite.
 _MIN_NOISE = 1e-7
-# A sample's weight is lower if its six whitened residuals have a sum of squares above 32. This happens to one
-# good sample in sixty thousand.
-OUTLIER_WEIGHT = 0.35
 
 
 @dataclass(frozen=True)

@@ -16,16 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, SETUPS
 from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.settings import HALF_TURN_MARGIN_DEG, MIN_POSES, MIN_SPREAD_DEG, MIN_TURN_DEG
 from freshfield.geometry import se3_inverse
 
 Array = NDArray[np.float64]
 
-MIN_POSES = 3
-# The axis of a smaller rotation is mostly noise. The sign of the axis is lost within the margin of half a
-# turn.
-MIN_TURN_DEG, HALF_TURN_MARGIN_DEG = 5.0, 10.0
-# Axes within a cone of about this half angle leave the translation along them undetermined.
-MIN_SPREAD_DEG = 8.0
 _MAX_SAMPLES = 80  # have 3160 pairs
 
 

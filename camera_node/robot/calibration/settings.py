@@ -1,0 +1,49 @@
+"""The numbers of a calibration: what is enough, what is refused, what is warned about."""
+
+from __future__ import annotations
+
+# Poses of a hand-eye calibration. With fewer than GOOD_POSES each method's own scatter is as large as the differences
+# between methods.
+MIN_POSES, GOOD_POSES = 3, 10
+# The axis of a smaller rotation is mostly noise. The sign of the axis is lost within the margin of half a turn.
+MIN_TURN_DEG, HALF_TURN_MARGIN_DEG = 5.0, 10.0
+# Axes within a cone of about this half angle leave the translation along them undetermined.
+MIN_SPREAD_DEG = 8.0
+
+# A guided session ends with GOOD_POSES, axes spread so far, and this standard deviation of the translation.
+GOOD_SPREAD_DEG, GOOD_MM = 15.0, 0.5
+# A pose rotated by less from a kept one adds little. Stamps matter beyond these motions between two frames.
+NEW_DEG, STILL_MM, STILL_DEG = 8.0, 0.5, 0.1
+MIN_TO_SOLVE = 4
+EXPLAIN_EVERY = 50  # of the pictures without the target
+
+# Residuals of a hand-eye calibration: medians to warn about, and those of a sample that does not fit the others (less
+# is the detector's noise, beside an arm that has nearly none).
+LARGE_RESIDUAL_DEG, LARGE_RESIDUAL_MM = 3.0, 20.0
+NOTABLE_DEG, NOTABLE_MM = 0.5, 1.0
+# A sample's weight is lower if its six whitened residuals have a sum of squares above 32. This happens to one good
+# sample in sixty thousand.
+OUTLIER_WEIGHT = 0.35
+# Larger values mean wrong input: inverted poses, millimeters, or poses of another body.
+WORST_DEG, WORST_MM, FARTHEST_M = 15.0, 100.0, 5.0
+
+# The scale of distances to the target is told where it differs from 1 by more than this and by so many standard
+# deviations; a factor beyond the bound is no size of a board. With fewer poses there is nothing left to judge it by.
+NOTABLE_SCALE, SURE, LARGEST_SCALE, POSES_FOR_SCALE = 0.005, 5.0, 2.0, 5
+MILLIMETERS = (800.0, 1250.0)  # scale where one of the two is in millimeters
+
+# Targets. With fewer corners of a board its orientation is too uncertain; fewer markers may be read into noise.
+MIN_CORNERS, MIN_MARKERS = 6, 3
+# Ratio of reprojection errors above which the second of the two poses of a flat target is ruled out.
+AMBIGUOUS = 1.5
+EXPLAINED = 4  # pictures without the target that are examined for the reason, which takes a second
+
+# Pictures of a lens calibration that show the target.
+MIN_VIEWS = 4
+# With all views parallel to the sensor, focal length and distance cannot be told apart.
+MIN_TILT_DEG = 10.0
+# Reprojection error of a picture that is left out, in medians of all.
+OUTLIER_ERROR = 4.0
+# Focal lengths over the image's longer side: 136 and 7 degrees of view. The solver diverges beyond them if the images
+# do not determine a lens.
+SHORTEST_FOCAL, LONGEST_FOCAL = 0.2, 8.0
