@@ -12,7 +12,7 @@ from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, calibrate
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, robust_start, solve
 from camera_node.robot.calibration.hand_eye.refinement import flange_residuals, refine
-from camera_node.robot.calibration.hand_eye.samples import Samples, angle_deg, distance_mm
+from camera_node.robot.calibration.hand_eye.samples import Samples, angle_deg, distance_mm, diversity
 from camera_node.robot.calibration.inputs import read_visp_folder
 from camera_node.robot.calibration.pose_pairs import read_pairs
 from camera_node.robot.calibration.targets import parse_target
@@ -58,6 +58,23 @@ def test_errors_that_cost_millimeters_decide_about_a_start_rather_than_tenths_of
     targets[:7, :3, 3] += rng.normal(0.0, 0.008, (7, 3))
     x, y = robust_start(Samples(exact.flange, targets))
     assert distance_mm(x, X) < 2.5 and distance_mm(y, Y) < 2.5
+
+
+@pytest.mark.parametrize(
+    ("turns_deg", "reason"),
+    [
+        ([[0, 0, 0], [5.1, 0, 0], [0, 5.1, 0]], None),
+        ([[0, 0, 0], [4.9, 0, 0], [0, 4.9, 0]], "hardly turned"),
+        ([[0, 0, 0], [30, 0, 0], [-30 * np.cos(0.350), 30 * np.sin(0.350), 0]], None),  # axes spread by 8.2 degrees
+        ([[0, 0, 0], [30, 0, 0], [-30 * np.cos(0.335), 30 * np.sin(0.335), 0]], "parallel axes"),  # by 7.8
+        ([[0, 0, 0], [169, 0, 0], [0, 169, 0]], None),
+        ([[0, 0, 0], [171, 0, 0], [0, 171, 0]], "near 180"),
+    ],
+)
+def test_how_much_the_flange_must_turn(turns_deg, reason):
+    flanges = np.array([se3(so3_exp(np.radians(turn)), np.zeros(3)) for turn in turns_deg])
+    found = diversity(Samples(flanges, flanges)).reason
+    assert found is None if reason is None else reason in str(found)
 
 
 def test_the_flanges_residual_is_the_motion_from_the_reported_to_the_predicted_pose():
