@@ -28,7 +28,7 @@ from channel_emu.model.settings import ChannelConfig
 from freshfield.files import write_json
 from freshfield.frame import FrameRejected, counted_ids, parse, valid_id
 from freshfield.ledger import Ledger
-from freshfield.limits import MAX_STREAMS_PER_CAMERA
+from freshfield.limits import MAX_OTHER_CALLS, MAX_STREAMS_PER_CAMERA
 from freshfield.streams import OpenStreams, ServedCall, SessionStreams, serve_health
 from freshfield.transport import CLIENT_OPTIONS
 from freshfield.v1 import clock_pb2, frames_pb2
@@ -66,10 +66,11 @@ class FrameProxy(Proxy):
         out: Path,
         priority: str = "normal",
     ) -> None:
-        super().__init__(config, seed, options)
+        most_streams = MAX_STREAMS_PER_CAMERA * len(cameras)
+        super().__init__(config, seed, options, most_streams + MAX_OTHER_CALLS)
         self.rejected: dict[str, int] = {}
         """Frames refused here, by reason."""
-        self.streams = OpenStreams(MAX_STREAMS_PER_CAMERA * len(cameras))
+        self.streams = OpenStreams(most_streams)
         self._sessions = SessionStreams(cameras)
         self._out = out
         self._status_lock, self._status_is_final = threading.Lock(), False

@@ -109,8 +109,15 @@ MAX_CONCURRENT_STREAMS = 1024
 """Streams of a gRPC connection: one for each camera of the largest scenario, and some further calls."""
 
 MAX_CALLS = 3 * MAX_CAMERAS
-"""Open calls of a server, on all its connections: three for each camera of the largest scenario. A new one ends one
-that carried nothing. At 30 kB a call, 90 MB."""
+"""Open calls of a server, on all its connections, unless it says how many it needs: three for each camera of the
+largest scenario. A new one ends one that carried nothing."""
+
+MAX_OTHER_CALLS = 100
+"""Open calls besides the streams of frames: clock exchanges, health, reflection."""
+
+MAX_PENDING_CALLS = 1000
+"""Calls that came and wait to be handled: all cameras of the largest scenario may connect at once. More are refused,
+from here on some of them, from 1.5 times as many on all."""
 
 FIRST_MESSAGE_TIMEOUT_S = 10.0
 """How long a call of a method that takes one message may last without it."""

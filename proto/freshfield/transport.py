@@ -23,10 +23,12 @@ import numpy as np
 from freshfield.access import Access, is_loopback
 from freshfield.limits import (
     GRPC_IDLE_S,
+    MAX_CALLS,
     MAX_CONCURRENT_STREAMS,
     MAX_GRPC_CONNECTIONS,
     MAX_MESSAGE_BYTES,
     MAX_PEER_TEXT_CHARS,
+    MAX_PENDING_CALLS,
     TLS_HANDSHAKE_TIMEOUT_S,
 )
 from freshfield.streams import Admission
@@ -60,7 +62,8 @@ SERVER_OPTIONS = [
     # Queueing is bounded by the streams' credits, not by this window.
     ("grpc.http2.lookahead_bytes", 1 << 20),
     ("grpc.http2.min_ping_interval_without_data_ms", _KEEPALIVE_MS // 2),
-    ("grpc.max_concurrent_streams", MAX_CONCURRENT_STREAMS),
+    ("grpc.server.max_pending_requests", MAX_PENDING_CALLS),
+    ("grpc.server.max_pending_requests_hard_limit", MAX_PENDING_CALLS * 3 // 2),
     ("grpc.server_handshake_timeout_ms", round(TLS_HANDSHAKE_TIMEOUT_S * 1e3)),
     ("grpc.max_allowed_incoming_connections", MAX_GRPC_CONNECTIONS),
     ("grpc.max_connection_idle_ms", round(GRPC_IDLE_S * 1e3)),
@@ -198,10 +201,14 @@ class Transport:
             return grpc.insecure_channel(target, options=CLIENT_OPTIONS)
         return grpc.secure_channel(target, credentials, options=CLIENT_OPTIONS)
 
-    def aio_server(self) -> grpc.aio.Server:
+    def aio_server(self, most_calls: int = MAX_CALLS) -> grpc.aio.Server:
         """Server without a port yet (see ``bind``); needs a running event loop. Raises TransportError as
-        ``access``."""
-        return grpc.aio.server(options=SERVER_OPTIONS, interceptors=[Admission(self.access)])
+        ``access``.
+
+        most_calls: open at once, on one connection or on all.
+        """
+        streams = ("grpc.max_concurrent_streams", min(most_calls, MAX_CONCURRENT_STREAMS))
+        return grpc.aio.server(options=[*SERVER_OPTIONS, streams], interceptors=[Admission(self.access, most_calls)])
 
     def bind(self, server: grpc.aio.Server, address: str) -> int:
         """Listen on ``host:port`` (port 0: any free one) and return the port.

@@ -11,6 +11,7 @@ from concurrent import futures
 import grpc
 import pytest
 
+from channel_emu.live import proxy
 from channel_emu.model import trace
 from channel_emu.testing import EmulatedLink, channel
 
@@ -238,6 +239,16 @@ def test_one_link_may_carry_all_methods(channel, greeter, client) -> None:
     assert _code(lambda: stub.unary_unary(FAIL)(b"", timeout=20)) == "UNAVAILABLE"  # the link is busy
     assert slow.result().startswith(b"hello")
     assert set(link.report().by_method) == {"up"}
+
+
+def test_methods_that_a_client_invents_share_one_link(channel, greeter, client, monkeypatch) -> None:
+    monkeypatch.setattr(proxy, "_MOST_METHODS", 2)
+    link = channel("ideal", to=greeter.address)
+    for n in range(5):
+        assert _code(lambda: client(link).unary_unary(f"/a.B/C{n}")(b"", timeout=5)) == "UNIMPLEMENTED"  # noqa: B023
+    by_method = link.settle().by_method
+    assert set(by_method) == {"up /a.B/C0", "up /a.B/C1", "up (other methods)"}
+    assert by_method["up (other methods)"].offered == 3
 
 
 pytest_plugins = ["pytester"]

@@ -140,7 +140,7 @@ def test_a_wrong_token_is_not_made_good_by_a_certificate() -> None:
         async def read(self) -> bytes:
             return b""
 
-        async def abort(self, code: grpc.StatusCode, _: str) -> None:
+        def set_code(self, code: grpc.StatusCode) -> None:
             raise PermissionError(code.name)
 
     class Details:
@@ -156,7 +156,7 @@ def test_a_wrong_token_is_not_made_good_by_a_certificate() -> None:
         async def who(request: object, context: object) -> str:
             return caller.get().role
 
-        admission = Admission(Access({"viewer": "v"}, certificates=True))
+        admission = Admission(Access({"viewer": "v"}, certificates=True), 9)
         handler = await admission.intercept_service(continuation, Details(*metadata))
         return await handler.stream_unary(None, Context())
 
