@@ -34,6 +34,8 @@ MAX_FILE_BYTES = 512 * 2**20
 # Largest tensor per image, elements: six times the largest of YOLO11x at 640 pixels.
 MAX_ELEMENTS = 2**26
 MAX_SIDE = 2048
+# Three times the largest of the family, quantized. ONNX Runtime takes 1 s to load a chain of so many, 12 s of 30,000.
+MAX_NODES = 10_000
 # The training size of these detectors, unless the file states another.
 USUAL_SIDE = 640
 # Written by edge-server train-detector of tag v0.1-all: mean (C,) and axes (C, K) of the pooled features.
@@ -173,6 +175,11 @@ def parse_model(data: bytes, path: Path) -> onnx.ModelProto:
         raise EmbeddingError(f"{path}: not an ONNX file, or cut short; export the detector again") from None
     if not model.graph.node or not model.opset_import:
         raise EmbeddingError(f"{path}: not an ONNX model; export the detector with format=onnx")
+    if len(model.graph.node) > MAX_NODES:
+        raise EmbeddingError(
+            f"{path}: has {len(model.graph.node)} nodes, more than any YOLO model ({MAX_NODES}); export the detector "
+            "again"
+        )
     loops = sorted({n.op_type for n in model.graph.node for a in n.attribute if a.HasField("g") or a.graphs})
     if loops or model.functions:
         raise EmbeddingError(

@@ -37,7 +37,7 @@ class ForegroundError(ValueError):
 class ForegroundConfig(Settings, frozen=True):
     """The section ``edge.foreground`` of a scenario. Of several detections the surest counts."""
 
-    detector: Annotated[str, about("YOLO segmentation ONNX (v8, v11), relative to the scenario, or tile: shipped")]
+    detector: Annotated[str, about("YOLO segmentation ONNX (any -seg), relative to the scenario, or tile: shipped")]
     kinds: Annotated[list[str], about("class names to detect; none: any")] = field(default_factory=list)
     confidence: Annotated[float, within(0.0, 1.0, "minimum score")] = 0.25
     margin: Annotated[float, within(0.0, 1.0, "added to each side of a detected box, as a share of it")] = 0.05

@@ -16,6 +16,7 @@ onnx = pytest.importorskip("onnx", reason="the extra embed is not installed")
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder  # noqa: E402
+from edge_server.embed.backbone import MAX_NODES  # noqa: E402
 from tests.edge_server.embed.graphs import detector  # noqa: E402
 
 
@@ -91,6 +92,10 @@ def joined_with_themselves(path: Path) -> None:
     detector(path, extra=nodes)
 
 
+def long_chain(path: Path) -> None:
+    detector(path, extra=tuple(node("Relu", [f"t{k}" if k else "end"], f"t{k + 1}") for k in range(MAX_NODES)))
+
+
 def padding(path: Path) -> None:
     kernel = numpy_helper.from_array(np.ones((1, 6, 1, 1), np.float32), "k")
     detector(path, extra=(node("Conv", ["end", "k"], "big", pads=[100_000] * 4),), weights=(kernel,))
@@ -109,6 +114,7 @@ BOMBS = {
         for kind in ("Expand", "Tile")
     },
     "concat": (joined_with_themselves, "larger than any backbone's"),
+    "chain": (long_chain, "10007 nodes, more than any YOLO model"),
     "padding": (padding, "larger than any backbone's"),
     "claims": (partial(empty_claims, dims=(2**20, 2**20)), "larger than any backbone's"),
     "small claims": (partial(empty_claims, dims=(1, 6, 8, 8)), "cannot load it"),

@@ -12,10 +12,11 @@ import pytest
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.foreground import ForegroundConfig, ForegroundError, read_foreground
-from edge_server.foreground.detector import Detection, Detector, decode
+from edge_server.foreground.detector import Detection, Detector, _end_to_end, _kinds, decode
 from edge_server.foreground.foreground import Foreground, clipped, make_foreground
 from edge_server.settings import read_config
 from freshfield.scenario import ScenarioError, load, parse
+from tests.conftest import case_dir
 from tests.edge_server.foreground.pictures import disc, iou, save_endless_loop, save_memory_bomb, save_orange_detector
 
 for module in ("onnx", "onnxruntime"):
@@ -150,6 +151,74 @@ def test_a_head_is_decoded_to_corners_best_score_first():
     assert [row[6] for row in decode(twice, 0.25, "test", 1)] == [9.0, 8.0]
     with pytest.raises(ForegroundError, match=r"test: gives \(1, 4, 64\), not the boxes and scores"):
         decode(np.zeros((1, 4, 64)), 0.25, "test", 1)
+
+
+def columns(*rows, cells=64):
+    """A head's output with these rows first: (1, cells, columns)."""
+    table = np.zeros((1, cells, len(rows[0])))
+    table[0, : len(rows)] = rows
+    return table
+
+
+TILE = (8.0, 17.0, 12.0, 23.0)  # corners of a box around (10, 20)
+
+
+@pytest.mark.parametrize(
+    ("output", "kinds", "end_to_end"),
+    [
+        (head((10, 20, 4, 6, 0.1, 0.9, 5.0)), 2, None),
+        (head((10, 20, 4, 6, 0.1, 0.9, 5.0)), 0, False),
+        (columns((10, 20, 4, 6, 0.0, 0.1, 0.9, 5.0)).transpose(0, 2, 1), 3, False),
+        (columns((10, 20, 4, 6, 1.0, 0.1, 0.9, 5.0)).transpose(0, 2, 1), 2, None),  # v5: objectness first
+        (columns((*TILE, 0.9, 1.0, 5.0), cells=300), 80, None),
+        (columns((*TILE, 0.9, 1.0, 5.0), cells=300), 2, True),
+        (columns((*TILE, 0.9, 1.0, 5.0), cells=5), 0, None),
+    ],
+)
+def test_every_head_of_a_segmentation_model_is_told_and_decoded(output, kinds, end_to_end):
+    (row,) = decode(output, 0.5, "test", 1, kinds, end_to_end)
+    kind = 2.0 if output.shape == (1, 8, 64) and kinds == 3 else 1.0
+    assert row == pytest.approx((*TILE, 0.9, kind, 5.0))
+    # What suppresses by itself is not suppressed again.
+    twice = columns((*TILE, 0.9, 1.0, 5.0), (*TILE, 0.8, 1.0, 6.0), cells=300)
+    assert [row[6] for row in decode(twice, 0.5, "test", 1, 80)] == [5.0, 6.0]
+
+
+@pytest.mark.parametrize(
+    ("output", "kinds", "message"),
+    [
+        (head((10, 20, 4, 6, 79.0, 0.0, 5.0)), 2, "scores lie in 0 to 79, not in 0 to 1"),
+        (head((10, 20, 4, 6, -3.0, 0.0, 5.0)), 2, "scores lie in -3 to 0"),
+        (head((0.5, 0.5, 0.1, 0.1, 0.9, 0.0, 5.0)), 2, "boxes are not in pixels"),
+        (head((10, 20, 4, 6, 0.9, 0.0, 5.0)), 5, "fits no head of 5 classes"),
+        (columns((*TILE, 0.9, 1.5, 5.0), cells=300), 80, "fits no head of 80 classes"),
+        (np.zeros((1, 300, 6)), 80, "not the boxes and scores of a YOLO segmentation head"),
+    ],
+)
+def test_a_head_that_is_not_understood_is_refused_with_the_command_that_exports_one(output, kinds, message):
+    with pytest.raises(ForegroundError, match=rf"test: .*{message}.*yolo export model=yolo11n-seg.pt format=onnx"):
+        decode(output, 0.5, "test", 2 if output.shape[2] == 6 else 1, kinds)
+
+
+def test_names_are_a_list_or_a_mapping():
+    assert (
+        _kinds({"names": "['apple', 'pear']"})
+        == _kinds({"names": "{0: 'apple', 1: 'pear'}"})
+        == {0: "apple", 1: "pear"}
+    )
+    assert _kinds({}) == _kinds({"names": "apple"}) == _kinds({"names": "{'a': 3}"}) == {}
+    assert [
+        _end_to_end(meta) for meta in ({}, {"end2end": "True"}, {"args": "{'nms': True}"}, {"args": "{'nms': False}"})
+    ] == [None, True, True, False]
+
+
+def test_reported_models_without_masks_are_refused_by_what_they_are():
+    tasks = {"obb": "obb", "pose": "pose", "v5": "detect", "v8": "detect", "rtdetr": "detect", "e2e_nms": "detect"}
+    for name, task in tasks.items():
+        with pytest.raises(
+            ForegroundError, match=rf"{name}.onnx: gives no masks: it is a model of the task {task}; name"
+        ):
+            Detector(str(case_dir("02-yolo-end-to-end-export") / f"{name}.onnx"))
 
 
 @pytest.mark.stability
