@@ -116,12 +116,12 @@ def seed_sequence(seed: int, purpose: str, camera: str = "") -> np.random.SeedSe
 def load(path: str | Path, seed: int | None = None) -> Scenario:
     """Read and check a scenario file.
 
-    path: the file, or the name of a shipped scenario, such as ``room``.
+    path: the file, or the name of a shipped scenario, such as ``room``, which a folder of that name does not hide.
     seed: replaces the file's seed.
     Raises ScenarioError.
     """
     file = Path(path)
-    if not file.exists() and file.suffix == "" and (SCENARIO_FOLDER / f"{file}.yaml").exists():
+    if not file.is_file() and file.suffix == "" and (SCENARIO_FOLDER / f"{file}.yaml").exists():
         file = SCENARIO_FOLDER / f"{file}.yaml"
     try:
         data = read_yaml(read_text(file))

@@ -53,6 +53,12 @@ def test_errors_are_one_line_with_the_file(tmp_path, text, message):
     assert str(error.value).startswith(str(file)) and "\n" not in str(error.value)
 
 
+def test_a_folder_does_not_hide_a_shipped_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "room").mkdir()
+    assert len(load("room").cameras) == 13
+
+
 def test_a_missing_file_lists_what_is_shipped():
     with pytest.raises(ScenarioError, match=r"shipped scenarios: .*room"):
         load("no-such-scenario")

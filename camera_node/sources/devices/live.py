@@ -1,7 +1,7 @@
 """Real cameras as sources: a thread takes the frames as they come, and ``read`` returns the newest one.
 
 Frames are stamped by the camera's driver, not when they are read, and each frame is read once. A camera that
-fails is reopened after growing pauses; meanwhile its captures are counted as failed.
+fails, or falls silent, is reopened after growing pauses; meanwhile its captures are counted as failed.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import atexit
 import importlib
 import logging
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from functools import partial
@@ -59,7 +60,7 @@ class LiveSource(Source):
     opener: opens the camera, or raises; called again after a failure.
     poses: of the camera.
     calibrated: intrinsics that replace the device's own, scaled to the images' size; None: the device's own.
-    first_frame_s: how long the first frame may take.
+    first_frame_s: how long the first frame may take, and how long an open camera may be silent before it is reopened.
     """
 
     def __init__(
@@ -73,6 +74,7 @@ class LiveSource(Source):
     ) -> None:
         self.camera, self.fps = camera, fps
         self._open, self._poses = opener, poses
+        self._patience_s = first_frame_s
         self._wait_s = min(0.5, 0.5 / float(fps))
         self._condition = threading.Condition()
         self._newest: tuple[int, Image] | None = None
@@ -130,13 +132,15 @@ class LiveSource(Source):
 
     def _main(self, feed: Feed) -> None:
         current: Feed | None = feed
-        failures = 0
+        failures, heard_s = 0, time.monotonic()
         while not self._stop.is_set():
             try:
                 if current is None:
-                    current = self._open()
+                    current, heard_s = self._open(), time.monotonic()
                 if self._take(current):
-                    failures = 0
+                    failures, heard_s = 0, time.monotonic()
+                elif time.monotonic() - heard_s >= self._patience_s:
+                    raise CameraError(f"{self.camera}: no frame for {self._patience_s:g} s: opening the camera again")
             except Exception as error:  # drivers raise anything, and this thread is the camera's only one
                 trouble = as_camera_error(self.camera, error)
                 if not failures:
