@@ -14,9 +14,9 @@ from channel_emu.model.link import EventKind
 from freshfield.streams import ServedCall
 
 # Maximum number of messages read ahead of the one being written; then the sender waits. Behind a message that
-# is still in the link any number are read, because the link must decide about each at its arrival. Dropped
-# ones are kept without their bytes.
-_MOST_READY = 64
+# is still in the link more are read, because the link must decide about each at its arrival. Dropped ones are
+# kept without their bytes.
+_MOST_READY, _MOST_BEHIND = 64, 10_000
 
 Read = Callable[[], Awaitable[Any]]
 Write = Callable[[bytes], Awaitable[None]]
@@ -115,7 +115,8 @@ class CallFlow:
                     self.settle(message, EventKind.DROPPED_BUSY)
                 else:
                     self._link.offer(message, self._now_ns())
-                if len(self._messages) >= _MOST_READY and self._messages[0].delivered is not None:
+                inside = self._messages and self._messages[0].delivered is None
+                if len(self._messages) >= (_MOST_BEHIND if inside else _MOST_READY):
                     self._not_full.clear()
                     await self._not_full.wait()
             self._ended = True

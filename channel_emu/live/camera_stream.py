@@ -27,6 +27,8 @@ PUSH = "/freshfield.v1.FrameStreamService/Push"
 # Maximum number of unanswered frames. More than one, so that waiting for an answer does not delay the next
 # frame; few, so that a stalled edge is noticed at once.
 CREDITS = 8
+# Answers to no frame that was sent, before the stream ends: a hostile edge would keep the emulator busy.
+_MOST_STRANGE = 100
 FIRST_BACKOFF_S = 0.1
 MAX_BACKOFF_S = 1.0
 
@@ -145,7 +147,7 @@ class CameraStream:
                 # The stream itself may still be open, and then asking for its status would wait for ever.
                 error = task.exception()
                 if isinstance(error, DecodeError):
-                    self._log_trouble("the edge sent bytes that are no answer")
+                    self._log_trouble("the edge sent what is no answer to a frame")
                     return False
                 if error is not None and not isinstance(error, STREAM_ENDED):
                     raise error
@@ -171,7 +173,7 @@ class CameraStream:
                 await call.write(frame.raw)
 
     async def _read(self, call: grpc.aio.StreamStreamCall) -> bool:
-        answered = False
+        answered, strange = False, 0
         try:
             while True:
                 data = await call.read()
@@ -179,7 +181,10 @@ class CameraStream:
                     return answered
                 response = pb.PushResponse.FromString(data)
                 if not any(frame.sequence == response.sequence for frame in self._unanswered):
-                    continue  # an answer to no frame that was sent
+                    strange += 1
+                    if strange > _MOST_STRANGE:
+                        raise DecodeError
+                    continue
                 while self._unanswered.popleft().sequence != response.sequence:
                     pass  # answers come in order, so earlier frames were answered too
                 if not answered:
@@ -212,8 +217,11 @@ class CameraStream:
 
     def _hand_on(self, frame: Message) -> None:
         now_ns = self._clock.now_ns()
-        self.forwarded += 1
         self._record(frame, "forwarded", now_ns)
+        if frame.handed_on:  # the second copy is no further frame
+            return
+        frame.handed_on = True
+        self.forwarded += 1
         if frame.transit is not None:  # not a held-out frame
             self.link.hand_on(frame, now_ns - self._origin_ns)
 

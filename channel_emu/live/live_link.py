@@ -41,6 +41,7 @@ class Message:
 
     raw: its bytes. session, sequence: of the frame; of another service, the call and the index in the call.
     delivered: None until the link has decided.
+    handed_on: whether it, or its first copy, was handed to gRPC.
     traced: whether its trace record was written.
     """
 
@@ -51,6 +52,7 @@ class Message:
     transit: Transit | None = None
     delivered: bool | None = None
     duplicated: bool = False
+    handed_on: bool = False
     traced: bool = False
 
 

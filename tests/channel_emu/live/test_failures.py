@@ -16,6 +16,7 @@ from channel_emu.live.proxy import EmulatorFailed, Proxy
 from channel_emu.model.chain import ChainError
 from freshfield.ledger import read_all
 from freshfield.transport import Transport
+from freshfield.v1 import frames_pb2 as pb
 from tests.channel_emu.live.emulator import make, offer, run
 from tests.integration.peer import Peer
 from tests.support import free_port
@@ -84,10 +85,17 @@ def test_a_part_that_breaks_ends_the_emulator(tmp_path: Path, monkeypatch: pytes
     run(live(lambda _, flow: setattr(flow.link, "advance", raising)))
 
 
-def test_an_answer_that_is_none_ends_the_stream_and_not_the_emulator(tmp_path: Path) -> None:
+STRANGE = pb.PushResponse(sequence=77).SerializeToString()
+
+
+@pytest.mark.parametrize("answers", [[b"\xff\xff\xff"], [STRANGE] * 1000], ids=["no answer", "to no frame"])
+def test_answers_that_are_none_end_the_stream_and_not_the_emulator(tmp_path: Path, answers: list[bytes]) -> None:
+    """Nor do they keep it busy for as long as they come."""
+
     async def nonsense(request: bytes, context: grpc.aio.ServicerContext) -> None:
         await context.read()
-        await context.write(b"\xff\xff\xff")
+        for answer in answers:
+            await context.write(answer)
         await asyncio.sleep(60)
 
     async def live() -> None:

@@ -101,6 +101,8 @@ def test_the_account_closes_with_every_fault(tmp_path: Path) -> None:
     assert set(account.rejected) == {"crc_mismatch", "replayed_sequence"}
     status = json.loads((tmp_path / "channel.json").read_text())
     assert status["edge_rejected"] == dict(account.rejected)
+    # The second copy of a frame is no further frame.
+    assert status["delay_error_ms"]["count"] == status["counts"]["forwarded"] == status["counts"]["delivered"]
 
 
 def test_a_reset_breaks_the_stream_and_the_camera_comes_back(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from channel_emu.live import priority, timer
+from channel_emu.live import call_flow, priority, timer
 from channel_emu.live.call_flow import CallFlow
 from channel_emu.live.frame_proxy import damage_payload
 from channel_emu.live.histogram import Histogram
@@ -110,5 +110,34 @@ def test_dropped_messages_hold_no_bytes() -> None:
         flow.settle(dropped, EventKind.LOST)
         flow.settle(kept, EventKind.DELIVERED)
         assert dropped.raw == b"" and kept.raw == b"y"
+
+    asyncio.run(live())
+
+
+def test_behind_a_message_in_the_link_no_more_are_read_than_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(call_flow, "_MOST_BEHIND", 100)
+
+    async def live() -> None:
+        link, read, written = mock.Mock(calls=set()), [], []
+        flow = CallFlow(0, ServedCall(mock.Mock()), link, lambda: 0)
+
+        async def endless() -> bytes:
+            read.append(len(read))
+            await asyncio.sleep(0)
+            return b"x"
+
+        async def write(raw: bytes) -> None:
+            written.append(raw)
+
+        carrying = asyncio.create_task(flow.carry(endless, write))
+        for _ in range(1000):
+            await asyncio.sleep(0)
+        assert len(read) == 100 and not written
+        for message in list(flow._messages):
+            flow.settle(message, EventKind.DELIVERED)
+        for _ in range(1000):
+            await asyncio.sleep(0)
+        assert len(written) >= 100 and len(read) > 100  # it goes on
+        carrying.cancel()
 
     asyncio.run(live())
