@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+from unittest.mock import AsyncMock
 
 import grpc
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -97,3 +99,19 @@ def test_the_offset_follows_a_peer_that_comes_back_with_another_clock(monkeypatc
 
     before, after = asyncio.run(offsets())
     assert abs(before) < 1.0 and abs(after - 3600.0) < 1.0
+
+
+def test_exchanges_follow_each_other_quickly_at_first(monkeypatch):
+    pauses, answers = [], iter([True] * 5 + [False, True])
+
+    async def exchanged(*_) -> bool:
+        return next(answers)
+
+    async def pause(seconds: float) -> None:
+        pauses.append(seconds)
+
+    monkeypatch.setattr(clock_offset, "exchange", exchanged)
+    monkeypatch.setattr(clock_offset.asyncio, "sleep", pause)
+    with pytest.raises(RuntimeError):  # the answers are over
+        asyncio.run(ClockSync(AsyncMock(), (), WallClock()).run())
+    assert pauses == [0.05, 0.05, 0.05, 1.0, 1.0, 1.0, 0.05]

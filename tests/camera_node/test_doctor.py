@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 from pathlib import Path
@@ -13,9 +14,11 @@ from camera_node import doctor
 from camera_node.cli import main
 from freshfield.clock import WallClock
 from freshfield.scenario import load
+from freshfield.transport import Transport
 from tests.camera_node.robot.arm.simulated import simulated_arm
 from tests.camera_node.sources.devices.mjpeg import NetworkCamera
 from tests.camera_node.sources.devices.test_live import CALIBRATION
+from tests.integration.peer import Peer
 
 
 def examined(capsys, *arguments):
@@ -131,6 +134,18 @@ def test_a_camera_at_a_fraction_of_the_rate_that_was_asked_for_is_wrong(capsys, 
     assert 2.0 < rate_hz < 16.0
     if not ok:
         assert f"of the {asked} asked: is it too dark" in said and "USB 2" in said
+
+
+def test_a_peer_tells_its_time():
+    async def offset_ms() -> tuple[float, float]:
+        peer = await Peer(clock=WallClock(offset_ns=3_000_000_000)).start()
+        try:
+            return await doctor._exchange(peer.address, Transport())
+        finally:
+            await peer.stop()
+
+    found, bound = asyncio.run(offset_ms())
+    assert abs(found - 3000.0) <= bound + 1.0
 
 
 def test_a_missing_package_says_what_to_install(monkeypatch):

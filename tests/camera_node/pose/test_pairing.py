@@ -120,8 +120,8 @@ def test_between_two_poses_however_far_apart(angle):
 
 
 @pytest.mark.stability
-def test_unit_quaternions_after_a_hundred_thousand_compositions():
-    steps = 100_000
+def test_unit_quaternions_after_twenty_thousand_compositions():
+    steps = 20_000
     # All turns are about one axis: after a whole number of rounds the product is the identity.
     step = matrix_to_quaternion(so3_exp(np.array([2, -3, 6]) / 7 * 2 * np.pi * 17 / steps))
     q, furthest = np.array([1.0, 0.0, 0.0, 0.0]), 0.0
@@ -132,4 +132,4 @@ def test_unit_quaternions_after_a_hundred_thousand_compositions():
             q = quaternion_normalize(q)
     assert furthest < 1e-14
     # Rounding of the step's angle adds up in proportion to the number of steps, and in nothing else.
-    np.testing.assert_allclose(np.abs(q), [1.0, 0.0, 0.0, 0.0], atol=1e-10)
+    np.testing.assert_allclose(np.abs(q), [1.0, 0.0, 0.0, 0.0], atol=2e-11)

@@ -57,6 +57,11 @@ def test_tum_files_keep_nanoseconds_and_put_w_first(tmp_path):
     np.testing.assert_allclose(exact.matrix()[:3, :3], so3_exp([0, 0, np.pi / 3]), atol=1e-6)
 
 
+def test_a_trajectory_may_have_one_sample(tmp_path):
+    (tmp_path / "track.txt").write_text("2 1 2 3 0 0 0 1")
+    assert read_tum(tmp_path / "track.txt").at(2_050 * MS)[0].translation_m == (1.0, 2.0, 3.0)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

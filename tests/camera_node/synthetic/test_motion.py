@@ -45,6 +45,7 @@ def test_mean_speed_of_the_parts_is_the_one_asked_for(speed):
 @given(st.tuples(*[st.floats(-1, 1)] * 3), st.tuples(*[st.floats(-1, 1)] * 3), st.tuples(*[st.floats(-1, 1)] * 3))
 def test_two_bones_meet_the_joint(root, tip, pole):
     upper, lower = 0.6, 0.5
+    assert motion.two_bone_ik(root, root, upper, lower, (0.0, 0.0, 1.0)) == (root[0], root[1], root[2] + upper)
     joint = np.array(motion.two_bone_ik(root, tip, upper, lower, pole))
     assert np.isfinite(joint).all()
     distance = float(np.linalg.norm(np.subtract(tip, root)))

@@ -44,6 +44,7 @@ def test_a_lens_is_exact_from_exact_corners():
     p = calibrate_lens(views(0.0), (640, 480), {}).pinhole
     np.testing.assert_allclose([p.fx, p.fy, p.cx, p.cy], [520.0, 523.0, 331.0, 236.0], atol=0.02)
     np.testing.assert_allclose(p.distortion, TRUE.distortion, atol=2e-4)
+    assert len(calibrate_lens(views(0.0, count=4), (640, 480), {}).views) == 4
 
 
 def test_a_lens_is_found_within_its_own_deviations():
@@ -66,7 +67,7 @@ def test_an_image_that_does_not_fit_is_left_out_and_named():
 @pytest.mark.parametrize(
     ("seen", "message"),
     [
-        (views(0.1, count=2), "too few pictures show the target: 2 of 3"),
+        (views(0.1, count=3), "too few pictures show the target: 3 of 4"),
         (views(0.0, 0.0), "do not determine"),
         (views(0.1, 0.0), "do not determine"),
         (views(0.0, 2.0), "held the same way"),

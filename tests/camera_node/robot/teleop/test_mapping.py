@@ -86,6 +86,7 @@ def test_silence_lets_go_and_asks_for_a_new_press_on_any_clock():
     ],
 )
 def test_what_is_no_pose_and_what_is_old_is_counted_and_changes_nothing(bad):
+    assert StylusSample(2**63 - 1, (0.0, 0.0, -10.0), (1.9, 0.0, 0.0, 0.0), True).is_valid()
     mapping = pressed()
     mapping.add_sample(sample(2, (0.3, 0.1, 0.2)), FLANGE)
     before = mapping.target.copy()

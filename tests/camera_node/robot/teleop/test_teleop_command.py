@@ -15,9 +15,10 @@ from camera_node.cli import main
 from camera_node.robot.arm.joint_states import ArmError
 from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.flange_camera import TruthClient
-from camera_node.robot.teleop import sinks
+from camera_node.robot.teleop import sinks, teleop_command
+from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.stylus import encode
-from camera_node.robot.teleop.teleoperator import Command
+from camera_node.robot.teleop.teleoperator import Command, Teleoperator
 from freshfield.clock import WallClock
 from tests.camera_node.robot.arm.simulated import simulated_arm, start_cli, wait_until_moving, write_cell
 from tests.camera_node.robot.teleop.checks import HOME, sample
@@ -122,6 +123,24 @@ def test_an_arm_that_has_been_stopped_is_sent_nothing_more(monkeypatch):
     with pytest.raises(ArmError, match="protective stop: stopped"):
         sink.send(0.01, still)
     assert control.servoJ.call_count == 2
+
+
+def test_the_operator_ends_it_and_the_arm_comes_to_rest(capsys):
+    """The stylus moves, and is put down on the way."""
+    stylus, sink = MagicMock(ended=False), MagicMock()
+    sent: list[Command] = []
+    sink.send.side_effect = lambda t_s, command: sent.append(command)
+
+    def poll(now_ns):
+        stylus.ended = len(sent) == 60
+        return [sample(now_ns, (0.001 * len(sent), 0.0, 0.0), len(sent) > 0)]
+
+    stylus.poll.side_effect = poll
+    operator = Teleoperator(UR3E, TeleopConfig(), HOME)
+    assert teleop_command._run_loop(operator, stylus, sink, None) == 0
+    assert np.abs(sent[60].speeds).max() > 0.0 and not sent[-1].speeds.any() and 61 < len(sent) < 200
+    sink.close.assert_called_once()
+    assert "clutch pressed 1 times" in capsys.readouterr().out
 
 
 def test_an_arm_that_is_not_there_and_wrong_settings_are_one_line(tmp_path, capsys, host):
