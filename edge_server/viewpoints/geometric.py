@@ -1,4 +1,4 @@
-"""Selectors that look at geometry only: random, uniform spacing, farthest point, coverage."""
+"""Selectors that look at geometry only: random and coverage."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from edge_server.viewpoints.registry import CaptureState
 
 Array = NDArray[np.float64]
 
-_LLOYD_ROUNDS = 20
-_STAND_IN = 1e-2  # factor on the value of a candidate that replaces a refused one
 _SAMPLES_A_SIDE = 8  # points along each side of a face of the object's box
 # The likeness of two views this far apart is exp(-1), for small angles.
 _ALIKE_RAD = 0.5
@@ -28,56 +26,6 @@ class RandomOrder:
 
     def values(self, state: CaptureState) -> Array:
         return state.rng.random(len(state.candidates))
-
-
-class FarthestPoint:
-    """The angle, at the target, to the nearest earlier view."""
-
-    name = "farthest"
-
-    def values(self, state: CaptureState) -> Array:
-        directions = state.candidates.directions
-        if not state.order:
-            return np.zeros(len(directions))
-        return np.arccos(np.clip(directions @ directions[state.order].T, -1.0, 1.0)).min(axis=1)
-
-
-class UniformSpacing:
-    """Members of one evenly spaced set of ``views_wanted`` candidates have value 1. Other candidates replace
-    refused members: their value is small, and larger the nearer they are to an open member."""
-
-    name = "uniform"
-
-    def values(self, state: CaptureState) -> Array:
-        directions = state.candidates.directions
-        usable = np.flatnonzero(state.open)
-        usable = np.union1d(usable, state.order).astype(np.int64)
-        members = _spread(directions, usable, state.order[:1], max(state.views_wanted, 1))
-        left = np.setdiff1d(members, state.order)
-        if not len(left):
-            return FarthestPoint().values(state)
-        values = _STAND_IN * (directions @ directions[left].T).max(axis=1)
-        values[left] = 1.0
-        return values
-
-
-def _spread(directions: Array, usable: NDArray[np.int64], fixed: list[int], count: int) -> NDArray[np.int64]:
-    """``count`` of the ``usable`` candidates, evenly spaced, with those of ``fixed`` among them: farthest
-    points first, then moved to the middles of their shares (Lloyd)."""
-    chosen = list(fixed) or [int(usable[0])]
-    while len(chosen) < min(count, len(usable)):
-        nearest = (directions[usable] @ directions[chosen].T).max(axis=1)
-        chosen.append(int(usable[np.argmin(np.round(nearest, 9))]))
-    for _ in range(_LLOYD_ROUNDS):
-        share = np.argmax(directions[usable] @ directions[chosen].T, axis=1)
-        moved = list(chosen)
-        for k in range(len(fixed), len(chosen)):
-            middle = directions[usable[share == k]].sum(axis=0)
-            moved[k] = int(usable[np.argmax(np.round(directions[usable] @ middle, 9))])
-        if moved == chosen or len(set(moved)) < len(moved):
-            break
-        chosen = moved
-    return np.array(sorted(chosen), np.int64)
 
 
 class Coverage:

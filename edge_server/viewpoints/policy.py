@@ -174,17 +174,8 @@ def train_policy(
     rng = np.random.default_rng(seed)
     steps = StepFeatures(candidates)
     layout = layout_of(steps, embeddings, config.views, rng)
-    spec = Spec(
-        "select",
-        layout,
-        hidden=config.hidden,
-        learning_rate=config.learning_rate,
-        clip=config.clip,
-        passes=config.passes,
-        minibatch=config.minibatch,
-        entropy=config.entropy,
-        target_kl=_ANY_KL,
-    )
+    shared = ("hidden", "learning_rate", "clip", "passes", "minibatch", "entropy")
+    spec = Spec("select", layout, target_kl=_ANY_KL, **{name: getattr(config, name) for name in shared})
     rows = Rows(candidates, embeddings, layout)
     usual = np.concatenate([reward(steps.actions([k]))[usable] for k in usable[:: max(len(usable) // 8, 1)]])
     # Rounding makes steps of equal reward differ by 1e-16: as a unit, it would blow the rewards up.

@@ -16,8 +16,6 @@ from edge_server.viewpoints.candidates import Candidates, ViewpointError
 # name -> (module, class, one line of help)
 SELECTORS: dict[str, tuple[str, str, str]] = {
     "random": ("geometric", "RandomOrder", "any candidate, uniformly at random"),
-    "uniform": ("geometric", "UniformSpacing", "an evenly spaced set, as large as the budget"),
-    "farthest": ("geometric", "FarthestPoint", "the candidate farthest from all earlier views"),
     "coverage": ("geometric", "Coverage", "sees most of the object's box that is still unseen; needs no images"),
     "fisher": ("fisher", "FisherRF", "most Fisher information about the Gaussians fitted so far (FisherRF)"),
     "ppo": ("policy", "CandidatePolicy", "ppo:FILE: a policy learned from preferences (--ask, study preferences)"),
@@ -67,7 +65,7 @@ class Selector(Protocol):
         ...
 
 
-def make_selector(name: str, **options: Any) -> Selector:
+def make_selector(name: str) -> Selector:
     """The named selector, whose module is imported only now. ``NAME:FILE`` hands FILE on to it. Raises
     ViewpointError for an unknown name."""
     base, _, file = name.partition(":")
@@ -77,5 +75,5 @@ def make_selector(name: str, **options: Any) -> Selector:
     made: Any = getattr(importlib.import_module(f"edge_server.viewpoints.{module}"), cls)
     if bool(file) != hasattr(made, "from_file"):
         raise ViewpointError(f"selector {name}: {'it takes no file' if file else f'expected {base}:FILE'}")
-    selector: Selector = made.from_file(file, **options) if file else made(**options)
+    selector: Selector = made.from_file(file) if file else made()
     return selector

@@ -22,16 +22,21 @@ import numpy as np
 
 from camera_node.capture import Camera
 from edge_server.experiments.virtual.from_scenario import training_cameras
-from edge_server.experiments.virtual.run_settings import Compute, RunSettings
+from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.simulate import digest
 from edge_server.report.frame_accounting import FrameCounts, account_frames
+from edge_server.settings import ComputeConfig
 from freshfield.limits import MAX_SESSIONS_PER_CAMERA
 from freshfield.scenario import Scenario
 from tests.chaos.chaos_deployment import ChaosDeployment
 from tests.chaos.fault_plan import FAULTS_OVER_S, QUEUE_LIMIT, SECONDS, Fault, draw_faults, scenario_of
 
 SETTINGS = RunSettings(
-    steps=2, compute=Compute(ms_per_step=20.0, ms_per_update=20.0), grace_ms=500.0, epoch_ms=100.0, score_every_ms=None
+    steps=2,
+    compute=ComputeConfig(ms_per_step=20.0, ms_per_update=20.0),
+    grace_ms=500.0,
+    epoch_ms=100.0,
+    score_every_ms=None,
 )
 RECOVERY_S = 2.0
 # Most frames inside a link: a queue's limit, plus the frame in service and the one not sampled yet.

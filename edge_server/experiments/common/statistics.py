@@ -93,20 +93,10 @@ def interval(values: Iterable[float | None]) -> Interval:
     return Interval(mean, mean - half, mean + half, len(known))
 
 
-def negated(answer: bool | None) -> bool | None:
-    """The negation; unknown (None) stays unknown."""
-    return None if answer is None else not answer
-
-
 def all_of(answers: Iterable[bool | None]) -> bool | None:
     """Whether every answer is yes: a single no decides, otherwise one unknown (None) leaves it unknown."""
     found = list(answers)
     return False if False in found else None if None in found else True
-
-
-def any_of(answers: Iterable[bool | None]) -> bool | None:
-    """Whether some answer is yes: a single yes decides, otherwise one unknown (None) leaves it unknown."""
-    return negated(all_of(map(negated, answers)))
 
 
 def paired(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> Interval:
@@ -118,9 +108,9 @@ def crossed(runs: Sequence[Mapping[int, float | None]]) -> Interval:
     """Interval of repeated trainings on the same seeds, over runs and seeds.
 
     Runs x seeds is a two-way table of random effects. The half width is the root of the sum of two squares
-    (MOVER): the half width over seeds, and that over runs, of which the residual variance is subtracted, each
-    with its own Student's t. Simulated with three runs it covers 90 to 97 %, least where seeds are few and
-    runs differ about as much as seeds do. Resampling would not do: three runs can be resampled in ten ways only.
+    (MOVER): the half width over seeds, and that over runs, of which half of the residual variance is subtracted, each
+    with its own Student's t. Simulated with three runs it covers 93.8 to 98 %; with all of the residual variance
+    subtracted 91 to 97. Resampling would not do: three runs can be resampled in ten ways only.
 
     runs: seed -> value of each run; a single run gives the interval over seeds. Seeds without a value in any
         run are left out; ``count`` is the number of the others.
@@ -139,9 +129,8 @@ def crossed(runs: Sequence[Mapping[int, float | None]]) -> Interval:
     of_seeds = count * float(((by_seed - mean) ** 2).sum()) / degrees[1]
     of_rest = float((rest**2).sum()) / degrees[2]
     t_runs, t_seeds = (float(stats.t.ppf(0.5 + _LEVEL / 2, d)) for d in degrees[:2])
-    both = t_runs**2 * max(of_runs - of_rest, 0.0) + t_seeds**2 * of_seeds
-    half = float(np.sqrt(both / (count * width)))
-    parts = max(of_runs - of_rest, 0.0), of_seeds
+    parts = max(of_runs - 0.5 * of_rest, 0.0), of_seeds
+    half = float(np.sqrt((t_runs**2 * parts[0] + t_seeds**2 * parts[1]) / (count * width)))
     weights = sum(part**2 / d for part, d in zip(parts, degrees))
     freedom = sum(parts) ** 2 / weights if weights > 0.0 else float(width - 1)  # Satterthwaite
     return Interval(mean, mean - half, mean + half, width, freedom)
@@ -254,20 +243,17 @@ def move_of_optimum(
     grids = [np.array(sorted(curve)) for curve in curves.values()]
     tables = [_table(curve, seeds, lower_is_better) for curve in curves.values()]
 
-    def slope_and_move(picks: NDArray[np.int64]) -> tuple[float, float]:
-        best = [grid[_first_best(table[picks].mean(0), least)] for grid, table in zip(grids, tables)]
-        # Rounded, because a level line has a slope of 1e-16 or so of either sign.
-        line = round(float(np.polyfit(parameters, best, 1)[0]), 9) if len(parameters) > 1 else np.nan
-        return line, float(best[-1] - best[0])
-
     if not seeds:
         nothing = Interval(np.nan, np.nan, np.nan, 0)
         return nothing, nothing
-    means = slope_and_move(np.arange(len(seeds)))
-    lows = highs = np.full(2, np.nan)
-    if len(seeds) >= FEWEST:
-        lows, highs = np.percentile([slope_and_move(p) for p in _picks(len(seeds))], [2.5, 97.5], axis=0)
-    line, move = (Interval(m, float(a), float(b), len(seeds)) for m, a, b in zip(means, lows, highs))
+    picks = np.concatenate([np.arange(len(seeds))[None], _picks(len(seeds))])  # the seeds themselves, then resampled
+    best = np.stack([grid[_first_best(table[picks].mean(1), least)] for grid, table in zip(grids, tables)], axis=1)
+    away = np.array(parameters, float) - np.mean(parameters)
+    slope = best @ away / (away @ away) if len(parameters) > 1 else np.full(len(best), np.nan)
+    # Rounded, because a level line has a slope of 1e-16 or so of either sign.
+    found = np.stack([np.round(slope, 9), best[:, -1] - best[:, 0]], axis=1)
+    lows, highs = np.percentile(found[1:], [2.5, 97.5], axis=0) if len(seeds) >= FEWEST else np.full((2, 2), np.nan)
+    line, move = (Interval(float(m), float(a), float(b), len(seeds)) for m, a, b in zip(found[0], lows, highs))
     return line, move
 
 

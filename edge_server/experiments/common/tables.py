@@ -37,6 +37,11 @@ def mean_or_none(values: Iterable[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
+def complete_mean(values: Sequence[float | None]) -> float | None:
+    """The mean; None if a value is missing or there are none."""
+    return None if None in values else mean_or_none(values)
+
+
 def over_seeds(
     rows: Iterable[Mapping[str, Any]],
     keys: Sequence[str],

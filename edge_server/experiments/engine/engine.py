@@ -57,7 +57,6 @@ class Engine:
         files: Callable[[Input], Iterable[Path | None]] | None = None,
         group: Callable[[Input], Hashable] | None = None,
         batch: int = _BATCH,
-        describe: Callable[[Input, Any], str] | None = None,
     ) -> list[Any]:
         """The result of ``work`` for each of ``inputs``, in their order; known ones are not computed again.
 
@@ -65,7 +64,6 @@ class Engine:
         files: the files and folders that the result of an input depends on.
         group: what inputs share; those of equal value are computed in one process, in turn.
         batch: most inputs of a task.
-        describe: text of one result, for progress.
         Raises EngineError, and whatever ``work`` raises. After KeyboardInterrupt the file has what was finished.
         """
         store = self._store = self._store or ResultStore(self.file)
@@ -78,8 +76,6 @@ class Engine:
             for (key, one), result in zip(task, results):
                 store.put(key, one, result)
                 done += 1
-                if describe is not None:
-                    self.say(f"[{done}/{total}] {describe(one, result)}")
             spent_s = time.monotonic() - began
             self.say(f"{name}: {done}/{total}, {spent_s:.0f} s, {spent_s / done * (total - done):.0f} s left")
         return [store.results[key] for key in keys]

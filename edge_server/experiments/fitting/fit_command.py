@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +22,17 @@ from camera_node.synthetic import SCENES
 from camera_node.synthetic.scene import HELD_OUT
 from camera_node.synthetic.source import WORLD_FPS
 from edge_server.edge_defaults import FIELD
-from edge_server.experiments.common.arguments import OptionError, add_lpips, at_least, command_parser, parse_options
+from edge_server.experiments.common.arguments import (
+    OptionError,
+    add_lpips,
+    at_least,
+    command_parser,
+    parse_options,
+    run_command,
+)
 from edge_server.experiments.fitting.evaluate import Scored, fit_in_slices, marks_s
 from edge_server.experiments.scenes.multiview_still import mean_baselines, score_views, synthetic_still
-from edge_server.experiments.scenes.recorded import Recorded, load_recorded
+from edge_server.experiments.scenes.recorded import MultiviewStill, load_recorded
 from edge_server.fidelity.images import Color, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Score, Scorer
@@ -111,12 +118,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.data is None:
         parser.error("name a data set: a folder, or the file that describes it")
     args.out = args.out or Path("runs") / f"fit-{_data_name(args.data)}"
-    try:
-        run(args)
-    except (DatasetError, OptionError) as error:
-        print(f"edge-server fit: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command("fit", lambda: run(args), (DatasetError, OptionError), "nothing was written")
 
 
 def run(request: argparse.Namespace) -> dict[str, Any]:
@@ -166,7 +168,7 @@ def _data_name(data: Path) -> str:
     return str(data) if _is_scene(data) else (data if data.is_dir() else data.parent).resolve().name
 
 
-def _open(request: argparse.Namespace) -> Recorded:
+def _open(request: argparse.Namespace) -> MultiviewStill:
     if not _is_scene(request.data):
         return load_recorded(request.data, request.holdout, request.scale, request.frame, request.format)
     for name in ("format", "holdout"):
@@ -174,13 +176,15 @@ def _open(request: argparse.Namespace) -> Recorded:
             raise OptionError(f"--{name} is for data sets; the scene {request.data} holds out {HELD_OUT}")
     t_s = request.frame / WORLD_FPS
     still = synthetic_still(str(request.data), size=max(8, round(_SCENE_SIZE / request.scale)), t_s=t_s)
-    return Recorded(request.data, still.training, still.held_out, f"at {t_s:g} s")
+    return replace(still, instant=f"at {t_s:g} s")
 
 
 class _Run:
     """A fit in progress: its files in ``request.out`` and its lines on the terminal."""
 
-    def __init__(self, request: argparse.Namespace, options: dict[str, Any], data: Recorded, model: Field) -> None:
+    def __init__(
+        self, request: argparse.Namespace, options: dict[str, Any], data: MultiviewStill, model: Field
+    ) -> None:
         self.request, self.options, self.data, self.model = request, options, data, model
         self.out = request.out
         metric, self.lpips_missing = open_lpips(request.lpips)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from camera_node.synthetic.scene import SCENES
 from edge_server.experiments.common.tables import median_or_none, over_seeds
-from edge_server.experiments.scenes.multiview_still import MultiviewStill, open_still, score_views
+from edge_server.experiments.scenes.multiview_still import WHITE, score_views, synthetic_still
+from edge_server.experiments.scenes.recorded import MultiviewStill, load_recorded
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import PerceptualMetric, Scorer
 from edge_server.fields import Budget
@@ -22,7 +24,11 @@ _MEDIANS = ("seconds", "steps", "ms_per_step", "rays_per_s", "samples_per_s", "p
 
 @dataclass(frozen=True)
 class Still:
-    """A still scene, as ``open_still`` takes it: name or data set, image size, and the views that are held out."""
+    """A still scene: the name of a synthetic one, or the path of a data set.
+
+    size: width and height in pixels of a synthetic scene.
+    holdout, scale, frame: as in ``load_recorded``, for a data set.
+    """
 
     scene: str
     size: int = 128
@@ -51,7 +57,10 @@ class Fit:
 @cache
 def views_of(still: Still) -> MultiviewStill:
     """The views of a still scene. Raises SceneError or DatasetError."""
-    return open_still(still.scene, still.size, still.holdout, still.scale, still.frame)
+    if still.scene in SCENES:
+        return synthetic_still(still.scene, size=still.size)
+    data = load_recorded(Path(still.scene), still.holdout, still.scale, still.frame)
+    return replace(data, held_out=data.held_out or data.training[:8], background=WHITE)
 
 
 @cache

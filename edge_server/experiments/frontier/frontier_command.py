@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -24,11 +23,11 @@ from edge_server.experiments.frontier import from_scratch, update_time
 from edge_server.experiments.frontier.from_scratch import Fit, Still
 from edge_server.experiments.frontier.output import recommendation, write_output
 from edge_server.experiments.frontier.update_time import Charged, MovingRun, MovingScene, variants
-from edge_server.experiments.virtual.run_settings import Compute
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import field_names, make_field
 from edge_server.report.machine import machine, versions
 from edge_server.scheduler import make_policy, parse_policy
+from edge_server.settings import ComputeConfig
 from freshfield.files import out_file, out_folder, write_json
 from freshfield.scenario import ScenarioError
 
@@ -214,16 +213,9 @@ class Frontier:
         write_json(self.out / "frontier.json", data)
         print(write_output(self.out, data), flush=True)
         if self.points is not None:
-            others = [row for row in self._other_points() if row["field"] not in self.fields]
-            write_json(self.points, {**about, "machine": data["machine"], "updates": [*others, *updates]})
+            write_json(self.points, {**about, "machine": data["machine"], "updates": updates})
         print(f"{self.out / 'frontier.json'} ({time.perf_counter() - begun:.0f} s)", flush=True)
         print(recommendation(updates), flush=True)
-
-    def _other_points(self) -> list[Row]:
-        """The points that the file of ``points`` has already."""
-        assert self.points is not None
-        known: list[Row] = json.loads(self.points.read_text())["updates"] if self.points.is_file() else []
-        return known
 
     def _from_scratch(self) -> list[Row]:
         """Rows of figure 1."""
@@ -234,9 +226,6 @@ class Frontier:
             fits,
             "from scratch",
             files=lambda fit: [*fit.still.files, self.weights],
-            describe=lambda fit, row: (
-                f"{fit.field:10} {fit.seconds:5.2f} s {row['steps']:6d} steps  PSNR {_db(row['psnr_db'])}"
-            ),
         )
         return from_scratch.curves(fits, points)
 
@@ -246,36 +235,17 @@ class Frontier:
         # With the number of images of the moving scene and the image size of figure 1.
         moving, speed = replace(sweep.moving, size=sweep.size), sweep.speeds[len(sweep.speeds) // 2]
         asked = [Charged(moving, speed, variant) for variant in measured_of]
-        measured = self.engine.run(
-            update_time.measure_compute,
-            asked,
-            "cost of updates",
-            describe=lambda one, row: (
-                f"{one.variant.label}: {row['ms_per_step']:.1f} ms a step, {row['ms_per_view']:.1f} ms a new view, "
-                f"{row['ms_per_update']:.1f} ms for everything else"
-            ),
-        )
+        measured = self.engine.run(update_time.measure_compute, asked, "cost of updates")
         runs = []
         for (variant, row), speed, seed in product(zip(measured_of, measured), sweep.speeds, self.seeds):
             times = (LAYERS_S, *sweep.update_s) if variant.layers else sweep.update_s
-            compute = Compute(**row)
+            compute = ComputeConfig(**row)
             runs += [
                 MovingRun(sweep.moving, speed, variant, seed, s, max(sweep.run_s, 6.0 * s), compute) for s in times
             ]
         points = self.engine.run(
-            partial(update_time.run_updates, weights=self.weights),
-            runs,
-            "updates",
-            files=lambda run: [self.weights],
-            describe=lambda run, row: (
-                f"{run.variant.label:16} {run.speed:g} m/s, update {row['update_s']:5.2f} s  "
-                f"shown {_db(row['shown_psnr_db'])}  moving {_db(row['shown_psnr_moving_db'])}"
-            ),
+            partial(update_time.run_updates, weights=self.weights), runs, "updates", files=lambda run: [self.weights]
         )
         rows = [{**point, **run.facts()} for run, point in zip(runs, points)]
         charged = {variant.label: row for variant, row in zip(measured_of, measured)}
         return charged, update_time.mean_over_seeds(rows)
-
-
-def _db(value: float | None) -> str:
-    return "   -   " if value is None else f"{value:5.2f} dB"

@@ -23,10 +23,9 @@ from edge_server.experiments.rollouts.episode import EpisodeFactory
 from edge_server.experiments.rollouts.rollout import named, rollout
 from edge_server.experiments.rollouts.setting import Setting
 from edge_server.experiments.virtual import costs
-from edge_server.experiments.virtual.run_settings import Compute
 from edge_server.fields.registry import option_help
 from edge_server.scheduler import parse_policy
-from edge_server.settings import LEAST_UPDATE_MS
+from edge_server.settings import LEAST_UPDATE_MS, ComputeConfig
 from freshfield.scenario import Scenario, parse
 
 # Seconds of virtual time in which costs are measured, and until what is shown counts.
@@ -109,7 +108,7 @@ class Charged:
 
 
 def measure_compute(asked: Charged) -> dict[str, float]:
-    """The time of updates on this machine, a ``Compute`` as a mapping (``edge-server costs``)."""
+    """The time of updates on this machine, a ``ComputeConfig`` as a mapping (``edge-server costs``)."""
     found: dict[str, float] = costs.measure(asked.moving.scenario(asked.speed, asked.variant), _COSTS_S)["compute"]
     if asked.variant.layers:
         return found
@@ -128,7 +127,7 @@ class MovingRun:
     seed: int
     update_s: float
     seconds: float
-    compute: Compute
+    compute: ComputeConfig
     lead_s: float = _LEAD_S
 
     @property
@@ -176,7 +175,7 @@ def run_updates(run: MovingRun, weights: Path | None = None) -> dict[str, Any]:
 def _factory(
     moving: MovingScene, speed: float, field: str, name: str, options: str, weights: Path | None
 ) -> EpisodeFactory:
-    run = MovingRun(moving, speed, Variant(field, name, json.loads(options)), 0, 1.0, 1.0, Compute(1.0))
+    run = MovingRun(moving, speed, Variant(field, name, json.loads(options)), 0, 1.0, 1.0, ComputeConfig(1.0))
     return EpisodeFactory(run.setting(), Folders(lpips=weights))
 
 
@@ -185,7 +184,7 @@ def static_steps(update_s: float) -> int:
     return max(1, round(_STATIC_STEPS_PER_S * update_s))
 
 
-def steps_for(update_s: float, compute: Compute) -> int:
+def steps_for(update_s: float, compute: ComputeConfig) -> int:
     """Number of optimizer steps for which an update of about ``update_s`` has time, at least one."""
     return max(1, round((update_s * 1e3 - compute.ms_per_update) / max(compute.ms_per_step, 0.01)))
 

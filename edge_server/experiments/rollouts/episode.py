@@ -27,7 +27,7 @@ from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.truth import ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import Truth, VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.scorer import Score, Scorer, mean_score
+from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
 from edge_server.live.buffer import FrameBuffer
@@ -133,35 +133,22 @@ def _remembered(image: Image, period_ns: int | None) -> Image:
 
 
 @dataclass(frozen=True)
-class CameraTruths:
-    """A ``Truth`` of several held-out cameras, made of one for each: scores are their mean."""
-
-    truths: dict[str, Truth]
-
-    def nearest_ns(self, present_ns: int) -> int:
-        """The instant nearest to ``present_ns`` of which the first camera's truth is known."""
-        return next(iter(self.truths.values())).nearest_ns(present_ns)
-
-    def view(self, camera: str, present_ns: int) -> tuple[Any, Any, Any]:
-        """Image, intrinsics and pose of a held-out camera at an instant."""
-        return self.truths[camera].view(camera, present_ns)
-
-    def score(self, field: Any, present_ns: int) -> Score | None:
-        """The mean over the cameras that have a score; None if none has."""
-        found = [s for truth in self.truths.values() if (s := truth.score(field, present_ns)) is not None]
-        return mean_score(found) if found else None
-
-
-@dataclass(frozen=True)
 class Stage:
-    """Of one motion: the truth of each held-out camera, and the training cameras."""
+    """Of one motion: the truth of the held-out cameras, and the training cameras."""
 
-    truths: dict[str, Truth]
+    truth: Truth
     cameras: list[Camera]
 
-    def truth(self, cameras: Sequence[str]) -> CameraTruths:
-        """The truth of some of the held-out cameras."""
-        return CameraTruths({camera: self.truths[camera] for camera in cameras})
+
+def open_stage(scenario: Scenario, scorer: Scorer, folders: Folders, period_ns: int | None = None) -> Stage:
+    """The stage of a scenario, with a cache of its true images. period_ns: after which the motion repeats. Raises
+    ScenarioError or DatasetError."""
+    truth = build_truth(scenario, source_config(scenario), read_config(scenario), scorer, folders.data)
+    if truth is None:
+        raise ScenarioError(f"{scenario.path}: cameras.held_out: no camera is held out, so that nothing is scored")
+    if isinstance(truth, ExactTruth):
+        truth = replace(truth, image=_remembered(truth.image, period_ns))
+    return Stage(truth, training_cameras(scenario, folders.data))
 
 
 class EpisodeFactory:
@@ -225,18 +212,7 @@ class EpisodeFactory:
         return self._field[1]
 
     def _stage(self, scenario: Scenario) -> Stage:
-        return Stage(
-            {camera: self._truth(scenario, camera) for camera in scenario.held_out},
-            training_cameras(scenario, self.folders.data),
-        )
-
-    def _truth(self, scenario: Scenario, camera: str) -> Truth:
-        alone = replace(scenario, held_out=(camera,))
-        truth = build_truth(alone, source_config(scenario), self._edge, self._scorer, self.folders.data)
-        assert truth is not None
-        if isinstance(truth, ExactTruth):
-            truth = replace(truth, image=_remembered(truth.image, self._period_ns))
-        return truth
+        return open_stage(scenario, self._scorer, self.folders, self._period_ns)
 
     def episode(self, seed: int) -> Episode:
         """The episode of a seed; the last one is kept."""
@@ -267,17 +243,16 @@ class Episode:
         """Run the deployment to the end of the record; returns it and all arrivals."""
         factory, setting = self._factory, self._factory.setting
         scenario, stage = factory.scenario(self.seed), factory.stage(self.seed)
-        heard = tuple(c for c in scenario.cameras if c not in setting.silent)
         edge = {**setting.scenario.edge, "policy": {"name": "all"}}
         deployment: VirtualDeployment = build_deployment(
-            replace(scenario, cameras=heard, edge=edge),
+            replace(scenario, edge=edge),
             RunSettings(steps=1, epoch_ms=1.0, first_ms=_NEVER_MS, score_every_ms=None),
             field=factory.field(self.seed),
-            cameras=[camera for camera in stage.cameras if camera.name in heard],
+            cameras=stage.cameras,
             data=factory.folders.data,
-            truth=next(iter(stage.truths.values())),
+            truth=stage.truth,
         )
-        recorder = _Recorder([c for c in scenario.training if c in heard])
+        recorder = _Recorder(scenario.training)
         deployment.updates.buffer = recorder
         deployment.run(self._until_ns / 1e9)
         return deployment, recorder.record
@@ -308,12 +283,12 @@ class Episode:
         else:
             field.load_state(warm)
         field.fit(views, Budget(steps=setting.steps))
-        snapshot, truths = field.snapshot(published_ns), self._factory.stage(self.seed).truths
+        snapshot, truth = field.snapshot(published_ns), self._factory.stage(self.seed).truth
         aaoi_ms = float(np.mean([(published_ns - view.generated_ns) / 1e6 for view in views]))
         wait_ms = (published_ns - point.now_ns) / 1e6
         found = {}
         for camera in cameras:
-            score = truths[camera].score(snapshot, published_ns)
+            score = truth.of((camera,)).score(snapshot, published_ns)
             scores = {name: None if score is None else getattr(score, name) for name in SCORES}
             found[camera] = Outcome(**scores, aaoi_ms=aaoi_ms, views=float(len(views)), wait_ms=wait_ms)
         return found

@@ -9,13 +9,12 @@ of one decision are comparable (``episode``).
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from edge_server.experiments.common.folders import Folders
@@ -63,11 +62,6 @@ class Decided:
             return Decided(slot, outcomes)
         features = decision.actor.spec.layout.features(decision.state)
         return Decided(slot, outcomes, features.tolist(), decision.action.tolist(), decision.logp)
-
-    @staticmethod
-    def from_json(data: Mapping[str, Any]) -> Decided:
-        """From what ``dataclasses.asdict`` gave."""
-        return Decided(**{**data, "outcomes": {c: Outcome(**o) for c, o in data["outcomes"].items()}})
 
 
 @dataclass(frozen=True)
@@ -147,7 +141,7 @@ def _deployed(factory: EpisodeFactory, seed: int, policy: Policy, cameras: tuple
         score_every_ms=None,
         shown_every_ms=SHOWN_EVERY_MS,
     )
-    truth, embedder = stage.truth(cameras or setting.rewarding), factory.embedder
+    truth, embedder = stage.truth.of(cameras or setting.rewarding), factory.embedder
     deployment = build_deployment(
         scenario, settings, field=field, cameras=stage.cameras, truth=truth, embedder=embedder
     )
@@ -170,20 +164,12 @@ def _deployed(factory: EpisodeFactory, seed: int, policy: Policy, cameras: tuple
 
 def named(name: str) -> PolicyMaker:
     """Maker of a policy as people write it, such as ``threshold:120``. Raises ValueError."""
-    return partial(_make_named, *parse_policy(name))
-
-
-def _make_named(name: str, value: float | None, rng: np.random.Generator) -> Policy:
-    return make_policy(name, value, rng)
+    return partial(make_policy, *parse_policy(name))
 
 
 def learned(actor: Actor, explore: bool = False) -> PolicyMaker:
     """Maker of a policy with these weights. explore: actions are drawn; otherwise the most probable ones."""
-    return partial(_make_learned, actor, explore)
-
-
-def _make_learned(actor: Actor, explore: bool, rng: np.random.Generator) -> Policy:
-    return BanditPolicy(actor, "learned", rng, explore=explore)
+    return partial(BanditPolicy, actor, "learned", explore=explore)
 
 
 # --- on the engine -----------------------------------------------------------------------------------------
@@ -224,7 +210,7 @@ def run_rollouts(
     Raises ScenarioError, DatasetError, ValueError or EngineError.
     """
     loaded = {n: _loaded(who) for n, who in actors.items()}
-    digests = {n: who if isinstance(who, str) else _digest(who) for n, who in loaded.items()}
+    digests = {n: who if isinstance(who, str) else who.digest for n, who in loaded.items()}
     makers = {n: named(who) if isinstance(who, str) else learned(who, explore) for n, who in loaded.items()}
     by_digest = {digests[n]: makers[n] for n in actors}
     files = folders.files_of(setting.scenario)
@@ -239,7 +225,7 @@ def run_rollouts(
     )
     kept: dict[str, dict[int, list[list[Run]]]] = {n: {} for n in actors}
     for (seed, n), repeats in zip([(seed, n) for seed in seeds for n in actors], found):
-        kept[n][seed] = [[_run_of(run) for run in runs] for runs in repeats]
+        kept[n][seed] = msgspec.convert(repeats, list[list[Run]])
     return kept
 
 
@@ -266,11 +252,6 @@ def embeddings_seen(seed: int, *, setting: Setting, folders: Folders) -> list[li
     return [row for s in states if s.embeddings is not None for row in s.embeddings[s.reported].tolist()]
 
 
-def _run_of(data: Mapping[str, Any]) -> Run:
-    whole = data["whole"]
-    return Run([Decided.from_json(d) for d in data["decided"]], None if whole is None else Outcome(**whole))
-
-
 def _factory(setting: Setting, folders: Folders) -> EpisodeFactory:
     at = (setting.key, folders)
     if at not in _FACTORIES:
@@ -278,13 +259,6 @@ def _factory(setting: Setting, folders: Folders) -> EpisodeFactory:
             _FACTORIES.pop(next(iter(_FACTORIES)))
         _FACTORIES[at] = EpisodeFactory(setting, folders)
     return _FACTORIES[at]
-
-
-def _digest(actor: Actor) -> str:
-    found = hashlib.sha256(json.dumps(actor.spec.as_json(), sort_keys=True).encode())
-    for name, weights in sorted(actor.weights.items()):
-        found.update(name.encode() + weights.tobytes())
-    return found.hexdigest()[:24]
 
 
 def _loaded(who: str | Actor) -> str | Actor:

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import structs
 
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.scheduler.learned.rewards import Reward, make_reward, without_missing_lpips
+from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.state import StateLayout
 from edge_server.settings import ComputeConfig, open_embedder, read_config
 from freshfield.scenario import Scenario, ScenarioError
@@ -56,7 +56,6 @@ class Setting:
     compute: virtual time charged per update.
     parts: parts of the state (6.33); only "semantics" embeds frames, as the scenario's ``edge.embedding``
         configures.
-    silent: cameras that never send.
     Raises ScenarioError or ValueError.
     """
 
@@ -75,7 +74,6 @@ class Setting:
     horizon_ms: float = 2000.0
     compute: ComputeConfig = dataclasses.field(default_factory=ComputeConfig)
     parts: tuple[str, ...] = ("age", "pose")
-    silent: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.scenario.held_out:
@@ -87,8 +85,6 @@ class Setting:
             raise ValueError(f"report: {', '.join(sorted(unknown))} is not held out")
         if not self.rewarding:
             raise ValueError("report: every held-out camera only reports, so that there is no reward")
-        if unknown := set(self.silent) - set(self.scenario.training):
-            raise ValueError(f"silent: {', '.join(sorted(unknown))} is not a training camera")
         if min(self.steps, self.warm_steps, self.decisions) < 1:
             raise ValueError("steps, warm_steps and decisions: expected at least 1")
         if not (self.span_ms >= GRID_MS and self.horizon_ms > 0.0 and 0.0 < self.refresh_ms < self.lead_ms):
@@ -160,8 +156,10 @@ def reward_of(
     missing: str | None = "the scenario's edge.lpips is none"
     if network != "none":
         _, missing = open_lpips(lpips_folder)
-    found = without_missing_lpips(reward, missing)
-    return found, None if found == reward else f"the reward has no term of distance: {missing}"
+    if not missing:
+        return reward, None
+    # Nothing can be learned from rewards that are never complete.
+    return dataclasses.replace(reward, distance=0.0), f"the reward has no term of distance: {missing}"
 
 
 def layout_of(setting: Setting, parts: tuple[str, ...]) -> StateLayout:

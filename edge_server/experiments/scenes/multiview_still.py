@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
-from camera_node.synthetic.scene import HELD_OUT, SCENES, Scene
-from edge_server.experiments.scenes.recorded import load_recorded
+from camera_node.synthetic.scene import HELD_OUT, Scene
+from edge_server.experiments.scenes.recorded import MultiviewStill
 from edge_server.fidelity.baselines import baseline
 from edge_server.fidelity.images import BLACK, Color, to_unit
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
@@ -23,40 +23,13 @@ from edge_server.fields import Field, View
 WHITE: Color = (1.0, 1.0, 1.0)
 
 
-@dataclass(frozen=True)
-class MultiviewStill:
-    """The views that a field is fitted to and scored on. background: color behind transparent images."""
-
-    name: str
-    training: tuple[View, ...]
-    held_out: tuple[View, ...]
-    background: Color = BLACK
-
-    def describe(self) -> str:
-        image = self.training[0].image
-        return f"{self.name}: {len(self.training)} views of {image.shape[1]} x {image.shape[0]}"
-
-
 def synthetic_still(name: str, cameras: int = 19, size: int = 128, t_s: float = 0.0) -> MultiviewStill:
     """The cameras of scene ``name`` at one instant, ``size`` pixels a side; cam00 is held out. Raises
     camera_node's SceneError."""
     scene = make_scene(name, {"count": cameras, "width": size, "height": size})
     views = [View(c, scene.render(c, t_s), pose, lens) for c, (lens, pose) in scene.cameras.items()]
     held_out = tuple(v for v in views if v.camera == HELD_OUT)
-    return MultiviewStill(name, tuple(v for v in views if v.camera != HELD_OUT), held_out)
-
-
-def open_still(scene: str, size: int = 128, holdout: str = "8", scale: float = 1.0, frame: int = 0) -> MultiviewStill:
-    """Open ``scene``: the name of a synthetic scene, or the path of a recorded data set.
-
-    size: width and height in pixels of a synthetic scene.
-    holdout, scale, frame: as in ``load_recorded``, for a data set.
-    Raises SceneError or DatasetError.
-    """
-    if scene in SCENES:
-        return synthetic_still(scene, size=size)
-    data = load_recorded(Path(scene), holdout, scale, frame)
-    return MultiviewStill(data.file.resolve().parent.name, data.training, data.held_out or data.training[:8], WHITE)
+    return MultiviewStill(name, tuple(v for v in views if v.camera != HELD_OUT), held_out, Path(name))
 
 
 def mean_baselines(training: Sequence[View], held_out: Sequence[View], color: Color = BLACK) -> dict[str, float | None]:

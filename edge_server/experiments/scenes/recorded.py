@@ -8,6 +8,7 @@ from pathlib import Path
 
 from camera_node.sources.datasets.formats import open_dataset
 from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
+from edge_server.fidelity.images import BLACK, Color
 from edge_server.fields import View
 
 # Value of --holdout for the split that the data set itself defines.
@@ -15,26 +16,33 @@ OWN_SPLIT = "split"
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """Views of one instant.
+class MultiviewStill:
+    """The views of one instant that a field is fitted to and scored on.
 
-    file: the file that was read.
+    file: the file that was read, or the scene.
     instant: the instant as text; empty if nothing moves.
     missing: number of entries of the file whose images do not exist.
     notes: what a user should know of how the files were read.
+    background: color behind transparent images.
     """
 
-    file: Path
+    name: str
     training: tuple[View, ...]
     held_out: tuple[View, ...]
+    file: Path
     instant: str = ""
     missing: int = 0
     notes: tuple[str, ...] = ()
+    background: Color = BLACK
+
+    def describe(self) -> str:
+        image = self.training[0].image
+        return f"{self.name}: {len(self.training)} views of {image.shape[1]} x {image.shape[0]}"
 
 
 def load_recorded(
     path: Path, holdout: str | None = "8", scale: float = 1.0, frame: int = 0, name: str | None = None
-) -> Recorded:
+) -> MultiviewStill:
     """Load the views of a data set, with decoded images including alpha.
 
     path: the folder of a data set, or the file that describes it.
@@ -51,8 +59,8 @@ def load_recorded(
     own = [key for key, record in found.items() if record.name in dataset.held_out]
     training, held_out = split(list(found), holdout or (OWN_SPLIT if own else "8"), own)
     views = {key: _view(key, found[key]) for key in (*training, *held_out)}
-    training_views, held_out_views = tuple(views[key] for key in training), tuple(views[key] for key in held_out)
-    return Recorded(file, training_views, held_out_views, instant, dataset.missing, dataset.notes)
+    trained, kept = (tuple(views[key] for key in keys) for keys in (training, held_out))
+    return MultiviewStill(file.resolve().parent.name, trained, kept, file, instant, dataset.missing, dataset.notes)
 
 
 def split(names: Sequence[str], holdout: str, own: Collection[str] = ()) -> tuple[list[str], list[str]]:

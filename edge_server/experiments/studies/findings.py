@@ -20,7 +20,7 @@ from edge_server.experiments.common.statistics import (
     paired,
     share_closed,
 )
-from edge_server.experiments.common.tables import number
+from edge_server.experiments.common.tables import complete_mean, number
 from edge_server.experiments.studies.study import METRICS, Finding, Statistic
 
 NO_DELAY, USE_ALL = "no delay", "all"
@@ -165,21 +165,20 @@ def better(mine: Row, other: Row) -> Statistic:
     return found
 
 
-def better_than_all(mine: Row, others: Sequence[Row], one_suffices: bool = False, worse: bool = False) -> Statistic:
-    """``mine`` is better than each of ``others``. worse: each of ``others`` is better than ``mine``; with
-    ``one_suffices``, one of them is."""
+def better_than_all(mine: Row, others: Sequence[Row], worse: bool = False) -> Statistic:
+    """``mine`` is better than each of ``others``. worse: each of ``others`` is better than ``mine``."""
 
     def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
         _, lower, digits, _ = METRICS[metric]
         gaps: dict[str, Interval] = {}
         for other in others:
-            pair = (other, mine) if one_suffices or worse else (mine, other)
+            pair = (other, mine) if worse else (mine, other)
             ours, theirs = (table.best_runs(metric, lower, **{**labels, **of}) for of in pair)
             gap = difference(theirs, ours) if lower else difference(ours, theirs)
             if gap.count:
                 gaps[" ".join(str(v) for k, v in other.items() if k != "best")] = gap
         text = ", ".join(f"{name} {gap.text(digits)}" for name, gap in gaps.items())
-        return Finding(f"differences: {text}.", tuple(gaps.values()), one_suffices) if gaps else None
+        return Finding(f"differences: {text}.", tuple(gaps.values())) if gaps else None
 
     return found
 
@@ -224,7 +223,7 @@ def half_way(mine: Row, base: Row, limit: Row) -> Statistic:
         above = difference(ours, [half])
         if not above.count:
             return None
-        share = share_closed({s: _mean([run.get(s) for run in ours]) for s in ours[0]}, low, high)
+        share = share_closed({s: complete_mean([run.get(s) for run in ours]) for s in ours[0]}, low, high)
         return Finding(f"{share.text(2)} of the way (interval over seeds alone).", (above,))
 
     return found
@@ -242,8 +241,3 @@ def _gain(a: PerSeed, b: Any, lower: bool) -> Interval:
 def _far_from_zero(runs: Sequence[PerSeed]) -> bool:
     base = crossed(runs)
     return base.low > 0.0 or base.high < 0.0
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [v for v in values if v is not None]
-    return sum(known) / len(known) if known and len(known) == len(values) else None

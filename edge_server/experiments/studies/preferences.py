@@ -16,7 +16,7 @@ from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.studies.drawing import draw_curve
 from edge_server.experiments.studies.findings import better, level
 from edge_server.experiments.studies.study import Claim, Study, StudyRequest, open_engine
-from edge_server.experiments.studies.trial import scenario_of, scene_label, scenes_here
+from edge_server.experiments.studies.trial import scene_label, scenes_here
 from edge_server.experiments.studies.viewpoints import JUDGED, SCENES, Workload, files_of, plan, stage_of, workload
 from edge_server.experiments.viewpoints.reconstructions import taste_score, varied_plan
 from edge_server.experiments.viewpoints.stage import Stage, open_embedder
@@ -56,7 +56,6 @@ class Taught:
     scene: str
     seed: int
     work: Workload
-    source: Any
     pool: int | None = None
     updates: int = 0
 
@@ -72,19 +71,15 @@ class Reconstruction:
     scene: str
     number: int
     work: Workload
-    source: Any
 
 
 def _cases(request: StudyRequest) -> list[Taught]:
     work, found = workload(request), []
     for scene in scenes_here(request, SCENES[request.quick]):
-        about = scene, work, scenario_of(scene).source
         taught = [f"policy, {taste}" for taste in (*TASTES, f"{_EMBEDDED}, embeddings")]
         for seed in request.repeats(3, 5):
-            found += [Taught(arm, scene, seed, *about[1:]) for arm in _ARMS]
-            found += [
-                Taught(arm, scene, seed, *about[1:], _POOL[request.quick], _UPDATES[request.quick]) for arm in taught
-            ]
+            found += [Taught(arm, scene, seed, work) for arm in _ARMS]
+            found += [Taught(arm, scene, seed, work, _POOL[request.quick], _UPDATES[request.quick]) for arm in taught]
     return found
 
 
@@ -96,9 +91,7 @@ def _measure(cases: Sequence[Taught], request: StudyRequest) -> list[Row]:
     with open_engine(request, "preferences", threads=1) as engine:
         for scene in dict.fromkeys(case.scene for case in cases):
             mine = [case for case in cases if case.scene == scene]
-            asked = [
-                Reconstruction(scene, k, mine[0].work, mine[0].source) for k in range(max(c.pool or 0 for c in mine))
-            ]
+            asked = [Reconstruction(scene, k, mine[0].work) for k in range(max(c.pool or 0 for c in mine))]
             pool = engine.run(
                 partial(reconstruct, folders=folders),
                 asked,

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row, SeedTable
-from edge_server.experiments.common.statistics import Interval, all_of, any_of, discoveries
+from edge_server.experiments.common.statistics import Interval, all_of, discoveries
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.engine import Engine
 from edge_server.report.machine import commit
@@ -121,25 +121,23 @@ class Finding:
     """What was found for a claim.
 
     text: in words.
-    differences: what must lie above the claim's bound: each of them, or with ``one_suffices`` one of them.
+    differences: what must lie above the claim's bound, each of them.
     """
 
     text: str
     differences: tuple[Interval, ...]
-    one_suffices: bool = False
 
     def above(self, bound: float) -> bool | None:
         """Whether the differences lie above the bound, by their 95 % intervals; None where that is undecided."""
-        answers = [d.above(bound) for d in self.differences]
-        return (any_of if self.one_suffices else all_of)(answers)
+        return all_of(d.above(bound) for d in self.differences)
 
     def p_value(self, bound: float) -> float:
-        """The p-value of ``above``: of all that must hold the largest; of several of which one suffices the smallest,
-        times their number."""
-        above = self.above(bound)
-        values = [d.p_value(bound) for d in self.differences if above is None or d.above(bound) is above]
-        together = above is not self.one_suffices if above is not None else not self.one_suffices
-        return max(values) if together else min(1.0, len(self.differences) * min(values))
+        """The p-value of ``above``: the largest of all; where some contradict it, the smallest of theirs, times the
+        number of all."""
+        values = [d.p_value(bound) for d in self.differences if d.above(bound) is False]
+        if not values:
+            return max(d.p_value(bound) for d in self.differences)
+        return min(1.0, len(self.differences) * min(values))
 
 
 Statistic = Callable[[SeedTable, str, Row], Finding | None]

@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 
 from camera_node.sources.datasets.records import DatasetError
+from edge_server.embed import EmbeddingError
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of, run_command
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.engine import EngineError
@@ -72,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 print("  " + verdict.line())
             print(f"  {time.monotonic() - began:.0f} s; {request.out / name}.md, .csv, .json and figures", flush=True)
 
-    errors = (ScenarioError, DatasetError, StudyError, EngineError, TrainingError, ViewpointError)
+    errors = (ScenarioError, DatasetError, StudyError, EngineError, TrainingError, ViewpointError, EmbeddingError)
     return run_command("study", work, errors, f"what is finished is in {args.out}: the same command goes on")
 
 

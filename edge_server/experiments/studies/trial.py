@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -17,21 +17,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.capture import Camera
-from camera_node.settings import source_config
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row
 from edge_server.experiments.common.tables import mean_or_none
+from edge_server.experiments.rollouts.episode import Stage, open_stage
 from edge_server.experiments.studies.study import StudyError, StudyRequest, open_engine
-from edge_server.experiments.virtual.from_scenario import build_deployment, build_truth, training_cameras
+from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
-from edge_server.experiments.virtual.truth import ExactTruth
-from edge_server.experiments.virtual.virtual_deployment import Truth, VirtualDeployment
+from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SHOWN, Scorer
 from edge_server.live.state import Publication
-from edge_server.scheduler.learned.rewards import W_S, f_w
-from edge_server.settings import read_config
+from edge_server.scheduler.learned.rewards import f_w
 from freshfield.scenario import Scenario, ScenarioError, load, parse, seed_sequence
 
 # Synthetic scenes use the thesis's capture period of 30 ms.
@@ -40,7 +37,6 @@ WORLD_FPS = 100 / 3
 SCENARIOS = {"room": "room19"}
 # Offset of decision instants between successive seeds; not whole frames, so seeds sample all capture phases.
 _STAGGER_MS = 217.0
-_TRUTHS_KEPT = 4096
 # Number of random instants at which a publication is scored, one in each equal part of the time it is shown.
 _SHOWN_INSTANTS = 3
 _MOMENT_S = 1e-6
@@ -77,7 +73,7 @@ class Trial:
     lpips: bool = True
 
     @property
-    def stage(self) -> tuple[Any, ...]:
+    def stage(self) -> tuple[str, int, float, int | None, float | None]:
         """Settings that determine the images. Trials of one stage share rendered and decoded images."""
         return (self.scene, self.size, self.scale, self.cameras, self.speed_m_per_s)
 
@@ -198,7 +194,7 @@ def sweep(
             base, labels = usual_trial(request, scene, seed=seed, **settings), {"scene": name, **labels}
             found.append(Point({**labels, "policy": "all"}, base))
             found += [
-                Point({**labels, "policy": policy, x: value}, dataclasses.replace(base, policy=policy, value=value))
+                Point({**labels, "policy": policy, x: value}, replace(base, policy=policy, value=value))
                 for policy, some in values.items()
                 for value in some
             ]
@@ -212,43 +208,22 @@ def run_points(points: Sequence[Point], request: StudyRequest) -> list[Row]:
     """The labels, the seed and the results of each point, also rated by F_w (6.37)."""
     with open_engine(request, "trials") as engine:
         results = engine.run(
-            partial(run_input, folders=request.folders),
-            [_input(point.trial) for point in points],
+            partial(run_trial, folders=request.folders),
+            [point.trial for point in points],
             "trials",
-            files=lambda one: _files(one, request.folders),
-            group=lambda one: json.dumps([one["stage"], one["trial"]["seed"]], sort_keys=True),
+            files=lambda trial: _files(trial, request.folders),
+            group=lambda trial: (trial.stage, trial.field, repr(trial.field_options), trial.seed),
         )
     return [
-        {**p.labels, "seed": p.trial.seed, **r, "f_w": f_w(r), "f_w_corrected": f_w(r, -W_S)}
+        {**p.labels, "seed": p.trial.seed, **r, "f_w": f_w(r), "f_w_corrected": f_w(r, corrected=True)}
         for p, r in zip(points, results)
     ]
 
 
-def _input(trial: Trial) -> Row:
-    """All that determines a trial's result: itself, and what its scenario says."""
-    s = trial.scenario()
-    sections = {"source": s.source, "channel": s.channel, "edge": s.edge, "cameras": s.cameras, "held_out": s.held_out}
-    stage = [*trial.stage, trial.field, trial.field_options]
-    return {"trial": dataclasses.asdict(trial), "scenario": sections, "stage": stage}
-
-
-def _files(one: Row, folders: Folders) -> list[Path]:
-    trial = Trial(**one["trial"])
-    used = folders if trial.lpips else dataclasses.replace(folders, lpips=None)
-    return used.files_of(trial.scenario())
-
-
-def run_input(one: Row, *, folders: Folders) -> Row:
-    """``run_trial`` on the engine."""
-    return run_trial(Trial(**one["trial"]), folders)
-
-
-@dataclass
-class Stage:
-    """Data shared by trials with the same images."""
-
-    cameras: list[Camera]
-    truth: Truth | None
+def _files(trial: Trial, folders: Folders) -> list[Path]:
+    """What a trial's result depends on beside itself: its scenario's file, and what that names."""
+    used, scenario = folders if trial.lpips else replace(folders, lpips=None), trial.scenario()
+    return [scenario.path, *used.files_of(scenario)]
 
 
 def run_trial(trial: Trial, folders: Folders) -> Row:
@@ -287,7 +262,7 @@ def _decided(trial: Trial, folders: Folders, look: Callable[[Publication, Virtua
         if not found:
             found.append(look(publication, deployment))
 
-    scenario, stage = trial.scenario(), _stage(json.dumps(trial.stage), trial, folders)
+    scenario, stage = trial.scenario(), _stage(trial.stage, trial.lpips, folders)
     deployment = build_deployment(
         scenario,
         trial.run_settings(),
@@ -332,8 +307,7 @@ def _shown_scores(publication: Publication, deployment: VirtualDeployment, rng: 
     The instants are random if the truth is known at any instant; in a recording they are those of its frames.
     """
     truth, began_ns = deployment.truth, publication.published_ns
-    if truth is None:
-        return {f"shown_{name}": None for name in SHOWN}
+    assert truth is not None  # of ``open_stage``
     lasts_ns = max(began_ns - deployment.decided_ns, deployment.capture_period_ns)
     snapshot = deployment.updates.field.snapshot(began_ns)
     scores = []
@@ -343,24 +317,15 @@ def _shown_scores(publication: Publication, deployment: VirtualDeployment, rng: 
     return {f"shown_{name}": mean_or_none([getattr(s, name) for s in scores if s]) for name in SHOWN}
 
 
-# A process keeps a few stages, because trials come grouped by their images.
-_STAGES: dict[tuple[str, Folders, bool], Stage] = {}
+@lru_cache(4)  # a process keeps a few, because trials come grouped by their images
+def _stage(stage: tuple[Any, ...], lpips: bool, folders: Folders) -> Stage:
+    scene, size, scale, cameras, speed = stage
+    trial = Trial(scene, 0, {"preset": "ideal"}, size=size, scale=scale, cameras=cameras, speed_m_per_s=speed)
+    scenario = trial.scenario()
+    return open_stage(scenario, Scorer(open_lpips(folders.lpips)[0] if lpips else None), folders)
+
+
 _FIELDS: dict[str, Any] = {}
-
-
-def _stage(key: str, trial: Trial, folders: Folders) -> Stage:
-    at = (key, folders, trial.lpips)
-    if at not in _STAGES:
-        while len(_STAGES) >= 4:
-            _STAGES.pop(next(iter(_STAGES)))
-        scenario = trial.scenario()
-        lpips = open_lpips(folders.lpips)[0] if trial.lpips else None
-        edge = read_config(scenario)
-        truth = build_truth(scenario, source_config(scenario), edge, Scorer(lpips), folders.data)
-        if isinstance(truth, ExactTruth):  # every trial scores against the same images
-            truth = dataclasses.replace(truth, image=lru_cache(_TRUTHS_KEPT)(truth.image))
-        _STAGES[at] = Stage(training_cameras(scenario, folders.data), truth)
-    return _STAGES[at]
 
 
 def _field(trial: Trial) -> Any:
@@ -380,8 +345,7 @@ def _rendered(
     trial: Trial, deployment: VirtualDeployment, present_ns: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """The held-out camera's true image and the field's rendering of it, uint8 (H, W, 3)."""
-    if deployment.truth is None:
-        raise ScenarioError(f"study {trial.scene}: no camera is held out, so there is nothing to show")
+    assert deployment.truth is not None  # of ``open_stage``
     image, lens, pose = deployment.truth.view(trial.scenario().held_out[0], present_ns)
     color = deployment.updates.field.snapshot(present_ns).render(pose, lens).color
     return image, np.clip(color * 255.0 + 0.5, 0, 255).astype(np.uint8)

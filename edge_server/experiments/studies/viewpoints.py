@@ -29,16 +29,13 @@ from edge_server.viewpoints.registry import make_selector
 # label -> (selector, weight of the way)
 ARMS = {
     "random": ("random", 0.0),
-    "uniform": ("uniform", 0.0),
-    "farthest": ("farthest", 0.0),
     "coverage": ("coverage", 0.0),
     "FisherRF": ("fisher", 0.0),
-    "uniform, short way": ("uniform", 0.3),
     "coverage, short way": ("coverage", 0.3),
 }
 JUDGED = 8  # views of table 4.3 and of the figures
 SCENES = {True: ("tile",), False: ("tile", "lego", "kitchen", "cell")}  # by whether it is a quick pass
-_SHOWN = ("random", "uniform", "coverage", "FisherRF")
+_SHOWN = ("random", "coverage", "FisherRF")
 
 
 @dataclass(frozen=True)
@@ -58,13 +55,12 @@ QUICK = Workload((3, 5, 8, 13), 64, 200, 60)
 
 @dataclass(frozen=True)
 class Capture:
-    """One capture: an arm on a scene. source: what the scene's scenario says, so that results are kept by it."""
+    """One capture: an arm on a scene."""
 
     arm: str
     scene: str
     seed: int
     work: Workload
-    source: Any = None
 
 
 @lru_cache(1)
@@ -79,7 +75,7 @@ def workload(request: StudyRequest) -> Workload:
 
 def _cases(request: StudyRequest) -> list[Capture]:
     return [
-        Capture(arm, scene, seed, workload(request), scenario_of(scene).source)
+        Capture(arm, scene, seed, workload(request))
         for scene in scenes_here(request, SCENES[request.quick])
         for arm in ARMS
         for seed in request.repeats(4, 8)
@@ -88,7 +84,8 @@ def _cases(request: StudyRequest) -> list[Capture]:
 
 def files_of(case: Any, folders: Folders) -> list[Any]:
     """Files that the result of a capture depends on."""
-    return list(folders.files_of(scenario_of(case.scene)))
+    scenario = scenario_of(case.scene)
+    return [scenario.path, *folders.files_of(scenario)]
 
 
 def _measure(cases: Sequence[Capture], request: StudyRequest) -> list[Row]:
@@ -122,15 +119,14 @@ def plan(stage: Stage, arm: str, seed: int, views: int, work: Workload) -> Plan:
 
 
 def capture(case: Capture, *, folders: Folders) -> list[Row]:
-    """A row for each number of views: quality on the views held out, path, and milliseconds of a choice. What does
-    not depend on the budget is planned once, and its beginnings are scored."""
+    """A row for each number of views: quality on the views held out, path, and milliseconds of a choice. It is
+    planned once, and its beginnings are scored."""
     stage, work = stage_of(case.scene, case.work, folders), case.work
     scorer = Scorer(open_lpips(folders.lpips)[0], background=stage.background)
     counts = [count for count in work.counts if count <= int(stage.candidates.reachable.sum())]
-    whole = None if ARMS[case.arm][0] == "uniform" else plan(stage, case.arm, case.seed, counts[-1], work)
+    made = plan(stage, case.arm, case.seed, counts[-1], work)
     rows = []
     for count in counts:
-        made = whole or plan(stage, case.arm, case.seed, count, work)
         score = stage.score(stage.fit(made.views[:count], work.steps, case.seed), scorer)
         stops = made.stops[:count]
         rows.append(

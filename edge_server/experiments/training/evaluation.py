@@ -15,6 +15,7 @@ import numpy as np
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import PerSeed, Row, SeedTable, difference
 from edge_server.experiments.common.statistics import crossed, interval, share_closed
+from edge_server.experiments.common.tables import complete_mean
 from edge_server.experiments.engine import Engine
 from edge_server.experiments.rollouts.episode import Outcome, mean_outcome
 from edge_server.experiments.rollouts.rollout import run_rollouts
@@ -88,9 +89,11 @@ class Evaluation:
         scored = {at for of in values for at, fits in of.items() if any(v is not None for v in fits)}
         found = []
         for candidate, of, rated in zip(self.candidates, outcomes, values):
-            mine: dict[str, PerSeed] = {"reward": _by_seed({at: _mean(fits) for at, fits in rated.items()}, scored)}
+            mine: dict[str, PerSeed] = {
+                "reward": _by_seed({at: complete_mean(fits) for at, fits in rated.items()}, scored)
+            }
             for term in (f.name for f in fields(Outcome)):
-                mine[term] = _by_seed({at: _mean([getattr(o, term) for o in fits]) for at, fits in of.items()})
+                mine[term] = _by_seed({at: complete_mean([getattr(o, term) for o in fits]) for at, fits in of.items()})
             found += _rows({**labels, **candidate.labels}, mine)
         kinds = dict.fromkeys(c.labels["policy"] for c in self.candidates if "value" in c.labels)
         for kind in (None, *kinds):
@@ -185,10 +188,4 @@ def _by_seed(values: Mapping[At, float | None], kept: Iterable[At] | None = None
         mine = found.setdefault(seed, [])
         if kept is None or (seed, number) in kept:  # type: ignore[operator]  # a set
             mine.append(value)
-    return {seed: _mean(mine) for seed, mine in found.items()}
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    """The mean; None if a value is missing or there are none."""
-    known = [v for v in values if v is not None]
-    return sum(known) / len(known) if known and len(known) == len(values) else None
+    return {seed: complete_mean(mine) for seed, mine in found.items()}

@@ -107,7 +107,6 @@ def train(setting: Setting, config: TrainingConfig, folders: Folders, jobs: int,
         for name in ("policy.npz", *REPORTS):
             (out / name).unlink(missing_ok=True)
         learner = _new_learner(setting, config, folders, jobs)
-    learner.reward_fields = dataclasses.asdict(config.reward)
     for number in range(first, config.batches):
         batch_began = time.monotonic()
         engine = Engine(jobs=jobs, threads=1, say=_now_and_then(say))

@@ -40,7 +40,7 @@ def varied_plan(stage: Stage, k: int, views: int) -> Plan:
         least = max(views, len(candidates) // 5)
         nearest = np.argsort(-angle)[: int(rng.integers(least, max(least + 1, len(candidates) // 2)))]
         candidates = candidates.within(np.isin(np.arange(len(candidates)), nearest))
-    name = ("random", "random", "farthest", "random", "coverage", "uniform")[k % 6]
+    name = ("random", "random", "coverage")[k % 3]
     weight = float(rng.choice([0.0, 0.0, 0.5]))
     return plan_capture(candidates, make_selector(name), Budget(views=views), stage.take, seed=k, travel_weight=weight)
 

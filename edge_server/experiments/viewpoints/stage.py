@@ -62,9 +62,9 @@ class Stage:
             self._taken[k] = _render(self.scene, f"view{k:03d}", self.candidates, k)
         return self._taken[k]
 
-    def fit(self, views: Sequence[View], steps: int, seed: int, representation: str = "splat") -> Field:
+    def fit(self, views: Sequence[View], steps: int, seed: int) -> Field:
         """Fit a new field to the views."""
-        made = make_field(representation, self.options, seed=seed)
+        made = make_field("splat", self.options, seed=seed)
         made.fit(list(views), Budget(steps=steps))
         return made
 

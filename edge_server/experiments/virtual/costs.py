@@ -9,7 +9,6 @@ which live run beside the updates, are not charged.
 from __future__ import annotations
 
 import dataclasses
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
+from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of, run_command
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.report.machine import machine, versions
@@ -58,15 +57,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=out_file, required=True, metavar="FILE", help="JSON file to write")
     add_folders(parser)
     args = parser.parse_args(argv)
-    try:
+
+    def work() -> None:
         found = measure(load(args.scenario), args.seconds, folders_of(args).data)
-    except (ScenarioError, DatasetError, ValueError) as error:
-        print(f"edge-server costs: {error}", file=sys.stderr)
-        return 2
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(args.out, found, indent=1)
-    print(", ".join(f"{name} {ms:g}" for name, ms in found["compute"].items() if ms), f"-> {args.out}")
-    return 0
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(args.out, found, indent=1)
+        print(", ".join(f"{name} {ms:g}" for name, ms in found["compute"].items() if ms), f"-> {args.out}")
+
+    return run_command("costs", work, (ScenarioError, DatasetError, ValueError), "nothing was written")
 
 
 def measure(scenario: Scenario, seconds: float, data: Path | None = None) -> dict[str, Any]:

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from edge_server.live.field_updater import LEAST_TAKEN
 from edge_server.settings import ComputeConfig
 
-# Cost of an update in virtual time.
-Compute = ComputeConfig
-_FREE = Compute()
+_FREE = ComputeConfig()
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,7 @@ class RunSettings:
     """
 
     steps: int
-    compute: Compute = _FREE
+    compute: ComputeConfig = _FREE
     epoch_ms: float = 0.0
     grace_ms: float = 3000.0
     score_every_ms: float | None = 0.0

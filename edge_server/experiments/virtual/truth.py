@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -33,6 +34,10 @@ class ExactTruth:
     scorer: Scorer
     cameras: dict[str, tuple[Pinhole, NDArray[np.float64]]]
     image: Callable[[str, float], NDArray[np.uint8]]
+
+    def of(self, cameras: Sequence[str]) -> ExactTruth:
+        """The truth of some of the cameras."""
+        return replace(self, cameras={camera: self.cameras[camera] for camera in cameras})
 
     def nearest_ns(self, present_ns: int) -> int:
         """The instant itself: the truth is known at any."""
@@ -68,6 +73,12 @@ class CapturedTruth:
             c.name: noise_bound(_image(c, c.capture(k)) for k in range(NOISE_FRAMES)) if noisy else BOUND
             for c in cameras
         }
+
+    def of(self, cameras: Sequence[str]) -> CapturedTruth:
+        """The truth of some of the cameras."""
+        some = copy(self)
+        some._cameras = tuple(c for c in self._cameras if c.name in cameras)
+        return some
 
     def nearest_ns(self, present_ns: int) -> int:
         """The instant of the first held-out camera's capture nearest to ``present_ns``."""

@@ -52,6 +52,10 @@ _AT_ARRIVAL = WakeCondition(on_arrival=True)
 class Truth(Protocol):
     """Scores renders of the field at the present. See ``experiments.virtual.truth``."""
 
+    def of(self, cameras: Sequence[str]) -> Truth:
+        """The truth of some of the held-out cameras."""
+        ...
+
     def nearest_ns(self, present_ns: int) -> int:
         """The instant nearest to ``present_ns`` of which the truth is known."""
         ...

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +32,14 @@ class Actor:
     spec: Spec
     weights: dict[str, NDArray[np.float64]]
     mean_features: NDArray[np.float64] | None = field(default=None, kw_only=True)
+
+    @property
+    def digest(self) -> str:
+        """Hash of the specification and the weights (hex)."""
+        found = hashlib.sha256(json.dumps(self.spec.as_json(), sort_keys=True).encode())
+        for name, weights in sorted(self.weights.items()):
+            found.update(name.encode() + weights.tobytes())
+        return found.hexdigest()[:24]
 
     def logits(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
         """Features (B, N, width) to logits: (B, N) of cameras, or (B, K) of omegas."""

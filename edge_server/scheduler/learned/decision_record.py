@@ -6,7 +6,6 @@ policy-HASH.npz. Only the newest decisions that fit are kept.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections import deque
 from collections.abc import Mapping
@@ -74,10 +73,7 @@ class DecisionWriter:
         """File of the policy and its size; size 0 where it was written before."""
         size = 0
         if self._policy is None or self._policy[0] is not actor:
-            digest = hashlib.sha256(repr(actor.spec.as_json()).encode())
-            for _, w in sorted(actor.weights.items()):
-                digest.update(w.tobytes())
-            name = f"policy-{digest.hexdigest()[:12]}.npz"
+            name = f"policy-{actor.digest[:12]}.npz"
             if not (self._folder / name).exists():
                 actor.save(self._folder / name)
                 size = (self._folder / name).stat().st_size

@@ -87,8 +87,6 @@ class Learner:
     def __init__(self, spec: Spec, seed: int = 0) -> None:
         self.spec = spec
         self.seed = seed
-        self.reward_fields: dict[str, Any] | None = None
-        """Fields of the ``rewards.Reward`` it is trained with; None: not said."""
         self.updates = 0
         self.decisions = 0
         streams = np.random.SeedSequence(seed).spawn(len(_STREAMS))
@@ -209,7 +207,6 @@ class Learner:
         about = {
             "spec": self.spec.as_json(),
             "seed": self.seed,
-            "taught_by": self.reward_fields,
             "updates": self.updates,
             "decisions": self.decisions,
             "cameras_seen": self._cameras_seen,
@@ -247,7 +244,6 @@ class Learner:
                 if step.shape != () or not 1.0 <= step < np.inf or (square < 0.0).any():
                     raise ValueError("Adam's moments are invalid")
                 self._adam.state[parameter] = {"step": torch.tensor(step), "exp_avg": mean, "exp_avg_sq": square}
-        self.reward_fields = about.get("taught_by")
         self._mean_features = _checked_tensor(arrays["usual"], torch.tensor(self._mean_features)).numpy()
         self._cameras_seen = int(about["cameras_seen"])
         self.updates, self.decisions = int(about["updates"]), int(about["decisions"])

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any, Literal, Protocol
 
 # Weights of (6.37) as 6.5 prints them: PSNR per dB, SSIM, LPIPS, age per millisecond.
@@ -108,17 +109,14 @@ REWARDS = {
 }
 
 
-def f_w(row: Mapping[str, Any], w_s: float = W_S) -> float | None:
+def f_w(row: Mapping[str, Any], corrected: bool = False) -> float | None:
     """F_w of (6.36) and (6.37), smaller is better; ages in slots of 1 ms. None where a metric is missing.
 
     row: with psnr_db, ssim, lpips and aaoi_ms.
-    w_s: weight of SSIM, as printed unless given.
+    corrected: with the sign of SSIM turned.
     """
-    metrics = [row.get(name) for name in ("psnr_db", "ssim", "lpips", "aaoi_ms")]
-    if any(value is None for value in metrics):
-        return None
-    psnr, ssim, lpips, age = (float(value) for value in metrics)  # type: ignore[arg-type]  # None was excluded
-    return W_P * psnr + w_s * ssim + W_L * lpips + W_T * age
+    found = REWARDS["corrected" if corrected else "thesis"].of(SimpleNamespace(**row))
+    return -found.total if found.complete and found.total is not None else None
 
 
 def make_reward(name: str = "corrected", fidelity: str = "whole", **others: Any) -> Reward:
@@ -127,9 +125,3 @@ def make_reward(name: str = "corrected", fidelity: str = "whole", **others: Any)
     if name not in REWARDS:
         raise ValueError(f"reward {name!r} is not known; choose one of {', '.join(REWARDS)}")
     return replace(REWARDS[name], fidelity=fidelity, **others)  # type: ignore[arg-type] # checked by Reward
-
-
-def without_missing_lpips(reward: Reward, lpips_missing: str | None) -> Reward:
-    """``reward`` without its LPIPS term where LPIPS is missing: nothing can be learned from rewards that are
-    never complete."""
-    return replace(reward, distance=0.0) if lpips_missing else reward

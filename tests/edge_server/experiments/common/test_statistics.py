@@ -12,7 +12,6 @@ from edge_server.experiments.common.statistics import (
     at_its_best,
     crossed,
     interval,
-    negated,
     optimum,
     paired,
     share_closed,
@@ -34,7 +33,6 @@ def test_too_few_values_have_no_interval():
     assert Interval(1.0, 0.5, 1.5, 9).above(0.4) is True
     assert Interval(1.0, 0.5, 1.5, 9).above(1.6) is False
     assert Interval(1.0, 0.5, 1.5, 9).above(1.0) is None
-    assert negated(None) is None and negated(True) is False
 
 
 def test_pairing_takes_out_what_seeds_have_in_common():
@@ -97,19 +95,20 @@ def test_the_share_of_a_gap():
 
 @pytest.mark.parametrize("spread", [0.0, 0.3, 1.0])
 def test_an_interval_over_runs_and_seeds_covers_what_it_says(spread):
-    """Three trainings that differ by ``spread``, tried on the same 60 seeds, whose mean is nought."""
+    """Differences of three trainings that vary by ``spread``, tried on the same 60 seeds, whose mean is nought: pairing
+    has taken out what seeds have in common, which is where the interval is narrowest for what it holds."""
     rng = np.random.default_rng(3)
     covered = by_seeds = 0
-    for _ in range(400):
-        table = spread * rng.normal(size=(3, 1)) + rng.normal(size=(1, 60)) + rng.normal(size=(3, 60))
+    for _ in range(1000):
+        table = spread * rng.normal(size=(3, 1)) + rng.normal(size=(3, 60))
         found = crossed([dict(enumerate(run)) for run in table.tolist()])
         alone = interval(table.mean(axis=0).tolist())
         assert found.mean == pytest.approx(alone.mean)
         covered += found.low <= 0.0 <= found.high
         by_seeds += alone.low <= 0.0 <= alone.high
-    assert covered >= 0.92 * 400
+    assert 930 <= covered <= 985
     if spread == 1.0:  # the interval that leaves the trainings out
-        assert by_seeds < 0.5 * 400
+        assert by_seeds < 500
 
 
 def test_runs_and_seeds_where_there_are_few_of_either():

@@ -24,12 +24,12 @@ from edge_server.experiments.frontier.update_time import (
     variants,
 )
 from edge_server.experiments.virtual import costs
-from edge_server.experiments.virtual.run_settings import Compute
 from edge_server.live.frontier import read_frontier
+from edge_server.settings import ComputeConfig
 from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
 
 TINY = MovingScene(cameras=4, size=32)
-COMPUTE = Compute(ms_per_step=30.0, ms_per_update=10.0)
+COMPUTE = ComputeConfig(ms_per_step=30.0, ms_per_update=10.0)
 
 
 def test_an_update_time_point_is_the_same_bit_for_bit_whatever_ran_before():
@@ -42,7 +42,7 @@ def test_an_update_time_point_is_the_same_bit_for_bit_whatever_ran_before():
     longer = run_updates(replace(run, update_s=0.4))
     assert longer["update_s"] == pytest.approx(0.4)
     assert longer["aaoi_ms"] - first["aaoi_ms"] == pytest.approx(300, abs=90)
-    at_arrivals = run_updates(replace(run, variant=layers, update_s=0.04, compute=Compute(0.0, 1.0)))
+    at_arrivals = run_updates(replace(run, variant=layers, update_s=0.04, compute=ComputeConfig(0.0, 1.0)))
     assert (at_arrivals["steps"], at_arrivals["update_s"]) == (10, 0.04) and at_arrivals["aaoi_ms"] < first["aaoi_ms"]
 
 

@@ -11,7 +11,7 @@ from edge_server.experiments.rollouts.episode import Choice, EpisodeFactory
 from edge_server.experiments.rollouts.rollout import choose, named
 from edge_server.experiments.rollouts.setting import PURPOSES, seeds
 from edge_server.experiments.virtual.from_scenario import build_deployment
-from edge_server.experiments.virtual.run_settings import Compute, RunSettings
+from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fields.registry import make_field
 from edge_server.scheduler import make_policy
@@ -19,6 +19,7 @@ from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
+from edge_server.settings import ComputeConfig
 from freshfield.scenario import ScenarioError
 from tests.edge_server.experiments.rollouts.small import FIELD, NOTHING, scenario, setting
 
@@ -34,7 +35,7 @@ def deployed(policy: str, value: float | None, seed: int, at_ns: int, **more) ->
     """The same deployment with its own edge, which decides first at an instant."""
     what = scenario(**more)
     edge = {**what.edge, "policy": {"name": policy, "value": value}}
-    terms = RunSettings(steps=4, epoch_ms=60_000.0, first_ms=at_ns / 1e6, scratch=True, compute=Compute(5.0))
+    terms = RunSettings(steps=4, epoch_ms=60_000.0, first_ms=at_ns / 1e6, scratch=True, compute=ComputeConfig(5.0))
     field = make_field("splat", FIELD, seed=setting().field_seed(seed))
     return build_deployment(dataclasses.replace(what, edge=edge, seed=seed), terms, field=field)
 
@@ -62,7 +63,7 @@ def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
         learner = Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), seed=4)
         learner.save(tmp_path / "policy.npz")
         policy = f"bandit:{tmp_path / 'policy.npz'}"
-    factory = EpisodeFactory(setting(compute=Compute(5.0)), NOTHING)
+    factory = EpisodeFactory(setting(compute=ComputeConfig(5.0)), NOTHING)
     episode = factory.episode(5)
     point = episode.points[0]
     choice = choose(named(policy)(np.random.default_rng(0)), episode, 0)

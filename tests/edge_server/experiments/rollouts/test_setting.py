@@ -45,7 +45,7 @@ def test_every_episode_has_a_motion_of_its_own_and_its_cameras_see_the_same_one(
         stage = factory.stage(seed)
         params = {"count": 5, "width": 24, "height": 24, "supersample": 1, "speed_m_per_s": 2.0}
         scene = make_scene("room", {**params, "motion_seed": seed})
-        images[seed] = stage.truths["cam00"].view("cam00", 10**9)[0]
+        images[seed] = stage.truth.view("cam00", 10**9)[0]
         assert np.array_equal(images[seed], scene.render("cam00", 1.0))
         source = stage.cameras[0].source
         assert np.array_equal(source.scene.render("cam01", 1.0), scene.render("cam01", 1.0))
@@ -81,17 +81,3 @@ def test_the_scenarios_seed_and_the_repeat_decide_the_fields_luck_and_so_does_th
     assert len({what.field_seed(seed) for what in (a, b, again) for seed in range(20)}) == 60
     found = [one_of(what).psnr_db for what in (a, b, again)]
     assert len(set(found)) == 3 and one_of(a).psnr_db == found[0]
-
-
-def test_a_silent_camera_never_reports_and_is_another_setting():
-    what = setting(silent=("cam02",))
-    assert what.key != setting().key
-    factory = EpisodeFactory(what, NOTHING)
-    for seed in range(3):
-        for point in factory.episode(seed).points:
-            assert point.cameras == ("cam01", "cam02", "cam03", "cam04")
-            assert not any(a.camera == "cam02" for a in point.arrivals)
-            assert not point.state.reported[1] and np.isnan(point.state.ages_ms[1])
-            assert point.state.reported[[0, 2, 3]].all()
-    with pytest.raises(ValueError, match="not a training camera"):
-        setting(silent=("cam00",))

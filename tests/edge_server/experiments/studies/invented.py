@@ -11,7 +11,7 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.studies.registry import STUDIES
 from edge_server.experiments.studies.study import StudyRequest, Verdict, judge
-from edge_server.scheduler.learned.rewards import W_S, f_w
+from edge_server.scheduler.learned.rewards import f_w
 
 
 def request(tmp_path: Path, **more: Any) -> StudyRequest:
@@ -53,7 +53,7 @@ def table_of(name: str, tmp_path: Path, rule: Callable[[Any], dict[str, Any]], s
     """The rows of a study of trials on ``room`` whose results follow a rule."""
     points = STUDIES[name].cases(request(tmp_path, seeds=seeds, scenes=("room",)))
     rows = [{**p.labels, "seed": p.trial.seed, **rule(p.trial)} for p in points]
-    return SeedTable([{**row, "f_w": f_w(row), "f_w_corrected": f_w(row, -W_S)} for row in rows])
+    return SeedTable([{**row, "f_w": f_w(row), "f_w_corrected": f_w(row, corrected=True)} for row in rows])
 
 
 def verdicts(name: str, tmp_path: Path, rule: Callable[[Any], dict[str, Any]], seeds: int = 6) -> list[Verdict]:

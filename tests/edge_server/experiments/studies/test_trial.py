@@ -85,7 +85,7 @@ def test_points_are_labeled_kept_and_not_run_again(tmp_path: Path, monkeypatch):
     assert [row["x"] for row in rows] == [60.0, 400.0] and rows[0]["psnr_db"] != rows[1]["psnr_db"]
     assert rows[0]["psnr_db"] == run_trial(points[0].trial, NO_DATA)["psnr_db"]
     assert rows[0]["f_w"] is None, "without LPIPS"
-    monkeypatch.setattr(trial_module, "run_trial", None)
+    monkeypatch.setattr(trial_module, "_decided", None)
     assert run_points(points, request(tmp_path)) == rows
     monkeypatch.undo()
     other = [replace(points[0], trial=replace(TRIAL, value=60.0, steps=5))]

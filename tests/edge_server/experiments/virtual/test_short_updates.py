@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.virtual.from_scenario import build_deployment
-from edge_server.experiments.virtual.run_settings import Compute, RunSettings
+from edge_server.experiments.virtual.run_settings import RunSettings
+from edge_server.settings import ComputeConfig
 from freshfield.scenario import parse
 from tests.edge_server.fields.small import small
 
@@ -31,7 +32,7 @@ def _mean_psnr(field: Any, cameras: int, size: int, steps: int, update_ms: float
     }
     settings = RunSettings(
         150,  # of the first update
-        compute=Compute(ms_per_update=0.9 * update_ms),
+        compute=ComputeConfig(ms_per_update=0.9 * update_ms),
         epoch_ms=update_ms,
         score_every_ms=200.0,
         grace_ms=500.0,

@@ -16,14 +16,15 @@ from channel_emu.model.link import EventKind
 from channel_emu.model.settings import channel_from_mapping
 from channel_emu.virtual.simulate import simulate
 from edge_server.experiments.virtual.from_scenario import build_deployment, exact_scene, training_cameras
-from edge_server.experiments.virtual.run_settings import Compute, RunSettings
+from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.truth import ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
+from edge_server.settings import ComputeConfig
 from freshfield import payload
 from freshfield.scenario import Scenario, parse
 from tests.edge_server.experiments.sets import SMALL, write_recording
 
-SETTINGS = RunSettings(steps=2, compute=Compute(ms_per_step=40.0, ms_per_update=20.0))
+SETTINGS = RunSettings(steps=2, compute=ComputeConfig(ms_per_step=40.0, ms_per_update=20.0))
 
 
 def scenario(channel: dict[str, Any] | None = None, seed: int = 3, **other: Any) -> Scenario:
@@ -109,7 +110,7 @@ def test_a_fault_of_the_rate_takes_longer_for_what_the_frames_hold():
 )
 def test_the_links_decide_as_the_simulation_does(channel):
     what = scenario(channel)
-    deployment = run(what, RunSettings(steps=1, compute=Compute(ms_per_update=500.0)), seconds=2.0)
+    deployment = run(what, RunSettings(steps=1, compute=ComputeConfig(ms_per_update=500.0)), seconds=2.0)
     config = channel_from_mapping(what.channel)
     alone = simulate(config, list(what.training), 2.0, what.seed, frame_period_ms=1e3 / 15)
     expected = {r.camera: r.link.counts[EventKind.DELIVERED] for r in alone.runs}
@@ -125,7 +126,7 @@ def test_the_present_is_when_the_charge_is_over():
 
 
 def test_free_compute_publishes_at_the_decision_and_never_spins():
-    free = run(scenario({}), RunSettings(steps=1, compute=Compute()), seconds=0.5)
+    free = run(scenario({}), RunSettings(steps=1, compute=ComputeConfig()), seconds=0.5)
     assert {p.update_ms for p in free.publications} == {0.0}
     assert len(free.publications) == 8, "once an arrival instant: ticks 0 to 7 of 15 a second"
     epochs = run(scenario({}), RunSettings(steps=1, epoch_ms=200.0), seconds=1.0)
@@ -146,7 +147,7 @@ def test_at_twice_the_load_frames_are_left_out_and_what_is_shown_does_not_age() 
     options = {"layers": True, "gaussians": 300, "start": 200, "seed_cells": 12, "threads": 1}
     edge = {"field": "splat", "field_options": options, "policy": {"name": "all"}, "updates": "arrivals"}
     settings = RunSettings(
-        steps=1, compute=Compute(ms_per_update=5.0, ms_per_view=10.0), epoch_ms=40.0, score_every_ms=None
+        steps=1, compute=ComputeConfig(ms_per_update=5.0, ms_per_view=10.0), epoch_ms=40.0, score_every_ms=None
     )
     ages = []
     for fps in (15.0, 30.0):
@@ -164,7 +165,7 @@ def test_at_twice_the_load_frames_are_left_out_and_what_is_shown_does_not_age() 
 
 def test_wait_uses_only_what_was_generated_after_the_decision():
     edge = {"field": "ngp", "field_options": SMALL, "policy": {"name": "wait", "value": 150.0}}
-    deployment = run(scenario(edge=edge), RunSettings(steps=1, compute=Compute(ms_per_update=10.0)), seconds=2.0)
+    deployment = run(scenario(edge=edge), RunSettings(steps=1, compute=ComputeConfig(ms_per_update=10.0)), seconds=2.0)
     assert len(deployment.publications) > 3
     for p in deployment.publications:
         assert p.update_ms >= 10.0 and max(p.ages_ms) <= 150.0 + 10.0 + 200.0
@@ -243,7 +244,7 @@ def test_wrong_poses_reach_the_field_and_wrong_lenses_are_believed():
 
 
 def test_what_is_shown_is_the_newest_publication_carried_on_to_seeded_instants() -> None:
-    settings = RunSettings(steps=2, compute=Compute(ms_per_step=40.0, ms_per_update=20.0), shown_every_ms=70.0)
+    settings = RunSettings(steps=2, compute=ComputeConfig(ms_per_step=40.0, ms_per_update=20.0), shown_every_ms=70.0)
     deployment = build_deployment(scenario(), settings)
     asked: list[tuple[int, int]] = []
     take = deployment.updates.field.snapshot
