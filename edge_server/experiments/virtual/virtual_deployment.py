@@ -1,7 +1,7 @@
 """A whole deployment in virtual time: cameras -> links -> gate -> buffer -> updates -> publications.
 
 It uses the live parts with a virtual clock. With one seed a run repeats bit for bit, faults included.
-``Compute`` sets the cost of an update; an update is published when that cost has elapsed. A frame is
+``ComputeConfig`` sets the cost of an update; an update is published when that cost has elapsed. A frame is
 captured and encoded only when an update uses it, a fault damages it, or a fault of its link depends on its
 size, which does not change results, because nothing reads a frame earlier.
 """
