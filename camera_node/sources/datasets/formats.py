@@ -18,6 +18,10 @@ from camera_node.sources.datasets.records import Dataset, DatasetError, find_fil
 FORMATS = tuple(kind for kind, model in MODELS.items() if issubclass(model, RecordedConfig))
 
 
+# What scanners and other tools leave, and the command of nerfstudio that makes a transforms.json of it.
+_CONVERTED = {"metadata.json": "record3d", "keyframes": "polycam", "cameras.xml": "metashape"}
+
+
 class Reader(Protocol):
     """Interface of a format's module. FILES: patterns of the files that describe a data set in a folder; the
     first usable one is taken."""
@@ -83,6 +87,9 @@ def open_dataset(path: Path, scale: float = 1.0, name: str | None = None) -> tup
         raise DatasetError(errors[0])
     if name is not None:
         raise DatasetError(f"{path}: holds no data set of the format {name}")
+    for file_name, tool in _CONVERTED.items():
+        if (path / file_name).exists():
+            raise DatasetError(f"{path}: holds {file_name}, of {tool}: convert it with ns-process-data {tool}")
     raise DatasetError(
         f"{path}: holds no data set: expected transforms.json, transforms_*.json, the calibration JSON of "
         "videos, poses_bounds.npy, annots.npy, Eyeful's cameras.json or a COLMAP model"

@@ -215,7 +215,9 @@ def _lens(d: dict[str, Any], image: Path, sizes: dict[str, tuple[int, int]], cam
         raise DatasetError(
             f"{where}: camera_model {d['camera_model']!r:.60} is no lens that is read: undistort the images"
         )
-    fisheye = bool(d.get("is_fisheye", model in _FISHEYE))
+    fisheye = d.get("is_fisheye", model in _FISHEYE)
+    if fisheye not in (True, False):
+        raise DatasetError(f"{where}: is_fisheye is {fisheye!r:.60}, expected true or false")
     if "camera_model" in d and fisheye != (model in _FISHEYE):
         raise DatasetError(
             f"{where}: is_fisheye and camera_model {model} contradict each other: leave out what is wrong"
@@ -244,7 +246,7 @@ def _lens(d: dict[str, Any], image: Path, sizes: dict[str, tuple[int, int]], cam
     cx = _number(d, "cx", where) if "cx" in d else width / 2.0
     cy = _number(d, "cy", where) if "cy" in d else height / 2.0
     with errors_at(where):
-        return Lens(width, height, fx, fy, cx, cy, tuple(bends[:4]), (bends[4], bends[5]), fisheye)
+        return Lens(width, height, fx, fy, cx, cy, tuple(bends[:4]), (bends[4], bends[5]), bool(fisheye))
 
 
 def _focal(d: dict[str, Any], axis: str, side: int, where: str) -> float | None:

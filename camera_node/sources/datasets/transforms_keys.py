@@ -9,7 +9,7 @@ from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
 
-CAMERA_NAMES = ("camera", "camera_label", "camera_name", "cam_name", "cam")
+CAMERA_NAMES = ("camera", "camera_label", "camera_name", "cam_name", "cam", "camera_id", "cam_id", "camera_index")
 """Keys of a frame that name the camera that took it; the first one counts."""
 
 _HONORED = """
@@ -27,7 +27,7 @@ applied_transform applied_scale scene_box scene_scale scene_center avg_pos near 
 depth_file_path depth_path depth_unit_scale_factor integer_depth_scale enable_depth_loading normal_path
 normal_file_path confidence_path ply_file_path sparse_pcd_path
 rotation sharpness sharpen blur_score frame frame_id frame_index n_frames colmap_im_id colmap_id image_id id
-timestamp timestamps timestamp_ns exposure exposure_time iso name version generator camera_id camera_make date
+timestamp timestamps timestamp_ns exposure exposure_time iso name version generator camera_make date
 driver_parameters n_extra_learnable_dims has_mask
 """
 HARMLESS = frozenset(_HARMLESS.split())
@@ -48,6 +48,7 @@ REFUSED: dict[str, str] = {
         "the camera moved during the exposure: give the pose of its middle as transform_matrix",
     ),
     "enable_ray_loading": "rays come from files of their own: give a lens instead",
+    **dict.fromkeys(("timestep", "timestep_index", "time_index", "frame_time"), "give the instant in seconds as time"),
     **dict.fromkeys(("from_mitsuba", "from_na"), "its axes are others: convert the poses to OpenGL's and leave it out"),
     **dict.fromkeys(
         ("white_transparent", "black_transparent", "mask_color"),
@@ -57,7 +58,7 @@ REFUSED: dict[str, str] = {
 
 # What a key that nobody here knows must not look like: words of lenses, projections and masks.
 _SUSPECT = re.compile(
-    r"fish|dist(ort|_?coef)|shutter|lens|fov|skew|mask|crop|proj|pano|equi|lat_?long|ortho|omni|shift|flip|mirror|"
+    r"fish|dist(ort|_?coef)|shutter|lens|fov|skew|mask|alpha|crop|proj|pano|equi|lat_?long|ortho|omni|shift|flip|mirror|"
     r"^([kpsb]\d+|f[xy]|c[xy]|focal.*|intr.*|extr.*|camera_(type|intrinsics|matrix|angle.*)|K|D)$",
     re.IGNORECASE,
 )
@@ -72,13 +73,18 @@ def check_keys(entry: Mapping[str, Any], where: str) -> set[str]:
             continue
         if key in REFUSED:
             raise DatasetError(f"{where}: {key}: {REFUSED[key]}")
-        if _SUSPECT.search(key):
-            raise DatasetError(
-                f"{where}: {key} is not understood and may change the camera or what may be learned: undistort or mask "
-                "the images accordingly, and leave it out"
-            )
+        refuse_suspect(key, where)
         unknown.add(key)
     return unknown
+
+
+def refuse_suspect(key: str, where: str) -> None:
+    """Raise DatasetError for an unknown key that looks as if it changed the camera or what may be learned."""
+    if _SUSPECT.search(key):
+        raise DatasetError(
+            f"{where}: {key} is not understood and may change the camera or what may be learned: undistort or mask "
+            "the images accordingly, and leave it out"
+        )
 
 
 def unknown_note(unknown: Iterable[str]) -> str:

@@ -102,6 +102,11 @@ def _records(dataset: Dataset, frame: int) -> tuple[dict[str, PosedImage], str]:
         rig = len(dataset.cameras) == len(dataset)
         return {(r.camera if rig else r.name): r for r in dataset}, ""
     cameras = {camera: dataset.of(camera) for camera in dataset.cameras}
+    if len(cameras) == 1:
+        raise DatasetError(
+            f"one camera, {dataset.cameras[0]}, and times: there is one view of each instant; if nothing "
+            "moves, leave out the times"
+        )
     slowest = max(cameras.values(), key=_apart_s)
     if not 0 <= frame < len(slowest):
         raise DatasetError(f"--frame {frame}: the recording has the frames 0 to {len(slowest) - 1}")

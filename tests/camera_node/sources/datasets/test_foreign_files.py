@@ -82,6 +82,8 @@ def test_keys_of_the_camera_are_honored_at_the_top_and_in_a_frame(tmp_path, keys
         ({"lens_shift_x": 0.1}, "lens_shift_x is not understood and may change the camera"),
         ({"fisheye_fov": 180}, "fisheye_fov is not understood"),
         ({"K": [[1]]}, "K is not understood"),
+        ({"alpha_path": "a.png"}, "alpha_path is not understood"),
+        ({"is_fisheye": "false"}, "is_fisheye is 'false', expected true or false"),
         ({"p3": 0.2}, "p3 is not understood"),
         ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR' is no lens that is read: undistort"),
         ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye and camera_model OPENCV contradict"),
@@ -238,6 +240,14 @@ def test_what_is_missing_is_named_with_what_lies_beside(tmp_path):
     assert load_dataset(file).notes == (note,)
     (tmp_path / "images").rename(tmp_path / "pictures")
     fails(rf"5 of 5 images are missing, first images/000.png; {tmp_path} holds .*pictures", load_dataset, file)
+
+
+@pytest.mark.parametrize(
+    ("name", "tool"), [("metadata.json", "record3d"), ("keyframes", "polycam"), ("cameras.xml", "metashape")]
+)
+def test_what_a_scanner_left_is_named_with_its_converter(tmp_path, name, tool):
+    (tmp_path / name).mkdir()
+    fails(rf"holds {name}, of {tool}: convert it with ns-process-data {tool}", open_dataset, tmp_path)
 
 
 def test_backslashes_are_slashes_and_links_lead_nowhere_else(tmp_path):

@@ -216,6 +216,11 @@ def test_what_does_not_fit_is_named(tmp_path):
     file.write_text(json.dumps(rig))
     with pytest.raises(DatasetError, match=r"cam01\.R_world_to_cam"):
         opened(video_scenario(file))
+    rig["cam01"]["dist_coeffs"] = [0.1]
+    file.write_text(json.dumps(rig))
+    with pytest.raises(DatasetError, match=r"json: cam01: dist_coeffs is not understood and may change the camera"):
+        opened(video_scenario(file))
+    rig["cam01"].pop("dist_coeffs")
     (tmp_path / "b/videos").mkdir(parents=True)
     with pytest.raises(DatasetError, match=r"expected one calib\*.json, found none"):
         opened(video_scenario(tmp_path / "b"))

@@ -107,6 +107,12 @@ def test_an_instant_of_cameras_of_different_rates_is_one_of_time(tmp_path):
     assert {c: round((g - 10) / 8) for c, g in greens.items()} == {"cam01": 30, "cam02": 15, "cam03": 15}
 
 
+def test_one_camera_with_times_has_one_view_of_each_instant(tmp_path):
+    write_recording(tmp_path, cameras=1)
+    with pytest.raises(DatasetError, match="one camera, cam00, and times: there is one view of each instant"):
+        load_recorded(tmp_path, "0")
+
+
 def test_masked_pixels_are_not_scored():
     truth = np.full((24, 32, 3), 100, np.uint8)
     rendering = np.full((24, 32, 3), 110 / 255, np.float32)
