@@ -3,7 +3,6 @@ them."""
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import subprocess
@@ -17,9 +16,15 @@ GRACE_S = 8.0
 """Time for a process to end after SIGTERM before it is killed."""
 
 _TAIL_BYTES = 16_384
-_PR_SET_PDEATHSIG = 1
-# Loaded here because a child must import nothing between fork and exec.
-_libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
+# Asks Linux to end the process when its parent is gone (prctl's PR_SET_PDEATHSIG), and becomes the command. Not between
+# fork and exec: there a process with gRPC's threads may not run Python.
+_DIE_WITH_PARENT = """
+import ctypes, os, signal, sys
+ctypes.CDLL(None).prctl(1, signal.SIGTERM, 0, 0, 0)
+signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+if os.getppid() == int(sys.argv[1]):
+    os.execvp(sys.argv[2], sys.argv[2:])
+"""
 
 
 @dataclass
@@ -48,14 +53,16 @@ class Child:
         with self.log.open("ab") as log:
             log.write(f"$ {' '.join(self.command)}\n".encode())
             log.flush()
+            starter: tuple[str, ...] = ()
+            if sys.platform == "linux":
+                starter = (sys.executable, "-I", "-S", "-c", _DIE_WITH_PARENT, str(os.getpid()))
             self.process = subprocess.Popen(
-                list(self.command),
+                [*starter, *self.command],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, "PYTHONUNBUFFERED": "1", **self.environment},
                 start_new_session=True,
-                preexec_fn=_die_with_parent if _libc else None,
             )
         self.started_s = time.monotonic()
 
@@ -140,9 +147,3 @@ def tail(path: Path, lines: int) -> list[str]:
     if size > _TAIL_BYTES and found:
         found = found[1:]  # the first line is incomplete
     return [line for line in found if not line.startswith("$ ")][-lines:]
-
-
-def _die_with_parent() -> None:
-    """Runs in the child. Without it, a launcher that is killed would leave its processes running."""
-    assert _libc is not None
-    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)

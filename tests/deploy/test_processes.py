@@ -29,6 +29,20 @@ def test_the_exit_summary_names_the_exit_code_and_the_last_lines(tmp_path: Path)
     assert str(child.log) in text
 
 
+def test_a_child_becomes_its_command_and_runs_no_python_between_fork_and_exec(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There it might wait forever for a lock that another thread of the launcher held."""
+    options: list[str] = []
+    start = subprocess.Popen
+    monkeypatch.setattr(processes.subprocess, "Popen", lambda *a, **b: options.extend(b) or start(*a, **b))
+    child = python(tmp_path, "import os, signal, sys; print(os.getpid(), sys.argv, signal.getsignal(signal.SIGTERM))")
+    child.start()
+    wait_until(lambda: not child.running, "it did not end")
+    assert f"\n{child.pid} ['-c'] {int(signal.SIG_DFL)}\n" in child.log.read_text()
+    assert "preexec_fn" not in options and "start_new_session" in options
+
+
 def test_stop_terminates_first_and_kills_after_the_grace_time(tmp_path: Path) -> None:
     obedient = python(
         tmp_path,
