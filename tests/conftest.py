@@ -34,42 +34,26 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(_CACHE / "freshfield"))
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# What computes, in virtual time or none, or waits for what has minutes to come: whoever runs beside it
-# changes nothing but how long it takes. All else meets clocks, ports or whole deployments and has the machine
-# to itself.
-_SIDE_BY_SIDE = (
-    "camera_node/pose",
-    "camera_node/robot/calibration",
-    "camera_node/robot/arm/test_viewpoint_tour.py",
-    "camera_node/robot/arm/test_kinematics.py",
-    "camera_node/sources/datasets",
-    "camera_node/sources/test_with_effects.py",
-    "camera_node/synthetic",
-    "channel_emu/estimate",
-    "channel_emu/model",
-    "channel_emu/virtual",
-    "chaos/test_seeds.py",
-    "deploy/test_check_report.py",
-    "deploy/test_docs.py",
-    "deploy/test_scenarios.py",
-    "deploy/test_wheel.py",
-    "edge_server/embed",
-    "edge_server/experiments",
-    "edge_server/export",
-    "edge_server/fidelity",
-    "edge_server/fields",
-    "edge_server/foreground",
-    "edge_server/live/test_buffer.py",
-    "edge_server/live/test_clock_jumps.py",
-    "edge_server/live/test_keyframes.py",
-    "edge_server/report",
-    "edge_server/scheduler",
-    "edge_server/surface",
-    "edge_server/viewpoints",
-    *(f"freshfield/test_{name}.py" for name in ("frame", "geometry", "payload", "scenario")),
-    "fuzz",
-    "test_architecture.py",
-    "test_lazy_imports.py",
+# What has the machine to itself: whole deployments, and what compares instants of the wall clock. All else computes, or
+# waits for what has seconds to come: whoever runs beside it changes nothing but how long it takes.
+_ALONE = (
+    "camera_node/robot/arm/test_drive.py",
+    "camera_node/robot/arm/test_joint_states.py",
+    "camera_node/robot/simulated_controller",
+    "camera_node/robot/teleop",
+    "camera_node/robot/test_flange_camera.py",
+    "camera_node/sources/devices/test_live.py",
+    "camera_node/test_capture.py",
+    "camera_node/test_clock_offset.py",
+    "camera_node/test_node.py",
+    "channel_emu/live/test_live_and_virtual.py",
+    "deploy/test_cell.py",
+    "deploy/test_up.py",
+    "edge_server/live/test_loop.py",
+    "edge_server/live/test_scoring_thread.py",
+    "edge_server/live/test_server.py",
+    "edge_server/live/test_server_learned.py",
+    "edge_server/page",
 )
 
 
@@ -92,8 +76,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=[item for item in items if item.nodeid in left_out])
         items[:] = [item for item in items if item.nodeid not in left_out]
     for item in items:
-        apart = any(item.path.is_relative_to(tests / place) for place in _SIDE_BY_SIDE)
-        if apart and item.get_closest_marker("alone") is None:
+        alone = any(item.path.is_relative_to(tests / place) for place in _ALONE)
+        if not alone and item.get_closest_marker("alone") is None:
             item.add_marker("side_by_side")
 
 

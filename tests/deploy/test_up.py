@@ -16,7 +16,11 @@ from typing import Any
 
 import pytest
 
+from freshfield.scenario import load
+from freshfield_up import run as launcher
+from freshfield_up.commands import ProcessSet
 from freshfield_up.folder import EARLIER, prepare
+from freshfield_up.processes import Child
 from freshfield_up.status import read_json
 from tests.support import free_port
 
@@ -128,9 +132,34 @@ def test_a_run_ends_when_its_time_is_up_with_a_report(up: Callable[..., Up]) -> 
     prepare(run.out, {}).close()  # knows all the names that a run writes
 
 
-@pytest.mark.parametrize(
-    "name, role", [pytest.param("node", "the camera node", marks=pytest.mark.slow), ("edge", "the edge server")]
-)
+def test_a_process_that_dies_ends_the_run_is_named_and_the_others_are_stopped(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Processes that only sleep stand for edge, emulator and node."""
+    monkeypatch.setattr(launcher.signal, "signal", lambda *_: None)
+
+    def child(name: str, words: str) -> Child:
+        return Child(name, f"the {name}", [sys.executable, "-c", words], tmp_path / "run" / f"log-{name}.txt")
+
+    sleeps, dies = (
+        "import time; time.sleep(60)",
+        "import os, time; print('so much'); time.sleep(0.8); os.kill(os.getpid(), 9)",
+    )
+    made = ProcessSet(child("edge", sleeps), child("emulator", sleeps), [child("node", dies)], "127.0.0.1:1", "")
+    monkeypatch.setattr(launcher, "process_set", lambda *_: made)
+    (tmp_path / "small.yaml").write_text(SMALL)
+    run = launcher.Launcher(load(tmp_path / "small.yaml"), launcher.Options(tmp_path / "run", port=free_port()))
+    assert run.run() == 1
+    said = capfd.readouterr().out
+    assert "the node was killed by SIGKILL" in said and "  | so much" in said
+    assert said.endswith("no report: the run did not start\n")
+    assert not any(child.running for child in made.children) and made.emulator.process is None
+    rows = [json.loads(line) for line in (tmp_path / "run" / "processes.jsonl").read_text().splitlines()]
+    assert rows[0]["edge"]["pid"] == made.edge.pid and "machine" in rows[0]
+
+
+@pytest.mark.slow  # 12 s each
+@pytest.mark.parametrize("name, role", [("node", "the camera node"), ("edge", "the edge server")])
 def test_a_killed_process_is_named_and_the_report_still_accounts_for_every_frame(
     up: Callable[..., Up], name: str, role: str
 ) -> None:
