@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.kernels.mlp import Net
-from edge_server.fields.common.kernels.occupancy import CELLS_A_TASK, count_views, sample_density, threshold
+from edge_server.fields.common.kernels.occupancy import CELLS_A_TASK, Cells, sample_density, threshold
 from edge_server.fields.common.kernels.rays import COARSE, Space
 from edge_server.fields.common.kernels.train import CHUNK
+from edge_server.fields.common.kernels.visual_hull import count_points
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.common.supervision import pack_cameras
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.view_store import ViewStore
 
@@ -20,6 +21,17 @@ EVERY = 8  # steps between refreshes
 PHASES = 4  # refreshes until every cell has been sampled
 FADE = 0.75  # share of a cell's density that is left at each sample
 EMPTY = 0.5  # density per scene unit that counts as empty: a step of it dims by a hundredth or two
+
+
+def cell_centers(cells: int, contracted: bool) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Centers (N, 3) of all cells in scene units, contraction undone, and how much longer steps are there, (N,)."""
+    half = 2.0 if contracted else 1.0
+    side = (np.arange(cells) + 0.5) * (2.0 * half / cells) - half
+    z, y, x = np.meshgrid(side, side, side, indexing="ij")
+    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    far = np.maximum(np.abs(points).max(axis=1), 1.0)  # 1 where nothing is contracted
+    spread = 1.0 / (2.0 - far)
+    return (points * (spread / far)[:, None]).astype(np.float32), (spread**2).astype(np.float32)
 
 
 class OccupancyGrid:
@@ -38,6 +50,7 @@ class OccupancyGrid:
         self.occupied = np.zeros(cells**3, np.uint8)
         self.coarse = np.zeros((cells // COARSE) ** 3, np.uint8)
         self.needed = 1
+        self._centers, self._stretch = cell_centers(cells, self.contracted)
 
     def space(self, step: float) -> Space:
         """The grid as kernels read it, without copies."""
@@ -58,67 +71,29 @@ class OccupancyGrid:
         pixels. Otherwise a moving body could not appear where space was known to be empty.
         """
         assert store.box is not None
-        views = pack_cameras(store.views, store.box)
-        masks = [m.moved for m in store.memory.values()]
-        mask_first = np.full(len(masks), -1, np.int64)
-        parts, length = [np.zeros(0, np.uint8)], 0
-        for k, mask in enumerate(masks):
-            if mask is not None:
-                mask_first[k] = length
-                parts.append(mask.reshape(-1).astype(np.uint8))
-                length += mask.size
-        marked = np.zeros_like(self.seen)
-        pool.run(
-            count_views,
-            self.cells,
-            self.contracted,
-            self.near,
-            views,
-            mask_first,
-            np.concatenate(parts),
-            self.seen,
-            marked,
-        )
+        rows = camera_rows([v.camera_to_world for v in store.views], [v.intrinsics for v in store.views], store.box)
+        seen, marked = (np.zeros(self.seen.size, np.int32) for _ in range(2))
+        for row, m in zip(rows, store.memory.values()):
+            mask = np.zeros(m.view.image.shape[:2], np.uint8) if m.moved is None else m.moved.astype(np.uint8)
+            pool.run(count_points, row[None], self._centers, mask, seen, marked)
+        self.seen[:] = seen
         self.needed = min(self.min_views, len(store.memory))
-        if length:
-            moving = (marked >= max(self.needed, 1)) & (2 * marked >= self.seen)
-            np.maximum(self.density, np.float32(1.5 * EMPTY), out=self.density, where=moving)
+        moving = (marked >= max(self.needed, 1)) & (2 * marked >= seen)
+        np.maximum(self.density, np.float32(1.5 * EMPTY), out=self.density, where=moving)
         self.update_occupied()
 
-    def refresh(
-        self,
-        pool: Pool,
-        key: np.uint64,
-        phase: int,
-        encoding: Any,
-        levels: int,
-        net: Net,
-        acts: NDArray[np.float32],
-        x: NDArray[np.float32],
-    ) -> None:
-        """Sample the density of every ``PHASES``-th cell, from cell ``phase`` on."""
-        pool.run(
-            sample_density,
-            key,
-            phase % PHASES,
-            PHASES,
-            np.float32(FADE),
-            encoding,
-            levels,
-            net,
-            self.cells,
-            self.contracted,
-            self.seen,
-            self.needed,
-            self.density,
-            acts,
-            x,
-        )
+    def refresh(self, pool: Pool, key: np.uint64, phase: int, model: tuple[Any, int, Net], acts: Any, x: Any) -> None:
+        """Sample the density of every ``PHASES``-th cell, from cell ``phase`` on. model: encoding, levels and network.
+        acts, x: see ``sample_density``."""
+        pool.run(sample_density, key, phase % PHASES, PHASES, np.float32(FADE), *model, self._cells(), acts, x)
         self.update_occupied()
+
+    def _cells(self) -> Cells:
+        return Cells(self.cells, self.seen, self.needed, self._stretch, self.density)
 
     def update_occupied(self) -> None:
         """Give samples to the cells with a density of ``EMPTY`` or more."""
-        threshold(self.density, self.seen, self.needed, EMPTY, self.cells, self.occupied, self.coarse)
+        threshold(self._cells(), EMPTY, self.occupied, self.coarse)
 
 
 assert CELLS_A_TASK <= CHUNK, "a task's samples must fit the scratch of a training chunk"

@@ -237,16 +237,8 @@ class TrainedField(SteppedField[RaySnapshot]):
         assert box is not None
         key = step_key(s.seed, self.step)
         if self.step % EVERY == 0:
-            self._occupancy.refresh(
-                self.pool,
-                key,
-                self.step // EVERY,
-                self._encoding,
-                levels,
-                self._net,
-                self._scratch.acts,
-                self._scratch_x,
-            )
+            model = self._encoding, levels, self._net
+            self._occupancy.refresh(self.pool, key, self.step // EVERY, model, self._scratch.acts, self._scratch_x)
         space: Space = self._occupancy.space(step_length(self.settings, self.step))
         batch = self._batch
         ray_sampling = RaySampling(

@@ -1,4 +1,4 @@
-"""A camera as a row of float32 that kernels read (``common.camera_rows``), and its lens."""
+"""A camera as a row of float32 that kernels read (``common.camera_rows``), its lens, and which points it sees."""
 
 from __future__ import annotations
 
@@ -40,3 +40,29 @@ def distort(cam, x, y):
     xyy = _F2 * x * g + eight * k2 * x * y * y + _F2 * p2
     yyy = six * y * g + eight * k2 * y * y * y + six * p1
     return u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy
+
+
+@device_function
+def rotate_to_camera(cam, x, y, z):
+    """A vector in world axes -> in camera axes."""
+    return (
+        cam[0] * x + cam[1] * y + cam[2] * z,
+        cam[3] * x + cam[4] * y + cam[5] * z,
+        cam[6] * x + cam[7] * y + cam[8] * z,
+    )
+
+
+@device_function
+def lens_terms(cam, x, y, z):
+    """The projection of a camera point through the lens, and what the Jacobian J and its gradient need:
+    x / z, y / z, both clamped, projected u, v, the lens's first and second derivatives, 1 / z. J is taken at
+    the ratios clamped to 1.3 times the field of view."""
+    inverse = _F1 / z
+    a, c = x * inverse, y * inverse
+    ta = min(max(a, cam[LIMITS]), cam[LIMITS + 1])
+    tc = min(max(c, cam[LIMITS + 2]), cam[LIMITS + 3])
+    u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy = distort(cam, ta, tc)
+    # Beyond the limits the lens is linear: its polynomial would fold back into the image out there.
+    u += dxx * (a - ta) + dxy * (c - tc)
+    v += dxy * (a - ta) + dyy * (c - tc)
+    return a, c, ta, tc, u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse

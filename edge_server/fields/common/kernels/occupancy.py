@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
-from edge_server.fields.common.kernels.jit import device_function, kernel
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.radiance_model import query_density
 from edge_server.fields.common.kernels.rays import COARSE
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite, uniform
@@ -13,80 +16,29 @@ from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
 CELLS_A_TASK = 2048  # at most train.CHUNK: they share its scratch
 
 
-@device_function
-def cell_centre(index, cells, contracted):
-    """Center of a cell in scene units (contraction undone) and how much longer a step is there."""
-    i, j, k = index % cells, (index // cells) % cells, index // (cells * cells)
-    half = 2.0 if contracted else 1.0
-    scale = 2.0 * half / cells
-    x, y, z = (i + 0.5) * scale - half, (j + 0.5) * scale - half, (k + 0.5) * scale - half
-    m = max(abs(x), max(abs(y), abs(z)))
-    if contracted and m > 1.0:
-        far = 1.0 / (2.0 - m)
-        s = far / m
-        return x * s, y * s, z * s, far * far
-    return x, y, z, 1.0
+class Cells(NamedTuple):
+    """Cells of space, side^3 of them, x fastest.
 
-
-@kernel
-def count_views(counter, worker, cells, contracted, near, views, mask_first, mask, seen, marked):
-    """For each cell, how many cameras see its center from farther than ``near``.
-
-    mask: uint8, a flag for each pixel of the views that have a mask, of view v from mask_first[v] on.
-    mask_first: int64 (V,), -1: no mask. seen: uint16 (cells^3,), the count.
-    marked: uint16 (cells^3,), how many cameras see the cell at a flagged pixel.
-    Lens distortion is left out: it moves a cell's center by less than a cell.
+    seen: uint16 (N,), how many cameras see each. needed: cameras that must see a cell.
+    stretch: float32 (N,), how much longer steps are where space is contracted.
+    density: float32 (N,), per scene unit, times ``stretch``; 0 in cells that too few cameras see.
     """
-    tasks = (seen.size + CELLS_A_TASK - 1) // CELLS_A_TASK
-    while True:
-        task = fetch_add(counter, 1)
-        if task >= tasks:
-            return
-        for cell in range(task * CELLS_A_TASK, min((task + 1) * CELLS_A_TASK, seen.size)):
-            x, y, z, _ = cell_centre(cell, cells, contracted)
-            count, flags = 0, 0
-            for v in range(views.origin.shape[0]):
-                px, py, pz = x - views.origin[v, 0], y - views.origin[v, 1], z - views.origin[v, 2]
-                r = views.rotation[v]
-                depth = r[0, 2] * px + r[1, 2] * py + r[2, 2] * pz
-                if depth <= near:
-                    continue
-                lens = views.lens[v]
-                column = lens[0] * (r[0, 0] * px + r[1, 0] * py + r[2, 0] * pz) / depth + lens[2]
-                row = lens[1] * (r[0, 1] * px + r[1, 1] * py + r[2, 1] * pz) / depth + lens[3]
-                width, height = views.size[v, 0], views.size[v, 1]
-                if 0.0 <= column < width and 0.0 <= row < height:
-                    count += 1
-                    if mask_first[v] >= 0:
-                        flags += mask[mask_first[v] + np.int64(row) * width + np.int64(column)]
-            seen[cell], marked[cell] = count, flags
+
+    side: int
+    seen: NDArray[np.uint16]
+    needed: int
+    stretch: NDArray[np.float32]
+    density: NDArray[np.float32]
 
 
 @kernel
-def sample_density(
-    counter,
-    worker,
-    key,
-    phase,
-    phases,
-    fade,
-    encoding,
-    levels,
-    net,
-    cells,
-    contracted,
-    seen,
-    min_views,
-    density,
-    acts,
-    x,
-):
+def sample_density(counter, worker, key, phase, phases, fade, encoding, levels, net, grid, acts, x):
     """Refresh every ``phases``-th cell's density: the larger of the faded old one and a new random sample.
 
-    key: uint64, random stream. seen: uint16 (cells^3,); cells seen by fewer than min_views get 0.
-    density: float32 (cells^3,), per scene unit, times how much longer steps are where space is contracted.
+    key: uint64, random stream. grid: ``Cells``.
     acts: float32 (W, units, CHUNK) and x: float32 (W, 3, CHUNK), scratch.
     """
+    cells, seen, min_views, density = grid.side, grid.seen, grid.needed, grid.density
     per_task = CELLS_A_TASK
     cells_here = (density.size + phases - 1 - phase) // phases
     tasks = (cells_here + per_task - 1) // per_task
@@ -117,17 +69,17 @@ def sample_density(
                 density[cell] = np.float32(0.0)
                 continue
             sigma = exp32(min(max(raw[n], np.float32(RAW_LOW)), np.float32(RAW_HIGH)))
-            _, _, _, stretch = cell_centre(cell, cells, contracted)
-            fresh = sigma * np.float32(stretch)
+            fresh = sigma * grid.stretch[cell]
             # A density that is not finite: sample the cell again, and let training repair it.
             density[cell] = max(density[cell] * fade, fresh) if is_finite(fresh) else np.float32(1e3)
             n += 1
 
 
 @kernel
-def threshold(density, seen, min_views, bound, cells, occupied, coarse):
+def threshold(grid, bound, occupied, coarse):
     """Mark the cells whose density reaches ``bound``, but never more than .7 of the mean over seen cells:
-    a bound that is wrong for the scene must not empty it. Fills occupied and coarse (uint8)."""
+    a bound that is wrong for the scene must not empty it. grid: ``Cells``. Fills occupied and coarse (uint8)."""
+    cells, seen, min_views, density = grid.side, grid.seen, grid.needed, grid.density
     total, count = 0.0, 0
     for cell in range(density.size):
         if seen[cell] >= min_views:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.camera import LENS, LIMITS, NEAR, ORIGIN, SIZE, distort, load_camera
+from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, SIZE, lens_terms, load_camera, rotate_to_camera
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import bits_of_float, draw, exp32, is_finite, log32
 from edge_server.fields.common.kernels.volume_rendering import harmonic
@@ -96,32 +96,6 @@ def rotation(w, x, y, z):
 def exp_scale(raw):
     """The scale of a raw parameter, which is clamped first."""
     return exp32(min(max(raw, np.float32(LOG_SCALE_LOW)), np.float32(LOG_SCALE_HIGH)))
-
-
-@device_function
-def rotate_to_camera(cam, x, y, z):
-    """A vector in world axes -> in camera axes."""
-    return (
-        cam[0] * x + cam[1] * y + cam[2] * z,
-        cam[3] * x + cam[4] * y + cam[5] * z,
-        cam[6] * x + cam[7] * y + cam[8] * z,
-    )
-
-
-@device_function
-def lens_terms(cam, x, y, z):
-    """The projection of a camera point through the lens, and what the Jacobian J and its gradient need:
-    x / z, y / z, both clamped, projected u, v, the lens's first and second derivatives, 1 / z. J is taken at
-    the ratios clamped to 1.3 times the field of view."""
-    inverse = _F1 / z
-    a, c = x * inverse, y * inverse
-    ta = min(max(a, cam[LIMITS]), cam[LIMITS + 1])
-    tc = min(max(c, cam[LIMITS + 2]), cam[LIMITS + 3])
-    u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy = distort(cam, ta, tc)
-    # Beyond the limits the lens is linear: its polynomial would fold back into the image out there.
-    u += dxx * (a - ta) + dxy * (c - tc)
-    v += dxy * (a - ta) + dyy * (c - tc)
-    return a, c, ta, tc, u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse
 
 
 @device_function

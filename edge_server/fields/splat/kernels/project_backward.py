@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_server.fields.common.kernels.camera import LENS, ORIGIN
+from edge_server.fields.common.kernels.camera import LENS, ORIGIN, lens_terms, rotate_to_camera
 from edge_server.fields.common.kernels.jit import device_function
 from edge_server.fields.common.kernels.volume_rendering import SH_C1, harmonic
 from edge_server.fields.splat.kernels.project import (
@@ -23,8 +23,6 @@ from edge_server.fields.splat.kernels.project import (
     QUATERNION,
     SCALE,
     exp_scale,
-    lens_terms,
-    rotate_to_camera,
     rotate_to_world,
     rotation,
     unit_quaternion,

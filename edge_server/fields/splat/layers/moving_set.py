@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common.kernels.visual_hull import count_points
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.buffers import RasterBuffers
@@ -18,7 +19,6 @@ from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.kernels.rasterize import Targets
 from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.kernels.align import align_view
-from edge_server.fields.splat.layers.kernels.visual_hull import count_foreground
 from edge_server.fields.splat.layers.motion import Motion, ViewRow
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 from edge_server.fields.splat.seeding import seed_gaussians
@@ -230,7 +230,7 @@ class MovingSet:
         square = np.ones((dilation_px, dilation_px), np.uint8)
         for points, o in zip(places, frames, strict=True):
             mask = cv2.dilate(o.foreground.astype(np.uint8), square)
-            self.pool.run(count_foreground, cameras[o.camera].row, np.ascontiguousarray(points), mask, seen, inside)
+            self.pool.run(count_points, cameras[o.camera].row, np.ascontiguousarray(points), mask, seen, inside)
         return inside / np.maximum(seen, 1)
 
     # --- state --------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.camera import LENS, NEAR, load_camera
+from edge_server.fields.common.kernels.camera import LENS, NEAR, lens_terms, load_camera, rotate_to_camera
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import draw
 from edge_server.fields.common.kernels.simd_vectors import (
@@ -30,17 +30,7 @@ from edge_server.fields.common.kernels.simd_vectors import (
     require_contiguous,
 )
 from edge_server.fields.splat.kernels.composite import PIXELS, SAVED, STRIP, STRIPS, _StripBuilder
-from edge_server.fields.splat.kernels.project import (
-    CONIC_A,
-    CONIC_B,
-    CONIC_C,
-    MEAN_X,
-    MEAN_Y,
-    RED,
-    TILE,
-    lens_terms,
-    rotate_to_camera,
-)
+from edge_server.fields.splat.kernels.project import CONIC_A, CONIC_B, CONIC_C, MEAN_X, MEAN_Y, RED, TILE
 from edge_server.fields.splat.kernels.rasterize import begin_tile, composite_strips, strip_scratch
 from edge_server.fields.splat.layers.settings import ATTACHED, NOISE, ROBUST
 from edge_server.fields.splat.settings import ALPHA_MAX, ALPHA_MIN

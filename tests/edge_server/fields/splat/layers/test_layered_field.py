@@ -258,7 +258,8 @@ def test_warming_up_compiles_every_kernel() -> None:
     """Nothing is left to compile when a body moves: in a process of its own."""
     code = """
 from numba.core.dispatcher import Dispatcher
-from edge_server.fields.splat.layers.kernels import align, plates, solve, visual_hull
+from edge_server.fields.common.kernels import visual_hull
+from edge_server.fields.splat.layers.kernels import align, plates, solve
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from tests.edge_server.fields.splat.layers.test_layered_field import SMALL, _run
 def compiled():

@@ -1,20 +1,19 @@
-"""Which points lie in a view's foreground."""
+"""Which points a view sees, and which lie in its mask: counted over views, a visual hull."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, load_camera
+from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, lens_terms, load_camera, rotate_to_camera
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.simd import fetch_add
-from edge_server.fields.splat.kernels.project import lens_terms, rotate_to_camera
 
 _POINTS = 256  # a task
 _F0 = np.float32(0.0)
 
 
 @kernel
-def count_foreground(counter, worker, cams, points, mask, seen, marked):
+def count_points(counter, worker, cams, points, mask, seen, marked):
     """Count a view for the points that it sees, and for those in its mask. Tasks are runs of points.
 
     cams: float32 (1, CAMERA). points: float32 (N, 3), scene units. mask: uint8 (H, W).

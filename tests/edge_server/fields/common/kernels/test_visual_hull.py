@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.fields.common.camera_rows import camera_rows
+from edge_server.fields.common.kernels.visual_hull import count_points
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.fields.splat.layers.kernels.visual_hull import count_foreground
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.splat.kernels.small_cloud import BOX
 
@@ -18,7 +18,7 @@ def test_points_are_counted_where_the_lens_puts_them() -> None:
     points = rng.normal(scale=1.2, size=(700, 3)).astype(np.float32)
     mask = (rng.random((30, 40)) < 0.4).astype(np.uint8)
     seen, marked = np.ones(700, np.int32), np.zeros(700, np.int32)
-    Pool(2, 0).run(count_foreground, camera_rows([pose], [LENS], BOX), points, mask, seen, marked)
+    Pool(2, 0).run(count_points, camera_rows([pose], [LENS], BOX), points, mask, seen, marked)
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     u, v = LENS.project(local).T
     inside = (local[:, 2] > 0.05) & (u >= 0) & (v >= 0) & (u < 40) & (v < 30)
