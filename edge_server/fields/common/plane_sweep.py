@@ -84,22 +84,10 @@ def score_grid(
         if data.weight.size:
             flags[a:b][data.weight[a:b] <= 0] = 0
     plain = empty_color(settings, some)
+    plain = np.zeros(0, np.float32) if plain is None else plain
     needed = min(max(settings.min_views, least), len(some))
-    scores = np.zeros(cells**3, np.float32)
-    pool.run(
-        score_cells,
-        cams,
-        data,
-        blurred,
-        flags,
-        plain is not None,
-        plain if plain is not None else np.zeros(3, np.float32),
-        np.float32(TOLERANCE),
-        box.contracted,
-        cells,
-        needed,
-        scores,
-    )
+    scores, tolerance = np.zeros(cells**3, np.float32), np.float32(TOLERANCE)
+    pool.run(score_cells, cams, data, blurred, flags, plain, tolerance, box.contracted, cells, needed, scores)
     return scores
 
 

@@ -65,25 +65,12 @@ class RaySnapshot:
         """What a camera sees at image points (N, 2)."""
         pose = np.asarray(camera_to_world, dtype=np.float64)
         lens, rotation = np.array(lens_row(intrinsics), dtype=np.float64), np.ascontiguousarray(pose[:3, :3])
-        origin, n = self.box.normalise(pose[:3, 3]), len(pixels)
+        camera, n = (lens, rotation, self.box.normalise(pose[:3, 3])), len(pixels)
         out = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
-        units = int(self.net.widths.sum())
+        units, pixels = int(self.net.widths.sum()), np.ascontiguousarray(pixels, dtype=np.float64)
         scratch = tuple(np.empty((self.pool.threads, rows, BATCH), np.float32) for rows in (units, 3, 3))
-        self.pool.run(
-            render_tiles,
-            lens,
-            rotation,
-            origin,
-            np.ascontiguousarray(pixels, dtype=np.float64),
-            self.space,
-            self.encoding,
-            self.levels,
-            self.net,
-            self.settings.sh_degree,
-            self.background,
-            scratch,
-            out,
-        )
+        model, degree = (self.encoding, self.levels, self.net), self.settings.sh_degree
+        self.pool.run(render_tiles, camera, pixels, self.space, model, degree, self.background, scratch, out)
         color, depth, opacity = out
         depth *= np.float32(self.box.radius_m)
         return color, depth, opacity

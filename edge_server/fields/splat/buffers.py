@@ -83,19 +83,8 @@ class RasterBuffers:
         gradients were not finite. cams: as given to the last ``project_and_bin``."""
         count = len(gaussians.params)
         dropped = np.zeros(-(-count // BLOCK) + 1, np.int64)
-        self.pool.run(
-            adam_step,
-            cams,
-            gaussians,
-            count,
-            self.projected,
-            self.lists.own_first,
-            self.lists.own_count,
-            self.sums,
-            moments,
-            rule,
-            dropped,
-        )
+        mine = self.projected, self.lists, self.sums
+        self.pool.run(adam_step, cams, gaussians, count, *mine, moments, rule, dropped)
         return int(dropped.sum())
 
     def _bin(self, count: int) -> None:

@@ -81,15 +81,13 @@ def _hidden_cells(cams, size, first, flags, nowhere, row, pixels, tally, hidden)
 
 
 @kernel
-def score_cells(
-    counter, worker, cams, views, blurred, flags, plain, plain_color, tolerance, contracted, cells, min_views, scores
-):
+def score_cells(counter, worker, cams, views, blurred, flags, plain, tolerance, contracted, cells, min_views, scores):
     """How well the cameras agree on the color of each cell. Tasks are layers along z.
 
     cams: float32 rows of at most MOST_VIEWS cameras; views: ``rays.Views`` of the same. Pixels of weight 0 do
         not vote. blurred: uint8 (pixels, 3 or 4), the pictures as sharp as the cells.
     flags: see ``_hidden_cells``; (0,): all cells are scored.
-    plain: whether plain_color, float32 (3,), is an empty background.
+    plain: float32 (3,), color of an empty background; (0,): there is none.
     tolerance: float32, between agreeing colors, summed over channels, in [0, 3].
     scores: float32 (cells^3,), x fastest, receives up to 1; NOT_SEEN where fewer than min_views see the cell,
         where it is hidden, or where background shows.
@@ -134,11 +132,11 @@ def score_cells(
                         np.float32(blurred[pixel, 2]) * _BYTE,
                     )
                     red[n], green[n], blue[n] = r, g, b
-                    away = abs(r - plain_color[0]) + abs(g - plain_color[1]) + abs(b - plain_color[2])
                     if blurred.shape[1] == 4:
                         empty += 1 if blurred[pixel, 3] < 16 else 0
-                    elif plain and away < np.float32(0.06):
-                        empty += 1
+                    elif plain.size > 0:
+                        away = abs(r - plain[0]) + abs(g - plain[1]) + abs(b - plain[2])
+                        empty += 1 if away < np.float32(0.06) else 0
                     n += 1
                     if empty >= _EMPTY_VIEWS:
                         break

@@ -36,18 +36,17 @@ def _march(encoding, space, o, travel, active, count, x, line, first):
 
 
 @kernel
-def render_tiles(
-    counter, worker, lens, rotation, origin, pixels, space, encoding, levels, net, sh_degree, background, scratch, out
-):
+def render_tiles(counter, worker, camera, pixels, space, model, sh_degree, background, scratch, out):
     """Render image points; tasks are runs of TILE of them.
 
-    lens: float64 (8,). rotation: float64 (3, 3), camera to world. origin: float64 (3,), scene units.
+    camera: lens, float64 (8,); rotation, float64 (3, 3), camera to world; origin, float64 (3,), scene units.
+    model: encoding, number of its levels in use, network.
     pixels: float64 (N, 2), image points. background: float32 (3,).
     scratch: float32 (W, units, BATCH), (W, 3, BATCH) and (W, 3, BATCH), activations, points and lines.
     out: color, float32 (N, 3), depth (scene units) and opacity: float32 (N,); all written.
     """
+    (lens, rotation, origin), (encoding, levels, net), (color, depth, opacity) = camera, model, out
     acts, x, line = scratch[0][worker], scratch[1][worker], scratch[2][worker]
-    color, depth, opacity = out
     dts, shaded = line[1], acts[acts.shape[0] - net.widths[-1] :]
     travel = np.empty((TILE, 6), np.float32)  # direction, distance reached, distance of leaving, optical depth
     first = np.empty(TILE + 1, np.int64)

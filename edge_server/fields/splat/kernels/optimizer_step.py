@@ -170,18 +170,16 @@ def _adam(first, size, params, moments, rule, g):
 
 
 @kernel
-def adam_step(
-    counter, worker, cams, gaussians, count, projected, own_first, own_count, pair_sums, moments, rule, dropped
-):
+def adam_step(counter, worker, cams, gaussians, count, projected, lists, pair_sums, moments, rule, dropped):
     """An Adam step of all Gaussians that have pairs; the others and their moments stay as they are. Tasks
     are blocks of Gaussians.
 
     cams: float32 (B, CAMERA), the cameras of this step.
-    projected, own_first, own_count, pair_sums: see ``project``, ``TileLists``, ``composite_backward``.
+    projected, lists, pair_sums: see ``project``, ``TileLists``, ``composite_backward``.
     moments: ``OptimizerState``, updated. rule: ``AdamParameters``.
     dropped: int64 (blocks,), written: gradients that were not finite.
     """
-    params = gaussians.params
+    params, own_first, own_count = gaussians.params, lists.own_first, lists.own_count
     width = params.shape[1]
     s, ids, touched = block_scratch(width), np.empty(BLOCK, np.int64), np.empty(BLOCK, np.bool_)
     g = np.empty(3 * width * BLOCK, np.float32)

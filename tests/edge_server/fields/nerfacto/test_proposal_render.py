@@ -53,21 +53,12 @@ def _render(
     view, n = VIEWS[2], len(pixels)
     x, line = (np.full((1, 3, BATCH), np.nan, np.float32) for _ in range(2))
     out = np.full((n, 3), np.nan, np.float32), np.full(n, np.nan, np.float32), np.full(n, np.nan, np.float32)
-    CallerPool().run(
-        render_tiles,
-        np.array(lens_row(view.intrinsics)),
-        view.camera_to_world[:3, :3].copy(),
-        snapshot.box.normalise(view.camera_to_world[:3, 3]),
-        pixels,
-        snapshot.space,
-        snapshot.encoding,
-        snapshot.levels,
-        snapshot.net,
-        snapshot.settings.sh_degree,
-        snapshot.background,
-        (np.empty((1, int(snapshot.net.widths.sum()), BATCH), np.float32), x, line),
-        out,
-    )
+    lens, rotation = np.array(lens_row(view.intrinsics)), view.camera_to_world[:3, :3].copy()
+    camera = lens, rotation, snapshot.box.normalise(view.camera_to_world[:3, 3])
+    model = snapshot.encoding, snapshot.levels, snapshot.net
+    scratch = np.empty((1, int(snapshot.net.widths.sum()), BATCH), np.float32), x, line
+    degree = snapshot.settings.sh_degree
+    CallerPool().run(render_tiles, camera, pixels, snapshot.space, model, degree, snapshot.background, scratch, out)
     here = np.isfinite(x[0, 0])
     return x[0][:, here].T, line[0, 0, here], line[0, 1, here], np.column_stack(out)
 

@@ -50,20 +50,8 @@ def test_where_something_moved_only_cells_that_most_cameras_see_move_are_scored(
 
     def scores(says: np.ndarray) -> np.ndarray:
         found = np.zeros(cells**3, np.float32)
-        pool.run(
-            score_cells,
-            cams,
-            data,
-            pixels,
-            says,
-            False,
-            np.zeros(3, np.float32),
-            np.float32(0.3),
-            contracted,
-            cells,
-            2,
-            found,
-        )
+        none, tolerance = np.zeros(0, np.float32), np.float32(0.3)
+        pool.run(score_cells, cams, data, pixels, says, none, tolerance, contracted, cells, 2, found)
         return found
 
     everywhere, where_marked = scores(np.zeros(0, np.int32)), scores(says)
