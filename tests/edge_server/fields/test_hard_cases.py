@@ -96,8 +96,7 @@ def test_cameras_a_ten_millionth_of_a_meter_apart_and_from_straight_down(name: s
         assert mean_psnr(field, views) > 14.0
 
 
-@pytest.mark.parametrize("value", [0, 255, 77])
-@pytest.mark.parametrize("channels", [3, 4])
+@pytest.mark.parametrize(("value", "channels"), [(0, 3), (255, 3), (77, 4)])
 @every_field
 def test_constant_black_and_saturated_pictures(name: str, value: int, channels: int) -> None:
     views = [replace(v, image=np.full((24, 24, channels), value, np.uint8)) for v in VIEWS]

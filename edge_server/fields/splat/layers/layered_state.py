@@ -27,7 +27,9 @@ Arrays = dict[str, NDArray[Any]]
 NAME = "splat in layers"
 VERSION = 6
 COUNTERS = ("layered", "origin_ns", "plates_s", "fine_s", "fine", "exposure_rounds")  # of the field
-TRACKED = ("anchors_s", "seeded_s", "fits")  # and of its tracker
+TRACKED = ("anchors_s", "seeded_s", "fits")  # of its tracker
+OF_CAMERA = ("newest_s", "rendered_step", "moves", "anew")
+ARRAYS_OF_CAMERA = ("away", "depth_m")  # or None
 
 
 def pack(field: Any) -> Arrays:
@@ -37,49 +39,34 @@ def pack(field: Any) -> Arrays:
     cameras, observations = [], []
     for k, camera in enumerate(field.cameras.values()):
         view = camera.view
-        cameras.append(
-            {
-                **_facts(view),
-                "taken": list(camera.taken),
-                "newest_s": _number(camera.newest_s),
-                "rendered_step": camera.rendered_step,
-                "moves": camera.moves,
-                "anew": camera.anew,
-                "intrinsics": asdict(view.intrinsics),
-            }
-        )
-        state |= {f"camera_{k}.image": view.image, f"camera_{k}.pose": view.camera_to_world}
-        state |= _prefixed(f"camera_{k}.plate.", camera.plate.state())
+        lens, taken = asdict(view.intrinsics), list(camera.taken)
+        cameras.append({**_facts(view), **_numbers(camera, OF_CAMERA), "taken": taken, "lens": lens})
+        arrays = {"image": view.image, "pose": view.camera_to_world, **_prefixed("plate.", camera.plate.state())}
         if camera.fine is not None:
-            state |= _prefixed(f"camera_{k}.fine.", camera.fine.state())
-        if camera.away is not None:
-            state[f"camera_{k}.away"] = camera.away
-        if camera.depth_m is not None:
-            state[f"camera_{k}.depth_m"] = camera.depth_m
+            arrays |= _prefixed("fine.", camera.fine.state())
+        arrays |= {name: array for name in ARRAYS_OF_CAMERA if (array := getattr(camera, name)) is not None}
+        state |= _prefixed(f"camera_{k}.", arrays)
     for k, o in enumerate(field.observations):
         observations.append({**_facts(o.view), "instant_s": o.instant_s, "fresh": o.fresh})
-        arrays: dict[str, NDArray[Any] | None] = {
-            "image": o.view.image,
-            "foreground": o.foreground,
-            "given": o.view.weight,
-            "weight": None if o.weight is None else _half(o.weight),
-        }
+        arrays = {"image": o.view.image, "foreground": o.foreground}
+        if o.view.weight is not None:
+            arrays["given"] = o.view.weight
+        if o.weight is not None:
+            arrays["weight"] = _half(o.weight)
         if o.row is not None:
             arrays |= {"matrix": o.row.matrix, "vector": o.row.vector, "around": o.row.around}
-        state |= _prefixed(f"frame_{k}.", {n: a for n, a in arrays.items() if a is not None})
+        state |= _prefixed(f"frame_{k}.", arrays)
     state |= _prefixed("still.", field.still.state()) | _prefixed("static.", field.static.state())
-    refused = sorted(field.refused)
-    counters = {name: _number(getattr(field, name)) for name in COUNTERS}
     tracked = None
     if field.tracker is not None:
         state |= _prefixed("moving.", field.tracker.moving.state())
-        tracked = {name: _number(getattr(field.tracker, name)) for name in TRACKED}
+        tracked = _numbers(field.tracker, TRACKED)
     meta = {
         "version": VERSION,
         "field": NAME,
         "settings": msgspec.structs.asdict(field.settings),
-        **counters,
-        "refused": refused,
+        **_numbers(field, COUNTERS),
+        "refused": sorted(field.refused),
         "tracked": tracked,
         "cameras": cameras,
         "frames": observations,
@@ -97,31 +84,17 @@ def unpack(field: Any, state: Arrays) -> None:
     field.cameras, field.observations, field.tracker = {}, Observations(), None
     for k, facts in enumerate(meta["cameras"]):
         arrays = _under(f"camera_{k}.", state)
-        lens = {**facts["intrinsics"], "distortion": tuple(facts["intrinsics"]["distortion"])}
-        view = View(
-            facts["camera"], np.array(arrays["image"]), np.array(arrays["pose"]), Pinhole(**lens), facts["generated_ns"]
-        )
+        lens = {**facts["lens"], "distortion": tuple(facts["lens"]["distortion"])}
+        image, pose = np.array(arrays["image"]), np.array(arrays["pose"])
+        view = View(facts["camera"], image, pose, Pinhole(**lens), facts["generated_ns"])
         check_view(view)
         plate = Plate(view.image.shape[0], view.image.shape[1], field.caller)
         plate.load_state(_under("plate.", arrays))
         fine = FinePlate.from_state(view, _under("fine.", arrays)) if "fine.color" in arrays else None
-        depth_m = np.array(arrays["depth_m"]) if "depth_m" in arrays else None
-        newest_s = -np.inf if facts["newest_s"] is None else facts["newest_s"]
-        taken = deque(facts["taken"], maxlen=FRAMES_KNOWN)
-        away = np.array(arrays["away"]) if "away" in arrays else None
-        field.cameras[view.camera] = FixedCamera(
-            view,
-            plate,
-            None,
-            depth_m,
-            facts["rendered_step"],
-            newest_s,
-            taken,
-            fine,
-            away,
-            facts["moves"],
-            facts["anew"],
-        )
+        camera = FixedCamera(view, plate, fine=fine, taken=deque(facts["taken"], maxlen=FRAMES_KNOWN))
+        camera.away, camera.depth_m = (np.array(arrays[n]) if n in arrays else None for n in ARRAYS_OF_CAMERA)
+        _set(camera, OF_CAMERA, facts)
+        field.cameras[view.camera] = camera
     for k, facts in enumerate(meta["frames"]):
         field.observations.add(_observation(field, facts, _under(f"frame_{k}.", state)))
     _set(field, COUNTERS, meta)
@@ -173,9 +146,10 @@ def _facts(view: View) -> dict[str, Any]:
     return {"camera": view.camera, "generated_ns": view.generated_ns}
 
 
-def _number(value: float | int | bool | None) -> float | int | bool | None:
-    """What JSON can hold: None for an infinite number."""
-    return None if value is None or not np.isfinite(value) else value
+def _numbers(owner: Any, names: tuple[str, ...]) -> dict[str, float | int | bool | None]:
+    """Attributes as JSON can hold them: None for an infinite number."""
+    values = {name: getattr(owner, name) for name in names}
+    return {name: None if value is None or not np.isfinite(value) else value for name, value in values.items()}
 
 
 def _prefixed(prefix: str, arrays: Arrays) -> Arrays:

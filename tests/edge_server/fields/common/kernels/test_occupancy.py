@@ -10,7 +10,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from edge_server.fields import Budget
 from edge_server.fields.common.kernels.occupancy import Cells, sample_density, threshold
 from edge_server.fields.common.kernels.rays import COARSE
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
@@ -20,31 +19,15 @@ from edge_server.fields.common.supervision import CameraMemory
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.common.view_store import ViewStore
 from edge_server.fields.ngp.field import NgpField
-from edge_server.fields.ngp.settings import NgpSettings
-from tests.edge_server.fields.scenes import ring
+from tests.edge_server.fields.common.kernels.small_field import SETTINGS, VIEWS, fitted
 from tests.edge_server.fields.torch_model import encode, mlp, to_torch
 
 CELLS = 8  # a task's worth of cells, so that its samples are all there afterwards
-VIEWS = ring(5, size=24)
-SETTINGS = NgpSettings(
-    levels=4,
-    log2_table=10,
-    finest_resolution=32,
-    hidden=16,
-    rays=64,
-    batch_samples=2048,
-    samples=48,
-    cells=16,
-    samples_start=48,
-    threads=1,
-)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def field() -> NgpField:
-    made = NgpField(SETTINGS, CallerPool())
-    made.fit(VIEWS, Budget(steps=10))
-    return made
+    return fitted()
 
 
 def _centres(cells: int, contracted: bool) -> tuple[NDArray, NDArray]:

@@ -11,39 +11,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from edge_server.fields import Budget
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.kernels.train import RaySampling, train_chunks
 from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, Weights
 from edge_server.fields.common.supervision import pack_views
-from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.common.training_schedule import step_length
 from edge_server.fields.ngp.field import NgpField
-from edge_server.fields.ngp.settings import NgpSettings
-from tests.edge_server.fields.scenes import ring
+from tests.edge_server.fields.common.kernels.small_field import SETTINGS, VIEWS, fitted
 from tests.edge_server.fields.torch_model import encode, mlp, ray_losses, shade, to_torch
 
-SETTINGS = NgpSettings(
-    levels=4,
-    log2_table=10,
-    finest_resolution=32,
-    hidden=16,
-    rays=64,
-    batch_samples=2048,
-    samples=48,
-    cells=16,
-    samples_start=48,
-    threads=1,
-)
-VIEWS = ring(5, size=24)
 DISTORTION = 0.2
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def field() -> NgpField:
-    made = NgpField(SETTINGS, CallerPool())
-    made.fit(VIEWS, Budget(steps=10))
-    return made
+    return fitted()
 
 
 def _weights() -> list[NDArray[np.float32]]:

@@ -141,8 +141,8 @@ def test_views_after_a_blackout_are_followed_again():
     assert errors[-30:].max() < 0.01
 
 
-def test_ten_minutes_neither_drift_nor_lose_precision():
-    errors, motion = followed(lambda t: walk(t, 6), 600.0, cameras=2)
+def test_two_minutes_neither_drift_nor_lose_precision():
+    errors, motion = followed(lambda t: walk(t, 6), 120.0, cameras=2)
     assert errors[-300:].max() < 2 * errors[100:400].max()
     assert np.isfinite(motion._knots).all()
 

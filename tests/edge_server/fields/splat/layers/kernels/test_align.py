@@ -108,35 +108,6 @@ def test_anchors_of_what_lies_together_agree_roughly():
     assert np.linalg.norm(vector - right) < 0.05 * np.linalg.norm(right)
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-def test_the_gradient_is_that_of_the_rendered_image(axis):
-    """Central differences of the weighted squared error, with all Gaussians moved across the line of sight,
-    where their projected shapes change little. The image is that of Gaussians a little further on."""
-    params, anchor, share, _, plate, _ = case(count=12)
-    params[:, :3] *= 0.3
-    params[:, 3:6] = np.log(0.1)
-    params[:, 10] = 0.0
-    weight = np.ones((21, 29), np.float32)
-    across = CAMS[0, 3 * axis : 3 * axis + 3].astype(float)
-
-    black = np.zeros((21, 29, 3), np.uint8)
-
-    def at(step, image=black):
-        moved = params.copy()
-        moved[:, :3] += step * across
-        return aligned(moved, anchor, share, image, plate, weight)
-
-    image = np.clip(np.rint(255 * at(0.05)[2]), 0, 255).astype(np.uint8)
-    _, vector, shown, _ = at(0.0, image)
-    robust = 1 / (1 + ((image / 255.0 - shown) ** 2).sum(axis=-1) / ROBUST**2)
-    ahead, back = (
-        0.5 * (robust[..., None] * (image / 255.0 - at(step)[2]) ** 2).sum() / NOISE**2 for step in (2e-3, -2e-3)
-    )
-    slope = (ahead - back) / 4e-3
-    assert abs(slope) > 10.0
-    np.testing.assert_allclose(-vector.reshape(-1, 3).sum(axis=0) @ across, slope, rtol=0.05)
-
-
 def test_the_number_of_threads_does_not_change_bits():
     given = case(count=200)
     for a, b in zip(aligned(*given), aligned(*given, pool=Pool(3)), strict=True):
