@@ -90,3 +90,15 @@ def load_arrays(wanted: Arrays, state: Arrays) -> None:
             raise ValueError(f"the state lacks {name!r}, {mine.dtype} of shape {mine.shape}")
     for name, mine in wanted.items():
         mine[...] = state[name]
+
+
+def take_attributes(owner: Any, names: tuple[str, ...]) -> Arrays:
+    """Copies of attributes that are arrays or numbers, by name."""
+    return {name: np.array(getattr(owner, name)) for name in names}
+
+
+def give_attributes(owner: Any, names: tuple[str, ...], state: Arrays) -> None:
+    """Set the attributes that ``take_attributes`` took, to copies. KeyError: one is missing."""
+    for name in names:
+        array = np.array(state[name])
+        setattr(owner, name, array if array.ndim else array.item())

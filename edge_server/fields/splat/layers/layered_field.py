@@ -311,7 +311,8 @@ class LayeredField:
         seen = [
             o for o in self.observations if o.camera in views and o.view.generated_ns == views[o.camera].generated_ns
         ]
-        if not seen or self.observations.newest_s - self.fine_s < tuned.FINE_EVERY_S:
+        alone = len(self.cameras) < tuned.LEAST_CAMERAS
+        if not seen or alone or self.observations.newest_s - self.fine_s < tuned.FINE_EVERY_S:
             return
         self.fine_s = self.observations.newest_s
         o = min(seen, key=lambda o: self.cameras[o.camera].fine_count)

@@ -24,11 +24,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common.field_state import give_attributes, take_attributes
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.kernels.solve import BAND, PAIRS, add_row, add_span, solve_knots
 
 WINDOW = tuned.FREE + tuned.FIXED
+_KEPT = ("anchors", "_knots", "_first", "_band")  # of a state
 # x(k) = x(k-1) + v + r a as differences[0] x(k-3) + ... + differences[3] x(k) = 0
 DIFFERENCES = np.array([-tuned.PERSISTENCE, 1.0 + 2.0 * tuned.PERSISTENCE, -2.0 - tuned.PERSISTENCE, 1.0])
 
@@ -240,23 +242,16 @@ class Motion:
         """All of it as plain arrays. Without anchors there are none."""
         if self.anchors is None:
             return {}
-        return {
-            "anchors": self.anchors.copy(),
-            "knots": self._knots.copy(),
-            "first": np.array(self._first),
-            "band": self._band.copy(),
-            "rng": np.array(json.dumps(self.rng.bit_generator.state)),
-        }
+        return {"rng": np.array(json.dumps(self.rng.bit_generator.state)), **take_attributes(self, _KEPT)}
 
     def load_state(self, state: dict[str, NDArray]) -> None:
         """Continue from ``state``, bit for bit."""
         if not state:
             self.forget()
             return
-        self.anchors, self._knots = np.array(state["anchors"]), np.array(state["knots"])
-        self._first = int(state["first"])
+        self.anchors = np.array(state["anchors"])
         self._link()
-        self._band = np.array(state["band"])
+        give_attributes(self, _KEPT, state)
         self.rng.bit_generator.state = json.loads(str(state["rng"]))
 
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common.field_state import give_attributes, take_attributes
 from edge_server.fields.common.kernels.visual_hull import count_points
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import Pool
@@ -25,6 +26,7 @@ from edge_server.fields.splat.seeding import seed_gaussians
 from edge_server.fields.splat.settings import SplatSettings
 
 Arrays = dict[str, NDArray]
+_KEPT = ("anchor", "share", "capacity_factor", "steps", "_grown", "_draws")  # of a state
 
 
 class MovingSet:
@@ -239,24 +241,14 @@ class MovingSet:
         """Everything needed to continue bit for bit."""
         cloud = {f"cloud.{f.name}": getattr(self.cloud, f.name).copy() for f in fields(self.cloud)}
         motion = {f"motion.{name}": array for name, array in self.motion.state().items()}
-        counters = np.array([self.steps, self._grown, self._draws], np.int64)
-        return {
-            **cloud,
-            **motion,
-            "anchor": self.anchor.copy(),
-            "share": self.share.copy(),
-            "capacity_factor": np.array(self.capacity_factor),
-            "counters": counters,
-        }
+        return {**cloud, **motion, **take_attributes(self, _KEPT)}
 
     def load_state(self, state: Arrays) -> None:
         """Continue from ``state``. KeyError: it lacks something."""
         self.cloud = GaussianCloud(*(np.array(state[f"cloud.{f.name}"]) for f in fields(GaussianCloud)))
         prefix = "motion."
         self.motion.load_state({n[len(prefix) :]: a for n, a in state.items() if n.startswith(prefix)})
-        self.anchor, self.share = np.array(state["anchor"]), np.array(state["share"])
-        self.capacity_factor = float(state["capacity_factor"])
-        self.steps, self._grown, self._draws = (int(n) for n in state["counters"])
+        give_attributes(self, _KEPT, state)
 
     def _rng(self, purpose: int) -> np.random.Generator:
         self._draws += 1

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common.field_state import give_attributes, take_attributes
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.kernels.plates import (
@@ -29,6 +30,7 @@ from edge_server.fields.splat.layers.kernels.plates import (
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray]
+_KEPT = ("gain", "count", "_frames", "_gains", "_held", "_static", "_has_static")  # of a state
 
 
 class Plate:
@@ -173,24 +175,12 @@ class Plate:
 
     def state(self) -> Arrays:
         """Everything needed to continue bit for bit."""
-        mine = {
-            **self.arrays._asdict(),
-            "gain": self.gain,
-            "frames": self._frames,
-            "gains": self._gains,
-            "held": self._held,
-            "static": self._static,
-            "counters": np.array([self.count, int(self._has_static)]),
-        }
-        return {name: array.copy() for name, array in mine.items()}
+        return {**{n: a.copy() for n, a in self.arrays._asdict().items()}, **take_attributes(self, _KEPT)}
 
     def load_state(self, state: Arrays) -> None:
         """Continue from ``state``. KeyError: it lacks something."""
-        mine = {name: np.array(array) for name, array in state.items()}
-        self.arrays = PlateArrays(*(mine[name] for name in PlateArrays._fields))
-        self.gain, self._frames, self._gains = mine["gain"], mine["frames"], mine["gains"]
-        self._held, self._static = mine["held"], mine["static"]
-        self.count, self._has_static = int(mine["counters"][0]), bool(mine["counters"][1])
+        self.arrays = PlateArrays(*(np.array(state[name]) for name in PlateArrays._fields))
+        give_attributes(self, _KEPT, state)
         self._blur()
         self._fill()
 
@@ -258,7 +248,7 @@ class FinePlate:
         """Everything needed to continue bit for bit."""
         lens = self.view.intrinsics
         numbers = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion]
-        return {"color": self.color, "frames": self.frames, "count": np.array(self.count), "lens": np.array(numbers)}
+        return {"lens": np.array(numbers), **take_attributes(self, ("color", "frames", "count"))}
 
     @staticmethod
     def from_state(view: View, state: Arrays) -> FinePlate:
@@ -267,8 +257,7 @@ class FinePlate:
         fx, fy, cx, cy, k1, k2, p1, p2 = (float(n) for n in state["lens"])
         lens = Pinhole(width, height, fx, fy, cx, cy, (k1, k2, p1, p2))
         fine = FinePlate(replace(view, image=np.zeros((height, width, 3), np.uint8), intrinsics=lens))
-        fine.color, fine.frames = np.array(state["color"]), np.array(state["frames"])
-        fine.count = int(state["count"])
+        give_attributes(fine, ("color", "frames", "count"), state)
         return fine
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, Rendering, View
+from edge_server.fields.common.field_state import give_attributes, take_attributes
 from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import Gaussians
@@ -24,6 +25,7 @@ from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.snapshot import SplatSnapshot
 
 Arrays = dict[str, NDArray]
+_KEPT = ("rounds", "_rounds_wanted", "_rate", "_round_step", "grows_until")  # of a state
 
 
 class PlateImage(NamedTuple):
@@ -221,9 +223,7 @@ class StaticLayer:
 
     def state(self) -> Arrays:
         """What is needed, beside the field's own state, to resume bit for bit."""
-        again = int(self._rate == tuned.RATE_AGAIN)
-        counters = [self.rounds, self._rounds_wanted, self._round_step, again, self.grows_until]
-        mine: Arrays = {"rounds": np.array(counters, np.int64)}
+        mine: Arrays = take_attributes(self, _KEPT)
         if self._mean is not None:
             mine["mean"] = self._mean.copy()
         for k, (camera, (plate, known)) in enumerate(self._learned.items()):
@@ -232,8 +232,7 @@ class StaticLayer:
 
     def load_state(self, state: Arrays) -> None:
         """Resume from ``state``, with a field that has resumed already. KeyError: it lacks something."""
-        self.rounds, self._rounds_wanted, self._round_step, again, self.grows_until = (int(n) for n in state["rounds"])
-        self._rate = tuned.RATE_AGAIN if again else tuned.RATE_FIRST
+        give_attributes(self, _KEPT, state)
         self._mean = np.array(state["mean"]) if "mean" in state else None
         self._learned = {}
         while (key := f"learned_{len(self._learned)}") + ".camera" in state:

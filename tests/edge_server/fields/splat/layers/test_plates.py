@@ -98,11 +98,21 @@ def test_a_fine_plate_is_at_the_common_exposure_and_leaves_out_what_moves() -> N
     whole = ring(2, size=2 * SIZE)[0]
     fine, away = FinePlate(whole), np.zeros((SIZE, SIZE), bool)
     away[:8] = True
-    for color, gain in ((100, 1.0), (160, 2.0), (80, 1.0)):
+
+    def take(color: int, gain: float) -> None:
         fine.take(np.full(whole.image.shape, color, np.uint8), away, np.full(3, gain, np.float32))
+
+    for color, gain in ((100, 1.0), (160, 2.0), (80, 1.0)):
+        assert not fine.known.any()  # of less than three frames
+        take(color, gain)
     assert fine.known[20:].all() and not fine.known[:16].any() and fine.count == 3
     np.testing.assert_allclose(fine.color[20:], (100 + 80 + 80) / 3, rtol=1e-5)
     assert not fine.color[:16].any()
+    for _ in range(40):
+        take(100, 1.0)
+    before = fine.color[20:].copy()
+    take(180, 1.0)  # counts for a sixteenth
+    np.testing.assert_allclose(fine.color[20:], before + (180 - before) / 16, rtol=1e-5)
 
 
 def _cleaned_whole(mask: np.ndarray) -> np.ndarray:
