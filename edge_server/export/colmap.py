@@ -18,6 +18,19 @@ from edge_server.export import ExportError, PosedImage
 from freshfield.files import write_text
 from freshfield.geometry import Pinhole, matrix_to_quaternion, se3_inverse
 
+_HEADS = {
+    "cameras": ("# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"),
+    "images": (
+        "# Image list with two lines of data per image:",
+        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
+        "#   POINTS2D[] as (X, Y, POINT3D_ID)",
+    ),
+    "points3D": (
+        "# 3D point list with one line of data per point:",
+        "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
+    ),
+}
+
 
 @dataclass(frozen=True)
 class Cloud:
@@ -29,17 +42,6 @@ class Cloud:
     seen: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class _Image:
-    number: int
-    name: str
-    camera: int
-    quaternion: NDArray[np.float64]
-    translation: NDArray[np.float64]
-    pixels: NDArray[np.float64]  # (M, 2)
-    points: NDArray[np.int64]  # (M,), numbers of points from 1
-
-
 def write_model(folder: Path, shots: Sequence[PosedImage], cloud: Cloud) -> None:
     """Write cameras.txt, images.txt and points3D.txt to ``folder``, which is created. Images are named
     NAME.png. ExportError: no shots."""
@@ -47,30 +49,27 @@ def write_model(folder: Path, shots: Sequence[PosedImage], cloud: Cloud) -> None
         raise ExportError("no camera has reported: there is nothing to write")
     folder.mkdir(parents=True, exist_ok=True)
     lenses = list(dict.fromkeys(shot.intrinsics for shot in shots))
-    images = [_image(k, shot, lenses, cloud) for k, shot in enumerate(shots)]
-    # For each point: (image number, index of its pixel among that image's).
-    tracks: list[list[tuple[int, int]]] = [[] for _ in cloud.points]
-    for image in images:
-        for place, point in enumerate(image.points):
-            tracks[point - 1].append((image.number, place))
-    write_text(folder / "cameras.txt", _cameras_text(lenses))
-    write_text(folder / "images.txt", _images_text(images))
-    write_text(folder / "points3D.txt", _points_text(cloud, tracks))
-
-
-def _image(k: int, shot: PosedImage, lenses: list[Pinhole], cloud: Cloud) -> _Image:
-    inverse = se3_inverse(shot.camera_to_world)
-    which = np.flatnonzero(cloud.seen[:, k])
-    pixels = shot.intrinsics.project(cloud.points[which] @ inverse[:3, :3].T + inverse[:3, 3])
-    return _Image(
-        number=k + 1,
-        name=f"{shot.name}.png",
-        camera=lenses.index(shot.intrinsics) + 1,
-        quaternion=matrix_to_quaternion(inverse[:3, :3]),
-        translation=inverse[:3, 3],
-        pixels=pixels,
-        points=which + 1,
-    )
+    images: list[str] = []
+    tracks: list[list[str]] = [[] for _ in cloud.points]  # of each point: image number and index of the pixel there
+    for number, shot in enumerate(shots, 1):
+        inverse = se3_inverse(shot.camera_to_world)
+        which = np.flatnonzero(cloud.seen[:, number - 1])
+        pixels = shot.intrinsics.project(cloud.points[which] @ inverse[:3, :3].T + inverse[:3, 3])
+        for place, point in enumerate(which):
+            tracks[point].append(f"{number} {place}")
+        pose = f"{_numbers(matrix_to_quaternion(inverse[:3, :3]))} {_numbers(inverse[:3, 3])}"
+        images.append(f"{number} {pose} {lenses.index(shot.intrinsics) + 1} {shot.name}.png")
+        images.append(" ".join(f"{_numbers(pixel)} {point + 1}" for pixel, point in zip(pixels, which)))
+    cameras = [
+        f"{k} {_model(lens)[0]} {lens.width} {lens.height} {_numbers(_model(lens)[1])}"
+        for k, lens in enumerate(lenses, 1)
+    ]
+    points = [
+        f"{k} {_numbers(at)} {color[0]} {color[1]} {color[2]} 0.0 {' '.join(track)}".rstrip()
+        for k, (at, color, track) in enumerate(zip(cloud.points, cloud.color, tracks), 1)
+    ]
+    for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
+        write_text(folder / f"{name}.txt", "\n".join([*_HEADS[name], *lines]) + "\n")
 
 
 def _model(lens: Pinhole) -> tuple[str, list[float]]:
@@ -81,35 +80,3 @@ def _model(lens: Pinhole) -> tuple[str, list[float]]:
 
 def _numbers(values: Sequence[float] | NDArray[np.float64]) -> str:
     return " ".join(repr(float(v)) for v in values)  # the shortest text that reads back to the same bits
-
-
-def _cameras_text(lenses: list[Pinhole]) -> str:
-    lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    for k, lens in enumerate(lenses):
-        model, params = _model(lens)
-        lines.append(f"{k + 1} {model} {lens.width} {lens.height} {_numbers(params)}")
-    return "\n".join(lines) + "\n"
-
-
-def _images_text(images: list[_Image]) -> str:
-    lines = [
-        "# Image list with two lines of data per image:",
-        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
-        "#   POINTS2D[] as (X, Y, POINT3D_ID)",
-    ]
-    for i in images:
-        pose = f"{_numbers(i.quaternion)} {_numbers(i.translation)}"
-        lines.append(f"{i.number} {pose} {i.camera} {i.name}")
-        lines.append(" ".join(f"{_numbers(pixel)} {point}" for pixel, point in zip(i.pixels, i.points)))
-    return "\n".join(lines) + "\n"
-
-
-def _points_text(cloud: Cloud, tracks: list[list[tuple[int, int]]]) -> str:
-    lines = [
-        "# 3D point list with one line of data per point:",
-        "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
-    ]
-    for k, (point, color, track) in enumerate(zip(cloud.points, cloud.color, tracks)):
-        places = " ".join(f"{image} {place}" for image, place in track)
-        lines.append(f"{k + 1} {_numbers(point)} {color[0]} {color[1]} {color[2]} 0.0 {places}".rstrip())
-    return "\n".join(lines) + "\n"

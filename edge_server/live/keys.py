@@ -19,7 +19,7 @@ from freshfield.files import out_folder
 from freshfield.scenario import load
 from freshfield.transport import TransportError
 
-_DAYS = 365
+_REQUEST = "openssl req -x509 -days 365 -noenc -newkey ec -pkeyopt ec_paramgen_curve:prime256v1"
 _MOST_NAME_CHARS = 64  # in a certificate's common name
 _HERE = ("localhost", "127.0.0.1", "::1")
 
@@ -94,28 +94,10 @@ def _certify(folder: Path, name: str, extensions: Sequence[str], authority: Path
     with tempfile.NamedTemporaryFile("w", suffix=".cnf") as config:  # else openssl's own adds extensions
         config.write("[req]\ndistinguished_name=name\n[name]\n")
         config.flush()
-        command: list[str | Path] = [
-            "openssl",
-            "req",
-            "-x509",
-            "-config",
-            config.name,
-            "-days",
-            str(_DAYS),
-            "-noenc",
-            "-subj",
-            f"/CN={name}",
-            "-newkey",
-            "ec",
-            "-pkeyopt",
-            "ec_paramgen_curve:prime256v1",
-            *signed,
-            *(word for extension in extensions for word in ("-addext", extension)),
-            "-keyout",
-            folder / "key.pem",
-            "-out",
-            folder / "cert.pem",
-        ]
+        command: list[str | Path] = [*_REQUEST.split(), "-config", config.name, "-subj", f"/CN={name}", *signed]
+        for extension in extensions:
+            command += ["-addext", extension]
+        command += ["-keyout", folder / "key.pem", "-out", folder / "cert.pem"]
         try:
             done = subprocess.run(command, capture_output=True, text=True)
         except FileNotFoundError:

@@ -398,21 +398,9 @@ def confirm(counter, worker, images, view, planes, share, agree, against, rise):
             step = 1.0 / min(images.lens[k, 0], images.lens[k, 1])
             total, compared = np.float32(0.0), True
             for trial in range(3):
+                near = d * (1.0 + step * (trial - 1))
                 cost, shown = plane_cost(
-                    images,
-                    view,
-                    row,
-                    column,
-                    d * (1.0 + step * (trial - 1)),
-                    nx,
-                    ny,
-                    nz,
-                    across,
-                    down,
-                    patch,
-                    weight,
-                    facts,
-                    0.0,
+                    images, view, row, column, near, nx, ny, nz, across, down, patch, weight, facts, 0.0
                 )
                 total += -cost if trial == 1 else np.float32(0.5) * cost
                 compared = compared and shown > 0
