@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from edge_server.cli import main as edge_server
+from edge_server.fidelity import fetch_lpips
 from edge_server.fidelity.fetch_lpips import FetchError, convert
-from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fidelity.lpips_weights import FILES, open_lpips
 
 # (name, (out, in, kernel)) of torchvision's convolutions.
 ALEX = (("0", (64, 3, 11)), ("3", (192, 64, 5)), ("6", (384, 192, 3)), ("8", (256, 384, 3)), ("10", (256, 256, 3)))
@@ -61,3 +62,10 @@ def test_a_package_that_is_missing_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "lpips", None)
     assert edge_server(["fetch-lpips", "--out", str(tmp_path)]) == 2
     assert "needs lpips: pip install 'freshfield[edge,lpips]'" in capsys.readouterr().err
+
+
+def test_the_command_writes_what_it_fetched_and_says_where(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(fetch_lpips, "_fetch", lambda: random_weights(ALEX, ALEX_LINS))
+    assert edge_server(["fetch-lpips", "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.split() == [str(tmp_path / name) for name in FILES]
+    assert open_lpips(tmp_path)[1] is None

@@ -202,3 +202,11 @@ def test_what_was_shown_at_the_newest_truth_is_scored_once_the_period_is_known()
     assert score.psnr_db == PSNR_CEILING_DB and score.published_ns == 40 * MS
     with pytest.raises(ValueError, match="48 x 24 but the truth is 48 x 48"):
         held_out.score_newest(Shows(truth_at(40)[:24] / 255))
+
+
+def test_a_camera_that_stopped_is_rendered_at_once_where_it_stands():
+    held_out, shown = HeldOutCamera("h", Scorer()), shows(160)
+    for ms, x_m in ((0, 0.0), (40, 0.1), (80, 0.2), (120, 0.2)):
+        held_out.take(frame(ms, x_m=x_m))
+    held_out.publish(publication(150), shown)
+    assert shown.poses == [0.2]

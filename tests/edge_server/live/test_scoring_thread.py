@@ -13,6 +13,7 @@ from edge_server.fields import Rendering
 from edge_server.live import scoring_thread
 from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import Publication
+from edge_server.run_records import Baseline
 from freshfield import payload
 from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose
@@ -173,3 +174,15 @@ def test_a_metric_that_cannot_be_loaded_costs_its_own_scores_alone() -> None:
 
     broken.minimum_side = 48  # larger than the frames: of them it is not asked
     assert _run([100 * MS], [k * 10 * MS for k in range(60)], scorer=Scorer(broken))
+
+
+def test_baselines_are_of_every_fifth_publication(monkeypatch: Any) -> None:
+    found: list[int] = []
+    monkeypatch.setattr(scoring_thread, "baseline", lambda views, *_: found.append(len(views)) or Baseline(1.0, 2.0))
+    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
+    monkeypatch.setattr(thread, "_affordable", lambda *_: True)
+    thread._held_out["cam00"].take(_frame(0, 0))
+    thread._held_out["cam00"].take(_frame(1, 10 * MS))
+    for number in range(3, 12):
+        thread._score_later(_publication(number, 10 * MS), Brightness(0), ["view"])  # type: ignore[list-item]
+    assert found == [1, 1] and thread.baselines.mean == Baseline(1.0, 2.0), "of 5 and 10"

@@ -20,7 +20,7 @@ from edge_server.fidelity.scorer import Score
 from edge_server.fields import Rendering
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication
-from edge_server.page import Page, PageError, page_url, start_page
+from edge_server.page import Page, PageError, page_url, panel, start_page
 from edge_server.page.controls import ControlPanel
 from edge_server.page.panel import PAIR_WIDTH, side_by_side
 from edge_server.page.rendering import LEVELS, MOVING, NEWER, ClientState, RenderLoop, browser_image
@@ -134,11 +134,38 @@ def test_one_camera_is_first_seen_from_before_it_and_then_from_where_the_fields_
     scene.refresh(state.cameras(), watched=True)
     (name,) = [call.args[0] for call in server.scene.add_camera_frustum.call_args_list]
     assert name == "/cameras/cam01"
+    np.testing.assert_array_equal(server.scene.add_camera_frustum.return_value.image, thumbnail(seen))
     ahead = scene._viewpoint.look_at - seen.pose.translation_m
     assert np.allclose(ahead, np.linalg.norm(ahead) * seen.pose.matrix()[:3, 2])
     state.publish(publication(0), SimpleNamespace(box=replace(UNIT_BOX, centre_m=(0.5, 0.0, 0.25))))
     scene.refresh(state.cameras(), watched=True)
     assert server.initial_camera.look_at.tolist() == [0.5, 0.0, 0.25]
+
+
+def test_the_tiles_say_the_latest_score_and_the_ages_of_training_cameras():
+    state = bare_state()
+    state.publish(replace(publication(4), update_ms=20.0, psnr_db=21.0, scored_on="cam00"), Broken())
+    state.publish(replace(publication(5), update_ms=30.0), Broken())
+    ages = (("cam00", True, 900.0), ("cam01", False, 100.0), ("cam02", False, 300.0), ("cam03", False, None))
+    cameras = [CameraView(name, held_out, None, age_ms, 0, 0) for name, held_out, age_ms in ages]
+    found = panel.summary(state, cameras, state.publications())
+    assert (found.updates, found.update_ms, found.psnr_db, found.scored_on) == (6, 30.0, 21.0, "cam00")
+    assert (found.mean_age_ms, found.worst_age_ms, found.reporting, found.cameras) == (200.0, 300.0, 3, 4)
+    assert found.condition == "live"
+    state.controls.paused = True
+    assert panel.summary(state, [], []).condition == "paused"
+
+
+def test_a_visitor_who_moves_by_a_millimeter_has_moved():
+    loop, client = RenderLoop(bare_state()), MagicMock(client_id=1)
+    client.camera = SimpleNamespace(
+        position=(1.0, 0.0, 0.0), wxyz=(1.0, 0, 0, 0), fov=0.9, image_width=8, image_height=6
+    )
+    loop.add_client(client)
+    for x_m, serial in ((1.0, 1), (1.001, 2), (1.001 + 1e-9, 2)):
+        client.camera.position = (x_m, 0.0, 0.0)
+        loop.camera_moved(client)
+        assert loop._visitors[1].serial == serial
 
 
 def test_truth_and_rendering_of_any_size_fit_side_by_side():
