@@ -9,10 +9,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import signal
-import socket
-import socketserver
 import subprocess
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +23,6 @@ from freshfield_up.net import free_ports, is_serving
 from freshfield_up.processes import Child, kill, stop
 from freshfield_up.status import read_json
 from tests.chaos.tcp_fault_proxy import FAULTS, TcpFaultProxy
-from tests.support import wait_until
 
 SMALL = """
 name: small
@@ -172,49 +168,3 @@ def test_real_processes_recover_from_every_kind_of_fault(tmp_path: Path) -> None
     # as long after each stream that fails, up to 5 s.
     late = {fault: seconds for fault, seconds in late.items() if fault[0] != "corrupted bytes"}
     assert max(late.values()) <= RECOVERY_S, late
-
-
-class Echo(socketserver.BaseRequestHandler):
-    def handle(self) -> None:
-        while data := self.request.recv(1 << 16):
-            self.request.sendall(data)
-
-
-def test_the_fault_proxy_has_the_faults_of_a_network_and_mends() -> None:
-    def connect() -> socket.socket:
-        host, port = hop.address.split(":")
-        return socket.create_connection((host, int(port)), timeout=0.3)
-
-    def echo(data: bytes) -> bytes:
-        near.sendall(data)
-        try:
-            return near.recv(100)
-        except TimeoutError:
-            return b"nothing"
-
-    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Echo) as server:
-        server.daemon_threads = True
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        hop = TcpFaultProxy(f"127.0.0.1:{server.server_address[1]}")
-        near = connect()
-        assert echo(b"whole") == b"whole"
-        hop.fault("corrupted bytes")
-        assert wait_until(lambda: (got := echo(b"whole")) != b"whole" and got, "never corrupted") != b"nothing"
-        hop.mend()
-        wait_until(lambda: echo(b"whole") == b"whole", "corrupted for ever")
-        hop.fault("black hole")
-        time.sleep(0.1)
-        assert echo(b"late") == b"nothing"
-        hop.mend()
-        assert near.recv(100) == b"late"  # as TCP has it: late, and not lost
-        hop.fault("half-open")
-        time.sleep(0.1)
-        assert echo(b"gone") == b"nothing"
-        with connect() as other:
-            other.sendall(b"new")
-            assert other.recv(100) == b"new"
-        hop.mend()
-        assert near.recv(100) == b"", "its end has not been told"
-        near.close()
-        hop.close()
-        server.shutdown()

@@ -47,11 +47,7 @@ def frame_account(out: Path):
 SHARED = {"service": {"law": "exponential", "mean_ms": 1.5}, "queue_limit": 6}
 SECTIONS = {
     "ch6": FAST,
-    "ch5": {"preset": "ch5", **QUICK},
-    "fcfs": {**QUICK, "discipline": "fcfs"},
     "ch6, one line": {**FAST, "service": {"mean_ms": [2.0, 4.0]}, "server": {"shared": True}},
-    "newest waits, one line": {**SHARED, "discipline": "newest-waits", "server": {"shared": True}},
-    "fcfs, one line": {**SHARED, "discipline": "fcfs", "server": {"shared": True}},
     "preempt, one line": {**SHARED, "discipline": "lcfs-preempt", "server": {"shared": True}},
 }
 

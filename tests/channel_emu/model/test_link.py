@@ -31,57 +31,23 @@ def play(subject: Link, offers_ms: list[float], until_ms: float = 1000) -> list[
     return [(str(e.kind), e.at_ns / MS, e.transit.number) for e in events]
 
 
-def test_drop_new_discards_while_busy_and_takes_the_frame_of_the_boundary() -> None:
-    assert play(link("drop-new", [10, 5, 5, 5]), [0, 4, 10, 30]) == [
-        ("started", 0, 0),
-        ("dropped_busy", 4, 1),
-        ("delivered", 10, 0),
-        ("started", 10, 2),
-        ("delivered", 15, 2),
-        ("started", 30, 3),
-        ("delivered", 35, 3),
-    ]
+# Delays in ms, instants of the offers, and what happens: s started, d delivered, b dropped busy, x superseded.
+STORIES = {
+    "drop-new": ([10, 5, 5, 5], [0, 4, 10, 30], "s0@0 b1@4 d0@10 s2@10 d2@15 s3@30 d3@35"),
+    "newest-waits": ([10, 5, 7, 5], [0, 2, 4], "s0@0 x1@4 d0@10 s2@10 d2@17"),
+    "fcfs": ([10, 5, 7, 5], [0, 1, 2, 3], "s0@0 b3@3 d0@10 s1@10 d1@15 s2@15 d2@22"),
+    "lcfs-preempt": ([10, 5], [0, 2], "s0@0 x0@2 s1@2 d1@7"),
+    "parallel": ([10, 5], [0, 2, 3], "s0@0 s1@2 b2@3 d1@7 d0@10"),
+}
+SIGNS = {"started": "s", "delivered": "d", "dropped_busy": "b", "superseded": "x"}
 
 
-def test_newest_waits_keeps_one_and_the_newest() -> None:
-    assert play(link("newest-waits", [10, 5, 7, 5]), [0, 2, 4]) == [
-        ("started", 0, 0),
-        ("superseded", 4, 1),
-        ("delivered", 10, 0),
-        ("started", 10, 2),
-        ("delivered", 17, 2),
-    ]
-
-
-def test_fcfs_serves_all_in_order_up_to_its_limit() -> None:
-    assert play(link("fcfs", [10, 5, 7, 5], queue_limit=2), [0, 1, 2, 3]) == [
-        ("started", 0, 0),
-        ("dropped_busy", 3, 3),
-        ("delivered", 10, 0),
-        ("started", 10, 1),
-        ("delivered", 15, 1),
-        ("started", 15, 2),
-        ("delivered", 22, 2),
-    ]
-
-
-def test_lcfs_preempts_the_frame_in_service() -> None:
-    assert play(link("lcfs-preempt", [10, 5]), [0, 2]) == [
-        ("started", 0, 0),
-        ("superseded", 2, 0),
-        ("started", 2, 1),
-        ("delivered", 7, 1),
-    ]
-
-
-def test_parallel_frames_overtake() -> None:
-    assert play(link("parallel", [10, 5], queue_limit=2), [0, 2, 3]) == [
-        ("started", 0, 0),
-        ("started", 2, 1),
-        ("dropped_busy", 3, 2),
-        ("delivered", 7, 1),
-        ("delivered", 10, 0),
-    ]
+@pytest.mark.parametrize("discipline", STORIES)
+def test_what_a_busy_link_does_with_a_new_frame(discipline: str) -> None:
+    """With room for two: waiting (fcfs) or in service (parallel). At 10 ms one comes as the first is done."""
+    delays_ms, offers_ms, story = STORIES[discipline]
+    told = play(link(discipline, delays_ms, queue_limit=2), offers_ms)
+    assert " ".join(f"{SIGNS[kind]}{number}@{at:g}" for kind, at, number in told) == story
 
 
 def test_a_fault_that_delays_nothing_leaves_the_delay_to_the_nanosecond() -> None:
