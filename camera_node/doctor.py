@@ -105,7 +105,7 @@ def _source(scenario: Scenario, config: SourceConfig, data: Path | None) -> Iter
     for extra in [*extras, *(["ur"] if arm is not None else [])]:
         yield _check(f"package {extra}", lambda extra=extra: _package(extra))  # type: ignore[misc]
     if isinstance(config, RecordedConfig):
-        yield _check("data", lambda: f"{find_data(config.data, scenario, data)} is there")
+        yield _check("data", lambda: _data(scenario, config, data))
     if isinstance(config, LiveConfig):
         if config.calibration is not None:
             yield _check("calibration", lambda: _calibration(scenario, config))
@@ -127,6 +127,20 @@ def _check(part: str, check: Callable[[], str]) -> CheckResult:
         return CheckResult(part, False, " ".join(str(error).split()).removeprefix(f"{part.split()[-1]}: "))
     except Exception as error:  # device libraries raise anything; the other parts must still be checked
         return CheckResult(part, False, f"{type(error).__name__}: {' '.join(str(error).split())}")
+
+
+def _data(scenario: Scenario, config: RecordedConfig, data: Path | None) -> str:
+    """Open the data set as a node does, and read every image that is a file."""
+    from camera_node.sources.datasets.formats import open_configured
+    from camera_node.sources.datasets.streamer import open_recorded
+
+    path = find_data(config.data, scenario, data)
+    open_recorded(scenario, config, scenario.cameras, data)
+    found = open_configured(path, config)
+    if config.kind not in ("video", "dynerf"):
+        for image in found:
+            image.read()
+    return "; ".join((f"{path}: {len(found)} images of {len(found.cameras)} cameras", *found.notes))
 
 
 def _python() -> str:

@@ -16,6 +16,7 @@ from freshfield.clock import WallClock
 from freshfield.scenario import load
 from freshfield.transport import Transport
 from tests.camera_node.robot.arm.simulated import simulated_arm
+from tests.camera_node.sources.datasets.photos import write_photos
 from tests.camera_node.sources.devices.mjpeg import NetworkCamera
 from tests.camera_node.sources.devices.test_live import CALIBRATION
 from tests.integration.peer import Peer
@@ -164,3 +165,21 @@ def test_people_read_lines_with_marks(capsys):
     main(["doctor"])
     said = capsys.readouterr().out
     assert "ok     python" in said and "-      scenario" in said
+
+
+def test_a_data_set_is_opened_and_its_images_are_read(capsys, tmp_path):
+    folder = write_photos(tmp_path / "set", 24).parent
+    scenario = {"cameras": {"count": 2}, "source": {"kind": "transforms", "data": str(folder)}}
+    (tmp_path / "s.yaml").write_text(yaml.safe_dump(scenario))
+
+    def said():
+        return examined(capsys, str(tmp_path / "s.yaml"))[1]["data"]
+
+    assert said() == (True, f"{folder}: 24 images of 1 cameras")
+    (folder / "images/003.png").unlink()
+    whole = (folder / "images/004.png").read_bytes()
+    (folder / "images/004.png").write_bytes(whole[:300])
+    ok, text = said()
+    assert not ok and "images/004.png: damaged or cut short" in text
+    (folder / "images/004.png").write_bytes(whole)
+    assert said()[1].startswith(f"{folder}: 23 images of 1 cameras; 1 of 24 images are missing, first images/003.png")

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
-from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at
+from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, file_within
 from camera_node.sources.datasets.video import Clip, rig_dataset
 from camera_node.sources.rig_calibration import CalibratedCamera
 from freshfield.geometry import Pinhole, Pose
@@ -34,7 +34,8 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
             f"{file}: has poses of {len(rows)} cameras, its folder {len(videos)} videos cam*.mp4: "
             "they belong together in the order of their names"
         )
-    clips = [Clip(video) for video in videos]
+    with errors_at(str(file)):
+        clips = [Clip(video) for video in videos if file_within(file.parent, video.name)]
     cameras = [_camera(row, clip, f"{file}: row {k}") for k, (row, clip) in enumerate(zip(rows, clips))]
     return rig_dataset({clip.path.stem: (camera, clip) for camera, clip in zip(cameras, clips)}, path, options)
 

@@ -18,8 +18,8 @@ from camera_node.sources.datasets.records import (
     Image,
     PosedImage,
     errors_at,
+    file_within,
     find_files,
-    path_within,
 )
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
 from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
@@ -52,15 +52,15 @@ def load_dataset(
     found: dict[str, Path] = {}
     for name in cameras:
         if name in files:
-            places = [files[name]]
+            video = calibration.parent / files[name] if (calibration.parent / files[name]).is_file() else None
         else:
             with errors_at(str(calibration)):
-                places = [str(path_within(p.format(name))) for p in _PLACES]
-        video = next((calibration.parent / p for p in places if (calibration.parent / p).is_file()), None)
+                found_at = (file_within(calibration.parent, place.format(name)) for place in _PLACES)
+                video = next((file for file in found_at if file is not None), None)
         if video is not None:
             found[name] = video
         elif name in files:
-            raise DatasetError(f"{calibration.parent / places[0]}: no such video (camera {name})")
+            raise DatasetError(f"{calibration.parent / files[name]}: no such video (camera {name})")
     if not found:
         raise DatasetError(f"{calibration}: none of its cameras has a video at {' or '.join(_PLACES)}")
     return rig_dataset({name: (cameras[name], Clip(found[name])) for name in found}, path, options, require_poses)

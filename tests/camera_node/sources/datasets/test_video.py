@@ -221,11 +221,17 @@ def test_what_does_not_fit_is_named(tmp_path):
     with pytest.raises(DatasetError, match=r"json: cam01: dist_coeffs is not understood and may change the camera"):
         opened(video_scenario(file))
     rig["cam01"].pop("dist_coeffs")
+    (tmp_path / "a/videos/cam00.mp4").rename(tmp_path / "private.mp4")
+    (tmp_path / "a/videos/cam00.mp4").symlink_to(tmp_path / "private.mp4")
+    rig["cam01"].pop("R_world_to_cam")
+    file.write_text(json.dumps(rig))
+    with pytest.raises(DatasetError, match=r"'videos/cam00\.mp4' is a symbolic link that leads out of the data set"):
+        opened(video_scenario(file))
+    (tmp_path / "a/videos/cam00.mp4").unlink()
     (tmp_path / "b/videos").mkdir(parents=True)
     with pytest.raises(DatasetError, match=r"expected one calib\*.json, found none"):
         opened(video_scenario(tmp_path / "b"))
     (tmp_path / "a/videos/cam00.mp4").write_bytes(b"no video at all")
-    rig["cam01"].pop("R_world_to_cam")
     file.write_text(json.dumps(rig))
     with pytest.raises(DatasetError, match=r"cam00.mp4: OpenCV cannot open"):
         opened(video_scenario(file))
