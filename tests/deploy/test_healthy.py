@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 import time
+from collections.abc import Callable
 from concurrent import futures
 from pathlib import Path
 
 import grpc
+import pytest
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
-
-def healthy(*words: str, **environment: str) -> bool:
-    command = [sys.executable, "-m", "freshfield_up.healthy", *words]
-    plain = {k: v for k, v in os.environ.items() if k != "CAMERA"}
-    done = subprocess.run(command, env={**plain, **environment}, capture_output=True, timeout=30)
-    assert done.returncode in (0, 1) and not done.stderr, done.stderr.decode()
-    return done.returncode == 0
+from freshfield_up import healthy as health_check
 
 
-def test_a_server_is_healthy_while_it_says_so() -> None:
+@pytest.fixture
+def healthy(monkeypatch: pytest.MonkeyPatch) -> Callable[..., bool]:
+    """What the check says, given its words and the camera of its container."""
+
+    def check(*words: str, camera: str | None = None) -> bool:
+        monkeypatch.setattr(sys, "argv", ["healthy", *words])
+        monkeypatch.delenv("CAMERA", raising=False)
+        if camera:
+            monkeypatch.setenv("CAMERA", camera)
+        return health_check.main() == 0
+
+    return check
+
+
+def test_a_server_is_healthy_while_it_says_so(healthy: Callable[..., bool]) -> None:
     server = grpc.server(futures.ThreadPoolExecutor(1))
     servicer = health.HealthServicer()
     health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
@@ -37,11 +46,11 @@ def test_a_server_is_healthy_while_it_says_so() -> None:
     assert not healthy("--serving", f"127.0.0.1:{port}")
 
 
-def test_a_node_is_healthy_while_its_own_status_is_fresh(tmp_path: Path) -> None:
+def test_a_node_is_healthy_while_its_own_status_is_fresh(healthy: Callable[..., bool], tmp_path: Path) -> None:
     assert not healthy("--node", str(tmp_path))
     (tmp_path / "node-cam01.json").write_text("{}")
-    assert healthy("--node", str(tmp_path)) and healthy("--node", str(tmp_path), CAMERA="cam01")
-    assert not healthy("--node", str(tmp_path), CAMERA="cam02"), "a neighbor's file is not this one's"
+    assert healthy("--node", str(tmp_path)) and healthy("--node", str(tmp_path), camera="cam01")
+    assert not healthy("--node", str(tmp_path), camera="cam02"), "a neighbor's file is not this one's"
     old = time.time() - 60
     os.utime(tmp_path / "node-cam01.json", (old, old))
-    assert not healthy("--node", str(tmp_path), CAMERA="cam01")
+    assert not healthy("--node", str(tmp_path), camera="cam01")
