@@ -91,6 +91,23 @@ def test_unknown_styluses_are_refused(text):
         open_stylus(text)
 
 
+@pytest.mark.parametrize("key", "wasdrfouikjl")
+def test_every_key_moves_along_or_turns_about_its_axis(key, monkeypatch):
+    """Forwards is x, left y, up z; turns follow the right hand, but k and i: the tip goes down and up."""
+    axes = {"w": 0, "s": 0, "a": 1, "d": 1, "r": 2, "f": 2, "o": 3, "u": 3, "k": 4, "i": 4, "j": 5, "l": 5}
+    controller, terminal = pty.openpty()
+    stylus = KeyboardStylus(terminal)
+    monkeypatch.setattr(stylus, "_read", lambda: key)
+    (found,) = stylus.poll(0)
+    moved = np.array([*found.position_m, *found.quaternion[1:]])
+    expected = np.zeros(6)
+    expected[axes[key]] = (0.005 if axes[key] < 3 else np.sin(0.01)) * (1 if key in "warokj" else -1)
+    np.testing.assert_allclose(moved, expected, atol=1e-12)
+    stylus.close()
+    os.close(controller)
+    os.close(terminal)
+
+
 def test_the_keyboard_of_a_real_terminal():
     controller, terminal = pty.openpty()
     stylus = KeyboardStylus(terminal)
