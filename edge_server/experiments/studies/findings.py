@@ -155,12 +155,12 @@ def better(mine: Row, other: Row) -> Statistic:
         gap = difference(theirs, ours) if lower else difference(ours, theirs)
         if not gap.count:
             return None
-        trained = TRAINING in {key for row in table.where(**{**labels, **mine}) for key in row}
-        of_runs = f"{len(ours)} trainings and " if len(ours) > 1 else "one training and " if trained else ""
         same = ": it does the very same" if gap.low == gap.high == 0.0 else ""
         base = crossed(theirs).mean
         share = f" ({100.0 * gap.mean / abs(base):+.1f} %)" if metric == "reward" and _far_from_zero(theirs) else ""
-        return Finding(f"{gap.text(digits)} better{share} over {of_runs}{gap.count} seeds{same}.", (gap,))
+        return Finding(
+            f"{gap.text(digits)} better{share} over {_counted(table, {**labels, **mine}, gap)}{same}.", (gap,)
+        )
 
     return found
 
@@ -177,8 +177,11 @@ def better_than_all(mine: Row, others: Sequence[Row], worse: bool = False) -> St
             gap = difference(theirs, ours) if lower else difference(ours, theirs)
             if gap.count:
                 gaps[" ".join(str(v) for k, v in other.items() if k != "best")] = gap
+        if not gaps:
+            return None
         text = ", ".join(f"{name} {gap.text(digits)}" for name, gap in gaps.items())
-        return Finding(f"differences: {text}.", tuple(gaps.values())) if gaps else None
+        counted = _counted(table, {**labels, **mine}, next(iter(gaps.values())))
+        return Finding(f"differences: {text} over {counted}.", tuple(gaps.values()))
 
     return found
 
@@ -208,7 +211,8 @@ def no_worse(mine: Row, other: Row) -> Statistic:
             return None
         gap, base = difference(ours, theirs), abs(crossed(theirs).mean)
         share = dataclasses.replace(gap, mean=gap.mean / base, low=gap.low / base, high=gap.high / base)
-        return Finding(f"{gap.text(digits)}, that is {100 * share.mean:+.2f} %.", (share,))
+        counted = _counted(table, {**labels, **mine}, gap)
+        return Finding(f"{gap.text(digits)}, that is {100 * share.mean:+.2f} %, over {counted}.", (share,))
 
     return found
 
@@ -224,9 +228,17 @@ def half_way(mine: Row, base: Row, limit: Row) -> Statistic:
         if not above.count:
             return None
         share = share_closed({s: complete_mean([run.get(s) for run in ours]) for s in ours[0]}, low, high)
-        return Finding(f"{share.text(2)} of the way (interval over seeds alone).", (above,))
+        counted = _counted(table, {**labels, **mine}, above)
+        return Finding(f"{share.text(2)} of the way over {counted} (interval over seeds alone).", (above,))
 
     return found
+
+
+def _counted(table: SeedTable, labels: Row, gap: Interval) -> str:
+    """How many trainings, if any, and seeds a difference is of."""
+    runs = {row[TRAINING] for row in table.where(**labels) if row.get(TRAINING) is not None}
+    trainings = f"{len(runs)} trainings and " if len(runs) > 1 else "one training and " if runs else ""
+    return f"{trainings}{gap.count} seeds"
 
 
 def _less(of: Interval, amount: float) -> Interval:

@@ -129,7 +129,7 @@ def _evaluate(
     write_json(args.out / "summary.json", {**kept, **about}, indent=1)
     lacking = kept["seeds_without_value"]
     more = f"; {lacking} more have a decision without a reward" if lacking else ""
-    print(f"  reward {_text(kept['reward'])} on {kept['seeds']} unseen seeds{more}")
+    print(f"  reward {_text(kept['reward'])} on {kept['seeds']} unseen seeds, of one training{more}")
     print(f"  over random {_text(kept['over_random'])}")
     print(f"  over the best fixed {kind} ({kept['best_fixed']}) {_text(kept['over_best_fixed'])}")
     print(f"  share of the way from random to the oracle: {_text(kept['share'])}")
