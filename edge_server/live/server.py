@@ -218,10 +218,10 @@ class EdgeServer:
             self.loop.stop()
             self._write_field()  # first: who asked for the end does not wait for ever
             self.scoring.stop(1.0)
-            if page is not None:
-                page.stop()
             grpc.join(1.0)
             self._write_final()
+            if page is not None:
+                page.stop()
         if self.loop.failure is not None:
             raise self.loop.failure
 

@@ -10,6 +10,7 @@ import socket
 import threading
 import time
 import urllib.request
+from types import SimpleNamespace
 
 import grpc
 import numpy as np
@@ -362,8 +363,14 @@ def test_a_time_that_no_timer_takes_is_refused(tmp_path, capsys, option, value):
     assert f"{option} " in said and "expected 0 to 1e+09" in said and said.count("\n") == 1
 
 
-def test_the_field_is_written_before_anything_that_may_take_long(serve, tmp_path, monkeypatch):
-    server, port, thread = serve()
+def test_files_are_written_before_anything_that_may_take_long(serve, tmp_path, monkeypatch):
+    closed = []
+
+    def page_stops() -> None:
+        (ledger,) = read_all(tmp_path / "out")
+        closed.append(ledger.closed)
+
+    server, port, thread = serve(open_page=lambda state: SimpleNamespace(url="here", stop=page_stops))
     feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
     feed.start()
     until(lambda: server.state.publications())
@@ -374,7 +381,7 @@ def test_the_field_is_written_before_anything_that_may_take_long(serve, tmp_path
     feed.stop()
     server.stop()
     thread.join(20)
-    assert written == [True]
+    assert written == [True] and closed == [True]
     assert STOP_S <= GRACE_S - 3.0, "the launcher would kill it before"
 
 
