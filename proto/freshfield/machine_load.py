@@ -36,7 +36,7 @@ class LoadMeter:
         """
         row: dict[str, Any] = {"t_s": round(t_s, 3)}
         for name, pid in (self._own if processes is None else processes).items():
-            used_s = _own_s() if pid == os.getpid() else cpu_s(pid)
+            used_s = time.process_time() if pid == os.getpid() else cpu_s(pid)
             if used_s is not None:
                 row[name] = {"rss_mb": rss_mb(pid), "cpu": self._cores(pid, used_s), "pid": pid}
         busy_s = _busy_s()
@@ -99,24 +99,15 @@ def cpu_s(pid: int) -> float | None:
         return None
 
 
-def machine_ticks() -> list[int] | None:
-    """Processor time of the whole machine since boot, in clock ticks: user (which includes guest), nice,
-    system, idle, iowait, irq, softirq, steal; None if it cannot be read."""
-    try:
-        return [int(word) for word in (_PROC / "stat").read_text().split("\n", 1)[0].split()[1:9]]
-    except (OSError, ValueError, IndexError):
-        return None
-
-
-def _own_s() -> float:
-    times = os.times()
-    return times.user + times.system
-
-
 def _busy_s() -> float | None:
     """Core-seconds that the whole machine has been busy since it started."""
-    ticks = machine_ticks()
-    return None if not ticks else float(sum(ticks[:3]) + sum(ticks[5:8])) / os.sysconf("SC_CLK_TCK")
+    try:
+        words = (_PROC / "stat").read_text().split("\n", 1)[0].split()
+        # Without idle and iowait; user includes guest.
+        user, nice, system, _, _, *interrupts_and_steal = map(int, words[1:9])
+    except (OSError, ValueError, IndexError):
+        return None
+    return (user + nice + system + sum(interrupts_and_steal)) / os.sysconf("SC_CLK_TCK")
 
 
 def _ours(row: Mapping[str, Any]) -> float:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import resource
 
 import numpy as np
 import pytest
 
-from freshfield.machine_load import cpu_s, outside_load, rss_mb
+from freshfield import machine_load
+from freshfield.machine_load import LoadMeter, cpu_s, outside_cores, outside_load, rss_mb
 
 
 def test_memory_and_processor_time_of_a_process():
@@ -32,3 +34,27 @@ def test_outside_load_is_what_the_machine_used_minus_ours():
 def test_nothing_known_is_none():
     assert outside_load([]) == {"cores": None, "ours": None, "method": None}
     assert outside_load([{"t_s": 0.0, "edge": use(1.0)}])["cores"] is None
+
+
+def test_a_row_has_the_cores_since_the_last_one(tmp_path, monkeypatch):
+    """By hand: two seconds in which process 7 used 3 core-seconds, and the machine 5 of its 8."""
+    ticks, now_s = os.sysconf("SC_CLK_TCK"), [100.0]
+    monkeypatch.setattr(machine_load, "_PROC", tmp_path)
+    monkeypatch.setattr(machine_load.time, "perf_counter", lambda: now_s[0])
+    (tmp_path / "7").mkdir()
+    (tmp_path / "7" / "statm").write_text("900 500 3")
+
+    def used(process_s: tuple[float, float], machine_s: tuple[float, ...]) -> None:
+        numbers = " ".join(str(round(s * ticks)) for s in process_s)
+        (tmp_path / "7" / "stat").write_text(f"7 (a (b) S) {' '.join('9' * 11)} {numbers} 9")
+        (tmp_path / "stat").write_text(f"cpu  {' '.join(str(round(s * ticks)) for s in machine_s)} 9 9\ncpu0 1")
+
+    used((1.0, 1.0), (10, 0, 10, 50, 5, 0, 0, 0))
+    meter = LoadMeter()
+    assert meter.row(0.0, {"edge": 7})["edge"]["cpu"] == 0.0
+    now_s[0] += 2.0
+    used((3.0, 2.0), (11, 1, 11, 52, 6, 0.5, 0.5, 1))
+    row = meter.row(2.0, {"edge": 7, "gone": 8})
+    memory_mb = round(500 * resource.getpagesize() / 1e6, 1)
+    assert row == {"t_s": 2.0, "edge": {"rss_mb": memory_mb, "cpu": 1.5, "pid": 7}, "machine": {"cpu": 2.5}}
+    assert outside_cores(row) == 1.0
