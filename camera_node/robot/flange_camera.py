@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
+import threading
 from collections.abc import Mapping
 from fractions import Fraction
 
@@ -35,14 +36,19 @@ _MAX_OFFSET_NS = 2 * round(STEP_S * 1e9)  # between the requested instant and th
 
 
 class TruthClient:
-    """True joint angles of a simulated arm. Connects at the first request, and again after a failure."""
+    """True joint angles of a simulated arm. Connects at the first request, and again after a failure. Thread-safe."""
 
     def __init__(self, host: str) -> None:
         self.host = host
         self._socket: socket.socket | None = None
+        self._lock = threading.Lock()
 
     def joints(self, t_ns: int) -> Array:
         """Joint angles (6,) at ``t_ns``. Raises PoseGapError without an answer for this instant."""
+        with self._lock:
+            return self._ask(t_ns)
+
+    def _ask(self, t_ns: int) -> Array:
         try:
             if self._socket is None:
                 self._socket = socket.create_connection((self.host, TRUTH_PORT), _TIMEOUT_S)

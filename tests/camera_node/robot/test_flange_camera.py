@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -65,6 +66,11 @@ def test_the_truth_of_another_instant_is_not_taken(host):
         for offset_ns in (-3600 * 10**9, 10**9):
             with pytest.raises(PoseGapError, match="ms away: is this machine too busy"):
                 truth.joints(clock.now_ns() + offset_ns)
+        # Each camera on the arm asks from a thread of its own, and gets its own instant's answer.
+        time.sleep(0.5)
+        instants = [clock.now_ns() - k * 10_000_000 for k in range(40)]
+        with ThreadPoolExecutor(4) as threads:
+            assert len(list(threads.map(truth.joints, 5 * instants))) == 200
 
 
 def test_without_an_arm_one_line_says_what_to_start(host):
