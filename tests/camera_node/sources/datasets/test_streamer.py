@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from camera_node.sources.base import rate
-from camera_node.sources.datasets.records import DatasetError
-from camera_node.sources.datasets.streamer import Playback, split_photos
+from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
+from camera_node.sources.datasets.streamer import Playback, Timeline, split_photos
+from freshfield.geometry import Pinhole
 
 
 def test_back_and_forth_and_restart():
@@ -65,3 +68,27 @@ def test_photos_are_dealt_once_and_every_eighth_is_held_out(count, training, hel
 def test_too_few_photos_say_so():
     with pytest.raises(DatasetError, match="3 images are too few"):
         split_photos(3, ["a", "b", "c"], ["d"])
+
+
+def test_own_test_images_go_to_held_out_cameras_and_to_nobody_else():
+    assert split_photos(6, ["a", "b"], ["d"], [1, 4]) == {"d": [1, 4], "a": [0, 3], "b": [2, 5]}
+    assert split_photos(6, ["a", "b"], [], [1, 4]) == {"a": [0, 3], "b": [2, 5]}
+
+
+def recorded(**times: list[float]) -> Dataset:
+    images = (
+        PosedImage(f"{camera}{k}", camera, time_s, np.eye(4), Pinhole(8, 8, 8, 8, 4, 4), lambda: None)
+        for camera, stamps in times.items()
+        for k, time_s in enumerate(stamps)
+    )
+    return Dataset(tuple(images))
+
+
+def test_a_timeline_holds_what_all_cameras_have_at_the_fastest_ones_rate():
+    found = recorded(fast=[0.2, 0.3, 0.4, 0.6, 0.7, 0.8], slow=[0.0, 0.2, 0.4, 0.6], once=[5.0])
+    timeline = Timeline.of(found, Path("set"))
+    assert timeline == Timeline(0.2, 5, Fraction(10))
+    assert list(timeline.nearest(found.of("fast"))) == [0, 1, 2, 2, 3]  # 0.5 s was dropped: the earlier of two
+    assert list(timeline.nearest(found.of("slow"))) == [1, 1, 2, 2, 3]
+    assert list(timeline.nearest(found.of("once"))) == [0] * 5
+    assert list(Timeline(0.0, 0, Fraction(10)).nearest(found.of("slow"))) == [0, 1, 2, 3]
