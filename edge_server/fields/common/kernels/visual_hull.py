@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, lens_terms, load_camera, rotate_to_camera
+from edge_server.fields.common.kernels.camera import (
+    LENS,
+    LIMITS,
+    NEAR,
+    ORIGIN,
+    lens_terms,
+    load_camera,
+    rotate_to_camera,
+)
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.simd import fetch_add
 
@@ -29,6 +37,9 @@ def count_points(counter, worker, cams, points, mask, seen, marked):
                 cam, points[i, 0] - cam[ORIGIN], points[i, 1] - cam[ORIGIN + 1], points[i, 2] - cam[ORIGIN + 2]
             )
             if not z > cam[NEAR]:
+                continue
+            # Most are far outside the image, which costs no lens to see.
+            if not (cam[LIMITS] * z <= x <= cam[LIMITS + 1] * z and cam[LIMITS + 2] * z <= y <= cam[LIMITS + 3] * z):
                 continue
             _, _, _, _, u, v, _, _, _, _, _, _, _, _ = lens_terms(cam, x, y, z)
             px = cam[LENS] * u + cam[LENS + 2]

@@ -264,7 +264,7 @@ field = LayeredField(SMALL)
 field.warm_up()
 before = compiled()
 assert sum(before.values()) > 5
-_run(field, range(40))
+_run(field, range(60))
 assert field.moving is not None and field.moving.alive and field.part_s["solving"] > 0.0
 assert compiled() == before, (before, compiled())
 """
