@@ -142,11 +142,12 @@ class Timeline:
         """Index of the image nearest to each instant."""
         if not self.count:
             return range(len(images))
-        instants_s = self.first_s + np.arange(self.count) / float(self.fps)
-        times_s = np.array([image.time_s or 0.0 for image in images])
-        after = np.searchsorted(times_s, instants_s).clip(1, max(1, len(times_s) - 1))
-        before_nearer = instants_s - times_s[after - 1] <= times_s[after.clip(max=len(times_s) - 1)] - instants_s
-        return [int(k) for k in np.where(before_nearer, after - 1, after).clip(max=len(times_s) - 1)]
+        # Whole nanoseconds, so that rounding errors do not choose between two images that are equally near.
+        instants = np.rint(1e9 * (self.first_s + np.arange(self.count) / float(self.fps))).astype(np.int64)
+        times = np.rint([1e9 * (image.time_s or 0.0) for image in images]).astype(np.int64)
+        after = np.searchsorted(times, instants).clip(max=len(times) - 1)
+        before = (after - 1).clip(min=0)
+        return [int(k) for k in np.where(instants - times[before] <= times[after] - instants, before, after)]
 
 
 def _recorded_fps(dataset: Dataset, images: Sequence[PosedImage], path: Path) -> Fraction:
