@@ -58,9 +58,7 @@ _ALONE = (
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--seeds", default="2,7,23", metavar="A..B", help="seeds of -m chaos, or numbers [%(default)s]"
-    )
+    parser.addoption("--seeds", default="2,7,23", metavar="A..B", help="seeds of -m chaos, or numbers [%(default)s]")
     parser.addoption(
         "--slow-part", default="1/1", metavar="K/N", help="of the slow tests, every N-th from the K-th [%(default)s]"
     )
