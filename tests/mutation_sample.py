@@ -42,7 +42,7 @@ from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator
 
-from edge_server.experiments.engine.result_store import ResultStore
+from edge_server.experiments.engine.engine import ResultStore
 
 ROOT = Path(__file__).resolve().parent.parent
 # Folders of sources, and where their tests are.

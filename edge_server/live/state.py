@@ -24,7 +24,7 @@ from edge_server.scheduler import Policy
 from freshfield.frame import Frame
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned
-    from edge_server.scheduler.learned.decision import Decision
+    from edge_server.scheduler.learned.actor import Decision
 
 SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages
 

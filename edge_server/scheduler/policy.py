@@ -17,7 +17,7 @@ from edge_server.scheduler.learned.state import STATE_PARTS, State
 from freshfield.limits import LONGEST_MS
 
 if TYPE_CHECKING:  # loaded only by the policies that need them
-    from edge_server.scheduler.learned.decision import Decision
+    from edge_server.scheduler.learned.actor import Decision
 
 
 class Observer(Protocol):

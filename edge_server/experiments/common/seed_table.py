@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from edge_server.experiments.common.statistics import Interval, at_its_best, crossed
+from edge_server.experiments.common.statistics import Interval, at_its_best, crossed, interval
 
 Row = dict[str, Any]
 PerSeed = dict[int, float | None]
@@ -28,6 +28,10 @@ class SeedTable:
     def values(self, metric: str, **labels: Any) -> PerSeed:
         """seed -> value of the point with these labels."""
         return {row["seed"]: row.get(metric) for row in self.where(**labels)}
+
+    def mean_text(self, metric: str, digits: int, **labels: Any) -> str:
+        """The mean of ``values`` with its interval, for tables."""
+        return interval(self.values(metric, **labels).values()).text(digits)
 
     def curve(self, x: str, metric: str, **labels: Any) -> Curve:
         """x -> seed -> value, for the points that have an x and at least one value."""

@@ -19,7 +19,7 @@ from edge_server.fields import Budget
 from edge_server.fields.registry import make_field
 from freshfield.machine_load import LoadMeter
 
-_MEDIANS = ("seconds", "steps", "ms_per_step", "rays_per_s", "samples_per_s", "psnr_db", "ssim", "lpips")
+_MEDIANS = ("seconds", "steps", "ms_per_step", "psnr_db", "ssim", "lpips")
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,6 @@ def fit_from_scratch(fit: Fit, weights: Path | None = None) -> dict[str, Any]:
         "seconds": report.seconds,
         "steps": report.steps,
         "ms_per_step": 1e3 * report.seconds / max(report.steps, 1),
-        "rays_per_s": report.rays / max(report.seconds, 1e-9),
-        "samples_per_s": report.samples / max(report.seconds, 1e-9),
         "psnr_db": score.psnr_db,
         "ssim": score.ssim,
         "lpips": score.lpips,

@@ -28,7 +28,7 @@ from edge_server.fields.registry import field_names, make_field
 from edge_server.report.machine import machine, versions
 from edge_server.scheduler import make_policy, parse_policy
 from edge_server.settings import ComputeConfig
-from freshfield.files import out_file, out_folder, write_json
+from freshfield.files import out_folder, write_json
 from freshfield.scenario import ScenarioError
 
 DESCRIPTION = """\
@@ -121,7 +121,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     size = parser.add_mutually_exclusive_group().add_argument
     size("--quick", action="store_true", help="a smaller sweep: four minutes on two cores, not one to two hours")
-    size("--shipped", action="store_true", help="the sweep that is shipped, with --field all --points FILE")
+    size("--shipped", action="store_true", help="the sweep that is shipped, with --field all")
     add("--scene", default="room", metavar="NAME|DATA", help="scene: room, tile or a data set [%(default)s]")
     add("--holdout", default="8", metavar="K|NAME,...", help="views of a data set to test on, as in fit [%(default)s]")
     add("--scale", type=float, default=1.0, metavar="K", help="divide image sizes of a data set by K [%(default)g]")
@@ -138,7 +138,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--seeds", type=int, metavar="N", help="number of seeds [1 with --quick, else 3]")
     add("--seed", type=int, default=0, metavar="N", help="first random seed [%(default)s]")
     add_lpips(parser)
-    add("--points", type=out_file, metavar="FILE", help="also write the points of figure 2 to FILE")
     add("--out", type=out_folder, default="runs/frontier", metavar="DIR", help="folder to write [%(default)s]")
     return parser
 
@@ -163,7 +162,7 @@ def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
     engine = Engine(args.out / "results.jsonl")
     seeds = range(args.seed, args.seed + sweep.seeds)
     found = weights if lpips is not None else None
-    return Frontier(args.out, engine, sweep, still, fields, options, seeds, found, missing, args.points)
+    return Frontier(args.out, engine, sweep, still, fields, options, seeds, found, missing)
 
 
 @dataclass
@@ -171,7 +170,6 @@ class Frontier:
     """A run of the command: measures the missing points, then writes tables, CSV and figures.
 
     weights, lpips_missing: folder of LPIPS weights, or why there are none.
-    points: a file for the points of figure 2.
     """
 
     out: Path
@@ -183,7 +181,6 @@ class Frontier:
     seeds: range
     weights: Path | None
     lpips_missing: str | None
-    points: Path | None = None
 
     def run(self) -> None:
         """Measure and write everything."""
@@ -197,9 +194,10 @@ class Frontier:
             if self.still.scene in SCENES:
                 why = f"nothing moves in {self.still.scene}"
             print(f"figure 2 left out: {why}", flush=True)
-        about = {"scene": still.describe(), "policy": self.sweep.moving.policy, "channel": self.sweep.moving.channel}
         data = {
-            **about,
+            "scene": still.describe(),
+            "policy": self.sweep.moving.policy,
+            "channel": self.sweep.moving.channel,
             "machine": machine(),
             "versions": versions(),
             "fields": list(self.fields),
@@ -212,8 +210,6 @@ class Frontier:
         }
         write_json(self.out / "frontier.json", data)
         print(write_output(self.out, data), flush=True)
-        if self.points is not None:
-            write_json(self.points, {**about, "machine": data["machine"], "updates": updates})
         print(f"{self.out / 'frontier.json'} ({time.perf_counter() - begun:.0f} s)", flush=True)
         print(recommendation(updates), flush=True)
 

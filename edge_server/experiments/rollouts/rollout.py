@@ -25,9 +25,8 @@ from edge_server.experiments.rollouts.setting import Setting
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.scheduler import BANDIT, Epoch, Policy, make_policy, parse_policy
-from edge_server.scheduler.learned.actor import Actor
+from edge_server.scheduler.learned.actor import Actor, Decision
 from edge_server.scheduler.learned.bandit import BanditPolicy
-from edge_server.scheduler.learned.decision import Decision
 from edge_server.settings import read_config
 
 # Period of the instants at which the shown image is scored, in a running deployment.

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
 from edge_server.experiments.common.seed_table import Row, SeedTable
-from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.studies.drawing import draw_images
 from edge_server.experiments.studies.findings import better, better_than_all
@@ -103,7 +102,7 @@ def _draw(request: StudyRequest, table: SeedTable) -> None:
 def _table(table: SeedTable) -> str:
     kinds = (("psnr_db", 2), ("ssim", 4), ("lpips", 4))
     rows = [
-        [case, *(interval(table.values(metric, case=case).values()).text(digits) for metric, digits in kinds)]
+        [case, *(table.mean_text(metric, digits, case=case) for metric, digits in kinds)]
         for (case,) in table.distinct("case")
     ]
     return markdown_table(["artifact", "PSNR (dB)", "SSIM", "LPIPS"], rows)

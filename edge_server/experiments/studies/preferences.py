@@ -11,7 +11,6 @@ import numpy as np
 
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row, SeedTable
-from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.studies.drawing import draw_curve
 from edge_server.experiments.studies.findings import better, level
@@ -100,7 +99,7 @@ def _measure(cases: Sequence[Taught], request: StudyRequest) -> list[Row]:
                 group=lambda one: one.scene,
             )
             done = engine.run(
-                partial(captured, folders=folders, pool=tuple(map(_frozen, pool))),
+                partial(captured, folders=folders, pool=pool),
                 mine,
                 f"{scene}: captures",
                 files=lambda one: files_of(one, folders),
@@ -128,10 +127,6 @@ def _measure(cases: Sequence[Taught], request: StudyRequest) -> list[Row]:
                 for row in question(features, scores[taste], taste, habit, seed)
             ]
     return rows
-
-
-def _frozen(item: Row) -> tuple[tuple[str, Any], ...]:
-    return tuple((name, tuple(v) if isinstance(v, list) else v) for name, v in item.items())
 
 
 def reconstruct(one: Reconstruction, *, folders: Folders) -> Row:
@@ -165,7 +160,7 @@ def captured(one: Taught, *, folders: Folders, pool: Sequence[Any]) -> Row:
     if one.pool is None:
         made = plan(stage, one.arm, one.seed, JUDGED, one.work)
         return {"returns": [], "capture": _measured(stage, made, one.work, one.seed)}
-    features, scores = _pool_features(stage, [dict(item) for item in pool[: one.pool]])
+    features, scores = _pool_features(stage, pool[: one.pool])
     expert = SimulatedExpert(one.taste, scores[one.taste], np.random.default_rng(one.seed), wrong=0.1)
     model = ask(expert, features, ASKED[-1])
     seen, embed = _seen(one.scene, one.work, folders) if one.arm.endswith("embeddings") else (None, None)
@@ -258,10 +253,7 @@ def _draw(request: StudyRequest, table: SeedTable) -> None:
 
 def _tables(table: SeedTable) -> str:
     """Agreement on unseen pairs, and captures of ``JUDGED`` views by arm."""
-
-    def mean(metric: str, digits: int, **labels: Any) -> str:
-        return interval(table.values(metric, **labels).values()).text(digits)
-
+    mean = table.mean_text
     parts = ["Simulated experts only; nobody was asked."]
     for (scene,) in table.distinct("scene"):
         answers = []

@@ -149,13 +149,6 @@ def summary(table: SeedTable, kind: str) -> dict[str, Any]:
         "best_fixed": f"{kind}:{max(means, key=lambda x: means[x]):g}" if means else None,
         "share": share_closed(mine[0], random[0], limit).rounded(6),
         "knowing_the_best_is_worth": difference(table.runs("reward", policy=f"{ORACLE} {kind}"), best).rounded(6),
-        "rewards": {
-            " ".join(str(v) for v in values): interval(
-                table.values("reward", **dict(zip(("policy", "value"), values))).values()
-            ).rounded(6)
-            for values in [*table.distinct("policy", "value"), *((p,) for (p,) in table.distinct("policy"))]
-            if len(values) == 2 or not table.curve("value", "reward", policy=values[0])
-        },
     }
 
 

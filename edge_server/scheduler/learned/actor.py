@@ -84,6 +84,19 @@ class Actor:
         return Actor(spec, found, mean_features=found.pop("usual"))
 
 
+@dataclass(frozen=True)
+class Decision:
+    """A learned policy's decision: number and time of its epoch, the state it saw, its action ((N,) bool, or
+    an index of the omegas), the action's log-probability, and the actor that took it."""
+
+    number: int
+    now_ns: int
+    state: State
+    action: NDArray[Any]
+    logp: float
+    actor: Actor
+
+
 def read_spec(path: Path | str, about: dict[str, Any]) -> Spec:
     """The specification in a checkpoint's metadata."""
     try:

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.scheduler.fixed import within_threshold
-from edge_server.scheduler.learned.actor import Actor
-from edge_server.scheduler.learned.decision import Decision
+from edge_server.scheduler.learned.actor import Actor, Decision
 from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow
 from edge_server.scheduler.wait import qualified, wait_window
 

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import checkpoint
-from edge_server.scheduler.learned.actor import Actor
-from edge_server.scheduler.learned.decision import Decision
+from edge_server.scheduler.learned.actor import Actor, Decision
 from edge_server.scheduler.learned.state import State
 from freshfield import payload
 from freshfield.untrusted import stored_bytes

@@ -15,25 +15,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 # Weights of (6.37) as 6.5 prints them: PSNR per dB, SSIM, LPIPS, age per millisecond.
 W_P, W_S, W_L, W_T = -0.02, 0.2, 0.3, 0.015
 
 TERMS = ("psnr", "ssim", "distance", "age", "views")
-
-
-class Scored(Protocol):
-    """What a reward needs of a score; ``fidelity.scorer.Score`` and ``live.state.Publication`` have it."""
-
-    @property
-    def psnr_db(self) -> float | None: ...
-    @property
-    def psnr_moving_db(self) -> float | None: ...
-    @property
-    def ssim(self) -> float | None: ...
-    @property
-    def lpips(self) -> float | None: ...
 
 
 @dataclass(frozen=True)
@@ -81,9 +68,10 @@ class Reward:
         if self.fidelity not in ("whole", "moving"):
             raise ValueError(f"reward {self.name}: fidelity is whole or moving, not {self.fidelity!r}")
 
-    def of(self, score: Scored) -> RewardTerms:
-        """The reward of a score. ``aaoi_ms`` and ``views`` are read where it has them, as a publication
-        does. A metric that the score lacks, or that is None or not finite, is missing."""
+    def of(self, score: Any) -> RewardTerms:
+        """The reward of a score, which has ``psnr_db``, ``psnr_moving_db``, ``ssim`` and ``lpips``; ``aaoi_ms`` and
+        ``views`` are read where it has them, as a publication does. A metric that it lacks, or that is None or not
+        finite, is missing."""
         psnr_db = score.psnr_db if self.fidelity == "whole" else score.psnr_moving_db
         found = {
             "psnr" if self.fidelity == "whole" else "psnr_moving": (self.psnr, psnr_db),

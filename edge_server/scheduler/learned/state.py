@@ -116,11 +116,6 @@ class StateLayout:
         """Number of columns: those of the parts, and the mask bit, 1 for a camera that has reported."""
         return max(columns.stop for columns in self.columns.values()) + 1
 
-    @property
-    def limit(self) -> float:
-        """Largest magnitude of a feature."""
-        return max(_FEATURE_LIMIT, float(np.log1p(self.oldest_ms / self.age_scale_ms)))
-
     def features(self, state: State) -> NDArray[np.float64]:
         """(N, width), finite for any state. A camera whose age is NaN counts as one that never reported.
         ValueError where semantics are needed and the state has none, or of another width."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edge_server.report.explain_command import main
-from edge_server.scheduler.learned.decision import Decision
+from edge_server.scheduler.learned.actor import Decision
 from edge_server.scheduler.learned.decision_record import DecisionWriter
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.settings import Spec

@@ -11,7 +11,7 @@ import pytest
 
 from edge_server.experiments.engine import content_key
 from edge_server.experiments.engine.content_key import code_digest, content_digest, result_key
-from edge_server.experiments.engine.result_store import ResultStore
+from edge_server.experiments.engine.engine import ResultStore
 from edge_server.settings import ComputeConfig
 from tests.edge_server.experiments.engine.jobs import Point, measure, note
 

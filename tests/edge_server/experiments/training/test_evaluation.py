@@ -117,7 +117,6 @@ def test_every_fit_is_scored_once_by_all_held_out_cameras(tmp_path):
     assert levels[0] != levels[1] and None not in {*levels[0].values(), *levels[1].values()}
     kept = summary(tables["cam04"], "threshold")
     assert kept["seeds"] == 3 and kept["best_fixed"].startswith("threshold:")
-    assert {"random", "all", "threshold 40.0", "learned", "oracle"} <= kept["rewards"].keys()
     before = (tmp_path / "known.jsonl").read_bytes()
     again = Engine(tmp_path / "known.jsonl", threads=1, say=lambda line: None)
     assert evaluate(reported(), NOTHING, again, seeds(0, "test", 3), candidates) == found

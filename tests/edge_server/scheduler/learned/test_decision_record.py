@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.scheduler.learned.decision import Decision
+from edge_server.scheduler.learned.actor import Decision
 from edge_server.scheduler.learned.decision_record import FOLDER, DecisionWriter, read_decision
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.settings import Spec

@@ -77,7 +77,7 @@ def test_extreme_poses_and_embeddings(spec, part):
         s = state(6, rng, d=4)
         array = rng.choice(EXTREMES, getattr(s, part).shape).astype(getattr(s, part).dtype)
         states.append(replace(s, **{part: array}))
-    assert np.abs(LAYOUT.batch(states)).max() <= LAYOUT.limit
+    assert np.abs(LAYOUT.batch(states)).max() <= max(8.0, np.log1p(LAYOUT.oldest_ms / LAYOUT.age_scale_ms))
     decide_and_learn(Learner(spec, 0), states)
     seen = np.concatenate([s.embeddings for s in states if s.embeddings is not None]).astype(np.float64)
     fitted = LAYOUT.standardized(seen)
