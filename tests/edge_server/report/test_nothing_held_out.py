@@ -44,9 +44,9 @@ def page_pair(folder: Path, on: str) -> str:
 def page_chart(folder: Path, on: str) -> str:
     drawn = []
     charts = object.__new__(timelines.Timelines)
-    charts._age = SimpleNamespace(draw=lambda *_, **__: None)
+    charts._age = charts._channel = SimpleNamespace(draw=lambda *_, **__: None)
     charts._psnr = SimpleNamespace(title="", draw=lambda *_, **__: drawn.append(charts._psnr.title))
-    empty = SimpleNamespace(columns=lambda: (np.zeros(0),) * 3)
+    empty = SimpleNamespace(columns=lambda: (np.zeros(0),) * 4, state_names=[])
     charts.refresh(empty, [replace(publication(0), psnr_db=20.0, scored_on=on)])
     return drawn[0]
 
