@@ -142,10 +142,10 @@ class Clip:
         if self.count < 1:
             raise DatasetError(f"{path}: the video says it has no frames")
         nominal_ms = np.arange(self.count) * (1e3 / self.fps)
-        self.even = float(np.abs(self._from_first_ms - nominal_ms).max()) < 500.0 / self.fps
+        self.even = float(np.abs(self._from_first_ms - nominal_ms).max()) < 100.0 / self.fps
         if not self.even:
             self.fps = 1e3 / float(np.median(np.diff(self._from_first_ms)))
-        self.times_s = first_s + (nominal_ms if self.even else self._from_first_ms) / 1e3
+        self.times_s = first_s + self._from_first_ms / 1e3
         self._capture: cv2.VideoCapture | None = None
         self._next, self._last = 0, -1
         self._block: dict[int, Image] = {}

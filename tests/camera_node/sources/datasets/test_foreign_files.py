@@ -129,6 +129,12 @@ def test_times_without_cameras(tmp_path):
     file = write_photos(tmp_path, 6)
     by_folder = timed(file, [0.0, 0.1, 0.2], folders=2)
     assert by_folder.moving and by_folder.cameras == ("cam0", "cam1") and len(by_folder.of("cam1")) == 3
+
+    def apart(data):
+        for k, frame in enumerate(data["frames"]):
+            frame["time"] = k / 10
+
+    fails("6 different times and no camera", edited, file, apart)  # folders of a split share no times
     file = write_photos(tmp_path, 6)
     fails("1 of 6 frames have a time and no camera", timed, file, [0.0, 0.1, 0.2], "cam")
     file = write_photos(tmp_path, 6)
@@ -140,6 +146,11 @@ def test_times_without_cameras(tmp_path):
     file = write_photos(tmp_path, 4)
     fixed = edited(file, lambda d: [f.update(transform_matrix=d["frames"][0]["transform_matrix"]) for f in d["frames"]])
     assert "4 images have 1 poses and no time" in fixed.notes[0]
+    for shown, noted in (((0, 0, 1, 1), 1), ((0, 0, 1, 2), 0)):
+        data = json.loads(write_photos(tmp_path, 4).read_text())
+        poses = [frame["transform_matrix"] for frame in data["frames"]]
+        frames = [{**frame, "transform_matrix": poses[k]} for frame, k in zip(data["frames"], shown)]
+        assert len(edited(file, frames=frames).notes) == noted
 
 
 def test_a_split_of_the_datas_own(tmp_path):

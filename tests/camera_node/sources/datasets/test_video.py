@@ -141,12 +141,28 @@ def restamped(video: Path, runs: list[tuple[int, float]]) -> None:
     size, *_, duration = struct.unpack(">IIIIII", data[at : at + 24])
     entries = b"".join(struct.pack(">II", count, round(factor * duration)) for count, factor in runs)
     box = struct.pack(">I4sII", 16 + len(entries), b"stts", 0, len(runs)) + entries
+    video.write_bytes(with_box(data, at, size, box, (b"moov", b"trak", b"mdia", b"minf", b"stbl")))
+
+
+def with_box(data: bytearray, at: int, size: int, box: bytes, parents: tuple[bytes, ...]) -> bytearray:
+    """An MP4 file with ``box`` in place of the ``size`` bytes at ``at``."""
     data[at : at + size] = box
-    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl"):
+    for name in parents:
         head = data.rindex(name, 0, at) - 4
         grown = struct.unpack(">I", data[head : head + 4])[0] + len(box) - size
         data[head : head + 4] = struct.pack(">I", grown)
-    video.write_bytes(data)
+    return data
+
+
+def delayed(video: Path, by_ms: int) -> None:
+    """Let an MP4 file show nothing at first, by an empty edit."""
+    data = bytearray(video.read_bytes())
+    at = data.index(b"elst") - 4
+    size, _, _, _, duration, media_time, rate = struct.unpack(">IIIIIiI", data[at : at + 28])
+    scale = struct.unpack(">I", data[(head := data.index(b"mvhd") + 16) : head + 4])[0]
+    edits = struct.pack(">IiIIiI", by_ms * scale // 1000, -1, rate, duration, media_time, rate)
+    box = struct.pack(">I4sII", 16 + len(edits), b"elst", 0, 2) + edits
+    video.write_bytes(with_box(data, at, size, box, (b"moov", b"trak", b"edts")))
 
 
 UNEVEN = [(9, 1), (1, 40), (30, 1)]
@@ -169,10 +185,26 @@ def test_frames_have_the_stamps_of_the_file_and_seeking_finds_them(tmp_path):
     assert shown == [*range(10), *[9] * 20, *[10] * 10]
 
 
+def test_a_dropped_frame_and_a_late_start_are_in_the_stamps(tmp_path):
+    file = write_rig(tmp_path)
+    restamped(tmp_path / "videos/cam01.mp4", [(20, 1), (1, 2), (19, 1)])
+    times = [r.time_s for r in load_dataset(file).of("cam01")]
+    assert times == pytest.approx([k / 20 for k in range(41) if k != 21])
+    file = write_rig(tmp_path / "late")
+    for name, by_ms in (("cam00", 100), ("cam01", 350)):
+        delayed(tmp_path / f"late/videos/{name}.mp4", by_ms)
+    dataset = load_dataset(file)
+    assert [dataset.of(c)[0].time_s for c in dataset.cameras] == pytest.approx([0.0, 0.25])
+    sources = opened(video_scenario(file))
+    assert [sources[c].content(0) for c in ("cam00", "cam01")] == [5, 0]
+
+
 def test_cameras_of_different_rates_stay_together(tmp_path):
     file = write_rig(tmp_path, faster=20.0)
     dataset = load_dataset(file)
-    assert dataset.fps is None and [float(dataset.of(c)[39].time_s) for c in ("cam00", "cam01")] == [1.95, 0.975]
+    assert dataset.fps is None and [float(dataset.of(c)[39].time_s) for c in ("cam00", "cam01")] == pytest.approx(
+        [1.95, 0.975]
+    )
     slow, fast = (opened(video_scenario(file, fps=40))[c] for c in ("cam00", "cam01"))
     seen = [(slow.content(tick), fast.content(tick)) for tick in range(80)]
     # 0.975 s are common; halves of an interval are nearer to the earlier one, and it goes back and forth.
