@@ -53,10 +53,9 @@ def open_source(path: Path) -> Source:
         raise ExportError(f"{file}: does not say which representation it is of") from None
     except ValueError as error:
         raise ExportError(f"{file}: {error}") from None
-    views: tuple[View, ...] = tuple(getattr(field.snapshot(), "cameras", ()))
-    if not views:
+    if not field.views:
         raise ExportError(f"{file}: its field has seen no camera yet: let the run publish an update first")
-    return Source(file, name, field, views)
+    return Source(file, name, field, field.views)
 
 
 def _saved_options(name: str, options: dict[str, Any], state: dict[str, Any]) -> dict[str, Any]:

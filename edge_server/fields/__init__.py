@@ -107,12 +107,15 @@ class Field(Renderer, Protocol):
     frame since the last fit. None: it wants only the newest frame of each camera.
     most_pixels: largest number of pixels of one image of every camera together, if larger images would take
     too much time for following what moves; None: no limit.
+    views: newest view of each camera that it learns from.
     """
 
     @property
     def frame_s(self) -> float | None: ...
     @property
     def most_pixels(self) -> int | None: ...
+    @property
+    def views(self) -> tuple[View, ...]: ...
 
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
         """Warm-start from the present parameters and train on ``views``. An empty set does nothing. Raises

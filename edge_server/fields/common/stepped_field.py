@@ -66,6 +66,11 @@ class SteppedField(ABC, Generic[S]):
         self.now = time.perf_counter  # the clock of budgets in seconds
         self.reset()
 
+    @property
+    def views(self) -> tuple[View, ...]:
+        """Newest view of each camera."""
+        return self.view_store.views
+
     def reset(self) -> None:
         """Forget the scene, its box and its cameras; keep settings and compiled kernels."""
         with self._lock:

@@ -104,6 +104,11 @@ class LayeredField:
         return tuned.MOST_PIXELS if self.layered else None
 
     @property
+    def views(self) -> tuple[View, ...]:
+        """What the still field learns from: a view of each camera, or its background plate."""
+        return self.still.views
+
+    @property
     def moving(self) -> MovingSet | None:
         """The moving set; None before plates are known."""
         return None if self.tracker is None else self.tracker.moving
