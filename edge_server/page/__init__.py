@@ -22,6 +22,7 @@ from edge_server.page.controls import notify
 from edge_server.page.panel import Panel
 from edge_server.page.rendering import RenderLoop
 from edge_server.page.scene import Scene
+from edge_server.page.settings import REFRESH_S
 from edge_server.page.timelines import History
 from freshfield.access import HttpDoor
 from freshfield.transport import Transport
@@ -30,7 +31,6 @@ __all__ = ["Page", "PageError", "start_page"]
 
 log = logging.getLogger(__name__)
 
-REFRESH_S = 0.5
 BRAND: tuple[int, int, int] = (0, 150, 115)
 
 

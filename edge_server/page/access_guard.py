@@ -29,6 +29,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosedError, InvalidMessage
 from websockets.http11 import Request, Response
 
+from edge_server.page.settings import SAY_EVERY_S
 from freshfield.access import ANYBODY, CHANGE, Caller, HttpDoor, HttpRefused
 from freshfield.limits import (
     MAX_CLICKS_HZ,
@@ -41,9 +42,6 @@ from freshfield.limits import (
 )
 
 log = logging.getLogger(__name__)
-
-SAY_EVERY_S = 60.0
-"""Least time between two lines of the log about one kind of refusal."""
 
 Vector = tuple[float, float, float]
 Process = Callable[[ServerConnection, Request], Response | None]

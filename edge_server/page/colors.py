@@ -10,10 +10,10 @@ import math
 
 import numpy as np
 
+from edge_server.page.settings import FRESH_MS, STALE_MS
+
 RGB = tuple[int, int, int]
 
-FRESH_MS = 50.0
-STALE_MS = 2000.0
 FRESH: RGB = (0, 190, 140)
 MIDDLE: RGB = (240, 228, 66)
 STALE: RGB = (210, 50, 10)

@@ -17,11 +17,10 @@ import viser
 
 from edge_server.live.state import EdgeState
 from edge_server.page.markup import frontier, note
+from edge_server.page.settings import NOTICE_S
 from edge_server.scheduler import make_policy, policy_help, short_name
 
 log = logging.getLogger(__name__)
-
-NOTICE_S = 8.0
 
 
 class ControlPanel:

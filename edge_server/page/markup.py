@@ -15,7 +15,8 @@ from markupsafe import Markup
 from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.frontier import best_point
 from edge_server.live.state import CameraView
-from edge_server.page.colors import AGAINST, FOR, FRESH_MS, HELD_OUT, RGB, STALE_MS, age_color, css, scale_color
+from edge_server.page.colors import AGAINST, FOR, HELD_OUT, RGB, age_color, css, scale_color
+from edge_server.page.settings import FRESH_MS, STALE_MS
 from edge_server.run_records import Frontier
 from freshfield.scenario import NOTHING_HELD_OUT
 

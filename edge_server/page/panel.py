@@ -14,6 +14,7 @@ from edge_server.live.state import CameraView, Comparison, EdgeState, Publicatio
 from edge_server.page import markup
 from edge_server.page.controls import ControlPanel
 from edge_server.page.decision_explanation import DecisionExplanation
+from edge_server.page.settings import AGE_PARTS_OF
 from edge_server.page.timelines import History, Timelines
 
 MAIN_WIDTH = 372
@@ -21,7 +22,6 @@ SIDE_WIDTH = 356
 # Width of two images and the gap between them, in pixels.
 PAIR_WIDTH = 640
 GAP = 8
-AGE_PARTS_OF = 50  # publications
 PANEL_COLOR = (36, 36, 36)
 
 

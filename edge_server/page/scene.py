@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from edge_server.live.state import CameraView, EdgeState
 from edge_server.page.colors import HELD_OUT, RGB, age_color
+from edge_server.page.settings import QUIET_S, SETTLE_S, THUMBNAIL_BUDGET_S, THUMBNAIL_EVERY_S
 from edge_server.page.viewpoint import VERTICAL_FOV_RAD, Viewpoint, initial_viewpoint
 from freshfield import payload
 from freshfield.frame import Frame
@@ -22,14 +23,7 @@ from freshfield.geometry import Pose
 log = logging.getLogger(__name__)
 
 THUMBNAIL_WIDTH = 112
-THUMBNAIL_EVERY_S = 1.0
-# Time for decoding thumbnails per refresh; cameras take turns.
-THUMBNAIL_BUDGET_S = 0.03
 FRUSTUM_OF_RADIUS = 0.06
-# For this long the starting viewpoint follows cameras that report late, for visitors who have not moved.
-SETTLE_S = 20.0
-# Cameras report one after the other: choose a viewpoint when no new one has reported for this long.
-QUIET_S = 0.7
 
 
 @dataclass

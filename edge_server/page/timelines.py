@@ -14,8 +14,8 @@ from edge_server.fidelity.scorer import fidelity_title
 from edge_server.live.state import CameraView, Publication
 from edge_server.page.colors import FRESH, HELD_OUT, MIDDLE, RGB, STALE, UNKNOWN, css
 from edge_server.page.markup import chart_caption
+from edge_server.page.settings import WINDOW_S
 
-WINDOW_S = 120.0
 LINE_PX = 1.6
 # A line without a value in the last so many rows, such as omega under a policy without one, is left out.
 RECENT = 10

@@ -14,7 +14,7 @@ from edge_server.experiments.common.statistics import Interval, all_of, discover
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.engine import Engine
 from edge_server.report.machine import commit
-from edge_server.scheduler.learned.rewards import W_S
+from edge_server.scheduler.learned.settings import W_S
 from freshfield.files import write_csv, write_json, write_text
 
 HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"

@@ -17,8 +17,7 @@ from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, Literal
 
-# Weights of (6.37) as 6.5 prints them: PSNR per dB, SSIM, LPIPS, age per millisecond.
-W_P, W_S, W_L, W_T = -0.02, 0.2, 0.3, 0.015
+from edge_server.scheduler.learned.settings import W_L, W_P, W_S, W_T
 
 TERMS = ("psnr", "ssim", "distance", "age", "views")
 

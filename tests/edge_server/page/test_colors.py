@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from edge_server.page.colors import FRESH, FRESH_MS, HELD_OUT, MIDDLE, STALE, STALE_MS, UNKNOWN, age_color, scale_color
+from edge_server.page.colors import FRESH, HELD_OUT, MIDDLE, STALE, UNKNOWN, age_color, scale_color
+from edge_server.page.settings import FRESH_MS, STALE_MS
 
 # Machado, Oliveira and Fernandes (2009), severity 1, acting on linear RGB.
 DEFICIENCIES = {

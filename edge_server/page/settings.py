@@ -1,0 +1,26 @@
+"""Times and ages of the live page."""
+
+from __future__ import annotations
+
+FRESH_MS = 50.0
+"""Up to this age a frame has the freshest color."""
+STALE_MS = 2000.0
+"""From this age it has the color of what is stale."""
+REFRESH_S = 0.5
+"""Between two refreshes of panels and scene."""
+WINDOW_S = 120.0
+"""Shown by the charts."""
+AGE_PARTS_OF = 50
+"""Publications over which the parts of the age are averaged."""
+NOTICE_S = 8.0
+"""For which an answer to a control stays."""
+SAY_EVERY_S = 60.0
+"""Between two log lines of one kind of refused request."""
+THUMBNAIL_EVERY_S = 1.0
+"""Between two thumbnails of a camera."""
+THUMBNAIL_BUDGET_S = 0.03
+"""For decoding thumbnails in a refresh; cameras take turns."""
+SETTLE_S = 20.0
+"""For this long the starting viewpoint follows cameras that report late, for visitors who have not moved."""
+QUIET_S = 0.7
+"""Cameras report one after the other: a viewpoint is chosen when no new one has reported for this long."""
