@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError, camera_to_world, errors_at, read_array, read_json
-from camera_node.sources.datasets.transforms_keys import refuse_suspect
+from camera_node.sources.datasets.transforms_keys import refuse_suspect, says_something
 from freshfield.geometry import Pinhole, Pose
 
 _READ = {"width", "height", "K", "dist_k1k2p1p2", "R_world_to_cam", "t_world_to_cam"}
@@ -40,7 +40,8 @@ def load_calibration(file: Path) -> dict[str, CalibratedCamera]:
 
 def _camera(entry: dict[str, Any], where: str) -> CalibratedCamera:
     for key in entry.keys() - _READ:
-        refuse_suspect(key, where)
+        if says_something(entry[key]):
+            refuse_suspect(key, where)
     k = read_array(entry, "K", (3, 3), where)
     distortion = read_array(entry, "dist_k1k2p1p2", (4,), where) if "dist_k1k2p1p2" in entry else np.zeros(4)
     size = [entry.get(key) for key in ("width", "height")]

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 UNITS_MS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "μs": 1e-3, "ms": 1.0, "msec": 1.0, "s": 1e3, "sec": 1e3}
-UNITS_MS |= {"nanoseconds": 1e-6, "microseconds": 1e-3, "milliseconds": 1.0, "seconds": 1e3, "min": 6e4}
+UNITS_MS |= {"nanoseconds": 1e-6, "microseconds": 1e-3, "milliseconds": 1.0, "seconds": 1e3}
 _TITLE = re.compile(rf"(?P<name>.+?)(\s*[\[(](?P<in>.+?)[\])]|[\s_/]+(?P<unit>{'|'.join(UNITS_MS)}))?", re.IGNORECASE)
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?")
 _NOTHING = ("", "-", "na", "n/a", "nan", "none", "null", "inf", "lost", "timeout", "*")

@@ -21,6 +21,7 @@ from edge_server.fields import Snapshot
 from edge_server.live.state import Publication
 from freshfield import payload
 from freshfield.frame import Frame
+from freshfield.geometry import Pose
 
 log = logging.getLogger(__name__)
 
@@ -79,7 +80,7 @@ class HeldOutCamera:
         self.noise = NoiseEstimate()
         self.truths: deque[Truth] = deque(maxlen=HISTORY_FRAMES)
         self._scorer, self._noisy = scorer, noisy
-        self._pending: deque[tuple[Publication, Image | Snapshot]] = deque()
+        self._pending: deque[tuple[Publication, Image | Snapshot, Pose]] = deque()
 
     def publish(self, publication: Publication, snapshot: Snapshot) -> list[Scored]:
         """Let a publication wait for its truth; returns those that have theirs. It goes unscored before the camera's
@@ -88,9 +89,10 @@ class HeldOutCamera:
             return []
         newest = self.truths[-1].frame
         if self.truths[-2].frame.pose == newest.pose:
-            self._pending.append((publication, snapshot.render(newest.pose.matrix(), newest.intrinsics).color))
-        elif all(isinstance(waiting, np.ndarray) for _, waiting in self._pending):
-            self._pending.append((publication, snapshot))
+            color = snapshot.render(newest.pose.matrix(), newest.intrinsics).color
+            self._pending.append((publication, color, newest.pose))
+        elif all(isinstance(waiting, np.ndarray) for _, waiting, _ in self._pending):
+            self._pending.append((publication, snapshot, newest.pose))
         return self._complete()
 
     def take(self, frame: Frame) -> list[Scored]:
@@ -100,7 +102,7 @@ class HeldOutCamera:
             self.truths.clear()
         self.truths.append(Truth(frame))
         # A waiting publication may be older than the history: the frames it needs are kept.
-        waiting_ns = [publication.published_ns for publication, _ in self._pending]
+        waiting_ns = [publication.published_ns for publication, _, _ in self._pending]
         oldest_ns = min([frame.generated_edge_ns, *waiting_ns]) - HISTORY_NS
         while self.truths[0].taken_ns < oldest_ns:
             self.truths.popleft()
@@ -124,10 +126,11 @@ class HeldOutCamera:
         done: list[Scored] = []
         period_ns = self.period_ns()
         while period_ns and self._pending and self.truths[-1].taken_ns >= self._pending[0][0].published_ns:
-            publication, waiting = self._pending.popleft()
+            publication, waiting, pose = self._pending.popleft()
             present_ns = publication.published_ns
             truth = min(self.truths, key=lambda truth: abs(truth.taken_ns - present_ns))
-            if abs(truth.taken_ns - present_ns) > GAP_PERIODS * period_ns:
+            moved = isinstance(waiting, np.ndarray) and truth.frame.pose != pose
+            if moved or abs(truth.taken_ns - present_ns) > GAP_PERIODS * period_ns:
                 continue
             try:
                 found = self._against(truth, present_ns, waiting)

@@ -47,13 +47,21 @@ def _detectors(printed: CharucoPrint) -> tuple[cv2.aruco.CharucoDetector, ...]:
     return tuple(found)
 
 
-def find_charuco(image: GrayImage, printed: CharucoPrint) -> tuple[Array, NDArray[np.intp]]:
-    """Corners (N, 2), pixel centers at whole numbers, and their numbers (N,) on the board; none if it is not there."""
+Found = tuple[Array, NDArray[np.intp]]
+
+
+def find_charuco(image: GrayImage, printed: CharucoPrint) -> tuple[Found, ...]:
+    """Corners (N, 2), pixel centers at whole numbers, and their numbers (N,) on the board, for each print that there is;
+    none where it is not there. A part of a board can fit both prints, a square apart: which one it is, the picture in
+    which only one of them finds corners tells."""
+    found: list[Found] = []
     for detector in _detectors(printed):
         pixels, numbers, _, _ = detector.detectBoard(image)
-        if numbers is not None and len(numbers):
-            return pixels.reshape(-1, 2).astype(np.float64), numbers.ravel().astype(np.intp)
-    return np.zeros((0, 2)), np.zeros(0, np.intp)
+        if numbers is None or not len(numbers):
+            found.append((np.zeros((0, 2)), np.zeros(0, np.intp)))
+        else:
+            found.append((pixels.reshape(-1, 2).astype(np.float64), numbers.ravel().astype(np.intp)))
+    return tuple(found)
 
 
 def explain_charuco(image: GrayImage, printed: CharucoPrint) -> str:
@@ -72,7 +80,7 @@ def explain_charuco(image: GrayImage, printed: CharucoPrint) -> str:
             name = f"{kind}_{next(size for size in _SIZES if seen[name].max() < size)}"
         return f"its markers are of dictionary {name}, not {printed.dictionary}"
     for other in _other_boards(printed, int(numbers.max())):
-        if len(find_charuco(image, other)[1]) >= MIN_CORNERS:
+        if max(len(numbers) for _, numbers in find_charuco(image, other)) >= MIN_CORNERS:
             swapped = (other.across, other.down) == (printed.down, printed.across)
             what = "its sizes are swapped" if swapped else "it is a board of another size"
             return f"{what}: {other.across}x{other.down} squares, not {printed.across}x{printed.down}"

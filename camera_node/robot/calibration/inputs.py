@@ -90,6 +90,7 @@ def find_corners(
     """
     found: dict[str, Corners] = {}
     unused: dict[str, str] = {}
+    grays: dict[str, NDArray[np.uint8]] = {}
     for k, file in enumerate(files):
         # As stored, whatever EXIF says of its orientation: what streams pictures ignores it, too.
         image = decode_file(file, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -99,14 +100,16 @@ def find_corners(
         size = size or (width, height)
         if (width, height) != size:
             raise CalibrationError(f"{file}: is {width} x {height}, expected {size[0]} x {size[1]}")
-        gray = np.asarray(image, dtype=np.uint8)
+        grays[file.name] = np.asarray(image, dtype=np.uint8)
+        target.find(grays[file.name])  # which of two prints it is, all pictures together tell
+        progress(k + 1)
+    for name, gray in grays.items():
         corners = target.find(gray)
         if corners is None:
             why = target.explain(gray) if len(unused) < EXPLAINED else ""
-            unused[file.name] = f"{target.name} not found{why and f': {why}'}"
+            unused[name] = f"{target.name} not found{why and f': {why}'}"
         else:
-            found[file.name] = corners
-        progress(k + 1)
+            found[name] = corners
     return found, unused, size or (0, 0)
 
 

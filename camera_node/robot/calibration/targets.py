@@ -117,8 +117,13 @@ def _charuco(name: str, squares: str, square: str, marker: str, dictionary: str 
     places = np.asarray(board.getChessboardCorners(), dtype=np.float64)
     printed = CharucoPrint(across, down, inner / side, dictionary.upper())
 
+    # Corners so far by print: a part of a board can fit both, a square apart, and then the pictures before it decide.
+    total: list[int] = []
+
     def find(image: GrayImage) -> Corners | None:
-        pixels, numbers = find_charuco(image, printed)
+        prints = find_charuco(image, printed)
+        total[:] = [len(numbers) + before for (_, numbers), before in zip(prints, total or [0] * len(prints))]
+        pixels, numbers = prints[int(np.argmax(total))]
         if len(numbers) < MIN_CORNERS:
             return None
         points = places[numbers]

@@ -136,6 +136,12 @@ class Timeline:
         if not known:
             return Timeline(0.0, 0, fps)
         first_s, last_s = max(first for first, _ in known), min(last for _, last in known)
+        if all(first == last for first, last in known):
+            return Timeline(0.0, 0, fps)  # one instant: nothing moves
+        if first_s > last_s:
+            raise DatasetError(
+                f"{path}: its cameras have no instant in common: one begins at {first_s:g} s, another ends at {last_s:g} s"
+            )
         return Timeline(first_s, max(1, round((last_s - first_s) * float(fps)) + 1), fps)
 
     def nearest(self, images: Sequence[PosedImage]) -> Sequence[int]:

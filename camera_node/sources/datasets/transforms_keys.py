@@ -58,7 +58,9 @@ REFUSED: dict[str, str] = {
 
 # What a key that nobody here knows must not look like: words of lenses, projections and masks.
 _SUSPECT = re.compile(
-    r"fish|dist(ort|_?coef)|shutter|lens|fov|skew|mask|alpha|crop|proj|pano|equi|lat_?long|ortho|omni|shift|flip|mirror|"
+    r"fish|^dist(?!ance)|coef|radial|tangential|shutter|lens_?(model|type|dist|corr)|^lens$|fov|skew|mask|alpha|crop|"
+    r"\broi\b|binning|(?<![a-z])projection|pano|equi|lat_?long|ortho|omni|shift|flip|mirror|rotate|orientation|"
+    r"_to_(cam|world)|2(w|c)$|convention|coordinate|^(camera_)?model$|"
     r"^([kpsb]\d+|f[xy]|c[xy]|focal.*|intr.*|extr.*|camera_(type|intrinsics|matrix|angle.*)|K|D)$",
     re.IGNORECASE,
 )
@@ -69,7 +71,7 @@ def check_keys(entry: Mapping[str, Any], where: str) -> set[str]:
     something and is refused, or looks as if it changed the camera or what may be learned."""
     unknown: set[str] = set()
     for key in entry.keys() - HONORED - HARMLESS:
-        if not _says_something(entry[key]):
+        if not says_something(entry[key]):
             continue
         if key in REFUSED:
             raise DatasetError(f"{where}: {key}: {REFUSED[key]}")
@@ -92,7 +94,7 @@ def unknown_note(unknown: Iterable[str]) -> str:
     return f"keys that are not understood and not used: {', '.join(sorted(unknown))[:300]}"
 
 
-def _says_something(value: Any) -> bool:
+def says_something(value: Any) -> bool:
     if isinstance(value, list | tuple):
-        return any(_says_something(each) for each in value)
+        return any(says_something(each) for each in value)
     return bool(value)
