@@ -140,7 +140,8 @@ class Timeline:
             return Timeline(0.0, 0, fps)  # one instant: nothing moves
         if first_s > last_s:
             raise DatasetError(
-                f"{path}: its cameras have no instant in common: one begins at {first_s:g} s, another ends at {last_s:g} s"
+                f"{path}: its cameras have no instant in common: one begins at {first_s:g} s, "
+                f"another ends at {last_s:g} s"
             )
         return Timeline(first_s, max(1, round((last_s - first_s) * float(fps)) + 1), fps)
 
