@@ -97,10 +97,7 @@ _COMMANDS = {
     ),
     "study": ("experiments.studies.study_command", "reproduce the thesis's figures, each with a verdict"),
     "explain": ("report.explain_command", "explain a policy's decision: shares of state parts, cameras, image regions"),
-    "export": (
-        "export.export_command",
-        "write a run's mesh, splats, points, cameras and poses as files for other programs",
-    ),
+    "export": ("export.export_command", "write a run's mesh, splats, points and cameras as files for other programs"),
     "keys": ("live.keys", "make a development CA, certificates and tokens for a scenario's processes"),
     "fetch-lpips": ("fidelity.fetch_lpips", "fetch LPIPS weights with the public package and convert them for --lpips"),
 }

@@ -40,6 +40,7 @@ _WAITING_PUBLICATIONS = 2
 _OPEN_PUBLICATIONS = 16
 _BASELINE_EVERY = 5
 _MOST_SNAPSHOTS = 16  # kept for held-out frames that arrive late
+_SILENT_NS = 2_000_000_000  # behind the others: such a camera's captures are not waited for
 _SHOWN_EVERY_S = 0.4  # largest mean time between two scores of what a held-out camera is shown
 _FULL_EVERY = 4  # one in this many scores of what is shown has all metrics, the others only PSNR
 # This thread may use a share of the cores' time, refilling an allowance of CPU seconds. What is shown may use
@@ -188,10 +189,9 @@ class ScoringThread:
 
     def _forget_snapshots(self) -> None:
         """Drop those that were replaced before the next capture at which what is shown is scored."""
-        next_ns = min(
-            max(self._next_shown_ns[name], camera.truths[-1].taken_ns if camera.truths else 0)
-            for name, camera in self._held_out.items()
-        )
+        newest_ns = {name: c.truths[-1].taken_ns if c.truths else 0 for name, c in self._held_out.items()}
+        since_ns = max(newest_ns.values()) - _SILENT_NS
+        next_ns = min(max(self._next_shown_ns[name], t_ns) for name, t_ns in newest_ns.items() if t_ns >= since_ns)
         while len(self._recent) > 1 and self._recent[1][0].published_ns <= next_ns:
             self._recent.popleft()
 

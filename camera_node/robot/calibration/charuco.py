@@ -52,8 +52,8 @@ Found = tuple[Array, NDArray[np.intp]]
 
 def find_charuco(image: GrayImage, printed: CharucoPrint) -> tuple[Found, ...]:
     """Corners (N, 2), pixel centers at whole numbers, and their numbers (N,) on the board, for each print that there
-    is; none where it is not there. A part of a board can fit both prints, a square apart: which one it is, the picture in
-    which only one of them finds corners tells."""
+    is; none where it is not there. A part of a board can fit both prints, a square apart: which one it is, the picture
+    in which only one of them finds corners tells."""
     found: list[Found] = []
     for detector in _detectors(printed):
         pixels, numbers, _, _ = detector.detectBoard(image)

@@ -18,6 +18,8 @@ import select
 import socket
 import sys
 import termios
+import time
+from collections.abc import Callable
 import tty
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,6 +63,7 @@ _ESCAPE, _END_OF_FILE, _MAX_BYTES = "\x1b", "\x04", 32
 MAX_BYTES = 2048
 _MAX_MESSAGES = 64  # per poll, so that a flood does not delay the arm
 _OWNED_NS = 1_000_000_000
+_SIGNED_WITHIN_NS = 5_000_000_000  # of a signed message's time from ours, clocks' offsets included
 _LEAST_KEY_BYTES, _MOST_KEY_BYTES = 16, 4096
 
 
@@ -168,19 +171,21 @@ class NetworkStylus:
     """Listens at ``host``:``port``; port 0 takes a free one, which ``port`` then tells. Raises TeleopError.
 
     Only the first sender counts, until it has been silent for a second. With a ``key`` messages must be signed with it,
-    and their times must grow, so that none can be sent again. Addresses that other machines reach need one: whoever
-    sends a datagram moves the arm.
+    and their times must grow and lie within 5 s of the time since 1970, so that none can be sent again. Addresses that
+    other machines reach need one: whoever sends a datagram moves the arm. wall_ns: the time since 1970.
     """
 
     ended = False
 
-    def __init__(self, host: str, port: int, key: bytes | None = None) -> None:
+    def __init__(
+        self, host: str, port: int, key: bytes | None = None, wall_ns: Callable[[], int] = time.time_ns
+    ) -> None:
         if key is None and not _is_loopback(host):
             raise TeleopError(
                 f"--stylus network: other machines reach {host}, and a message moves the arm: sign them with a key, "
                 "--stylus-key FILE"
             )
-        self._key, self._newest_ns = key, -1
+        self._key, self._newest_ns, self._wall_ns = key, -1, wall_ns
         self._owner: tuple[str, int] | None = None
         self._heard_ns = 0
         try:
@@ -205,7 +210,7 @@ class NetworkStylus:
             if self._owner is not None and sender[:2] != self._owner and now_ns - self._heard_ns < _OWNED_NS:
                 continue
             sample = parse(data, self._key)
-            if sample is None or (self._key is not None and sample.t_ns <= self._newest_ns):
+            if sample is None or (self._key is not None and not self._fresh(sample.t_ns)):
                 continue
             self._newest_ns = sample.t_ns
             if self._owner != sender[:2]:
@@ -213,6 +218,9 @@ class NetworkStylus:
             self._owner, self._heard_ns = sender[:2], now_ns
             found.append(sample)
         return found
+
+    def _fresh(self, t_ns: int) -> bool:
+        return t_ns > self._newest_ns and abs(t_ns - self._wall_ns()) <= _SIGNED_WITHIN_NS
 
     def close(self) -> None:
         self._socket.close()

@@ -104,6 +104,15 @@ def test_snapshots_replaced_before_the_next_scored_capture_are_dropped() -> None
     assert [p.published_ns // MS for p, _ in thread._recent] == [500, 520, 540, 560, 580]
 
 
+def test_a_silent_held_out_camera_keeps_no_snapshots(monkeypatch: Any) -> None:
+    monkeypatch.setattr(scoring_thread, "_SILENT_NS", 100 * MS)
+    thread = ScoringThread(["cam00", "cam01"], Scorer(), lambda *_: None, lambda *_: None)
+    for k in range(1, 13):
+        thread._held_out["cam00"].take(_frame(k, k * 20 * MS))
+        thread._score_later(_publication(k, k * 20 * MS), Brightness(k * 20 * MS), [])
+    assert len(thread._recent) == 1
+
+
 def test_an_instant_whose_publication_went_by_unseen_is_not_scored(monkeypatch: Any) -> None:
     shown: list[tuple[Score, Publication]] = []
     thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *of: shown.append(of))

@@ -72,13 +72,18 @@ def test_where_others_can_send_only_signed_messages_count_and_none_twice(tmp_pat
             open_stylus(f"network:{host}:7010")
     stylus = open_stylus("network:0.0.0.0:7010", file)
     stylus.close()
-    stylus = NetworkStylus("127.0.0.1", 0, key)
+    stylus = NetworkStylus("127.0.0.1", 0, key, wall_ns=lambda: 5 + 4 * 10**9)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         first, second = sample(5), sample(6)
         forged = encode(first, b"another key of 16")
         assert received(stylus, 0, (sender, encode(first)), (sender, forged), (sender, encode(first, key))) == [first]
         assert received(stylus, 5 * 10**9, (sender, encode(first, key)), (sender, encode(second, key))) == [second]
     stylus.close()
+    later = NetworkStylus("127.0.0.1", 0, key, wall_ns=lambda: 7 + 5 * 10**9)  # a session in which both are sent again
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        third = sample(7)
+        assert received(later, 0, *((sender, encode(each, key)) for each in (first, second, third))) == [third]
+    later.close()
     file.write_bytes(b"short")
     for path, why in ((file, "at least 16"), (tmp_path, "cannot be read")):
         with pytest.raises(TeleopError, match=why):
