@@ -19,8 +19,8 @@ import socket
 import sys
 import termios
 import time
-from collections.abc import Callable
 import tty
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
