@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable
 from concurrent import futures
 from pathlib import Path
 
@@ -16,21 +15,17 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from freshfield_up import healthy as health_check
 
 
-@pytest.fixture
-def healthy(monkeypatch: pytest.MonkeyPatch) -> Callable[..., bool]:
+def healthy(*words: str, camera: str | None = None) -> bool:
     """What the check says, given its words and the camera of its container."""
-
-    def check(*words: str, camera: str | None = None) -> bool:
-        monkeypatch.setattr(sys, "argv", ["healthy", *words])
-        monkeypatch.delenv("CAMERA", raising=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["healthy", *words])
+        patch.delenv("CAMERA", raising=False)
         if camera:
-            monkeypatch.setenv("CAMERA", camera)
+            patch.setenv("CAMERA", camera)
         return health_check.main() == 0
 
-    return check
 
-
-def test_a_server_is_healthy_while_it_says_so(healthy: Callable[..., bool]) -> None:
+def test_a_server_is_healthy_while_it_says_so() -> None:
     server = grpc.server(futures.ThreadPoolExecutor(1))
     servicer = health.HealthServicer()
     health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
@@ -46,7 +41,7 @@ def test_a_server_is_healthy_while_it_says_so(healthy: Callable[..., bool]) -> N
     assert not healthy("--serving", f"127.0.0.1:{port}")
 
 
-def test_a_node_is_healthy_while_its_own_status_is_fresh(healthy: Callable[..., bool], tmp_path: Path) -> None:
+def test_a_node_is_healthy_while_its_own_status_is_fresh(tmp_path: Path) -> None:
     assert not healthy("--node", str(tmp_path))
     (tmp_path / "node-cam01.json").write_text("{}")
     assert healthy("--node", str(tmp_path)) and healthy("--node", str(tmp_path), camera="cam01")

@@ -86,10 +86,11 @@ def test_the_health_check_passes_mutual_tls(keys):
             f"--tls-{part}={keys / 'emulator' / file}"
             for part, file in (("cert", "cert.pem"), ("key", "key.pem"), ("ca", "ca.pem"))
         ]
-        with_it = await asyncio.to_thread(healthy, "--serving", f"127.0.0.1:{port}", *words)
-        without = await asyncio.to_thread(healthy, "--serving", f"127.0.0.1:{port}")
-        await server.stop(None)
-        return with_it, without
+        try:
+            with_it = await asyncio.to_thread(healthy, "--serving", f"127.0.0.1:{port}", *words)
+            return with_it, await asyncio.to_thread(healthy, "--serving", f"127.0.0.1:{port}")
+        finally:
+            await server.stop(None)
 
     assert asyncio.run(scene()) == (True, False)
 
