@@ -4,7 +4,8 @@
                "R_world_to_cam": [[...]], "t_world_to_cam": [...]}, ...}
 
 In ``K`` pixel centers are whole numbers, as in OpenCV, so 0.5 is added here. ``R`` and ``t`` take world
-points to camera axes (meters); they may be missing if a trajectory or an arm gives the poses.
+points to camera axes (meters); they may be missing if a trajectory or an arm gives the poses. Any other key that says
+something is refused, unless it is known to be harmless: names and numbers of cameras, errors of calibrations, dates.
 """
 
 from __future__ import annotations
@@ -16,10 +17,18 @@ from typing import Any
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError, camera_to_world, errors_at, read_array, read_json
-from camera_node.sources.datasets.transforms_keys import refuse_suspect, says_something
+from camera_node.sources.datasets.transforms_keys import says_something
 from freshfield.geometry import Pinhole, Pose
 
-_READ = {"width", "height", "K", "dist_k1k2p1p2", "R_world_to_cam", "t_world_to_cam"}
+_READ = ("width", "height", "K", "dist_k1k2p1p2", "R_world_to_cam", "t_world_to_cam")
+_HARMLESS = """
+error_px std_fx_fy_cx_cy_k1_k2_p1_p2 camera_center_m
+error errors error_std rms rmse rms_px rms_error reprojection_error reprojection_errors reprojection_error_px
+mean_reprojection_error avg_reprojection_error per_view_errors views num_images images
+name camera camera_name label id camera_id serial serial_number device make
+date created calibrated_at calibration_date timestamp version comment description notes
+"""
+_UNITS = ("m", "meter", "meters", "metre", "metres", "px", "pixel", "pixels")
 
 
 @dataclass(frozen=True)
@@ -38,10 +47,21 @@ def load_calibration(file: Path) -> dict[str, CalibratedCamera]:
     return {str(name): _camera(entry, f"{file}: {name}") for name, entry in data.items()}
 
 
+def _sizes(width: Any, height: Any) -> dict[str, tuple[Any, ...]]:
+    """Keys that may repeat the size -> what they may say."""
+    both = ([width, height],)
+    return {"image_size": both, "size": both, "resolution": both, "image_width": (width,), "image_height": (height,)}
+
+
 def _camera(entry: dict[str, Any], where: str) -> CalibratedCamera:
-    for key in entry.keys() - _READ:
-        if says_something(entry[key]):
-            refuse_suspect(key, where)
+    entry = {key: value for key, value in entry.items() if value is not None}
+    repeated = {"units": _UNITS, "unit": _UNITS} | _sizes(entry.get("width"), entry.get("height"))
+    for key in sorted(entry.keys() - {*_HARMLESS.split(), *_READ}):
+        if says_something(entry[key]) and entry[key] not in repeated.get(key, ()):
+            raise DatasetError(
+                f"{where}: {key} is not understood and may change the camera: say it by {', '.join(_READ)}, or "
+                "undistort the pictures, and leave it out"
+            )
     k = read_array(entry, "K", (3, 3), where)
     distortion = read_array(entry, "dist_k1k2p1p2", (4,), where) if "dist_k1k2p1p2" in entry else np.zeros(4)
     size = [entry.get(key) for key in ("width", "height")]

@@ -146,9 +146,13 @@ def _from_rows(path: Path, discipline: str) -> Recording:
             )
         came = [*read.times_ms(delivered or delay or offered)]
         camera = read.text("camera")
+        begin = next((at for at in read.times_ms(offered) if math.isfinite(at)), 0.0)  # stamps may be since 1970
         for (line, row), at, then, lost in zip(read.rows, read.times_ms(offered), came, read.lost()):
-            then = math.nan if lost else then if delivered else at + then
-            if math.isnan(at) or abs(at) > _MAX_ROWS_MS or then < at:
+            at -= begin
+            then = math.nan if lost else then - begin if delivered else at + then
+            if abs(at) > _MAX_ROWS_MS:
+                raise TableError(f"line {line}: {offered.title} is decades away from the first: {', '.join(row):.100}")
+            if math.isnan(at) or then < at:
                 raise TableError(
                     f"line {line}: delivered_ms is not earlier than offered_ms, or blank: {', '.join(row):.100}"
                 )

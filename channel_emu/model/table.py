@@ -13,6 +13,7 @@ UNITS_MS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "μs": 1e-3, "ms": 1.0, "msec":
 UNITS_MS |= {"nanoseconds": 1e-6, "microseconds": 1e-3, "milliseconds": 1.0, "seconds": 1e3}
 _TITLE = re.compile(rf"(?P<name>.+?)(\s*[\[(](?P<in>.+?)[\])]|[\s_/]+(?P<unit>{'|'.join(UNITS_MS)}))?", re.IGNORECASE)
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?")
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")  # or three decimals
 _NOTHING = ("", "-", "na", "n/a", "nan", "none", "null", "inf", "lost", "timeout", "*")
 _FLAGS = {"0": False, "false": False, "no": False, "": False, "1": True, "true": True, "yes": True}
 
@@ -109,8 +110,11 @@ def read_table(text: str) -> Table:
                 f"line {k} has {len(row)} fields, expected {width}: decimal commas need semicolons between"
             )
     words = [word for _, row in rows for word in row if _NUMBER.fullmatch(word)]
-    if any("," in word for word in words) and any("." in word for word in words):
+    commas = [word for word in words if "," in word]
+    if commas and any("." in word for word in words):
         raise TableError("numbers are written with decimal points and with commas: use one of them")
+    if commas and all(_THOUSANDS.fullmatch(word) for word in commas):
+        raise TableError(f"{commas[0]} may be thousands or have three decimals: write decimal points, or no commas")
     return Table(titles, tuple((k, row + ("",) * (width - len(row))) for k, row in rows))
 
 

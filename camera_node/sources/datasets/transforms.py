@@ -76,8 +76,11 @@ def _load(file: Path, options: ImageOptions) -> Dataset:
     listed += tests
     split, left_out = _split(data, {_name(frame, where) for _, frame, where in listed}, str(file))
     held_out |= split
+    bad = [where for _, frame, where in listed if frame.get("is_bad")]
     listed = [each for each in listed if not each[1].get("is_bad") and _name(*each[1:]) not in left_out]
     cameras, notes = _cameras([frame for _, frame, _ in listed], str(file))
+    if bad and not listed:
+        notes.append(f"{len(bad)} of its frames are marked is_bad, and none is left")
     unknown = check_keys(data, str(file)).union(*(check_keys(frame, where) for _, frame, where in listed))
     images: list[PosedImage] = []
     missing: list[str] = []
@@ -107,6 +110,7 @@ def _read(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     data = read_json(file)
     if not isinstance(data, dict) or "frames" not in data:
         raise DatasetError(f"{file}: expected a mapping with a list 'frames'")
+    data = _without_null(data)
     return data, _frames(data, "frames", file)
 
 
@@ -114,7 +118,12 @@ def _frames(data: dict[str, Any], key: str, file: Path) -> list[dict[str, Any]]:
     frames = data.get(key, [])
     if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
         raise DatasetError(f"{file}: expected a mapping with a list '{key}' of mappings")
-    return frames
+    return [_without_null(frame) for frame in frames]
+
+
+def _without_null(entry: dict[str, Any]) -> dict[str, Any]:
+    """A key whose value is null is as good as absent."""
+    return {key: value for key, value in entry.items() if value is not None}
 
 
 def _name(frame: dict[str, Any], where: str) -> str:
@@ -146,6 +155,8 @@ def _cameras(frames: Sequence[dict[str, Any]], where: str) -> tuple[list[str], l
     known which images belong to one instant."""
     named = [str(next((frame[key] for key in CAMERA_NAMES if key in frame), "")) for frame in frames]
     times = [frame["time"] for frame in frames if "time" in frame]
+    if not frames:
+        return [], []
     if not times:
         poses = {repr(frame.get("transform_matrix")) for frame in frames}
         if 2 * len(poses) > len(frames):

@@ -32,6 +32,7 @@ driver_parameters n_extra_learnable_dims has_mask
 """
 HARMLESS = frozenset(_HARMLESS.split())
 
+_STEPS = ("timestep", "timestep_index", "time_index", "frame_time")  # of a frame; beside its time they say nothing more
 _PINHOLES = "cut them into images of a pinhole camera"
 _UNDISTORT = "undistort the images and leave it out"
 REFUSED: dict[str, str] = {
@@ -48,7 +49,7 @@ REFUSED: dict[str, str] = {
         "the camera moved during the exposure: give the pose of its middle as transform_matrix",
     ),
     "enable_ray_loading": "rays come from files of their own: give a lens instead",
-    **dict.fromkeys(("timestep", "timestep_index", "time_index", "frame_time"), "give the instant in seconds as time"),
+    **dict.fromkeys(_STEPS, "give the instant in seconds as time"),
     **dict.fromkeys(("from_mitsuba", "from_na"), "its axes are others: convert the poses to OpenGL's and leave it out"),
     **dict.fromkeys(
         ("white_transparent", "black_transparent", "mask_color"),
@@ -60,8 +61,8 @@ REFUSED: dict[str, str] = {
 _SUSPECT = re.compile(
     r"fish|^dist(?!ance)|coef|radial|tangential|shutter|lens_?(model|type|dist|corr)|^lens$|fov|skew|mask|alpha|crop|"
     r"\broi\b|binning|(?<![a-z])projection|pano|equi|lat_?long|ortho|omni|shift|flip|mirror|rotate|orientation|"
-    r"_to_(cam|world)|2(w|c)$|convention|coordinate|^(camera_)?model$|"
-    r"^([kpsb]\d+|f[xy]|c[xy]|focal.*|intr.*|extr.*|camera_(type|intrinsics|matrix|angle.*)|K|D)$",
+    r"_to_(cam|world)|2(w|c)$|convention|coordinate|pose_?type|^(camera_)?model$|"
+    r"^([kpsb]_?\d+|f[xy]|c[xy]|focal.*|intr.*|extr.*|camera_(type|intrinsics|matrix|angle.*)|K|D)$",
     re.IGNORECASE,
 )
 
@@ -73,20 +74,17 @@ def check_keys(entry: Mapping[str, Any], where: str) -> set[str]:
     for key in entry.keys() - HONORED - HARMLESS:
         if not says_something(entry[key]):
             continue
+        if key in _STEPS and "time" in entry:
+            continue
         if key in REFUSED:
             raise DatasetError(f"{where}: {key}: {REFUSED[key]}")
-        refuse_suspect(key, where)
+        if _SUSPECT.search(key):
+            raise DatasetError(
+                f"{where}: {key} is not understood and may change the camera or what may be learned: undistort or mask "
+                "the images accordingly, and leave it out"
+            )
         unknown.add(key)
     return unknown
-
-
-def refuse_suspect(key: str, where: str) -> None:
-    """Raise DatasetError for an unknown key that looks as if it changed the camera or what may be learned."""
-    if _SUSPECT.search(key):
-        raise DatasetError(
-            f"{where}: {key} is not understood and may change the camera or what may be learned: undistort or mask "
-            "the images accordingly, and leave it out"
-        )
 
 
 def unknown_note(unknown: Iterable[str]) -> str:
@@ -95,6 +93,7 @@ def unknown_note(unknown: Iterable[str]) -> str:
 
 
 def says_something(value: Any) -> bool:
+    """Whether a value is other than null, zero, false and empty, or a list of such."""
     if isinstance(value, list | tuple):
         return any(says_something(each) for each in value)
     return bool(value)

@@ -32,6 +32,8 @@ _PLACES = ("videos/{}.mp4", "{}.mp4")
 _SKIP_FRAMES = 30
 # Videos decode only forwards: to play backwards, this many (shrunk) frames are decoded at once.
 _BLOCK = 12
+# So many of the last frames tell whether a video ends where its packets do: OpenCV seeks to within a frame or two.
+_ENDING = 4
 
 
 def load_dataset(
@@ -144,7 +146,10 @@ class Clip:
         nominal_ms = np.arange(self.count) * (1e3 / self.fps)
         self.even = float(np.abs(self._from_first_ms - nominal_ms).max()) < 100.0 / self.fps
         if not self.even:
-            self.fps = 1e3 / float(np.median(np.diff(self._from_first_ms)))
+            # The mean without gaps: the median of stamps in whole milliseconds is off by up to half of one.
+            apart_ms = np.diff(self._from_first_ms)
+            usual_ms = np.median(apart_ms)
+            self.fps = 1e3 / float(apart_ms[np.abs(apart_ms - usual_ms) <= 0.5 * usual_ms].mean())
         self.times_s = first_s + self._from_first_ms / 1e3
         self._capture: cv2.VideoCapture | None = None
         self._next, self._last = 0, -1
@@ -205,11 +210,22 @@ class Clip:
 
 
 def _stamps(path: Path, fps: float) -> tuple[NDArray[np.float64], float]:
-    """The frames' stamps from the first on, ms, and that of the first, s; from the packets, which are not decoded."""
-    packets = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
-    stamps: list[tuple[float, float]] = []
-    while packets.grab():
-        stamps.append((packets.get(cv2.CAP_PROP_POS_MSEC), packets.get(cv2.CAP_PROP_PTS)))
-    packets.release()
-    stamps.sort()
+    """The frames' stamps from the first on, ms, and that of the first, s. They are those of the packets, which are not
+    decoded, unless some are no frames: a cut without encoding keeps packets from the key frame before it on."""
+    stamps = sorted(_grabbed(cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])))
+    if len(stamps) > 1:
+        ending = cv2.VideoCapture(str(path))
+        ending.set(cv2.CAP_PROP_POS_FRAMES, max(0, len(stamps) - _ENDING))
+        last_ms = max((ms for ms, _ in _grabbed(ending)), default=-np.inf)
+        if last_ms < 0.5 * (stamps[-1][0] + stamps[-2][0]):
+            stamps = sorted(_grabbed(cv2.VideoCapture(str(path)))) or stamps
     return np.array([ms for ms, _ in stamps]), stamps[0][1] / fps if stamps else 0.0
+
+
+def _grabbed(capture: cv2.VideoCapture) -> list[tuple[float, float]]:
+    """The stamps of what is left of a video: ms from the first on, and ticks of its rate. It is released then."""
+    stamps: list[tuple[float, float]] = []
+    while capture.grab():
+        stamps.append((capture.get(cv2.CAP_PROP_POS_MSEC), capture.get(cv2.CAP_PROP_PTS)))
+    capture.release()
+    return stamps

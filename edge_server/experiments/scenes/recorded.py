@@ -94,7 +94,8 @@ def _is_called(view: str, name: str) -> bool:
 def _records(dataset: Dataset, frame: int) -> tuple[dict[str, PosedImage], str]:
     """One image per camera of a moving data set, else all, by the names of their views; and the instant as text.
 
-    Frame N is that of the slowest camera; of the others it is the image nearest in time. Raises DatasetError."""
+    Frames are those of the slowest camera, from the first one that all have; of the others it is the image nearest in
+    time. Raises DatasetError."""
     if not dataset.moving:
         if frame:
             raise DatasetError(f"--frame {frame}: this data set has no frames of several cameras: leave it out")
@@ -108,6 +109,9 @@ def _records(dataset: Dataset, frame: int) -> tuple[dict[str, PosedImage], str]:
             "moves, leave out the times"
         )
     slowest = max(cameras.values(), key=_apart_s)
+    near_s = 0.5 * _apart_s(slowest) + 1e-6
+    begin_s = max(records[0].time_s or 0.0 for records in cameras.values()) - near_s
+    slowest = tuple(record for record in slowest if (record.time_s or 0.0) >= begin_s) or slowest
     if not 0 <= frame < len(slowest):
         raise DatasetError(f"--frame {frame}: the recording has the frames 0 to {len(slowest) - 1}")
     t_s = slowest[frame].time_s or 0.0
@@ -116,7 +120,7 @@ def _records(dataset: Dataset, frame: int) -> tuple[dict[str, PosedImage], str]:
         for camera, records in cameras.items()
     }
     for camera, record in found.items():
-        if abs((record.time_s or 0.0) - t_s) > 0.5 * _apart_s(slowest) + 1e-6:
+        if abs((record.time_s or 0.0) - t_s) > near_s:
             raise DatasetError(f"--frame {frame}: camera {camera} has no image near {t_s:g} s: choose another frame")
     return found, f"frame {frame} of {len(slowest)}"
 

@@ -156,5 +156,8 @@ def settings_from(
         raise ScenarioError(f"{kind.name}.effort: expected one of {', '.join(efforts)}, got {effort!r}")
     valid = option_help(kind)
     if unknown := sorted(set(given) - set(valid)):
-        raise ScenarioError(f"{kind.name} has no option {', '.join(unknown)}; it has: effort, {', '.join(valid)}")
+        renamed = " (harmonics is now sh_degree: 1)" if "harmonics" in unknown and "sh_degree" in valid else ""
+        raise ScenarioError(
+            f"{kind.name} has no option {', '.join(unknown)}{renamed}; it has: effort, {', '.join(valid)}"
+        )
     return read_settings(kind, {"seed": seed, **efforts[effort], **given}, kind.name)

@@ -135,6 +135,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
         (HEAD + "0,5\n30,40\n", "2 delays .2 frames, 2 came.; at least 20 are needed"),
         (HEAD + "".join(f"{30 * n},\n" for n in range(100)), "none of its 100 frames came through"),
         (HEAD + "0,5\n30,20\n", "line 3: delivered_ms is not earlier than offered_ms, or blank: 30, 20"),
+        (HEAD + "0,5\n1e12,\n1.1e12,\n", "line 4: offered_ms is decades away from the first: 1.1e12, "),
         (HEAD + "0,5\nrain\n", "line 3: offered_ms is 'rain', expected a number"),
         (HEAD + '"' + 140_000 * "0", "cannot be read as a table: field larger than"),
         ("0,5\n30,40\n", "expected a header with the columns offered_ms, .* it has no header"),

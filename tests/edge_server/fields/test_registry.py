@@ -59,6 +59,7 @@ REFUSED: list[tuple[str, Any, str]] = [
     ("resolution", 2, "4 to 1024"),
     ("levles", 3, "no option levles; it has: effort, "),
     ("rate_net", 0.1, "no option rate_net; it has: effort, "),  # a tuned number, no option
+    ("harmonics", 4, "no option harmonics (harmonics is now sh_degree: 1); it has: effort, "),
 ]
 
 

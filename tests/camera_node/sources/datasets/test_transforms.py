@@ -72,6 +72,19 @@ def test_intrinsics_of_a_frame_stand_above_those_of_the_file(tmp_path):
     assert second.intrinsics.fx == 50.0 and second.intrinsics.distortion == (0.1, 0.0, 0.0, -0.01)
 
 
+def test_null_is_as_good_as_absent_and_a_step_beside_a_time_says_nothing_more(tmp_path):
+    file = write_photos(tmp_path, 4, cameras=3)
+    expected = load_dataset(file)
+    nulls = dict.fromkeys(("k1", "is_fisheye", "camera_label", "camera_angle_x", "mask_path"))
+    edit(file, lambda d: [d.update(nulls), *(f.update(nulls, fl_x=None, timestep=3) for f in d["frames"])])
+    found = load_dataset(file)
+    assert [(r.name, r.camera, r.time_s) for r in found] == [(r.name, r.camera, r.time_s) for r in expected]
+    assert found[0].intrinsics == expected[0].intrinsics and found.notes == expected.notes
+    edit(file, lambda d: [f.update(time=None, camera=None, timestep=None) for f in d["frames"]])
+    still = load_dataset(file)
+    assert not still.moving and still.cameras == ("",)
+
+
 def test_time_and_camera_make_a_recording(tmp_path):
     dataset = load_dataset(write_photos(tmp_path, 4, cameras=3))
     assert dataset.moving and dataset.cameras == ("cam00", "cam01", "cam02")
@@ -114,6 +127,14 @@ def test_alpha_is_kept_laid_on_a_color_and_weighted_when_shrinking(tmp_path):
         (lambda d: d.update(fl_x=-1.0), "impossible"),
         (lambda d: [d.pop("fl_x"), d.pop("fl_y")], "camera_angle_x"),
         (lambda d: [f.update(file_path="images/none") for f in d["frames"]], "missing"),
+        (
+            lambda d: [f.update(is_bad=True) for f in d["frames"]],
+            r"json: 2 of its frames are marked is_bad, and none is",
+        ),
+        (lambda d: d["frames"][0].update(pose_type="w2c"), "pose_type is not understood and may change the camera"),
+        (lambda d: d.update(coordinate_system="opencv"), "coordinate_system is not understood and may change"),
+        (lambda d: d.update(convention="opencv"), "convention is not understood and may change"),
+        (lambda d: d.update(k_1=0.1), "k_1 is not understood and may change"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path, change, message):

@@ -199,6 +199,26 @@ def test_a_dropped_frame_and_a_late_start_are_in_the_stamps(tmp_path):
     assert [sources[c].content(0) for c in ("cam00", "cam01")] == [5, 0]
 
 
+def test_frames_before_the_edit_list_of_a_cut_video_are_none(tmp_path):
+    data = bytearray((data_dir("pose2sim_single_person") / "videos/cam03.mp4").read_bytes())
+    whole = Clip(data_dir("pose2sim_single_person") / "videos/cam03.mp4").frame(2, 34, 60)
+    at, head = data.index(b"elst") + 12, data.index(b"mdhd") + 16
+    (scale,), (media_time,) = (struct.unpack(">I", data[k : k + 4]) for k in (head, at + 4))
+    data[at + 4 : at + 8] = struct.pack(">I", media_time + 2 * scale // 60)  # as ffmpeg -ss -c copy writes it
+    (tmp_path / "cut.mp4").write_bytes(data)
+    clip = Clip(tmp_path / "cut.mp4")
+    assert clip.count == 98 and clip.times_s == pytest.approx(np.arange(98) / 60)
+    assert clip.frame(97, 34, 60).shape == (60, 34, 3)
+    np.testing.assert_array_equal(clip.frame(0, 34, 60), whole)
+
+
+def test_the_rate_of_uneven_stamps_is_their_mean_without_gaps(tmp_path):
+    write_rig(tmp_path, 1)
+    video = tmp_path / "videos/cam00.mp4"
+    restamped(video, [(20, 1), (1, 40), (12, 1.25), (7, 1)])  # of 1/20 s; the last duration is no gap between two
+    assert Clip(video).fps == pytest.approx(20 * 38 / (26 + 12 * 1.25), rel=1e-4)
+
+
 def test_cameras_of_different_rates_stay_together(tmp_path):
     file = write_rig(tmp_path, faster=20.0)
     dataset = load_dataset(file)
@@ -267,6 +287,46 @@ def test_what_does_not_fit_is_named(tmp_path):
     file.write_text(json.dumps(rig))
     with pytest.raises(DatasetError, match=r"cam00.mp4: OpenCV cannot open"):
         opened(video_scenario(file))
+
+
+UNKNOWN = {
+    "dist": [0.1],
+    "camera_model": "OPENCV_FISHEYE",
+    "model": "fisheye",
+    "coeffs": [0, 0.1],
+    "radial": [0.1],
+    "rotate": 90,
+    "binning": 2,
+    "roi": [0, 0, 9, 9],
+    "T_cam_to_world": [[1, 0]],
+    "dist_k3": 0.1,
+    "units": "mm",
+    "image_size": [128, 96],
+    "image_width": 128,
+    "skew": True,
+}
+
+
+@pytest.mark.parametrize("key", UNKNOWN)
+def test_a_key_of_a_rig_that_is_not_understood_is_refused_if_it_says_something(tmp_path, key):
+    file = write_rig(tmp_path, 1)
+    rig = json.loads(file.read_text())
+    expected = load_calibration(file)
+    for nothing in (None, 0, False, [], [0.0, 0], ""):
+        file.write_text(json.dumps({"cam00": {**rig["cam00"], key: nothing}}))
+        assert load_calibration(file) == expected
+    file.write_text(json.dumps({"cam00": {**rig["cam00"], key: UNKNOWN[key]}}))
+    with pytest.raises(DatasetError, match=f"json: cam00: {key} is not understood and may change the camera: say it"):
+        load_calibration(file)
+
+
+def test_what_says_nothing_of_a_rigs_camera_may_stand_there(tmp_path):
+    file = write_rig(tmp_path, 1)
+    rig, expected = json.loads(file.read_text()), load_calibration(file)
+    rig["cam00"] |= {"error_px": 0.2, "std_fx_fy_cx_cy_k1_k2_p1_p2": [1] * 8, "name": "left", "date": "2026-11-27"}
+    rig["cam00"] |= {"units": "m", "image_size": [64, 48], "image_width": 64, "image_height": 48, "serial": "0042"}
+    file.write_text(json.dumps(rig))
+    assert load_calibration(file) == expected
 
 
 def test_a_camera_without_a_pose_is_missed_only_where_it_is_used(tmp_path):

@@ -92,15 +92,19 @@ def test_an_instant_of_cameras_of_different_rates_is_one_of_time(tmp_path):
     file = write_recording(tmp_path)
     data = json.loads(file.read_text())
     late = [frame for frame in data["frames"] if frame["camera"] == "cam01"]
-    data["frames"].remove(late[0])  # cam01 dropped a frame
+    data["frames"].remove(late[0])  # cam01 began a frame later: that one is the first
     file.write_text(json.dumps(data))
     instants = sorted({frame["time"] for frame in data["frames"]})
-    shown = load_recorded(tmp_path, "0", frame=1)
+    shown = load_recorded(tmp_path, "0")
+    assert shown.instant == "frame 0 of 2"
     (view,) = [v for v in shown.training if v.camera == "cam01"]
     records = [r for r in load_dataset(file) if r.camera == "cam01" and r.time_s == pytest.approx(instants[1])]
     assert np.array_equal(view.image, records[0].read())
-    with pytest.raises(DatasetError, match="camera cam01 has no image near 0 s: choose another frame"):
-        load_recorded(tmp_path, "0", frame=0)
+    data["frames"] = [frame for frame in data["frames"] if frame not in late[1:]]
+    data["frames"].append({**late[0]})  # it began with the others and then dropped its frames
+    file.write_text(json.dumps(data))
+    with pytest.raises(DatasetError, match=f"camera cam01 has no image near {instants[1]:g} s: choose another frame"):
+        load_recorded(tmp_path, "0", frame=1)
     case = load_recorded(case_dir("04-fit-videos-of-different-rates"), "cam02", frame=15)
     greens = {v.camera: float(v.image[:, -v.image.shape[1] // 3 :, 1].mean()) for v in (*case.training, *case.held_out)}
     assert case.instant == "frame 15 of 20"
