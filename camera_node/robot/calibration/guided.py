@@ -38,7 +38,7 @@ from camera_node.robot.calibration.settings import (
     STILL_DEG,
     STILL_MM,
 )
-from camera_node.robot.calibration.targets import Target, estimate_pose, to_gray
+from camera_node.robot.calibration.targets import WHICH_PRINT, Target, estimate_pose, to_gray
 from camera_node.settings import ArmConfig, source_config
 from camera_node.sources.base import Source
 from camera_node.sources.registry import open_sources
@@ -161,6 +161,8 @@ class HandEyeSession:
             if self._missed % EXPLAIN_EVERY == 1:  # it takes a second
                 self._why = self._target.explain(gray)
             return self._step("target not found", self._why or "bring all of it into the picture, well lit")
+        if not self._target.decided():
+            return self._step("target unclear", WHICH_PRINT)
         turned_deg = angle_deg(self.samples.flange, flange)
         if len(turned_deg) and turned_deg.min() < NEW_DEG:
             return self._step(f"like pose {int(np.argmin(turned_deg)) + 1}")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
 from camera_node.robot.calibration.settings import EXPLAINED
-from camera_node.robot.calibration.targets import Corners, Target, estimate_pose
+from camera_node.robot.calibration.targets import WHICH_PRINT, Corners, Target, estimate_pose
 from camera_node.sources.datasets.imaging import decode_file
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import Pinhole, se3, so3_exp
@@ -109,6 +109,8 @@ def find_corners(
         if corners is None:
             why = target.explain(gray) if len(unused) < EXPLAINED else ""
             unused[name] = f"{target.name} not found{why and f': {why}'}"
+        elif not target.decided():
+            unused[name] = WHICH_PRINT
         else:
             found[name] = corners
     return found, unused, size or (0, 0)

@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 GrayImage = NDArray[np.uint8]
 
 NOTATIONS = "charuco:7x5:30mm:22mm or chessboard:9x6:23.6mm"
+WHICH_PRINT = "parts of the board fit two prints, a square apart: show all of it once"
 # Corners of a chessboard that was described by its squares, or miscounted by one or two.
 _OTHER_SIZES = ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1), (-2, -2), (2, 2))
 _SUBPIX = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
@@ -52,6 +53,7 @@ class Target:
         modules).
     pattern_m: width and height without the white border.
     square_m: side of a square.
+    decided: whether it is known which of two prints the target is (see ``charuco.find_charuco``).
     """
 
     name: str
@@ -62,6 +64,7 @@ class Target:
     modules: int
     pattern_m: tuple[float, float]
     square_m: float
+    decided: Callable[[], bool] = lambda: True
 
 
 def parse_target(spec: str) -> Target:
@@ -117,13 +120,16 @@ def _charuco(name: str, squares: str, square: str, marker: str, dictionary: str 
     places = np.asarray(board.getChessboardCorners(), dtype=np.float64)
     printed = CharucoPrint(across, down, inner / side, dictionary.upper())
 
-    # Corners so far by print: a part of a board can fit both, a square apart, and then the pictures before it decide.
-    total: list[int] = []
+    # Corners so far by print, of pictures that tell the prints apart: a part of a board can fit both, a square apart,
+    # and then the other pictures decide.
+    total = [0, 0]
 
     def find(image: GrayImage) -> Corners | None:
         prints = find_charuco(image, printed)
-        total[:] = [len(numbers) + before for (_, numbers), before in zip(prints, total or [0] * len(prints))]
-        pixels, numbers = prints[int(np.argmax(total))]
+        counts = [len(numbers) for _, numbers in prints]
+        if max(counts) - min(counts) >= MIN_CORNERS:
+            total[:] = [count + before for count, before in zip(counts, total)]
+        pixels, numbers = prints[int(np.argmax(total if any(total) else counts))]
         if len(numbers) < MIN_CORNERS:
             return None
         points = places[numbers]
@@ -135,7 +141,11 @@ def _charuco(name: str, squares: str, square: str, marker: str, dictionary: str 
         return np.asarray(board.generateImage((width, round(width * down / across))), dtype=np.uint8)
 
     size = across * side, down * side
-    return Target(name, size, find, lambda image: explain_charuco(image, printed), draw, across, size, side)
+
+    def explain(image: GrayImage) -> str:
+        return explain_charuco(image, printed)
+
+    return Target(name, size, find, explain, draw, across, size, side, lambda: any(total) or down % 2 == 1)
 
 
 def _chessboard(name: str, corners: str, square: str) -> Target:

@@ -10,7 +10,7 @@ import pytest
 
 from camera_node.robot.calibration.inputs import find_corners, list_images
 from camera_node.robot.calibration.lens_calibration import calibrate_lens
-from camera_node.robot.calibration.targets import parse_target
+from camera_node.robot.calibration.targets import WHICH_PRINT, parse_target
 from tests.conftest import data_dir
 
 
@@ -28,6 +28,32 @@ def test_boards_of_both_prints_are_found_where_they_are(across, down, legacy):
     corners = parse_target(f"charuco:{across}x{down}:30mm:22mm").find(printed(across, down, legacy))
     assert len(corners.points) == (across - 1) * (down - 1)
     np.testing.assert_allclose(corners.pixels, 40 + corners.points[:, :2] / 0.03 * 80, atol=0.5)
+
+
+@pytest.mark.parametrize(
+    ("legacy", "columns", "decided"),
+    [
+        (True, (0, 4), False),  # 21 corners of each print
+        (True, (1, 5), True),  # 14 and 21
+        (False, (1, 5), False),
+        (False, (0, 4), True),
+    ],
+)
+def test_parts_that_fit_both_prints_are_told_by_a_whole_board_among_them(legacy, columns, decided, tmp_path):
+    whole = printed(5, 8, legacy)
+    part = np.full_like(whole, 255)
+    seen = np.s_[:, 40 + 80 * columns[0] : 40 + 80 * columns[1]]
+    part[seen] = whole[seen]
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), part)
+    board = parse_target("charuco:5x8:30mm:22mm")
+    found, unused, _ = find_corners(list_images(tmp_path), board, None, lambda done: None)
+    assert len(found) == 3 * decided == 3 - len(unused) and set(unused.values()) <= {WHICH_PRINT}
+    cv2.imwrite(str(tmp_path / "3.png"), whole)
+    found, unused, _ = find_corners(list_images(tmp_path), board, None, lambda done: None)
+    assert len(found) == 4 and not unused
+    for corners in found.values():
+        np.testing.assert_allclose(corners.pixels, 40 + corners.points[:, :2] / 0.03 * 80, atol=0.5)
 
 
 @pytest.mark.parametrize(

@@ -18,13 +18,14 @@ from camera_node.robot.calibration import guided
 from camera_node.robot.calibration.guided import HandEyeSession, missing_turn
 from camera_node.robot.calibration.hand_eye.calibrate import calibrate
 from camera_node.robot.calibration.hand_eye.samples import angle_deg, distance_mm
-from camera_node.robot.calibration.targets import parse_target
+from camera_node.robot.calibration.targets import WHICH_PRINT, parse_target
 from camera_node.settings import source_config
 from camera_node.sources.base import Shot
-from freshfield.geometry import Pose, se3, se3_inverse, so3_exp
+from freshfield.geometry import Pinhole, Pose, se3, se3_inverse, so3_exp
 from freshfield.scenario import load
 from tests.camera_node.robot.calibration import known_truth
 from tests.camera_node.robot.calibration.rendered import BOARD, LENS, taken
+from tests.camera_node.robot.calibration.test_charuco import printed
 
 X = known_truth.CAMERA_IN_FLANGE
 
@@ -47,6 +48,17 @@ def test_it_waits_for_stillness_keeps_what_is_new_and_says_when_there_is_enough(
     assert angle_deg(found.transform, X) < 0.1
     step = session.offer(np.ascontiguousarray(images[-1][:, ::-1]), LENS, flanges[-1])
     assert step.outcome == "target not found" and "the picture is mirrored" in step.advice
+
+
+def test_it_asks_for_all_of_a_board_whose_part_fits_two_prints():
+    whole = printed(5, 8, legacy=True)
+    part = whole.copy()
+    part[:, 40 + 80 * 4 :] = 255
+    session = HandEyeSession(parse_target("charuco:5x8:30mm:22mm"), EYE_IN_HAND)
+    lens = Pinhole(480, 720, 600.0, 600.0, 240.0, 360.0)
+    steps = [session.offer(image, lens, np.eye(4)) for image in (part, part, whole, part)]
+    assert [step.outcome for step in steps] == ["arm moving", "target unclear", "kept", "like pose 1"]
+    assert steps[1].advice == WHICH_PRINT and len(session.samples) == 1
 
 
 def test_it_asks_for_turns_about_the_axis_that_is_missing():
