@@ -32,8 +32,9 @@ _PLACES = ("videos/{}.mp4", "{}.mp4")
 _SKIP_FRAMES = 30
 # Videos decode only forwards: to play backwards, this many (shrunk) frames are decoded at once.
 _BLOCK = 12
-# So many of the last frames tell whether a video ends where its packets do: OpenCV seeks to within a frame or two.
-_ENDING = 4
+# So many of the last frames tell whether a video ends where its packets do; more, where stamps are so uneven that
+# OpenCV, which seeks by the mean rate, finds none.
+_ENDINGS = (4, _SKIP_FRAMES)
 
 
 def load_dataset(
@@ -214,12 +215,17 @@ def _stamps(path: Path, fps: float) -> tuple[NDArray[np.float64], float]:
     decoded, unless some are no frames: a cut without encoding keeps packets from the key frame before it on."""
     stamps = sorted(_grabbed(cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])))
     if len(stamps) > 1:
-        ending = cv2.VideoCapture(str(path))
-        ending.set(cv2.CAP_PROP_POS_FRAMES, max(0, len(stamps) - _ENDING))
-        last_ms = max((ms for ms, _ in _grabbed(ending)), default=-np.inf)
-        if last_ms < 0.5 * (stamps[-1][0] + stamps[-2][0]):
+        late_ms = 0.5 * (stamps[-1][0] + stamps[-2][0])
+        if not any(_last_ms(path, max(0, len(stamps) - back)) > late_ms for back in _ENDINGS):
             stamps = sorted(_grabbed(cv2.VideoCapture(str(path)))) or stamps
     return np.array([ms for ms, _ in stamps]), stamps[0][1] / fps if stamps else 0.0
+
+
+def _last_ms(path: Path, index: int) -> float:
+    """The stamp of the last frame that can be decoded, about from frame ``index`` on; -inf if there is none."""
+    capture = cv2.VideoCapture(str(path))
+    capture.set(cv2.CAP_PROP_POS_FRAMES, index)
+    return max((ms for ms, _ in _grabbed(capture)), default=-np.inf)
 
 
 def _grabbed(capture: cv2.VideoCapture) -> list[tuple[float, float]]:

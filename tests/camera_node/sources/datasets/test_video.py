@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from camera_node.settings import source_config
+from camera_node.sources.datasets import video
 from camera_node.sources.datasets.photo import ImageOptions
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.datasets.video import Clip, load_dataset
@@ -210,6 +211,15 @@ def test_frames_before_the_edit_list_of_a_cut_video_are_none(tmp_path):
     assert clip.count == 98 and clip.times_s == pytest.approx(np.arange(98) / 60)
     assert clip.frame(97, 34, 60).shape == (60, 34, 3)
     np.testing.assert_array_equal(clip.frame(0, 34, 60), whole)
+
+
+@pytest.mark.parametrize("runs", [[(40, 1)], UNEVEN])
+def test_the_end_of_a_video_is_enough_to_tell_that_its_packets_are_frames(tmp_path, monkeypatch, runs):
+    write_rig(tmp_path, 1)
+    restamped(tmp_path / "videos/cam00.mp4", runs)
+    grabbed, counts = video._grabbed, []
+    monkeypatch.setattr(video, "_grabbed", lambda capture: counts.append(len(found := grabbed(capture))) or found)
+    assert Clip(tmp_path / "videos/cam00.mp4").count == FRAMES == counts[0] and 0 < counts[-1] < FRAMES
 
 
 def test_the_rate_of_uneven_stamps_is_their_mean_without_gaps(tmp_path):
