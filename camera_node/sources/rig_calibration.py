@@ -28,6 +28,7 @@ mean_reprojection_error avg_reprojection_error per_view_errors views num_images 
 name camera camera_name label id camera_id serial serial_number device make
 date created calibrated_at calibration_date timestamp version comment description notes
 """
+_MODELS = ("OPENCV", "opencv", "PINHOLE", "pinhole", "perspective", "plumb_bob")  # what is read, by its names
 _UNITS = ("m", "meter", "meters", "metre", "metres", "px", "pixel", "pixels")
 
 
@@ -55,7 +56,8 @@ def _sizes(width: Any, height: Any) -> dict[str, tuple[Any, ...]]:
 
 def _camera(entry: dict[str, Any], where: str) -> CalibratedCamera:
     entry = {key: value for key, value in entry.items() if value is not None}
-    repeated = {"units": _UNITS, "unit": _UNITS} | _sizes(entry.get("width"), entry.get("height"))
+    repeated = dict.fromkeys(("camera_model", "model", "distortion_model"), _MODELS)
+    repeated |= {"units": _UNITS, "unit": _UNITS} | _sizes(entry.get("width"), entry.get("height"))
     for key in sorted(entry.keys() - {*_HARMLESS.split(), *_READ}):
         if says_something(entry[key]) and entry[key] not in repeated.get(key, ()):
             raise DatasetError(

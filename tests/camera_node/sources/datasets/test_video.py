@@ -335,6 +335,7 @@ def test_what_says_nothing_of_a_rigs_camera_may_stand_there(tmp_path):
     rig, expected = json.loads(file.read_text()), load_calibration(file)
     rig["cam00"] |= {"error_px": 0.2, "std_fx_fy_cx_cy_k1_k2_p1_p2": [1] * 8, "name": "left", "date": "2026-11-27"}
     rig["cam00"] |= {"units": "m", "image_size": [64, 48], "image_width": 64, "image_height": 48, "serial": "0042"}
+    rig["cam00"]["camera_model"] = "OPENCV"
     file.write_text(json.dumps(rig))
     assert load_calibration(file) == expected
 
