@@ -113,9 +113,10 @@ class HeldOutCamera:
         times = [truth.taken_ns for truth in self.truths]
         return float(np.median(np.diff(times))) if len(times) > 1 else None
 
-    def score_newest(self, snapshot: Snapshot, psnr_only: bool = False) -> Score | None:
-        """Score ``snapshot`` against the newest frame; None before the second, or if it cannot be decoded."""
-        if len(self.truths) < 2:
+    def score_newest(self, taken_ns: int, snapshot: Snapshot, psnr_only: bool = False) -> Score | None:
+        """Score ``snapshot`` against the newest frame, taken at ``taken_ns``; None before the second frame, or if the
+        newest cannot be decoded."""
+        if len(self.truths) < 2 or self.truths[-1].taken_ns != taken_ns:
             return None
         truth = self.truths[-1]
         found = self._against(truth, truth.taken_ns, snapshot, psnr_only)
@@ -125,7 +126,9 @@ class HeldOutCamera:
         """Score the waiting publications whose nearest capture is known: one at or after the present is here."""
         done: list[Scored] = []
         period_ns = self.period_ns()
-        while period_ns and self._pending and self.truths[-1].taken_ns >= self._pending[0][0].published_ns:
+        while period_ns and self._pending and self.truths:  # damaged ones are removed meanwhile
+            if self.truths[-1].taken_ns < self._pending[0][0].published_ns:
+                break
             publication, waiting, pose = self._pending.popleft()
             present_ns = publication.published_ns
             truth = min(self.truths, key=lambda truth: abs(truth.taken_ns - present_ns))

@@ -169,7 +169,7 @@ class ScoringThread:
         self._next_shown_ns[frame.camera] = taken_ns + round(gap_s * 1e9)
         publication, snapshot = found
         begun_s, full = time.thread_time(), self._shown_count % _FULL_EVERY == 0
-        score = self._held_out[frame.camera].score_newest(snapshot.at(taken_ns), psnr_only=not full)
+        score = self._held_out[frame.camera].score_newest(taken_ns, snapshot.at(taken_ns), psnr_only=not full)
         self._shown_cost_s = time.thread_time() - begun_s
         self._shown_count += 1
         if score is not None:

@@ -182,6 +182,18 @@ def test_one_damaged_frame_costs_its_own_publication_and_is_decoded_once(monkeyp
     assert held_out.undecodable == 1 and torn not in [truth.frame for truth in held_out.truths]
 
 
+def test_damaged_frames_alone_score_nothing_and_an_older_frame_is_no_stand_in():
+    held_out = camera()
+    for ms in (0, 2):
+        held_out.take(replace(frame(ms), payload=b"torn"))
+    for ms in (3, 4, 98, 99):
+        held_out.publish(publication(ms), shows(ms))
+    assert held_out.take(replace(frame(100), payload=b"torn")) == []
+    assert held_out.undecodable == 3 and not held_out.truths
+    feed(held_out, 240, 120)
+    assert held_out.score_newest(280 * MS, shows(280)) is None, "the frame of then was damaged"
+
+
 def test_a_poisoned_rendering_goes_unscored_and_the_log_says_where(caplog):
     poisoned = truth_at(0) / 255
     poisoned[3, 4, 1] = np.nan
@@ -193,15 +205,15 @@ def test_a_poisoned_rendering_goes_unscored_and_the_log_says_where(caplog):
 
 def test_what_was_shown_at_the_newest_truth_is_scored_once_the_period_is_known():
     held_out = camera()
-    assert held_out.score_newest(shows(0)) is None
+    assert held_out.score_newest(0, shows(0)) is None
     feed(held_out, 0)
-    assert held_out.period_ns() is None and held_out.score_newest(shows(0)) is None
+    assert held_out.period_ns() is None and held_out.score_newest(0, shows(0)) is None
     feed(held_out, 40, 40)
     assert held_out.period_ns() == 40 * MS
-    score = held_out.score_newest(shows(40))
+    score = held_out.score_newest(40 * MS, shows(40))
     assert score.psnr_db == PSNR_CEILING_DB and score.published_ns == 40 * MS
     with pytest.raises(ValueError, match="48 x 24 but the truth is 48 x 48"):
-        held_out.score_newest(Shows(truth_at(40)[:24] / 255))
+        held_out.score_newest(40 * MS, Shows(truth_at(40)[:24] / 255))
 
 
 def test_a_camera_that_stopped_is_rendered_at_once_where_it_stands():
