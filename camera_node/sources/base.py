@@ -10,6 +10,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import Scenario, ScenarioError
 
@@ -23,6 +24,7 @@ class Shot:
     pose: camera-to-world.
     pose_gap_ns: time between the exposure and the pose sample that it was paired with.
     captured_ns: when a real camera exposed it, on the node's clock; None: at the tick's instant.
+    depth: what a depth sensor measured with it, if it has one and this frame brings its depth.
     """
 
     image: NDArray[np.uint8] | bytes
@@ -30,6 +32,7 @@ class Shot:
     intrinsics: Pinhole
     pose_gap_ns: int = 0
     captured_ns: int | None = None
+    depth: DepthImage | None = None
 
     @property
     def payload(self) -> bytes:

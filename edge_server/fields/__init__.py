@@ -25,6 +25,9 @@ class View:
     camera_to_world: float64 (4, 4), OpenCV axes, meters.
     generated_ns: capture time, edge clock.
     weight: float32 (H, W) in [0, 1], how much each pixel supervises; None: all of them in full.
+    depth: float32 (H, W), measured depth along the optical axis of each pixel of ``image``, meters; 0 where nothing was
+    measured. None: this frame brings none.
+    depth_ns: when it was measured, edge clock; None: with the image.
     whole: where ``image`` was decoded smaller (``Field.most_pixels``), decodes the same frame at its full
     resolution and returns that view, or None if the frame is damaged.
     """
@@ -35,6 +38,8 @@ class View:
     intrinsics: Pinhole
     generated_ns: int = 0
     weight: NDArray[np.float32] | None = None
+    depth: NDArray[np.float32] | None = None
+    depth_ns: int | None = None
     whole: Callable[[], View | None] | None = field(default=None, compare=False, repr=False)
 
 
