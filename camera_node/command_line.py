@@ -139,6 +139,9 @@ def _add_doctor(doctor: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder that runs will be written to [%(default)s]",
     )
+    doctor.add_argument(
+        "--plan", type=Path, metavar="FILE.svg", help="draw what fixed cameras see, and where one more helps most"
+    )
     doctor.add_argument("--json", action="store_true", help="print the result as one JSON object")
     transport.add_arguments(doctor, listens=False)
 

@@ -59,7 +59,7 @@ class CheckResult:
 def run(args: argparse.Namespace) -> int:
     """Run all checks and print the results. Returns the exit code: 1 if something is wrong, else 0."""
     results = []
-    for result in run_checks(args.scenario, args.to, args.data, args.out, transport.from_arguments(args)):
+    for result in run_checks(args.scenario, args.to, args.data, args.out, transport.from_arguments(args), args.plan):
         results.append(result)
         if not args.json:
             mark = {True: "ok", False: "WRONG", None: "-"}[result.ok]
@@ -73,7 +73,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def run_checks(
-    name: str | None, to: str | None, data: Path | None, out: Path, security: transport.Transport
+    name: str | None,
+    to: str | None,
+    data: Path | None,
+    out: Path,
+    security: transport.Transport,
+    plan: Path | None = None,
 ) -> Iterator[CheckResult]:
     """Yield the results as they come.
 
@@ -82,6 +87,7 @@ def run_checks(
     data: folder of the data sets; None: $FRESHFIELD_DATA.
     out: folder where runs will be written.
     security: TLS and tokens of the connection to ``to``.
+    plan: SVG file to draw what the cameras see in; None: none.
     """
     yield _check("python", _python)
     yield _check("clock", _clock)
@@ -96,10 +102,10 @@ def run_checks(
     opened: list[tuple[Scenario, SourceConfig]] = []
     yield _check("scenario", lambda: _scenario(name, opened))
     for scenario, config in opened:
-        yield from _source(scenario, config, data)
+        yield from _source(scenario, config, data, plan)
 
 
-def _source(scenario: Scenario, config: SourceConfig, data: Path | None) -> Iterator[CheckResult]:
+def _source(scenario: Scenario, config: SourceConfig, data: Path | None, plan: Path | None) -> Iterator[CheckResult]:
     extras = [config.kind] if config.kind in _PACKAGES else []
     arm: ArmConfig | None = getattr(config, "arm", None)
     for extra in [*extras, *(["ur"] if arm is not None else [])]:
@@ -118,6 +124,10 @@ def _source(scenario: Scenario, config: SourceConfig, data: Path | None) -> Iter
         yield _check("arm", lambda: checks.joint_states(arm))
         if (path := arm.path) is not None:
             yield _check("arm's path", lambda: checks.path(scenario, arm, path))
+    if config.kind != "mcap":  # a recording is read once, from its beginning
+        from camera_node import coverage_check
+
+        yield _check("coverage", lambda: coverage_check.check(scenario, config, data, plan))
 
 
 def _check(part: str, check: Callable[[], str]) -> CheckResult:

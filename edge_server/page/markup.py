@@ -95,6 +95,11 @@ def table(cameras: Sequence[CameraView], selected: Sequence[str] = ()) -> str:
     return str(_panel.table(cameras, set(selected)))
 
 
+def coverage(plan: str, words: str) -> str:
+    """What fixed cameras see. plan: SVG of ``freshfield.coverage.plan_svg``."""
+    return str(_panel.coverage(plan, words[:1].upper() + words[1:]))
+
+
 def comparison_caption(camera: str, psnr_db: float | None, update: int, held_out: bool) -> str:
     """The caption above the pair of images. held_out: the camera is."""
     truth = "truth at the present" if held_out else NOTHING_HELD_OUT

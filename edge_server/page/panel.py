@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -14,8 +14,9 @@ from edge_server.live.state import CameraView, Comparison, EdgeState, Publicatio
 from edge_server.page import markup
 from edge_server.page.controls import ControlPanel
 from edge_server.page.decision_explanation import DecisionExplanation
-from edge_server.page.settings import AGE_PARTS_OF
+from edge_server.page.settings import AGE_PARTS_OF, POSE_NOISE
 from edge_server.page.timelines import History, Timelines
+from freshfield import coverage
 
 MAIN_WIDTH = 372
 SIDE_WIDTH = 356
@@ -52,6 +53,10 @@ class Panel:
             self._channel = gui.add_html("", visible=False)
             gui.add_html(markup.legend())
             self._table = gui.add_html("")
+        with side.add_tab("Coverage"):
+            self._coverage = gui.add_html(markup.note("Reckoned once every camera has sent a frame and stands still."))
+            self._places: dict[str, coverage.Camera] = {}  # of the cameras at the last refresh
+            self._reckoned_for: dict[str, coverage.Camera] = {}
         side.dock_left()
         side.set_width(SIDE_WIDTH)
         self._gui = gui
@@ -71,6 +76,7 @@ class Panel:
         if channel is not None:
             self._channel.content = markup.channel_line(channel)
             self._channel.visible = True
+        self._refresh_coverage([c for c in cameras if not c.held_out])
         self._refreshes += 1
         if self._refreshes % 2:  # charts need only one new point a second
             self._timelines.refresh(history, publications)
@@ -80,6 +86,19 @@ class Panel:
         if comparison is not None and comparison.number != self._compared_update:
             held_out = any(c.held_out for c in cameras if c.camera == comparison.camera)
             self._show_comparison(comparison, publications, held_out)
+
+    def _refresh_coverage(self, cameras: Sequence[CameraView]) -> None:
+        """Reckon what the cameras see once they stand still, and again if one stands somewhere else then."""
+        frames = {c.camera: c.newest for c in cameras if c.newest is not None}
+        if not frames or len(frames) < len(cameras):
+            return
+        known = {name: (frame.intrinsics, frame.pose.matrix()) for name, frame in frames.items()}
+        stand_still, self._places = _same_places(known, self._places), known
+        if not stand_still or _same_places(known, self._reckoned_for):
+            return
+        self._reckoned_for = known
+        found = coverage.reckon(list(known.values()))
+        self._coverage.content = markup.coverage(coverage.plan_svg(known, found), found.words)
 
     def _show_comparison(self, comparison: Comparison, publications: list[Publication], held_out: bool) -> None:
         self._compared_update = comparison.number
@@ -93,6 +112,13 @@ class Panel:
             self._pair = self._gui.add_image(pair, format="jpeg", jpeg_quality=88, order=order)
         else:
             self._pair.image = pair
+
+
+def _same_places(cameras: Mapping[str, coverage.Camera], others: Mapping[str, coverage.Camera]) -> bool:
+    """Whether the same cameras stand where they stood, but for the noise of their poses."""
+    return cameras.keys() == others.keys() and all(
+        np.allclose(pose, others[name][1], atol=POSE_NOISE) for name, (_, pose) in cameras.items()
+    )
 
 
 def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publication]) -> markup.Summary:

@@ -24,3 +24,5 @@ SETTLE_S = 20.0
 """For this long the starting viewpoint follows cameras that report late, for visitors who have not moved."""
 QUIET_S = 0.7
 """Cameras report one after the other: a viewpoint is chosen when no new one has reported for this long."""
+POSE_NOISE = 0.02
+"""Meters, and radians: a camera whose pose changes by less stands still."""

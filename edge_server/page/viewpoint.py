@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edge_server.fields.common.scene_box import converging_point
-from freshfield.geometry import Pinhole, look_at, quaternion_to_matrix
+from freshfield.geometry import Pinhole, converging_point, look_at, quaternion_to_matrix
 
 Array = NDArray[np.float64]
 

@@ -219,6 +219,17 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
 # --- pinhole cameras --------------------------------------------------------------------------
 
 
+def converging_point(origins: Array, directions: Array) -> Array | None:
+    """The point (3,) nearest to all rays (N, 3) in least squares; None where they run parallel or apart."""
+    projectors = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    total = projectors.sum(axis=0)
+    if np.linalg.eigvalsh(total)[0] < 1e-3 * len(origins):
+        return None
+    point = np.linalg.solve(total, (projectors @ origins[:, :, None]).sum(axis=0)[:, 0])
+    along = ((point - origins) * directions).sum(axis=1)
+    return point if np.median(along) > 0 else None
+
+
 @dataclass(frozen=True)
 class Pinhole:
     """Pinhole intrinsics in pixels (corner origin).

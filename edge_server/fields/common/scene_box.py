@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from freshfield.geometry import converging_point
 
 Array = NDArray[np.float64]
 
@@ -55,17 +56,6 @@ class SceneBox:
 
 # The box of a field that has seen nothing yet.
 UNIT_BOX = SceneBox((0.0, 0.0, 0.0), 1.0, 0.1, False, 1.0, 0.01)
-
-
-def converging_point(origins: Array, directions: Array) -> Array | None:
-    """The point (3,) nearest to all rays (N, 3) in least squares; None where they run parallel or apart."""
-    projectors = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    total = projectors.sum(axis=0)
-    if np.linalg.eigvalsh(total)[0] < 1e-3 * len(origins):
-        return None
-    point = np.linalg.solve(total, (projectors @ origins[:, :, None]).sum(axis=0)[:, 0])
-    along = ((point - origins) * directions).sum(axis=1)
-    return point if np.median(along) > 0 else None
 
 
 def scene_box(

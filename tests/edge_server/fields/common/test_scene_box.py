@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.scenes.multiview_still import synthetic_still
-from edge_server.fields.common.scene_box import _main_group, converging_point, plain_background, scene_box
-from freshfield.geometry import look_at
+from edge_server.fields.common.scene_box import _main_group, plain_background, scene_box
+from freshfield.geometry import converging_point, look_at
 from tests.edge_server.fields.scenes import ring
 
 RING = ring(8, size=16)
