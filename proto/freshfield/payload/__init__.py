@@ -11,7 +11,7 @@ import os
 import struct
 
 from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_JPEG_SCANS, MAX_JPEG_SEGMENTS, MAX_PAYLOAD_BYTES
-from freshfield.png import pixels_only, png_size
+from freshfield.payload.png import pixels_only, png_size
 
 # OpenCV reads this when it is first imported: a second barrier behind the header checks below.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_IMAGE_SIDE_PX**2))
