@@ -131,11 +131,12 @@ def open_flange_cameras(
     Raises ScenarioError and ArmError."""
     for camera in seen:
         made = effects.get(camera)
-        if made is not None and made.exposure:
-            names = ", ".join(type(effect).__module__.rsplit(".", 1)[1] for effect in made.exposure)
+        if made is not None and (made.exposure or made.depth):
+            unfit = (*made.exposure, *made.depth)
+            names = ", ".join(type(effect).__module__.rsplit(".", 1)[1] for effect in unfit)
             raise ScenarioError(
                 f"{scenario.path}: source.effects: {names}: not for a camera that an arm carries ({camera}): "
-                "they take the camera to stand still while it exposes"
+                "they take the camera to stand still"
             )
     mounts = load_hand_eyes(scenario, config, seen)
     poses = camera_poses(scenario, config, seen)

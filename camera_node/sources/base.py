@@ -10,6 +10,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from freshfield import payload
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import Scenario, ScenarioError
@@ -24,7 +25,7 @@ class Shot:
     pose: camera-to-world.
     pose_gap_ns: time between the exposure and the pose sample that it was paired with.
     captured_ns: when a real camera exposed it, on the node's clock; None: at the tick's instant.
-    depth: what a depth sensor measured with it, if it has one and this frame brings its depth.
+    depth: what a depth sensor measured with it, of sources that have it at hand; else ``Source.depth`` makes it.
     """
 
     image: NDArray[np.uint8] | bytes
@@ -39,6 +40,13 @@ class Shot:
         """The image of an encoded shot."""
         assert isinstance(self.image, bytes)
         return self.image
+
+
+def pixels(shot: Shot, codec: str) -> NDArray[np.uint8]:
+    """The shot's image, decoded if need be: uint8 (H, W, 3) or (H, W, 4). codec: of encoded shots."""
+    if isinstance(shot.image, bytes):
+        return payload.decode(shot.image, codec, shot.intrinsics.width, shot.intrinsics.height)
+    return shot.image
 
 
 def rate(fps: float) -> Fraction:
@@ -70,6 +78,11 @@ class Source(ABC):
     def read(self, content: int) -> Shot:
         """Render, read or decode shot number ``content``. Raises ValueError (DatasetError, PoseGapError) if
         it is not available; other shots may still be."""
+
+    def depth(self, content: int, shot: Shot) -> DepthImage | None:
+        """What a depth sensor measured with ``shot``, which ``read(content)`` gave; None without a sensor. To be
+        asked only for frames that carry depth: it may have to be rendered or decoded. Raises as ``read``."""
+        return shot.depth
 
     def prepare(self, stopped: Callable[[], bool]) -> None:  # noqa: B027
         """Render or decode ahead, so that ``read`` is fast. Returns early once ``stopped()`` is true."""

@@ -52,7 +52,7 @@ def open_sources(
         assert isinstance(config, McapConfig)
         sources = open_replay(scenario, config, cameras, data)
     for camera, made in effects.items():
-        if made is not None and (made.image or made.pose):
+        if made is not None and (made.image or made.pose or made.depth):
             from camera_node.sources.with_effects import AffectedSource
 
             sources[camera] = AffectedSource(sources[camera], made, config.codec)

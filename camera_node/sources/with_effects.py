@@ -6,9 +6,12 @@ import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import cv2
+import numpy as np
+
 from camera_node.settings import SourceConfig, errors_of
-from camera_node.sources.base import Shot, Source
-from freshfield import payload
+from camera_node.sources.base import Shot, Source, pixels
+from freshfield.depth import DepthImage
 from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:
@@ -58,10 +61,19 @@ class AffectedSource(Source):
         shot = dataclasses.replace(shot, pose=self._effects.reported_pose(shot.pose, content))
         if not self._effects.image:
             return shot
-        image = shot.image
-        if isinstance(image, bytes):
-            image = payload.decode(image, self._codec, shot.intrinsics.width, shot.intrinsics.height)
-        return dataclasses.replace(shot, image=self._effects.apply(image, content, float(content / self.fps)))
+        image = self._effects.apply(pixels(shot, self._codec), content, float(content / self.fps))
+        return dataclasses.replace(shot, image=image)
+
+    def depth(self, content: int, shot: Shot) -> DepthImage | None:
+        """The source's depth, taken as exact, as the listed sensor would measure it."""
+        exact = self._source.depth(self._source.content(content) if self._each_differs else content, shot)
+        if exact is None or not self._effects.depth:
+            return exact
+        height, width = exact.counts.shape
+        image = cv2.resize(pixels(shot, self._codec), (width, height), interpolation=cv2.INTER_AREA)
+        lens = exact.intrinsics or shot.intrinsics.scaled(width / shot.intrinsics.width)
+        measured = self._effects.depth[0].measure(exact.meters(), np.asarray(image, np.uint8), lens, content)
+        return dataclasses.replace(exact, counts=measured.counts, meters_per_count=measured.meters_per_count)
 
     def prepare(self, stopped: Callable[[], bool]) -> None:
         self._source.prepare(stopped)

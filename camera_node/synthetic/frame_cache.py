@@ -24,8 +24,8 @@ from freshfield.files import write_bytes
 MAX_DISK_BYTES = 2 << 30
 _NAME = re.compile("[0-9a-f]{32}")  # name of the folder of one camera's frames
 _pruned: set[Path] = set()  # roots that this process has pruned
-# Files of this package that do not influence what a frame looks like.
-_NOT_RENDERING = ("frame_cache.py", "source.py")
+# Files of this package that do not influence what an image looks like.
+_NOT_RENDERING = ("depth.py", "depth_sensor.py", "frame_cache.py", "source.py")
 
 
 def default_folder() -> Path:

@@ -8,21 +8,25 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from camera_node.settings import SourceConfig, WorldConfig, errors_of
-from camera_node.sources.base import Shot, Source, rate
+from camera_node.sources.base import Shot, Source, pixels, rate
 from camera_node.synthetic import Scene, make_scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects
 from camera_node.synthetic.frame_cache import FrameCache, default_folder, renderer_version
 from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.render import Image
 from freshfield import payload
+from freshfield.depth import DepthImage
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
 from freshfield.settings import as_mapping
+
+if TYPE_CHECKING:
+    from camera_node.synthetic.depth import DepthRenderer
 
 WORLD_FPS = 15.0
 # A sequence with more different frames counts as not repeating: frames are rendered on demand and not kept.
@@ -69,6 +73,7 @@ class WorldSource(Source):
         self._pose, self._effects = Pose.from_matrix(matrix), effects
         # Frames to which image effects are applied later are stored losslessly.
         self._codec, self._quality = "zstd" if effects.image else codec, quality
+        self._depth: DepthRenderer | None = None
         self.cache: FrameCache | None = None
         if folder is not None and self.repeats_after is not None:
             self.cache = FrameCache(self.key(), self._codec, (lens.width, lens.height), folder)
@@ -86,6 +91,19 @@ class WorldSource(Source):
             image = self._stored(frame)
         return Shot(image, self._effects.reported_pose(self._pose, content), self.intrinsics)
 
+    def depth(self, content: int, shot: Shot) -> DepthImage | None:
+        """As the listed depth sensor measures it. Of a scene that repeats, measurements repeat too."""
+        if not self._effects.depth:
+            return None
+        lens, matrix = self.scene.cameras[self.camera_id]
+        if self._depth is None:
+            from camera_node.synthetic.depth import DepthRenderer
+
+            self._depth = DepthRenderer(self.scene.world, lens, matrix)
+        frame = content % self.repeats_after if self.repeats_after else content
+        exact = self._depth.depth(self._time_s(frame))
+        return self._effects.depth[0].measure(exact, pixels(shot, self._codec), lens, content)
+
     def image(self, frame: int) -> Image:
         """Frame before effects of kind image: uint8 (H, W, 3), exact."""
         if self.cache is None or not self._effects.image:
@@ -100,6 +118,7 @@ class WorldSource(Source):
 
     def release(self) -> None:
         # Replace the scene by the same one without its renderers.
+        self._depth = None
         self.scene = self.scene.with_world(self.scene.world)
 
     def key(self) -> str:

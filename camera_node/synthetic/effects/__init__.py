@@ -6,7 +6,8 @@ The kinds, by where they act:
 * ``exposure`` changes how an instant becomes an image (likewise);
 * ``image``    changes each frame as it is streamed, recorded ones too (costs time a frame);
 * ``clock``    changes the node's clock and so its time stamps;
-* ``pose``     changes the pose that frames report, not the image.
+* ``pose``     changes the pose that frames report, not the image;
+* ``depth``    measures depth with frames that carry it (costs time for each of those).
 
 To add one, write a file here with a dataclass of the same name (the effect's parameters and ``kind``) and add
 it to ``NAMES``. An effect that draws from a camera's random stream does so in ``start``.
@@ -28,10 +29,19 @@ from numpy.typing import NDArray
 from camera_node.clocks import ClockError
 from camera_node.synthetic.render import Image
 from camera_node.synthetic.scene import Scene
+from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
 from freshfield.settings import ScenarioError, Settings, about, read_settings
 
-NAMES = ("clock_drift", "exposure_drift", "lens_distortion", "motion_blur", "pose_noise", "sensor_noise")
+NAMES = (
+    "clock_drift",
+    "depth_sensor",
+    "exposure_drift",
+    "lens_distortion",
+    "motion_blur",
+    "pose_noise",
+    "sensor_noise",
+)
 
 
 class EffectError(ScenarioError):
@@ -106,6 +116,16 @@ class PoseEffect(Protocol):
         ...
 
 
+class DepthEffect(Protocol):
+    def measure(self, depth_m: NDArray[np.float32], image: Image, camera: Pinhole, index: int) -> DepthImage:
+        """What a sensor measures with frame number ``index``.
+
+        depth_m: exact depth (H, W) along the optical axis, 0 where nothing is. Must not be changed, nor ``image``.
+        image: uint8 (H, W, 3), what the camera shows. camera: its lens.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class Effects:
     """The effects of one camera, by kind and in the order listed."""
@@ -115,6 +135,7 @@ class Effects:
     image: tuple[ImageEffect, ...] = ()
     clock: tuple[ClockError, ...] = ()
     pose: tuple[PoseEffect, ...] = ()
+    depth: tuple[DepthEffect, ...] = ()
     rendered: tuple[tuple[str, Any], ...] = ()  # name and parameters of the effects within cached frames
 
     def extend(self, scene: Scene) -> Scene:

@@ -46,7 +46,7 @@ def pixels(camera: Camera, tick: int) -> np.ndarray:
     return payload.decode(shot.payload, "zstd", shot.intrinsics.width, shot.intrinsics.height)
 
 
-@pytest.mark.parametrize("name", sorted(set(NAMES) - {"clock_drift"}))
+@pytest.mark.parametrize("name", sorted(set(NAMES) - {"clock_drift", "depth_sensor"}))
 def test_an_effect_reaches_the_frames_but_not_the_truth(name):
     """Deterministic by the seed, whoever else is there; in_truth reaches the held-out camera, too."""
     plain, affected, truth = cameras({}), cameras({name: {}}), cameras({name: {"in_truth": True}})
@@ -60,6 +60,25 @@ def test_an_effect_reaches_the_frames_but_not_the_truth(name):
     assert frames(affected["cam01"]) != frames(plain["cam01"])
     assert frames(truth["cam00"]) != frames(plain["cam00"])
     assert frames(truth["cam01"]) == frames(affected["cam01"]) == frames(fewer["cam01"])
+
+
+def test_a_depth_sensor_measures_with_every_camera_but_the_held_out_one_and_changes_no_image():
+    plain, found = cameras({}), cameras({"depth_sensor": {}})
+    fewer = cameras({"depth_sensor": {}}, count=2)
+
+    def depth(camera: Camera, content: int) -> np.ndarray | None:
+        measured = camera.source.depth(content, camera.source.read(content))
+        return None if measured is None else measured.counts
+
+    assert depth(plain["cam01"], 3) is None and depth(found["cam00"], 3) is None
+    first = depth(found["cam01"], 3)
+    assert first is not None and first.shape == (16, 24) and first.any()
+    assert np.array_equal(first, depth(fewer["cam01"], 3)) and not np.array_equal(first, depth(found["cam02"], 3))
+    found["cam01"].source.release()
+    assert np.array_equal(first, depth(found["cam01"], 3))
+    assert found["cam01"].capture(3) == plain["cam01"].capture(3)
+    assert found["cam01"].source.contents == plain["cam01"].source.contents
+    assert found["cam01"].source.key() == plain["cam01"].source.key(), "rendered frames are found again"
 
 
 def test_a_wrong_pose_is_claimed_of_the_right_image():

@@ -22,6 +22,10 @@ EXTREMES: dict[str, list[dict]] = {
         {"amplitude_stops": 8.0, "offset_spread_stops": 8.0, "period_s": 0.01},
         {"amplitude_stops": 0.0, "offset_spread_stops": 0.0, "period_s": 1e6},
     ],
+    "depth_sensor": [
+        {"noise_px": 100.0, "fixed_noise_px": 100.0, "smoothing_px": 10.0, "step_px": 100.0, "farthest_m": 65.535},
+        {"nearest_m": 1e3, "scale_spread_percent": 20.0, "silhouette_holes": 1.0, "flying": 1.0, "dark_holes": 1.0},
+    ],
     "lens_distortion": [{"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}, {"k1": 10.0}, {"k1": -1e-9}],
     "pose_noise": [
         {"translation_mm": 1e5, "rotation_deg": 180.0},
@@ -51,7 +55,10 @@ def test_the_ends_of_the_ranges_give_sound_frames_in_every_scene(name, parameter
         camera = WorldSource("eye", scene, "cam01", 15, effects=made, codec="zstd")
         pose = Pose.from_matrix(scene.cameras["cam01"][1])
         for k in (0, 4, 10**12):
-            image = camera.read(k).image
+            shot = camera.read(k)
+            image = shot.image
+            measured = camera.depth(k, shot)
+            assert (measured is not None) == (name == "depth_sensor")
             if isinstance(image, np.ndarray):
                 assert image.shape == (12, 16, 3) and image.dtype == np.uint8
             reported = made.reported_pose(pose, k)

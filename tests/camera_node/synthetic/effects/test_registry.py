@@ -33,11 +33,12 @@ effects = fx.load_effects(listed, lambda n: streams.append(n) or np.random.defau
 camera = WorldSource("cam01", scene, "cam01", 15, effects=effects, folder=folder)
 sys.setprofile(count)
 for k in range(12):
-    camera.read(camera.content(k))
+    camera.depth(k, camera.read(camera.content(k)))
     effects.node_ns(k)
 sys.setprofile(None)
 held = tracemalloc.take_snapshot().filter_traces(
     [tracemalloc.Filter(True, "*synthetic/effects/[a-z]*", all_frames=True)]).statistics("filename")
+assert listed or "camera_node.synthetic.depth" not in sys.modules
 modules = sorted(m.rsplit(".", 1)[1] for m in sys.modules if m.startswith("camera_node.synthetic.effects."))
 print(modules, streams, calls > 0, sum(s.size for s in held) > 0)
 """
@@ -56,8 +57,8 @@ def test_nothing_listed_is_nothing_imported_called_or_allocated(tmp_path):
 
 def test_what_is_listed_is_all_that_is_imported(tmp_path):
     """The other way round, so that the test above cannot pass by measuring nothing."""
-    expected = "['sensor_noise'] ['sensor_noise'] True True"
-    assert stream({"sensor_noise": {}}, str(tmp_path)) == expected
+    for name in ("sensor_noise", "depth_sensor"):
+        assert stream({name: {}}, str(tmp_path)) == f"['{name}'] ['{name}'] True True"
 
 
 def test_each_effect_imports_itself_and_no_other():
@@ -92,6 +93,7 @@ def test_every_file_is_registered_and_follows_the_protocol():
     on_disk = sorted(m.name for m in pkgutil.iter_modules(fx.__path__))
     assert sorted(fx.NAMES) == on_disk
     methods = {"lens": "rendered", "exposure": "expose", "image": "apply", "clock": "node_ns", "pose": "reported"}
+    methods["depth"] = "measure"
     for name in fx.NAMES:
         cls = fx.effect_class(name)
         assert callable(getattr(cls().start(np.random.default_rng(0)), methods[cls.kind]))
@@ -117,7 +119,7 @@ def test_the_held_out_camera_shows_the_truth_unless_in_truth():
 @pytest.mark.parametrize(
     ("listed", "message"),
     [
-        ({"smoke": {}}, "unknown effect 'smoke'; valid effects: clock_drift, exposure_drift, lens_distortion, "),
+        ({"smoke": {}}, "unknown effect 'smoke'; valid effects: clock_drift, depth_sensor, exposure_drift, "),
         ({"sensor_noise": {"sigma": 1}}, "effect sensor_noise.sigma: unknown key; expected one of read_noise"),
         ({"motion_blur": {"exposure_ms": 0}}, "exposure_ms: expected .*1e-06 to 1000"),
         ({"lens_distortion": {"calibrated": "no"}}, "lens_distortion.calibrated"),
@@ -132,6 +134,7 @@ def test_an_invalid_effect_is_refused_in_one_line(listed, message):
 # Parameters with which an effect changes nothing.
 NEUTRAL: dict[str, dict] = {
     "clock_drift": {},
+    "depth_sensor": {},
     "exposure_drift": {"amplitude_stops": 0.0, "offset_spread_stops": 0.0},
     "lens_distortion": {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0},
     "motion_blur": {"samples": 1},

@@ -1,0 +1,181 @@
+"""Each error of the depth sensor has the size, the place and the sign that its parameter says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from camera_node.synthetic import make_scene
+from camera_node.synthetic.effects import load_effects
+from camera_node.synthetic.effects.depth_sensor import DepthSensor, StereoDepth
+from camera_node.synthetic.source import WorldSource
+from freshfield.geometry import Pinhole
+
+EXACT = {
+    "noise_px": 0.0,
+    "fixed_noise_px": 0.0,
+    "step_px": 0.0,
+    "scale_spread_percent": 0.0,
+    "nearest_m": 0.0,
+    "farthest_m": 65.535,
+    "shadow": False,
+    "silhouette_holes": 0.0,
+    "flying": 0.0,
+    "dark_holes": 0.0,
+    "bright_holes": 0.0,
+}
+LENS = Pinhole.from_fov(160, 120, 60.0)
+GRAY = np.full((120, 160, 3), 128, np.uint8)
+K = 425.0 * 0.05  # disparity = K / depth
+WALL = np.full((120, 160), 2.0, np.float32)
+
+
+def sensor(seed: int = 0, **parameters) -> StereoDepth:
+    return DepthSensor(**{**EXACT, **parameters}).start(np.random.default_rng(seed))
+
+
+def counts(made: StereoDepth, depth=WALL, index: int = 0, image=GRAY) -> np.ndarray:
+    measured = made.measure(depth, image, LENS, index)
+    assert measured.counts.dtype == np.uint16 and measured.meters_per_count == 0.001
+    assert measured.intrinsics is None and measured.to_camera is None, "registered to the image"
+    return measured.counts
+
+
+def disparity_error(made: StereoDepth, frames: int, depth_m: float = 2.0) -> np.ndarray:
+    shown = np.stack([counts(made, np.full_like(WALL, depth_m), k) for k in range(frames)])
+    assert (shown > 0).all()
+    return K / (shown * 1e-3) - K / depth_m
+
+
+def test_without_errors_it_is_exact_depth_in_millimeters():
+    depth = np.random.default_rng(1).uniform(0.001, 65.0, WALL.shape).astype(np.float32)
+    depth[5] = 0.0
+    assert np.abs(counts(sensor(), depth) - depth * 1e3).max() < 0.51
+
+
+@pytest.mark.parametrize("depth_m", [1.0, 2.0])
+def test_noise_has_the_stated_deviation_and_reach(depth_m):
+    new = disparity_error(sensor(noise_px=0.08), 40, depth_m)
+    assert new.std() == pytest.approx(0.08, rel=0.04)
+    assert abs(np.corrcoef(new[:-1].ravel(), new[1:].ravel())[0, 1]) < 0.05, "new in each frame"
+    fixed = disparity_error(sensor(fixed_noise_px=0.06), 2, depth_m)
+    assert np.array_equal(fixed[0], fixed[1])
+    assert fixed[0].std() == pytest.approx(0.06, rel=0.1)
+    # White noise smoothed by sigma has the autocorrelation exp(-x^2 / (4 sigma^2)).
+    sigma = 2.3 * LENS.fx / 425.0
+    for x in (1, 2):
+        near = np.corrcoef(new[:, :, x:].ravel(), new[:, :, :-x].ravel())[0, 1]
+        assert near == pytest.approx(np.exp(-(x**2) / (4.0 * sigma**2)), abs=0.05)
+    rough = disparity_error(sensor(noise_px=0.08, smoothing_px=0.0), 10, depth_m)
+    assert rough.std() == pytest.approx(0.08, rel=0.04)
+    assert abs(np.corrcoef(rough[:, :, 1:].ravel(), rough[:, :, :-1].ravel())[0, 1]) < 0.05
+
+
+def test_steps_of_disparity():
+    ramp = np.linspace(1.0, 8.0, WALL.size, dtype=np.float32).reshape(WALL.shape)
+    steps = K / (counts(sensor(step_px=1 / 32), ramp) * 1e-3) * 32.0
+    # At 1 m a millimeter is .02 px, which is .7 of a step; from 3 m on the steps stand out.
+    far = ramp > 3.0
+    assert np.abs(steps - np.rint(steps))[far].max() < 0.05
+    found = np.unique(np.rint(steps[far]))
+    assert len(found) == pytest.approx(32.0 * (K / 3.0 - K / 8.0), abs=2)
+
+
+def test_scale_is_one_factor_a_camera():
+    cameras = [sensor(k, scale_spread_percent=0.5) for k in range(400)]
+    assert np.std([c.scale for c in cameras]) == pytest.approx(0.005, rel=0.12)
+    for camera in cameras[:5]:
+        assert (np.abs(counts(camera, WALL) - 2000.0 * camera.scale) <= 0.5).all()
+
+
+def test_the_range():
+    depth = np.linspace(0.1, 12.0, WALL.size, dtype=np.float32).reshape(WALL.shape)
+    seen = counts(sensor(nearest_m=0.3, farthest_m=8.0), depth) > 0
+    assert np.array_equal(seen, (depth >= 0.3) & (depth <= 8.0))
+
+
+def box(near_m: float = 1.0, far_m: float = 4.0) -> np.ndarray:
+    """A box in front of a wall, in the columns 60 to 99."""
+    depth = np.full_like(WALL, far_m)
+    depth[:, 60:100] = near_m
+    return depth
+
+
+def test_the_second_imager_s_shadow_is_left_of_what_is_near():
+    hole = counts(sensor(shadow=True), box()) == 0
+    columns = np.flatnonzero(hole.any(axis=0))
+    width_px = LENS.fx * 0.05 * (1.0 / 1.0 - 1.0 / 4.0)  # difference of disparities, in pixels of the image
+    assert columns.max() == 59 and len(columns) == pytest.approx(width_px, abs=1.0)
+    assert hole[:, columns].all()
+    # Seen from both imagers: a plane that is not across the axis.
+    slanted = 1.0 / (0.2 + 0.004 * np.arange(160, dtype=np.float32))
+    for row in (slanted, slanted[::-1]):
+        assert (counts(sensor(shadow=True), np.tile(row, (120, 1))) > 0).all()
+
+
+def test_silhouettes_have_holes_and_flying_pixels():
+    at = np.isin(np.arange(160), (59, 60, 99, 100))  # the pixels beside a jump, on both sides
+    shown = np.stack([counts(sensor(silhouette_holes=0.3), box(), k) for k in range(20)])
+    assert (shown[:, :, ~at] > 0).all()
+    assert (shown[:, :, at] == 0).mean() == pytest.approx(0.3, abs=0.02)
+    flown = np.stack([counts(sensor(flying=0.5), box(), k) for k in range(20)])
+    assert np.array_equal(flown[:, :, ~at], np.broadcast_to(np.rint(box() * 1e3), flown.shape)[:, :, ~at])
+    moved = flown[:, :, at] != np.rint(box() * 1e3)[:, at]
+    assert moved.mean() == pytest.approx(0.5, abs=0.02)
+    assert flown.min() >= 1000 and flown.max() <= 4000
+    share = (1.0 / (flown[:, :, at][moved] * 1e-3) - 0.25) / 0.75  # of inverse depth, from the wall to the box
+    assert share.mean() == pytest.approx(0.5, abs=0.03) and share.std() == pytest.approx(12**-0.5, abs=0.03)
+    # A plane has no silhouette, however slanted.
+    slanted = np.tile(1.0 / (0.13 + 0.02 * np.arange(160, dtype=np.float32)), (120, 1))
+    assert np.array_equal(counts(sensor(silhouette_holes=1.0), slanted)[:, 1:-1], counts(sensor(), slanted)[:, 1:-1])
+
+
+def test_dark_and_overexposed_pixels_stay_unmeasured():
+    image = GRAY.copy()
+    image[:40], image[40:80] = 24, 251
+    made = sensor(dark_holes=0.7, bright_holes=0.5)
+    first, later = (counts(made, image=image, index=k) == 0 for k in (0, 9))
+    assert np.array_equal(first, later), "no median over time fills them"
+    assert first[:40].mean() == pytest.approx(0.7, abs=0.02)
+    assert first[40:80].mean() == pytest.approx(0.5, abs=0.02)
+    assert not first[80:].any()
+
+
+def test_a_measurement_depends_on_the_stream_and_the_frame_s_number_alone():
+    def shown(seed: int, numbers: tuple[int, ...]) -> list[bytes]:
+        made = DepthSensor().start(np.random.default_rng(seed))
+        return [counts(made, box(), k).tobytes() for k in numbers]
+
+    first = shown(0, (0, 1, 2**40))
+    assert len(set(first)) == 3 and shown(0, (2**40, 1, 0)) == first[::-1]
+    assert shown(1, (0,)) != first[:1]
+
+
+def test_in_the_room_it_leaves_little_unmeasured_and_errs_by_centimeters():
+    scene = make_scene("room", {"supersample": 1})
+    effects = load_effects({"depth_sensor": {}}, lambda _: np.random.default_rng(3))
+    camera = WorldSource("eye", scene, "cam01", 15, effects=effects)
+    exact = WorldSource(
+        "eye", scene, "cam01", 15, effects=load_effects({"depth_sensor": EXACT}, lambda _: np.random.default_rng(3))
+    )
+    measured, true = (c.depth(20, c.read(20)).meters() for c in (camera, exact))
+    assert (true > 0).all()
+    assert 0.005 < (measured == 0).mean() < 0.03
+    seen = measured > 0
+    error_px = np.abs(K / measured[seen] - K / true[seen])
+    assert np.median(error_px) < 0.12
+    assert 0.002 < (error_px > 0.6).mean() < 0.02
+
+
+@pytest.mark.stability
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (48, 5)])
+def test_any_size_and_any_depth_give_counts(shape):
+    rng = np.random.default_rng(2)
+    image = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
+    for depth in (0.0, 1e-30, 1e-3, 0.3, 8.0, 65.5, 1e4, 1e30):
+        for parameters in ({}, EXACT, {"smoothing_px": 10.0, "noise_px": 100.0, "fixed_noise_px": 100.0}):
+            made = DepthSensor(**parameters).start(np.random.default_rng(0))
+            found = made.measure(np.full(shape, depth, np.float32), image, LENS, 2**62).counts
+            assert found.shape == shape
+            assert depth > 0.0 or not found.any(), "nothing there, nothing measured"
