@@ -98,7 +98,7 @@ class WorldConfig(SourceConfig, frozen=True, kw_only=True):
     images of its cameras are rendered from the simulated arm's true pose.
     """
 
-    scene: Annotated[str, about("room, tile or tower")] = "room"
+    scene: Annotated[str, about("room, drawn_room, tile or tower")] = "room"
     width: Annotated[int | None, about("pixels")] = None
     height: Annotated[int | None, about("pixels")] = None
     horizontal_fov_deg: Annotated[float | None, about("of the cameras")] = None

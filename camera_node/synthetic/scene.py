@@ -23,7 +23,7 @@ from freshfield.geometry import Array, Pinhole, world_rays
 from freshfield.limits import MAX_IMAGE_SIDE_PX
 from freshfield.settings import ScenarioError, Settings, as_mapping, read_settings, within
 
-SCENES = ("room", "tile", "tower")
+SCENES = ("drawn_room", "room", "tile", "tower")
 HELD_OUT = "cam00"
 MAX_CAMERAS = 19
 Fov = Annotated[float, within(5.0, 150.0, "horizontal field of view of the cameras")]

