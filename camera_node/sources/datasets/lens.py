@@ -10,18 +10,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.sources.datasets.imaging import as_image
-from camera_node.sources.datasets.records import DatasetError, Image
+from camera_node.sources.datasets.records import DatasetError
 from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
 from freshfield.geometry import Pinhole, invertible
 
 import cv2  # isort: skip
 
 Array = NDArray[np.float64]
+Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.uint16])
 
 # Widest angle from the axis of an undistorted image; beyond it the corners are mostly stretched.
 _WIDEST_RAD = math.radians(60.0)
@@ -100,12 +101,13 @@ def exact(lens: Lens) -> bool:
     return _as_pinhole(lens) is not None
 
 
-def undistort(lens: Lens, image: NDArray[np.uint8]) -> Image:
+def undistort(lens: Lens, image: Pixels, nearest: bool = False) -> Pixels:
     """Resample an image (H, W) or (H, W, C) of ``lens`` to the camera ``pinhole(lens)``; unchanged if exact.
-    Raises as ``pinhole``."""
+    nearest: take the nearest pixel, as for depth, of which no mean may be taken. Raises as ``pinhole``."""
     if exact(lens):
         return image
-    return as_image(cv2.remap(image, *_maps(lens), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    between = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+    return cast(Pixels, cv2.remap(image, *_maps(lens), between, borderMode=cv2.BORDER_REPLICATE))
 
 
 @lru_cache(maxsize=256)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,7 @@ from camera_node.sources.datasets.imaging import composite, image_size, read_ima
 from camera_node.sources.datasets.lens import Lens, exact, pinhole, undistort
 from camera_node.sources.datasets.records import DatasetError, Image, PosedImage, errors_at
 from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
+from freshfield.depth import DepthImage
 from freshfield.geometry import Pose
 
 import cv2  # isort: skip
@@ -35,6 +38,10 @@ class ImageOptions:
 FULL_SIZE = ImageOptions()
 
 
+class DepthReader(Protocol):
+    def __call__(self, photo: Photo) -> DepthImage: ...
+
+
 @dataclass(frozen=True)
 class Photo:
     """An image file.
@@ -43,6 +50,7 @@ class Photo:
     mask: image file that is zero in the background.
     ignored: image file of pixels that must not be learned from, and whether these are its zeros or the others.
     upright: rotate the file as its EXIF data say.
+    depth: reads the depth that belongs to the photo.
     """
 
     path: Path
@@ -51,6 +59,7 @@ class Photo:
     mask: Path | None = None
     ignored: tuple[Path, bool] | None = None
     upright: bool = False
+    depth: DepthReader | None = None
 
     def read(self) -> Image:
         """Read it as uint8 RGB or RGBA according to ``options``. Raises DatasetError."""
@@ -125,4 +134,5 @@ def posed_photo(
         read=photo.read,
         path=photo.path if stored else None,
         weight=photo.weight if photo.ignored is not None else None,
+        depth=None if photo.depth is None else partial(photo.depth, photo),
     )

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from freshfield import untrusted
+from freshfield.depth import DepthImage
 from freshfield.geometry import GeometryError, Pinhole, se3_inverse
 
 Image = NDArray[np.uint8]
@@ -38,6 +39,7 @@ class PosedImage:
     path: the image's own file, if ``read`` does not scale, mask, turn or undistort it; else None.
     release: frees what ``read`` keeps open, such as a decoder.
     weight: returns float32 (H, W) in [0, 1], how much each pixel of the image may be learned from; None: all fully.
+    depth: returns what a depth sensor measured with it; raises DatasetError. None: no sensor did.
     """
 
     name: str
@@ -49,6 +51,7 @@ class PosedImage:
     path: Path | None = None
     release: Callable[[], None] = lambda: None
     weight: Callable[[], NDArray[np.float32]] | None = None
+    depth: Callable[[], DepthImage] | None = None
 
 
 @dataclass(frozen=True)

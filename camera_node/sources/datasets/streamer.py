@@ -22,6 +22,7 @@ from camera_node.sources.base import Shot, Source, assign_cameras, rate
 from camera_node.sources.datasets.formats import open_configured
 from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
 from freshfield import payload
+from freshfield.depth import DepthImage
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
 
@@ -212,6 +213,10 @@ class ImageSource(Source):
             decoded = shown.read()  # once also of what is sent as stored: a file that is cut short is refused by name
             self._whole.add(content)
         return Shot(decoded if image is None else image, pose, shown.intrinsics, gap_ns)
+
+    def depth(self, content: int, shot: Shot) -> DepthImage | None:
+        measured = self._images[content].depth
+        return None if measured is None else measured()
 
     def release(self) -> None:
         self._images[0].release()

@@ -19,6 +19,7 @@ from typing import Any, get_args
 import numpy as np
 
 from camera_node.settings import Background
+from camera_node.sources.datasets.depth_file import DepthFile
 from camera_node.sources.datasets.imaging import image_size
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
@@ -84,6 +85,7 @@ def _load(file: Path, options: ImageOptions) -> Dataset:
     unknown = check_keys(data, str(file)).union(*(check_keys(frame, where) for _, frame, where in listed))
     images: list[PosedImage] = []
     missing: list[str] = []
+    without_depth: list[Path] = []
     sizes: dict[str, tuple[int, int]] = {}
     for (top, frame, where), camera in zip(listed, cameras):
         name = _name(frame, where)
@@ -93,11 +95,18 @@ def _load(file: Path, options: ImageOptions) -> Dataset:
             missing.append(name)
             continue
         lens = _lens({**top, **frame}, image, sizes, camera, where)
-        photo = Photo(image, lens, options, ignored=_ignored(file.parent, {**top, **frame}, image, where))
+        depth = _depth(file.parent, {**top, **frame}, where)
+        if depth is not None and not depth.path.is_file():
+            without_depth.append(depth.path)
+            depth = None
+        ignored = _ignored(file.parent, {**top, **frame}, image, where)
+        photo = Photo(image, lens, options, ignored=ignored, depth=depth.read if depth else None)
         time_s = _number(frame, "time", where) if "time" in frame else None
         images.append(posed_photo(photo, name, _pose(frame, where), where, camera, time_s))
     if missing:
         notes.append(missing_note(missing, len(listed), file.parent))
+    if without_depth:
+        notes.append(f"{len(without_depth)} of its depth files are missing, first {without_depth[0]}")
     if unknown:
         notes.append(unknown_note(unknown))
     fps = _number(data, "fps", str(file)) if "fps" in data else None
@@ -204,6 +213,20 @@ def _ignored(folder: Path, d: dict[str, Any], image: Path, where: str) -> tuple[
         if mask is None:
             raise DatasetError(f"{str(name)[:200]!r} is missing")
     return mask, True
+
+
+def _depth(folder: Path, d: dict[str, Any], where: str) -> DepthFile | None:
+    """The frame's depth: nerfstudio's keys, or instant-ngp's."""
+    name = d.get("depth_file_path") or d.get("depth_path")
+    if not name:
+        return None
+    key = next((key for key in ("depth_unit_scale_factor", "integer_depth_scale") if key in d), None)
+    unit_m = None if key is None else _number(d, key, where)
+    if unit_m is not None and not 0.0 < unit_m <= 1e3:
+        raise DatasetError(f"{where}: {key} is {unit_m:g}: expected the meters of a 1 in the files, such as 0.001")
+    with errors_at(f"{where}: depth_file_path"):
+        found = file_within(folder, str(name))
+        return DepthFile(found or folder / path_within(str(name)), unit_m)
 
 
 def _pose(frame: dict[str, Any], where: str) -> np.ndarray:

@@ -16,16 +16,16 @@ _HONORED = """
 frames file_path transform_matrix fps time is_bad mask_path
 camera_model is_fisheye fl_x fl_y cx cy w h camera_angle_x camera_angle_y x_fov y_fov k1 k2 k3 k4 p1 p2
 distortion_params train_filenames test_filenames val_filenames test_frames
+depth_file_path depth_path depth_unit_scale_factor integer_depth_scale
 """
 HONORED = frozenset((*_HONORED.split(), *CAMERA_NAMES))
 
-# Where the scene lies and how large it is, which is found from the cameras here; depth, normals and points, which are
-# not used; how it was made.
+# Where the scene lies and how large it is, which is found from the cameras here; normals and points, which are not
+# used; how it was made.
 _HARMLESS = """
 aabb_scale aabb scale offset render_aabb render_aabb_to_local up orientation_override auto_scale_poses_override
 applied_transform applied_scale scene_box scene_scale scene_center avg_pos near far z_near z_far bounds
-depth_file_path depth_path depth_unit_scale_factor integer_depth_scale enable_depth_loading normal_path
-normal_file_path confidence_path ply_file_path sparse_pcd_path
+enable_depth_loading normal_path normal_file_path confidence_path ply_file_path sparse_pcd_path
 rotation sharpness sharpen blur_score frame frame_id frame_index n_frames colmap_im_id colmap_id image_id id
 timestamp timestamps timestamp_ns exposure exposure_time iso name version generator camera_make date
 driver_parameters n_extra_learnable_dims has_mask

@@ -1,0 +1,116 @@
+"""A file of a depth image: 16-bit PNG or TIFF, numpy's npy, or EXR, in the unit that its format or data set says."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.sources.datasets.imaging import decode_file, shrink
+from camera_node.sources.datasets.lens import pinhole, undistort
+from camera_node.sources.datasets.photo import Photo
+from camera_node.sources.datasets.records import DatasetError
+from freshfield.depth import DepthImage
+from freshfield.geometry import Pinhole, Pose
+from freshfield.untrusted import check_file
+
+import cv2  # isort: skip
+
+MILLIMETER = 0.001
+_MOST_COUNTS = 65535
+# Half of an image's depth lies between these, or its unit is another: 1 m read as millimeters is 1 km or 1 mm.
+_NEAR_M, _FAR_M = 0.02, 200.0
+# Tolerated difference of aspect ratio between depth and the image it is registered to, both in whole pixels.
+_SAME_SHAPE = 0.05
+
+
+@dataclass(frozen=True)
+class DepthFile:
+    """A depth image, which is checked and converted when it is read.
+
+    unit_m: meters of a 1 in the file; None: .001 for whole numbers, 1 for floating point.
+    nothing: number that says, as 0 does, that nothing was measured.
+    lens, to_camera: as in ``DepthImage``, of depth that is not registered to the image.
+    """
+
+    path: Path
+    unit_m: float | None = None
+    nothing: int = 0
+    lens: Pinhole | None = None
+    to_camera: Pose | None = None
+
+    def read(self, photo: Photo) -> DepthImage:
+        """The depth that belongs to ``photo``: undistorted like it, and no larger. Whole numbers stay as they are;
+        others become whole millimeters. Raises DatasetError."""
+        values = _numbers(self.path)
+        unit = self.unit_m or (1.0 if values.dtype.kind == "f" else MILLIMETER)
+        measured = np.isfinite(values) & (values > 0) & (values != self.nothing)
+        self._check_unit(values[measured], unit)
+        if values.dtype.kind == "f":
+            values = np.rint(np.where(measured, values, 0).astype(np.float64) * (unit / MILLIMETER))
+            measured &= values <= _MOST_COUNTS
+            unit = MILLIMETER
+        counts = np.where(measured, values, 0).astype(np.uint16)
+        if self.lens is not None:
+            if counts.shape != (self.lens.height, self.lens.width):
+                raise DatasetError(f"{self.path}: {_size(counts)}, expected {self.lens.width} x {self.lens.height}")
+            return DepthImage(counts, unit, self.lens, self.to_camera)
+        return DepthImage(self._registered(counts, photo), unit)
+
+    def _registered(self, counts: NDArray[np.uint16], photo: Photo) -> NDArray[np.uint16]:
+        height, width = counts.shape
+        lens = photo.lens
+        if abs((width / lens.width) / (height / lens.height) - 1.0) > _SAME_SHAPE:
+            raise DatasetError(
+                f"{self.path}: depth is {_size(counts)}, its image {lens.width} x {lens.height}: another shape; "
+                "register it to the image"
+            )
+        counts = undistort(lens.resized(width, height), counts, nearest=True)
+        small = shrink(pinhole(lens), photo.options.scale)
+        if width > small.width:
+            size = (small.width, small.height)
+            counts = np.asarray(cv2.resize(counts, size, interpolation=cv2.INTER_NEAREST_EXACT), np.uint16)
+        return counts
+
+    def _check_unit(self, measured: NDArray[Any], unit: float) -> None:
+        middle_m = float(np.median(measured)) * unit if measured.size else 1.0
+        if not _NEAR_M <= middle_m <= _FAR_M:
+            raise DatasetError(
+                f"{self.path}: the median of its depth is {middle_m:.3g} m, if a 1 in it is {unit:g} m: say the unit "
+                "of its numbers in meters (depth_unit_scale_factor of a transforms.json)"
+            )
+
+
+def _numbers(path: Path) -> NDArray[Any]:
+    """The file's numbers, (H, W), 16 bits or floating point. Raises DatasetError."""
+    if path.suffix.lower() == ".npy":
+        try:
+            check_file(path)
+            values = np.load(path, allow_pickle=False)
+        except Exception as error:  # numpy reads a damaged header as Python, which raises anything
+            raise DatasetError(f"{path}: cannot be read as numbers of numpy: {error}") from None
+    else:
+        os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")  # asked when the first EXR file is read
+        values = decode_file(path, cv2.IMREAD_UNCHANGED)
+        if values is None:
+            raise DatasetError(f"{path}: missing, damaged, or no depth image that OpenCV can read")
+    values = np.squeeze(values)
+    if values.ndim == 3 and values.dtype.kind == "f":  # EXR files may name their one channel R, or repeat it
+        used = [c for c in range(values.shape[2]) if values[..., c].any()] or [0]
+        if all(np.array_equal(values[..., used[0]], values[..., c], equal_nan=True) for c in used):
+            values = values[..., used[0]]
+    if values.ndim != 2 or values.dtype.kind not in "uf" or values.dtype == np.uint8 or values.size == 0:
+        raise DatasetError(
+            f"{path}: {values.dtype} of shape {values.shape}: expected one number a pixel, of 16 bits or floating point"
+        )
+    if values.dtype.kind == "u" and values.max(initial=0) > _MOST_COUNTS:
+        raise DatasetError(f"{path}: its numbers exceed 16 bits: store floating point, in meters")
+    return values
+
+
+def _size(counts: NDArray[np.uint16]) -> str:
+    return f"{counts.shape[1]} x {counts.shape[0]}"
