@@ -187,6 +187,6 @@ def test_a_data_set_is_opened_and_its_images_are_read(capsys, tmp_path):
 
 def test_what_fixed_cameras_see_is_reckoned_and_drawn(capsys, tmp_path):
     drawn = tmp_path / "plan.svg"
-    _, parts = examined(capsys, "compose", "--plan", str(drawn))
+    _, parts = examined(capsys, "quad", "--plan", str(drawn))
     assert parts["coverage"][0] and "50 % by two or more, 54 degrees apart. One more camera" in parts["coverage"][1]
     assert drawn.read_text().count("<polygon") == 4 + 1

@@ -54,7 +54,7 @@ def test_errors_name_file_and_key(source, message):
     assert str(error.value).startswith("s.yaml: source") and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["room", "room19", "tile", "tower", "ideal", "fox", "lego", "kitchen", "compose"])
+@pytest.mark.parametrize("name", ["room", "room19", "tile", "tower", "ideal", "fox", "lego", "kitchen", "duo", "quad"])
 def test_shipped_scenarios_have_a_valid_source(name):
     source_config(load(name))
 

@@ -26,7 +26,7 @@ BASE_IMAGE = "docker.io/library/python:3.11-slim-bookworm"
 
 
 def test_every_camera_of_the_scenario_has_its_container() -> None:
-    scenario = load(ROOT / "deploy" / "scenarios" / "compose.yaml")
+    scenario = load(ROOT / "deploy" / "scenarios" / "quad.yaml")
     assert set(CAMERAS) == set(scenario.cameras)
     for name, service in CAMERAS.items():
         assert re.search(rf"--camera {name}$", service["command"])

@@ -17,7 +17,22 @@ from freshfield.scenario import SCENARIO_FOLDER, load
 from tests.conftest import data_dir
 
 FILES = sorted(SCENARIO_FOLDER.glob("*.yaml"))
-NAMES = {"room", "room19", "tile", "tower", "ideal", "fox", "lego", "kitchen", "cell", "scan", "card", "thesis"}
+NAMES = {
+    "room",
+    "room19",
+    "tile",
+    "tower",
+    "ideal",
+    "fox",
+    "lego",
+    "kitchen",
+    "cell",
+    "scan",
+    "card",
+    "thesis",
+    "duo",
+    "quad",
+}
 
 
 def test_the_promised_scenarios_are_there() -> None:
@@ -30,8 +45,10 @@ def test_every_package_accepts_its_section(file: Path) -> None:
     assert scenario.name == file.stem, "a report names the scenario: it must lead back to the file"
     assert scenario.description
     arm = getattr(source_config(scenario), "arm", None)
-    # A scene needs views from several sides: of several cameras, or of one that an arm carries round it.
-    assert len(scenario.training) >= 3 or set(arm.cameras) >= set(scenario.training)
+    # A scene needs views from several sides: of several cameras, of two that measure depth, or of one that an arm
+    # carries round it.
+    least = 2 if "depth_sensor" in source_config(scenario).effects else 3
+    assert len(scenario.training) >= least or set(arm.cameras) >= set(scenario.training)
     channel_from_mapping(scenario.channel, f"{file}: channel")
     edge = read_config(scenario)
     make_policy(edge.policy.name, edge.policy.value, scenario.rng("policy"))
