@@ -17,6 +17,7 @@ from camera_node.sources.registry import open_sources
 from camera_node.sources.with_effects import camera_effects
 from freshfield import payload
 from freshfield.clock import Clock
+from freshfield.depth import EncodedDepth
 from freshfield.scenario import Scenario
 
 
@@ -39,10 +40,10 @@ class ShotCache:
     def put(self, camera: str, content: int, shot: Shot) -> None:
         """Keep a shot if it fits."""
         with self._lock:
-            fits = self.bytes + len(shot.payload) <= self.max_bytes
-            if fits and (camera, content) not in self._shots:
+            size = len(shot.payload) + _depth_bytes(shot)
+            if self.bytes + size <= self.max_bytes and (camera, content) not in self._shots:
                 self._shots[camera, content] = shot
-                self.bytes += len(shot.payload)
+                self.bytes += size
 
 
 class Camera:
@@ -52,10 +53,16 @@ class Camera:
 
     config: gives codec and quality. cache: shared by the process's cameras.
     clock_error: makes the camera's clock wrong; None: it is right.
+    depth_every: each such shot of the source is sent with its depth, where it has any; 0: none.
     """
 
     def __init__(
-        self, source: Source, config: SourceConfig, cache: ShotCache, clock_error: ClockError | None = None
+        self,
+        source: Source,
+        config: SourceConfig,
+        cache: ShotCache,
+        clock_error: ClockError | None = None,
+        depth_every: int = 0,
     ) -> None:
         self.name = source.camera
         self.fps = source.fps
@@ -68,6 +75,7 @@ class Camera:
         self._quality = config.quality
         self._cache = cache
         self._clock_error = clock_error
+        self._depth_every = depth_every
 
     def clock(self, true: Clock) -> NodeClock:
         """The clock with which this camera stamps frames. true: tells the true time."""
@@ -117,7 +125,9 @@ class Camera:
             shot = self.shot(0)
         except (ValueError, OSError):
             return False
-        return self._cache.bytes + (contents - 1) * len(shot.payload) <= self._cache.max_bytes
+        depths = -(-contents // self._depth_every) if self._depth_every else 0
+        more = (contents - 1) * len(shot.payload) + (depths - 1) * _depth_bytes(shot)
+        return self._cache.bytes + more <= self._cache.max_bytes
 
     def _encode(self, content: int) -> Shot:
         shot = self.source.read(content)
@@ -125,7 +135,22 @@ class Camera:
         if not isinstance(data, bytes):
             data = payload.encode(data, self.codec, self._quality)
         payload.check(data, self.codec, shot.intrinsics.width, shot.intrinsics.height)
-        return replace(shot, image=data)
+        depth = self._encode_depth(content, shot)
+        if depth is not None:
+            depth.check(shot.intrinsics, len(data))
+        return replace(shot, image=data, depth=None, encoded_depth=depth)
+
+    def _encode_depth(self, content: int, shot: Shot) -> EncodedDepth | None:
+        if not self._depth_every:
+            return None
+        if isinstance(self.source, ScheduledSource):  # replayed as it came
+            return shot.encoded_depth
+        measured = None if content % self._depth_every else self.source.depth(content, shot)
+        return None if measured is None else measured.encode()
+
+
+def _depth_bytes(shot: Shot) -> int:
+    return 0 if shot.encoded_depth is None else len(shot.encoded_depth.payload)
 
 
 def build_cameras(
@@ -145,7 +170,8 @@ def build_cameras(
     sources = open_sources(scenario, config, cameras, data, effects)
     cache = ShotCache(cache_bytes)
     clock_errors = {c: made for c, made in effects.items() if made is not None and made.clock}
-    return [Camera(sources[c], config, cache, clock_errors.get(c)) for c in scenario.cameras if c in sources]
+    every = {c: 0 if c in scenario.held_out else config.depth_every for c in scenario.cameras}
+    return [Camera(sources[c], config, cache, clock_errors.get(c), every[c]) for c in scenario.cameras if c in sources]
 
 
 def prepare(cameras: Sequence[Camera], stopped: Callable[[], bool]) -> None:

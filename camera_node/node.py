@@ -211,6 +211,7 @@ class Node:
             payload=shot.payload,
             held_out=camera.name in self._scenario.held_out,
             pose_gap_ns=shot.pose_gap_ns,
+            depth=shot.encoded_depth,
         )
 
     def _failed(self, camera: str, error: Exception) -> None:

@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta, field
 
 from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_STAMP_S
+from freshfield.payload import DEFAULT_CODEC
 from freshfield.scenario import Scenario
 from freshfield.settings import ScenarioError, Settings, about, read_settings, within
 
@@ -36,8 +37,11 @@ class SourceConfig(Settings, frozen=True, kw_only=True):
 
     kind: str
     fps: Annotated[float, within(*FPS_RANGE, "captures per second")] | None = None
-    codec: Literal["jpeg", "png", "zstd"] = "jpeg"
+    codec: Literal["jpeg", "png", "zstd"] = DEFAULT_CODEC
     quality: Annotated[int, within(1, 100, "of JPEG; from 90 up, color is not subsampled")] = 92
+    # A depth image takes as many bytes as its picture, or more; of each fifth frame it is worth within .1 dB (moving
+    # pixels: .5 dB) of all of it.
+    depth_every: Annotated[int, within(0, 10**6, "each so many-th frame of a depth camera brings depth; 0: none")] = 5
     effects: dict[str, dict[str, Any] | None] = field(default_factory=dict)
 
 
@@ -234,8 +238,8 @@ class ColmapConfig(RecordedConfig, frozen=True, kw_only=True):
 
 class McapConfig(SourceConfig, frozen=True, kw_only=True):
     """A session that ``edge-server run --record`` wrote, replayed message by message: the same bytes and
-    poses, stamps shifted to now, from first to last, after which the node ends. fps, codec and quality are the
-    recording's own."""
+    poses, stamps shifted to now, from first to last, after which the node ends. fps, codec, quality and depth are
+    the recording's own."""
 
     file: Annotated[str, about("the recording")] = ""
     assignment: Annotated[dict[str, str], about("scenario camera -> the recording's")] = field(default_factory=dict)

@@ -43,6 +43,7 @@ import channel_emu.virtual.simulate
             (
                 "edge_server.embed",
                 "edge_server.foreground",
+                "edge_server.live.depth_in_image",
                 "edge_server.live.keyframes",
                 "edge_server.surface",
                 "edge_server.fields.splat.planar",

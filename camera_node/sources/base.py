@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from freshfield import payload
-from freshfield.depth import DepthImage
+from freshfield.depth import DepthImage, EncodedDepth
 from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import Scenario, ScenarioError
 
@@ -26,6 +26,7 @@ class Shot:
     pose_gap_ns: time between the exposure and the pose sample that it was paired with.
     captured_ns: when a real camera exposed it, on the node's clock; None: at the tick's instant.
     depth: what a depth sensor measured with it, of sources that have it at hand; else ``Source.depth`` makes it.
+    encoded_depth: the same as it is sent, once the shot is encoded.
     """
 
     image: NDArray[np.uint8] | bytes
@@ -34,6 +35,7 @@ class Shot:
     pose_gap_ns: int = 0
     captured_ns: int | None = None
     depth: DepthImage | None = None
+    encoded_depth: EncodedDepth | None = None
 
     @property
     def payload(self) -> bytes:

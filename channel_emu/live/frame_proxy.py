@@ -207,8 +207,8 @@ class FrameProxy(Proxy):
 
 def damage_payload(raw: bytes, flips: Flips) -> bytes:
     """A PushRequest with damaged payload bytes; the checksum stays the sender's, so the edge notices."""
-    from channel_emu.model.faults.corruption import damage  # only where a scenario lists it
+    from channel_emu.model.faults.corruption import damage_frame  # only where a scenario lists it
 
     request = frames_pb2.PushRequest.FromString(raw)
-    request.payload = damage(request.payload, flips)
+    damage_frame(request, flips)
     return request.SerializeToString()

@@ -54,6 +54,7 @@ class FrameAdmission:
     training, held_out: ids of the cameras in each role.
     max_side_px: longest side of an image, pixels; see ``Scenario.max_side_px``.
     known: what ``last_frames`` told in an earlier process, so that no frame is taken again after a restart.
+    codec: of the images, as the scenario says; None: any.
     """
 
     def __init__(
@@ -62,8 +63,9 @@ class FrameAdmission:
         held_out: Collection[str],
         max_side_px: int = MAX_IMAGE_SIDE_PX,
         known: LastFrames | None = None,
+        codec: str | None = None,
     ) -> None:
-        self._max_side_px = max_side_px
+        self._max_side_px, self._codec = max_side_px, codec
         self._roles = {c: False for c in training} | {c: True for c in held_out}
         self.cameras: Collection[str] = self._roles.keys()
         self.doubled: Counter[str] = Counter()
@@ -81,19 +83,26 @@ class FrameAdmission:
         }
 
     def admit(self, frame: Frame, now_ns: int) -> None:
-        """Raises FrameRejected with reason unknown_camera, wrong_role, too_large, replayed_sequence,
-        time_reversed, from_future or too_old. now_ns: on the edge's clock."""
+        """Raises FrameRejected with reason unknown_camera, wrong_role, unknown_codec, too_large, depth_too_large,
+        replayed_sequence, time_reversed, from_future or too_old. now_ns: on the edge's clock."""
         if frame.camera not in self._roles:
             raise FrameRejected("unknown_camera", f"camera {frame.camera!r} is not part of this scenario")
         if frame.held_out != self._roles[frame.camera]:
             raise FrameRejected("wrong_role", f"{frame.camera} is held out on one side and not on the other")
-        k = frame.intrinsics
+        if self._codec is not None and frame.codec != self._codec:
+            raise FrameRejected(
+                "unknown_codec", f"a {frame.codec}, where the scenario (source.codec) has {self._codec}: the same file?"
+            )
+        k, depth = frame.intrinsics, frame.depth
         if max(k.width, k.height) > self._max_side_px:
             raise FrameRejected(
                 "too_large",
                 f"{k.width} x {k.height}: the scenario (source.width, source.height) has images of at most "
                 f"{self._max_side_px} pixels a side",
             )
+        most_px = max(self._max_side_px, limits.DEPTH_SIDE_PX)
+        if depth is not None and max(depth.width, depth.height) > most_px:
+            raise FrameRejected("depth_too_large", f"depth of {depth.width} x {depth.height}: {most_px} a side at most")
         sessions = self._sessions[frame.camera]
         session = sessions.get(frame.session, _Session())
         if frame.sequence <= session.sequence:
@@ -135,7 +144,7 @@ class FrameAdmission:
 class Ingest:
     """FrameStreamService of the edge.
 
-    max_side_px, known: see ``FrameAdmission``.
+    max_side_px, known, codec: see ``FrameAdmission``.
     on_held_out(frame), on_accepted(request, now_ns): called on the event loop for held-out frames and for
     every accepted one; they must not block.
     Counts are plain numbers; readers see them without a lock.
@@ -151,10 +160,11 @@ class Ingest:
         on_accepted: Callable[[pb.PushRequest, int], None] | None = None,
         max_side_px: int = MAX_IMAGE_SIDE_PX,
         known: LastFrames | None = None,
+        codec: str | None = None,
     ) -> None:
         self._clock = clock
         self.buffer = buffer
-        self.admission = FrameAdmission(buffer.cameras, held_out, max_side_px, known)
+        self.admission = FrameAdmission(buffer.cameras, held_out, max_side_px, known, codec)
         self._ledger = ledger
         self._on_held_out = on_held_out
         self._on_accepted = on_accepted

@@ -157,6 +157,7 @@ class EdgeServer:
             None if self.recorder is None else self.recorder.frame,
             scenario.max_side_px,
             _last_frames(options.out / "edge.json"),
+            scenario.codec,
         )
         self._decision_log = DecisionLog(options.out, embedding_for(config, policy))
         controls = Controls(policy.name, policy.value)

@@ -26,13 +26,14 @@ class ViewDecoder:
     most_pixels: largest number of pixels of an image; larger ones are decoded at 1/2, 1/4 or 1/8 of their
     width and height. None: images keep their size.
     undecodable: number of damaged payloads. A failure is remembered, so that a frame counts once.
+    undecodable_depth: number of frames whose depth is damaged, which costs them only the depth.
     """
 
     def __init__(self, foreground: Foreground | None = None, most_pixels: int | None = None) -> None:
         self.foreground = foreground
         self.most_pixels = most_pixels
         self._views: dict[str, tuple[Frame, View | None]] = {}
-        self.undecodable = 0
+        self.undecodable = self.undecodable_depth = 0
 
     def take_at_most(self, pixels: int | None) -> None:
         """Set ``most_pixels``. Views of another size are forgotten."""
@@ -63,9 +64,9 @@ class ViewDecoder:
         view = self._decode_at(item, halvings)
         if view is None:
             self.undecodable += 1
-        elif halvings:
-            view = replace(view, whole=lambda: self._decode_at(item, 0))
-        return view
+            return None
+        self.undecodable_depth += item.depth is not None and view.depth is None
+        return replace(view, whole=lambda: self._decode_at(item, 0)) if halvings else view
 
     def _decode_at(self, frame: Frame, halvings: int) -> View | None:
         k = frame.intrinsics
@@ -75,7 +76,17 @@ class ViewDecoder:
             return None
         if self.foreground is not None:
             image = self.foreground.apply(frame.camera, image)
-        return View(frame.camera, image, frame.pose.matrix(), k.halved(halvings), frame.generated_edge_ns)
+        taken_ns = frame.generated_edge_ns
+        view = View(frame.camera, image, frame.pose.matrix(), k.halved(halvings), taken_ns)
+        if frame.depth is None:
+            return view
+        from edge_server.live.depth_in_image import depth_in_image  # only where a camera measures depth
+
+        try:
+            depth = depth_in_image(frame.depth.decode(), k, halvings)
+        except payload.PayloadError:
+            return view
+        return replace(view, depth=depth, depth_ns=taken_ns + frame.depth.after_image_ns)
 
     def _halvings(self, k: Pinhole) -> int:
         if self.most_pixels is None:

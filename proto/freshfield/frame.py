@@ -9,13 +9,14 @@ import math
 import re
 import struct
 from collections.abc import Container
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 
 import google_crc32c
 from google.protobuf.message import DecodeError
 
 from freshfield import limits, payload
+from freshfield.depth import EncodedDepth
 from freshfield.geometry import Pinhole, Pose, invertible, quaternion_normalize
 from freshfield.v1 import frames_pb2 as pb
 
@@ -25,6 +26,7 @@ _CODECS = {"jpeg": pb.CODEC_JPEG, "png": pb.CODEC_PNG, "zstd": pb.CODEC_ZSTD}
 CODEC_NAMES = {number: name for name, number in _CODECS.items()}
 _UINT32 = 0xFFFFFFFF  # an enum on the wire may be negative
 _PACKED = struct.Struct("<QqqqqIIII7d8d")
+_DEPTH_PACKED = struct.Struct("<IIIdq??8d7d")
 _COUNTS = attrgetter("sequence", "generated_ns", "clock_offset_ns", "clock_uncertainty_ns", "pose_gap_ns")
 _POSE_FIELDS = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _LENS_FIELDS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
@@ -50,6 +52,7 @@ class Frame:
     clock_offset_ns: edge clock minus node clock, as the node estimates it.
     clock_uncertainty_ns: bound of the estimate's error.
     pose_gap_ns: time between the capture and the pose sample that it was paired with.
+    depth: measured with the image; None: this frame brings none.
     received_ns: arrival on the edge's clock, once it has arrived; not on the wire.
     """
 
@@ -65,6 +68,7 @@ class Frame:
     clock_offset_ns: int = 0
     clock_uncertainty_ns: int = 0
     pose_gap_ns: int = 0
+    depth: EncodedDepth | None = None
     received_ns: int = field(default=0, compare=False)
 
     @property
@@ -94,13 +98,21 @@ def counted_ids(header: pb.FrameHeader, cameras: Container[str]) -> tuple[str, s
     return camera, session if valid_id(session) else OTHER
 
 
-def checksum(header: pb.FrameHeader, data: bytes) -> int:
-    """CRC32C over the header's fields, packed in a fixed order, and the payload ``data``. It covers the
-    header because a flipped bit must not become a wrong pose."""
+def checksum(request: pb.PushRequest) -> int:
+    """CRC32C over the header's fields, packed in a fixed order, and the payload; then over the same of the depth, if
+    there is any. It covers the header because a flipped bit must not become a wrong pose."""
+    header = request.header
     numbers = (*_COUNTS(header), header.codec & _UINT32, header.width, header.height, header.role & _UINT32)
     packed = _PACKED.pack(*numbers, *_POSE(header.pose), *_LENS(header.intrinsics))
     crc = google_crc32c.value(header.camera_id.encode() + b"\0" + header.session_id.encode() + packed)
-    return google_crc32c.extend(crc, data)
+    crc = google_crc32c.extend(crc, request.payload)
+    if not request.HasField("depth"):
+        return crc
+    depth = request.depth
+    own = depth.HasField("intrinsics"), depth.HasField("to_camera")
+    sizes = depth.codec & _UINT32, depth.width, depth.height, depth.meters_per_count, depth.after_image_ns
+    packed = _DEPTH_PACKED.pack(*sizes, *own, *_LENS(depth.intrinsics), *_POSE(depth.to_camera))
+    return google_crc32c.extend(google_crc32c.extend(crc, packed), depth.payload)
 
 
 def to_request(frame: Frame) -> pb.PushRequest:
@@ -113,22 +125,68 @@ def to_request(frame: Frame) -> pb.PushRequest:
         generated_ns=frame.generated_ns,
         clock_offset_ns=frame.clock_offset_ns,
         clock_uncertainty_ns=frame.clock_uncertainty_ns,
-        pose=pb.Pose(**dict(zip(_POSE_FIELDS, (*frame.pose.quaternion, *frame.pose.translation_m)))),
+        pose=_pose_message(frame.pose),
         pose_gap_ns=frame.pose_gap_ns,
-        intrinsics=pb.Intrinsics(**dict(zip(_LENS_FIELDS, (k.fx, k.fy, k.cx, k.cy, *k.distortion)))),
+        intrinsics=_lens_message(k),
         codec=_CODECS[frame.codec],
         width=k.width,
         height=k.height,
         role=pb.ROLE_HELD_OUT if frame.held_out else pb.ROLE_TRAIN,
     )
-    return pb.PushRequest(header=header, payload=frame.payload, crc32c=checksum(header, frame.payload))
+    request = pb.PushRequest(header=header, payload=frame.payload)
+    if frame.depth is not None:
+        request.depth.CopyFrom(_depth_message(frame.depth))
+    request.crc32c = checksum(request)
+    return request
 
 
 def pose_and_lens(h: pb.FrameHeader) -> tuple[Pose, Pinhole]:
     """Pose and intrinsics of a header, bit for bit and unchecked, for sending them again."""
-    qw, qx, qy, qz, *translation_m = _POSE(h.pose)
-    fx, fy, cx, cy, *distortion = _LENS(h.intrinsics)
-    return Pose((qw, qx, qy, qz), tuple(translation_m)), Pinhole(h.width, h.height, fx, fy, cx, cy, tuple(distortion))
+    return _pose(h.pose), _lens(h.width, h.height, h.intrinsics)
+
+
+def depth_of(message: pb.Depth) -> EncodedDepth:
+    """Depth of a message, bit for bit and unchecked, for sending it again."""
+    return EncodedDepth(
+        payload=message.payload,
+        width=message.width,
+        height=message.height,
+        meters_per_count=message.meters_per_count,
+        intrinsics=_lens(message.width, message.height, message.intrinsics) if message.HasField("intrinsics") else None,
+        to_camera=_pose(message.to_camera) if message.HasField("to_camera") else None,
+        after_image_ns=message.after_image_ns,
+    )
+
+
+def _pose_message(pose: Pose) -> pb.Pose:
+    return pb.Pose(**dict(zip(_POSE_FIELDS, (*pose.quaternion, *pose.translation_m))))
+
+
+def _lens_message(k: Pinhole) -> pb.Intrinsics:
+    return pb.Intrinsics(**dict(zip(_LENS_FIELDS, (k.fx, k.fy, k.cx, k.cy, *k.distortion))))
+
+
+def _depth_message(depth: EncodedDepth) -> pb.Depth:
+    return pb.Depth(
+        codec=pb.DEPTH_CODEC_DELTA_ZSTD,
+        width=depth.width,
+        height=depth.height,
+        meters_per_count=depth.meters_per_count,
+        after_image_ns=depth.after_image_ns,
+        intrinsics=None if depth.intrinsics is None else _lens_message(depth.intrinsics),
+        to_camera=None if depth.to_camera is None else _pose_message(depth.to_camera),
+        payload=depth.payload,
+    )
+
+
+def _pose(message: pb.Pose) -> Pose:
+    qw, qx, qy, qz, *translation_m = _POSE(message)
+    return Pose((qw, qx, qy, qz), tuple(translation_m))
+
+
+def _lens(width: int, height: int, message: pb.Intrinsics) -> Pinhole:
+    fx, fy, cx, cy, *distortion = _LENS(message)
+    return Pinhole(width, height, fx, fy, cx, cy, tuple(distortion))
 
 
 def parse(raw: bytes) -> pb.PushRequest:
@@ -143,12 +201,13 @@ def from_request(request: pb.PushRequest) -> Frame:
     """Check a message and return its frame, the payload still encoded.
 
     Raises FrameRejected with reason bad_id, bad_header, crc_mismatch, bad_pose, bad_intrinsics, or a reason
-    of ``payload.check`` (too_large, unknown_codec, bad_payload, size_mismatch).
+    of ``payload.check`` (too_large, unknown_codec, bad_payload, size_mismatch). For depth each of these begins
+    with ``depth_``, and ``depth_bad_header`` is one more.
     """
     h = request.header
     if not valid_id(h.camera_id) or not valid_id(h.session_id):
         raise FrameRejected("bad_id", "camera and session ids are 1 to 64 letters, digits, '.', '_', '-'")
-    if checksum(h, request.payload) != request.crc32c:
+    if checksum(request) != request.crc32c:
         raise FrameRejected("crc_mismatch", f"frame {h.sequence} of {h.camera_id} was damaged on the way")
     codec = CODEC_NAMES.get(h.codec)
     if codec is None:
@@ -171,12 +230,30 @@ def from_request(request: pb.PushRequest) -> Frame:
         clock_offset_ns=h.clock_offset_ns,
         clock_uncertainty_ns=h.clock_uncertainty_ns,
         pose_gap_ns=h.pose_gap_ns,
+        depth=_checked_depth(request, lens) if request.HasField("depth") else None,
     )
     try:
         payload.check(frame.payload, codec, h.width, h.height)
     except payload.PayloadError as error:
         raise FrameRejected(error.reason, str(error)) from None
     return frame
+
+
+def _checked_depth(request: pb.PushRequest, image: Pinhole) -> EncodedDepth:
+    depth = depth_of(request.depth)
+    try:
+        if request.header.role == pb.ROLE_HELD_OUT:
+            raise FrameRejected("bad_header", "a held-out camera sends none")
+        if request.depth.codec != pb.DEPTH_CODEC_DELTA_ZSTD:
+            raise FrameRejected("unknown_codec", f"codec number {request.depth.codec} is not known here")
+        depth.check(image, len(request.payload))
+        if depth.intrinsics is not None:
+            _checked_lens(depth.intrinsics)
+        if depth.to_camera is not None:
+            depth = replace(depth, to_camera=_checked_pose(depth.to_camera))
+    except (payload.PayloadError, FrameRejected) as error:
+        raise FrameRejected(f"depth_{error.reason}", f"depth: {error}") from None
+    return depth
 
 
 def _checked_pose(pose: Pose) -> Pose:

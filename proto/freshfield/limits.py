@@ -9,13 +9,28 @@ from __future__ import annotations
 # --- messages and images ----------------------------------------------------------------------
 
 MAX_PAYLOAD_BYTES = 8 * 2**20
-"""Size of an encoded image: four bits per pixel of the largest one, more than a high-quality JPEG needs."""
+"""Size of an encoded image, with its depth: four bits per pixel of the largest one, more than a high-quality JPEG
+needs."""
 
 MAX_MESSAGE_BYTES = MAX_PAYLOAD_BYTES + 4096
 """Size of a gRPC message: the largest payload, and space for the header."""
 
 MAX_IMAGE_SIDE_PX = 4096
 """Width and height of a decoded image: 50 MB of RGB, which bounds the cost of a decompression bomb."""
+
+DEPTH_SIDE_PX = 1280
+"""Width and height of depth that is never too large, however small a scenario's images are: the sensors of RealSense
+and OAK cameras have 1280 columns at most."""
+
+METERS_PER_COUNT = (1e-6, 1.0)
+"""Scale of depth in 16 bits: at the least its range is 6.5 cm, less than any sensor's, at the most 65 km."""
+
+MAX_DEPTH_LENSES = 24
+"""Lenses of depth sensors of which the edge keeps the rays, up to 13 MB each: more cameras than any rig here has, and
+few, because a hostile sender's lens may differ in each frame."""
+
+MAX_DEPTH_GAP_NS = 10**10
+"""Time between an image and its depth. Streams of a camera are some 100 ms apart, replays of a slow sensor seconds."""
 
 MAX_PNG_CHUNKS = 10_000
 """Chunks of a PNG, because a decoder reads all. Encoders write 8 kB or more per chunk: 1000 in 8 MB."""

@@ -24,6 +24,7 @@ import numpy as np
 
 from freshfield.frame import valid_id
 from freshfield.limits import MAX_CAMERAS, MAX_IMAGE_SIDE_PX
+from freshfield.payload import DEFAULT_CODEC
 from freshfield.settings import ScenarioError, Settings, about, read_settings, within
 from freshfield.untrusted import UntrustedError, read_text, read_yaml
 
@@ -91,6 +92,12 @@ class Scenario:
         sides = [self.source.get(name) for name in ("width", "height")]
         whole = [side for side in sides if type(side) is int and side > 0]
         return max(whole) if len(whole) == len(sides) else MAX_IMAGE_SIDE_PX
+
+    @property
+    def codec(self) -> str | None:
+        """How the cameras compress images; None without a source, and for a recording, whose own codec is sent."""
+        told = self.source.get("kind") not in (None, "mcap")
+        return str(self.source.get("codec", DEFAULT_CODEC)) if told else None
 
     def phase_ns(self, camera: str, fps: float) -> int:
         """Delay of a camera's captures after the multiples of 1 / ``fps``, below 1 / ``fps``; see

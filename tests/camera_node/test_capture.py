@@ -6,14 +6,16 @@ import asyncio
 
 import pytest
 
-from camera_node.capture import ShotCache, build_cameras, prepare
+from camera_node.capture import Camera, ShotCache, build_cameras, prepare
 from camera_node.outbox import Outbox
-from camera_node.settings import source_config
+from camera_node.settings import WorldConfig, source_config
 from camera_node.sources.base import Shot
 from freshfield import ledger
 from freshfield.clock import VirtualClock
 from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose
+from freshfield.payload import PayloadError
+from tests.camera_node.depth_source import DepthSource
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 
 POSE, LENS = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Pinhole.from_fov(8, 8, 60)
@@ -52,6 +54,40 @@ def test_a_frame_too_large_to_send_is_an_error_of_that_frame(tmp_path, monkeypat
     camera = build_cameras(scenario, source_config(scenario), scenario.cameras)[1]
     with pytest.raises(ValueError, match="exceeds 100"):
         camera.capture(0)
+
+
+def depth_camera(every: int, contents: int | None = None, cache: ShotCache | None = None, **depth) -> Camera:
+    source = DepthSource("cam01", contents, **depth)
+    return Camera(source, WorldConfig(kind="world"), cache or ShotCache(10**6), depth_every=every)
+
+
+@pytest.mark.parametrize(("every", "ticks"), [(0, []), (1, list(range(12))), (5, [0, 5, 10]), (100, [0])])
+@pytest.mark.parametrize("contents", [None, 12])
+def test_each_so_many_th_shot_brings_depth(every, ticks, contents):
+    camera = depth_camera(every, contents)
+    for _ in range(2):  # the second time from the cache, where shots repeat
+        depths = {tick: camera.capture(tick).encoded_depth for tick in range(12)}
+        assert [tick for tick, depth in depths.items() if depth is not None] == ticks
+        assert all((depths[tick].decode().counts == tick + 1).all() for tick in ticks)
+
+
+def test_depth_is_cached_encoded_and_its_bytes_count():
+    cache = ShotCache(10**6)
+    camera = depth_camera(5, 10, cache)
+    prepare([camera], lambda: False)
+    shots = [camera.cached(tick) for tick in range(10)]
+    assert camera.capture(15).encoded_depth is shots[5].encoded_depth
+    depths = [shot.encoded_depth.payload for shot in shots if shot.encoded_depth is not None]
+    assert len(depths) == 2 and cache.bytes == sum(len(shot.payload) for shot in shots) + sum(map(len, depths))
+    for room, fits in ((cache.bytes, True), (cache.bytes - len(depths[0]), False)):
+        assert depth_camera(5, 10, ShotCache(room)).fits() == fits
+
+
+def test_depth_that_cannot_be_sent_is_an_error_of_that_frame():
+    for wrong, message in (({"after_image_ns": 10**11}, "100 s after its image"), ({"intrinsics": LENS}, "a lens of")):
+        with pytest.raises(PayloadError, match=message):
+            depth_camera(5, **wrong).capture(0)
+        assert depth_camera(0, **wrong).capture(0).depth is None
 
 
 def frame(sequence: int) -> Frame:

@@ -237,7 +237,7 @@ class ChaosDeployment(VirtualDeployment):
             header = request.header
             try:
                 reason = self._deliver(from_request(request), ())
-                self.damaged_admitted += not reason and checksum(header, request.payload) != request.crc32c
+                self.damaged_admitted += not reason and checksum(request) != request.crc32c
             except FrameRejected as error:
                 reason = error.reason
                 self.rejected[reason] += 1
@@ -288,7 +288,7 @@ class ChaosDeployment(VirtualDeployment):
             message, name, values = wrong[k]
             setattr(message, name, values[rng.integers(len(values))])
         if rng.random() < 0.9:
-            request.crc32c = checksum(header, request.payload)
+            request.crc32c = checksum(request)
         return request
 
     # --- what a frame meets ---------------------------------------------------------------------------

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from freshfield import payload
+from freshfield.depth import DepthImage
 from freshfield.frame import Frame, FrameRejected, checksum, counted_ids, from_request, parse, to_request, valid_id
 from freshfield.geometry import Pinhole, Pose, quaternion_normalize
 from freshfield.v1 import frames_pb2 as pb
@@ -21,6 +24,10 @@ from tests.support import lines_run
 
 IMAGE = np.arange(16 * 12 * 3, dtype=np.uint8).reshape(12, 16, 3)
 DATA = {codec: payload.encode(IMAGE, codec) for codec in payload.CODECS}
+DEPTH_LENS = Pinhole(8, 5, 9.0, 9.5, 4.0, 2.5, (0.01, 0.0, 0.0, 0.0))
+DEPTH = DepthImage(
+    np.arange(40, dtype=np.uint16).reshape(5, 8), 0.001, DEPTH_LENS, Pose((1.0, 0.0, 0.0, 0.0), (0.05, 0.0, 0.0)), -9
+).encode()
 INT64 = st.integers(-(2**63), 2**63 - 1)
 
 
@@ -56,9 +63,10 @@ ids = st.from_regex(r"[A-Za-z0-9._-]{1,64}", fullmatch=True)
     held_out=st.booleans(),
     offset_ns=INT64,
     uncertainty_ns=st.integers(0, 2**63 - 1),
+    depth=st.sampled_from([None, DEPTH, replace(DEPTH, to_camera=None, after_image_ns=0)]),
 )
 def test_what_is_sent_is_what_arrives(
-    camera, session, sequence, generated_ns, q, t, codec, held_out, offset_ns, uncertainty_ns
+    camera, session, sequence, generated_ns, q, t, codec, held_out, offset_ns, uncertainty_ns, depth
 ):
     sent = frame(
         camera=camera,
@@ -71,6 +79,7 @@ def test_what_is_sent_is_what_arrives(
         held_out=held_out,
         clock_offset_ns=offset_ns,
         clock_uncertainty_ns=uncertainty_ns,
+        depth=None if held_out else depth,
     )
     wire = to_request(sent).SerializeToString()
     back = from_request(pb.PushRequest.FromString(wire))
@@ -80,25 +89,34 @@ def test_what_is_sent_is_what_arrives(
     assert back.generated_edge_ns == generated_ns + offset_ns
 
 
+def test_without_depth_a_frame_is_the_bytes_that_it_always_was():
+    """As of the version before depth, so that nodes and edges of both understand each other."""
+    request = to_request(frame(codec="jpeg", payload=b"what a camera saw"))
+    wire = request.SerializeToString(deterministic=True)
+    assert request.crc32c == 0x9A231BEE and len(wire) == 206
+    assert hashlib.sha256(wire).hexdigest() == "3dbb1fc20dcfebe6806afbc1cf133122550fdb60b19b5bf23de974e866ab1afa"
+
+
 @settings(max_examples=300)
-@given(at=st.integers(0, 10**6), bit=st.integers(0, 7))
-def test_a_flipped_bit_never_becomes_another_frame(at, bit):
-    wire = bytearray(to_request(frame()).SerializeToString())
+@given(at=st.integers(0, 10**6), bit=st.integers(0, 7), depth=st.sampled_from([None, DEPTH]))
+def test_a_flipped_bit_never_becomes_another_frame(at, bit, depth):
+    sent = frame(held_out=depth is None, depth=depth)
+    wire = bytearray(to_request(sent).SerializeToString())
     wire[at % len(wire)] ^= 1 << bit
     try:
         request = pb.PushRequest.FromString(bytes(wire))
         back = from_request(request)
     except (FrameRejected, DecodeError):
         return
-    assert back == from_request(to_request(frame()))
+    assert back == from_request(to_request(sent))
 
 
-def changed(change, checksummed: bool = True) -> pb.PushRequest:
+def changed(change, checksummed: bool = True, **values) -> pb.PushRequest:
     """A request that somebody altered, with a checksum that fits unless told otherwise."""
-    request = to_request(frame())
+    request = to_request(frame(**values))
     change(request)
     if checksummed:
-        request.crc32c = checksum(request.header, request.payload)
+        request.crc32c = checksum(request)
     return request
 
 
@@ -154,8 +172,52 @@ def test_each_refusal_has_its_reason(change, reason):
     assert error.value.reason == reason and str(error.value)
 
 
+def set_depth(**values):
+    def change(request):
+        for path, value in values.items():
+            *parents, name = path.split("__")
+            target = request.depth
+            for parent in parents:
+                target = getattr(target, parent)
+            setattr(target, name, value)
+
+    return change
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (set_depth(codec=pb.DEPTH_CODEC_UNSPECIFIED), "depth_unknown_codec"),
+        (set_depth(codec=99), "depth_unknown_codec"),
+        (set_depth(codec=-1), "depth_unknown_codec"),
+        (set_depth(width=0), "depth_too_large"),
+        (set_depth(height=5000), "depth_too_large"),
+        (set_depth(width=9), "depth_size_mismatch"),
+        (set_depth(payload=b""), "depth_bad_payload"),
+        (set_depth(payload=payload.encode(IMAGE, "zstd")), "depth_size_mismatch"),
+        (set_depth(meters_per_count=math.nan), "depth_bad_header"),
+        (set_depth(meters_per_count=math.inf), "depth_bad_header"),
+        (set_depth(meters_per_count=-1.0), "depth_bad_header"),
+        (set_depth(after_image_ns=-(2**63)), "depth_bad_header"),
+        (set_depth(intrinsics__fx=math.nan), "depth_bad_intrinsics"),
+        (set_depth(intrinsics__fx=0.0), "depth_bad_intrinsics"),
+        (set_depth(intrinsics__k1=-30.0), "depth_bad_intrinsics"),
+        (set_depth(to_camera__qw=0.5), "depth_bad_pose"),
+        (set_depth(to_camera__tx_m=math.inf), "depth_bad_pose"),
+        (lambda r: r.depth.ClearField("intrinsics"), "depth_bad_header"),
+        (lambda r: r.depth.Clear(), "depth_unknown_codec"),
+        (lambda r: setattr(r.header, "role", pb.ROLE_HELD_OUT), "depth_bad_header"),
+    ],
+)
+def test_depth_is_refused_for_its_own_reasons(change, reason):
+    with pytest.raises(FrameRejected) as error:
+        from_request(changed(change, held_out=False, depth=DEPTH))
+    assert error.value.reason == reason and str(error.value).startswith("depth: ")
+
+
 def fields(message) -> list[str]:
-    """Paths of every field of the header, those of pose and intrinsics among them."""
+    """Paths of every field of a message, those of pose and intrinsics among them."""
     paths = []
     for field in message.DESCRIPTOR.fields:
         inner = field.type == field.TYPE_MESSAGE
@@ -164,27 +226,47 @@ def fields(message) -> list[str]:
 
 
 def test_there_are_this_many_fields():
-    assert len(fields(pb.FrameHeader())) == 26
+    assert (len(fields(pb.FrameHeader())), len(fields(pb.Depth()))) == (26, 21)
 
 
-@pytest.mark.parametrize("path", fields(pb.FrameHeader()))
-def test_the_checksum_covers_every_field(path):
+@pytest.mark.parametrize(
+    ("part", "path"), [*(("header", p) for p in fields(pb.FrameHeader())), *(("depth", p) for p in fields(pb.Depth()))]
+)
+def test_the_checksum_covers_every_field(part, path):
     """Each value altered by the least that its type can be: had it no part in the checksum, the frame would pass."""
 
     def alter(request):
         *parents, name = path.split("__")
-        target = request.header
+        target = getattr(request, part)
         for parent in parents:
             target = getattr(target, parent)
         value = getattr(target, name)
-        setattr(
-            target,
-            name,
-            value + "x" if isinstance(value, str) else value + 1 if isinstance(value, int) else value + 1e-9,
-        )
+        more = {str: "x", bytes: b"x", int: 1, float: 1e-9}[type(value)]
+        setattr(target, name, value + more)
 
     with pytest.raises(FrameRejected) as error:
-        from_request(changed(alter, checksummed=False))
+        from_request(changed(alter, checksummed=False, held_out=False, depth=DEPTH))
+    assert error.value.reason == "crc_mismatch"
+
+
+@pytest.mark.parametrize(
+    "alter",
+    [
+        lambda r: r.ClearField("depth"),
+        lambda r: r.depth.ClearField("intrinsics"),
+        lambda r: r.depth.ClearField("to_camera"),
+    ],
+    ids=["depth", "its lens", "its pose"],
+)
+def test_the_checksum_covers_what_is_left_out(alter):
+    with pytest.raises(FrameRejected) as error:
+        from_request(changed(alter, checksummed=False, held_out=False, depth=DEPTH))
+    assert error.value.reason == "crc_mismatch"
+
+
+def test_the_checksum_covers_depth_that_is_added():
+    with pytest.raises(FrameRejected) as error:
+        from_request(changed(lambda r: r.depth.SetInParent(), checksummed=False))
     assert error.value.reason == "crc_mismatch"
 
 

@@ -10,6 +10,7 @@ import contextlib
 import json
 import tempfile
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,6 +27,7 @@ from edge_server.live.ingest import Ingest
 from edge_server.settings import read_config
 from freshfield import payload, scenario
 from freshfield.clock import VirtualClock
+from freshfield.depth import DepthImage, EncodedDepth
 from freshfield.frame import FrameRejected, checksum, counted_ids, parse, to_request
 from freshfield.geometry import Pinhole
 from freshfield.v1 import frames_pb2 as pb
@@ -47,7 +49,7 @@ def request(folder: Path) -> Target:
         plain = ingest.take(data)
         with contextlib.suppress(FrameRejected):
             message = parse(data)
-            message.crc32c = checksum(message.header, message.payload)
+            message.crc32c = checksum(message)
             data = message.SerializeToString()
         clock.advance_to(clock.now_ns() + 10**6)
         mended = ingest.take(data)
@@ -83,6 +85,23 @@ def pixels(folder: Path) -> Target:
             return error.reason
         assert image.dtype == np.uint8 and image.shape[:2] == (height, width) and image.shape[2] in (3, 4)
         return name
+
+    return take
+
+
+def depths(folder: Path) -> Target:
+    """``EncodedDepth.check``, and ``decode`` of what passes. The first two bytes: width and height."""
+
+    def take(data: bytes) -> str:
+        width, height = (data[:2] + b"\0\0")[:2]
+        depth = EncodedDepth(data[2:], width, height, 0.001)
+        try:
+            depth.check(Pinhole(width, height, 9.0, 9.0, 1.0, 1.0), 1)
+            counts = depth.decode().counts
+        except payload.PayloadError as error:
+            return error.reason
+        assert counts.dtype == np.uint16 and counts.shape == (height, width)
+        return "depth"
 
     return take
 
@@ -170,13 +189,14 @@ TARGETS: dict[str, Callable[[Path], Target]] = {
     "request": request,
     "header": header,
     "payload": pixels,
+    "depth": depths,
     "scenario": scenarios,
     "checkpoint": checkpoints,
     "mcap": mcap,
     "colmap": models,
     "transforms": transform_files,
 }
-MOST_MS = {"request": 50.0, "header": 50.0, "payload": 200.0}
+MOST_MS = {"request": 50.0, "header": 50.0, "payload": 200.0, "depth": 50.0}
 """Of one input's processor time: what a loop with other callers may be kept; a file may take MOST_FILE_MS."""
 MOST_FILE_MS = 2000.0
 SPLIT = b"\n--\n"
@@ -194,6 +214,10 @@ def _messages() -> Iterable[bytes]:
         lens = Pinhole(2, 2, 2.0, 2.0, 1.0, 1.0, (0.1, 0.0, 0.0, 0.0))
         sent = frame(camera, codec=codec, payload=data, intrinsics=lens, generated_ns=NOW, held_out=camera == "cam00")
         yield to_request(sent).SerializeToString()
+    measured = DepthImage(np.eye(2, dtype=np.uint16), 0.001, lens, sent.pose, 5).encode()
+    yield to_request(
+        replace(sent, camera="cam01", sequence=1, generated_ns=NOW + 1, depth=measured)
+    ).SerializeToString()
     yield pb.PushRequest().SerializeToString()
 
 
@@ -201,6 +225,11 @@ def _payloads() -> Iterable[bytes]:
     image = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
     for number, codec in enumerate(payload.CODECS):
         yield bytes([number, 8, 8]) + payload.encode(image, codec)
+
+
+def _depths() -> Iterable[bytes]:
+    for counts in (np.arange(64, dtype=np.uint16).reshape(8, 8), np.eye(8, dtype=np.uint16)):  # the second with a table
+        yield b"\x08\x08" + DepthImage(counts, 0.001).encode().payload
 
 
 def _checkpoints() -> Iterable[bytes]:
@@ -246,6 +275,7 @@ _HONEST: dict[str, Callable[[], Iterable[bytes]]] = {
     "request": _messages,
     "header": _messages,
     "payload": _payloads,
+    "depth": _depths,
     "checkpoint": _checkpoints,
     "mcap": _sessions,
     "colmap": _models,

@@ -12,16 +12,17 @@ from tests.fuzz.targets import MOST_FILE_MS, MOST_MS, TARGETS, seeds
 from tests.support import work_ms
 
 HONEST = {
-    "request": 2,
+    "request": 3,
     "header": 2,
     "payload": 3,
+    "depth": 2,
     "scenario": 15,
     "checkpoint": 1,
     "mcap": 1,
     "colmap": 2,
     "transforms": 2,
 }
-ACCEPTED = ("accepted", "read", "jpeg", "png", "zstd", "2 cameras")
+ACCEPTED = ("accepted", "read", "jpeg", "png", "zstd", "depth", "2 cameras")
 
 
 @pytest.mark.parametrize("name", TARGETS)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from channel_emu.model.faults import chance
 from channel_emu.model.link import Transit
 from freshfield.settings import within
+
+if TYPE_CHECKING:
+    from freshfield.v1 import frames_pb2
 
 
 class Params(chance.Params, frozen=True):
@@ -30,3 +33,12 @@ def damage(payload: bytes, flips: tuple[tuple[float, int], ...]) -> bytes:
         if data:
             data[int(place * len(data))] ^= mask
     return bytes(data)
+
+
+def damage_frame(request: frames_pb2.PushRequest, flips: tuple[tuple[float, int], ...]) -> None:
+    """Damage a frame: its image and its depth are one run of bytes."""
+    image = len(request.payload)
+    data = damage(request.payload + request.depth.payload, flips)
+    request.payload = data[:image]
+    if data[image:]:
+        request.depth.payload = data[image:]

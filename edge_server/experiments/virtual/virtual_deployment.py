@@ -284,10 +284,10 @@ class VirtualDeployment:
         now_ns = self.clock.now_ns()
         try:
             if flips:
-                from channel_emu.model.faults.corruption import damage  # loaded only where a scenario lists it
+                from channel_emu.model.faults.corruption import damage_frame  # only where a scenario lists it
 
                 request = to_request(self._with_image(frame))
-                request.payload = damage(request.payload, flips)
+                damage_frame(request, flips)
                 frame = from_request(request)
             self._admission.admit(frame, now_ns)
         except FrameRejected as error:
@@ -305,7 +305,12 @@ class VirtualDeployment:
             return frame
         shot = self._cameras[frame.camera].capture(frame.sequence)
         return dataclasses.replace(
-            frame, pose=shot.pose, intrinsics=shot.intrinsics, payload=shot.payload, pose_gap_ns=shot.pose_gap_ns
+            frame,
+            pose=shot.pose,
+            intrinsics=shot.intrinsics,
+            payload=shot.payload,
+            pose_gap_ns=shot.pose_gap_ns,
+            depth=shot.encoded_depth,
         )
 
     # --- the edge -------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import struct
+from typing import Literal
 
 from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_JPEG_SCANS, MAX_JPEG_SEGMENTS, MAX_PAYLOAD_BYTES
 from freshfield.payload.png import pixels_only, png_size
@@ -22,6 +23,8 @@ import zstandard
 from numpy.typing import NDArray
 
 CODECS = ("jpeg", "png", "zstd")
+DEFAULT_CODEC: Literal["jpeg"] = "jpeg"
+"""Of a scenario that names none: what most cameras send."""
 # Indexed by the number of halvings.
 _JPEG_FLAGS = (cv2.IMREAD_COLOR, cv2.IMREAD_REDUCED_COLOR_2, cv2.IMREAD_REDUCED_COLOR_4, cv2.IMREAD_REDUCED_COLOR_8)
 
@@ -75,11 +78,7 @@ def check(payload: bytes, codec: str, width: int, height: int) -> None:
     if not (0 < width <= MAX_IMAGE_SIDE_PX and 0 < height <= MAX_IMAGE_SIDE_PX):
         raise PayloadError("too_large", f"{width} x {height} is not within 1..{MAX_IMAGE_SIDE_PX} a side")
     if codec == "zstd":
-        try:
-            declared = zstandard.get_frame_parameters(payload).content_size
-        except zstandard.ZstdError as error:
-            raise PayloadError("bad_payload", f"not a zstandard frame: {error}") from None
-        if declared != width * height * 3:
+        if (declared := declared_bytes(payload)) != width * height * 3:
             raise PayloadError("size_mismatch", f"zstd declares {declared} bytes, not {width} x {height} x 3")
         return
     if codec == "jpeg":
@@ -106,12 +105,7 @@ def decode(payload: bytes, codec: str, width: int, height: int, halvings: int = 
     """
     check(payload, codec, width, height)
     if codec == "zstd":
-        try:
-            raw = zstandard.ZstdDecompressor().decompress(payload, max_output_size=width * height * 3)
-        except zstandard.ZstdError as error:
-            raise PayloadError("undecodable", f"zstandard: {error}") from None
-        if len(raw) != width * height * 3:
-            raise PayloadError("undecodable", f"zstandard gave {len(raw)} bytes")
+        raw = inflate(payload, width * height * 3)
         return _halved(np.frombuffer(raw, np.uint8).reshape(height, width, 3), halvings)
     flags = cv2.IMREAD_UNCHANGED
     if codec == "png":
@@ -133,6 +127,25 @@ def decode(payload: bytes, codec: str, width: int, height: int, halvings: int = 
     else:
         order = cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB
     return _halved(np.asarray(cv2.cvtColor(image, order), dtype=np.uint8), halvings)
+
+
+def declared_bytes(payload: bytes) -> int:
+    """Size that a zstandard frame declares. Raises PayloadError ``bad_payload`` if it is none."""
+    try:
+        return int(zstandard.get_frame_parameters(payload).content_size)
+    except zstandard.ZstdError as error:
+        raise PayloadError("bad_payload", f"not a zstandard frame: {error}") from None
+
+
+def inflate(payload: bytes, size: int) -> bytes:
+    """Decompress a zstandard frame that declares ``size`` bytes. Raises PayloadError ``undecodable``."""
+    try:
+        raw = zstandard.ZstdDecompressor().decompress(payload, max_output_size=size)
+    except zstandard.ZstdError as error:
+        raise PayloadError("undecodable", f"zstandard: {error}") from None
+    if len(raw) != size:
+        raise PayloadError("undecodable", f"zstandard gave {len(raw)} bytes")
+    return raw
 
 
 def _halved(image: NDArray[np.uint8], halvings: int) -> NDArray[np.uint8]:

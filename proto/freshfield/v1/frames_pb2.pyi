@@ -26,6 +26,11 @@ class Outcome(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     OUTCOME_DROPPED_BUSY: _ClassVar[Outcome]
     OUTCOME_SUPERSEDED: _ClassVar[Outcome]
     OUTCOME_REJECTED: _ClassVar[Outcome]
+
+class DepthCodec(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    DEPTH_CODEC_UNSPECIFIED: _ClassVar[DepthCodec]
+    DEPTH_CODEC_DELTA_ZSTD: _ClassVar[DepthCodec]
 CODEC_UNSPECIFIED: Codec
 CODEC_JPEG: Codec
 CODEC_PNG: Codec
@@ -38,6 +43,8 @@ OUTCOME_ACCEPTED: Outcome
 OUTCOME_DROPPED_BUSY: Outcome
 OUTCOME_SUPERSEDED: Outcome
 OUTCOME_REJECTED: Outcome
+DEPTH_CODEC_UNSPECIFIED: DepthCodec
+DEPTH_CODEC_DELTA_ZSTD: DepthCodec
 
 class Pose(_message.Message):
     __slots__ = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
@@ -107,15 +114,37 @@ class FrameHeader(_message.Message):
     role: Role
     def __init__(self, camera_id: _Optional[str] = ..., session_id: _Optional[str] = ..., sequence: _Optional[int] = ..., generated_ns: _Optional[int] = ..., clock_offset_ns: _Optional[int] = ..., clock_uncertainty_ns: _Optional[int] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., pose_gap_ns: _Optional[int] = ..., intrinsics: _Optional[_Union[Intrinsics, _Mapping]] = ..., codec: _Optional[_Union[Codec, str]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., role: _Optional[_Union[Role, str]] = ...) -> None: ...
 
+class Depth(_message.Message):
+    __slots__ = ("codec", "width", "height", "meters_per_count", "after_image_ns", "intrinsics", "to_camera", "payload")
+    CODEC_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    METERS_PER_COUNT_FIELD_NUMBER: _ClassVar[int]
+    AFTER_IMAGE_NS_FIELD_NUMBER: _ClassVar[int]
+    INTRINSICS_FIELD_NUMBER: _ClassVar[int]
+    TO_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    PAYLOAD_FIELD_NUMBER: _ClassVar[int]
+    codec: DepthCodec
+    width: int
+    height: int
+    meters_per_count: float
+    after_image_ns: int
+    intrinsics: Intrinsics
+    to_camera: Pose
+    payload: bytes
+    def __init__(self, codec: _Optional[_Union[DepthCodec, str]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., meters_per_count: _Optional[float] = ..., after_image_ns: _Optional[int] = ..., intrinsics: _Optional[_Union[Intrinsics, _Mapping]] = ..., to_camera: _Optional[_Union[Pose, _Mapping]] = ..., payload: _Optional[bytes] = ...) -> None: ...
+
 class PushRequest(_message.Message):
-    __slots__ = ("header", "payload", "crc32c")
+    __slots__ = ("header", "payload", "crc32c", "depth")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     PAYLOAD_FIELD_NUMBER: _ClassVar[int]
     CRC32C_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_FIELD_NUMBER: _ClassVar[int]
     header: FrameHeader
     payload: bytes
     crc32c: int
-    def __init__(self, header: _Optional[_Union[FrameHeader, _Mapping]] = ..., payload: _Optional[bytes] = ..., crc32c: _Optional[int] = ...) -> None: ...
+    depth: Depth
+    def __init__(self, header: _Optional[_Union[FrameHeader, _Mapping]] = ..., payload: _Optional[bytes] = ..., crc32c: _Optional[int] = ..., depth: _Optional[_Union[Depth, _Mapping]] = ...) -> None: ...
 
 class PushResponse(_message.Message):
     __slots__ = ("sequence", "outcome", "reason", "detail")

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from channel_emu.model.channel import Channel
-from channel_emu.model.faults.corruption import damage
+from channel_emu.model.faults.corruption import damage, damage_frame
 from channel_emu.model.link import EventKind, Link
 from channel_emu.model.settings import channel_from_mapping
+from freshfield.v1 import frames_pb2
 
 MS = 10**6
 
@@ -100,3 +101,13 @@ def test_an_unlisted_fault_changes_no_draw() -> None:
     section["faults"] = {"loss": {"probability": 0.5}}
     lossy = Channel(channel_from_mapping(section), 4).link("a")
     assert [t.due_ns for t in offer_many(plain, 200)] == [t.due_ns for t in offer_many(lossy, 200)]
+
+
+def test_image_and_depth_are_damaged_as_one_run_of_bytes() -> None:
+    places = tuple(((k + 0.5) / 100, 255) for k in range(100))
+    request = frames_pb2.PushRequest(payload=bytes(80), depth=frames_pb2.Depth(payload=bytes(20)))
+    damage_frame(request, places)
+    assert (request.payload, request.depth.payload) == (b"\xff" * 80, b"\xff" * 20)
+    plain = frames_pb2.PushRequest(payload=bytes(100))
+    damage_frame(plain, places)
+    assert plain == frames_pb2.PushRequest(payload=damage(bytes(100), places)) and not plain.HasField("depth")

@@ -7,11 +7,13 @@ import dataclasses
 import msgspec
 import numpy as np
 import pytest
+import zstandard
 
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.ingest import FrameAdmission, Ingest, RollingPercentiles
 from freshfield import access, payload
 from freshfield.clock import VirtualClock
+from freshfield.depth import DepthImage, EncodedDepth
 from freshfield.frame import FrameRejected, checksum, to_request
 from freshfield.geometry import Pinhole
 from freshfield.ledger import Ledger, LedgerReader
@@ -63,12 +65,12 @@ def bad(kind: str) -> pb.PushRequest:
     if kind == "bad_pose":
         request = to_request(base)
         request.header.pose.qw = 7.0
-        request.crc32c = checksum(request.header, request.payload)
+        request.crc32c = checksum(request)
         return request
     if kind in ("unknown_codec", "bad_header"):  # an enum on the wire may be negative
         request = to_request(base)
         setattr(request.header, "codec" if kind == "unknown_codec" else "role", -7)
-        request.crc32c = checksum(request.header, request.payload)
+        request.crc32c = checksum(request)
         return request
     changes = {
         "unknown_camera": {"camera": "cam77"},
@@ -131,6 +133,45 @@ def test_a_thousand_made_up_cameras_are_counted_as_one(ingest):
         ingest.take(to_request(good(camera=f"made-up-{i}", session=f"s{i}")))
     assert ingest.rejected_by_camera == {"?": 1000}
     assert {(e.camera, e.session) for e in LedgerReader(ingest.test_ledger.path).events} == {("?", "?")}
+
+
+@pytest.mark.parametrize("codec", [*payload.CODECS, None])
+def test_only_the_codec_that_the_scenario_names_is_taken(codec):
+    """A PNG costs its decoder more than a JPEG of as many bytes, so that a sender may not choose."""
+    admission = FrameAdmission(["cam01"], [], codec=codec)
+    image = np.zeros((24, 32, 3), np.uint8)
+    for sequence, sent in enumerate(payload.CODECS):
+        item = good(sequence, codec=sent, payload=payload.encode(image, sent))
+        if codec in (None, sent):
+            admission.admit(item, NOW)
+            continue
+        with pytest.raises(FrameRejected, match=f"a {sent}, where the scenario .* has {codec}") as refused:
+            admission.admit(item, NOW)
+        assert refused.value.reason == "unknown_codec"
+
+
+def depth(width: int = 32, height: int = 24, **other) -> EncodedDepth:
+    return DepthImage(np.ones((height, width), np.uint16), 0.001, **other).encode()
+
+
+@pytest.mark.stability
+def test_depth_may_be_larger_than_its_image_up_to_a_sensors_size(ingest):
+    """The scenario's images have 128 pixels a side."""
+    answers = []
+    for k, side in enumerate((128, 1280, 1281)):
+        sensor = Pinhole.from_fov(side, 24, 60.0)
+        answers.append(ingest.take(to_request(good(k, depth=depth(side, intrinsics=sensor)))))
+    assert [answer.reason for answer in answers] == ["", "", "depth_too_large"]
+    assert ingest.delivered["cam01"] == 2 and ingest.rejected == {"depth_too_large": 1}
+
+
+@pytest.mark.stability
+def test_a_bomb_of_depth_is_refused_and_loses_nothing_else(ingest):
+    bomb = zstandard.ZstdCompressor().compress(bytes(2**28))
+    answer = ingest.take(to_request(good(0, depth=dataclasses.replace(depth(), payload=bomb))))
+    assert answer.reason == "depth_size_mismatch" and "depth: " in answer.detail
+    assert ingest.take(to_request(good(1, depth=depth()))).outcome == pb.OUTCOME_ACCEPTED
+    assert ingest.buffer.newest()["cam01"].depth == depth()
 
 
 def test_replay_and_reversed_time_are_refused_within_a_session_only():

@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from edge_server.live.view_decoder import ViewDecoder
 from freshfield import payload
+from freshfield.depth import DepthImage
 from tests.edge_server.frames import damaged_frame, frame
 
 
@@ -53,6 +57,35 @@ def test_a_large_image_is_decoded_smaller_and_whole_when_asked_for():
         np.testing.assert_allclose(
             view.intrinsics.rays([[1.0, 2.0]]), whole.intrinsics.rays([[32 / size[1], 2.0 * 24 / size[0]]])
         )
+
+
+def test_depth_comes_with_its_view_and_with_its_own_time():
+    counts = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32)
+    sent = DepthImage(counts, 0.002, after_image_ns=-30).encode()
+    item = frame(generated_ns=100, clock_offset_ns=7, depth=sent)
+    view = ViewDecoder().view(item)
+    np.testing.assert_array_equal(view.depth, counts * np.float32(0.002))
+    assert view.depth.dtype == np.float32 and (view.generated_ns, view.depth_ns) == (107, 77)
+    small = ViewDecoder(most_pixels=200).view(item)
+    assert small.depth.shape == small.image.shape[:2] == (12, 16)
+    np.testing.assert_array_equal(small.whole().depth, view.depth)
+    plain = ViewDecoder().view(frame())
+    assert plain.depth is None and plain.depth_ns is None
+
+
+@pytest.mark.stability
+def test_damaged_depth_costs_the_depth_and_not_the_image():
+    sent = DepthImage(np.random.default_rng(0).integers(0, 9000, (24, 32), np.uint16), 0.001).encode()
+    cut = replace(sent, payload=sent.payload[: len(sent.payload) // 2])
+    cut.check(frame().intrinsics, 1)  # it passes at the door
+    decoder = ViewDecoder(most_pixels=200)
+    for _ in range(2):
+        (view,) = decoder.views([item := frame(depth=cut)])
+        decoder.views([item])
+        assert view.image.shape == (12, 16, 3) and view.depth is None and view.whole().depth is None
+    assert (decoder.undecodable, decoder.undecodable_depth) == (0, 2)
+    assert decoder.view(damaged_frame(depth=sent)) is None
+    assert (decoder.undecodable, decoder.undecodable_depth) == (1, 2)
 
 
 def test_a_damaged_png_writes_nothing_to_the_log(capfd):

@@ -1,0 +1,76 @@
+"""Measured depth at the pixels of its image. Imported with the first frame that brings depth."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from freshfield.depth import DepthImage
+from freshfield.geometry import Pinhole
+from freshfield.limits import MAX_DEPTH_LENSES
+
+
+def depth_in_image(depth: DepthImage, lens: Pinhole, halvings: int) -> NDArray[np.float32]:
+    """Depth along the image's optical axis in meters, float32 (H, W), 0 where nothing was measured.
+
+    lens: of the image before it was halved, ``halvings`` times, to H x W.
+
+    Each pixel takes the measurement nearest to its center: a mean over pixels would lie between two surfaces. Depth
+    of a lens of its own is first moved into the image, at the coarser of both resolutions, so that no gaps open
+    between its pixels; of what lands on one pixel the nearest surface counts.
+    """
+    image = lens.halved(halvings)
+    if depth.intrinsics is None:
+        height, width = depth.counts.shape
+        return _sampled(depth.meters(), image, 2.0**halvings * width / lens.width, 2.0**halvings * height / lens.height)
+    grid = image.scaled(min(1.0, depth.intrinsics.fx / image.fx, depth.intrinsics.fy / image.fy))
+    moved = _moved(depth, depth.intrinsics, grid)
+    return _sampled(moved, image, grid.width / image.width, grid.height / image.height)
+
+
+def _sampled(depth: NDArray[np.float32], image: Pinhole, per_column: float, per_row: float) -> NDArray[np.float32]:
+    """Depth at the centers of the image's pixels. per_column, per_row: depth pixels for each of the image's."""
+    if per_column == per_row == 1.0:
+        return depth
+    rows = np.minimum((np.arange(image.height) + 0.5) * per_row, depth.shape[0] - 1).astype(np.intp)
+    columns = np.minimum((np.arange(image.width) + 0.5) * per_column, depth.shape[1] - 1).astype(np.intp)
+    return depth[rows[:, None], columns]
+
+
+def _moved(depth: DepthImage, sensor: Pinhole, grid: Pinhole) -> NDArray[np.float32]:
+    """Depth in the pixels of ``grid``, the image's lens at some resolution, meters."""
+    step = max(1, int(min(sensor.fx / grid.fx, sensor.fy / grid.fy)))
+    z = depth.counts[step // 2 :: step, step // 2 :: step] * np.float32(depth.meters_per_count)
+    measured = z > 0
+    plane, ahead_m = _plane_points(sensor, step)[measured], z[measured, None]
+    points = np.concatenate([plane * ahead_m, ahead_m], 1)
+    if depth.to_camera is not None:
+        pose = depth.to_camera.matrix().astype(np.float32)
+        points = points @ pose[:3, :3].T + pose[:3, 3]
+    if grid.distorted:  # far outside its image such a lens may lead back into it
+        points = points[np.hypot(points[:, 0], points[:, 1]) <= points[:, 2] * _reach(grid)]
+    column, row = np.floor(grid.project(points)).T
+    inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
+    out = np.full(grid.height * grid.width, np.inf, np.float32)
+    place = (row[inside] * grid.width + column[inside]).astype(np.intp)
+    np.minimum.at(out, place, points[inside, 2].astype(np.float32))
+    out[np.isinf(out)] = 0.0
+    return out.reshape(grid.height, grid.width)
+
+
+@lru_cache(MAX_DEPTH_LENSES)
+def _plane_points(sensor: Pinhole, step: int) -> NDArray[np.float32]:
+    """x and y at depth 1 of each ``step``-th pixel's center, float32 (H, W, 2), sensor axes."""
+    u, v = np.meshgrid(np.arange(step // 2, sensor.width, step), np.arange(step // 2, sensor.height, step))
+    rays = sensor.rays(np.stack([u, v], -1) + 0.5)
+    return (rays[..., :2] / rays[..., 2:]).astype(np.float32)
+
+
+@lru_cache(MAX_DEPTH_LENSES)
+def _reach(image: Pinhole) -> float:
+    """Tangent of the largest angle between the optical axis and a pixel's corner."""
+    u, v = np.meshgrid(np.linspace(0, image.width, 33), np.linspace(0, image.height, 33))
+    rays = image.rays(np.stack([u.ravel(), v.ravel()], -1))
+    return float((np.hypot(rays[:, 0], rays[:, 1]) / rays[:, 2]).max())

@@ -1,0 +1,30 @@
+"""A camera that measures depth with each frame."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+
+from camera_node.sources.base import Shot, Source
+from freshfield.depth import DepthImage
+from freshfield.geometry import Pinhole, Pose
+
+POSE = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+LENS = Pinhole.from_fov(32, 24, 60.0)
+
+
+class DepthSource(Source):
+    """contents: see ``Source``. depth: keys of each shot's ``DepthImage``, whose counts are the shot's number + 1."""
+
+    def __init__(self, camera: str, contents: int | None = None, fps: float = 10.0, **depth) -> None:
+        self.camera, self.contents, self.fps, self.intrinsics = camera, contents, Fraction(fps), LENS
+        self._depth = depth
+
+    def content(self, tick: int) -> int:
+        return tick if self.contents is None else tick % self.contents
+
+    def read(self, content: int) -> Shot:
+        image = np.full((24, 32, 3), content % 200, np.uint8)
+        counts = np.full((24, 32), content + 1, np.uint16)
+        return Shot(image, POSE, LENS, depth=DepthImage(counts, 0.001, **self._depth))

@@ -1,0 +1,124 @@
+"""Depth at its image's pixels: registered or moved there, the nearest surface first, holes left open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_server.live.depth_in_image import depth_in_image
+from freshfield.depth import DepthImage
+from freshfield.geometry import Pinhole, Pose
+
+IMAGE = Pinhole.from_fov(64, 48, 70.0)
+SENSOR = Pinhole(80, 60, 70.0, 70.0, 41.0, 29.0)
+BESIDE = Pose((1.0, 0.0, 0.0, 0.0), (0.06, -0.01, 0.02))  # of the sensor, right of the camera
+
+
+def depth(counts, **other) -> DepthImage:
+    return DepthImage(np.asarray(counts, np.uint16), 0.001, **other)
+
+
+def box_before_wall(sensor: Pinhole, pose: Pose) -> np.ndarray:
+    """Millimeters that a sensor measures of a wall at 3 m and a square of 60 cm at 1.5 m, camera axes."""
+    rays = sensor.rays() @ pose.matrix()[:3, :3].T
+    at = np.array(pose.translation_m)
+    reached = {}
+    for z in (1.5, 3.0):
+        scale = (z - at[2]) / rays[..., 2]
+        reached[z] = at + rays * scale[..., None]
+    on_box = np.abs(reached[1.5][..., :2]).max(-1) < 0.3
+    z = np.where(on_box, 1.5, 3.0) - at[2]  # the axes are parallel
+    return np.round(1000 * z)
+
+
+def moved_point_by_point(measured: DepthImage, image: Pinhole) -> np.ndarray:
+    """The reference: each measured pixel at a time, the nearest wins."""
+    out = np.zeros((image.height, image.width))
+    rays = measured.intrinsics.rays()
+    for row, column in np.argwhere(measured.counts > 0):
+        ray = rays[row, column]
+        point = ray / ray[2] * measured.counts[row, column] * measured.meters_per_count
+        world = measured.to_camera.matrix() @ [*point, 1.0]
+        u, v = np.floor(image.project(world[:3]))
+        if 0 <= u < image.width and 0 <= v < image.height:
+            old = out[int(v), int(u)]
+            out[int(v), int(u)] = world[2] if old == 0 else min(old, world[2])
+    return out
+
+
+def test_depth_of_the_images_own_size_is_taken_as_it_is():
+    counts = np.arange(48 * 64).reshape(48, 64)
+    np.testing.assert_allclose(depth_in_image(depth(counts), IMAGE, 0), counts * 0.001, rtol=1e-6)
+
+
+def test_registered_depth_of_another_size_gives_the_nearest_measurement():
+    fine = np.arange(96 * 128).reshape(96, 128)
+    found = depth_in_image(depth(fine), IMAGE, 0) / np.float32(0.001)
+    np.testing.assert_allclose(found, fine[1::2, 1::2], rtol=1e-6)
+    coarse = np.arange(24 * 32).reshape(24, 32) + 1
+    found = depth_in_image(depth(coarse), IMAGE, 0)
+    np.testing.assert_allclose(found, np.kron(coarse, np.ones((2, 2))) * 0.001, rtol=1e-6)
+
+
+@pytest.mark.parametrize("halvings", [0, 1, 2, 3])
+@pytest.mark.parametrize("size", [(64, 48), (63, 47), (61, 50)])
+def test_halved_images_see_the_same_depth(size, halvings):
+    """A plane's depth is known at every pixel; odd sides are rounded up."""
+    lens = replace(IMAGE, width=size[0], height=size[1])
+    rays = lens.rays()
+    counts = np.round(2000 / (1 + 0.3 * rays[..., 0] / rays[..., 2]))
+    small = lens.halved(halvings)
+    found = depth_in_image(depth(counts), lens, halvings)
+    rays = small.rays()
+    assert found.shape == (small.height, small.width)
+    expected = 2.0 / (1 + 0.3 * rays[..., 0] / rays[..., 2])
+    assert np.abs(found / expected - 1)[:-1, :-1].max() < 0.011 * 2**halvings  # within half of its pixel
+
+
+def test_depth_of_a_lens_and_a_pose_of_its_own_is_moved_as_one_by_one():
+    measured = depth(box_before_wall(SENSOR, BESIDE), intrinsics=SENSOR, to_camera=BESIDE)
+    measured.counts[5:9, 50:60] = 0
+    np.testing.assert_allclose(depth_in_image(measured, IMAGE, 0), moved_point_by_point(measured, IMAGE), rtol=1e-5)
+
+
+@pytest.mark.parametrize("halvings", [0, 1])
+@pytest.mark.parametrize(
+    ("sensor", "share"),
+    [(SENSOR, 0.6), (Pinhole.from_fov(160, 120, 75.0), 0.95), (Pinhole.from_fov(40, 30, 75.0), 0.95)],
+)
+def test_the_nearest_surface_wins_and_what_the_sensor_did_not_see_stays_open(sensor, share, halvings):
+    true = box_before_wall(IMAGE.halved(halvings), Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))) / 1000
+    measured = depth(box_before_wall(sensor, BESIDE), intrinsics=sensor, to_camera=BESIDE)
+    found = depth_in_image(measured, IMAGE, halvings)
+    seen = found > 0
+    right = np.abs(found - true) < 0.002
+    assert found.shape == true.shape and share < seen.mean() < 1.0  # its view ends, and the box hides wall from it
+    assert right[seen].mean() > 0.97, "all but the box's outline"
+    assert right[true == 1.5].mean() > 0.7
+
+
+@pytest.mark.stability
+def test_hard_depth_gives_holes_and_no_warning():
+    behind = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -100.0))
+    turned = Pose((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0))  # looks back
+    far = np.full((60, 80), 65535)
+    for counts, pose in ((np.zeros((60, 80)), BESIDE), (far, behind), (far, turned), (np.ones((60, 80)), behind)):
+        with np.errstate(all="raise"):
+            found = depth_in_image(depth(counts, intrinsics=SENSOR, to_camera=pose), IMAGE, 1)
+        assert found.shape == (24, 32) and not found.any()
+    found = depth_in_image(depth(far, intrinsics=SENSOR), IMAGE, 0)
+    assert np.isfinite(found).all() and found.max() == np.float32(65.535)
+
+
+@pytest.mark.stability
+def test_a_lens_with_distortion_takes_in_only_what_it_sees():
+    """Beyond its image this lens's model leads back into it: a wide sensor's points must not land there."""
+    lens = replace(IMAGE, distortion=(-0.28, 0.07, 0.0, 0.0))
+    wide = Pinhole.from_fov(200, 150, 150.0)
+    rays = wide.rays()
+    outside = np.hypot(rays[..., 0], rays[..., 1]) / rays[..., 2] > 1.5
+    assert outside.any()
+    found = depth_in_image(depth(np.where(outside, 500, 2000), intrinsics=wide), lens, 0)
+    assert not (found == np.float32(0.5)).any() and (found == np.float32(2.0)).mean() > 0.5
