@@ -71,7 +71,7 @@ ARM := $(if $(shell grep -ls '^ *arm:' $(SCENARIO) deploy/scenarios/$(SCENARIO).
 MESH := $(if $(shell grep -ls '^ *export:' $(SCENARIO) deploy/scenarios/$(SCENARIO).yaml),.venv/.ok-mesh)
 
 demo: .venv/.ok-run .venv/.ok-kernels $(ARM) $(MESH)  ## run a scenario: SCENARIO=FILE FOR=60s OUT=runs/demo PORT=8080 DATA=FOLDER
-	@$(PY) -m freshfield_up.cli $(SCENARIO) --for=$(FOR) --out $(OUT) --port $(PORT) $(if $(DATA),--data $(DATA))
+	@.venv/bin/freshfield-up $(SCENARIO) --for=$(FOR) --out $(OUT) --port $(PORT) $(if $(DATA),--data $(DATA))
 
 # Two passes: what only computes on all cores, then what meets clocks and ports. 5: nothing was selected.
 CHOSEN = ($(SELECT))$(if $(BROWSER),, and not browser)
@@ -100,7 +100,7 @@ bench: .venv/.ok-test  ## how much later the emulator hands a message on: runs/b
 
 figures: .venv/.ok-test  ## the thesis's figures, hours to days: docs/results/thesis; DATA=FOLDER JOBS=2 STUDY=--quick
 	for name in $(FIGURES); do \
-	  $(if $(DATA),FRESHFIELD_DATA=$(DATA)) $(PY) -m edge_server.cli study $$name --out runs/figures \
+	  $(if $(DATA),FRESHFIELD_DATA=$(DATA)) .venv/bin/edge-server study $$name --out runs/figures \
 	    $(if $(JOBS),--jobs $(JOBS)) $(STUDY) || exit 1; \
 	done  # after Ctrl-C the same command goes on
 	@mkdir -p docs/results/thesis

@@ -1,24 +1,235 @@
-"""The entry point of ``camera-node``, which imports nothing until Ctrl-C is harmless."""
+"""The commands of ``camera-node``: run the cameras of a scenario, list the kinds of sources, and more."""
 
 from __future__ import annotations
 
+import argparse
+import asyncio
+import logging
 import signal
 import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from camera_node.robot import arm_cli
+from camera_node.robot.calibration import CalibrationError, calibrate_command
+from freshfield import transport
+from freshfield.files import out_folder
+from freshfield.scenario import Scenario, ScenarioError, load
+
+if TYPE_CHECKING:
+    from camera_node.capture import Camera
+
+EXAMPLES = """examples:
+  camera-node run room --all --to 127.0.0.1:7001             every camera of the shipped scenario "room"
+  camera-node run room.yaml --camera cam03 --to emu:7001     one camera, e.g. on its own machine
+  camera-node run fox --all --to :7001 --data ~/data         recorded data, from the folder --data
+  camera-node prepare room --all                             render ahead, so that run starts quickly
+  camera-node calibrate hand-eye --help                      pose of a camera on an arm
+  camera-node sources                                        keys of a scenario's source section
+  camera-node effects                                        effects that a source section can list
+  camera-node simulate-arm cell                              a simulated arm for the scenario "cell"
+  camera-node drive-arm cell                                 move its camera around the target
+  camera-node teleop cell --stylus keyboard                  an operator moves it; or network:PORT
+  camera-node doctor cell                                    what is missing on this machine
+
+In the help of a command, [x] after an option is its default.
+
+exit codes: 0 stopped as asked, 1 failed while running or no frame was taken, 2 wrong scenario, option or data
+"""
+
+
+DEFAULT_CACHE_MB, MAX_CACHE_MB = 64.0, 1e6
+
+
+class UsageError(Exception):
+    """A mistake in how the command was called; shown as one line."""
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command and return its exit status."""
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.default_int_handler:
-        # Within an import Ctrl-C would print a traceback; the default action just ends the process.
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from camera_node import command_line
-
-    signal.signal(signal.SIGINT, before)
+    parser = argparse.ArgumentParser(
+        prog="camera-node",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=EXAMPLES,
+        description="Streams timestamped, posed frames of one or several cameras to the next hop.",
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_run(
+        commands.add_parser(
+            "run",
+            help="stream cameras of a scenario",
+            epilog=EXAMPLES,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+    )
+    prepare = commands.add_parser(
+        "prepare", help="render and cache a scenario's frames, which run otherwise does when it starts"
+    )
+    _add_cameras(prepare)
+    prepare.add_argument("-q", "--quiet", action="store_true", help="print only warnings")
+    prepare.set_defaults(run=_prepare)
+    calibrate_command.add_arguments(commands.add_parser("calibrate", help="hand-eye and intrinsic calibration"))
+    sources = commands.add_parser("sources", help="list the kinds of sources and their keys")
+    effects = commands.add_parser("effects", help="list effects and their parameters")
+    for each in (sources, effects):
+        each.set_defaults(run=_print_list)
+    arm_cli.add_commands(commands)
+    _add_doctor(
+        commands.add_parser(
+            "doctor",
+            help="check this machine's part of a setup: what is wrong, and how to fix it",
+            description="Checks one by one the packages, cameras, arm, clock, network, disk and files "
+            "that a scenario needs on this machine. Moves nothing. Exit code 1 if something is wrong.",
+        )
+    )
+    args = parser.parse_args(arguments)
     try:
-        return command_line.run(arguments)
-    except KeyboardInterrupt:
-        return 130
+        return int(args.run(args))
+    except (UsageError, CalibrationError, ScenarioError, transport.TransportError) as error:
+        print(f"camera-node: {error}", file=sys.stderr)
+        return 2
+
+
+def _add_cameras(command: argparse.ArgumentParser) -> None:
+    command.add_argument("scenario", help="scenario file, or the name of a shipped one")
+    who = command.add_mutually_exclusive_group(required=True)
+    who.add_argument("--camera", metavar="ID[,ID]", help="cameras of the scenario to stream or render")
+    who.add_argument("--all", action="store_true", help="all cameras of the scenario")
+    command.add_argument("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    command.add_argument("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
+
+
+def _add_run(run: argparse.ArgumentParser) -> None:
+    run.set_defaults(run=_run)
+    _add_cameras(run)
+    run.add_argument("--to", required=True, metavar="HOST:PORT", help="address of the channel emulator or edge server")
+    run.add_argument(
+        "--out", type=out_folder, metavar="DIR", help="folder to write the ledger and status file to [not written]"
+    )
+    run.add_argument("--seconds", type=float, metavar="S", help="end after S seconds of capture [on Ctrl-C]")
+    run.add_argument(
+        "--cache-mb",
+        type=float,
+        default=DEFAULT_CACHE_MB,
+        metavar="MB",
+        help="memory for compressed frames kept for the next loop; 0: none [%(default)g]",
+    )
+    run.add_argument(
+        "--response-timeout",
+        type=float,
+        default=5.0,
+        metavar="S",
+        help="reconnect if a frame is not answered within S seconds, or much later than earlier ones [%(default)g]",
+    )
+    run.add_argument("-q", "--quiet", action="store_true", help="print only warnings")
+    transport.add_arguments(run, listens=False)
+
+
+def _add_doctor(doctor: argparse.ArgumentParser) -> None:
+    doctor.set_defaults(run=_doctor)
+    doctor.add_argument(
+        "scenario", nargs="?", help="scenario file, or the name of a shipped one [check what every scenario needs]"
+    )
+    doctor.add_argument("--to", metavar="HOST:PORT", help="address of the channel emulator or edge server")
+    doctor.add_argument("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    doctor.add_argument(
+        "--out",
+        type=Path,
+        default=Path("runs"),
+        metavar="DIR",
+        help="folder that runs will be written to [%(default)s]",
+    )
+    doctor.add_argument(
+        "--plan", type=Path, metavar="FILE.svg", help="draw what fixed cameras see, and where one more helps most"
+    )
+    doctor.add_argument("--json", action="store_true", help="print the result as one JSON object")
+    transport.add_arguments(doctor, listens=False)
+
+
+def _open(args: argparse.Namespace, cache_mb: float) -> tuple[Scenario, list[Camera]]:
+    """The scenario and the chosen cameras, opened. Raises UsageError or ScenarioError."""
+    from camera_node.capture import build_cameras
+    from camera_node.settings import source_config
+
+    arm_cli.log_to_stderr(logging.WARNING if args.quiet else logging.INFO)
+    scenario = load(args.scenario, args.seed)
+    try:
+        cameras = build_cameras(
+            scenario, source_config(scenario), _chosen(scenario, args), args.data, int(cache_mb * 2**20)
+        )
+    except (ValueError, OSError) as error:
+        raise UsageError(str(error)) from None
+    return scenario, cameras
+
+
+def _print_list(args: argparse.Namespace) -> int:
+    from camera_node import listing
+
+    print(listing.sources() if args.command == "sources" else listing.effects())
+    return 0
+
+
+def _doctor(args: argparse.Namespace) -> int:
+    from camera_node import doctor
+
+    return doctor.run(args)
+
+
+def _prepare(args: argparse.Namespace) -> int:
+    from camera_node.capture import prepare
+
+    _, cameras = _open(args, DEFAULT_CACHE_MB)
+    prepare(cameras, lambda: False)
+    return 0
+
+
+def _run(args: argparse.Namespace) -> int:
+    from camera_node.node import Node, NodeOptions
+
+    # Written so that they refuse NaN, too.
+    if args.seconds is not None and not args.seconds > 0:
+        raise UsageError("--seconds: expected a positive number")
+    if not 0 <= args.cache_mb <= MAX_CACHE_MB:
+        raise UsageError(f"--cache-mb: expected 0 to {MAX_CACHE_MB:.0f}")
+    if not args.response_timeout > 0:
+        raise UsageError("--response-timeout: expected a positive number")
+    options = NodeOptions(
+        to=transport.peer("--to", args.to),
+        transport=transport.from_arguments(args),
+        out=args.out,
+        seconds=args.seconds,
+        response_timeout_s=args.response_timeout,
+    )
+    scenario, cameras = _open(args, args.cache_mb)
+
+    async def live() -> str | None:
+        node = Node(scenario, cameras, options)
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, node.stop)
+        await node.run()
+        return node.failure()
+
+    try:
+        failure = asyncio.run(live())
+    except (OSError, RuntimeError) as error:
+        failure = str(error)
+    if failure is not None:
+        print(f"camera-node: {failure}", file=sys.stderr)
+    return 0 if failure is None else 1
+
+
+def _chosen(scenario: Scenario, args: argparse.Namespace) -> tuple[str, ...]:
+    if args.all:
+        return scenario.cameras
+    chosen = tuple(dict.fromkeys(c.strip() for c in args.camera.split(",") if c.strip()))
+    unknown = [c for c in chosen if c not in scenario.cameras]
+    if unknown or not chosen:
+        raise UsageError(
+            f"--camera: {scenario.path} has no camera {', '.join(unknown) or 'of no name'}; "
+            f"it has {', '.join(scenario.cameras)}"
+        )
+    return chosen
 
 
 if __name__ == "__main__":

@@ -40,8 +40,8 @@ In the help of a command, [x] after an option is its default.
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line. argv: arguments without the program's name; None: those of the process.
 
-    Returns the exit status: 0; 1 if the live emulator failed; 2 for bad input; 130 after
-    Ctrl-C.
+    Returns the exit status: 0; 1 if the live emulator failed; 2 for bad input. KeyboardInterrupt and BrokenPipeError
+    are for ``freshfield.console``.
     """
     parser = argparse.ArgumentParser(
         prog="channel-emu", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -55,12 +55,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         if "to" in args:
             args.to = transport.peer("--to", args.to)
         return args.go(args)
+    except BrokenPipeError:  # nobody reads the output
+        raise
     # ValueError: a scenario, its notation, a transport option, a trace. OSError: a path, an address.
     except (ValueError, OSError) as error:
         print(f"channel-emu: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        return 130
 
 
 def _add_run(commands: Any) -> None:

@@ -44,7 +44,8 @@ In the help of a command, [x] after an option is its default.
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0, 1 (it failed while running) or 2 (bad input)."""
+    """Run the command line; returns the exit status: 0, 1 (it failed while running) or 2 (bad input). KeyboardInterrupt
+    and BrokenPipeError are for ``freshfield.console``."""
     parser = argparse.ArgumentParser(
         prog="edge-server", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -61,11 +62,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             return command(words[1:], _compare_with_scene) if words[0] == "export" else command(words[1:])
         args = parser.parse_args(words)
         return args.run(args)
+    except BrokenPipeError:  # nobody reads the output
+        raise
     except (ScenarioError, TransportError, OSError) as error:  # OSError: of a file or folder
         print(f"edge-server: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        return 130
 
 
 # Commands with options and a main of their own, imported only when called: command -> (module, help).

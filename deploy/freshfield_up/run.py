@@ -7,10 +7,12 @@ import signal
 import subprocess
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+from freshfield import console
 from freshfield.machine_load import LoadMeter
 from freshfield.scenario import Scenario
 from freshfield_up import folder, mesh, net
@@ -95,7 +97,8 @@ class Launcher:
             _say(f"{self.scenario.name}: {cameras}, seed {self.scenario.seed}")
             _say(f"logs and results: {options.out}")
             try:
-                self._supervise()
+                with suppress(BrokenPipeError):  # nobody reads the lines any more: ends as at Ctrl-C
+                    self._supervise()
             finally:
                 self._stop()
             self._export()
@@ -270,4 +273,9 @@ class Launcher:
 
 
 def _say(text: str) -> None:
-    print(text, flush=True)
+    """Print a line. Raises BrokenPipeError once if nobody reads them: the lines of stopping are then dropped."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        console.discard_output()
+        raise

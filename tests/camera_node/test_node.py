@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import signal
-import subprocess
-import sys
 import threading
-import time
 from fractions import Fraction
 from unittest.mock import MagicMock
 
@@ -124,14 +120,3 @@ def test_a_node_that_reached_nobody_ends_with_1(capsys):
     words = ["run", "tile", "--camera", "cam01", "--to", NOBODY, "--seconds", "0.2", "--quiet"]
     assert main(words) == 1
     assert f"camera-node: {NOBODY} was never reached: " in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("after_s", [0.05, 0.3, 0.8])
-def test_ctrl_c_while_it_starts_prints_no_traceback(after_s):
-    words = ["run", "room", "--all", "--to", NOBODY, "--quiet"]
-    code = f"from camera_node.cli import main; print(flush=True); raise SystemExit(main({words}))"
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    process.stdout.readline()  # Python itself has started
-    time.sleep(after_s)
-    process.send_signal(signal.SIGINT)
-    assert b"Traceback" not in process.communicate(timeout=20)[1]

@@ -158,6 +158,22 @@ def test_a_process_that_dies_ends_the_run_is_named_and_the_others_are_stopped(
     assert rows[0]["edge"]["pid"] == made.edge.pid and "machine" in rows[0]
 
 
+def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``freshfield-up room | head -3``; processes that only sleep stand for edge, emulator and node."""
+    monkeypatch.setattr(launcher.signal, "signal", lambda *_: None)
+    reader, writer = os.pipe()
+    sleeps = [sys.executable, "-c", "import time; time.sleep(60)"]
+    children = [Child(name, name, sleeps, tmp_path / f"{name}.txt") for name in ("edge", "emulator", "node")]
+    made = ProcessSet(*children[:2], [children[2]], "127.0.0.1:1", "")
+    monkeypatch.setattr(launcher, "process_set", lambda *_: made)
+    monkeypatch.setattr(made.edge, "start", lambda: (Child.start(made.edge), os.close(reader)))
+    monkeypatch.setattr(sys, "stdout", os.fdopen(writer, "w"))
+    (tmp_path / "small.yaml").write_text(SMALL)
+    run = launcher.Launcher(load(tmp_path / "small.yaml"), launcher.Options(tmp_path / "run", port=free_port()))
+    assert run.run() == 0
+    assert made.edge.process is not None and not any(child.running for child in children)
+
+
 @pytest.mark.slow  # 12 s each
 @pytest.mark.parametrize("name, role", [("node", "the camera node"), ("edge", "the edge server")])
 def test_a_killed_process_is_named_and_the_report_still_accounts_for_every_frame(

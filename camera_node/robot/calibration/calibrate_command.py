@@ -108,6 +108,8 @@ def run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # nobody reads the output
+        raise
     except (ValueError, OSError) as error:  # of a scenario, a file, a camera or an arm, in one line
         raise CalibrationError(str(error)) from None
 
