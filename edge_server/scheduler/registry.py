@@ -15,6 +15,7 @@ from edge_server.scheduler import fixed
 from edge_server.scheduler.policy import Policy
 from edge_server.scheduler.wait import Wait, WaitArrived, WaitFlush
 from freshfield.limits import MAX_POLICY_CHARS
+from freshfield.scenario import SCENARIO_FOLDER
 
 # name -> (class, one line of help)
 POLICIES: dict[str, tuple[type[Policy], str]] = {
@@ -73,7 +74,7 @@ def make_live_policy(name: str, value: float | None, rng: np.random.Generator) -
 
 def parse_policy(text: str) -> tuple[str, float | None]:
     """Name and value of a policy as people type it: ``threshold:120``, ``all``, ``bandit:FILE`` with FILE
-    relative to the working directory. ValueError where the value is not a number."""
+    relative to the working directory (``resolve_checkpoint``). ValueError where the value is not a number."""
     if text.startswith(BANDIT):
         return resolve_checkpoint(text, Path()), None
     name, _, value = text.partition(":")
@@ -89,10 +90,16 @@ def short_name(name: str) -> str:
 
 
 def resolve_checkpoint(name: str, folder: Path) -> str:
-    """``bandit:FILE`` with FILE, relative to ``folder``, made absolute; any other policy's name as it is."""
+    """``bandit:FILE`` with FILE made absolute; any other policy's name as it is.
+
+    FILE is relative to ``folder``; if there is none, to the folder of the shipped scenarios, so that what is shipped
+    (``bandit:card/policy.npz``) is found from anywhere, also in an installed wheel.
+    """
     if not name.startswith(BANDIT):
         return name
-    return BANDIT + str((folder / Path(name.removeprefix(BANDIT)).expanduser()).absolute())
+    file = Path(name.removeprefix(BANDIT)).expanduser()
+    own, shipped = (folder / file).absolute(), SCENARIO_FOLDER / file
+    return BANDIT + str(shipped if shipped.is_file() and not own.exists() else own)
 
 
 def policy_help(name: str) -> str:

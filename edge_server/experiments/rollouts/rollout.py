@@ -262,4 +262,6 @@ def _factory(setting: Setting, folders: Folders) -> EpisodeFactory:
 
 def _loaded(who: str | Actor) -> str | Actor:
     """The actor in the file of ``bandit:FILE``, so that results are keyed by its weights; anything else as it is."""
-    return Actor.load(who.removeprefix(BANDIT)) if isinstance(who, str) and who.startswith(BANDIT) else who
+    if isinstance(who, str) and who.startswith(BANDIT):
+        return Actor.load(parse_policy(who)[0].removeprefix(BANDIT))
+    return who

@@ -100,6 +100,20 @@ def test_a_file_is_relative_to_where_it_is_named(tmp_path, monkeypatch):
     assert read_config(made).policy.name == f"bandit:{tmp_path}/there/p.npz"
 
 
+def test_the_shipped_policy_has_a_name_that_a_file_of_ones_own_takes_over(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shipped = f"bandit:{scenario.SCENARIO_FOLDER / 'card/policy.npz'}"
+    assert parse_policy("bandit:card/policy.npz") == (shipped, None)
+    assert make_live_policy(shipped, None, np.random.default_rng(0)).name == shipped
+    data = {"name": "tiny", "cameras": {"count": 3}, "edge": {"policy": {"name": "bandit:card/policy.npz"}}}
+    made = scenario.parse(data, tmp_path / "tiny.yaml")
+    assert read_config(made).policy.name == shipped
+    (tmp_path / "card").mkdir()
+    (own := tmp_path / "card/policy.npz").write_bytes(b"")
+    assert parse_policy("bandit:card/policy.npz") == (f"bandit:{own}", None)
+    assert read_config(made).policy.name == f"bandit:{own}"
+
+
 # --- in the loop ------------------------------------------------------------------------------------
 
 
