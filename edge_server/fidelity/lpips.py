@@ -4,6 +4,9 @@ Features after each slice of a frozen AlexNet are normalized over channels, thei
 difference is weighted by the learned (not squared) channel weights, averaged over pixels and summed over
 slices. The thesis's (3.35) squares the weights and does not mention the normalization; papers and tools
 report the published network, and so does this. Distances are comparable only within one network, AlexNet here.
+
+With a mask the pixels outside it are black in both images, and the differences of a slice are averaged with the shares
+of the mask in its cells as weights (mLPIPS of Gao et al., 2022, which enlarges the differences to pixels instead).
 """
 
 from __future__ import annotations
@@ -43,19 +46,22 @@ class Lpips:
         self._lock = threading.Lock()
         self._loaded: Network | None = None
 
-    def __call__(self, rendering: NDArray, truth: NDArray) -> float:
+    def __call__(self, rendering: NDArray, truth: NDArray, mask: NDArray[np.bool_] | None = None) -> float:
         """Distance of two images as ``images.to_unit`` takes them: 0 for equal ones, about 1 for unrelated
         ones.
 
+        mask: (H, W), the pixels to score, at least one; None: all.
         Raises ImageError where a side is shorter than ``minimum_side``.
         """
         a, b = to_unit(rendering, "rendering"), to_unit(truth, "truth")
         same_size(a, b)
-        return float(self.batch(a[None], b[None])[0])
+        return float(self.batch(a[None], b[None], None if mask is None else mask[None])[0])
 
-    def batch(self, renderings: NDArray, truths: NDArray) -> NDArray[np.float64]:
-        """Distances (N,) of image pairs (N, H, W, 3), floating in [0, 1], finite. Raises ImageError for other
-        shapes, a side shorter than ``minimum_side``, or a distance that is not finite."""
+    def batch(
+        self, renderings: NDArray, truths: NDArray, masks: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.float64]:
+        """Distances (N,) of image pairs (N, H, W, 3), floating in [0, 1], finite; masks: (N, H, W). Raises ImageError
+        for other shapes, a side shorter than ``minimum_side``, or a distance that is not finite."""
         if renderings.shape != truths.shape or renderings.ndim != 4 or renderings.shape[3] != 3:
             raise ImageError(f"expected two (N, H, W, 3) stacks, got {renderings.shape} and {truths.shape}")
         height, width = renderings.shape[1:3]
@@ -63,7 +69,9 @@ class Lpips:
             raise ImageError(
                 f"LPIPS needs images of at least {MINIMUM_SIDE} x {MINIMUM_SIDE} pixels, got {width} x {height}"
             )
-        distances = self._network().distances(renderings, truths)
+        if masks is not None:
+            renderings, truths = renderings * masks[..., None], truths * masks[..., None]
+        distances = self._network().distances(renderings, truths, masks)
         if not np.isfinite(distances).all():
             raise ImageError("LPIPS is not finite: an image holds NaN, infinity or values far outside [0, 1]")
         return distances

@@ -32,8 +32,11 @@ class Network:
         self._parameters = {key: torch.from_numpy(array) for key, array in parameters.items()}
         self._lin = [torch.from_numpy(each) for each in lin]
 
-    def distances(self, renderings: NDArray, truths: NDArray) -> NDArray[np.float64]:
-        """Distances (N,) of image pairs (N, H, W, 3), floating in [0, 1]."""
+    def distances(
+        self, renderings: NDArray, truths: NDArray, masks: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.float64]:
+        """Distances (N,) of image pairs (N, H, W, 3), floating in [0, 1]. masks: (N, H, W), the weights of pixels in
+        the averages; None: all weigh the same."""
         n = len(renderings)
         with torch.inference_mode(), one_torch_thread():
             x = np.concatenate([renderings, truths]).astype(np.float32).transpose(0, 3, 1, 2)
@@ -43,9 +46,18 @@ class Network:
             for features, lin in zip(_slices(self._parameters, pixels), self._lin):
                 unit = features / (features.square().sum(1, keepdim=True).sqrt() + EPSILON)
                 weighted = (unit[:n] - unit[n:]).square() * lin.view(1, -1, 1, 1)
-                total += weighted.double().sum(1).mean((1, 2))
+                total += _mean(weighted.double().sum(1), masks)
         found: NDArray[np.float64] = total.numpy()
         return found
+
+
+def _mean(values: Tensor, masks: NDArray[np.bool_] | None) -> Tensor:
+    """Mean (N,) of ``values`` (N, h, w), weighted by the share of ``masks`` (N, H, W) in each cell."""
+    if masks is None:
+        return values.mean((1, 2))
+    _, height, width = values.shape
+    shares = F.adaptive_avg_pool2d(torch.from_numpy(masks.astype(np.float64)), (height, width))
+    return (values * shares).sum((1, 2)) / shares.sum((1, 2))
 
 
 def _slices(p: Parameters, x: Tensor) -> list[Tensor]:

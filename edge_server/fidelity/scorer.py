@@ -37,7 +37,7 @@ class PerceptualMetric(Protocol):
 
     minimum_side: int
 
-    def __call__(self, rendering: NDArray, truth: NDArray) -> float: ...
+    def __call__(self, rendering: NDArray, truth: NDArray, mask: NDArray[np.bool_] | None = None) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ class Score:
 
     camera: the held-out camera, or several joined by commas.
     published_ns: the present.
-    psnr_db: over the whole image.
+    psnr_db: over the whole image; as every score, within the mask if there is one.
     psnr_moving_db: over the pixels that are known to move; None where none are.
     psnr_still_db: over the other pixels; None where all move.
-    ssim, lpips: None where the image is too small, lpips also without weights.
+    ssim, lpips: None where the image, or for SSIM the mask, is too small; lpips also without weights.
     truth_gap_ms: capture of the truth minus the present; None on selected views.
     moving_share: share of the pixels that are known to move.
     on: the kind of truth.
@@ -93,6 +93,7 @@ class Scorer:
         earlier: Sequence[NDArray] = (),
         bound: float = BOUND,
         psnr_only: bool = False,
+        mask: NDArray[np.bool_] | None = None,
     ) -> Score:
         """Score one rendering against one truth.
 
@@ -101,24 +102,27 @@ class Scorer:
         earlier: earlier truths of the same camera, which show what pixels move.
         bound: difference in [0, 1] above which a pixel moves.
         psnr_only: the other metrics, which cost more, are None.
-        Raises ImageError for NaN, infinity or a wrong shape in either image.
+        mask: (H, W), the pixels to score; None: all.
+        Raises ImageError for NaN, infinity or a wrong shape in either image, or a mask of nothing.
         """
         a = to_unit(rendering, "rendering")
         b = to_unit(truth, "held-out frame", self.background)
         moving = moving_mask(b, earlier, bound)
-        total = psnr(a, b)
-        assert total is not None  # no mask was given
+        total = psnr(a, b, mask)
+        if total is None:
+            raise ImageError("held-out frame: every pixel is masked")
+        scored = np.ones_like(moving) if mask is None else mask
         side = 0 if psnr_only else min(a.shape[:2])
         return Score(
             camera=camera,
             published_ns=published_ns,
             psnr_db=total,
-            psnr_moving_db=psnr(a, b, moving),
-            psnr_still_db=psnr(a, b, ~moving),
-            ssim=ssim(a, b) if side >= TAPS else None,
-            lpips=self._lpips(a, b) if self._lpips is not None and side >= self._lpips.minimum_side else None,
+            psnr_moving_db=psnr(a, b, moving & scored),
+            psnr_still_db=psnr(a, b, ~moving & scored),
+            ssim=ssim(a, b, mask) if side >= TAPS else None,
+            lpips=self._lpips(a, b, mask) if self._lpips is not None and side >= self._lpips.minimum_side else None,
             truth_gap_ms=(generated_ns - published_ns) / 1e6,
-            moving_share=float(moving.mean()),
+            moving_share=float(moving[scored].mean()),
         )
 
     def score_selected(self, renderings: Sequence[tuple[str, NDArray, NDArray]], published_ns: int) -> Score | None:

@@ -3,7 +3,8 @@
 Window: 11-tap Gaussian, sigma 1.5; K = (0.01, 0.03) on a range of 1 (the thesis writes k L^2 where the
 paper squares K too; the paper's is what every tool computes). Variances are the window's weighted ones,
 without Bessel's correction. **Valid region only**: the map is averaged where the window lies wholly
-inside the image, so that no border rule matters; the three channels are scored separately and averaged.
+inside the image, so that no border rule matters; the three channels are scored separately and averaged. With a mask
+it is averaged where the window lies wholly within the mask, too: a pixel outside it has no effect.
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ def gaussian_window() -> NDArray[np.float64]:
     return w / w.sum()
 
 
-def ssim(rendering: NDArray, truth: NDArray) -> float:
+def ssim(rendering: NDArray, truth: NDArray, mask: NDArray[np.bool_] | None = None) -> float | None:
     """Mean SSIM in [-1, 1]; 1 for equal images of any content.
 
     Images are as ``images.to_unit`` takes them; both sides at least 11 pixels, else ImageError.
+    mask: (H, W), the pixels to score; None: all. Where no window fits in, the result is None.
     """
     a, b = to_unit(rendering, "rendering"), to_unit(truth, "truth")
     same_size(a, b)
@@ -43,7 +45,16 @@ def ssim(rendering: NDArray, truth: NDArray) -> float:
     cov = _windowed(a * b) - mu_a * mu_b
     luminance = (2.0 * mu_a * mu_b + C1) / (mu_a * mu_a + mu_b * mu_b + C1)
     structure = (2.0 * cov + C2) / (var_a + var_b + C2)
-    return float(np.clip((luminance * structure).mean(), -1.0, 1.0))
+    values = luminance * structure
+    if mask is not None:
+        values = values[_windows_within(mask)]
+    return float(np.clip(values.mean(), -1.0, 1.0)) if values.size else None
+
+
+def _windows_within(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Windows of the valid region, (H - 10, W - 10), all of whose pixels are in the mask (H, W)."""
+    half, window = TAPS // 2, np.ones((TAPS, TAPS), np.uint8)
+    return np.asarray(cv2.erode(mask.astype(np.uint8), window)[half:-half, half:-half] > 0)
 
 
 def _windowed(image: Image) -> Image:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +12,9 @@ from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.scene import HELD_OUT, Scene
-from edge_server.experiments.scenes.recorded import MultiviewStill
+from edge_server.experiments.scenes.recorded import LEAST_WEIGHT, MultiviewStill
 from edge_server.fidelity.baselines import baseline
-from edge_server.fidelity.images import BLACK, Color, to_unit
+from edge_server.fidelity.images import BLACK, Color
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import Field, View
 
@@ -55,17 +53,10 @@ def known_options(scene: Scene, nearest_m: float) -> dict[str, Any]:
 
 
 def score_views(field: Field, views: Sequence[View], scorer: Scorer) -> tuple[Score, NDArray[np.float32]]:
-    """Mean score over ``views``, and the rendering (H, W, 3) of the first."""
+    """Mean score over ``views``, within their masks, and the rendering (H, W, 3) of the first."""
     renderings = [field.render(v.camera_to_world, v.intrinsics).color for v in views]
-    return mean_score([_score(scorer, v, image) for v, image in zip(views, renderings)]), renderings[0]
-
-
-def _score(scorer: Scorer, view: View, image: NDArray[np.float32]) -> Score:
-    """The score of the pixels that the view's mask keeps: the others count as right, and not in the mean of PSNR."""
-    if view.weight is None:
-        return scorer.score(view.camera, image, 0, view.image, 0)
-    kept = view.weight > 0.5
-    truth = to_unit(view.image, "held-out view", scorer.background)
-    found = scorer.score(view.camera, np.where(kept[..., None], image, truth), 0, view.image, 0)
-    share = max(float(kept.mean()), 1.0 / kept.size)
-    return replace(found, psnr_db=found.psnr_db + 10.0 * math.log10(share))
+    masks = [None if v.weight is None else v.weight > LEAST_WEIGHT for v in views]
+    scores = [
+        scorer.score(v.camera, image, 0, v.image, 0, mask=mask) for v, image, mask in zip(views, renderings, masks)
+    ]
+    return mean_score(scores), renderings[0]

@@ -13,6 +13,8 @@ from edge_server.fields import View
 
 # Value of --holdout for the split that the data set itself defines.
 OWN_SPLIT = "split"
+# A pixel whose weight is larger is scored: undistortion and shrinking leave some that are masked in part.
+LEAST_WEIGHT = 0.5
 
 
 @dataclass(frozen=True)
@@ -59,8 +61,14 @@ def load_recorded(
     own = [key for key, record in found.items() if record.name in dataset.held_out]
     training, held_out = split(list(found), holdout or (OWN_SPLIT if own else "8"), own)
     views = {key: _view(key, found[key]) for key in (*training, *held_out)}
-    trained, kept = (tuple(views[key] for key in keys) for keys in (training, held_out))
-    return MultiviewStill(file.resolve().parent.name, trained, kept, file, instant, dataset.missing, dataset.notes)
+    blank = [key for key, v in views.items() if v.weight is not None and not (v.weight > LEAST_WEIGHT).any()]
+    if not set(training) - set(blank):
+        raise DatasetError(f"{file}: masks leave nothing of the training images: are they inverted?")
+    notes = dataset.notes
+    if blank:
+        notes += (f"masks leave nothing of {len(blank)} images, first {blank[0]}: they are not used",)
+    trained, kept = (tuple(views[k] for k in keys if k not in blank) for keys in (training, held_out))
+    return MultiviewStill(file.resolve().parent.name, trained, kept, file, instant, dataset.missing, notes)
 
 
 def split(names: Sequence[str], holdout: str, own: Collection[str] = ()) -> tuple[list[str], list[str]]:

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from edge_server.fidelity import lpips_network
 from edge_server.fidelity.images import ImageError
 from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, open_lpips, weights_folder
 from tests.conftest import data_dir
@@ -41,11 +42,31 @@ def test_golden_blurs_of_a_photograph():
     assert distances == pytest.approx(GOLDEN_BLUR, rel=0.1)
 
 
+def test_a_mask_blackens_the_rest_and_weighs_each_cell_of_a_slice_by_its_share():
+    import torch
+    from torch.nn.functional import adaptive_avg_pool2d
+
+    lpips = metric()
+    a, b = np.random.default_rng(3).random((2, 64, 96, 3))
+    mask = np.ones((64, 96), bool)
+    mask[:, 70:] = mask[50:, :10] = False
+    distance, black = lpips(a, b, mask), (a * mask[..., None], b * mask[..., None])
+    assert distance == lpips(*black, mask) != pytest.approx(lpips(*black), rel=0.01)
+    assert lpips(a, b, np.ones_like(mask)) == pytest.approx(lpips(a, b), abs=1e-12)
+    network, expected = lpips._network(), 0.0
+    x = torch.from_numpy(np.stack(black).astype(np.float32).transpose(0, 3, 1, 2)) * 2 - 1
+    x = (x - torch.tensor(lpips_network.SHIFT).view(3, 1, 1)) / torch.tensor(lpips_network.SCALE).view(3, 1, 1)
+    for found, weights in zip(lpips_network._slices(network._parameters, x), lpips._lin):
+        unit = (found / found.norm(dim=1, keepdim=True).clamp_min(1e-9)).double().numpy()
+        map_ = ((unit[0] - unit[1]) ** 2 * weights[:, None, None]).sum(0)
+        share = adaptive_avg_pool2d(torch.from_numpy(mask.astype(float))[None], map_.shape)[0].numpy()
+        expected += np.average(map_, weights=share)
+    assert distance == pytest.approx(expected, rel=1e-4)
+
+
 def test_it_computes_with_one_thread_whatever_torch_may_use(monkeypatch):
     """Two that spin for each other take forty times as long on a busy machine, and may round otherwise."""
     import torch
-
-    from edge_server.fidelity import lpips_network
 
     lpips, used, conv2d = metric(), [], torch.nn.functional.conv2d
 

@@ -7,7 +7,7 @@ from edge_server.fidelity.images import ImageError
 from edge_server.fidelity.ssim import ssim
 
 
-def reference_ssim(a, b):
+def reference_ssim(a, b, mask=None):
     """(3.33) window by window, with an explicit 11 x 11 Gaussian: slow, and nothing to get wrong."""
     x = np.arange(-5, 6)
     w = np.exp(-(x[:, None] ** 2 + x[None, :] ** 2) / (2 * 1.5**2))
@@ -16,6 +16,8 @@ def reference_ssim(a, b):
     for channel in range(3):
         for row in range(a.shape[0] - 10):
             for column in range(a.shape[1] - 10):
+                if mask is not None and not mask[row : row + 11, column : column + 11].all():
+                    continue
                 p = a[row : row + 11, column : column + 11, channel]
                 q = b[row : row + 11, column : column + 11, channel]
                 mp, mq = (w * p).sum(), (w * q).sum()
@@ -32,6 +34,20 @@ def test_equals_the_definition(shape):
     a = rng.random((*shape, 3))
     b = np.clip(a + rng.normal(0, 0.2, a.shape), 0, 1)
     assert ssim(a, b) == pytest.approx(reference_ssim(a, b), abs=1e-9)
+
+
+def test_a_mask_leaves_the_windows_that_lie_wholly_within_it():
+    rng = np.random.default_rng(5)
+    a, b = rng.random((2, 40, 37, 3))
+    mask = np.ones((40, 37), bool)
+    mask[:9, 3] = mask[30, :20] = mask[39, 36] = False
+    assert ssim(a, b, mask) == pytest.approx(reference_ssim(a, b, mask), abs=1e-9)
+    assert ssim(a, b, np.ones_like(mask)) == ssim(a, b)
+    mask[:] = False
+    mask[4:15, 20:31] = True
+    assert ssim(a, b, mask) == pytest.approx(reference_ssim(a[4:15, 20:31], b[4:15, 20:31]), abs=1e-9)
+    mask[4, 20] = False
+    assert ssim(a, b, mask) is None
 
 
 def test_an_image_smaller_than_the_window_is_refused():

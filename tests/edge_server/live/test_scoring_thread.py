@@ -164,7 +164,7 @@ class LoadsLong:
     minimum_side = 1
     loaded = False
 
-    def __call__(self, a: Any, b: Any) -> float:
+    def __call__(self, a: Any, b: Any, mask: Any) -> float:
         begun_s = time.thread_time()
         while not self.loaded and time.thread_time() < begun_s + 0.2:
             pass
@@ -178,7 +178,7 @@ def test_what_a_metric_loads_is_not_charged(monkeypatch: Any) -> None:
 
 
 def test_a_metric_that_cannot_be_loaded_costs_its_own_scores_alone() -> None:
-    def broken(a: Any, b: Any) -> float:
+    def broken(a: Any, b: Any, mask: Any) -> float:
         raise RuntimeError("no weights")
 
     broken.minimum_side = 48  # larger than the frames: of them it is not asked

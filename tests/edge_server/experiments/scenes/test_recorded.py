@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,6 +14,8 @@ from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.datasets.transforms import load_dataset
 from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.experiments.scenes.recorded import load_recorded
+from edge_server.fidelity.images import ImageError
+from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import View
 from freshfield.geometry import Pinhole
@@ -117,20 +120,48 @@ def test_one_camera_with_times_has_one_view_of_each_instant(tmp_path):
         load_recorded(tmp_path, "0")
 
 
-def test_masked_pixels_are_not_scored():
-    truth = np.full((24, 32, 3), 100, np.uint8)
-    rendering = np.full((24, 32, 3), 110 / 255, np.float32)
-    rendering[12:] = 0.9
-    weight = np.ones((24, 32), np.float32)
-    weight[12:] = 0.0
-    whole = View("a", truth, np.eye(4), Pinhole(32, 24, 30.0, 30.0, 16.0, 12.0))
+@pytest.mark.parametrize("masked", [0.0, 0.9])
+def test_masked_pixels_are_not_scored(masked):
+    truth = np.full((64, 32, 3), 100, np.uint8)
+    rendering = np.full((64, 32, 3), 110 / 255, np.float32)
+    rendering[32:] = masked
+    weight = np.ones((64, 32), np.float32)
+    weight[32:] = 0.5
+    whole = View("a", truth, np.eye(4), Pinhole(32, 64, 30.0, 30.0, 16.0, 32.0))
 
     class Renders:
         def render(self, *_):
             return SimpleNamespace(color=rendering)
 
-    score, _ = score_views(Renders(), [replace(whole, weight=weight)], Scorer())
-    assert score.psnr_db == pytest.approx(20 * np.log10(255 / 10), abs=0.01)
+    scorer = Scorer(open_lpips(data_dir("lpips"))[0])
+    score, _ = score_views(Renders(), [replace(whole, weight=weight)], scorer)
+    part = scorer.score("a", rendering[:32], 0, truth[:32], 0)
+    assert score.psnr_db == score.psnr_still_db == pytest.approx(20 * np.log10(255 / 10), abs=0.01)
+    assert score.ssim == pytest.approx(part.ssim, abs=1e-9)
+    assert 0.0 < score.lpips == scorer.score("a", rendering, 0, truth, 0, mask=weight > 0.5).lpips
+    earlier = truth.copy()
+    earlier[24:] += 50
+    score = scorer.score("a", rendering, 0, truth, 0, [earlier], psnr_only=True, mask=weight > 0.5)
+    assert (score.moving_share, score.psnr_moving_db) == (0.25, pytest.approx(part.psnr_db))
+    with pytest.raises(ImageError, match="every pixel is masked"):
+        scorer.score("a", rendering, 0, truth, 0, mask=weight > 1)
+
+
+def test_images_of_which_masks_leave_nothing_are_said_and_not_used(tmp_path):
+    file = write_photos(tmp_path, 4, 32)
+    data = json.loads(file.read_text())
+    cv2.imwrite(str(tmp_path / "black.png"), np.zeros((32, 32), np.uint8))
+    for frame in data["frames"][2:]:
+        frame["mask_path"] = "black.png"
+    file.write_text(json.dumps(data))
+    found = load_recorded(tmp_path, "3")
+    assert (len(found.training), len(found.held_out)) == (1, 1)
+    assert found.notes[-1].startswith("masks leave nothing of 2 images, first ")
+    for frame in data["frames"]:
+        frame["mask_path"] = "black.png"
+    file.write_text(json.dumps(data))
+    with pytest.raises(DatasetError, match="masks leave nothing of the training images"):
+        load_recorded(tmp_path, "2")
 
 
 def test_a_frame_of_what_has_none_is_refused(tmp_path):
