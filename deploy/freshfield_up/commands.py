@@ -135,6 +135,6 @@ def program(name: str) -> str:
     if found is None:
         raise MissingCommand(
             f"{name} is not installed beside {sys.executable}; use `make demo`, or install the project "
-            "there with: pip install -e '.[edge,embed]'"
+            "there with: pip install -e '.[edge]'"
         )
     return found
