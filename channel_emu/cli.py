@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line. argv: arguments without the program's name; None: those of the process.
 
     Returns the exit status: 0; 1 if the live emulator failed; 2 for bad input. KeyboardInterrupt and BrokenPipeError
-    are for ``freshfield.console``.
+    are for ``freshfield_up.console``.
     """
     parser = argparse.ArgumentParser(
         prog="channel-emu", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter

@@ -45,7 +45,7 @@ In the help of a command, [x] after an option is its default.
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status: 0, 1 (it failed while running) or 2 (bad input). KeyboardInterrupt
-    and BrokenPipeError are for ``freshfield.console``."""
+    and BrokenPipeError are for ``freshfield_up.console``."""
     parser = argparse.ArgumentParser(
         prog="edge-server", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from freshfield import console
 from freshfield.machine_load import LoadMeter
 from freshfield.scenario import Scenario
-from freshfield_up import folder, mesh, net
+from freshfield_up import console, folder, mesh, net
 from freshfield_up.commands import ProcessSet, process_set, program
 from freshfield_up.processes import GRACE_S, Child, kill, stop
 from freshfield_up.status import read_json, status_line

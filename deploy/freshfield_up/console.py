@@ -1,4 +1,4 @@
-"""Entry points of the four commands: how each of them ends at Ctrl-C, or when nobody reads its output.
+"""Entry points of the installed commands: how each of them ends at Ctrl-C, or when nobody reads its output.
 
 This file imports nothing of the commands until Ctrl-C is harmless, so it knows their modules by name only.
 """

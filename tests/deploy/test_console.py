@@ -11,7 +11,7 @@ import tomllib
 
 import pytest
 
-from freshfield import console
+from freshfield_up import console
 from tests.conftest import ROOT
 
 COMMANDS = {
