@@ -236,6 +236,11 @@ class ColmapConfig(RecordedConfig, frozen=True, kw_only=True):
     background: Background = "white"
 
 
+class HandheldConfig(RecordedConfig, frozen=True, kw_only=True):
+    """One moving camera with depth. data: the folder of a TUM RGB-D sequence (rgb.txt), of a 7-Scenes sequence
+    (frame-*.pose.txt), of a Record3D export "EXR + JPG" (metadata.json), or of Polycam's raw data (keyframes)."""
+
+
 class McapConfig(SourceConfig, frozen=True, kw_only=True):
     """A session that ``edge-server run --record`` wrote, replayed message by message: the same bytes and
     poses, stamps shifted to now, from first to last, after which the node ends. fps, codec, quality and depth are
@@ -260,6 +265,10 @@ MODELS: dict[str, type[SourceConfig]] = {
     "zju": ZjuConfig,
     "eyeful": EyefulConfig,
     "colmap": ColmapConfig,
+    "tum": HandheldConfig,
+    "sevenscenes": HandheldConfig,
+    "record3d": HandheldConfig,
+    "polycam": HandheldConfig,
     "mcap": McapConfig,
     "camera": CameraConfig,
     "oak": OakConfig,

@@ -19,10 +19,10 @@ from camera_node.sources.datasets.records import (
     DatasetError,
     PosedImage,
     camera_to_world,
+    dataset_of_files,
     errors_at,
     file_within,
     find_files,
-    missing_note,
 )
 from freshfield.geometry import quaternion_to_matrix
 from freshfield.untrusted import read_bytes, read_text
@@ -83,11 +83,7 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
         with errors_at(where):
             pose = camera_to_world(quaternion_to_matrix(image.pose[:4]), image.pose[4:])
         found.append(posed_photo(photo, image.name, pose, where))
-    note = missing_note(missing, len(entries), folder) if missing else ""
-    if not found:
-        raise DatasetError(f"{file}: none of its images exists: {note or 'it lists none'}")
-    with errors_at(str(file.with_stem("images"))):
-        return Dataset(tuple(found), len(missing), notes=(note,) if note else ())
+    return dataset_of_files(found, missing, folder, str(file.with_stem("images")))
 
 
 def _mask(folder: Path, root: Path, name: str) -> Path | None:

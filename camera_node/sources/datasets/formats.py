@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 from camera_node.settings import MODELS, RecordedConfig, VideoConfig
+from camera_node.sources.datasets import rgbd
 from camera_node.sources.datasets.photo import ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, find_files, read_json
 
@@ -19,7 +20,7 @@ FORMATS = tuple(kind for kind, model in MODELS.items() if issubclass(model, Reco
 
 
 # What scanners and other tools leave, and the command of nerfstudio that makes a transforms.json of it.
-_CONVERTED = {"metadata.json": "record3d", "keyframes": "polycam", "cameras.xml": "metashape"}
+_CONVERTED = {"cameras.xml": "metashape"}
 
 
 class Reader(Protocol):
@@ -34,7 +35,8 @@ class Reader(Protocol):
 
 def reader(name: str) -> Reader:
     """Import and return the reader module of a format, one of ``FORMATS``."""
-    return cast(Reader, importlib.import_module(f"camera_node.sources.datasets.{name}"))
+    room = "rgbd." if name in rgbd.FORMATS else ""
+    return cast(Reader, importlib.import_module(f"camera_node.sources.datasets.{room}{name}"))
 
 
 def open_configured(path: Path, config: RecordedConfig) -> Dataset:
@@ -53,8 +55,10 @@ def recognize(file: Path) -> str:
     Returns ``transforms`` if nothing matches; its reader then reports what is missing. Raises DatasetError
     for a damaged JSON file.
     """
+    if file.name == "metadata.json":
+        return "record3d"
     if file.suffix in (".bin", ".txt"):
-        return "colmap"
+        return {"rgb.txt": "tum", "frame-000000.pose.txt": "sevenscenes"}.get(file.name, "colmap")
     data = read_json(file) if file.suffix == ".json" else None
     if isinstance(data, dict):
         return "transforms" if "frames" in data else "eyeful" if "KRT" in data else "video"
@@ -92,5 +96,6 @@ def open_dataset(path: Path, scale: float = 1.0, name: str | None = None) -> tup
             raise DatasetError(f"{path}: holds {file_name}, of {tool}: convert it with ns-process-data {tool}")
     raise DatasetError(
         f"{path}: holds no data set: expected transforms.json, transforms_*.json, the calibration JSON of "
-        "videos, poses_bounds.npy, annots.npy, Eyeful's cameras.json or a COLMAP model"
+        "videos, poses_bounds.npy, annots.npy, Eyeful's cameras.json, a COLMAP model, or an export of a depth camera "
+        "(rgb.txt, frame-000000.pose.txt, metadata.json, keyframes)"
     )

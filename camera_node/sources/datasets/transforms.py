@@ -19,7 +19,6 @@ from typing import Any, get_args
 import numpy as np
 
 from camera_node.settings import Background
-from camera_node.sources.datasets.depth_file import DepthFile
 from camera_node.sources.datasets.imaging import image_size
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
@@ -35,6 +34,7 @@ from camera_node.sources.datasets.records import (
     read_array,
     read_json,
 )
+from camera_node.sources.datasets.rgbd.depth_file import DepthFile
 from camera_node.sources.datasets.transforms_keys import CAMERA_NAMES, check_keys, unknown_note
 from freshfield.geometry import OPENGL_TO_OPENCV
 

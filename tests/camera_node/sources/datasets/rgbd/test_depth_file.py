@@ -12,10 +12,10 @@ import pytest
 from camera_node.capture import build_cameras
 from camera_node.settings import source_config
 from camera_node.sources.datasets import transforms
-from camera_node.sources.datasets.depth_file import DepthFile
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import ImageOptions, Photo
 from camera_node.sources.datasets.records import DatasetError
+from camera_node.sources.datasets.rgbd.depth_file import DepthFile
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 from tests.conftest import data_dir
 

@@ -56,9 +56,10 @@ class DepthFile:
             unit = MILLIMETER
         counts = np.where(measured, values, 0).astype(np.uint16)
         if self.lens is not None:
-            if counts.shape != (self.lens.height, self.lens.width):
-                raise DatasetError(f"{self.path}: {_size(counts)}, expected {self.lens.width} x {self.lens.height}")
-            return DepthImage(counts, unit, self.lens, self.to_camera)
+            lens = self.lens.scaled(counts.shape[1] / self.lens.width)  # of a smaller copy
+            if counts.shape != (lens.height, lens.width):
+                raise DatasetError(f"{self.path}: {_size(counts)}, its sensor {self.lens.width} x {self.lens.height}")
+            return DepthImage(counts, unit, lens, self.to_camera)
         return DepthImage(self._registered(counts, photo), unit)
 
     def _registered(self, counts: NDArray[np.uint16], photo: Photo) -> NDArray[np.uint16]:

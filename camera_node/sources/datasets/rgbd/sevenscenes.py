@@ -1,0 +1,65 @@
+"""7-Scenes (Shotton et al., "Scene Coordinate Regression Forests", CVPR 2013): one hand-held Kinect.
+
+    frame-000000.color.png  640 x 480
+    frame-000000.depth.png  millimeters, 65535 where nothing was measured; not registered to the image
+    frame-000000.pose.txt   camera-to-world (4 x 4) of the depth camera, OpenCV axes, meters
+
+The data set gives a focal length of 585 px for depth, and neither the image's lens nor where depth lies to it. Those
+here are nominal, and of another Kinect whose calibration is commonly used (LIRIS human activities data set, Kinect
+calibration): expect errors of about a pixel.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from camera_node.sources.datasets.lens import Lens
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
+from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage, dataset_of_files, file_within
+from camera_node.sources.datasets.rgbd.depth_file import DepthFile
+from freshfield.geometry import Pinhole, Pose, se3_inverse
+from freshfield.untrusted import read_text
+
+FILES = ("frame-000000.pose.txt",)
+FPS = 30.0
+NOTHING = 65535
+DEPTH_LENS = Pinhole(640, 480, 585.0, 585.0, 320.0, 240.0)
+_LENS = Lens(640, 480, 525.0, 525.0, 320.0, 240.0)
+_DEPTH_TO_CAMERA = Pose.from_matrix(
+    [
+        [9.9996518e-01, 2.6765126e-03, -7.9041012e-03, -2.5558943e-02],
+        [-2.7409311e-03, 9.9996303e-01, -8.1504521e-03, 1.0109636e-04],
+        [7.8819942e-03, 8.1718329e-03, 9.9993555e-01, 2.0318322e-03],
+    ]
+)
+
+
+def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
+    """The frames of a sequence's folder that have an image and a pose. Raises DatasetError."""
+    folder = path if path.is_dir() else path.parent
+    to_depth = se3_inverse(_DEPTH_TO_CAMERA.matrix())
+    images: list[PosedImage] = []
+    missing: list[str] = []
+    for file in sorted(folder.glob("frame-*.pose.txt")):
+        name = file.name.removesuffix(".pose.txt")
+        color, depth = (file_within(folder, f"{name}.{kind}.png") for kind in ("color", "depth"))
+        if color is None:
+            missing.append(f"{name}.color.png")
+            continue
+        reader = DepthFile(depth, nothing=NOTHING, lens=DEPTH_LENS, to_camera=_DEPTH_TO_CAMERA).read if depth else None
+        number = name.removeprefix("frame-")
+        if not number.isdecimal():
+            raise DatasetError(f"{file}: expected frame-NUMBER.pose.txt")
+        photo = Photo(color, _LENS, options, depth=reader)
+        images.append(posed_photo(photo, name, _pose(file) @ to_depth, str(file), time_s=int(number) / FPS))
+    return dataset_of_files(images, missing, folder, str(folder))
+
+
+def _pose(file: Path) -> np.ndarray:
+    try:
+        matrix = np.array(read_text(file).split(), dtype=np.float64).reshape(4, 4)
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{file}: expected a matrix of 4 x 4 numbers: {error}") from None
+    return matrix

@@ -1,0 +1,84 @@
+"""TUM RGB-D (Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012): one hand-held Kinect.
+
+    rgb.txt, depth.txt  seconds file
+    groundtruth.txt     seconds tx ty tz qx qy qz qw, camera-to-world, OpenCV axes, meters
+
+Each image gets the depth and the pose nearest in time, within 20 ms, as with the benchmark's ``associate.py``; images
+without a pose are left out. Depth is registered to the image, 5000 counts a meter. The files hold no intrinsics: the
+benchmark recommends ROS's defaults, and gives others for ``freiburg3``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from camera_node.pose.providers import PoseGapError, TrajectoryError, read_tum
+from camera_node.sources.datasets.lens import Lens
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
+from camera_node.sources.datasets.records import (
+    Dataset,
+    DatasetError,
+    PosedImage,
+    dataset_of_files,
+    errors_at,
+    file_within,
+)
+from camera_node.sources.datasets.rgbd.depth_file import DepthFile
+from freshfield.untrusted import read_text
+
+FILES = ("rgb.txt",)
+METERS_PER_COUNT = 1.0 / 5000.0
+_NEAR_NS = 20_000_000
+# Published with pixel centers at whole numbers, so .5 is added.
+_LENS = Lens(640, 480, 525.0, 525.0, 320.0, 240.0)
+_FREIBURG3 = Lens(640, 480, 535.4, 539.2, 320.6, 248.1)
+
+
+def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
+    """The images of a sequence's folder, or of its ``rgb.txt``. Raises DatasetError."""
+    folder = path if path.is_dir() else path.parent
+    try:
+        poses = read_tum(folder / "groundtruth.txt", interpolate=False, max_gap_ns=_NEAR_NS)
+    except TrajectoryError as error:
+        raise DatasetError(str(error)) from None
+    listed = _listed(folder / "rgb.txt")
+    depth = dict(_listed(folder / "depth.txt"))
+    times = np.array(sorted(depth), dtype=np.int64)
+    lens = _FREIBURG3 if "freiburg3" in folder.resolve().name else _LENS
+    images: list[PosedImage] = []
+    missing: list[str] = []
+    unposed = 0
+    for t_ns, name in listed:
+        where = f"{folder / 'rgb.txt'}: {name}"
+        with errors_at(where):
+            file = file_within(folder, name)
+        if file is None:
+            missing.append(name)
+            continue
+        try:
+            pose, _ = poses.at(t_ns)
+        except PoseGapError:
+            unposed += 1
+            continue
+        nearest = int(times[np.abs(times - t_ns).argmin()]) if times.size else t_ns + 2 * _NEAR_NS
+        with errors_at(f"{folder / 'depth.txt'}"):
+            measured = file_within(folder, depth[nearest]) if abs(nearest - t_ns) <= _NEAR_NS else None
+        photo = Photo(file, lens, options, depth=DepthFile(measured, METERS_PER_COUNT).read if measured else None)
+        images.append(posed_photo(photo, name, pose.matrix(), where, time_s=(t_ns - listed[0][0]) / 1e9))
+    left_out = f"{unposed} of {len(listed)} images have no pose within 20 ms: left out"
+    if unposed and not images:
+        raise DatasetError(f"{folder}: {left_out}")
+    found = dataset_of_files(images, missing, folder, str(folder / "rgb.txt"))
+    return replace(found, notes=(*found.notes, left_out)) if unposed else found
+
+
+def _listed(file: Path) -> list[tuple[int, str]]:
+    """Times (ns) and files of a list. Raises DatasetError."""
+    try:
+        lines = [line.split() for line in read_text(file).splitlines() if line.strip() and line.strip()[0] != "#"]
+        return [(round(float(seconds) * 1e9), name) for seconds, name in lines]
+    except (OSError, ValueError, OverflowError) as error:
+        raise DatasetError(f"{file}: expected lines of seconds and file: {error}") from None
