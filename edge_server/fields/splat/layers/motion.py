@@ -8,8 +8,8 @@ last. The last FREE knots are solved for together by least squares, the FIXED on
 - a view at t with the normal matrix H and the gradient g of ``kernels.align``, taken where D(t) was D_0, says
   H D(t) = H D_0 + g;
 - an acceleration persists: X_k = X_k-1 + v + PERSISTENCE a, v and a the last differences, with a deviation of
-  ACCELERATION_M_PER_S2 dt^2;
-- neighboring anchors move alike: their X_k - X_k-1 differ by NEIGHBOR_M_PER_S dt.
+  ``acceleration_m_per_s2`` dt^2;
+- neighboring anchors move alike: their X_k - X_k-1 differ by ``neighbor_m_per_s`` dt.
 
 A late view needs no special case: it bears on older knots.
 """
@@ -67,11 +67,13 @@ class Motion:
     radius_m: meters of a scene unit.
     rng: generator for the choice of anchors.
     anchors: float64 (K, 3), scene units, places at which the displacement is 0; None: not chosen yet.
+    acceleration_m_per_s2, neighbor_m_per_s: deviations of the prior.
     """
 
     def __init__(self, radius_m: float, rng: np.random.Generator) -> None:
         self.radius_m, self.rng = radius_m, rng
         self.pool: Pool = CallerPool()
+        self.acceleration_m_per_s2, self.neighbor_m_per_s = tuned.ACCELERATION_M_PER_S2, tuned.NEIGHBOR_M_PER_S
         self.forget()
 
     def forget(self) -> None:
@@ -231,7 +233,7 @@ class Motion:
     def _prior_weights(self) -> tuple[float, float]:
         """1 / variance of the persistence of acceleration, and of neighbors moving alike, in scene units."""
         dt = 1.0 / tuned.KNOTS_PER_S
-        steady, alike = tuned.ACCELERATION_M_PER_S2 * dt**2, tuned.NEIGHBOR_M_PER_S * dt
+        steady, alike = self.acceleration_m_per_s2 * dt**2, self.neighbor_m_per_s * dt
         return (self.radius_m / steady) ** 2, (self.radius_m / alike) ** 2
 
     def copy(self) -> Motion:

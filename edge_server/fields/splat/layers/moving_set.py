@@ -42,7 +42,7 @@ class MovingSet:
         self.cloud = GaussianCloud.empty(settings)
         self.anchor, self.share = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
         self.capacity_factor, self.steps, self._grown, self._draws = 1.0, 0, 0, 0
-        self.motion = Motion(box.radius_m, self._rng(0))
+        self.motion, self.few = Motion(box.radius_m, self._rng(0)), False
         self.raster = RasterBuffers(pool)
 
     def __len__(self) -> int:
@@ -62,6 +62,17 @@ class MovingSet:
         """Let the capacity follow the foreground's share of the pixels: up at once, down slowly."""
         now = min(max(share / tuned.USUAL_SHARE, 1.0), tuned.MOST_FOREGROUND)
         self.capacity_factor = max(tuned.FOREGROUND_DECAY * self.capacity_factor, now)
+
+    def bind(self, cameras: int) -> None:
+        """Choose how motion is bound, by the number of cameras."""
+        self.few = cameras <= tuned.FEW_CAMERAS
+        if self.few:
+            far_m = self.box.distance_m
+            self.motion.acceleration_m_per_s2 = min(tuned.FEW_ACCELERATION_M_PER_S2, far_m)
+            self.motion.neighbor_m_per_s = min(tuned.FEW_NEIGHBOR_M_PER_S, far_m)
+        else:
+            self.motion.acceleration_m_per_s2 = tuned.ACCELERATION_M_PER_S2
+            self.motion.neighbor_m_per_s = tuned.NEIGHBOR_M_PER_S
 
     # --- at an instant ------------------------------------------------------------------------
 
@@ -209,7 +220,8 @@ class MovingSet:
         if self.motion.anchors is not None:
             self.cloud.params[:, :3] = self.places(instant_s)
         places = self.cloud.params[:, :3]
-        count = min(round(tuned.ANCHORS * self.capacity_factor), max(1, len(places) // tuned.GAUSSIANS_AN_ANCHOR))
+        count = round((tuned.FEW_ANCHORS if self.few else tuned.ANCHORS) * self.capacity_factor)
+        count = min(count, max(1, len(places) // tuned.GAUSSIANS_AN_ANCHOR))
         self.motion.choose_anchors(places, opacity(self.cloud.params), count, instant_s)
         self.anchor, self.share = self.motion.attach(places, instant_s)
 

@@ -79,6 +79,13 @@ MISSING_ERROR = 0.12  # color error, in the worst channel, above which foregroun
 SEEDS_A_PIXEL = 0.1
 FEW = 32  # Gaussians: all foreground needs new ones below this
 
+# --- few cameras ---
+# Up to four views leave more of the motion open: it is bound more tightly, has more anchors, and is seeded sooner.
+# Accelerations and speeds are at most the cameras' distance to the scene, a second squared and a second: what is seen
+# from near is small and slow.
+FEW_CAMERAS = 4
+FEW_ANCHORS, FEW_ACCELERATION_M_PER_S2, FEW_NEIGHBOR_M_PER_S, FEW_SEED_EVERY_S = 32, 3.0, 3.0, 0.07
+
 # --- following motion (tracker) ---
 # Most passes of Gauss-Newton over a stride, and the median movement of anchors that calls for another one.
 PASSES, AGAIN_M = 3, 0.02

@@ -55,6 +55,7 @@ class MotionTracker:
         """
         moving, newest_s = self.moving, self.observations.newest_s
         self.fits += 1
+        moving.bind(len(self.cameras))
         moving.follow_foreground(float(np.mean([o.share for o in self.observations])))
         strides = self._strides()
         for until_s in strides:
@@ -73,7 +74,8 @@ class MotionTracker:
             publish()
         since_s, begun = newest_s - self.seeded_s, self.times.now()
         has_room = pace.has_room(self._seed_time.seconds, 1.0, 0.0) or since_s >= tuned.SEED_AT_LEAST_EVERY_S
-        if not moving.alive or (since_s >= tuned.SEED_EVERY_S and has_room):
+        every_s = tuned.FEW_SEED_EVERY_S if moving.few else tuned.SEED_EVERY_S
+        if not moving.alive or (since_s >= every_s and has_room):
             self.seeded_s = newest_s
             self._seed()
             self._seed_time.add(self.times.add("seeding", begun) - begun)

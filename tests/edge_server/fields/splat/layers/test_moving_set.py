@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -48,6 +50,19 @@ def _set_of(places_m: np.ndarray) -> MovingSet:
     moving.cloud = GaussianCloud.new(params)
     moving.renew_anchors(INSTANT_S)
     return moving
+
+
+@pytest.mark.parametrize(
+    ("cameras", "distance_m", "bounds"), [(4, 3.2, (3.0, 3.0)), (2, 0.9, (0.9, 0.9)), (5, 0.9, (5.0, 2.0))]
+)
+def test_motion_of_few_cameras_is_bound_by_their_distance(
+    cameras: int, distance_m: float, bounds: tuple[float, float]
+) -> None:
+    """Acceleration and difference of neighbors' speeds; five cameras are not few."""
+    moving = MovingSet(SplatSettings(), CallerPool(), replace(BOX, distance_m=distance_m), 0)
+    moving.bind(2)
+    moving.bind(cameras)
+    assert (moving.motion.acceleration_m_per_s2, moving.motion.neighbor_m_per_s) == bounds
 
 
 @pytest.mark.parametrize(("outside", "left"), [(6, 14), (14, 0)])
