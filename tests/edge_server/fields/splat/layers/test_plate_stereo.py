@@ -1,0 +1,138 @@
+"""Depth of plates by stereo, against the exact depth of the synthetic room."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from camera_node.synthetic import make_scene
+from edge_server.fields import View
+from edge_server.fields.common.scene_box import scene_box
+from edge_server.fields.common.threads.thread_pool import shared_pool
+from edge_server.fields.splat.layers.plate_stereo import sweep_plates
+from edge_server.fields.splat.layers.static_layer import PlateImage
+from freshfield.geometry import Pinhole
+
+Plates = list[PlateImage]
+
+
+@cache
+def _room(count: int, size: int = 128) -> tuple[Plates, NDArray[np.float64]]:
+    """Plates of the room without a person, and their depths (N, H, W)."""
+    scene = make_scene("room", {"count": count + 1, "width": size, "height": size, "people": 0, "supersample": 2})
+    plates, depths = [], []
+    for name, (lens, pose) in list(scene.cameras.items())[1:]:
+        renderer = scene.renderer(name)
+        plates.append(_plate(View(name, renderer.image(0.0), pose, lens)))
+        # Of the four rays around a pixel's center.
+        fine = renderer.distance() * lens.scaled(2).rays()[..., 2]
+        depths.append(fine.reshape(size, 2, size, 2).mean(axis=(1, 3)))
+    return plates, np.stack(depths)
+
+
+def _plate(view: View) -> PlateImage:
+    return PlateImage(view, view.image.astype(np.float32), np.ones(view.image.shape[:2], bool))
+
+
+def _sweep(plates: Sequence[PlateImage]) -> NDArray[np.float32]:
+    """Depths (N, H, W) of the plates that are as large as the first."""
+    found = sweep_plates(plates, scene_box([p.view for p in plates]), shared_pool())
+    assert all(depth.dtype == np.float32 and depth.shape == p.known.shape for depth, p in zip(found, plates))
+    assert all(np.isfinite(depth).all() and (depth >= 0).all() for depth in found)
+    return np.stack([depth for depth in found if depth.shape == found[0].shape])
+
+
+def _changed(plates: Plates, change: dict[int, NDArray]) -> Plates:
+    """Plates with other colors, by number."""
+    return [p._replace(color=np.asarray(change.get(k, p.color), np.float32)) for k, p in enumerate(plates)]
+
+
+@pytest.mark.parametrize(("count", "share", "median", "right"), [(3, 0.5, 0.015, 0.75), (4, 0.75, 0.01, 0.88)])
+def test_most_of_the_room_is_found(count: int, share: float, median: float, right: float) -> None:
+    """share: of the pixels with depth; median: relative error; right: share of these within 5 %."""
+    plates, truth = _room(count)
+    found = _sweep(plates)
+    there = found > 0
+    error = np.abs(found - truth)[there] / truth[there]
+    assert there.mean() > share and np.median(error) < median and (error < 0.05).mean() > right
+
+
+def test_what_is_unknown_has_no_depth_and_says_nothing() -> None:
+    plates, _ = _room(3, 64)
+    known = np.ones((64, 64), bool)
+    known[20:50, 20:50] = False
+    hidden = [plates[0]._replace(known=known), *plates[1:]]
+    found = _sweep(hidden)
+    assert (found[0][~known] == 0).all() and (found[0][known] > 0).mean() > 0.3
+    # Whatever stands there: nothing is compared with it.
+    color = plates[0].color.copy()
+    color[22:48, 22:48] = np.nan
+    np.testing.assert_array_equal(found, _sweep([hidden[0]._replace(color=color), *plates[1:]]))
+
+
+def test_large_plates_are_matched_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
+    plates, truth = _room(4)
+    monkeypatch.setattr("edge_server.fields.splat.layers.settings.SWEEP_PIXELS", 64 * 64)
+    found = _sweep(plates)
+    there = found > 0
+    assert there.mean() > 0.6 and np.median(np.abs(found - truth)[there] / truth[there]) < 0.03
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("unit", [1.0 / 3.0, 2.0, 1e-3, 1e4])
+def test_other_units_change_nothing(unit: float) -> None:
+    plates, _ = _room(3, 64)
+    poses = [p.view.camera_to_world * np.array([1.0, 1.0, 1.0, unit]) for p in plates]
+    for pose in poses:
+        pose[3, 3] = 1.0
+    scaled = [p._replace(view=replace(p.view, camera_to_world=pose)) for p, pose in zip(plates, poses)]
+    before, after = _sweep(plates), _sweep(scaled) / unit
+    both = (before > 0) & (after > 0)
+    assert both.sum() > 0.99 * max((before > 0).sum(), (after > 0).sum())
+    assert (np.abs(after - before)[both] < 0.01 * before[both]).mean() > 0.99
+
+
+@pytest.mark.stability
+def test_cameras_that_tell_no_depth() -> None:
+    """One alone, two at one place, and two that see nothing in common."""
+    plates, _ = _room(4, 64)
+    assert (_sweep(plates[:1]) == 0).all()
+    pose = plates[0].view.camera_to_world.copy()
+    pose[:3, 3] += 2e-3
+    noise = np.random.default_rng(1).normal(0.0, 2.0, plates[0].color.shape)
+    same = plates[0]._replace(view=replace(plates[0].view, camera="same", camera_to_world=pose))
+    assert (_sweep([plates[0], same._replace(color=same.color + noise)]) == 0).all()
+    away = plates[0].view.camera_to_world.copy()
+    away[:3, 3] += 8.0 * (plates[0].view.camera_to_world[:3, 3] - away[:3, 2])
+    away[:3, [0, 2]] *= -1.0
+    turned = plates[1]._replace(view=replace(plates[1].view, camera_to_world=away))
+    assert (_sweep([plates[0], turned]) == 0).all()
+    # The second of two at one place takes nothing from what the others tell.
+    assert (_sweep([*plates, same])[:4] > 0).mean() > 0.98 * (_sweep(plates) > 0).mean()
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("level", [0.0, 3.0, 128.0, 255.0])
+@pytest.mark.parametrize("noise", [0.0, 1.0, 2.0])
+def test_walls_of_one_color_and_darkness_have_no_depth(level: float, noise: float) -> None:
+    plates, _ = _room(4, 64)
+    rng = np.random.default_rng(2)
+    flat = {k: np.clip(level + rng.normal(0.0, noise, (64, 64, 3)), 0.0, 255.0) for k in range(4)}
+    assert (_sweep(_changed(plates, flat)) > 0).mean() < 0.01
+
+
+@pytest.mark.stability
+def test_what_no_plate_can_show_costs_its_own_pixels_only() -> None:
+    plates, _ = _room(4, 64)
+    whole = _sweep(plates)
+    for bad in (np.nan, np.inf, -np.inf, 1e30):
+        broken = _sweep(_changed(plates, {0: np.full((64, 64, 3), bad)}))
+        assert ((broken[1:] > 0).mean() > 0.5 * (whole[1:] > 0).mean()) and ((broken[0] > 0).mean() < 0.01)
+    lens, pose = Pinhole.from_fov(1, 1, 60.0), plates[0].view.camera_to_world
+    speck = _plate(View("speck", np.full((1, 1, 3), 9, np.uint8), pose, lens))
+    assert (_sweep([*plates, speck])[0] > 0).any()
