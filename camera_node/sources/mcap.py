@@ -55,7 +55,8 @@ class ReplaySource(Source):
     def read(self, content: int) -> Shot:
         frame = self._frames[content]
         pose, lens = pose_and_lens(frame.header)
-        return Shot(self._session.payload(frame), pose, lens, frame.header.pose_gap_ns)
+        depth = self._session.depth(frame)
+        return Shot(self._session.payload(frame), pose, lens, frame.header.pose_gap_ns, encoded_depth=depth)
 
 
 def open_replay(scenario: Scenario, config: McapConfig, cameras: Sequence[str], data: Path | None) -> dict[str, Source]:

@@ -13,6 +13,7 @@ import zstandard
 
 from freshfield import frame as wire
 from freshfield import payload
+from freshfield.depth import DepthImage, EncodedDepth
 from freshfield.geometry import Pinhole, Pose, look_at
 from freshfield.session import DECISIONS, SessionError
 
@@ -29,6 +30,12 @@ from freshfield.session.writer import SessionWriter
 LENS = Pinhole(32, 24, 40.1, 41.3, 15.7, 12.2, (0.01, -0.002, 0.0003, 0.0))
 SCHEMA = {"type": "object", "properties": {"number": {"type": "integer"}}}
 START_NS = 1_763_000_000_123_456_789
+
+
+def depth_of(rng: np.random.Generator) -> EncodedDepth:
+    """Depth of a sensor beside the camera."""
+    lens, beside = Pinhole(16, 12, 20.0, 20.0, 8.0, 6.0), Pose((1.0, 0.0, 0.0, 0.0), (0.05, 0.0, 0.0))
+    return DepthImage(rng.integers(0, 9000, (12, 16), np.uint16), 0.001, lens, beside, -5_000_000).encode()
 
 
 def requests(count: int = 12, cameras: tuple[str, ...] = ("cam00", "cam01")):
@@ -52,6 +59,7 @@ def requests(count: int = 12, cameras: tuple[str, ...] = ("cam00", "cam01")):
                 clock_offset_ns=-1_234_567,
                 clock_uncertainty_ns=1000,
                 pose_gap_ns=7,
+                depth=depth_of(rng) if number and k % 3 == 0 else None,
             )
             yield wire.to_request(frame), captured + 2_000_000
 
@@ -76,6 +84,9 @@ def test_frames_are_read_as_they_were_sent(tmp_path):
         for frame, (request, arrived_ns) in zip(found, expected):
             assert frame.header == request.header and frame.arrived_ns == arrived_ns
             assert session.payload(frame) == request.payload
+            sent_depth = wire.depth_of(request.depth) if request.HasField("depth") else None
+            assert session.depth(frame) == sent_depth
+    assert sum(session.depth(frame) is not None for frame in session.frames["cam01"]) == 4
     session.close()
 
 
@@ -85,7 +96,7 @@ def test_viewers_find_what_they_know(tmp_path):
     with (tmp_path / "a.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         summary = reader.get_summary()
-        assert summary is not None and summary.statistics.message_count == 4 * 6 + 2 + 3
+        assert summary is not None and summary.statistics.message_count == 4 * 6 + 1 + 2 + 3
         found: dict[str, list] = {}
         for schema, channel, message, decoded in reader.iter_decoded_messages(
             topics=[c.topic for c in summary.channels.values() if c.message_encoding == "protobuf"]

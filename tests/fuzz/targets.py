@@ -153,6 +153,7 @@ def mcap(folder: Path) -> Target:
             for found in session.frames.values():
                 for one in found:
                     session.payload(one)
+                    session.depth(one)
         finally:
             session.close()
         return f"{len(session.frames)} cameras"
@@ -243,7 +244,8 @@ def _sessions() -> Iterable[bytes]:
 
     with tempfile.TemporaryDirectory() as folder:
         writer = SessionWriter(Path(folder) / "a", {"scenario": "fuzz"})
-        for message in list(_messages())[:2]:
+        given = list(_messages())
+        for message in (*given[:2], given[3]):  # of two cameras, the last with depth
             writer.frame(pb.PushRequest.FromString(message), NOW)
         writer.close({"dropped": 0})
         yield (Path(folder) / "a").read_bytes()

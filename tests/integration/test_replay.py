@@ -6,14 +6,15 @@ import asyncio
 import json
 import logging
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from camera_node.capture import build_cameras
+from camera_node.capture import Camera, ShotCache, build_cameras
 from camera_node.node import Node, NodeOptions
-from camera_node.settings import source_config
+from camera_node.settings import WorldConfig, source_config
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.ingest import Ingest
 from edge_server.live.output.recorder import Recorder
@@ -27,6 +28,7 @@ from freshfield.ledger import Ledger
 from freshfield.scenario import ScenarioError, parse
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
+from tests.camera_node.depth_source import DepthSource
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 from tests.edge_server.fields_for_tests import TINY
 from tests.integration.peer import Peer
@@ -99,7 +101,8 @@ def said(request: pb.PushRequest) -> tuple:
     """Everything of a message that a replay repeats: pose and lens to the bit."""
     h = request.header
     parts = [part.SerializeToString(deterministic=True) for part in (h.pose, h.intrinsics)]
-    return (*parts, h.codec, h.width, h.height, h.role, h.pose_gap_ns, request.payload)
+    depth = request.depth.SerializeToString(deterministic=True) if request.HasField("depth") else None
+    return (*parts, h.codec, h.width, h.height, h.role, h.pose_gap_ns, request.payload, depth)
 
 
 def test_everything_that_was_accepted_is_recorded(session):
@@ -175,6 +178,27 @@ def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
     assert "cam01: 1 frames do not follow the one before in time" in caplog.text
     schedule = camera.schedule(7)
     assert [schedule.due_ns(k) - 7 for k in range(3)] == [0, 10**9, 2 * 10**9] and schedule.next(2, 0) == (None, 0)
+
+
+def test_a_recorded_run_replays_with_its_depth(tmp_path):
+    """As it came, also where it belongs to another instant; what shows a held-out camera sends none."""
+    source = DepthSource("cam01", 4, after_image_ns=-40_000_000)
+    camera = Camera(source, WorldConfig(kind="world"), ShotCache(10**6), depth_every=2)
+    recorder = Recorder(tmp_path / "a.mcap", "test")
+    sent = []
+    for k in range(4):
+        shot, at_ns = camera.capture(k), (k + 10) * 10**8
+        frame = Frame("cam01", "s", k, at_ns, shot.pose, shot.intrinsics, "jpeg", shot.payload)
+        sent.append(to_request(replace(frame, depth=shot.encoded_depth)))
+        recorder.frame(sent[-1], at_ns + 5)
+    recorder.close()
+    scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam02": "y"})
+    got = sent_by(scenario, ["cam01"])
+    assert [said(request) for request in got] == [said(request) for request in sent]
+    assert [request.HasField("depth") for request in got] == [True, False, True, False]
+    scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "cam01", "cam01": "x", "cam02": "y"})
+    got = sent_by(scenario, ["cam00"])
+    assert len(got) == 4 and not any(request.HasField("depth") for request in got)
 
 
 @pytest.mark.slow

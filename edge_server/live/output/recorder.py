@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 _MAX_QUEUE_BYTES = 64 * 2**20
 _MAX_QUEUE_MESSAGES = 4096
 _POLL_S = 0.05
-# Assumed size of a message beside its payload.
+# Assumed size of a message beside its payloads.
 _MESSAGE_BYTES = 1024
 
 
@@ -59,7 +59,8 @@ class Recorder:
 
     def frame(self, request: pb.PushRequest, arrived_ns: int) -> None:
         """Record an accepted frame. The request must not be changed afterwards."""
-        self._put(len(request.payload) + _MESSAGE_BYTES, lambda: self._writer.frame(request, arrived_ns))
+        size = len(request.payload) + len(request.depth.payload) + _MESSAGE_BYTES
+        self._put(size, lambda: self._writer.frame(request, arrived_ns))
 
     def published(self, publication: Publication) -> None:
         """Record an update of the field."""

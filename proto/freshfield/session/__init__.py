@@ -3,6 +3,7 @@
 Topics, CAMERA being a camera's id:
 
     /CAMERA/header       freshfield.v1.FrameHeader    the frame's header as it came over the wire
+    /CAMERA/depth        freshfield.v1.Depth          its depth as it came, if it brought any; before the image
     /CAMERA/image        foxglove.CompressedImage     its payload; jpeg, png, or zstd, which viewers lack
     /CAMERA/pose         foxglove.PoseInFrame         camera-to-world; frame ``world``
     /CAMERA/calibration  foxglove.CameraCalibration   when it changes; OpenCV's pixel origin
@@ -11,7 +12,7 @@ Topics, CAMERA being a camera's id:
     /scores              freshfield.Decision          JSON: the same with its fidelity, when that is known
 
 A message's log time is its arrival at the edge, its publish time the capture, both on the edge's clock.
-Header and image hold everything that was sent; the other topics repeat it in formats that viewers know.
+Header, depth and image hold everything that was sent; the other topics repeat it in formats that viewers know.
 Chunks are not compressed: payloads already are, and a truncated file stays readable up to the cut.
 
 Needs the packages mcap, mcap-protobuf-support and foxglove-schemas-protobuf (extra ``mcap``), which only
@@ -21,7 +22,7 @@ Needs the packages mcap, mcap-protobuf-support and foxglove-schemas-protobuf (ex
 from __future__ import annotations
 
 WORLD = "world"
-HEADER, IMAGE, POSE, CALIBRATION = "header", "image", "pose", "calibration"
+HEADER, DEPTH, IMAGE, POSE, CALIBRATION = "header", "depth", "image", "pose", "calibration"
 TRANSFORMS, DECISIONS, SCORES = "/tf", "/decisions", "/scores"
 INSTALL = "recordings need MCAP: pip install 'freshfield[mcap]'"
 

@@ -12,9 +12,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from freshfield.session import HEADER, IMAGE, INSTALL, SessionError
+from freshfield.depth import EncodedDepth
+from freshfield.frame import depth_of
+from freshfield.session import DEPTH, HEADER, IMAGE, INSTALL, SessionError
 from freshfield.v1 import frames_pb2 as pb
 
 try:
@@ -45,11 +47,15 @@ class _Location(NamedTuple):
 
 @dataclass(frozen=True)
 class SessionFrame:
-    """A recorded frame whose payload is still in the file. arrived_ns: arrival on the edge's clock."""
+    """A recorded frame whose payload is still in the file.
+
+    arrived_ns: arrival on the edge's clock. depth_location: None: it brought no depth.
+    """
 
     header: pb.FrameHeader
     arrived_ns: int
     location: _Location
+    depth_location: _Location | None = None
 
 
 class Session:
@@ -68,6 +74,7 @@ class Session:
         self.cut: str | None = None
         self._channels: dict[int, str] = {}
         self._headers: dict[str, tuple[int, int, pb.FrameHeader]] = {}
+        self._depths: dict[str, _Location] = {}  # of the frames whose header is read and whose image is not
         self._damaged = 0
         self._file = path.open("rb")
         self._lock = threading.Lock()
@@ -89,8 +96,15 @@ class Session:
 
     def payload(self, frame: SessionFrame) -> bytes:
         """The payload of one of ``frames``, byte for byte. Raises SessionError if it cannot be read again."""
+        return bytes(self._read_again(CompressedImage, frame.location).data)
+
+    def depth(self, frame: SessionFrame) -> EncodedDepth | None:
+        """The depth of one of ``frames``, as it came; None: it brought none. Raises as ``payload``."""
+        return None if frame.depth_location is None else depth_of(self._read_again(pb.Depth, frame.depth_location))
+
+    def _read_again(self, kind: type[Any], location: _Location) -> Any:
         try:
-            return bytes(CompressedImage.FromString(_message(self._at(*frame.location)).data).data)
+            return kind.FromString(_message(self._at(*location)).data)
         except (DecodeError, *_UNREADABLE) as error:
             raise SessionError(f"{self.path}: a message cannot be read again: {error}") from None
 
@@ -173,11 +187,14 @@ class Session:
                 except DecodeError:
                     return
                 self._headers[camera] = (message.log_time, message.publish_time, header)
+                self._depths.pop(camera, None)
+            elif kind == DEPTH and camera:
+                self._depths[camera] = location
             elif kind == IMAGE and camera:
                 # The image follows its header; without one it is not a frame.
-                before = self._headers.pop(camera, None)
+                before, depth = self._headers.pop(camera, None), self._depths.pop(camera, None)
                 if before is not None and before[:2] == (message.log_time, message.publish_time):
-                    self.frames.setdefault(camera, []).append(SessionFrame(before[2], before[0], location))
+                    self.frames.setdefault(camera, []).append(SessionFrame(before[2], before[0], location, depth))
 
 
 def _framed(data: bytes, at: int) -> Iterator[tuple[int, int, int]]:

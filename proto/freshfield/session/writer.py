@@ -9,7 +9,18 @@ from pathlib import Path
 from typing import Any
 
 from freshfield.frame import CODEC_NAMES
-from freshfield.session import CALIBRATION, HEADER, IMAGE, INSTALL, POSE, TRANSFORMS, WORLD, SessionError, topic_of
+from freshfield.session import (
+    CALIBRATION,
+    DEPTH,
+    HEADER,
+    IMAGE,
+    INSTALL,
+    POSE,
+    TRANSFORMS,
+    WORLD,
+    SessionError,
+    topic_of,
+)
 from freshfield.v1 import frames_pb2 as pb
 
 try:
@@ -69,6 +80,8 @@ class SessionWriter:
         self._proto(TRANSFORMS, transform, *times)
         self._proto(topic_of(camera, POSE), pose, *times)
         self._proto(topic_of(camera, HEADER), header, *times)
+        if request.HasField("depth"):
+            self._proto(topic_of(camera, DEPTH), request.depth, *times)
         self._proto(topic_of(camera, IMAGE), image, *times)
 
     def data(self, topic: str, name: str, schema: Mapping[str, Any], values: Mapping[str, Any], t_ns: int) -> None:
