@@ -80,7 +80,7 @@ def fuzz_one(name: str, runs: int, seconds: float, folder: Path) -> None:
 
     options = [
         f"-artifact_prefix={folder.parent}/{name}-",
-        f"-dict={folder / 'words'}",
+        *([f"-dict={folder / 'words'}"] if words else []),  # an empty one is an error
         "-verbosity=0",
         f"-max_len={MOST_INPUT_BYTES}",
         "-len_control=0",

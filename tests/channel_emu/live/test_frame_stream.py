@@ -10,6 +10,7 @@ from pathlib import Path
 
 import grpc
 import grpc.aio
+import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
@@ -18,6 +19,7 @@ from channel_emu.live.camera_stream import CREDITS, PUSH
 from channel_emu.live.live_link import Message
 from channel_emu.model import trace
 from edge_server.report.frame_accounting import account_frames
+from freshfield.depth import DepthImage
 from freshfield.frame import to_request
 from freshfield.ledger import read_all
 from freshfield.transport import Transport
@@ -79,6 +81,26 @@ def test_live_decisions_are_those_of_virtual_time(tmp_path: Path, section: dict)
     if section is FAST:
         assert status["states"] == ["low", "high"] and status["state"] in status["states"]
         assert sum(status["state_share"].values()) == pytest.approx(1)
+
+
+def test_depth_passes_untouched_and_takes_its_time_on_the_line(tmp_path: Path) -> None:
+    """At 1 Mbit/s a byte takes 8 microseconds, whatever it belongs to."""
+    counts = np.random.default_rng(0).integers(0, 2**16, (48, 64), np.uint16)
+    depth = DepthImage(counts, 0.001, after_image_ns=-7).encode()
+
+    async def live() -> None:
+        async with emulate(
+            tmp_path, {"preset": "ideal", "faults": {"bandwidth": 1.0}}, trace=tmp_path / "t.jsonl"
+        ) as r:
+            r.cameras["cam01"].depth = depth
+            await asyncio.gather(*(r.cameras[c].push() for c in ("cam00", "cam01")))
+            await r.settled()
+            newest = r.edge.ingest.buffer.newest()
+            assert (newest["cam00"].depth, newest["cam01"].depth) == (None, depth)
+
+    run(live())
+    took_ns = {r.camera: r.due_ns - r.offered_ns for r in trace.read(tmp_path / "t.jsonl").records}
+    assert took_ns["cam01"] - took_ns["cam00"] == pytest.approx(8000 * len(depth.payload), rel=0.02)
 
 
 def test_the_account_closes_with_every_fault(tmp_path: Path) -> None:

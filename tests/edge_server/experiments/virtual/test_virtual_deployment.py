@@ -21,6 +21,7 @@ from edge_server.experiments.virtual.truth import ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.settings import ComputeConfig
 from freshfield import payload
+from freshfield.frame import to_request
 from freshfield.scenario import Scenario, parse
 from tests.edge_server.experiments.sets import SMALL, write_recording
 
@@ -101,6 +102,34 @@ def test_a_fault_of_the_rate_takes_longer_for_what_the_frames_hold():
     deployment = run(scenario({"preset": "ideal", "faults": {"bandwidth": 0.05}}), seconds=1.0)
     newest = deployment.updates.buffer.newest().values()
     assert newest and min(item.received_ns - item.generated_ns for item in newest) > 60_000_000
+
+
+def with_sensors(channel: dict[str, Any], every: int) -> Scenario:
+    source = {"kind": "world", "scene": "room", "width": 32, "height": 32, "fps": 15, "params": {"supersample": 1}}
+    return scenario(channel, source={**source, "depth_every": every, "effects": {"depth_sensor": {}}})
+
+
+@pytest.mark.parametrize("every", [0, 1, 5])
+def test_depth_is_in_every_so_many_th_frame_and_takes_its_time_on_the_line(every):
+    rate = {"preset": "ideal", "faults": {"bandwidth": 1.0}}
+    seen: dict[int, bool] = {}
+    deployment = build_deployment(with_sensors(rate, every), SETTINGS)
+    for _ in range(12):
+        deployment.run(1 / 15)
+        for item in deployment.updates.buffer.newest().values():
+            took_ns = item.received_ns - item.generated_ns
+            assert took_ns == pytest.approx(8000 * to_request(item).ByteSize(), abs=1)
+            seen[item.sequence] = item.depth is not None
+    assert len(seen) > 8 and {k: every > 0 and k % every == 0 for k in seen} == seen
+
+
+def test_depth_that_an_update_uses_is_made_for_it_at_the_images_pixels():
+    deployment = run(with_sensors({"preset": "ch5"}, 1))
+    (*_, item) = deployment.with_images(list(deployment.updates.buffer.newest().values()))
+    view = deployment.updates.decoder.view(item)
+    assert view.depth.shape == view.image.shape[:2] == (32, 32) and view.depth_ns == view.generated_ns
+    assert 0.5 < np.median(view.depth[view.depth > 0]) < 8.0
+    assert run(with_sensors({"preset": "ch5"}, 1)).publications == deployment.publications
 
 
 @pytest.mark.parametrize(
