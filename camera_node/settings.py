@@ -194,7 +194,7 @@ class CameraConfig(LiveConfig, frozen=True, kw_only=True):
 
 class OakConfig(LiveConfig, frozen=True, kw_only=True):
     """Luxonis OAK cameras through depthai 3 (extra ``oak``). A picture that is not rectified carries its lens, as well
-    as four coefficients describe it.
+    as four coefficients describe it. Depth of a device with a stereo pair needs ``rectify``.
     """
 
     socket: Annotated[str, about("which of the device's cameras")] = "CAM_A"
@@ -203,7 +203,8 @@ class OakConfig(LiveConfig, frozen=True, kw_only=True):
 
 
 class RealsenseConfig(LiveConfig, frozen=True, kw_only=True):
-    """Intel RealSense D400 cameras, their color stream (extra ``realsense``)."""
+    """Intel RealSense D400 cameras: color, and depth of the same size unless ``depth_every`` is 0 (extra
+    ``realsense``)."""
 
 
 class DynerfConfig(RecordedConfig, frozen=True, kw_only=True):

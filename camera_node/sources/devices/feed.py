@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole
 
 Image = NDArray[np.uint8]
@@ -23,11 +24,13 @@ class Feed(ABC):
     intrinsics: the device's own, for images as ``grab`` returns them; None if it has none.
     no_intrinsics: one line on why ``intrinsics`` is None and what to do; else "".
     stamped_by: where time stamps come from, for people; known after the first frame.
+    depth: what a depth sensor measured with the frame that ``grab`` returned last; None: nothing, or there is none.
     """
 
     intrinsics: Pinhole | None = None
     no_intrinsics: str = ""
     stamped_by: str = ""
+    depth: DepthImage | None = None
 
     @abstractmethod
     def grab(self, timeout_s: float) -> tuple[int, Image] | None:

@@ -22,6 +22,7 @@ from camera_node.sources.base import Shot, Source, rate
 from camera_node.sources.devices.feed import CameraError, Feed, Image, as_camera_error
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
 from freshfield.clock import Clock, WallClock
+from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario, ScenarioError
 
@@ -77,19 +78,20 @@ class LiveSource(Source):
         self._patience_s = first_frame_s
         self._wait_s = min(0.5, 0.5 / float(fps))
         self._condition = threading.Condition()
-        self._newest: tuple[int, Image] | None = None
+        self._newest: tuple[int, Image, DepthImage | None] | None = None
         self._trouble = "none since the last one"
         self._stop = threading.Event()
         feed: Feed | None = None
         try:
             feed = opener()
-            self._newest = feed.grab(first_frame_s)
-            if self._newest is None:
+            first = feed.grab(first_frame_s)
+            if first is None:
                 raise CameraError(f"{camera}: the camera opened, but sent no frame for {first_frame_s:g} s")
             lens = calibrated or feed.intrinsics
             if lens is None:
                 raise CameraError(feed.no_intrinsics)
-            self.intrinsics = self._scaled(lens, self._newest[1])
+            self.intrinsics = self._scaled(lens, first[1])
+            self._newest = (*first, feed.depth)
         except BaseException as error:
             if feed is not None:
                 _close_quietly(feed)
@@ -108,10 +110,10 @@ class LiveSource(Source):
             if not self._condition.wait_for(lambda: self._newest is not None, self._wait_s):
                 raise CameraError(f"{self.camera}: no new frame: {self._trouble}")
             assert self._newest is not None
-            captured_ns, image = self._newest
+            captured_ns, image, depth = self._newest
             self._newest = None
         pose, gap_ns = self._poses.at(captured_ns)
-        return Shot(image, pose, self.intrinsics, gap_ns, captured_ns)
+        return Shot(image, pose, self.intrinsics, gap_ns, captured_ns, depth)
 
     def close(self) -> None:
         """Stop the thread, which closes the camera."""
@@ -164,7 +166,7 @@ class LiveSource(Source):
             raise CameraError(f"{self.camera}: its pictures have changed their size")
         self._trouble = "none since the last one"
         with self._condition:
-            self._newest = taken
+            self._newest = (*taken, feed.depth)
             self._condition.notify_all()
         return True
 

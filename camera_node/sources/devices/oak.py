@@ -2,6 +2,8 @@
 
 The library synchronizes the device's clock with the host's. Intrinsics come from the calibration stored in
 the device, and an autofocus lens is fixed at the position at which it was calibrated.
+
+With ``rectify`` a device that has a stereo pair also measures depth and registers it to the straightened image.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from camera_node.sources.devices.feed import (
 )
 from camera_node.sources.devices.lens_coefficients import fit_opencv_distortion
 from freshfield.clock import Clock
+from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole
 
 log = logging.getLogger("camera-node")
@@ -32,6 +35,9 @@ log = logging.getLogger("camera-node")
 _SEARCH_MS = "2000"
 # Beyond this error, four coefficients do not describe the lens: better let the device rectify the image.
 _WORST_LENS_PX = 1.0
+# Of the pair's images: what the mono cameras of all models offer, and what depth is computed from.
+_STEREO_SIZE = (640, 400)
+METERS_PER_COUNT = 0.001  # depthai's depth is in millimeters unless told otherwise
 
 
 def library() -> Any:
@@ -75,6 +81,7 @@ class OakFeed(Feed):
             raise CameraError(f"{camera}: source.socket: expected one of {', '.join(sockets)}")
         self._device: Any = None
         self._pipeline: Any = None
+        self._depths: DepthQueue | None = None
         try:
             self._device = dai.Device(find(camera, device))
             self._pipeline = dai.Pipeline(self._device)
@@ -93,6 +100,11 @@ class OakFeed(Feed):
                 enableUndistortion=config.rectify,
             )
             self._frames = FrameQueue(camera, output.createOutputQueue(maxSize=2, blocking=False), clock)
+            pairs = self._device.getStereoPairs() if config.depth_every else []
+            if pairs and config.rectify:
+                self._depths = DepthQueue(self._measure_depth(pairs[0], output, float(fps)), clock)
+            elif pairs:
+                log.info("%s: it measures depth only with source.rectify: true", camera)
             self._pipeline.start()
             size = (config.width, config.height)
             self.intrinsics, self.no_intrinsics = intrinsics_or_reason(
@@ -104,8 +116,27 @@ class OakFeed(Feed):
                 raise
             raise CameraError(f"{camera}: the OAK camera could not be started: {_first_line(error)}") from None
 
+    def _measure_depth(self, pair: Any, image: Any, fps: float) -> Any:
+        """Add stereo of a pair of cameras, registered to the output ``image``. Returns the queue of depth frames."""
+        dai = library()
+        stereo = self._pipeline.create(dai.node.StereoDepth)
+        for socket, seen_by in ((pair.left, stereo.left), (pair.right, stereo.right)):
+            camera = self._pipeline.create(dai.node.Camera).build(socket)
+            camera.requestOutput(_STEREO_SIZE, fps=fps).link(seen_by)
+        registered = stereo.depth
+        if self._device.getPlatform() == dai.Platform.RVC4:  # its stereo cannot register depth itself
+            align = self._pipeline.create(dai.node.ImageAlign)
+            stereo.depth.link(align.input)
+            image.link(align.inputAlignTo)
+            registered = align.outputAligned
+        else:
+            image.link(stereo.inputAlignTo)
+        return registered.createOutputQueue(maxSize=2, blocking=False)
+
     def grab(self, timeout_s: float) -> tuple[int, Image] | None:
-        return self._frames.grab(timeout_s)
+        taken = self._frames.grab(timeout_s)
+        self.depth = self._depths.newest(taken[0]) if taken is not None and self._depths is not None else None
+        return taken
 
     def close(self) -> None:
         if self._pipeline is not None:
@@ -128,10 +159,30 @@ class FrameQueue:
             raise CameraError(f"{self._camera}: the OAK camera is gone: {_first_line(error)}") from None
         if frame is None:
             return None
-        exposed = frame.getTimestamp(self._dai.CameraExposureOffset.MIDDLE)
-        age = self._dai.Clock.now() - exposed
-        captured_ns = self._clock.now_ns() - (age // datetime.timedelta(microseconds=1)) * 1000
-        return captured_ns, cast(Image, np.ascontiguousarray(frame.getCvFrame()[:, :, ::-1]))
+        return captured_ns(frame, self._clock), cast(Image, np.ascontiguousarray(frame.getCvFrame()[:, :, ::-1]))
+
+
+class DepthQueue:
+    """Frames of a depthai queue of depth in millimeters, registered to the images."""
+
+    def __init__(self, queue: Any, clock: Clock) -> None:
+        self._queue, self._clock = queue, clock
+
+    def newest(self, image_ns: int) -> DepthImage | None:
+        """The newest frame that was not taken yet, for an image that was captured at ``image_ns``; None: none came.
+        That the device is gone is said by the images' queue."""
+        frames = self._queue.tryGetAll()
+        if not frames:
+            return None
+        counts = np.array(frames[-1].getFrame(), dtype=np.uint16)
+        return DepthImage(counts, METERS_PER_COUNT, after_image_ns=captured_ns(frames[-1], self._clock) - image_ns)
+
+
+def captured_ns(frame: Any, clock: Clock) -> int:
+    """The middle of a frame's exposure on ``clock``."""
+    dai = library()
+    age = dai.Clock.now() - frame.getTimestamp(dai.CameraExposureOffset.MIDDLE)
+    return clock.now_ns() - (age // datetime.timedelta(microseconds=1)) * 1000
 
 
 def calibrated_focus(calibration: Any, socket: Any) -> int:

@@ -1,4 +1,7 @@
-"""The color stream of Intel RealSense D400 cameras, such as the thesis's D435i (thesis 4.3.1).
+"""The color and depth streams of Intel RealSense D400 cameras, such as the thesis's D435i (thesis 4.3.1).
+
+Depth is sent as it is measured, with the intrinsics and the place of its own sensor: aligning it to the color stream
+would cost time here, and pixels. A camera that cannot stream both, as on USB 2, streams color alone.
 
 With the library's global time, stamps are on the host's clock; for a device without it, the device's clock is
 mapped to ours by the fastest samples (``ArrivalClock``). A stamp is the beginning of the readout; if the
@@ -8,6 +11,7 @@ frame's metadata tell the middle of the exposure, that is used instead.
 from __future__ import annotations
 
 import contextlib
+import logging
 from fractions import Fraction
 from typing import Any, cast
 
@@ -25,7 +29,10 @@ from camera_node.sources.devices.feed import (
 )
 from camera_node.sources.devices.lens_coefficients import fit_opencv_distortion
 from freshfield.clock import Clock, SystemClock
-from freshfield.geometry import Pinhole
+from freshfield.depth import DepthImage
+from freshfield.geometry import Pinhole, Pose, se3
+
+log = logging.getLogger("camera-node")
 
 _LONGEST_EXPOSURE_US = 200_000  # the color sensors of the series expose at most 165 ms
 
@@ -65,19 +72,18 @@ def find(camera: str, device: str | None) -> str:
 
 
 class RealsenseFeed(Feed):
-    """A running pipeline of one camera's color stream."""
+    """A running pipeline of one camera's color stream, and of its depth unless ``depth_every`` is 0."""
 
     stamped_by = "the device, at the middle of the exposure where it tells that"
 
     def __init__(self, camera: str, device: str | None, config: RealsenseConfig, fps: Fraction, clock: Clock) -> None:
         rs = library()
         self._camera = camera
-        wanted = rs.config()
-        wanted.enable_device(find(camera, device))
-        wanted.enable_stream(rs.stream.color, config.width, config.height, rs.format.rgb8, round(fps))
         self._pipeline = rs.pipeline()
+        self._sensor: DepthSensor | None = None
+        serial, size_and_rate = find(camera, device), (config.width, config.height, round(fps))
         try:
-            profile = self._pipeline.start(wanted)
+            profile = self._start(serial, size_and_rate, bool(config.depth_every))
         except RuntimeError as error:
             raise CameraError(
                 f"{camera}: the RealSense camera offers no color stream of {config.width} x "
@@ -85,11 +91,29 @@ class RealsenseFeed(Feed):
             ) from None
         try:
             found = self._set_up(profile, config)
-        except RuntimeError as error:
+            if any(stream.stream_type() == rs.stream.depth for stream in profile.get_streams()):
+                self._sensor = DepthSensor(camera, profile, FrameClock(clock, SystemClock()))
+        except (RuntimeError, CameraError) as error:
             self.close()
             raise as_camera_error(camera, error) from None
         self.intrinsics, self.no_intrinsics = intrinsics_or_reason(lambda: lens(camera, found))
         self._stamps = FrameClock(clock, SystemClock())
+
+    def _start(self, serial: str, size_and_rate: tuple[int, int, int], with_depth: bool) -> Any:
+        """Start the pipeline, without depth if it cannot start with it. Returns its profile. Raises RuntimeError."""
+        rs = library()
+        wanted = rs.config()
+        wanted.enable_device(serial)
+        *size, rate = size_and_rate
+        wanted.enable_stream(rs.stream.color, *size, rs.format.rgb8, rate)
+        if not with_depth:
+            return self._pipeline.start(wanted)
+        wanted.enable_stream(rs.stream.depth, *size, rs.format.z16, rate)
+        try:
+            return self._pipeline.start(wanted)
+        except RuntimeError as error:
+            log.warning("%s: no depth of %d x %d at %d a second: %s", self._camera, *size_and_rate, error)
+            return self._start(serial, size_and_rate, with_depth=False)
 
     def _set_up(self, profile: Any, config: RealsenseConfig) -> Any:
         """Enable global time and set the exposure. Returns the library's intrinsics."""
@@ -109,11 +133,36 @@ class RealsenseFeed(Feed):
         except RuntimeError as error:
             raise CameraError(f"{self._camera}: the RealSense camera is gone: {error}") from None
         frame = frames.get_color_frame() if arrived else None
-        return as_grabbed(frame, self._stamps) if frame else None
+        if not frame:
+            return None
+        taken = as_grabbed(frame, self._stamps)
+        measured = frames.get_depth_frame() if self._sensor is not None else None
+        self.depth = self._sensor.image(measured, taken[0]) if self._sensor is not None and measured else None
+        return taken
 
     def close(self) -> None:
         with contextlib.suppress(RuntimeError):  # it may be gone
             self._pipeline.stop()
+
+
+class DepthSensor:
+    """Converts depth frames. stamps: of the depth stream. Raises CameraError for a lens that is not OpenCV's."""
+
+    def __init__(self, camera: str, profile: Any, stamps: FrameClock) -> None:
+        rs = library()
+        streams = [profile.get_stream(kind).as_video_stream_profile() for kind in (rs.stream.depth, rs.stream.color)]
+        self._stamps = stamps
+        self._meters_per_count = float(profile.get_device().first_depth_sensor().get_depth_scale())
+        self._lens = lens(camera, streams[0].get_intrinsics())
+        place = streams[0].get_extrinsics_to(streams[1])  # rotation column by column, meters
+        rotation = np.array(place.rotation, dtype=np.float64).reshape(3, 3).T
+        self._to_camera = Pose.from_matrix(se3(rotation, place.translation))
+
+    def image(self, frame: Any, image_ns: int) -> DepthImage:
+        """The measurement of a depth frame, with an image that was captured at ``image_ns``."""
+        counts = np.array(frame.get_data(), dtype=np.uint16)
+        after_ns = self._stamps.captured_ns(frame) - image_ns
+        return DepthImage(counts, self._meters_per_count, self._lens, self._to_camera, after_ns)
 
 
 class FrameClock:

@@ -225,7 +225,7 @@ STANDING = FixedPose(Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
 class Feed:
     """A camera that gives frames until ``breaks_after`` of them, and then ``trouble``."""
 
-    stamped_by, no_intrinsics = "itself", ""
+    stamped_by, no_intrinsics, depth = "itself", "", None
 
     def __init__(self, intrinsics=LENS, no_intrinsics="", breaks_after=10**9, trouble=None):
         self.intrinsics, self.no_intrinsics = intrinsics, no_intrinsics

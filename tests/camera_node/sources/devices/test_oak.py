@@ -19,6 +19,7 @@ from camera_node.sources.devices import oak
 from camera_node.sources.devices.feed import CameraError
 from camera_node.sources.devices.live import LiveSource, open_feed
 from freshfield.clock import WallClock
+from freshfield.depth import DepthImage
 from freshfield.geometry import Pose
 from freshfield.scenario import parse
 
@@ -28,6 +29,7 @@ except CameraError as error:
     pytest.skip(str(error), allow_module_level=True)
 
 WIDTH, HEIGHT = 64, 48
+DEPTH = DepthImage(np.full((HEIGHT, WIDTH), 1500, np.uint16), 0.001)
 
 
 def plan(**source):
@@ -78,6 +80,7 @@ def test_it_is_a_source_like_any_other_and_says_when_it_is_gone(replay):
 
     class Feed(oak.FrameQueue):
         intrinsics = oak.lens("eye", calibration(), dai.CameraBoardSocket.CAM_A, (WIDTH, HEIGHT), False)
+        depth = DEPTH
 
         def close(self):
             pass
@@ -91,6 +94,7 @@ def test_it_is_a_source_like_any_other_and_says_when_it_is_gone(replay):
     source = LiveSource("eye", Fraction(10), once, fixed, first_frame_s=10.0)
     shot = source.read(0)
     assert shot.captured_ns and shot.intrinsics.width == WIDTH
+    assert source.depth(0, shot) is DEPTH
     pipeline.stop()
     with pytest.raises(CameraError, match="no new frame: eye: "):
         until = time.monotonic() + 10.0
@@ -101,6 +105,25 @@ def test_it_is_a_source_like_any_other_and_says_when_it_is_gone(replay):
                 if "OAK" in str(error):
                     raise
     source.close()
+
+
+def test_depth_is_the_newest_frame_in_millimeters_with_its_time():
+    queue, clock = dai.MessageQueue("depth", 4, False), WallClock()
+    depths = oak.DepthQueue(queue, clock)
+    assert depths.newest(0) is None
+    for number in (1, 2):
+        frame = dai.ImgFrame()
+        frame.setType(dai.ImgFrame.Type.RAW16)
+        frame.setWidth(WIDTH)
+        frame.setHeight(HEIGHT)
+        frame.setFrame(np.full((HEIGHT, WIDTH), 1000 * number, np.uint16))
+        frame.setTimestamp(dai.Clock.now())
+        queue.send(frame)
+    measured = depths.newest(clock.now_ns() - 20_000_000)
+    assert measured.counts.shape == (HEIGHT, WIDTH) and (measured.counts == 2000).all()
+    assert measured.meters_per_count == 0.001 and measured.intrinsics is None, "registered to the image"
+    assert 10_000_000 < measured.after_image_ns < 30_000_000
+    assert depths.newest(0) is None, "each once"
 
 
 def calibration(distortion=None):

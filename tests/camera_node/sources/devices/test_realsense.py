@@ -15,6 +15,7 @@ from camera_node.settings import source_config
 from camera_node.sources.devices.feed import CameraError
 from camera_node.sources.devices.live import open_feed
 from freshfield.clock import VirtualClock, WallClock
+from freshfield.geometry import look_at
 from freshfield.scenario import parse
 
 rs = pytest.importorskip(
@@ -119,6 +120,82 @@ def test_a_lens_that_cannot_be_described_is_refused():
         realsense.lens("eye", intrinsics(rs.distortion.kannala_brandt4))
     with pytest.raises(CameraError, match="cannot be undone"):
         realsense.lens("eye", intrinsics(coefficients=(0.1, 0, 0, 0, 0)))
+
+
+class Both:
+    """The profile of a pipeline that streams both; streams and device are the library's own."""
+
+    def __init__(self, apart: np.ndarray, scale: float) -> None:
+        self._device = rs.software_device()
+        self.streams, self.sensors = {}, {}
+        for kind, form, bpp in ((rs.stream.depth, rs.format.z16, 2), (rs.stream.color, rs.format.rgb8, 3)):
+            sensor = self._device.add_sensor(kind.name)
+            stream = rs.video_stream()
+            stream.type, stream.uid, stream.width, stream.height = kind, bpp, WIDTH, HEIGHT
+            stream.fps, stream.bpp, stream.fmt, stream.intrinsics = 30, bpp, form, intrinsics()
+            self.streams[kind], self.sensors[kind] = sensor.add_video_stream(stream), sensor
+        self.sensors[rs.stream.depth].add_read_only_option(rs.option.depth_units, scale)
+        place = rs.extrinsics()
+        place.rotation, place.translation = apart[:3, :3].T.ravel().tolist(), apart[:3, 3].tolist()
+        self.streams[rs.stream.depth].register_extrinsics_to(self.streams[rs.stream.color], place)
+
+    def get_stream(self, kind):
+        return self.streams[kind]
+
+    def get_device(self):
+        return self._device
+
+
+def test_depth_comes_with_its_unit_its_lens_its_place_and_its_time():
+    apart = look_at([0.015, 0.001, 0.0], [0.03, 0.001, 2.0], up=(0.0, -1.0, 0.0))
+    both = Both(apart, 0.0005)
+    sensor = realsense.DepthSensor("eye", both, realsense.FrameClock(*CLOCKS))
+    source, queue = both.sensors[rs.stream.depth], rs.frame_queue(2)
+    source.open(both.streams[rs.stream.depth])
+    source.start(queue)
+    counts = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH)
+    frame = rs.software_video_frame()
+    frame.pixels, frame.stride, frame.bpp = counts, 2 * WIDTH, 2
+    frame.timestamp, frame.domain, frame.frame_number = SYSTEM_NS / 1e6 - 40.0, rs.timestamp_domain.global_time, 1
+    frame.profile = both.streams[rs.stream.depth].as_video_stream_profile()
+    source.on_video_frame(frame)
+    found = sensor.image(queue.wait_for_frame(5000), OURS_NS - 50_000_000)
+    source.stop()
+    source.close()
+    assert np.array_equal(found.counts, counts) and found.counts.dtype == np.uint16
+    assert found.meters_per_count == pytest.approx(0.0005)
+    assert found.after_image_ns == pytest.approx(10e6, abs=1e3)
+    assert (found.intrinsics.fx, found.intrinsics.cx) == (60.0, 32.0)
+    # A point in front of the depth sensor, in the camera's axes as the library itself moves it.
+    place = both.streams[rs.stream.depth].get_extrinsics_to(both.streams[rs.stream.color])
+    expected = rs.rs2_transform_point_to_point(place, [0.1, -0.2, 1.5])
+    assert np.allclose((found.to_camera.matrix() @ [0.1, -0.2, 1.5, 1.0])[:3], expected, atol=1e-6)
+    assert np.allclose(found.to_camera.matrix(), apart, atol=1e-6)
+
+
+@pytest.mark.parametrize("every", [0, 5])
+def test_a_camera_that_cannot_stream_both_streams_color(monkeypatch, caplog, every):
+    started = []
+    pipeline = MagicMock()  # the library's own finds no device
+
+    def start(config):
+        started.append(config)
+        if len(started) == 1 and every:
+            raise RuntimeError("Couldn't resolve requests")
+        return pipeline.profile
+
+    pipeline.start.side_effect = start
+    pipeline.profile.get_stream.return_value.as_video_stream_profile.return_value.get_intrinsics.return_value = (
+        intrinsics()
+    )
+    pipeline.profile.get_streams.return_value = []
+    monkeypatch.setattr(rs, "pipeline", lambda: pipeline)
+    monkeypatch.setattr(realsense, "find", lambda camera, device: "1")
+    source = {"kind": "realsense", "depth_every": every}
+    scenario = parse({"cameras": {"ids": ["eye"]}, "source": source}, Path("scenario.yaml"))
+    feed = realsense.RealsenseFeed("eye", None, source_config(scenario), Fraction(15), WallClock())
+    assert len(started) == (2 if every else 1) and feed.intrinsics is not None and feed.depth is None
+    assert ("eye: no depth of 640 x 400 at 15 a second: Couldn't" in caplog.text) == bool(every)
 
 
 def test_without_a_device_one_clear_line_within_three_seconds():
