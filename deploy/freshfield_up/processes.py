@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-GRACE_S = 8.0
-"""Time for a process to end after SIGTERM before it is killed."""
+GRACE_S = 30.0
+"""Time for a process to end after SIGTERM before it is killed: the edge server waits up to 20 s for its last update."""
 
 _TAIL_BYTES = 16_384
 # Asks Linux to end the process when its parent is gone (prctl's PR_SET_PDEATHSIG), and becomes the command. Not between
