@@ -1,2 +1,4 @@
-"""The command ``freshfield-up``: starts and supervises every process of a scenario on one machine. ``console`` holds the
-entry points of all commands."""
+"""The command ``freshfield-up``: starts and supervises every process of a scenario on one machine.
+
+``console`` holds the entry points of all commands.
+"""

@@ -21,9 +21,9 @@ _MAX_SLEEP_S = 0.2
 _TOO_SHORT = 3  # updates in a row without a step, after which a warning is due
 _SHED_EVERY_S = 30.0  # between two warnings that frames are left out
 STOP_S = 20.0
-"""How long the server waits at its end for the update in progress, without which there is no checkpoint. On a machine with
-five times as much to do as it has cores, updates of ``ngp`` at 640 x 480 take 6 s, the longest 18. The launcher kills the
-server after ``freshfield_up.processes.GRACE_S``, of which the checkpoint and the last pictures need some."""
+"""How long the server waits at its end for the update in progress, without which there is no checkpoint. On a machine
+with five times as much to do as it has cores, updates of ``ngp`` at 640 x 480 take 6 s, the longest 18. The launcher
+kills the server after ``freshfield_up.processes.GRACE_S``, of which the checkpoint and the last pictures need some."""
 
 
 class UpdateLoop:
