@@ -56,11 +56,13 @@ class ShownRow(Struct, kw_only=True):
     age_ms: AgeParts = field(default_factory=AgeParts)
 
 
-class AgesRow(Struct):
-    """A line of ages.jsonl: the age of every camera's newest frame; None before its first."""
+class AgesRow(Struct, omit_defaults=True):
+    """A line of ages.jsonl: the age of every camera's newest frame, None before its first; and of the newest depth of
+    those that send it."""
 
     t_s: Number
     age_ms: dict[str, Number | None]
+    depth_age_ms: dict[str, Number] = {}
 
 
 class UpdateCounts(Struct):
@@ -81,6 +83,20 @@ class Baseline(Struct, frozen=True):
 
     mean_colour_db: Number | None = None
     nearest_view_db: Number | None = None
+
+
+class DepthCounts(Struct):
+    """Depth that arrived with a camera's frames: how many had it, and its encoded bytes."""
+
+    frames: Count
+    bytes: Count
+
+
+class DepthStatus(Struct):
+    """Depth that arrived, by camera, and how much of it was damaged."""
+
+    cameras: dict[str, DepthCounts]
+    undecodable: Count = 0
 
 
 class FitData(Struct):
@@ -111,6 +127,7 @@ class EdgeStatus(Struct, kw_only=True):
     updates: UpdateCounts | None = None
     foreground: dict[str, Number | None] | None = None
     baseline: Baseline | None = None
+    depth: DepthStatus | None = None
     data: FitData | None = None
     lpips_missing: str | None = None
     lpips_network: str | None = None

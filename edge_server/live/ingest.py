@@ -19,6 +19,7 @@ import numpy as np
 from edge_server.live.buffer import FrameBuffer
 from freshfield import limits
 from freshfield.clock import Clock
+from freshfield.depth import EncodedDepth
 from freshfield.frame import Frame, FrameRejected, counted_ids, from_request, parse
 from freshfield.ledger import Ledger
 from freshfield.limits import MAX_IMAGE_SIDE_PX
@@ -41,6 +42,20 @@ class _Session:
     """Capture time of its first admitted frame, on the edge's clock."""
     newest_ns: int = 0
     """Capture time of its last admitted frame, on the edge's clock."""
+
+
+@dataclass
+class DepthArrivals:
+    """Depth that came with one camera's frames. bytes: encoded. newest_ns: when the newest was measured, edge clock."""
+
+    frames: int = 0
+    bytes: int = 0
+    newest_ns: int = -(2**63)
+
+    def add(self, frame: Frame, depth: EncodedDepth) -> None:
+        self.frames += 1
+        self.bytes += len(depth.payload)
+        self.newest_ns = max(self.newest_ns, frame.generated_edge_ns + depth.after_image_ns)
 
 
 LastFrames = Mapping[str, Mapping[str, tuple[int, int]]]
@@ -172,6 +187,8 @@ class Ingest:
         self.rejected: Counter[str] = Counter()
         self.rejected_by_camera: Counter[str] = Counter()
         self.newest_held_out: dict[str, Frame] = {}
+        self.depth: dict[str, DepthArrivals] = {}
+        """Of the cameras that have sent depth."""
         self.check_ms = RollingPercentiles(4096)
         cameras = self.admission.cameras
         self.streams = OpenStreams(limits.MAX_STREAMS_PER_CAMERA * len(cameras))
@@ -182,6 +199,10 @@ class Ingest:
         that cannot be parsed."""
         push = grpc.stream_stream_rpc_method_handler(self._push, None, pb.PushResponse.SerializeToString)
         server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(_SERVICE, {"Push": push}),))
+
+    def depth_ages_ms(self, now_ns: int) -> dict[str, float]:
+        """Age of the newest depth of each camera that has sent any."""
+        return {camera: (now_ns - depth.newest_ns) / 1e6 for camera, depth in self.depth.copy().items()}
 
     async def _push(self, _: object, context: grpc.aio.ServicerContext) -> None:
         async with self.streams.open(context) as stream:
@@ -218,6 +239,8 @@ class Ingest:
             self._on_held_out(frame)
         else:
             self.buffer.put(frame, now_ns)
+        if frame.depth is not None:
+            self.depth.setdefault(frame.camera, DepthArrivals()).add(frame, frame.depth)
         self.delivered[frame.camera] += 1
         self._ledger.write(now_ns, frame.camera, frame.session, frame.sequence, "delivered")
         if self._on_accepted is not None:

@@ -34,7 +34,7 @@ from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.output.journal import Journal
 from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Snapshot
-from edge_server.run_records import EdgeStatus, UpdateCounts
+from edge_server.run_records import DepthCounts, DepthStatus, EdgeStatus, UpdateCounts
 from edge_server.scheduler import LivePolicies, short_name
 from edge_server.settings import EdgeConfig, described, embedding_for, read_config
 from freshfield.clock import Clock, WallClock
@@ -245,7 +245,8 @@ class EdgeServer:
         saved_ns = self.clock.now_ns()
         while not self._stopping.wait(_AGES_PERIOD_S) and self.loop.alive:
             now_ns = self.clock.now_ns()
-            self.journal.ages((now_ns - self.start_ns) / 1e9, self.buffer.ages_ms(now_ns))
+            ages = self.buffer.ages_ms(now_ns), self.ingest.depth_ages_ms(now_ns)
+            self.journal.ages((now_ns - self.start_ns) / 1e9, *ages)
             if ticks % every == 0:
                 self.journal.write_status()
             ticks += 1
@@ -343,8 +344,11 @@ class EdgeServer:
     def status(self) -> dict[str, Any]:
         """Contents of edge.json."""
         last, scored = self.state.newest(), self.state.newest(scored=True)
+        depth = {c: DepthCounts(d.frames, d.bytes) for c, d in self.ingest.depth.copy().items()}
+        depth_status = DepthStatus(depth, self.updater.decoder.undecodable_depth)
         return {
             **({} if self.recorder is None else {"recording": self.recorder.status()}),
+            **({"depth": msgspec.to_builtins(depth_status)} if depth else {}),
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
             "started_ns": self.start_ns,

@@ -14,7 +14,7 @@ from edge_server.fidelity.scorer import SHOWN
 from edge_server.report.frame_accounting import account_frames
 from edge_server.report.machine import machine, versions
 from edge_server.report.run_files import RunFiles, read_run_files
-from edge_server.run_records import AgesRow, Baseline, EdgeStatus, ShownRow, UpdateCounts, UpdateRow
+from edge_server.run_records import AgesRow, Baseline, DepthStatus, EdgeStatus, ShownRow, UpdateCounts, UpdateRow
 from freshfield.files import write_json, write_text
 from freshfield.machine_load import outside_load
 
@@ -71,6 +71,8 @@ def assemble(files: RunFiles) -> dict[str, Any]:
         "channel": msgspec.to_builtins(files.channel),
         "notes": notes + accounting.notes,
     }
+    if edge.depth is not None:
+        report["depth"] = depth(edge.depth, files.ages)
     if files.mesh:
         report["mesh"] = msgspec.to_builtins(files.mesh)
     if edge.kind == "fit":
@@ -91,6 +93,19 @@ def ages(rows: Sequence[AgesRow]) -> dict[str, Any]:
     everything = [age_ms for values in samples.values() for age_ms in values]
     total = _spread(everything) or {"mean": None, "p50": None, "p95": None}
     return {**total, "by_camera": {camera: _spread(values) for camera, values in sorted(samples.items())}}
+
+
+def depth(status: DepthStatus, rows: Sequence[AgesRow]) -> dict[str, Any]:
+    """Depth that arrived: {frames, bytes, undecodable: how many were damaged, age_ms: of the newest depth, averaged
+    over time as ``ages``, cameras: {camera: {frames, bytes}}}."""
+    counts = status.cameras.values()
+    return {
+        "frames": sum(camera.frames for camera in counts),
+        "bytes": sum(camera.bytes for camera in counts),
+        "undecodable": status.undecodable,
+        "age_ms": _spread([age_ms for row in rows for age_ms in row.depth_age_ms.values()]),
+        "cameras": msgspec.to_builtins(status.cameras),
+    }
 
 
 def updates(series: Sequence[UpdateRow], edge: UpdateCounts) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from msgspec.structs import asdict
 
 from edge_server.fidelity.scorer import SHOWN, Score
@@ -90,9 +91,13 @@ class Journal:
         )
         self._files["shown"].write(json.dumps(line, default=asdict, allow_nan=False))
 
-    def ages(self, t_s: float, ages_ms: Mapping[str, float | None]) -> None:
-        line = AgesRow(round(t_s, 4), {c: a if a is None else round(a, 3) for c, a in ages_ms.items()})
-        self._files["ages"].write(json.dumps(line, default=asdict))
+    def ages(
+        self, t_s: float, ages_ms: Mapping[str, float | None], depth_ages_ms: Mapping[str, float] | None = None
+    ) -> None:
+        """Write a line of ages. depth_ages_ms: of the newest depth of cameras that send it."""
+        ages = {c: a if a is None else round(a, 3) for c, a in ages_ms.items()}
+        line = AgesRow(round(t_s, 4), ages, {c: round(a, 3) for c, a in (depth_ages_ms or {}).items()})
+        self._files["ages"].write(msgspec.json.encode(line).decode())
 
     def write_status(self) -> None:
         """Replace edge.json; where that fails, the old one stays."""

@@ -31,6 +31,8 @@ class EdgeCollector:
         rejected = CounterMetricFamily("freshfield_frames_rejected", "frames refused", labels=["reason"])
         for reason, count in dict(self._ingest.rejected).items():  # ingest adds reasons meanwhile
             rejected.add_metric([reason], count)
+        if self._ingest.depth:  # no series of depth where no camera sends it
+            yield from self._depth()
         shed = self._ingest.buffer.shed
         yield from (age, delivered, rejected)
         yield CounterMetricFamily("freshfield_frames_shed", "frames left out for lack of time", value=shed)
@@ -51,6 +53,17 @@ class EdgeCollector:
         for name in ("psnr_db", "psnr_moving_db", "ssim", "lpips"):
             if (value := getattr(scored, name, None)) is not None:
                 yield GaugeMetricFamily(f"freshfield_{name}", about, value=value)
+
+    def _depth(self) -> Iterator[Metric]:
+        frames = CounterMetricFamily("freshfield_depth_frames", "frames accepted with depth", labels=["camera"])
+        size = CounterMetricFamily("freshfield_depth_bytes", "encoded depth in accepted frames", labels=["camera"])
+        age = GaugeMetricFamily("freshfield_depth_age_seconds", "age of the newest depth", labels=["camera"])
+        now_ns = self._state.now_ns()
+        for camera, depth in self._ingest.depth.copy().items():
+            frames.add_metric([camera], depth.frames)
+            size.add_metric([camera], depth.bytes)
+            age.add_metric([camera], (now_ns - depth.newest_ns) / 1e9)
+        yield from (frames, size, age)
 
 
 def serve_metrics(state: EdgeState, ingest: Ingest, host: str, port: int, transport: Transport | None = None) -> None:

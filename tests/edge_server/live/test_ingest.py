@@ -165,6 +165,16 @@ def test_depth_may_be_larger_than_its_image_up_to_a_sensors_size(ingest):
     assert ingest.delivered["cam01"] == 2 and ingest.rejected == {"depth_too_large": 1}
 
 
+def test_depth_is_counted_by_camera_with_its_own_age(ingest):
+    assert ingest.depth == {}
+    for k, later_ns in enumerate((-100 * MS, 20 * MS, None)):
+        sent = None if later_ns is None else depth(after_image_ns=later_ns)
+        ingest.take(to_request(good(k, depth=sent)))
+    (found,) = ingest.depth.items()
+    assert found[0] == "cam01" and (found[1].frames, found[1].bytes) == (2, 2 * len(depth().payload))
+    assert ingest.depth_ages_ms(NOW) == {"cam01": pytest.approx(30.0, abs=1e-3)}
+
+
 @pytest.mark.stability
 def test_a_bomb_of_depth_is_refused_and_loses_nothing_else(ingest):
     bomb = zstandard.ZstdCompressor().compress(bytes(2**28))

@@ -133,6 +133,27 @@ def test_the_page_shows_frames_that_were_left_out_and_images_that_were_cut(tmp_p
     assert "1 (all of it was found to be the object)" in page
 
 
+def test_depth_is_reported_where_there_is_some(run, tmp_path):
+    assert "depth" not in run[1] and "depth" not in page_of(run[0])[1]
+    write_run(tmp_path)
+    found = {"cam01": {"frames": 40, "bytes": 380_000}, "cam02": {"frames": 10, "bytes": 120_000}}
+    edit_edge(tmp_path, depth={"cameras": found, "undecodable": 2})
+    with (tmp_path / "ages.jsonl").open("a") as file:
+        for age_ms in (100.0, 300.0):
+            file.write(json.dumps({"t_s": 50.0, "age_ms": {}, "depth_age_ms": {"cam01": age_ms}}) + "\n")
+    report, page = page_of(tmp_path)
+    assert report["depth"] == {
+        "frames": 50,
+        "bytes": 500_000,
+        "undecodable": 2,
+        "age_ms": {"mean": 200.0, "p50": 200.0, "p95": pytest.approx(290.0)},
+        "cameras": found,
+    }
+    assert report["age_ms"] == run[1]["age_ms"]
+    assert "50 frames brought depth, 10.0 kB each; the newest depth was 200 ms old on average" in page
+    assert "depth that could not be decoded: 2" in page
+
+
 def test_every_figure_is_drawn_and_inside_a_page_that_loads_nothing(run):
     out, _ = run
     names = ["comparison", "fidelity", "ages", "updates", "channel", "processes"]

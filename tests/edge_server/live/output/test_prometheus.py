@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from types import SimpleNamespace
 
+from edge_server.live.ingest import DepthArrivals
 from edge_server.live.output.prometheus import EdgeCollector
 from tests.edge_server.page.test_page import bare_state
 
@@ -21,9 +22,25 @@ class Growing(Counter):
 def test_a_reason_that_comes_while_metrics_are_read_does_not_fail_them():
     ingest = SimpleNamespace(
         rejected=Growing(crc=4, stale=1),
+        depth={},
         buffer=SimpleNamespace(shed=2),
         check_ms=SimpleNamespace(percentile=lambda percent: None),
     )
     found = {metric.name: metric for metric in EdgeCollector(bare_state(), ingest).collect()}
     rejected = {s.labels["reason"]: s.value for s in found["freshfield_frames_rejected"].samples}
     assert rejected == {"crc": 4.0, "stale": 1.0}
+    assert not any("depth" in name for name in found)
+
+
+def test_depth_has_metrics_where_a_camera_sends_it():
+    state = bare_state()
+    ingest = SimpleNamespace(
+        rejected={},
+        depth={"cam01": DepthArrivals(3, 2500, state.now_ns() - 10**9)},
+        buffer=SimpleNamespace(shed=0),
+        check_ms=SimpleNamespace(percentile=lambda percent: None),
+    )
+    found = {m.name: m.samples[0] for m in EdgeCollector(state, ingest).collect() if "depth" in m.name}
+    assert {name: sample.labels for name, sample in found.items()} == {name: {"camera": "cam01"} for name in found}
+    assert found["freshfield_depth_frames"].value == 3 and found["freshfield_depth_bytes"].value == 2500
+    assert 1.0 <= found["freshfield_depth_age_seconds"].value < 30.0
