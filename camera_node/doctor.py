@@ -20,10 +20,21 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from camera_node.settings import ArmConfig, LiveConfig, RecordedConfig, SourceConfig, find_data, source_config
+from camera_node.settings import (
+    ArmConfig,
+    LiveConfig,
+    McapConfig,
+    RecordedConfig,
+    SourceConfig,
+    find_data,
+    source_config,
+)
 from camera_node.sources.base import rate
+from camera_node.sources.devices.feed import Image
 from freshfield import transport
 from freshfield.clock import WallClock
+from freshfield.depth import DepthImage
+from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, load
 
 LEAST_FREE_GB = 2.0
@@ -124,10 +135,26 @@ def _source(scenario: Scenario, config: SourceConfig, data: Path | None, plan: P
         yield _check("arm", lambda: checks.joint_states(arm))
         if (path := arm.path) is not None:
             yield _check("arm's path", lambda: checks.path(scenario, arm, path))
+    if config.depth_every and arm is None and not isinstance(config, LiveConfig | McapConfig):
+        yield from _depth(scenario, config, data)
     if config.kind != "mcap":  # a recording is read once, from its beginning
         from camera_node import coverage_check
 
         yield _check("coverage", lambda: coverage_check.check(scenario, config, data, plan))
+
+
+def _depth(scenario: Scenario, config: SourceConfig, data: Path | None) -> Iterator[CheckResult]:
+    """The depth of each camera that measures it; nothing if none does."""
+    from camera_node import depth_check
+
+    try:
+        views = depth_check.first_views(scenario, config, data)
+    except (ValueError, OSError) as error:
+        yield CheckResult("depth", False, " ".join(str(error).split()))
+        return
+    for view in views:
+        others = [other for other in views if other is not view]
+        yield _check(f"depth {view.camera}", lambda view=view, others=others: depth_check.check(view, others))  # type: ignore[misc]
 
 
 def _check(part: str, check: Callable[[], str]) -> CheckResult:
@@ -261,6 +288,7 @@ def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
     clock = WallClock()
     asked_hz = config.fps or DEFAULT_FPS
     listen_s = min(max(_LISTEN_S, _JUDGED_FRAMES / asked_hz), _LISTEN_AT_MOST_S)
+    measured: tuple[Image, DepthImage] | None = None
     feed = open_feed(camera, config, rate(asked_hz), clock)
     try:
         first = feed.grab(config.first_frame_s)
@@ -271,6 +299,8 @@ def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
             taken = feed.grab(_LISTEN_S)
             if taken is not None:
                 ages_ms.append((clock.now_ns() - taken[0]) / 1e6)
+                if feed.depth is not None:
+                    measured = (taken[1], feed.depth)
         lens, no_intrinsics, stamped_by = feed.intrinsics, feed.no_intrinsics, feed.stamped_by
     finally:
         feed.close()
@@ -289,4 +319,9 @@ def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
             "this size so fast (smaller width and height, or fps)?"
         )
     age = f", {sum(ages_ms) / len(ages_ms):.0f} ms old when they come" if ages_ms else ""
+    if measured is not None and lens is not None:
+        from camera_node.depth_check import DepthView, check
+
+        anywhere = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        known += f"; depth {check(DepthView(camera, measured[0], lens, anywhere, measured[1]), [])}"
     return f"{width} x {height}, {rate_hz:.3g} frames a second{age}, stamped by {stamped_by}; {known}"
