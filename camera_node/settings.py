@@ -241,6 +241,10 @@ class HandheldConfig(RecordedConfig, frozen=True, kw_only=True):
     (frame-*.pose.txt), of a Record3D export "EXR + JPG" (metadata.json), or of Polycam's raw data (keyframes)."""
 
 
+class FoxgloveConfig(RecordedConfig, frozen=True, kw_only=True):
+    """A recording in MCAP, by any tool, in Foxglove's protobuf messages (extra ``mcap``). data: the file."""
+
+
 class McapConfig(SourceConfig, frozen=True, kw_only=True):
     """A session that ``edge-server run --record`` wrote, replayed message by message: the same bytes and
     poses, stamps shifted to now, from first to last, after which the node ends. fps, codec, quality and depth are
@@ -269,6 +273,7 @@ MODELS: dict[str, type[SourceConfig]] = {
     "sevenscenes": HandheldConfig,
     "record3d": HandheldConfig,
     "polycam": HandheldConfig,
+    "foxglove": FoxgloveConfig,
     "mcap": McapConfig,
     "camera": CameraConfig,
     "oak": OakConfig,

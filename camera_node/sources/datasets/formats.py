@@ -57,6 +57,8 @@ def recognize(file: Path) -> str:
     """
     if file.name == "metadata.json":
         return "record3d"
+    if file.suffix == ".mcap":
+        return "foxglove"
     if file.suffix in (".bin", ".txt"):
         return {"rgb.txt": "tum", "frame-000000.pose.txt": "sevenscenes"}.get(file.name, "colmap")
     data = read_json(file) if file.suffix == ".json" else None

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.sources.datasets.imaging import decode_file, shrink
-from camera_node.sources.datasets.lens import pinhole, undistort
+from camera_node.sources.datasets.lens import Lens, pinhole, undistort
 from camera_node.sources.datasets.photo import Photo
 from camera_node.sources.datasets.records import DatasetError
 from freshfield.depth import DepthImage
@@ -44,46 +44,54 @@ class DepthFile:
     to_camera: Pose | None = None
 
     def read(self, photo: Photo) -> DepthImage:
-        """The depth that belongs to ``photo``: undistorted like it, and no larger. Whole numbers stay as they are;
-        others become whole millimeters. Raises DatasetError."""
-        values = _numbers(self.path)
-        unit = self.unit_m or (1.0 if values.dtype.kind == "f" else MILLIMETER)
-        measured = np.isfinite(values) & (values > 0) & (values != self.nothing)
-        self._check_unit(values[measured], unit)
-        if values.dtype.kind == "f":
-            values = np.rint(np.where(measured, values, 0).astype(np.float64) * (unit / MILLIMETER))
-            measured &= values <= _MOST_COUNTS
-            unit = MILLIMETER
-        counts = np.where(measured, values, 0).astype(np.uint16)
-        if self.lens is not None:
-            lens = self.lens.scaled(counts.shape[1] / self.lens.width)  # of a smaller copy
-            if counts.shape != (lens.height, lens.width):
-                raise DatasetError(f"{self.path}: {_size(counts)}, its sensor {self.lens.width} x {self.lens.height}")
-            return DepthImage(counts, unit, lens, self.to_camera)
-        return DepthImage(self._registered(counts, photo), unit)
+        """The depth that belongs to ``photo``, as ``to_counts`` and ``registered`` make it. Raises DatasetError."""
+        counts, unit = to_counts(_numbers(self.path), self.unit_m, str(self.path), self.nothing)
+        if self.lens is None:
+            return DepthImage(registered(counts, photo.lens, photo.options.scale, str(self.path)), unit)
+        lens = self.lens.scaled(counts.shape[1] / self.lens.width)  # of a smaller copy
+        if counts.shape != (lens.height, lens.width):
+            raise DatasetError(f"{self.path}: {_size(counts)}, its sensor {self.lens.width} x {self.lens.height}")
+        return DepthImage(counts, unit, lens, self.to_camera)
 
-    def _registered(self, counts: NDArray[np.uint16], photo: Photo) -> NDArray[np.uint16]:
-        height, width = counts.shape
-        lens = photo.lens
-        if abs((width / lens.width) / (height / lens.height) - 1.0) > _SAME_SHAPE:
-            raise DatasetError(
-                f"{self.path}: depth is {_size(counts)}, its image {lens.width} x {lens.height}: another shape; "
-                "register it to the image"
-            )
-        counts = undistort(lens.resized(width, height), counts, nearest=True)
-        small = shrink(pinhole(lens), photo.options.scale)
-        if width > small.width:
-            size = (small.width, small.height)
-            counts = np.asarray(cv2.resize(counts, size, interpolation=cv2.INTER_NEAREST_EXACT), np.uint16)
-        return counts
 
-    def _check_unit(self, measured: NDArray[Any], unit: float) -> None:
-        middle_m = float(np.median(measured)) * unit if measured.size else 1.0
-        if not _NEAR_M <= middle_m <= _FAR_M:
-            raise DatasetError(
-                f"{self.path}: the median of its depth is {middle_m:.3g} m, if a 1 in it is {unit:g} m: say the unit "
-                "of its numbers in meters (depth_unit_scale_factor of a transforms.json)"
-            )
+def to_counts(
+    values: NDArray[Any], unit_m: float | None, where: str, nothing: int = 0
+) -> tuple[NDArray[np.uint16], float]:
+    """Counts of a depth image, and meters a count. Whole numbers stay as they are, others become whole millimeters.
+
+    values: (H, W), 16 bits or floating point. unit_m, nothing: as in ``DepthFile``. where: for error messages.
+    Raises DatasetError if the unit cannot be right.
+    """
+    unit = unit_m or (1.0 if values.dtype.kind == "f" else MILLIMETER)
+    measured = np.isfinite(values) & (values > 0) & (values != nothing)
+    middle_m = float(np.median(values[measured])) * unit if measured.any() else 1.0
+    if not _NEAR_M <= middle_m <= _FAR_M:
+        raise DatasetError(
+            f"{where}: the median of its depth is {middle_m:.3g} m, if a 1 in it is {unit:g} m: say the unit of its "
+            "numbers in meters (depth_unit_scale_factor of a transforms.json)"
+        )
+    if values.dtype.kind == "f":
+        values = np.rint(np.where(measured, values, 0).astype(np.float64) * (unit / MILLIMETER))
+        measured &= values <= _MOST_COUNTS
+        unit = MILLIMETER
+    return np.where(measured, values, 0).astype(np.uint16), unit
+
+
+def registered(counts: NDArray[np.uint16], lens: Lens, scale: float, where: str) -> NDArray[np.uint16]:
+    """Depth that is registered to images of ``lens``, undistorted and shrunk by ``scale`` as they are, and no larger.
+    Raises DatasetError if it has another shape."""
+    height, width = counts.shape
+    if abs((width / lens.width) / (height / lens.height) - 1.0) > _SAME_SHAPE:
+        raise DatasetError(
+            f"{where}: depth is {_size(counts)}, its image {lens.width} x {lens.height}: another shape; register it "
+            "to the image"
+        )
+    counts = undistort(lens.resized(width, height), counts, nearest=True)
+    small = shrink(pinhole(lens), scale)
+    if width > small.width:
+        size = (small.width, small.height)
+        counts = np.asarray(cv2.resize(counts, size, interpolation=cv2.INTER_NEAREST_EXACT), np.uint16)
+    return counts
 
 
 def _numbers(path: Path) -> NDArray[Any]:
