@@ -36,6 +36,7 @@ from edge_server.live.field_updater import FieldUpdater, open_updater
 from edge_server.live.ingest import FrameAdmission
 from edge_server.scheduler import make_policy, parse_policy
 from edge_server.settings import read_config
+from freshfield.depth import DepthImage
 from freshfield.frame import Frame, FrameRejected, checksum, from_request, to_request, valid_id
 from freshfield.ledger import Ledger
 from freshfield.scenario import Scenario, seed_sequence
@@ -255,9 +256,13 @@ class ChaosDeployment(VirtualDeployment):
         shot, now_ns = camera.capture(0), self.clock.now_ns()
         self._attempts += 1
         sequence = 2**40 + self._attempts
-        frame = Frame(camera.name, "hostile", sequence, now_ns, shot.pose, shot.intrinsics, camera.codec, shot.payload)
+        lens = shot.intrinsics
+        measured = DepthImage(np.full((lens.height, lens.width), 2000, np.uint16), 0.001).encode()
+        frame = Frame(
+            camera.name, "hostile", sequence, now_ns, shot.pose, lens, camera.codec, shot.payload, depth=measured
+        )
         request = to_request(frame)
-        header, data = request.header, shot.payload
+        header, depth, data = request.header, request.depth, shot.payload
         wrong: list[tuple[Any, str, list[Any]]] = [
             (header, "camera_id", ["mars", "../etc", "", "a" * 65, "cam01\t"]),
             (header, "session_id", ["a\nb", "", "x" * 1000]),
@@ -272,6 +277,11 @@ class ChaosDeployment(VirtualDeployment):
             *((header.pose, name, [0.0, 1.0, nan, inf, 1e300, 5e-324]) for name in ("qw", "qz")),
             *((header.pose, name, [1e7, nan, -inf, 3.0]) for name in ("tx_m", "tz_m")),
             *((header.intrinsics, name, [0.0, -5.0, 1e-9, 1e9, nan]) for name in ("fx", "cy", "k1", "p2")),
+            (depth, "codec", [-1, 0, 99]),
+            (depth, "width", [0, 1, lens.width + 1, 2**31 - 1]),
+            (depth, "meters_per_count", [0.0, nan, -inf, 1e300]),
+            (depth, "after_image_ns", [-(2**63), 2**63 - 1]),
+            (depth, "payload", [b"", measured.payload[:-5], data, bytes(rng.bytes(200))]),
             (
                 request,
                 "payload",
