@@ -76,6 +76,14 @@ class ViewStore:
         self._packed = (tuple(views), data)
         return PackedUpdate(data, box_changed, visibility_changed or box_changed, has_new_images)
 
+    def keep_box(self) -> None:
+        """Keep the scene's box, whatever cameras come."""
+        self._box_cameras = FINAL_BOX_CAMERAS
+
+    def forget_views(self) -> None:
+        """Forget the views; box and background stay."""
+        self.memory, self._packed = {}, None
+
     def background(self) -> NDArray[np.float32]:
         """The color (3,) behind everything that is rendered."""
         name = self.settings.background

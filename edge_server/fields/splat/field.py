@@ -70,6 +70,24 @@ class StillField(SteppedField[SplatSnapshot]):
         with self._lock:
             self._ingest(views)
 
+    def keep_box(self, views: Sequence[View]) -> None:
+        """Keep the scene's box as it is, or as ``views`` have it where there is none, whatever cameras come."""
+        with self._lock:
+            if self.view_store.box is None:
+                self.view_store.add(views)
+            self.view_store.keep_box()
+
+    def begin_anew(self, params: NDArray[np.float32] | None) -> None:
+        """Forget views and Gaussians, but for the scene's box.
+
+        params: float32 (N, P), of the first Gaussians; None: they are found from the next views.
+        """
+        with self._lock:
+            self.view_store.forget_views()
+            self._forget_parameters()
+            if params is not None:
+                self.cloud = GaussianCloud.new(params)
+
     def train_step(self, progress: float, grow: bool) -> tuple[float, int, int]:
         """One optimizer step at ``progress``, in [0, 1], of a schedule. grow: whether Gaussians may be split and
         pruned. Returns the mean squared error, pixels, and pairs of a Gaussian and a tile."""

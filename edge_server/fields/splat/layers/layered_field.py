@@ -30,7 +30,6 @@ from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import COLOR, Gaussians
 from edge_server.fields.splat.layers import settings as tuned
-from edge_server.fields.splat.layers.exposures import equalize_exposures
 from edge_server.fields.splat.layers.layered_state import pack, unpack
 from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import (
@@ -41,7 +40,8 @@ from edge_server.fields.splat.layers.observations import (
     newest_of_each,
 )
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
-from edge_server.fields.splat.layers.static_layer import PlateImage, StaticLayer
+from edge_server.fields.splat.layers.static_layer import StaticLayer
+from edge_server.fields.splat.layers.static_supervision import StaticSupervision
 from edge_server.fields.splat.layers.tracker import MotionTracker, PartTimes
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.snapshot import SplatSnapshot
@@ -70,6 +70,7 @@ class LayeredField:
         self.still = StillField(self.settings, self.pool)
         self.static = StaticLayer(self.still)
         self.part_s = PartTimes(self.now)
+        self.supervision = StaticSupervision(self.static, self.part_s)
         self._frame_time = StepTimer()
         self.reset()
 
@@ -85,13 +86,9 @@ class LayeredField:
         self.layered = True  # False: a camera moves, or its frames are none for layers
         self.refused: set[str] = set()  # cameras whose newest frame shows something else than their plate
         self.origin_ns: int | None = None
-        self.plates_s = -np.inf  # instant of the frames when plates were last compared
-        self.fine_s = -np.inf  # instant of the frames when one was last taken in at its full resolution
-        self.fine = False  # whether the still field learns from fine plates
-        self.exposure_rounds = 0  # number of rounds of ``_exposures_agree`` so far
+        self.supervision = StaticSupervision(self.static, self.part_s)
         self._published: SplatSnapshot | None = None
-        self._earlier: SplatSnapshot | None = None  # what the still field showed, while it is worse than before
-        self._exposed: tuple[tuple[int, bytes], Gaussians] | None = None  # see ``_at_present_exposure``
+        self._exposed: tuple[SplatSnapshot, bytes, Gaussians] | None = None  # see ``_at_present_exposure``
 
     @property
     def frame_s(self) -> float | None:
@@ -106,7 +103,7 @@ class LayeredField:
     @property
     def views(self) -> tuple[View, ...]:
         """What the still field learns from: a view of each camera, or its background plate."""
-        return self.still.views
+        return tuple(view for view in self.still.views if not self.cameras or view.camera in self.cameras)
 
     @property
     def moving(self) -> MovingSet | None:
@@ -137,16 +134,18 @@ class LayeredField:
         if self.tracker is not None and not len(self.observations):
             self._begin_again("no camera stands where it stood")
         if self.tracker is None:
-            if not self._plates_are_known():
+            if not self.supervision.plates_are_known(self.cameras, self.observations):
                 report = self._fit_still(views, budget, pace)
-                self._take_whole(taken)
+                self.supervision.take_whole(taken, self.cameras, self.observations)
                 return report
-            if not self._exposures_agree():
+            agree = self.supervision.exposures_agree(self.cameras, self.observations)
+            self._published = self._published or self.supervision.earlier
+            if not agree:
                 return FitReport(0, pace.elapsed_s(), 0.0, 0, 0, note="the cameras' exposures are equalized")
             log.info("layers begin: the plates of %d cameras are known", len(self.cameras))
         tracker = self.tracker or self._begin_layers()
         beside = budget.seconds is not None
-        self._compare_plates(beside)
+        self.supervision.compare(self.cameras, self.observations, beside)
         self._find_rows()
         parameters = self.still.adam_parameters(tuned.STEP_PROGRESS)
         steps, rays, samples = tracker.follow(pace, self._publish, parameters)
@@ -159,7 +158,7 @@ class LayeredField:
             self.part_s.add("static field", begun)
         self._publish()
         self._take_renderings(beside)
-        self._take_whole(taken)
+        self.supervision.take_whole(taken, self.cameras, self.observations)
         note = "" if steps or pace.steps else self._why_no_step(tracker.moving) if taken else "no new views"
         return FitReport(
             steps,
@@ -206,7 +205,7 @@ class LayeredField:
         field = LayeredField(tiny, pool)
         views = [View("warm-up", np.full((32, 32, 3), 128, np.uint8), pose, camera, k) for k in range(2)]
         field._take_in(views)
-        field.static.begin(field._plates())
+        field.static.begin([camera.plate_image(fine=False) for camera in field.cameras.values()])
         moving = field._begin_layers().moving
         field._find_rows()
         moving.run_kernels(field.cameras["warm-up"], next(iter(field.observations)))
@@ -226,7 +225,7 @@ class LayeredField:
 
     def finish_loading(self) -> None:
         """What follows from the loaded parts."""
-        self._published = self._exposed = self._earlier = None
+        self._published = self._exposed = None
         if self.tracker is not None:
             self.static.publish()
             self._find_rows()
@@ -247,9 +246,11 @@ class LayeredField:
         """Go on with the still field alone, until ``reset``."""
         log.info("layers are given up until a reset: %s", reason)
         self.static.forget()
-        self.layered = self.fine = False
+        if self.supervision.with_depth:  # virtual ones
+            self.still.view_store.forget_views()
+        self.layered = False
         self._published, self.tracker, self.observations = None, None, Observations()
-        self.cameras = {}
+        self.cameras, self.supervision = {}, StaticSupervision(self.static, self.part_s)
 
     def _take_in(self, views: Sequence[View]) -> list[View]:
         """Plates and foregrounds of the views not seen before. Returns these views."""
@@ -287,6 +288,8 @@ class LayeredField:
             self.refused = refused
             return
         self.refused -= {view.camera}
+        if view.depth is not None:
+            self.supervision.take_depth(camera, view, foreground)
         if camera.anew:
             return  # against an empty plate nothing is foreground
         self.observations.add(
@@ -301,7 +304,7 @@ class LayeredField:
     def _move_camera(self, view: View) -> FixedCamera:
         """Begin a camera anew where it stands now, at the exposure that it had; the others go on."""
         log.info("%s stands somewhere else: its plate begins anew", view.camera)
-        self.static.forget_camera(view.camera)
+        self.supervision.forget_camera(view.camera)
         before, camera = self.cameras[view.camera], FixedCamera.begin(view, self.caller)
         camera.taken, camera.moves, camera.anew = before.taken, before.moves, True
         camera.correct_exposure(before.plate.gain)
@@ -309,40 +312,14 @@ class LayeredField:
         self.observations.forget_camera(view.camera)
         return camera
 
-    def _take_whole(self, taken: Sequence[View]) -> None:
-        """Take one of the frames into its camera's fine plate, now and then; the cameras take turns."""
-        begun = self.now()
-        views = {v.camera: v for v in taken if v.whole is not None}
-        seen = [
-            o for o in self.observations if o.camera in views and o.view.generated_ns == views[o.camera].generated_ns
-        ]
-        alone = len(self.cameras) < tuned.LEAST_CAMERAS
-        if not seen or alone or self.observations.newest_s - self.fine_s < tuned.FINE_EVERY_S:
-            return
-        self.fine_s = self.observations.newest_s
-        o = min(seen, key=lambda o: self.cameras[o.camera].fine_count)
-        camera, decode = self.cameras[o.camera], views[o.camera].whole
-        if camera.fine is not None and decode is not None and (whole := decode()) is not None:
-            camera.fine.take(whole.image, o.foreground | ~camera.plate.known, camera.plate.gain)
-        self.part_s.add("fine plates", begun)
-
-    def _plates_are_known(self) -> bool:
-        return (
-            len(self.cameras) >= tuned.LEAST_CAMERAS
-            and len(self.observations) > 0
-            and self.observations.newest_s >= tuned.PLATE_S
-            # Of a camera that has gone silent nothing more will come.
-            and all(self.cameras[o.camera].plate.count >= tuned.PLATE_FRAMES for o in self.observations)
-        )
-
     # --- the still field ---------------------------------------------------------------------
 
     def _begin_layers(self) -> MotionTracker:
         """Begin to follow what moves, in the scene's box."""
-        self.plates_s = self.observations.newest_s
+        self.supervision.plates_s = self.observations.newest_s
         self.make_tracker()
         assert self.tracker is not None
-        self.tracker.anchors_s = self.plates_s
+        self.tracker.anchors_s = self.supervision.plates_s
         return self.tracker
 
     def _begin_again(self, why: str) -> None:
@@ -351,74 +328,15 @@ class LayeredField:
         log.info("layers begin again: %s", why)
         self.static.forget()
         self.tracker = None
-        self.exposure_rounds = 0
+        self.supervision.begin_again()
         self.observations = Observations()
         for camera in self.cameras.values():
             camera.row, camera.depth_m, camera.rendered_step, camera.anew = None, None, -1, False
-
-    def _begin_anew(self) -> None:
-        """Have the still field forget what it has learned, and begin with the plates as they are; what it showed is
-        shown until it is better."""
-        self._earlier, self._exposed = self._earlier or self.still.snapshot(), None
-        self._published = self._published or self._earlier
-        self.static.forget()
-        self.still.reset()
-        self.static.begin(self._plates())
 
     def make_tracker(self) -> None:
         """A tracker of nothing yet, in the static field's box."""
         moving = MovingSet(self.settings, self.caller, self._box(), self.settings.seed)
         self.tracker = MotionTracker(moving, self.observations, self.cameras, self.part_s)
-
-    def _compare_plates(self, beside: bool) -> None:
-        """Have the still field learn plates that have changed. beside: in a thread, until it has learned
-        them; or else only note that there is something to learn."""
-        begun, now_s = self.now(), self.observations.newest_s
-        if not self.fine and self._fine_plates_are_known():
-            self.static.stop()
-            self.fine = True
-            self.static.refine(self._plates())
-            self.plates_s = now_s
-        if beside and self.static.training:
-            return
-        finished = self.static.finished
-        if finished and now_s - self.plates_s < tuned.PLATES_EVERY_S:
-            return
-        if finished or beside:
-            plates = self._plates()
-            self.plates_s = now_s
-            if beside:
-                self.static.train_beside(plates, [camera.view for camera in self.cameras.values()])
-            else:
-                self.static.learn_again(plates)
-        self.part_s.add("static field", begun)
-
-    def _exposures_agree(self) -> bool:
-        """Begin with the plates, and correct the cameras' exposures where they differ; the field that shows that they
-        agree goes on. One round a call. Returns whether it was the last."""
-        begun, views = self.now(), [camera.view for camera in self.cameras.values()]
-        agree = self.exposure_rounds >= tuned.EXPOSURE_ROUNDS
-        self._begin_anew()
-        if not agree:
-            self.exposure_rounds += 1
-            self.static.train(StepBudget(Budget(steps=tuned.EXPOSURE_STEPS), self.now))
-            self.static.publish()
-            self.static.render(views)
-            renderings = {name: rendering for name, (_, rendering) in self.static.rendered.items()}
-            self.static.rendered = {}
-            agree = equalize_exposures(self.cameras, renderings)
-            if agree:
-                self.exposure_rounds = tuned.EXPOSURE_ROUNDS
-        self.part_s.add("exposures", begun)
-        return agree
-
-    def _plates(self) -> list[PlateImage]:
-        return [camera.plate_image(self.fine) for camera in self.cameras.values()]
-
-    def _fine_plates_are_known(self) -> bool:
-        seen = [self.cameras[camera].fine for camera in {o.camera for o in self.observations}]
-        fine = [f for f in seen if f is not None]
-        return bool(fine) and all(f.count >= tuned.FINE_FRAMES for f in fine)
 
     def _find_rows(self) -> None:
         for camera in self.cameras.values():
@@ -448,7 +366,7 @@ class LayeredField:
 
     def _publish(self) -> None:
         """Show the layers as they are now."""
-        still, tracker = self._still_to_show(), self.tracker
+        still, tracker = self.supervision.to_show(self._box()), self.tracker
         if still is None:
             return
         assert tracker is not None and self.origin_ns is not None
@@ -458,26 +376,15 @@ class LayeredField:
         self._published = LayeredSnapshot.of(still, exposed, shown)
         self.part_s.add("publication", begun)
 
-    def _still_to_show(self) -> SplatSnapshot | None:
-        """The still field, or what it showed before it began anew, until it is better; None if that is of another
-        box."""
-        earlier = self._earlier
-        if earlier is None or self.static.ready:
-            if earlier is not None:
-                self._earlier = self._exposed = None
-            return self.static.shown
-        return earlier if earlier.box == self._box() else None
-
     def _at_present_exposure(self, shown: SplatSnapshot) -> Gaussians:
         """The still field at the cameras' present exposure; the arrays of the last publication, where nothing has
         changed."""
         gain = np.median([c.plate.gain for c in self.cameras.values()], axis=0).astype(np.float32)
-        key = (shown.step, gain.tobytes())
-        if self._exposed is None or self._exposed[0] != key:
+        if self._exposed is None or self._exposed[0] is not shown or self._exposed[1] != gain.tobytes():
             params = shown.gaussians.params.copy()
             params[:, COLOR:] *= np.tile(gain, (params.shape[1] - COLOR) // 3)
-            self._exposed = (key, Gaussians(params, self.settings.sh_degree))
-        return self._exposed[1]
+            self._exposed = (shown, gain.tobytes(), Gaussians(params, self.settings.sh_degree))
+        return self._exposed[2]
 
 
 make = LayeredField

@@ -20,16 +20,19 @@ from edge_server.fields.splat.layers.observations import FixedCamera, Observatio
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
 from edge_server.fields.splat.layers.settings import FRAMES_KNOWN
 from edge_server.fields.splat.layers.static_layer import StaticLayer
+from edge_server.fields.splat.layers.static_supervision import StaticSupervision
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
-VERSION = 6
-COUNTERS = ("layered", "origin_ns", "plates_s", "fine_s", "fine", "exposure_rounds")  # of the field
+VERSION = 7
+COUNTERS = ("layered", "origin_ns")  # of the field
+# Of its supervision.
+SUPERVISED = ("plates_s", "fine_s", "fine", "exposure_rounds", "anew", "with_depth", "early")
 TRACKED = ("anchors_s", "seeded_s", "fits")  # of its tracker
-OF_CAMERA = ("newest_s", "rendered_step", "moves", "anew")
-ARRAYS_OF_CAMERA = ("away", "depth_m")  # or None
+OF_CAMERA = ("newest_s", "rendered_step", "moves", "anew", "depth_scale")
+ARRAYS_OF_CAMERA = ("away", "depth_m", "reported")  # or None
 
 
 def pack(field: Any) -> Arrays:
@@ -44,6 +47,8 @@ def pack(field: Any) -> Arrays:
         arrays = {"image": view.image, "pose": view.camera_to_world, **_prefixed("plate.", camera.plate.state())}
         if camera.fine is not None:
             arrays |= _prefixed("fine.", camera.fine.state())
+        if camera.depth is not None:
+            arrays |= _prefixed("depth.", camera.depth.state())
         arrays |= {name: array for name in ARRAYS_OF_CAMERA if (array := getattr(camera, name)) is not None}
         state |= _prefixed(f"camera_{k}.", arrays)
     for k, o in enumerate(field.observations):
@@ -57,6 +62,8 @@ def pack(field: Any) -> Arrays:
             arrays |= {"matrix": o.row.matrix, "vector": o.row.vector, "around": o.row.around}
         state |= _prefixed(f"frame_{k}.", arrays)
     state |= _prefixed("still.", field.still.state()) | _prefixed("static.", field.static.state())
+    if field.supervision.depth is not None:
+        state |= _prefixed("depth.", field.supervision.depth.state())
     tracked = None
     if field.tracker is not None:
         state |= _prefixed("moving.", field.tracker.moving.state())
@@ -66,6 +73,7 @@ def pack(field: Any) -> Arrays:
         "field": NAME,
         "settings": msgspec.structs.asdict(field.settings),
         **_numbers(field, COUNTERS),
+        **_numbers(field.supervision, SUPERVISED),
         "refused": sorted(field.refused),
         "tracked": tracked,
         "cameras": cameras,
@@ -81,6 +89,9 @@ def unpack(field: Any, state: Arrays) -> None:
     field.still.load_state(_under("still.", state))
     field.static = StaticLayer(field.still)
     field.static.load_state(_under("static.", state))
+    field.supervision = StaticSupervision(field.static, field.part_s)
+    if "depth.wrong" in state:
+        field.supervision.make_depth().load_state(_under("depth.", state))
     field.cameras, field.observations, field.tracker = {}, Observations(), None
     for k, facts in enumerate(meta["cameras"]):
         arrays = _under(f"camera_{k}.", state)
@@ -92,12 +103,16 @@ def unpack(field: Any, state: Arrays) -> None:
         plate.load_state(_under("plate.", arrays))
         fine = FinePlate.from_state(view, _under("fine.", arrays)) if "fine.color" in arrays else None
         camera = FixedCamera(view, plate, fine=fine, taken=deque(facts["taken"], maxlen=FRAMES_KNOWN))
-        camera.away, camera.depth_m = (np.array(arrays[n]) if n in arrays else None for n in ARRAYS_OF_CAMERA)
+        for name in ARRAYS_OF_CAMERA:
+            setattr(camera, name, np.array(arrays[name]) if name in arrays else None)
         _set(camera, OF_CAMERA, facts)
+        if "depth.count" in arrays:
+            field.supervision.make_depth_plate(camera).load_state(_under("depth.", arrays))
         field.cameras[view.camera] = camera
     for k, facts in enumerate(meta["frames"]):
         field.observations.add(_observation(field, facts, _under(f"frame_{k}.", state)))
     _set(field, COUNTERS, meta)
+    _set(field.supervision, SUPERVISED, meta)
     field.refused = set(meta["refused"])
     if meta["tracked"] is not None:
         if field.still.view_store.box is None:

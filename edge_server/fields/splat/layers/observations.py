@@ -6,6 +6,7 @@ from bisect import insort
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -18,6 +19,9 @@ from edge_server.fields.splat.layers.motion import ViewRow
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
 from edge_server.fields.splat.layers.static_layer import PlateImage
 
+if TYPE_CHECKING:
+    from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate
+
 
 @dataclass
 class FixedCamera:
@@ -29,6 +33,9 @@ class FixedCamera:
     newest_s: instant of the newest frame that was aligned.
     taken: ``generated_ns`` of the latest frames taken in.
     fine: the plate at the full resolution; None where the frames taken in have it.
+    depth: the plate's depth; None of a camera that has measured none.
+    reported: float64 (4, 4), the pose that its frames say, where that of ``view`` was corrected.
+    depth_scale: factor on the depth that its frames bring.
     away: float64 (4, 4), pose of the newest frame, where that was taken elsewhere.
     moves: number of places other than its own from which frames came, since it last stood still.
     anew: whether it began anew where it stands, and its plate says little yet.
@@ -42,6 +49,9 @@ class FixedCamera:
     newest_s: float = -np.inf
     taken: deque[int] = field(default_factory=lambda: deque(maxlen=tuned.FRAMES_KNOWN))
     fine: FinePlate | None = None
+    depth: DepthPlate | None = None
+    reported: NDArray[np.float64] | None = None
+    depth_scale: float = 1.0
     away: NDArray[np.float64] | None = None
     moves: int = 0
     anew: bool = False
@@ -51,11 +61,11 @@ class FixedCamera:
         """A camera that has shown nothing yet. view: its first frame. pool: runs the plate's kernels."""
         whole = None if view.whole is None else view.whole()
         plate = Plate(view.image.shape[0], view.image.shape[1], pool)
-        return cls(replace(view, whole=None), plate, fine=None if whole is None else FinePlate(whole))
+        return cls(replace(view, whole=None, depth=None), plate, fine=None if whole is None else FinePlate(whole))
 
     def stands_at(self, view: View) -> bool:
         """Whether a frame was taken from the camera's place."""
-        if not _same_pose(self.view.camera_to_world, view.camera_to_world):
+        if not _same_pose(self.reported_pose, view.camera_to_world):
             return False
         self.away = None
         if self.plate.count > tuned.STANDS_FRAMES:
@@ -69,6 +79,18 @@ class FixedCamera:
         self.moves += not stands
         self.away = view.camera_to_world
         return stands
+
+    @property
+    def reported_pose(self) -> NDArray[np.float64]:
+        """The pose that its frames say."""
+        return self.view.camera_to_world if self.reported is None else self.reported
+
+    def correct(self, pose: NDArray[np.float64], depth_scale: float) -> None:
+        """Take a pose (4, 4) and a factor on depth instead of those that its frames say."""
+        self.reported = self.reported_pose
+        self.view, self.row, self.depth_scale = replace(self.view, camera_to_world=pose), None, depth_scale
+        if self.fine is not None:
+            self.fine.view = replace(self.fine.view, camera_to_world=pose)
 
     @property
     def fine_count(self) -> int:

@@ -57,7 +57,7 @@ def _lens(plate: PlateImage) -> Pinhole:
 
 def _prepare(plate: PlateImage, lens: Pinhole) -> NDArray[np.float32]:
     """The plate's colors in [0, 1], or UNKNOWN, float32 (3, H, W), blurred as interpolation will blur the others'."""
-    known = plate.known & np.isfinite(plate.color).all(axis=2)
+    known = (plate.known > 0) & np.isfinite(plate.color).all(axis=2)
     rgba = np.dstack([np.where(known[..., None], np.clip(plate.color / 255.0, 0.0, 1.0), 0.0), known])
     small = cv2.resize(rgba.astype(np.float32), (lens.width, lens.height), interpolation=cv2.INTER_AREA)
     color = np.clip(cv2.GaussianBlur(small[..., :3], (0, 0), tuned.SWEEP_BLUR_PX), 0.0, 1.0)

@@ -8,7 +8,7 @@ again.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -25,19 +25,19 @@ from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.snapshot import SplatSnapshot
 
 Arrays = dict[str, NDArray]
-_KEPT = ("rounds", "_rounds_wanted", "_rate", "_round_step", "grows_until")  # of a state
+_KEPT = ("rounds", "_rounds_wanted", "_rate", "_round_step", "grows_until", "shown_after")  # of a state
 
 
 class PlateImage(NamedTuple):
     """A background plate as it was at one moment.
 
     view: the camera's first frame. color: float32 (H, W, 3), at the cameras' common exposure, steps of 255.
-    known: bool (H, W), where there is a plate.
+    known: bool (H, W), where there is a plate; or float32 (H, W) in [0, 1], how much each pixel counts.
     """
 
     view: View
     color: NDArray[np.float32]
-    known: NDArray[np.bool_]
+    known: NDArray[np.bool_] | NDArray[np.float32]
 
 
 class StaticLayer:
@@ -60,6 +60,7 @@ class StaticLayer:
         self.shown: SplatSnapshot | None = None
         self.rendered: dict[str, tuple[int, Rendering]] = {}
         self.grows_until = tuned.SCHEDULE  # step
+        self.shown_after = tuned.SHOWN_AFTER  # steps
         self._learned: dict[str, tuple[NDArray, NDArray]] = {}  # camera -> plate, known: as learned
         self._begin_rounds(tuned.ROUNDS_FIRST, tuned.RATE_FIRST)
 
@@ -82,13 +83,15 @@ class StaticLayer:
     @property
     def ready(self) -> bool:
         """Whether the field is good enough to be shown, and to say what lies where plates are unknown."""
-        return self.shown is not None and self.shown.step >= tuned.SHOWN_AFTER
+        return self.shown is not None and self.shown.step >= self.shown_after
 
     # --- plates -------------------------------------------------------------------------------
 
-    def begin(self, plates: Sequence[PlateImage]) -> None:
-        """``learn`` the first plates, in a schedule that begins now."""
+    def begin(self, plates: Sequence[PlateImage], shown_after: int | None = None) -> None:
+        """``learn`` the first plates, in a schedule that begins now. shown_after: steps after which the field is better
+        than what was shown before; None: SHOWN_AFTER."""
         self.learn(plates)
+        self.shown_after = tuned.SHOWN_AFTER if shown_after is None else shown_after
         self.grows_until = self.field.step + tuned.SCHEDULE
         self._begin_rounds(tuned.ROUNDS_FIRST, tuned.RATE_FIRST)
 
@@ -101,13 +104,14 @@ class StaticLayer:
             self._learned[view.camera] = (color, known)
         self.field.take_in(views)
 
-    def learn_again(self, plates: Sequence[PlateImage]) -> bool:
-        """``learn`` if the plates have changed since, and begin rounds of training. Returns whether."""
-        if sum(self._changed_pixels(plate) for plate in plates) <= tuned.CHANGED_PIXELS * len(plates):
-            return False
+    def have_changed(self, plates: Sequence[PlateImage]) -> bool:
+        """Whether plates have changed since they were learned."""
+        return sum(self._changed_pixels(plate) for plate in plates) > tuned.CHANGED_PIXELS * len(plates)
+
+    def learn_again(self, plates: Sequence[PlateImage]) -> None:
+        """``learn``, and begin rounds of training."""
         self.learn(plates)
         self._begin_rounds(tuned.ROUNDS_AGAIN, tuned.RATE_AGAIN)
-        return True
 
     def refine(self, plates: Sequence[PlateImage]) -> None:
         """``learn`` the same plates at a higher resolution, in what is left of the schedule, or in its second
@@ -118,13 +122,14 @@ class StaticLayer:
 
     def _changed_pixels(self, plate: PlateImage) -> int:
         if plate.view.camera not in self._learned:
-            return int(plate.known.sum())
+            return int(np.count_nonzero(plate.known))
         before, was_known = self._learned[plate.view.camera]
         if was_known.shape != plate.known.shape:
-            return int(plate.known.sum())
-        both = plate.known & was_known
+            return int(np.count_nonzero(plate.known))
+        now_known, was_known = plate.known > 0, was_known > 0
+        both = now_known & was_known
         differs = cv2.blur(cv2.absdiff(plate.color, before) * both[..., None], (3, 3)).max(axis=2) > tuned.CHANGED
-        return int((plate.known & (differs | ~was_known)).sum())
+        return int((now_known & (differs | ~was_known)).sum())
 
     # --- training -----------------------------------------------------------------------------
 
@@ -159,11 +164,11 @@ class StaticLayer:
             self.field.set_params(self._mean)
             self._mean = None
 
-    def train_beside(self, plates: Sequence[PlateImage], views: Sequence[View]) -> None:
-        """Learn plates that have changed, in a thread, until nothing is left to learn, and render ``views``
-        meanwhile. The thread must not be at work."""
+    def train_beside(self, begin: Callable[[], None], views: Sequence[View]) -> None:
+        """Train in a thread, until nothing is left to learn, and render ``views`` meanwhile. The thread must not be at
+        work. begin: called first, in the thread."""
         self._stopping = False
-        self._thread = threading.Thread(target=self._main, args=(plates, views), name="static-field", daemon=True)
+        self._thread = threading.Thread(target=self._main, args=(begin, views), name="static-field", daemon=True)
         self._thread.start()
 
     @property
@@ -171,6 +176,10 @@ class StaticLayer:
         """Whether the thread is at work. Raises what ended it early."""
         self._raise_failure()
         return self._thread is not None and self._thread.is_alive()
+
+    def end_soon(self) -> None:
+        """Have the thread end after a few steps."""
+        self._stopping = True
 
     def stop(self) -> None:
         """End the thread after a few steps, and wait for it. Raises what ended it early."""
@@ -186,10 +195,9 @@ class StaticLayer:
             failure.add_note("The static field was being trained beside the updates.")
             raise failure
 
-    def _main(self, plates: Sequence[PlateImage], views: Sequence[View]) -> None:
+    def _main(self, begin: Callable[[], None], views: Sequence[View]) -> None:
         try:
-            if self.finished:
-                self.learn_again(plates)
+            begin()
             rendered_step = self.field.step
             while not self.finished and not self._stopping:
                 self.train(StepBudget(Budget(steps=tuned.ROUND)))

@@ -448,12 +448,12 @@ def test_fine_plates_are_collected_from_the_first_frame_on() -> None:
     field, fewest = LayeredField(SMALL), 0
     for frame in range(80):
         field.fit([_small(k, frame) for k in range(len(CAMERAS))], Budget(steps=1))
-        if field.fine:
+        if field.supervision.fine:
             break
         counts = [camera.fine_count for camera in field.cameras.values()]
         fewest = min(counts)
-        assert max(counts) - fewest <= 1 and (sum(counts) == frame + 1 or field.exposure_rounds > 0)
-    assert field.fine and fewest == 4
+        assert max(counts) - fewest <= 1 and (sum(counts) == frame + 1 or field.supervision.exposure_rounds > 0)
+    assert field.supervision.fine and fewest == 4
 
 
 @pytest.mark.slow
@@ -470,11 +470,11 @@ def test_frames_taken_in_at_half_their_size_still_give_plates_at_full_resolution
         run(field, range(30), fine)
         again = LayeredField(SMALL)
         again.load_state(field.state())  # between the coarse and the fine plates
-        assert not field.fine
+        assert not field.supervision.fine
         for one in (field, again) if fine else (field,):
             run(one, range(30, 80), fine)
         if fine:
             same_state(field, again)
-        assert field.fine is fine
+        assert field.supervision.fine is fine
         scores.append(np.mean([_score(field.snapshot(round(s * 1e9)), s) for s in instants_s]))
     assert scores[1] > scores[0] + 1.0, scores

@@ -1,0 +1,177 @@
+"""What the static field learns where cameras measure depth: their plates, virtual ones, and its first Gaussians."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.fields.splat.layers.depth import settings as tuned
+from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
+from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
+from edge_server.fields.splat.layers.depth.kernels.surfaces import Meshes
+from edge_server.fields.splat.layers.depth.overlaps import contradicting, exposures
+from edge_server.fields.splat.layers.depth.registration import Correction, register
+from edge_server.fields.splat.layers.depth.surfaces import Surface, SurfaceScene
+from edge_server.fields.splat.layers.depth.virtual_plates import virtual_plates
+from edge_server.fields.splat.layers.static_layer import PlateImage
+from edge_server.fields.splat.settings import SplatSettings
+
+log = logging.getLogger(__name__)
+
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class CameraPlates:
+    """The plates of a camera as they were at one moment, for another thread.
+
+    plate: at the resolution of ``depth``. learned: what the static field learns, maybe finer.
+    depth: None of a camera that has measured none.
+    reported: its pose, camera-to-world (4, 4), as its frames say it.
+    """
+
+    plate: PlateImage
+    learned: PlateImage
+    depth: DepthPlate | None
+    reported: NDArray[np.float64]
+
+    @property
+    def name(self) -> str:
+        """The camera."""
+        return self.plate.view.camera
+
+    def inverse(self, pool: Pool) -> NDArray[np.float32]:
+        """See ``DepthPlate.medians``; all 0 where depth is noise or there is none."""
+        nothing = np.zeros(self.plate.known.shape, np.float32)
+        if self.depth is None:
+            return nothing
+        found = self.depth.medians(pool)
+        return found if self.depth.is_steady(found) else nothing
+
+    def surface(self, inverse: NDArray[np.float32], slope: NDArray[np.float32] | None = None) -> Surface:
+        """slope: None: not known."""
+        view, color, known = self.plate
+        slope = np.zeros((*inverse.shape, 2), np.float32) if slope is None else slope
+        return Surface(view.intrinsics, self.reported, color, known > 0, inverse, slope)
+
+
+class DepthSupervision:
+    """Prepares what the static field learns. One thread at a time may call it.
+
+    wrong: cameras whose depth contradicts the others', and is not used.
+    corrections: camera -> its pose and the scale of its depth, where registration has found them.
+    scene: the surfaces as they were last learned; None before that, or where none can be used.
+    """
+
+    def __init__(self, settings: SplatSettings, pool: Pool) -> None:
+        self.settings, self.pool = settings, pool
+        self.wrong: tuple[str, ...] = ()
+        self.corrections: dict[str, Correction] = {}
+        self.scene: SurfaceScene | None = None
+        self._learned: dict[str, NDArray[np.float32]] = {}  # camera -> inverse depths as learned
+
+    def forget_camera(self, camera: str) -> None:
+        """Forget what was learned of a camera that stands somewhere else now."""
+        self._learned.pop(camera, None)
+        self.corrections = {name: found for name, found in self.corrections.items() if name != camera}
+
+    @property
+    def displaced(self) -> dict[str, Correction]:
+        """Cameras that stand elsewhere than their frames say, or whose depth is of another scale."""
+        return {name: found for name, found in self.corrections.items() if found.is_large}
+
+    def exposures(self, cameras: Sequence[CameraPlates]) -> Mapping[str, NDArray[np.float64]]:
+        """Camera -> log of its exposure over the mean of all, (3,)."""
+        surfaces = [camera.surface(camera.inverse(self.pool)) for camera in cameras]
+        for k in contradicting(surfaces):
+            surfaces[k] = replace(surfaces[k], inverse=np.zeros_like(surfaces[k].inverse))
+        logs = exposures(surfaces)
+        return {camera.name: found for camera, found in zip(cameras, logs)}
+
+    def has_changed(self, cameras: Sequence[CameraPlates]) -> bool:
+        """Whether depths are known that were not when they were last learned, or differ from those."""
+        changed = 0
+        for camera in cameras:
+            now = camera.inverse(self.pool)
+            before = self._learned.get(camera.name, np.zeros_like(now))
+            changed += int(np.count_nonzero((now > 0) & (np.abs(now - before) > tuned.STEADY)))
+        return changed > tuned.CHANGED_SHARE * sum(camera.plate.known.size for camera in cameras)
+
+    def plates(self, cameras: Sequence[CameraPlates], anew: bool) -> tuple[list[PlateImage], list[Surface]]:
+        """What to learn: the cameras' plates, and virtual ones; and the surfaces that these show. anew: whether to find
+        ``corrections`` first."""
+        inverse = {camera.name: camera.inverse(self.pool) for camera in cameras}
+        self._learned = inverse
+        rough = [camera.surface(inverse[camera.name]) for camera in cameras]
+        wrong = tuple(cameras[k].name for k in contradicting(rough))
+        if wrong != self.wrong:
+            log.warning("depth that contradicts the other cameras' is not used: %s", ", ".join(wrong) or "now none")
+            self.wrong = wrong
+        used = [camera for camera in cameras if camera.name not in wrong and inverse[camera.name].any()]
+        surfaces = [camera.surface(*smooth(inverse[camera.name], camera.plate.color, self.pool)) for camera in used]
+        if anew:
+            self._register([camera.name for camera in used], surfaces)
+        fix = self.corrections
+        surfaces = [fix[c.name].applied(s) if c.name in fix else s for c, s in zip(used, surfaces)]
+        poses = [fix[c.name].pose if c.name in fix else c.reported for c in cameras]
+        plates = [
+            camera.learned._replace(view=replace(camera.learned.view, camera_to_world=pose))
+            for camera, pose in zip(cameras, poses)
+        ]
+        self.scene = SurfaceScene.of(surfaces) if surfaces else None
+        if self.scene is not None:
+            plates += virtual_plates(self.scene, surfaces, poses, _are_whole(cameras, surfaces), self.pool)
+        return plates, surfaces
+
+    def _register(self, names: Sequence[str], surfaces: Sequence[Surface]) -> None:
+        before = self.displaced
+        self.corrections = dict(zip(names, register(surfaces))) if len(names) > 1 else {}
+        for name, found in self.displaced.items():
+            if name not in before:
+                log.warning("%s does not stand where its frames say, or its depth is of another scale: %s", name, found)
+
+    def first_gaussians(self, surfaces: Sequence[Surface], box: SceneBox) -> NDArray[np.float32] | None:
+        """Parameters of the static field's first Gaussians; None: it has to find them itself."""
+        if not surfaces:
+            return None
+        return first_gaussians(surfaces, box, self.settings, np.random.default_rng([self.settings.seed, 7]))
+
+    # --- state --------------------------------------------------------------------------------
+
+    def state(self) -> Arrays:
+        """Everything needed to continue bit for bit."""
+        mine: Arrays = {"wrong": np.array(self.wrong, dtype=np.str_)}
+        mine |= {f"learned.{camera}": inverse for camera, inverse in self._learned.items()}
+        for camera, found in self.corrections.items():
+            mine[f"correction.{camera}"] = np.concatenate(
+                [found.pose.ravel(), [found.scale, found.turn_deg, found.shift_m]]
+            )
+        if self.scene is not None:
+            mine |= {"center": self.scene.center, **{f"meshes.{n}": a for n, a in self.scene.meshes._asdict().items()}}
+        return {name: np.array(array) for name, array in mine.items()}
+
+    def load_state(self, state: Arrays) -> None:
+        """Continue from ``state``. KeyError: it lacks something."""
+        self.wrong = tuple(str(camera) for camera in state["wrong"])
+        self._learned = {n.removeprefix("learned."): np.array(a) for n, a in state.items() if n.startswith("learned.")}
+        self.corrections, self.scene = {}, None
+        for name, numbers in state.items():
+            if name.startswith("correction."):
+                pose, rest = np.array(numbers[:16]).reshape(4, 4), map(float, numbers[16:])
+                self.corrections[name.removeprefix("correction.")] = Correction(pose, *rest)
+        if "center" in state:
+            meshes = Meshes(*(np.array(state[f"meshes.{name}"]) for name in Meshes._fields))
+            self.scene = SurfaceScene(np.array(state["center"]), meshes)
+
+
+def _are_whole(cameras: Sequence[CameraPlates], surfaces: Sequence[Surface]) -> bool:
+    """Whether nearly all of what the plates show has depth."""
+    known = sum(int(np.count_nonzero(camera.plate.known)) for camera in cameras)
+    return sum(int(np.count_nonzero(s.depth())) for s in surfaces) >= (1.0 - tuned.MOST_HOLES) * known

@@ -1,0 +1,1 @@
+"""Kernels of depth plates and of what is drawn from them."""

@@ -1,0 +1,200 @@
+"""Poses of cameras and scales of their depth, corrected until their depth plates lie on one another.
+
+Gauss-Newton over seven numbers a camera: turn, shift, and log of the scale. Points of one camera, placed before another
+one, differ from its surface along the normal, and from its plate in brightness. What calibration says is the prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.splat.layers.depth import settings as tuned
+from edge_server.fields.splat.layers.depth.surfaces import Surface
+from freshfield.geometry import so3_exp, so3_log
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What a camera's calibration should have been.
+
+    pose: camera-to-world (4, 4). scale: factor on its depth.
+    turn_deg, shift_m: how far the pose is from the one that was reported.
+    """
+
+    pose: Array
+    scale: float
+    turn_deg: float
+    shift_m: float
+
+    @property
+    def is_large(self) -> bool:
+        """Whether the camera was bumped, or its depth is of another scale: calibration and sensors err less."""
+        off = self.turn_deg / tuned.LARGE_TURN_DEG, self.shift_m / tuned.LARGE_SHIFT_M
+        return bool(max(*off, abs(np.log(self.scale)) / tuned.LARGE_LOG_SCALE) > 1.0)
+
+    def __str__(self) -> str:
+        return f"{self.turn_deg:.1f} degrees, {100 * self.shift_m:.1f} cm, depth times {self.scale:.3f}"
+
+    def applied(self, surface: Surface) -> Surface:
+        """The surface of the camera at its pose and scale."""
+        by = np.float32(1.0 / self.scale)
+        return replace(surface, pose=self.pose, inverse=surface.inverse * by, slope=surface.slope * by)
+
+
+class _Camera(NamedTuple):
+    """A surface as it is compared: in its camera's axes, at its reported scale.
+
+    surface: as given. points, normals: (H, W, 3). depth: (H, W).
+    rows, columns: (N,), of the pixels that are placed before other cameras.
+    gray, right, down: (H, W), brightness in [0, 1], and its slopes a pixel.
+    """
+
+    surface: Surface
+    points: Array
+    normals: Array
+    depth: NDArray[np.float32]
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    gray: NDArray[np.float32]
+    right: NDArray[np.float32]
+    down: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, surface: Surface) -> _Camera:
+        depth = surface.depth()
+        stride = max(1, round(np.sqrt(depth.size / tuned.REGISTERED_POINTS)))
+        rows, columns = (stride * k for k in np.nonzero(depth[::stride, ::stride]))
+        gray = cv2.cvtColor(np.clip(surface.color / np.float32(255.0), 0, 1).astype(np.float32), cv2.COLOR_RGB2GRAY)
+        gray = cv2.GaussianBlur(gray, (0, 0), 0.8)
+        right, down = (cv2.Sobel(gray, cv2.CV_32F, x, 1 - x, scale=0.125) for x in (1, 0))
+        points, normals = surface.rays() * depth[..., None], surface.normals() @ surface.pose[:3, :3]
+        images = (np.asarray(image, np.float32) for image in (gray, right, down))
+        return cls(surface, points, normals, depth, rows, columns, *images)
+
+
+class _Pair(NamedTuple):
+    """Residuals (N,) of points of one camera before another one, their weights, and their slopes by both cameras' seven
+    numbers, (N, 7)."""
+
+    error: Array
+    weight: Array
+    by_first: Array
+    by_second: Array
+
+
+def register(surfaces: Sequence[Surface]) -> list[Correction]:
+    """Corrections of cameras from their surfaces at the reported poses and scales. Those reported are kept where others
+    do not fit better."""
+    cameras, count = [_Camera.of(s) for s in surfaces], len(surfaces)
+    poses, scales = [s.pose.copy() for s in surfaces], np.ones(count)
+    deviation = np.tile([np.deg2rad(tuned.TURN_DEG)] * 3 + [tuned.SHIFT_M] * 3 + [tuned.LOG_SCALE], count)
+    total = np.zeros(7 * count)
+    before = _cost(cameras, poses, scales)
+    for k in range(tuned.REGISTRATION_ROUNDS):
+        # Most cameras are as calibrated, but one that was bumped is far off: its prior is a Cauchy distribution's.
+        prior = 1.0 / (deviation**2 * (1.0 + (total / (3.0 * deviation)) ** 2))
+        h, g = np.diag(prior), -total * prior
+        near_m = tuned.NEAR_M * (tuned.NEAR_AT_FIRST if 2 * k < tuned.REGISTRATION_ROUNDS else 1.0)
+        for i, j in _pairs(count):
+            for found in _compare(cameras, poses, scales, i, j, near_m):
+                _add(h, g, i, j, found)
+        step = np.linalg.solve(h, g)
+        total += step
+        for i in range(count):
+            turn, shift, grow = np.split(step[7 * i : 7 * i + 7], [3, 6])
+            poses[i][:3, :3] = so3_exp(turn) @ poses[i][:3, :3]
+            poses[i][:3, 3] += shift
+            scales[i] *= np.exp(np.clip(grow[0], -0.3, 0.3))
+        if np.abs(step / deviation).max() < 0.01:
+            break
+    if not _cost(cameras, poses, scales) < before:
+        poses, scales = [s.pose for s in surfaces], np.ones(count)
+    return [_correction(s.pose, pose, float(scale)) for s, pose, scale in zip(surfaces, poses, scales)]
+
+
+def _correction(reported: Array, pose: Array, scale: float) -> Correction:
+    turn = np.linalg.norm(so3_log(pose[:3, :3] @ reported[:3, :3].T))
+    return Correction(pose, scale, float(np.rad2deg(turn)), float(np.linalg.norm(pose[:3, 3] - reported[:3, 3])))
+
+
+def _pairs(count: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(count) for j in range(count) if i != j]
+
+
+def _cost(cameras: Sequence[_Camera], poses: Sequence[Array], scales: Array) -> float:
+    """Mean robust cost (Geman and McClure) of distances along normals, at most 1."""
+    near = tuned.NEAR_M * tuned.NEAR_AT_FIRST
+    found = [list(_compare(cameras, poses, scales, i, j, near))[:1] for i, j in _pairs(len(cameras))]
+    square = np.concatenate([np.zeros(1), *[(p.error / near) ** 2 for pair in found for p in pair]])
+    # Points that no surface is near to count in full.
+    most = sum(len(c.rows) for c in cameras) * (len(cameras) - 1)
+    return 1.0 - float((1.0 / (1.0 + square)).sum()) / max(most, 1)
+
+
+def _compare(
+    cameras: Sequence[_Camera], poses: Sequence[Array], scales: Array, i: int, j: int, near_m: float
+) -> list[_Pair]:
+    """Points of camera i before camera j: distances along normals, then differences of brightness; empty where the two
+    share too few. A camera turns about its own center."""
+    ours, theirs = cameras[i], cameras[j]
+    turn_i, turn_j, lens = poses[i][:3, :3], poses[j][:3, :3], theirs.surface.lens
+    to_i = (ours.points[ours.rows, ours.columns] * scales[i]) @ turn_i.T  # from camera i
+    points = to_i + poses[i][:3, 3]
+    local = (points - poses[j][:3, 3]) @ turn_j
+    with np.errstate(invalid="ignore", over="ignore"):
+        u, v = np.nan_to_num(lens.project(local), nan=-1.0).T
+    inside = (local[:, 2] > tuned.NEAREST_M) & (u >= 1) & (v >= 1) & (u < lens.width - 1) & (v < lens.height - 1)
+    x, y = np.where(inside, u, 0).astype(int), np.where(inside, v, 0).astype(int)
+    normal = theirs.normals[y, x] @ turn_j.T
+    to_j = (theirs.points[y, x] * scales[j]) @ turn_j.T  # from camera j to its own surface
+    error = ((points - poses[j][:3, 3] - to_j) * normal).sum(axis=1)
+    facing = -(normal * to_j).sum(axis=1) / np.maximum(np.linalg.norm(to_j, axis=1), 1e-9)
+    alike = (normal * (ours.normals[ours.rows, ours.columns] @ turn_i.T)).sum(axis=1)
+    use = inside & (theirs.depth[y, x] > 0) & (np.abs(error) < 4.0 * near_m)
+    use &= (alike > tuned.LEAST_ALIKE) & (facing > tuned.REGISTERED_FACING)
+    if np.count_nonzero(use) < tuned.OVERLAP_LEAST:
+        return []
+    to_i, to_j, points, local, normal, error = (a[use] for a in (to_i, to_j, points, local, normal, error))
+    noise = tuned.DEPTH_NOISE * local[:, 2] + tuned.DEPTH_NOISE_M
+    weight = 1.0 / (noise**2 * (1.0 + (error / near_m) ** 2) ** 2 * tuned.ERR_ALIKE)
+    distance = _Pair(error, weight, _by_numbers(to_i, normal, True), -_by_numbers(to_j, normal, True))
+    map_x, map_y = (np.asarray(a[use] - 0.5, np.float32)[None] for a in (u, v))
+    gray, right, down = (
+        cv2.remap(a, map_x, map_y, cv2.INTER_LINEAR)[0].astype(float) for a in (theirs.gray, theirs.right, theirs.down)
+    )
+    error = gray - ours.gray[ours.rows, ours.columns][use]
+    a, b, z = right * lens.fx, down * lens.fy, local[:, 2]
+    slope = np.stack([a / z, b / z, -(a * local[:, 0] + b * local[:, 1]) / z**2], axis=1) @ turn_j.T
+    robust = 1.0 + (error / tuned.NEAR_GRAY) ** 2
+    weight = tuned.GRAY_WEIGHT / (tuned.GRAY_NOISE**2 * robust**2 * tuned.ERR_ALIKE)
+    away = points - poses[j][:3, 3]
+    return [distance, _Pair(error, weight, _by_numbers(to_i, slope, True), -_by_numbers(away, slope, False))]
+
+
+def _by_numbers(arm: Array, slope: Array, scales: bool) -> Array:
+    """Slopes by turn, shift and log scale of a camera, (N, 7), of what changes by ``slope`` (N, 3) a meter of a point.
+
+    arm: (N, 3), from the camera to the point. scales: whether the point moves with the scale.
+    """
+    by_scale = (arm * slope).sum(axis=1, keepdims=True) * scales
+    return np.concatenate([np.cross(arm, slope), slope, by_scale], axis=1)
+
+
+def _add(h: Array, g: Array, i: int, j: int, pair: _Pair) -> None:
+    """Add residuals to the normal equations."""
+    a, b = slice(7 * i, 7 * i + 7), slice(7 * j, 7 * j + 7)
+    first, second = pair.by_first * pair.weight[:, None], pair.by_second * pair.weight[:, None]
+    h[a, a] += pair.by_first.T @ first
+    h[b, b] += pair.by_second.T @ second
+    h[a, b] += pair.by_first.T @ second
+    h[b, a] += pair.by_second.T @ first
+    g[a] -= first.T @ pair.error
+    g[b] -= second.T @ pair.error

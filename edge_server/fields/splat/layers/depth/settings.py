@@ -1,0 +1,78 @@
+"""Numbers of the layers where cameras measure depth, tuned on `room` with a simulated stereo sensor.
+
+Depth is kept as its inverse, in which a plane is linear in the image and the noise of a stereo camera is even.
+"""
+
+from __future__ import annotations
+
+# A stereo sensor's disparity in pixels is this times inverse depth: 425 px focal length, .05 m baseline (RealSense
+# D400 at 848 x 480). Bounds below are disparities of such a sensor.
+_DISPARITY_PX_M = 21.25
+
+# --- depth plates (depth_plate) ---
+KEPT = 15  # depths a pixel remembers: a second of frames at 15 a second
+LEAST = 3  # depths of a pixel that make its median known
+STEADY = 0.4 / _DISPARITY_PX_M  # 1 / m: two thirds lie this near their median, or the pixel flies between two surfaces
+RADIUS = 3  # pixels, of the window in which a plane is fitted
+SPREAD_PX = 2.1  # deviation of the window's Gaussian
+ROUNDS = 3  # of reweighting
+NOISE = 0.12 / _DISPARITY_PX_M  # 1 / m: a neighbor so far off the plane counts half
+OUTLIER = 2.5  # times NOISE, beyond which it does not count
+SMOOTH_COLOR = 30.0  # of 3 x 255: a neighbor that differs so much counts half
+HOLE_PX = 3  # pixels without depth as near as this to some take over a neighbor's plane
+HOLE_COLOR = 12.0  # of 255: a difference of color that counts as much as 4 pixels of distance
+HOLE_MOST = 2.0  # times HOLE_COLOR, color and distance together, above which a neighbor's plane is not taken over
+
+# --- surfaces, drawn from places between the cameras (surfaces) ---
+NEAREST_M = 0.05  # what is nearer to a camera is not drawn
+CUT = 0.012  # 1 / m: a mesh is cut where inverse depth jumps by more, off both slopes
+STRETCH = 400.0  # a triangle whose longest side squared is so many times its area is seen at too grazing an angle
+MIXED = 0.08  # trust in pixels beside a cut: they mix two surfaces
+AGREE = 0.03  # relative difference of depth at which two surfaces half agree
+THROUGH = 2.5  # times AGREE: a camera that measures a depth so much larger sees through a point
+REJECT, REJECT_LEAST = (
+    0.6,
+    0.4,
+)  # a surface does not count if more cameras see through it than this times those that agree
+FORWARD = 3.0  # how much more a camera counts whose direction is like the view's, in the exponent of a cosine
+LEAST_FACING = 0.02  # cosine at which a surface counts as facing a camera, at least
+
+# --- virtual plates ---
+VIRTUAL_PLATES = 12
+MARGIN_DEG = 20.0  # how much wider than the cameras' directions theirs are spread; half of it downwards
+UNSEEN_WEIGHT = 0.1  # in training, of pixels that no camera sees
+MOST_HOLES = 0.06  # share of the plates without depth, above which the weight is 0: cameras may see what is there
+FADE_PX = 16.0  # of an image 128 pixels wide: so far from what is seen, colors are those of the mean by 1 - 1 / e
+SURE = 0.3  # agreement above which a pixel counts as seen
+
+# --- first Gaussians ---
+FIRST_SIZE, FIRST_THICKNESS = 0.5, 0.2  # deviation in distances to their neighbors; across the surface, of that
+FIRST_OPACITY = 0.5
+
+# --- what cameras see of one another (overlaps) ---
+OVERLAP_POINTS = 1024  # of one camera that are looked for in others
+OVERLAP_LEAST = 50  # points that two cameras must share to say anything
+# Half of a camera's depths lie between these, times the distance to where the cameras look: else they are of another
+# unit. Only of cameras that look from directions so far apart that the place is certain.
+RANGE, LEAST_ANGLE_DEG = (0.25, 6.0), 30.0
+CONTRADICTS = 0.12  # relative difference of depths; poses and scales that registration can correct stay below
+LEAST_AGREE = 0.5  # share of the shared points that agree, below which a camera's depth is left out
+HIDDEN_WEIGHT = 0.1  # in it, of points behind what the other camera measures: those may be hidden, but not nearly all
+DARK, BRIGHT = 20.0, 235.0  # only plates between these are used to estimate exposures, steps of 255
+
+# --- when what begins ---
+PLATE_S = 0.6  # as ``layers.settings.PLATE_S``, where most of the cameras have depth
+SHOWN_AFTER = 50, 200  # steps after which the first field, and one that began anew, is shown
+CHANGED_SHARE = 0.01  # of the pixels: with more depths that are new or have changed, the static field learns again
+
+# --- registration ---
+REGISTERED_POINTS = 4096  # of a camera that are placed before the others
+REGISTRATION_ROUNDS = 8  # of Gauss-Newton
+TURN_DEG, SHIFT_M, LOG_SCALE = 0.25, 0.004, 0.006  # deviations of calibrated poses, and of a sensor's scale
+NEAR_M, NEAR_AT_FIRST = 0.06, 2.0  # distance along the normal at which a point counts a quarter; times this at first
+LEAST_ALIKE, REGISTERED_FACING = 0.7, 0.15  # cosines of two normals, and of a normal and the direction to the camera
+DEPTH_NOISE, DEPTH_NOISE_M = 0.006, 0.004  # deviation of a smoothed depth: share of the distance, and added to that
+NEAR_GRAY, GRAY_NOISE = 0.08, 0.03  # as NEAR_M, and deviation, of brightness in [0, 1]
+GRAY_WEIGHT = 0.15  # of a difference of brightness
+ERR_ALIKE = 25.0  # neighboring pixels err alike: so many count as one
+LARGE_TURN_DEG, LARGE_SHIFT_M, LARGE_LOG_SCALE = 1.0, 0.03, 0.025  # corrections above any of these are reported

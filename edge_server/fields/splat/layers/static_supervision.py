@@ -1,0 +1,297 @@
+"""What the static field learns from fixed cameras, and when: plates, at one exposure, and what depth adds to them.
+
+With a budget in seconds, what takes long is done in the thread that trains the static field.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import Budget, View
+from edge_server.fields.common.training_schedule import StepBudget
+from edge_server.fields.splat.layers import settings as tuned
+from edge_server.fields.splat.layers.exposures import equalize_exposures
+from edge_server.fields.splat.layers.observations import FixedCamera, Observations
+from edge_server.fields.splat.layers.static_layer import PlateImage, StaticLayer
+from edge_server.fields.splat.layers.tracker import PartTimes
+from edge_server.fields.splat.snapshot import SplatSnapshot
+
+if TYPE_CHECKING:
+    from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate
+    from edge_server.fields.splat.layers.depth.depth_supervision import CameraPlates, DepthSupervision
+
+log = logging.getLogger(__name__)
+
+Cameras = Mapping[str, FixedCamera]
+
+
+class StaticSupervision:
+    """Keeps a ``StaticLayer`` at what the plates show.
+
+    plates_s: instant of the frames when plates were last compared.
+    fine_s: instant of the frames when one was last taken in at its full resolution.
+    fine: whether the static field learns from fine plates.
+    exposure_rounds: number of rounds of ``exposures_agree`` so far.
+    anew: whether the static field is to begin anew, with depth.
+    with_depth: whether it has begun with depth. early: whether it then began before plates were certain.
+    depth: None as long as no camera has measured depth.
+    earlier: what the static field showed before it began anew; None if it has become better than that.
+    """
+
+    def __init__(self, static: StaticLayer, times: PartTimes) -> None:
+        self.static, self.times = static, times
+        self.plates_s = self.fine_s = -np.inf
+        self.fine = False
+        self.exposure_rounds = 0
+        self.anew = self.with_depth = self.early = False
+        self.depth: DepthSupervision | None = None
+        self.earlier: SplatSnapshot | None = None
+
+    def begin_again(self) -> None:
+        """Forget how the static field has begun; plates stay."""
+        self.exposure_rounds = 0
+        self.anew = self.with_depth = self.early = False
+
+    # --- depth --------------------------------------------------------------------------------
+
+    def take_depth(self, camera: FixedCamera, view: View, foreground: NDArray[np.bool_]) -> None:
+        """Take in the depth of a frame that was taken into the camera's plate."""
+        begun = self.times.now()
+        assert view.depth is not None
+        self.make_depth_plate(camera).take(view.depth, foreground, camera.plate.pool)
+        self.times.add("depth plates", begun)
+
+    def make_depth_plate(self, camera: FixedCamera) -> DepthPlate:
+        """A camera's depth plate, made once a frame of it brings depth."""
+        if camera.depth is None:
+            from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate
+
+            self.make_depth()
+            camera.depth = DepthPlate.empty(*camera.view.image.shape[:2])
+        return camera.depth
+
+    def make_depth(self) -> DepthSupervision:
+        """Supervision with depth, made once a frame brings some."""
+        if self.depth is None:
+            from edge_server.fields.splat.layers.depth.depth_supervision import DepthSupervision
+
+            self.depth = DepthSupervision(self.static.field.settings, self.static.field.pool)
+        return self.depth
+
+    def forget_camera(self, camera: str) -> None:
+        """Forget what was learned of a camera that stands somewhere else now."""
+        self.static.forget_camera(camera)
+        if self.depth is not None:
+            self.depth.forget_camera(camera)
+
+    def _depth_is_known(self, observed: Sequence[FixedCamera]) -> bool:
+        """Whether at least half of the cameras have depth, and those that have know it."""
+        known = [c.depth.is_known(c.plate.known) for c in observed if c.depth is not None and c.depth.count.any()]
+        return 2 * len(known) >= max(len(observed), 1) and all(known)
+
+    # --- when layers begin --------------------------------------------------------------------
+
+    def plates_are_known(self, cameras: Cameras, observations: Observations) -> bool:
+        """Whether layers may begin."""
+        # Of a camera that has gone silent nothing more will come.
+        observed = _observed(cameras, observations)
+        if not observed or any(camera.plate.count < tuned.PLATE_FRAMES for camera in observed):
+            return False
+        if self._depth_is_known(observed):
+            from edge_server.fields.splat.layers.depth.settings import PLATE_S
+
+            return observations.newest_s >= PLATE_S
+        return len(cameras) >= tuned.LEAST_CAMERAS and observations.newest_s >= tuned.PLATE_S
+
+    def exposures_agree(self, cameras: Cameras, observations: Observations) -> bool:
+        """Begin with the plates, and correct the cameras' exposures where they differ; the field that shows that they
+        agree goes on. One round a call. Returns whether it was the last."""
+        begun = self.times.now()
+        if self._depth_is_known(_observed(cameras, observations)):
+            agree = self._begin_with_depth(cameras, observations)
+        else:
+            agree = self.exposure_rounds >= tuned.EXPOSURE_ROUNDS
+            self._begin(self._plates(cameras))
+            if not agree:
+                agree = self._equalize(cameras)
+        self.times.add("exposures", begun)
+        return agree
+
+    def _begin(self, plates: Sequence[PlateImage]) -> None:
+        """Have the still field forget what it has learned, and begin with ``plates``. What it showed is shown until it
+        is better."""
+        self.earlier = self.earlier or self.static.field.snapshot()
+        self.static.forget()
+        self.static.field.reset()
+        self.static.begin(plates)
+
+    def _equalize(self, cameras: Cameras) -> bool:
+        """Train for a few steps, and correct exposures by how plates differ from what is shown then. Returns whether
+        they agreed."""
+        self.exposure_rounds += 1
+        self.static.train(StepBudget(Budget(steps=tuned.EXPOSURE_STEPS), self.times.now))
+        self.static.publish()
+        self.static.render([camera.view for camera in cameras.values()])
+        renderings = {name: rendering for name, (_, rendering) in self.static.rendered.items()}
+        self.static.rendered = {}
+        agree = equalize_exposures(cameras, renderings)
+        if agree:
+            self.exposure_rounds = tuned.EXPOSURE_ROUNDS
+        return agree
+
+    def _begin_with_depth(self, cameras: Cameras, observations: Observations) -> bool:
+        """Correct exposures by what cameras see of the same surfaces, and have the field begin anew with depth. Returns
+        True."""
+        logs = self.make_depth().exposures(self._copied(cameras))
+        if np.std(list(logs.values()), axis=0).max() >= tuned.EXPOSURES_AGREE:
+            for name, log_ratio in logs.items():
+                cameras[name].correct_exposure(np.exp(log_ratio).astype(np.float32))
+        self.exposure_rounds = tuned.EXPOSURE_ROUNDS
+        self.static.field.keep_box([camera.view for camera in cameras.values()])
+        self.earlier = self.earlier or self.static.shown or self.static.field.snapshot()
+        self.anew, self.early = True, observations.newest_s < tuned.PLATE_S
+        return True
+
+    # --- what is learned ----------------------------------------------------------------------
+
+    def compare(self, cameras: Cameras, observations: Observations, beside: bool) -> None:
+        """Have the static field learn plates that have changed, or begin anew.
+
+        beside: in a thread, until it has learned them; or else only note that there is something to learn.
+        """
+        begun, now_s = self.times.now(), observations.newest_s
+        if self.depth is not None and not self.anew:
+            certain = self.early and now_s >= tuned.PLATE_S
+            new = not self.with_depth and self._depth_is_known(
+                [cameras[name] for name in {o.camera for o in observations}]
+            )
+            if certain or new:
+                self._begin_with_depth(cameras, observations)
+        self._correct(cameras, observations)
+        if not self.fine and self._fine_plates_are_known(cameras, observations):
+            self.static.stop()
+            self.fine = True
+            if not self.anew:
+                self.static.refine(self._plates(cameras))
+            self.plates_s = now_s
+        if beside and self.static.training:
+            if self.anew:
+                self.static.end_soon()
+        elif self.anew:
+            self._begin_anew(cameras, beside)
+            self.plates_s = now_s
+        elif beside if not self.static.finished else now_s - self.plates_s >= tuned.PLATES_EVERY_S:
+            self.plates_s = now_s
+            self._learn_again(cameras, beside)
+        self.times.add("static field", begun)
+
+    def _correct(self, cameras: Cameras, observations: Observations) -> None:
+        """Have cameras and frames take over the poses that registration has found."""
+        for name, found in ({} if self.depth is None else self.depth.corrections).items():
+            if not np.array_equal(cameras[name].view.camera_to_world, found.pose):
+                cameras[name].correct(found.pose, found.scale)
+                for o in observations:
+                    if o.camera == name:
+                        o.view, o.row = replace(o.view, camera_to_world=found.pose), None
+
+    def _begin_anew(self, cameras: Cameras, beside: bool) -> None:
+        """Begin with the plates and their depth, from nothing: a field that has begun early knows people as background,
+        and going on with it keeps them."""
+        from edge_server.fields.splat.layers.depth.settings import SHOWN_AFTER
+
+        depth, static, copies = self.make_depth(), self.static, self._copied(cameras)
+        shown_after = SHOWN_AFTER[0 if self.early and not self.with_depth else 1]
+        self.early, self.anew, self.with_depth = self.early and not self.with_depth, False, True
+        static.forget()
+        box = static.field.view_store.box
+        assert box is not None
+
+        def begin() -> None:
+            plates, surfaces = depth.plates(copies, anew=True)
+            static.field.begin_anew(depth.first_gaussians(surfaces, box))
+            static.begin(plates, shown_after)
+
+        if beside:
+            static.train_beside(begin, [camera.view for camera in cameras.values()])
+        else:
+            begin()
+
+    def _learn_again(self, cameras: Cameras, beside: bool) -> None:
+        static, depth = self.static, self.depth
+        if depth is not None and self.with_depth:
+            copies, known = self._copied(cameras), depth
+
+            def learn() -> None:
+                real = [camera.learned for camera in copies]
+                if static.finished and (static.have_changed(real) or known.has_changed(copies)):
+                    static.learn_again(known.plates(copies, anew=False)[0])
+        else:
+            plates = self._plates(cameras)
+
+            def learn() -> None:
+                if static.finished and static.have_changed(plates):
+                    static.learn_again(plates)
+
+        if beside:
+            static.train_beside(learn, [camera.view for camera in cameras.values()])
+        else:
+            learn()
+
+    def _plates(self, cameras: Cameras) -> list[PlateImage]:
+        if self.depth is not None and self.with_depth:
+            return self.depth.plates(self._copied(cameras), anew=False)[0]
+        return [camera.plate_image(self.fine) for camera in cameras.values()]
+
+    def _copied(self, cameras: Cameras) -> list[CameraPlates]:
+        from edge_server.fields.splat.layers.depth.depth_supervision import CameraPlates
+
+        copies = []
+        for camera in cameras.values():
+            plate = camera.plate_image(fine=False)
+            learned = camera.plate_image(fine=True) if self.fine else plate
+            depth = None if camera.depth is None else camera.depth.copied()
+            copies.append(CameraPlates(plate, learned, depth, camera.reported_pose))
+        return copies
+
+    # --- plates at full resolution ------------------------------------------------------------
+
+    def take_whole(self, taken: Sequence[View], cameras: Cameras, observations: Observations) -> None:
+        """Take one of the frames into its camera's fine plate, now and then; the cameras take turns."""
+        begun = self.times.now()
+        views = {v.camera: v for v in taken if v.whole is not None}
+        seen = [o for o in observations if o.camera in views and o.view.generated_ns == views[o.camera].generated_ns]
+        alone = len(cameras) < tuned.LEAST_CAMERAS
+        if not seen or alone or observations.newest_s - self.fine_s < tuned.FINE_EVERY_S:
+            return
+        self.fine_s = observations.newest_s
+        o = min(seen, key=lambda o: cameras[o.camera].fine_count)
+        camera, decode = cameras[o.camera], views[o.camera].whole
+        if camera.fine is not None and decode is not None and (whole := decode()) is not None:
+            camera.fine.take(whole.image, o.foreground | ~camera.plate.known, camera.plate.gain)
+        self.times.add("fine plates", begun)
+
+    def _fine_plates_are_known(self, cameras: Cameras, observations: Observations) -> bool:
+        seen = [cameras[camera].fine for camera in {o.camera for o in observations}]
+        fine = [f for f in seen if f is not None]
+        return bool(fine) and all(f.count >= tuned.FINE_FRAMES for f in fine)
+
+    # --- what is shown ------------------------------------------------------------------------
+
+    def to_show(self, box: Any) -> SplatSnapshot | None:
+        """The static field, or what it showed before it began anew, until it is better; None if that is of another
+        box."""
+        if self.earlier is None or self.static.ready:
+            self.earlier = None
+            return self.static.shown
+        return self.earlier if self.earlier.box == box else None
+
+
+def _observed(cameras: Cameras, observations: Observations) -> list[FixedCamera]:
+    """The cameras of which frames are observed."""
+    return [cameras[name] for name in {o.camera for o in observations}]

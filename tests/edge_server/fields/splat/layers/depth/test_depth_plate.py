@@ -1,0 +1,135 @@
+"""Depth plates: medians over time, planes fitted to inverse depths, small holes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
+from edge_server.fields.splat.layers.depth import settings
+from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
+
+POOL = CallerPool()
+
+
+def _medians(samples: NDArray[np.float32], count: NDArray[np.int32]) -> NDArray[np.float32]:
+    """``find_medians`` in numpy."""
+    out = np.zeros(count.shape, np.float32)
+    for y, x in np.ndindex(*count.shape):
+        kept = samples[y, x, : min(count[y, x], settings.KEPT)]
+        if len(kept) >= settings.LEAST:
+            median = np.float32(np.median(kept))
+            if 3 * np.count_nonzero(np.abs(kept - median) < settings.STEADY) >= 2 * len(kept):
+                out[y, x] = median
+    return out
+
+
+def _plane(inverse: NDArray[np.float32], image: NDArray[np.float32], y: int, x: int) -> tuple[float, float, float]:
+    """``fit_planes`` at one pixel, in numpy and float64: inverse depth and its two slopes."""
+    q = inverse.astype(float)
+    j, i = np.mgrid[: q.shape[0], : q.shape[1]]
+    dx, dy = i - x, j - y
+    near = q[(np.abs(dx) <= 1) & (np.abs(dy) <= 1) & (q > 0)]
+    a, b, c = float(np.median(near)), 0.0, 0.0
+    if len(near) < 4 and abs(a - q[y, x]) > 4 * settings.NOISE:
+        a = q[y, x]
+    window = (np.maximum(np.abs(dx), np.abs(dy)) <= settings.RADIUS) & (q > 0)
+    color = np.abs(image.astype(float) - image[y, x]).sum(axis=2) / settings.SMOOTH_COLOR
+    for k in range(settings.ROUNDS):
+        e = (q - (a + b * dx + c * dy)) / (settings.NOISE * (2.0 if k == 0 else 1.0))
+        w = np.exp(-(dx**2 + dy**2) / (2.0 * settings.SPREAD_PX**2)) / ((1 + e**2) * (1 + color**2))
+        w = w * (window & (np.abs(e) <= settings.OUTLIER))
+        if w.sum() < 0.5:
+            break
+        mx, my = (w * dx).sum() / w.sum(), (w * dy).sum() / w.sum()
+        design = np.stack([dx - mx, dy - my], axis=-1).reshape(-1, 2)
+        normal = design.T @ (design * w.reshape(-1, 1)) + 0.05 * w.sum() * np.eye(2)
+        b, c = np.linalg.solve(normal, design.T @ (w * q).ravel())
+        a = (w * q).sum() / w.sum() - b * mx - c * my
+    return a, b, c
+
+
+def _scene(rng: np.random.Generator, size: int = 24) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Inverse depths of a slanted wall before another one, with noise and holes, and an image."""
+    y, x = np.mgrid[:size, :size]
+    q = np.where(x < size // 2, 0.5 + 0.01 * x, 0.25 + 0.004 * y) + settings.NOISE * 0.7 * rng.standard_normal(
+        (size, size)
+    )
+    q[rng.random((size, size)) < 0.05] = 0.0
+    image = np.where((x < size // 2)[..., None], 60.0, 180.0) + rng.uniform(0, 10, (size, size, 3))
+    return q.astype(np.float32), image.astype(np.float32)
+
+
+def test_medians_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(1)
+    plate = DepthPlate.empty(9, 11)
+    for _ in range(40):
+        depth = rng.uniform(1.0, 1.0 + rng.random((9, 11)) * 0.3).astype(np.float32)
+        plate.take(np.where(rng.random((9, 11)) < 0.6, depth, 0).astype(np.float32), rng.random((9, 11)) < 0.2, POOL)
+    assert plate.count.max() > settings.KEPT and plate.is_known(np.ones((9, 11), bool))
+    found = plate.medians(POOL)
+    assert (found == 0).any() and (found > 0).any()
+    np.testing.assert_allclose(found, _medians(plate.samples, plate.count), rtol=1e-6)
+
+
+def test_planes_are_those_of_numpy_whatever_the_number_of_threads() -> None:
+    inverse, image = _scene(np.random.default_rng(2))
+    found, slope = smooth(inverse, image, POOL)
+    for y, x in np.ndindex(*inverse.shape):
+        if inverse[y, x] > 0:
+            np.testing.assert_allclose((found[y, x], *slope[y, x]), _plane(inverse, image, y, x), rtol=2e-3, atol=2e-4)
+    pool = Pool(2)
+    for mine, theirs in zip(smooth(inverse, image, pool), (found, slope)):
+        np.testing.assert_array_equal(mine, theirs)
+    pool.close()
+
+
+def test_smoothing_halves_the_noise_and_keeps_edges_and_small_holes_are_filled() -> None:
+    inverse, image = _scene(np.random.default_rng(3))
+    y, x = np.mgrid[:24, :24]
+    true = np.where(x < 12, 0.5 + 0.01 * x, 0.25 + 0.004 * y)
+    found, _ = smooth(inverse, image, POOL)
+    assert (found > 0).all()
+    measured = inverse > 0
+    assert np.abs(found - true)[measured].mean() < 0.5 * np.abs(inverse - true)[measured].mean()
+    assert np.abs(found - true)[~measured].max() < 4 * settings.NOISE
+
+
+def test_a_pixel_that_flies_between_surfaces_is_not_known() -> None:
+    plate = DepthPlate.empty(1, 2)
+    for k in range(9):
+        plate.take(np.array([[2.0, (1.0, 2.0, 4.0)[k % 3]]], np.float32), np.zeros((1, 2), bool), POOL)
+    np.testing.assert_allclose(plate.medians(POOL), [[0.5, 0.0]])
+
+
+@pytest.mark.stability
+def test_what_no_sensor_measures_is_no_depth() -> None:
+    plate = DepthPlate.empty(2, 4)
+    broken = np.array([[np.nan, np.inf, -np.inf, -1.0], [0.0, -0.0, 1e9, 3.0]], np.float32)
+    for _ in range(5):
+        plate.take(broken, np.zeros((2, 4), bool), POOL)
+    found = plate.medians(POOL)
+    np.testing.assert_allclose(found, [[0, 0, 0, 0], [0, 0, 0, 1 / 3]], rtol=1e-6)
+    assert np.isfinite(smooth(found, np.zeros((2, 4, 3), np.float32), POOL)[0]).all()
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("depth_m", [1e-4, 1e-2, 1.0, 1e3, 9e5])
+def test_planes_of_any_distance_are_finite(depth_m: float) -> None:
+    rng = np.random.default_rng(4)
+    inverse = (1.0 / (depth_m * rng.uniform(0.5, 2.0, (16, 16)))).astype(np.float32)
+    for array in smooth(inverse, rng.uniform(0, 255, (16, 16, 3)).astype(np.float32), POOL):
+        assert np.isfinite(array).all()
+
+
+def test_most_pixels_that_measure_anything_must_have_depth() -> None:
+    plate, nothing = DepthPlate.empty(4, 4), np.zeros((4, 4), bool)
+    everywhere = ~nothing
+    assert not plate.is_known(everywhere)
+    depth = np.zeros((4, 4), np.float32)
+    depth[:2] = 1.0  # the others are beyond the sensor's range
+    for _ in range(settings.LEAST):
+        assert not plate.is_known(everywhere)
+        plate.take(depth, nothing, POOL)
+    assert plate.is_known(everywhere) and not plate.is_known(nothing)

@@ -1,0 +1,161 @@
+"""Depth plates drawn from other places: what is seen, where, in which color; virtual plates; what cameras share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+from edge_server.fields.common.scene_box import UNIT_BOX
+from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
+from edge_server.fields.splat.kernels.project import COLOR, QUATERNION, SCALE
+from edge_server.fields.splat.layers.depth import settings
+from edge_server.fields.splat.layers.depth.depth_plate import smooth
+from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
+from edge_server.fields.splat.layers.depth.overlaps import contradicting, exposures
+from edge_server.fields.splat.layers.depth.surfaces import Surface, SurfaceScene
+from edge_server.fields.splat.layers.depth.virtual_plates import fill_unseen, poses_between, virtual_plates
+from edge_server.fields.splat.settings import SplatSettings
+from freshfield.geometry import Pinhole, look_at, quaternion_to_matrix
+from tests.edge_server.fields.scenes import psnr, ring, seen
+
+POOL = CallerPool()
+
+
+def surface_of(view: View, scale: float = 1.0, gain: float = 1.0) -> Surface:
+    """What a camera with a perfect sensor knows of the scene of balls; the sky has no depth."""
+    image, distance = seen(view.intrinsics, view.camera_to_world)
+    z = distance * view.intrinsics.rays()[..., 2] * scale
+    inverse = np.where(np.isfinite(z), 1.0 / z, 0.0).astype(np.float32)
+    color = (image * gain).astype(np.float32)
+    known = np.ones(z.shape, bool)
+    return Surface(view.intrinsics, view.camera_to_world, color, known, *smooth(inverse, color, POOL))
+
+
+CAMERAS = ring(7)
+SURFACES = [surface_of(view) for view in CAMERAS[:6]]
+SCENE = SurfaceScene.of(SURFACES)
+
+
+def test_normals_and_points_are_those_of_a_plane() -> None:
+    """A wall that passes 2 m ahead, turned by the camera's pose."""
+    lens, pose = Pinhole.from_fov(20, 16, 70.0), look_at((1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
+    normal = np.array([0.3, -0.2, -0.9]) / np.linalg.norm([0.3, -0.2, -0.9])  # camera axes, towards the camera
+    v, u = np.mgrid[:16, :20]
+    rays = np.stack([(u + 0.5 - lens.cx) / lens.fx, (v + 0.5 - lens.cy) / lens.fy, np.ones((16, 20))], axis=-1)
+    inverse = rays @ (-normal / 1.8)
+    slope = np.broadcast_to(-normal[:2] / 1.8 / [lens.fx, lens.fy], (16, 20, 2)).astype(np.float32)
+    black = np.zeros((16, 20, 3), np.float32)
+    surface = Surface(lens, pose, black, np.ones((16, 20), bool), inverse.astype(np.float32), slope)
+    np.testing.assert_allclose(surface.normals(), np.broadcast_to(pose[:3, :3] @ normal, (16, 20, 3)), atol=1e-5)
+    local = (surface.points() - pose[:3, 3]) @ pose[:3, :3]
+    np.testing.assert_allclose(local @ normal, -1.8, rtol=1e-5)
+    assert surface.joined()[:-1, :-1].all() and not surface.joined()[-1].any()
+
+
+def test_a_held_out_view_is_drawn_as_it_is() -> None:
+    held = CAMERAS[6]
+    truth, distance = seen(held.intrinsics, held.camera_to_world)
+    (color,), (agreement,) = SCENE.render([held.camera_to_world], held.intrinsics, POOL)
+    there, sure = np.isfinite(distance), agreement > settings.SURE
+    assert sure[there].mean() > 0.9 and sure[~there].mean() < 0.1
+    assert psnr(color[sure & there], truth[sure & there] / 255.0) > 17.0
+    assert (color >= 0).all() and (color <= 1.0 + 1e-5).all() and ((agreement >= 0) & (agreement <= 1)).all()
+
+
+def test_it_does_not_depend_on_threads() -> None:
+    pool = Pool(2)
+    poses = [view.camera_to_world for view in CAMERAS[:2]]
+    for mine, theirs in zip(
+        SCENE.render(poses, CAMERAS[0].intrinsics, pool), SCENE.render(poses, CAMERAS[0].intrinsics, POOL)
+    ):
+        np.testing.assert_array_equal(mine, theirs)
+    pool.close()
+
+
+def _wall(lens: Pinhole, pose: NDArray, z_m: float, level: float) -> Surface:
+    """A wall that fills a camera's image at one depth."""
+    shape = lens.height, lens.width
+    inverse, color = np.full(shape, 1.0 / z_m, np.float32), np.full((*shape, 3), level, np.float32)
+    return Surface(lens, pose, color, np.ones(shape, bool), inverse, np.zeros((*shape, 2), np.float32))
+
+
+def test_what_more_cameras_see_through_is_not_drawn() -> None:
+    """Three cameras side by side look at a wall; one of them says that it is nearer."""
+    lens = Pinhole.from_fov(32, 32, 60.0)
+    poses = [np.eye(4) for _ in range(3)]
+    for k, pose in enumerate(poses):
+        pose[0, 3] = 0.05 * k
+    walls = [_wall(lens, poses[0], 1.0, 50.0), _wall(lens, poses[1], 2.0, 200.0), _wall(lens, poses[2], 2.0, 200.0)]
+    (color,), (agreement,) = SurfaceScene.of(walls).render([poses[1]], lens, POOL)
+    inside = np.s_[4:28, 4:28]
+    np.testing.assert_allclose(color[inside], 200.0 / 255.0, atol=1e-3)
+    assert (agreement[inside] == 1.0).all()
+
+
+def test_virtual_plates_are_spread_between_the_cameras() -> None:
+    poses = [view.camera_to_world for view in CAMERAS[:2]]
+    between = poses_between(poses, SURFACES[:2], 12)
+    target = np.array([0.0, 0.0, 0.4])
+    angles = []
+    for pose in between:
+        away = pose[:3, 3] - target
+        np.testing.assert_allclose(pose[:3, 2], -away / np.linalg.norm(away), atol=0.05)
+        angles.append(np.degrees(np.arctan2(away[1], away[0])))
+    assert min(angles) > -21.0 and max(angles) < 73.0 and np.ptp(angles) > 60.0
+    plates = virtual_plates(SCENE, SURFACES, poses, True, POOL)
+    assert len(plates) == settings.VIRTUAL_PLATES and all(" " in plate.view.camera for plate in plates)
+    assert all(plate.known.min() == np.float32(settings.UNSEEN_WEIGHT) for plate in plates)
+    assert any((plate.known == 0).any() for plate in virtual_plates(SCENE, SURFACES, poses, False, POOL))
+
+
+def test_what_nobody_sees_fades_to_the_mean_color() -> None:
+    color, agreement = np.zeros((64, 64, 3), np.float32), np.zeros((64, 64), np.float32)
+    color[:, :8], agreement[:, :8] = [1.0, 0.5, 0.0], 1.0
+    color[:32, :8] = [0.0, 0.5, 1.0]
+    filled = fill_unseen(color, agreement)
+    np.testing.assert_array_equal(filled[:, :8], color[:, :8])
+    assert np.abs(filled[4, 10] - color[4, 4]).max() < 0.35 and np.abs(filled[4, 63] - 0.5).max() < 0.05
+
+
+def test_first_gaussians_lie_on_the_surfaces() -> None:
+    found = first_gaussians(SURFACES, UNIT_BOX, SplatSettings(start=600), np.random.default_rng(0))
+    assert found.shape[0] == 600 and np.isfinite(found).all()
+    ball = np.linalg.norm(found[:, :3] - [0.0, 0.0, 0.5], axis=1)
+    on_ball, on_ground = np.abs(ball - 0.5) < 0.03, np.abs(found[:, 2]) < 0.03
+    assert (on_ball | on_ground).mean() > 0.9
+    normal = quaternion_to_matrix(found[:, QUATERNION : QUATERNION + 4])[:, :, 2]
+    outwards = (found[:, :3] - [0.0, 0.0, 0.5]) / ball[:, None]
+    assert np.median(np.abs((normal * outwards).sum(axis=1))[on_ball & ~on_ground]) > 0.95
+    assert (found[:, SCALE + 2] < found[:, SCALE]).all() and ((found[:, COLOR:] >= 0) & (found[:, COLOR:] <= 1)).all()
+
+
+def test_depth_of_a_wrong_scale_contradicts_the_others() -> None:
+    assert contradicting(SURFACES) == []
+    spoiled = [surface_of(view, scale) for view, scale in zip(CAMERAS, (1.0, 1.0, 10.0, 1.0))]
+    assert contradicting(spoiled) == [2]
+    assert contradicting([surface_of(view, scale) for view, scale in zip(CAMERAS, (1.0, 0.1))]) == [1]
+    assert contradicting([surface_of(view, 1000.0) for view in CAMERAS[:4]]) == [0, 1, 2, 3]
+    assert contradicting([surface_of(CAMERAS[0], 10.0)]) == []  # alone, nothing tells
+
+
+def test_exposures_follow_from_what_cameras_share() -> None:
+    gains = np.array([0.8, 1.0, 1.1, 0.9])
+    found = exposures([surface_of(view, gain=gain) for view, gain in zip(CAMERAS, gains)])
+    logs = np.log(gains) - np.log(gains).mean()
+    np.testing.assert_allclose(found, np.broadcast_to(logs[:, None], (4, 3)), atol=0.03)
+    blind = replace(surface_of(CAMERAS[1]), inverse=np.zeros_like(SURFACES[1].inverse))
+    np.testing.assert_allclose(exposures([surface_of(CAMERAS[0], gain=0.8), blind])[:, 0], [-0.112, 0.112], atol=0.03)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("depth_m", [1e-3, 1.0, 1e4])
+def test_any_distance_is_drawn_finitely(depth_m: float) -> None:
+    walls = [_wall(view.intrinsics, view.camera_to_world, depth_m, 100.0) for view in CAMERAS[:3]]
+    plates = virtual_plates(SurfaceScene.of(walls), walls, [wall.pose for wall in walls], True, POOL)
+    assert all(np.isfinite(plate.color).all() and np.isfinite(plate.known).all() for plate in plates)
+    assert np.isfinite(first_gaussians(walls, UNIT_BOX, SplatSettings(start=64), np.random.default_rng(0))).all()
+    assert contradicting(walls[:1]) == []

@@ -1,0 +1,149 @@
+"""The field in layers where cameras measure depth: a ball that moves before few cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from edge_server.fields import Budget, View
+from edge_server.fields.splat.layers.depth import settings as depth_settings
+from edge_server.fields.splat.layers.layered_field import LayeredField
+from edge_server.fields.splat.settings import SplatSettings
+from tests.edge_server.fields.scenes import psnr, ring, seen
+from tests.edge_server.fields.small import same_state
+
+SMALL = SplatSettings(gaussians=1200, start=700, seed_cells=32, densify_every=20, threads=2)
+RIG = ring(9)
+CAMERAS, HELD = [RIG[0], RIG[2], RIG[4]], RIG[1]
+FRAME_S = 1.0 / 15.0
+
+Spoil = Callable[[int, int, NDArray[np.float32]], NDArray[np.float32] | None]
+
+
+@pytest.fixture(autouse=True)
+def _shown_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(depth_settings, "SHOWN_AFTER", (20, 40))
+
+
+def _ball_m(instant_s: float) -> NDArray[np.float64]:
+    return np.array([0.25 * np.cos(3 * instant_s), 0.25 * np.sin(3 * instant_s), 0.5])
+
+
+@cache
+def _frame(camera: int, frame: int) -> View:
+    view, instant_s = CAMERAS[camera], (frame + camera / len(CAMERAS)) * FRAME_S
+    image, distance = seen(view.intrinsics, view.camera_to_world, _ball_m(instant_s))
+    z = np.where(np.isfinite(distance), distance * view.intrinsics.rays()[..., 2], 0.0).astype(np.float32)
+    return replace(view, image=image, generated_ns=round(instant_s * 1e9), depth=z)
+
+
+def _no_depth(camera: int, frame: int, depth: NDArray[np.float32]) -> None:
+    return None
+
+
+def _run(field: Any, frames: range, spoil: Spoil | None = None, cameras: int = 3, steps: int = 20) -> None:
+    for frame in frames:
+        views = [_frame(k, frame) for k in range(cameras)]
+        if spoil is not None:
+            views = [
+                replace(v, depth=None if v.depth is None else spoil(k, frame, v.depth)) for k, v in enumerate(views)
+            ]
+        field.fit(views, Budget(steps=steps))
+
+
+def _score(field: LayeredField, frame: int) -> float:
+    truth, _ = seen(HELD.intrinsics, HELD.camera_to_world, _ball_m(frame * FRAME_S))
+    color = field.snapshot().render(HELD.camera_to_world, HELD.intrinsics).color
+    assert np.isfinite(color).all()
+    return psnr(color, truth / 255.0)
+
+
+@cache
+def _usual(kind: str) -> float:
+    """Score of the field after 40 frames: ``none``: without depth; ``exact``."""
+    field = LayeredField(SMALL)
+    _run(field, range(40), _no_depth if kind == "none" else None)
+    return _score(field, 39)
+
+
+def test_depth_lets_layers_begin_sooner_and_shows_what_is_between_the_cameras() -> None:
+    field = LayeredField(SMALL)
+    _run(field, range(13))
+    assert field.tracker is not None and field.supervision.early
+    assert all(" " not in view.camera for view in field.views) and len(field.still.views) > len(field.views)
+    _run(field, range(13, 40))
+    assert not field.supervision.early and field.supervision.with_depth
+    assert _score(field, 39) > _usual("none") + 0.3
+
+
+def test_one_camera_with_depth_has_layers() -> None:
+    field = LayeredField(SMALL)
+    _run(field, range(14), cameras=1)
+    assert field.tracker is not None
+    without = LayeredField(SMALL)
+    _run(without, range(30), _no_depth, cameras=1)
+    assert without.tracker is None
+
+
+def test_each_fifth_depth_does() -> None:
+    field = LayeredField(SMALL)
+    _run(field, range(40), lambda camera, frame, depth: depth if frame % 5 == 0 else None)
+    assert _score(field, 39) > _usual("exact") - 1.0
+
+
+def test_a_camera_without_depth_beside_others_is_learned_too() -> None:
+    field = LayeredField(SMALL)
+    _run(field, range(40), lambda camera, frame, depth: None if camera == 1 else depth)
+    assert field.supervision.with_depth and _score(field, 39) > _usual("none")
+
+
+@pytest.mark.parametrize("frames", [6, 12, 30])
+def test_it_resumes_bit_for_bit(frames: int) -> None:
+    field, other = LayeredField(SMALL), LayeredField(SMALL)
+    _run(field, range(frames), steps=5)
+    other.load_state(field.state())
+    for each in (field, other):
+        _run(each, range(frames, frames + 8), steps=5)
+    same_state(field, other)
+
+
+def test_with_a_budget_in_seconds_the_long_work_is_done_beside() -> None:
+    field = LayeredField(SMALL)
+    for frame in range(20):
+        field.fit([_frame(k, frame) for k in range(3)], Budget(seconds=0.02))
+    while field.static.training and not field.static.ready:
+        field.fit([_frame(k, 20) for k in range(3)], Budget(seconds=0.02))
+    assert field.static.ready and field.supervision.with_depth
+    field.static.stop()
+
+
+_RNG = np.random.default_rng(5)
+_SPOILED: dict[str, Spoil] = {
+    "all holes": lambda camera, frame, depth: np.zeros_like(depth),
+    "NaN": lambda camera, frame, depth: np.full_like(depth, np.nan),
+    "infinite": lambda camera, frame, depth: np.full_like(depth, np.inf),
+    "constant": lambda camera, frame, depth: np.full_like(depth, 1.0),
+    "inverted": lambda camera, frame, depth: np.where(depth > 0, 1.0 / np.maximum(depth, 1e-3), 0).astype(np.float32),
+    "ten times too far": lambda camera, frame, depth: depth * np.float32(10.0),
+    "millimeters": lambda camera, frame, depth: depth * np.float32(1000.0),
+    "noise": lambda camera, frame, depth: _RNG.uniform(0.1, 9.0, depth.shape).astype(np.float32),
+    "one camera ten times too far": lambda camera, frame, depth: depth * np.float32(10.0 if camera == 0 else 1.0),
+    "ten times too far, later": lambda camera, frame, depth: depth * np.float32(10.0 if frame > 20 else 1.0),
+    "half of the image": lambda camera, frame, depth: np.where(np.arange(48) < 24, depth, 0).astype(np.float32),
+}
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("kind", _SPOILED)
+def test_broken_depth_costs_little(kind: str) -> None:
+    field = LayeredField(SMALL)
+    _run(field, range(40), _SPOILED[kind])
+    assert field.layered and len(field.cameras) == 3
+    # A constant depth of the right order of magnitude, before cameras that share little, is believed.
+    assert _score(field, 39) > _usual("none") - (2.5 if kind == "constant" else 0.5)
