@@ -198,14 +198,24 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     return dataclasses.replace(scenario, edge=edge)
 
 
-def _settings(config: EdgeConfig, args: argparse.Namespace) -> RunSettings:
+def usual_settings(config: EdgeConfig) -> RunSettings:
+    """What an ``edge:`` section says of a run, scored at random instants."""
     return RunSettings(
-        steps=config.steps if args.steps is None else args.steps,
+        steps=config.steps,
         compute=config.compute,
-        epoch_ms=_epoch_ms(config) if args.epoch_ms is None else args.epoch_ms,
+        epoch_ms=_epoch_ms(config),
         grace_ms=config.grace_ms,
         score_every_ms=_SCORED_EVERY_MS,
         shown_every_ms=_SCORED_EVERY_MS,
+    )
+
+
+def _settings(config: EdgeConfig, args: argparse.Namespace) -> RunSettings:
+    found = usual_settings(config)
+    return dataclasses.replace(
+        found,
+        steps=found.steps if args.steps is None else args.steps,
+        epoch_ms=found.epoch_ms if args.epoch_ms is None else args.epoch_ms,
     )
 
 
