@@ -4,9 +4,10 @@
     frame-000000.depth.png  millimeters, 65535 where nothing was measured; not registered to the image
     frame-000000.pose.txt   camera-to-world (4 x 4) of the depth camera, OpenCV axes, meters
 
-The data set gives a focal length of 585 px for depth, and neither the image's lens nor where depth lies to it. Those
-here are nominal, and of another Kinect whose calibration is commonly used (LIRIS human activities data set, Kinect
-calibration): expect errors of about a pixel.
+The data set gives a focal length of 585 px for depth, and neither the image's lens nor the place of the depth sensor.
+Here they are nominal: a focal length of 525 px, and the sensor 25.6 mm beside the camera, not turned. On eight frames
+of the red kitchen edges of depth then lie on those of the image to 2 px (contrast 2.1; with the calibration of another
+Kinect that public code uses, which also turns the sensor by .6 degrees, 1.2).
 """
 
 from __future__ import annotations
@@ -27,13 +28,7 @@ FPS = 30.0
 NOTHING = 65535
 DEPTH_LENS = Pinhole(640, 480, 585.0, 585.0, 320.0, 240.0)
 _LENS = Lens(640, 480, 525.0, 525.0, 320.0, 240.0)
-_DEPTH_TO_CAMERA = Pose.from_matrix(
-    [
-        [9.9996518e-01, 2.6765126e-03, -7.9041012e-03, -2.5558943e-02],
-        [-2.7409311e-03, 9.9996303e-01, -8.1504521e-03, 1.0109636e-04],
-        [7.8819942e-03, 8.1718329e-03, 9.9993555e-01, 2.0318322e-03],
-    ]
-)
+_DEPTH_TO_CAMERA = Pose((1.0, 0.0, 0.0, 0.0), (-0.0256, 0.0, 0.0))
 
 
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
@@ -44,7 +39,8 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
     missing: list[str] = []
     for file in sorted(folder.glob("frame-*.pose.txt")):
         name = file.name.removesuffix(".pose.txt")
-        color, depth = (file_within(folder, f"{name}.{kind}.png") for kind in ("color", "depth"))
+        color = file_within(folder, f"{name}.color", (".png", ".jpg"))  # redistributions have JPEGs
+        depth = file_within(folder, f"{name}.depth.png")
         if color is None:
             missing.append(f"{name}.color.png")
             continue
