@@ -97,17 +97,3 @@ def test_a_nan_of_one_frame_costs_no_other_frame_of_its_batch(tmp_path):
     ]
     rows, ok = cache.of(items)
     assert ok.tolist() == [True, False, True] and cache.failed == 1 and np.isfinite(rows).all()
-
-
-def test_two_hundred_cameras_of_all_sizes(shipped):
-    cache = EmbeddingCache(shipped, ViewDecoder().view)
-    items = []
-    for k in range(200):
-        height, width = int(RNG.integers(8, 120)), int(RNG.integers(8, 120))
-        image = RNG.integers(0, 256, (height, width, 3), dtype=np.uint8)
-        camera = Pinhole.from_fov(width, height, 60.0)
-        items.append(frame(f"cam{k:03d}", intrinsics=camera, codec="zstd", payload=payload.encode(image, "zstd")))
-    rows, ok = cache.of(items)
-    assert rows.shape == (200, shipped.dim) and ok.all() and np.isfinite(rows).all()
-    some = [items[k] for k in (3, 77, 199)]
-    assert (cache.of(some)[0] == rows[[3, 77, 199]]).all()

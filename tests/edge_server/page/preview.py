@@ -1,6 +1,6 @@
 """A toy deployment for the page.
 
-A ball circles over a floor, and cameras on an arc see it. The "field" is the analytic scene at the instant of an
+A ball circles over a plate, and cameras on an arc see it. The "field" is the analytic scene at the instant of an
 update: what a perfect field would show. Only learning and network are left out.
 """
 
@@ -19,7 +19,8 @@ from edge_server.scheduler import POLICIES, make_policy
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.frame import Frame
-from freshfield.geometry import Pinhole, Pose, look_at, world_rays
+from freshfield.geometry import Pinhole, Pose, look_at
+from tests.edge_server.fields.scenes import seen
 
 CAMERAS = 9
 LENS = Pinhole.from_fov(128, 96, 55.0)
@@ -27,54 +28,23 @@ BALL_RADIUS_M = 0.55
 ORBIT_RADIUS_M = 0.6
 PERIOD_S = 6.0
 UPDATE_S = 0.8
-FLOOR_RADIUS_M = 2.2
-EMPTY = np.array([0.10, 0.115, 0.135])
-_SUN = np.array([0.4, -0.5, 0.77])
 
 
 class BallScene:
-    """The scene at one instant, as a Snapshot. Empty space is dark blue."""
+    """The scene at one instant, as a Snapshot."""
 
     def __init__(self, t_s: float) -> None:
         angle = 2 * np.pi * t_s / PERIOD_S
         self.center = np.array([ORBIT_RADIUS_M * np.cos(angle), ORBIT_RADIUS_M * np.sin(angle), BALL_RADIUS_M])
-        self.spin = 3.0 * angle
 
     def at(self, present_ns: int) -> BallScene:
         return self
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
-        origin, rays = world_rays(intrinsics, camera_to_world)
-        toward = origin - self.center
-        b = rays @ toward
-        root = b * b - (toward @ toward - BALL_RADIUS_M**2)
-        ball = np.where(root > 0, -b - np.sqrt(np.maximum(root, 0)), np.inf)
-        ball = np.where(ball > 0, ball, np.inf)
-        down = np.where(rays[..., 2] < -1e-6, rays[..., 2], -1e-6)
-        floor = np.where(rays[..., 2] < -1e-6, -origin[2] / down, np.inf)
-        spot = origin + rays * np.where(np.isfinite(floor), floor, 0.0)[..., None]
-        floor = np.where((floor > 0) & (np.hypot(spot[..., 0], spot[..., 1]) < FLOOR_RADIUS_M), floor, np.inf)
-        depth = np.minimum(ball, floor)
-        seen = np.isfinite(depth)
-        hit = origin + rays * np.where(seen, depth, 0.0)[..., None]
-        color = np.where((ball <= floor)[..., None], self._ball_color(hit), self._floor_color(hit))
-        color = np.where(seen[..., None], color, EMPTY)
-        return Rendering(
-            color.astype(np.float32), np.where(seen, depth, 0.0).astype(np.float32), seen.astype(np.float32)
-        )
-
-    def _ball_color(self, at: NDArray) -> NDArray:
-        normal = (at - self.center) / BALL_RADIUS_M
-        turned = np.arctan2(normal[..., 1], normal[..., 0]) - self.spin
-        stripe = 0.5 + 0.5 * np.sign(np.sin(6 * turned) * np.sin(9 * normal[..., 2]))
-        base = np.where(stripe[..., None] > 0.5, (0.93, 0.42, 0.20), (0.98, 0.86, 0.66))
-        return base * (0.35 + 0.65 * np.clip(normal @ _SUN, 0, 1))[..., None]
-
-    def _floor_color(self, at: NDArray) -> NDArray:
-        checks = (np.floor(at[..., 0] * 2) + np.floor(at[..., 1] * 2)) % 2
-        base = np.where(checks[..., None] > 0.5, (0.55, 0.62, 0.66), (0.30, 0.37, 0.43))
-        gap = np.hypot(at[..., 0] - self.center[0], at[..., 1] - self.center[1]) / BALL_RADIUS_M
-        return base * (1 - 0.55 * np.exp(-(gap**2)))[..., None]
+        image, away_m = seen(intrinsics, camera_to_world, self.center, BALL_RADIUS_M)
+        solid = np.isfinite(away_m)
+        depth = np.where(solid, away_m, 0.0).astype(np.float32)
+        return Rendering((image / 255.0).astype(np.float32), depth, solid.astype(np.float32))
 
 
 class Preview:

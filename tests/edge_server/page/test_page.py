@@ -262,12 +262,6 @@ def test_a_taken_port_is_reported():
     assert page_url("::1", 8080, tls=True) == "https://[::1]:8080"
 
 
-@pytest.mark.parametrize(("host", "port"), [("203.0.113.7", 8080), ("127.0.0.1", 70000)])
-def test_an_impossible_address_is_refused(host, port):
-    with pytest.raises(PageError):
-        start_page(bare_state(), host, port)
-
-
 def test_stop_frees_the_port_and_ends_the_threads(tmp_path, capfd):
     before = set(threading.enumerate())
     with preview_page(tmp_path) as (_, page):
@@ -291,7 +285,7 @@ def test_a_visitor_is_sent_the_scene_from_where_they_stand(tmp_path):
         with Visitor(page.port, (4.0, 0.0, 3.0)) as visitor:
             visitor.wait_for(lambda: visitor.images >= 2, "a coarse and a finer image")
             here = _decode(visitor)
-            visitor.stand_at((0.2, 0.1, 6.0))
+            visitor.stand_at((0.2, 0.1, 2.5))
             at = visitor.images
             visitor.wait_for(lambda: visitor.images > at + 1, "an image from the new place")
             above = _decode(visitor)
@@ -299,20 +293,6 @@ def test_a_visitor_is_sent_the_scene_from_where_they_stand(tmp_path):
     assert here.std() > 20 and above.std() > 20
     size = (64, 48)
     assert np.abs(cv2.resize(here, size).astype(float) - cv2.resize(above, size)).mean() > 10
-
-
-def test_images_come_coarse_first_then_fine(tmp_path):
-    with preview_page(tmp_path) as (preview, page):
-        wait_until(lambda: preview.state.started, "no update")
-        preview.state.controls.paused = True
-        with Visitor(page.port) as visitor:
-            visitor.wait_for(lambda: visitor.images >= 1, "an image")
-            first = _decode(visitor).shape[0]
-            visitor.wait_for(lambda: visitor.images >= 3, "two refinements")
-            assert _decode(visitor).shape[0] > first
-            settled = visitor.images
-            time.sleep(1.5)
-            assert visitor.images == settled  # nothing new: nothing sent
 
 
 @pytest.mark.parametrize(("update_ms", "newer_s"), [(25.0, 0.03), (800.0, 0.16), (5000.0, 0.2)])

@@ -19,7 +19,6 @@ from edge_server.report.report_page import counts, number
 from edge_server.report.run_files import continuous, read_run_files
 from edge_server.run_records import EdgeStatus, UpdateCounts, UpdateRow
 from edge_server.settings import ExportConfig
-from freshfield_up.summary import summarize
 from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, SECONDS, page_of, publication, write_run
 
 
@@ -118,21 +117,6 @@ def test_updates_are_counted_as_the_edge_counted_them(run):
     assert counted["without_step"] == 40 and counted["refused"] == {"cam01": 3}
 
 
-def test_the_page_shows_frames_that_were_left_out_and_images_that_were_cut(tmp_path):
-    write_run(tmp_path)
-    assert "cut out of" not in page_of(tmp_path)[1]
-    cut = {"masked": 41, "not_detected": 3, "empty_box": 0, "empty_mask": 0, "full_mask": 1, "ms_per_image": 2.4}
-    edit_edge(tmp_path, updates={"count": 50, "shed": 17, "without_step": 3}, foreground=cut)
-    report, page = page_of(tmp_path)
-    assert report["foreground"] == cut and report["updates"]["shed"] == 17
-    assert (
-        "left out for lack of time: 17" in page
-        and "50 updates, 3 of them without time for a step of training; median" in page
-    )
-    assert "The object was cut out of 41 images, 2 ms each; used whole: 3 (nothing was found in it)" in page
-    assert "1 (all of it was found to be the object)" in page
-
-
 def test_depth_is_reported_where_there_is_some(run, tmp_path):
     assert "depth" not in run[1] and "depth" not in page_of(run[0])[1]
     write_run(tmp_path)
@@ -188,32 +172,6 @@ def test_numbers_are_written_for_people():
     assert number(1234.56, 1, " ms") == "1,234.6 ms" and number(None) == "–"
     assert number(1500.0, 2, " s", 0.001) == "1.50 s"
     assert counts({"crc": 4, "stale": 1200}) == "crc 4, stale 1,200"
-
-
-def test_a_mesh_is_reported_where_there_is_one(run, tmp_path):
-    assert "mesh" not in run[1] and "<h2>Mesh" not in (run[0] / "report.html").read_text()
-    measured = {
-        "chamfer_mm": 6.926,
-        "accuracy_mm": 5.0,
-        "accuracy_median_mm": 1.1,
-        "accuracy_p95_mm": 9.0,
-        "completeness_mm": 8.0,
-        "complete": 0.6074,
-        "precise": 0.5,
-        "within_mm": 3.0,
-        "target_chamfer_mm": 1.5,
-        "target_complete": 0.95,
-    }
-    facts = {"file": "tile.ply", "triangles": 19794, "vertices": 9900, "watertight": False, "cameras": 18}
-    write_run(tmp_path)
-    for found in (measured, None):
-        mesh = {**facts, "seconds": 11.6, "stages_s": {"fuse": 0.4}, "measured": found}
-        (tmp_path / "mesh.json").write_text(json.dumps(mesh))
-        (report, page), last = page_of(tmp_path), summarize(tmp_path)
-        assert report["mesh"] == mesh
-        assert ("6.93 mm" in page and "60.7 %" in page) == (found is not None)
-        assert ("chamfer 6.93 mm (target 1.5), 61 % of the" in last) == (found is not None)
-        assert "tile.ply: 19,794 triangles, made in 12 s" in last
 
 
 @pytest.mark.parametrize("wrong", [{"mesh": "../tile.ply"}, {"mesh": "tile.obj"}, {"mesh": "a.ply", "voxel_mm": 0}])

@@ -79,29 +79,6 @@ def test_single_pixels_of_nonsense_do_not_spread():
     assert np.percentile(np.abs(radii(maps) - RADIUS_M), 95) < 0.003
 
 
-def test_a_million_equal_maps_would_not_overflow():
-    """Weights add up (3.10): the mean must hold when one more says nothing new."""
-    one = ball_maps(1)
-    volume = fuse_maps(GRID, one)
-    heavy = volume.blocks._replace(weight=volume.blocks.weight * 1e6)
-    before = heavy.distance.copy()
-    from edge_server.fields.common.threads.thread_pool import shared_pool
-    from edge_server.surface.kernels.fuse import fuse
-    from edge_server.surface.volume import kernel_depth
-
-    shared_pool().run(fuse, heavy, kernel_depth(one[0]), GRID.voxel_m, GRID.band_m)
-    known = volume.blocks.weight > 0
-    np.testing.assert_allclose(heavy.distance[known], before[known], atol=1e-6)
-
-
-def test_a_camera_within_the_surface_and_one_behind_it():
-    inside = np.eye(4)
-    inside[:3, 3] = (0.0, 0.0, 0.05)
-    look = depth_map(np.full((64, 64), 0.04, np.float32), GRAY, inside, LENS)
-    volume = fuse_maps(GRID, [look, *ball_maps(8)])
-    assert np.isfinite(volume.blocks.distance).all()
-
-
 def test_a_renderer_that_has_diverged():
     class Diverged(BallRenderer):
         def render(self, camera_to_world, intrinsics):

@@ -61,21 +61,6 @@ def test_what_is_listed_is_all_that_is_imported(tmp_path):
         assert stream({name: {}}, str(tmp_path)) == f"['{name}'] ['{name}'] True True"
 
 
-def test_each_effect_imports_itself_and_no_other():
-    """In one process for all: an effect's module is dropped again before the next is listed."""
-    code = """
-import sys, numpy as np
-from camera_node.synthetic import effects as fx
-prefix = fx.__name__ + "."
-for name in fx.NAMES:
-    fx.load_effects({name: {}}, lambda n: np.random.default_rng(0))
-    print(name, sorted(m.removeprefix(prefix) for m in sys.modules if m.startswith(prefix)) == [name])
-    del sys.modules[prefix + name]
-"""
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.split("\n")[:-1] == [f"{name} True" for name in fx.NAMES]
-
-
 def test_nothing_listed_passes_everything_through_untouched():
     effects = fx.load_effects({}, lambda name: pytest.fail("no stream is needed"))
     scene, image = make_scene("tile", {"width": 8, "height": 8}), np.zeros((8, 8, 3), np.uint8)

@@ -10,7 +10,7 @@ import pytest
 from edge_server.scheduler.learned.ppo import Batch, Diagnostics, Learner
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import State, StateLayout
-from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, FreshOnes, Waits, collect, regret, state, teach
+from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, FreshOnes, collect, regret, state
 
 pytestmark = pytest.mark.stability
 LAYOUT = StateLayout(("age", "pose", "semantics"), dim=4)
@@ -44,14 +44,6 @@ def decide_and_learn(learner: Learner, states: list[State], rewards=None) -> Dia
     finite(learner, diagnostics)
     assert np.isfinite(learner.value(states)).all()
     return diagnostics
-
-
-def learns_on(learner: Learner, problem) -> None:
-    """What happened before has broken nothing: an easy problem is still learned. Anything learned from noise
-    has to be unlearned, hence more updates than a new learner needs."""
-    teach(learner, problem, 16)
-    finite(learner)
-    assert regret(learner, problem) < 0.04
 
 
 @by_action
@@ -171,20 +163,3 @@ def test_ratios_that_overflow(spec, claimed):
         finite(learner, learner.update(learner.batch(states, actions, np.full(32, claimed), rewards)))
     diagnostics = learner.update(learner.batch(states, actions, np.full(32, np.nan), rewards))
     assert diagnostics.dropped == 32
-
-
-@by_action
-def test_after_all_of_this_it_learns_on(spec):
-    """One learner, every hard case in turn, then a problem it can solve."""
-    problem = FreshOnes() if spec.action == "select" else Waits()
-    spec = replace(spec, layout=problem.layout)
-    learner = Learner(spec, 0)
-    rng = np.random.default_rng(0)
-    hard = [state(6, rng, silent=k) for k in range(7)]
-    hard += [replace(s, ages_ms=rng.choice(EXTREME_AGES_MS, 6), reported=np.ones(6, bool)) for s in hard]
-    decide_and_learn(learner, hard)
-    decide_and_learn(learner, hard, np.full(14, 0.8))
-    decide_and_learn(learner, hard, np.where(np.arange(14) % 3, np.nan, 1e6))
-    actions, _ = learner.act(hard)
-    finite(learner, learner.update(learner.batch(hard, actions, np.full(14, -1e5), rng.standard_normal(14))))
-    learns_on(learner, problem)

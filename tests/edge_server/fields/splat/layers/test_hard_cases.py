@@ -7,7 +7,6 @@ Six cameras see balls that go about on a table.
 from __future__ import annotations
 
 import copy
-import tracemalloc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
@@ -72,7 +71,6 @@ class Case:
     balls: where they are. before: where they were. light: of the half of the table with x > 0.
     arrives: see ``_on_time``. sent: what a camera sends instead of the view that it took.
     fresh_s: instant of the first fresh views. spread: whether cameras fire one after the other.
-    update: frames' times that an update takes: what it leads to is shown at its end. 0: none.
     """
 
     balls: Callable[[float], Balls] = _walk
@@ -82,7 +80,6 @@ class Case:
     sent: Callable[[int, View, float], View] = _as_taken
     fresh_s: float = NETWORK_S
     spread: bool = True
-    update: int = 0
 
     def balls_at(self, t: float) -> Balls:
         return self.balls(t) if t >= 0 else self.before(t)
@@ -108,14 +105,14 @@ class Stage:
     """A case as it goes on.
 
     now_s: of the last frame's time, since the event.
-    scores: random instants, and PSNR there of what is shown carried on to them, of the same standing still,
-    and of a table without balls; where balls are or were in the last 0.3 s.
+    scores: random instants, and PSNR there of what is shown carried on to them, and of a table without balls; where
+    balls are or were in the last 0.3 s.
     """
 
     def __init__(self, case: Case) -> None:
         self.case, self.field, self.now_s = case, LayeredField(SETTINGS), -EVENT_S
         self.shown: Any = self.field.snapshot()
-        self.scores: list[tuple[float, float, float, float]] = []
+        self.scores: list[tuple[float, float, float]] = []
         self.frames = 0
         self.flying: list[tuple[float, int, View]] = []
 
@@ -125,21 +122,17 @@ class Stage:
             for k in range(len(CAMERAS)):
                 self._capture(k, self.now_s + self.case.spread * k / len(CAMERAS) * FRAME_S)
             self.now_s += FRAME_S
-            if self.frames % (self.case.update or 1) == 0:
-                self._update()
+            self._update()
             self.frames += 1
             rng = np.random.default_rng(self.frames)
             for part in rng.random(3 * score):
                 self._score(self.now_s + part * FRAME_S)
 
     def _update(self) -> None:
-        if self.case.update:  # what the last one led to is shown now
-            self.shown = self.field.snapshot()
         due = sorted((one for one in self.flying if one[0] <= self.now_s), key=lambda one: one[:2])
         self.flying = [one for one in self.flying if one[0] > self.now_s]
         self.field.fit([view for *_, view in due], Budget(steps=STEPS))
-        if not self.case.update:
-            self.shown = self.field.snapshot()
+        self.shown = self.field.snapshot()
 
     def _capture(self, k: int, t: float) -> None:
         arrives_s = self.case.arrives(k, t) if t >= 0.0 else t + NETWORK_S
@@ -153,15 +146,15 @@ class Stage:
         for then in (t, t - 0.1, t - 0.2, t - 0.3):
             body |= (self.case.picture(HELD, then) != self.case.picture(HELD, then, False)).any(axis=-1)
         carried, empty = self.shown.at(round((t + EVENT_S) * 1e9)), self.case.picture(HELD, t, False)
-        images = [one.render(HELD.camera_to_world, HELD.intrinsics).color for one in (carried, self.shown)]
-        assert np.isfinite(images).all()
-        scores = (psnr(image[body], truth[body] / 255.0) for image in (*images, empty / 255.0))
-        self.scores.append((t, *scores))
+        image = carried.render(HELD.camera_to_world, HELD.intrinsics).color
+        assert np.isfinite(image).all()
+        scores = (psnr(one[body], truth[body] / 255.0) for one in (image, empty / 255.0))
+        self.scores.append((t, next(scores), next(scores)))
 
-    def median_db(self, from_s: float, until_s: float) -> tuple[float, float, float]:
+    def median_db(self, from_s: float, until_s: float) -> tuple[float, float]:
         """Medians of the scores of a time."""
-        carried, standing, empty = np.median([s[1:] for s in self.scores if from_s <= s[0] < until_s], axis=0)
-        return float(carried), float(standing), float(empty)
+        carried, empty = np.median([s[1:] for s in self.scores if from_s <= s[0] < until_s], axis=0)
+        return float(carried), float(empty)
 
     def going_on_as(self, case: Case) -> Stage:
         """A copy of it, to which something else happens."""
@@ -241,34 +234,10 @@ def test_what_moves_is_shown_as_well_as_before_half_a_second_after(name: str) ->
     case = CASES[name]
     stage = _begun(case.before, case.spread).going_on_as(case)
     stage.run(case.fresh_s + AFTER_S)
-    before_db, _, _ = stage.median_db(-SCORED_S, 0.0)
-    after_db, _, empty_db = stage.median_db(case.fresh_s + BACK_S, case.fresh_s + AFTER_S)
+    before_db, _ = stage.median_db(-SCORED_S, 0.0)
+    after_db, empty_db = stage.median_db(case.fresh_s + BACK_S, case.fresh_s + AFTER_S)
     assert after_db > empty_db + 3.0
     assert after_db > before_db - BACK_DB
-
-
-def test_the_event_is_seen() -> None:
-    """What the cases cost before fresh views come: they test something."""
-    for name in ("a teleport", "one camera only", "a burst after a blackout"):
-        case = CASES[name]
-        stage = _begun(case.before, case.spread).going_on_as(case)
-        stage.run(case.fresh_s + 0.1)
-        worst_db = stage.median_db(case.fresh_s - NETWORK_S, case.fresh_s + 0.2)[0]
-        assert worst_db < stage.median_db(-SCORED_S, 0.0)[0] - 2.0, name
-
-
-@pytest.mark.slow
-def test_a_slow_processor_makes_it_older_but_not_worse_than_standing_still() -> None:
-    """Updates of 67, 133, 200 and 267 ms, from the first frame on."""
-    known_db = [_begun(_walk, True).median_db(-SCORED_S, 0.0)[0]]
-    for update in (1, 2, 3, 4):
-        stage = Stage(Case(update=update))
-        stage.run(-SCORED_S, score=False)
-        stage.run(1.0)
-        carried_db, standing_db, empty_db = stage.median_db(-SCORED_S, 1.0)
-        assert carried_db > max(standing_db + 1.0, empty_db + 1.0), (update, carried_db, standing_db)
-        assert carried_db < known_db[-1]
-        known_db.append(carried_db)
 
 
 def test_motion_is_solved_again_where_it_was_far_off(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -287,17 +256,6 @@ def test_motion_is_solved_again_where_it_was_far_off(monkeypatch: pytest.MonkeyP
     around = _begun(_walk, True).going_on_as(Case())
     assert 1.6 <= passes_a_frame(around, 0.8) <= 2.4
     assert 2.4 < passes_a_frame(_begun(_walk, True).going_on_as(CASES["a teleport"]), 0.4) <= 3.0
-
-
-@pytest.mark.slow
-def test_ten_seconds_later_it_is_as_good() -> None:
-    """Seven rounds of the ball, and ten times the time over which motion is estimated."""
-    stage, end_s = _begun(_walk, True).going_on_as(Case()), 10.0
-    before = len(stage.field.moving)
-    stage.run(end_s - SCORED_S, score=False)
-    stage.run(end_s)
-    assert stage.median_db(end_s - SCORED_S, end_s)[0] > stage.median_db(-SCORED_S, 0.0)[0] - BACK_DB
-    assert len(stage.field.moving) < 2 * before
 
 
 def _views(stage_s: float, cameras: Sequence[View], away: NDArray[np.float64]) -> list[View]:
@@ -325,17 +283,3 @@ def test_ten_kilometers_away_it_is_shown_as_here() -> None:
                 scores.append(psnr(color, truth.image / 255.0))
         shown_db.append(np.median(scores))
     assert shown_db[0] > 18.0 and abs(shown_db[1] - shown_db[0]) < 0.5, shown_db
-
-
-@pytest.mark.slow
-def test_two_hundred_cameras_take_bounded_memory_and_time() -> None:
-    field, cameras, seconds = LayeredField(SETTINGS), ring(200, 16), []
-    tracemalloc.start()
-    for frame in range(1, 25):
-        views = _views(frame * FRAME_S, cameras, np.eye(4))
-        seconds.append(field.fit(views, Budget(seconds=0.1)).seconds)
-        shown = field.snapshot().render(HELD.camera_to_world, HELD.intrinsics)
-        assert np.isfinite(shown.color).all()
-    most_mb = tracemalloc.get_traced_memory()[1] / 1e6
-    tracemalloc.stop()
-    assert np.median(seconds) < 3.0 and most_mb < 150.0, (seconds, most_mb)
