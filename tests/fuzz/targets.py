@@ -164,6 +164,8 @@ def mcap(folder: Path) -> Target:
 def _images(dataset: Dataset) -> str:
     for image in dataset:
         assert np.isfinite(image.camera_to_world).all() and image.intrinsics.width > 0
+        if image.depth is not None:
+            assert image.depth().counts.dtype == np.uint16
     return "read"
 
 
@@ -183,6 +185,7 @@ def models(folder: Path) -> Target:
 
 def transform_files(folder: Path) -> Target:
     (folder / "a.png").write_bytes(PNG)
+    np.save(folder / "d.npy", np.ones((4, 4), np.float32))
     return of_file("a.json", folder, lambda f: _images(transforms.load_dataset(f)), DatasetError)
 
 
@@ -270,6 +273,9 @@ def _transforms() -> Iterable[bytes]:
     entry = {"file_path": "a.png", "transform_matrix": pose, "time": 0.5, "camera": "c"}
     lens = {"fl_x": 2.0, "fl_y": 2.0, "cx": 1, "cy": 1, "w": 2, "h": 2, "k1": 0.1, "fps": 30}
     yield json.dumps({**lens, "frames": [entry, {**entry, "file_path": "none"}]}).encode()
+    yield json.dumps(
+        {**lens, "depth_unit_scale_factor": 0.5, "frames": [{**entry, "depth_file_path": "d.npy"}]}
+    ).encode()
     yield json.dumps({"camera_angle_x": 0.7, "frames": [{"file_path": "./a", "transform_matrix": pose}]}).encode()
 
 

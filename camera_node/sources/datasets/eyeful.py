@@ -13,6 +13,7 @@ is not read.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,9 @@ from camera_node.sources.datasets.records import (
     Dataset,
     DatasetError,
     PosedImage,
+    dataset_of_files,
     errors_at,
     file_within,
-    missing_note,
     path_within,
     read_array,
     read_json,
@@ -66,13 +67,8 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
             continue
         photo = Photo(image, lens, options)
         found.append(posed_photo(photo, name, _UPRIGHT @ camera_to_world, where, name.split("/")[0]))
-    note = missing_note(missing, len(entries), pictures) if missing else ""
-    if not found:
-        raise DatasetError(f"{file}: none of its images exists: {note}")
-    held_out &= {image.name for image in found}
-    with errors_at(str(file)):
-        notes = (note,) if note else ()
-        return Dataset(tuple(found), len(missing), held_out=held_out, per_camera=True, notes=notes)
+    dataset = dataset_of_files(found, missing, pictures, str(file))
+    return replace(dataset, held_out=held_out & {image.name for image in found}, per_camera=True)
 
 
 def _images(folder: Path, images: str | None) -> Path:

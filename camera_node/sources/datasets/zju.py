@@ -25,9 +25,9 @@ from camera_node.sources.datasets.records import (
     DatasetError,
     PosedImage,
     camera_to_world,
+    dataset_of_files,
     errors_at,
     file_within,
-    missing_note,
     path_within,
 )
 
@@ -85,12 +85,9 @@ def load_dataset(
                 raise DatasetError(f"{(folder / masks / name).with_suffix('.png')}: missing, the mask of {name}")
             photo = Photo(picture, lens, options, mask)
             images.append(posed_photo(photo, f"{camera}/{k:06d}", pose, where, camera, k / recorded_fps))
-    note = missing_note(missing, count * len(instants), folder) if missing else ""
-    if not images:
-        raise DatasetError(f"{file}: none of its images exists: {note}")
     if len({i.camera for i in images}) != len({(i.camera, i.camera_to_world.tobytes()) for i in images}):
         raise DatasetError(f"{file}: two of its cameras keep their images in one folder")
-    return Dataset(tuple(images), len(missing), recorded_fps, notes=(note,) if note else ())
+    return dataset_of_files(images, missing, folder, str(file), recorded_fps)
 
 
 def _listed(counts: dict[str, int]) -> str:
