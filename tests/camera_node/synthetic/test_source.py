@@ -15,8 +15,27 @@ from camera_node.synthetic.effects import load_effects
 from camera_node.synthetic.frame_cache import default_folder, prune
 from camera_node.synthetic.source import WorldSource
 from freshfield import payload
+from freshfield.scenario import ScenarioError, parse
 
 SMALL = {"width": 32, "height": 32, "supersample": 1, "speed_m_per_s": 8.0}  # 0.6 s: few frames
+
+
+@pytest.mark.parametrize(
+    ("ids", "taken"),
+    [
+        (["cam02", "cam01"], ["cam02", "cam01"]),
+        (["cam02", "eye"], ["cam00", "cam01"]),
+        (["left", "right"], ["cam00", "cam01"]),
+        ([f"c{k}" for k in range(4)], None),
+    ],
+)
+def test_cameras_are_those_of_the_scene_by_name_if_it_has_all_of_them_or_else_in_order(ids, taken):
+    scenario = parse({"cameras": {"ids": ids}}, Path("own.yaml"))
+    if taken is None:
+        with pytest.raises(ScenarioError, match=r"own\.yaml: cameras: the scene has 3: cam00, cam01, cam02"):
+            source_module._scene_cameras(scenario, room(count=3))
+    else:
+        assert source_module._scene_cameras(scenario, room(count=3)) == dict(zip(ids, taken))
 
 
 def room(**changes):

@@ -40,6 +40,18 @@ def test_verdicts_of_viewpoints_follow_the_figures():
         assert answers(judge(viewpoints.VIEWPOINTS, SeedTable(rows))) == {answer}
 
 
+def test_tables_of_viewpoints_give_each_metric_its_decimals():
+    metrics = {"psnr_db": 20.06, "ssim": 0.8126, "lpips": 0.2004, "path_m": 5.0, "choice_ms": 7.25}
+    rows = [
+        {"scene": "tile", "arm": arm, "seed": 0, "views": views, **metrics, "psnr_db": 20.06 + views}
+        for arm in viewpoints.ARMS
+        for views in (3, viewpoints.JUDGED)
+    ]
+    counts, judged = viewpoints._tables(SeedTable(rows)).split("With ")
+    assert "| selector | 3 | 8 |" in counts and "| random | 23.1 | 28.1 |" in counts
+    assert "| random | 28.06 | 0.813 | 0.200 | 5.00 | 7.2 |" in judged
+
+
 @pytest.mark.parametrize(("share", "knows", "said"), [(0.95, False, "holds"), (0.85, True, "does not hold")])
 def test_verdicts_of_preferences_follow_the_answers(share, knows, said):
     rows = [

@@ -17,6 +17,7 @@ from edge_server.page.preferences import PreferencePage
 from edge_server.viewpoints.candidates import half_hemisphere
 from edge_server.viewpoints.capture_planner import Budget
 from freshfield.geometry import Pinhole
+from tests.edge_server.experiments.sets import write_photos
 
 
 def test_a_capture_is_planned_and_written(tmp_path, capsys):
@@ -52,6 +53,18 @@ def test_budgets_as_people_type_them():
     assert read_budget("8,2.5m") == Budget(8, 2.5)
     with pytest.raises(OptionError):
         read_budget("8 views")
+
+
+@pytest.mark.parametrize("alpha", [False, True])
+def test_candidates_of_a_recording_are_its_training_views_and_transparent_ones_stand_before_white(tmp_path, alpha):
+    write_photos(tmp_path / "set", 9, alpha=alpha)
+    (tmp_path / "own.yaml").write_text("source: {kind: transforms, data: set}\ncameras: {count: 2}\n")
+    stage = open_stage(str(tmp_path / "own.yaml"), data=tmp_path, scale=2.0)
+    assert (len(stage.candidates), len(stage.held_out)) == (7, 2)
+    view = stage.take(3)
+    assert view is stage.recorded[3] and view.image.shape == (16, 16, 4 if alpha else 3)
+    np.testing.assert_allclose(stage.candidates.poses[3], view.camera_to_world)
+    assert (stage.background, stage.options) == (((1.0,) * 3, {"background": "white"}) if alpha else ((0.0,) * 3, {}))
 
 
 def test_an_arm_says_which_candidates_it_reaches():

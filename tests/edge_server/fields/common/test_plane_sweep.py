@@ -10,7 +10,7 @@ import pytest
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget, View
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.plane_sweep import GUIDE_RAYS, depth_guide
+from edge_server.fields.common.plane_sweep import GUIDE_RAYS, depth_guide, foreground_mask
 from edge_server.fields.common.scene_box import SceneBox, scene_box
 from edge_server.fields.common.supervision import pack_views
 from edge_server.fields.common.threads.thread_pool import shared_pool
@@ -57,6 +57,16 @@ def test_what_is_transparent_or_of_one_color_has_no_depth() -> None:
 
 def _silent(view: View) -> View:
     return replace(view, weight=np.zeros(view.image.shape[:2], np.float32))
+
+
+def test_what_is_nearly_transparent_or_nearly_of_the_plain_color_is_empty() -> None:
+    clear = np.zeros((1, 3, 4), np.uint8)
+    clear[..., 3] = 15, 16, 255
+    assert foreground_mask(clear, None).tolist() == [[False, True, True]]
+    plain = np.array([0.2, 0.4, 0.6], np.float32)
+    near = np.array([[(51, 102, 153), (54, 99, 162), (55, 99, 162)]], np.uint8)  # 0, 15 and 16 of 255 off in all
+    assert foreground_mask(near, plain).tolist() == [[False, False, True]]
+    assert foreground_mask(near, None).all()
 
 
 def test_two_views_have_none_and_those_of_no_weight_no_say() -> None:
