@@ -107,11 +107,6 @@ def test_the_edges_image_compiles_the_kernels_of_a_field_that_there_is(monkeypat
     assert compiled == ["layers"]
 
 
-def test_the_camera_image_has_no_torch() -> None:
-    text = (ROOT / "deploy" / "camera.Dockerfile").read_text()
-    assert "install" in text and "edge.txt" not in text and "torch" not in text.split("\nARG", 1)[1]
-
-
 def engine() -> tuple[list[str], str]:
     """A compose command that works here and the engine below it, or skip with the reason."""
     tried = []

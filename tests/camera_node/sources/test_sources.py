@@ -84,15 +84,6 @@ def test_a_jpeg_of_the_right_size_is_sent_as_it_lies(tmp_path):
     assert not isinstance(shrunk.read(5).image, bytes) and shrunk.intrinsics.width == 96
 
 
-@pytest.mark.parametrize(("name", "cameras", "scale"), [("fox", 13, 4), ("lego_synthetic", 13, 2)])
-def test_real_photo_sets_stream(name, cameras, scale):
-    scenario = photo_scenario(data_dir(name), cameras, codec="jpeg", scale=scale)
-    for camera in build_cameras(scenario, source_config(scenario), scenario.cameras):
-        shot = camera.capture(12345)
-        image = payload.decode(shot.payload, "jpeg", shot.intrinsics.width, shot.intrinsics.height)
-        assert image.std() > 10
-
-
 def world_scenario(**source):
     section = {"kind": "world", "scene": "room", "width": 24, "height": 16, "fps": 10, **source}
     return parse({"cameras": {"count": 3, "held_out": ["cam00"]}, "source": section}, Path("world.yaml"))
@@ -125,9 +116,3 @@ def test_noise_makes_every_tick_its_own_and_spares_the_truth(tmp_path, monkeypat
         one, again, later = noisy.capture(3), noisy.capture(3), noisy.capture(3 + 10**6 * 7920)
         assert one.payload == again.payload  # the noise belongs to the tick
         assert one.payload != later.payload
-
-
-def test_an_unknown_effect_is_named(tmp_path):
-    scenario = photo_scenario(write_photos(tmp_path, 24), 3, effects={"sensor_nois": None})
-    with pytest.raises(ScenarioError, match=r"source.effects.*sensor_nois"):
-        build_cameras(scenario, source_config(scenario), scenario.cameras)

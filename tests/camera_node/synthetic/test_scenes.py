@@ -145,19 +145,6 @@ def test_motions_that_are_drawn_differ_in_speed_direction_start_and_path():
     assert np.ptp([w.center[0] for w in walks]) > 0.3 and np.ptp([w.radii[1] for w in walks]) > 0.15
 
 
-def test_several_may_walk_the_loop():
-    def seen(t_s: float, **params):
-        return make_scene("room", {**SMALL, "supersample": 1, **params}).render("cam00", t_s)
-
-    def same(a, b) -> bool:
-        return np.abs(a.astype(int) - b).max() <= 1
-
-    two, one, other = seen(0.4, people=2), seen(0.4), seen(0.4 + 0.5 * make_scene("room", SMALL).period_s)
-    still = np.abs(one.astype(int) - other).max(axis=2) <= 1
-    assert np.mean(two[still] == one[still]) > 0.95 and not same(two, one) and not same(two, other)
-    assert same(seen(0.4, people=0), seen(0.9, people=0)) and not make_scene("room", {"people": 0}).moving
-
-
 def test_a_person_on_a_clockwise_walk_faces_forward():
     walk = next(w for s in range(9) if (w := make_walk((0.0, 1.0), (0.7, 0.5), 1.0, s)).direction < 0)
     for phase in np.linspace(0, 1, 13):
