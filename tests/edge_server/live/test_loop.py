@@ -58,8 +58,9 @@ def test_an_empty_buffer_selects_nothing():
 def test_on_arrivals_nothing_is_selected_twice_and_a_field_that_wants_it_gets_every_frame():
     made = make_policy("all", None, np.random.default_rng(0))
     field = tiny_field()
-    field.frame_s = 0.0
+    field.frame_s, field.most_pixels = 0.0, 1001
     u = FieldUpdater(FrameBuffer(("cam01", "cam02")), made, field, start_ns=0, on_arrivals=True)
+    assert u.decoder.most_pixels == 500  # of each camera
     fed = []
     field.fit = lambda views, budget: fed.append([(v.camera, v.generated_ns // MS) for v in views])
     for at in (10, 20, 30):
