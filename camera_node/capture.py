@@ -11,7 +11,7 @@ from pathlib import Path
 
 from camera_node.capture_schedule import CaptureSchedule, RateSchedule, ScheduledSource
 from camera_node.clocks import ClockError, NodeClock
-from camera_node.settings import LiveConfig, SourceConfig
+from camera_node.settings import DEPTH_STEP, LiveConfig, SourceConfig
 from camera_node.sources.base import Shot, Source
 from camera_node.sources.registry import open_sources
 from camera_node.sources.with_effects import camera_effects
@@ -53,7 +53,7 @@ class Camera:
 
     config: gives codec and quality. cache: shared by the process's cameras.
     clock_error: makes the camera's clock wrong; None: it is right.
-    depth_every: each such shot of the source is sent with its depth, where it has any; 0: none.
+    depth_every: of so many shots of the source one is sent with its depth, where it has any; 0: none.
     """
 
     def __init__(
@@ -145,7 +145,8 @@ class Camera:
             return None
         if isinstance(self.source, ScheduledSource):  # replayed as it came
             return shot.encoded_depth
-        measured = None if content % self._depth_every else self.source.depth(content, shot)
+        wanted = content * DEPTH_STEP % 2**32 * self._depth_every < 2**32
+        measured = self.source.depth(content, shot) if wanted else None
         return None if measured is None else measured.encode()
 
 

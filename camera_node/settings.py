@@ -26,6 +26,10 @@ FPS_RANGE = (0.01, 1000.0)
 """Bounds of a rate of captures or of a recording, frames a second."""
 MAX_GAP_MS = 3.6e6
 """Longest time between a frame and its pose sample: poses an hour away belong to another recording."""
+DEPTH_STEP = 0x9E3779B9
+"""2^32 by the golden ratio: shot k has depth where k * DEPTH_STEP mod 2^32 is below 2^32 / depth_every. That is one in
+depth_every shots, spread evenly (each fifth: 3, 5 or 8 apart), and also one in depth_every of each second, third, ...
+shot: a link that takes exactly so many captures a frame would never get depth if it came with each so many-th."""
 MAX_LATENCY_MS = 6e4
 """Longest latency of a camera: one that is a minute late is not live."""
 
@@ -40,7 +44,7 @@ class SourceConfig(Settings, frozen=True, kw_only=True):
     codec: Literal["jpeg", "png", "zstd"] = DEFAULT_CODEC
     quality: Annotated[int, within(1, 100, "of JPEG; from 90 up, color is not subsampled")] = 92
     # Depth takes about as many bytes as its image: so it adds a sixth to them, and of 15 frames a second three measure.
-    depth_every: Annotated[int, within(0, 10**6, "each so many-th frame of a depth camera brings depth; 0: none")] = 5
+    depth_every: Annotated[int, within(0, 10**6, "of so many frames of a depth camera one brings depth; 0: none")] = 5
     effects: dict[str, dict[str, Any] | None] = field(default_factory=dict)
 
 

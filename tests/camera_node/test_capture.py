@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 
+import numpy as np
 import pytest
 
 from camera_node.capture import Camera, ShotCache, build_cameras, prepare
 from camera_node.outbox import Outbox
-from camera_node.settings import WorldConfig, source_config
+from camera_node.settings import DEPTH_STEP, WorldConfig, source_config
 from camera_node.sources.base import Shot
 from freshfield import ledger
 from freshfield.clock import VirtualClock
@@ -61,14 +62,27 @@ def depth_camera(every: int, contents: int | None = None, cache: ShotCache | Non
     return Camera(source, WorldConfig(kind="world"), cache or ShotCache(10**6), depth_every=every)
 
 
-@pytest.mark.parametrize(("every", "ticks"), [(0, []), (1, list(range(12))), (5, [0, 5, 10]), (100, [0])])
+@pytest.mark.parametrize(
+    ("every", "ticks"), [(0, []), (1, list(range(12))), (3, [0, 2, 5, 7, 10]), (5, [0, 5, 10]), (100, [0])]
+)
 @pytest.mark.parametrize("contents", [None, 12])
-def test_each_so_many_th_shot_brings_depth(every, ticks, contents):
+def test_one_in_so_many_shots_brings_depth(every, ticks, contents):
     camera = depth_camera(every, contents)
     for _ in range(2):  # the second time from the cache, where shots repeat
         depths = {tick: camera.capture(tick).encoded_depth for tick in range(12)}
         assert [tick for tick, depth in depths.items() if depth is not None] == ticks
         assert all((depths[tick].decode().counts == tick + 1).all() for tick in ticks)
+
+
+@pytest.mark.parametrize("every", [2, 3, 5, 10])
+def test_a_link_that_takes_each_so_many_th_frame_still_gets_depth(every):
+    """A line of finite rate that drops what finds it busy takes exactly each second, third, ... frame."""
+    wanted = np.arange(60_000) * DEPTH_STEP % 2**32 * every < 2**32
+    for stride in range(1, 13):
+        for first in range(stride):
+            (taken,) = np.nonzero(wanted[first::stride])
+            assert len(taken) == pytest.approx(len(wanted[first::stride]) / every, rel=0.1)
+            assert np.diff(taken).max() <= 8 * every
 
 
 def test_depth_is_cached_encoded_and_its_bytes_count():
