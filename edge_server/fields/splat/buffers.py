@@ -11,7 +11,7 @@ from edge_server.fields.splat.kernels.bin_tiles import TileLists, bin_tiles
 from edge_server.fields.splat.kernels.composite import PIXELS, SAVED, STRIPS, SUMS
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, adam_step
 from edge_server.fields.splat.kernels.project import BLOCK, FOOTPRINT, PROJECTED, TILE, Gaussians, project
-from edge_server.fields.splat.kernels.rasterize import ROWS, Raster, Targets, train_tiles
+from edge_server.fields.splat.kernels.rasterize import LOSSES, MOMENTS, ROWS, Raster, Targets, train_tiles
 
 MAX_PAIRS = 1 << 22  # pairs a camera: further Gaussians are left out, so that memory is bounded
 
@@ -72,19 +72,32 @@ class RasterBuffers:
     def train(self, targets: Targets, view: int) -> NDArray[np.float64]:
         """Compare the first camera of the last ``project_and_bin`` with image ``view`` of the targets, and write the
         gradients of its pairs to ``sums``. Returns ``losses``, see ``train_tiles``."""
-        losses = np.zeros((int(self.columns[0] * self.rows[0]), 2))
+        width = LOSSES + (3 * MOMENTS if len(targets.exposure) else 0)
+        losses = np.zeros((int(self.columns[0] * self.rows[0]), width))
         self.pool.run(train_tiles, self.first, targets, view, self.sums, losses)
         return losses
 
     def step(
-        self, cams: NDArray[np.float32], gaussians: Gaussians, moments: OptimizerState, rule: AdamParameters
+        self,
+        cams: NDArray[np.float32],
+        gaussians: Gaussians,
+        moments: OptimizerState,
+        rule: AdamParameters,
+        rigid: NDArray[np.float64] | None = None,
     ) -> int:
         """An optimizer step from the gradients in ``sums``: changes the Gaussians and their moments. Returns how many
-        gradients were not finite. cams: as given to the last ``project_and_bin``."""
+        gradients were not finite.
+
+        cams: as given to the last ``project_and_bin``.
+        rigid: float64 (6,), written: force and torque, see ``adam_step``.
+        """
         count = len(gaussians.params)
-        dropped = np.zeros(-(-count // BLOCK) + 1, np.int64)
+        blocks = -(-count // BLOCK) + 1
+        dropped, by_block = np.zeros(blocks, np.int64), np.zeros((0 if rigid is None else blocks, 6))
         mine = self.projected, self.lists, self.sums
-        self.pool.run(adam_step, cams, gaussians, count, *mine, moments, rule, dropped)
+        self.pool.run(adam_step, cams, gaussians, count, *mine, moments, rule, dropped, by_block)
+        if rigid is not None:
+            rigid[:] = by_block.sum(axis=0)
         return int(dropped.sum())
 
     def _bin(self, count: int) -> None:

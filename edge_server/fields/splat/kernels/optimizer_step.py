@@ -17,6 +17,8 @@ from edge_server.fields.splat.kernels.project_backward import (
     GRADIENT,
     SEEN,
     SLOPE,
+    add_force,
+    add_torque,
     block_scratch,
     gather_sums,
     harmonics_backward,
@@ -76,10 +78,10 @@ class AdamParameters(NamedTuple):
 
 
 @cache
-def age_corrections() -> NDArray[np.float32]:
-    """``AdamParameters.corrections``, (4096, 3)."""
+def age_corrections(settle_steps: float = SETTLE_STEPS) -> NDArray[np.float32]:
+    """``AdamParameters.corrections``, (4096, 3), of Gaussians that train at full rates for ``settle_steps``."""
     age = np.maximum(np.arange(_AGES), 1)
-    decay = np.maximum(np.minimum(SETTLE_STEPS / age, 1.0), RATE_SETTLED)
+    decay = np.maximum(np.minimum(settle_steps / age, 1.0), RATE_SETTLED)
     return np.stack([1.0 / (1.0 - BETA1**age), 1.0 / (1.0 - BETA2**age), decay], axis=-1).astype(np.float32)
 
 
@@ -170,7 +172,7 @@ def _adam(first, size, params, moments, rule, g):
 
 
 @kernel
-def adam_step(counter, worker, cams, gaussians, count, projected, lists, pair_sums, moments, rule, dropped):
+def adam_step(counter, worker, cams, gaussians, count, projected, lists, pair_sums, moments, rule, dropped, rigid):
     """An Adam step of all Gaussians that have pairs; the others and their moments stay as they are. Tasks
     are blocks of Gaussians.
 
@@ -178,6 +180,8 @@ def adam_step(counter, worker, cams, gaussians, count, projected, lists, pair_su
     projected, lists, pair_sums: see ``project``, ``TileLists``, ``composite_backward``.
     moments: ``OptimizerState``, updated. rule: ``AdamParameters``.
     dropped: int64 (blocks,), written: gradients that were not finite.
+    rigid: float64 (blocks, 6), 0 at first; sums over blocks are the force and torque on all Gaussians as one rigid
+        body, about the only camera's center (``add_force``, ``add_torque``). (0, 6): not asked for.
     """
     params, own_first, own_count = gaussians.params, lists.own_first, lists.own_count
     width = params.shape[1]
@@ -198,7 +202,11 @@ def adam_step(counter, worker, cams, gaussians, count, projected, lists, pair_su
                 continue
             cam = load_camera(cams, b)
             project_backward(cam, s)
+            if rigid.shape[0] > 0:
+                add_torque(cam, s, here, rigid[block, 3:])
             harmonics_backward(cam, gaussians, ids, here, s)
+            if rigid.shape[0] > 0:
+                add_force(s, here, rigid[block])
             for j in range(here):
                 i, slope = base + j, s[SLOPE + j]
                 if s[SEEN + j] == _F0:

@@ -220,3 +220,33 @@ def harmonics_backward(cam, gaussians, ids, count, s):
         s[at] += (lx - along * nx) * length
         s[at + BLOCK] += (ly - along * ny) * length
         s[at + 2 * BLOCK] += (lz - along * nz) * length
+
+
+@device_function
+def add_torque(cam, s, count, total):
+    """Add to ``total``, float64 (3,), the torque on the block's first ``count`` Gaussians as parts of one rigid body,
+    about the camera's center: the gradient by a rotation vector, world axes, that would turn all of them. Before
+    ``harmonics_backward``: colors seen from the camera stay as they are when it turns."""
+    t0 = t1 = t2 = _F0
+    for j in range(count):
+        at = GRADIENT + j
+        x, y, z = s[_X + j] - cam[ORIGIN], s[_X + BLOCK + j] - cam[ORIGIN + 1], s[_X + 2 * BLOCK + j] - cam[ORIGIN + 2]
+        fx, fy, fz = s[at], s[at + BLOCK], s[at + 2 * BLOCK]
+        qw, qx, qy, qz = s[_Q + j], s[_Q + BLOCK + j], s[_Q + 2 * BLOCK + j], s[_Q + 3 * BLOCK + j]
+        gw, gx = s[at + QUATERNION * BLOCK], s[at + (QUATERNION + 1) * BLOCK]
+        gy, gz = s[at + (QUATERNION + 2) * BLOCK], s[at + (QUATERNION + 3) * BLOCK]
+        # A small rotation w multiplies the quaternion by (1, w / 2) from the left.
+        t0 += y * fz - z * fy + _HALF * (qw * gx - gw * qx + qy * gz - qz * gy)
+        t1 += z * fx - x * fz + _HALF * (qw * gy - gw * qy + qz * gx - qx * gz)
+        t2 += x * fy - y * fx + _HALF * (qw * gz - gw * qz + qx * gy - qy * gx)
+    total[0], total[1], total[2] = total[0] + t0, total[1] + t1, total[2] + t2
+
+
+@device_function
+def add_force(s, count, total):
+    """Add to ``total``, float64 (3,), the force on the block's first ``count`` Gaussians: the gradient by a shift of
+    all of them. After ``harmonics_backward``."""
+    f0 = f1 = f2 = _F0
+    for j in range(count):
+        f0, f1, f2 = f0 + s[GRADIENT + j], f1 + s[GRADIENT + BLOCK + j], f2 + s[GRADIENT + 2 * BLOCK + j]
+    total[0], total[1], total[2] = total[0] + f0, total[1] + f1, total[2] + f2

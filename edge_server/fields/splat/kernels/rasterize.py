@@ -32,9 +32,15 @@ from edge_server.fields.splat.kernels.project import TILE
 _T, _R, _G, _B, _Z = (n * PIXELS for n in range(5))
 _ER, _BEHIND = 5 * PIXELS, 8 * PIXELS
 ROWS = 9
+EXPOSURE = 7  # columns of ``Targets.exposure``
+# Columns of a tile's losses: the loss, whether it was not finite, and, where exposures are asked for, for each
+# channel the sums over pixels of their weights w, and of w r, w r r, w t and w r t: r is what is rendered, t the
+# image at the field's exposure.
+LOSSES, MOMENTS = 2, 5
 
 _F0, _F1, _F2 = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 _BYTE = np.float32(1.0 / 255.0)
+_C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)  # of SSIM (Wang et al. 2004), for colors in [0, 1]
 
 
 class Targets(NamedTuple):
@@ -45,6 +51,9 @@ class Targets(NamedTuple):
     weight: float32 (P,), how much each pixel counts; (0,) where all count in full.
     behind: float32 (P, 3), steps of 255, what is behind the Gaussians in each pixel; (0, 3): ``background``.
     background: float32 (3,), in [0, 1].
+    exposure: float32 (V, EXPOSURE), for each image the three gains and the three biases by which a rendering becomes
+        the image, and a factor on its loss; (0, EXPOSURE): images are as rendered.
+    dissimilarity: weight in the loss of (1 - SSIM) / 2, of each channel of a tile and times its pixels. 0: none.
     """
 
     first: NDArray[np.int64]
@@ -53,6 +62,8 @@ class Targets(NamedTuple):
     weight: NDArray[np.float32]
     behind: NDArray[np.float32]
     background: NDArray[np.float32]
+    exposure: NDArray[np.float32] = np.zeros((0, EXPOSURE), np.float32)
+    dissimilarity: np.float32 = np.float32(0.0)
 
 
 class Raster(NamedTuple):
@@ -171,13 +182,68 @@ def _load_tile(targets, view, x0, y0, target, behind, share):
     return some
 
 
+@device_function
+def _undo_exposure(exposure, target, share):
+    """Change target (3, PIXELS) to the field's exposure, and weigh its pixels, share (PIXELS,), by what an error there
+    means in the image. exposure: a row of ``Targets.exposure``."""
+    for c in range(3):
+        inverse, bias = _F1 / exposure[c], exposure[3 + c]
+        for k in range(PIXELS):
+            target[c, k] = (target[c, k] - bias) * inverse
+    for k in range(PIXELS):
+        share[k] *= exposure[6]
+
+
+@device_function
+def _add_moments(s, behind, target, share, losses):
+    """Write the columns of ``losses`` from LOSSES on. s: the tile's memory."""
+    for c in range(3):
+        w = wr = wrr = wt = wrt = _F0
+        for k in range(PIXELS):
+            r = s[_R + c * PIXELS + k] + s[_T + k] * behind[c, k]
+            t, share_r = target[c, k], share[k] * r
+            w, wr, wrr, wt, wrt = w + share[k], wr + share_r, wrr + share_r * r, wt + share[k] * t, wrt + share_r * t
+        for n, total in enumerate((w, wr, wrr, wt, wrt)):
+            losses[LOSSES + c * MOMENTS + n] = total
+
+
+@device_function
+def _add_dissimilarity(s, behind, target, share, weight):
+    """Add the gradient of ``weight`` (1 - SSIM) / 2, times the tile's pixels, to the rows from ER on, and what the
+    background has of it. A tile is the window of SSIM (Wang et al. 2004); windows do not overlap."""
+    w = _F0
+    for k in range(PIXELS):
+        w += share[k]
+    over = _F1 / max(w, np.float32(1e-6))
+    for c in range(3):
+        mr = mt = rr = tt = rt = _F0
+        for k in range(PIXELS):
+            r, t = s[_R + c * PIXELS + k] + s[_T + k] * behind[c, k], target[c, k]
+            mr, mt = mr + share[k] * r, mt + share[k] * t
+            rr, tt, rt = rr + share[k] * r * r, tt + share[k] * t * t, rt + share[k] * r * t
+        mr, mt = mr * over, mt * over
+        rr, tt, rt = max(rr * over - mr * mr, _F0), max(tt * over - mt * mt, _F0), rt * over - mr * mt
+        means, spreads = mr * mr + mt * mt + _C1, rr + tt + _C2
+        alike, together = (_F2 * mr * mt + _C1) / means, (_F2 * rt + _C2) / spreads
+        half = np.float32(-0.5) * weight
+        by_mean = half * together * _F2 * (mt - alike * mr) / means
+        by_t, by_r = half * alike * _F2 / spreads, -half * alike * _F2 * together / spreads
+        for k in range(PIXELS):
+            r = s[_R + c * PIXELS + k] + s[_T + k] * behind[c, k]
+            slope = share[k] * (by_mean + by_t * (target[c, k] - mt) + by_r * (r - mr))
+            s[_ER + c * PIXELS + k] += slope
+            s[_BEHIND + k] += s[_T + k] * behind[c, k] * slope
+
+
 @kernel
 def train_tiles(counter, worker, raster, targets, view, sums, losses):
     """Render the raster, compare it with image ``view`` of the targets, and backpropagate to the pairs. Tasks are
-    tiles. The loss is the squared color error times the pixel's weight, summed over pixels.
+    tiles. The loss is the squared color error times the pixel's weight, summed over pixels, and what
+    ``Targets.dissimilarity`` adds (its gradient only).
 
     sums: float32 (B, P, SUMS), written for the pairs of slot 0.
-    losses: float64 (tiles, 2), written: the loss, and 1 if the tile is left out as not finite.
+    losses: float64 (tiles, LOSSES), written: the loss, and 1 if the tile is left out as not finite. With
+        3 MOMENTS more columns: see there.
     """
     lists, tiles = raster.lists, raster.columns * raster.rows
     s, store, share = raster.memory[worker], raster.saved[worker], np.empty(PIXELS, np.float32)
@@ -194,6 +260,8 @@ def train_tiles(counter, worker, raster, targets, view, sums, losses):
         x0, y0, begin, end = begin_tile(raster, t, s, strip_pairs, count)
         if not _load_tile(targets, view, x0, y0, target, behind, share):
             count[0] = count[1] = count[2] = count[3] = 0
+        if targets.exposure.shape[0] > 0:
+            _undo_exposure(targets.exposure[view], target, share)
         size = (end - begin) * SAVED
         composite_strips(raster, strip_pairs, count, x0, y0, s, store, size, SAVED, composited)
         square = _F0
@@ -206,6 +274,10 @@ def train_tiles(counter, worker, raster, targets, view, sums, losses):
                 square += share[k] * (e * e)
                 s[_ER + c * PIXELS + k] = slope
                 s[_BEHIND + k] += s[_T + k] * behind[c, k] * slope
+        if targets.dissimilarity > _F0:
+            _add_dissimilarity(s, behind, target, share, targets.dissimilarity)
+        if losses.shape[1] > LOSSES:
+            _add_moments(s, behind, target, share, losses[t])
         finite = is_finite(square)
         losses[t, 0], losses[t, 1] = square if finite else 0.0, 0.0 if finite else 1.0
         if not finite:
