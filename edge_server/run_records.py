@@ -30,6 +30,8 @@ class UpdateRow(Struct, kw_only=True):
     psnr_moving_db: Number | None = None
     ssim: Number | None = None
     lpips: Number | None = None
+    psnr_refined_db: Number | None = None
+    ssim_refined: Number | None = None
     truth_gap_ms: Number | None = None
     scored_on: str | None = None
 

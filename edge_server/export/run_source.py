@@ -9,9 +9,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from edge_server.export import ExportError, PosedImage, file_names
-from edge_server.fields import Field, View, checkpoint
+from edge_server.fields import Field, RefinesCameras, View, checkpoint
 from edge_server.fields.registry import make_field, option_help
 from freshfield.untrusted import stored_bytes
 
@@ -31,12 +32,14 @@ class Source:
 
     @property
     def shots(self) -> list[PosedImage]:
-        """The views as images to write."""
+        """The views as images to write, at the poses that belong to the field's Gaussians: corrected ones, if it
+        corrects them."""
         names = file_names([v.camera for v in self.views])
-        return [
-            PosedImage(name, v.image, np.asarray(v.camera_to_world, np.float64), v.intrinsics)
-            for name, v in zip(names, self.views)
-        ]
+        return [PosedImage(name, v.image, self._pose(v), v.intrinsics) for name, v in zip(names, self.views)]
+
+    def _pose(self, view: View) -> NDArray[np.float64]:
+        known = self.field.correction(view) if isinstance(self.field, RefinesCameras) else None
+        return np.asarray(view.camera_to_world if known is None else known.camera_to_world, np.float64)
 
 
 def open_source(path: Path) -> Source:

@@ -53,6 +53,8 @@ class Score:
     truth_gap_ms: capture of the truth minus the present; None on selected views.
     moving_share: share of the pixels that are known to move.
     on: the kind of truth.
+    psnr_refined_db, ssim_refined: of a rendering at the pose and exposure that the field's corrections of other views
+        suggest, the truth itself not looked at; None where the field corrects nothing.
     """
 
     camera: str
@@ -65,6 +67,8 @@ class Score:
     moving_share: float = 0.0
     on: Literal["held-out", "selected"] = "held-out"
     psnr_still_db: float | None = None
+    psnr_refined_db: float | None = None
+    ssim_refined: float | None = None
 
 
 class Scorer:
@@ -140,7 +144,7 @@ def mean_score(scores: Sequence[Score]) -> Score:
     if not scores:
         raise ImageError("no scores to average")
     means: dict[str, Any] = {}
-    for name in (*SHOWN, "truth_gap_ms", "moving_share"):
+    for name in (*SHOWN, "truth_gap_ms", "moving_share", "psnr_refined_db", "ssim_refined"):
         known = [v for s in scores if (v := getattr(s, name)) is not None]
         means[name] = float(np.mean(known)) if known else None
     return replace(scores[0], camera=",".join(dict.fromkeys(s.camera for s in scores)), **means)

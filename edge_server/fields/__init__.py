@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +84,33 @@ class Rendering:
     color: NDArray[np.float32]
     depth: NDArray[np.float32]
     opacity: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Correction:
+    """How a field renders what a camera saw, where it has learned that poses and exposures are inexact.
+
+    camera_to_world: (4, 4), where to render from.
+    gain, bias: (3,), by channel, from a rendering's colors to those of the image.
+    """
+
+    camera_to_world: NDArray[np.float64]
+    gain: NDArray[np.float64]
+    bias: NDArray[np.float64]
+
+    def exposed(self, color: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A rendering (H, W, 3) at the image's exposure, in [0, 1]."""
+        return np.clip(color * self.gain + self.bias, 0.0, 1.0).astype(np.float32)
+
+
+@runtime_checkable
+class RefinesCameras(Protocol):
+    """A field that may correct the poses and exposures of its views."""
+
+    def correction(self, view: View) -> Correction | None:
+        """How to render what ``view`` saw, without looking at its image: by its own correction if the field learns
+        from it, else by those of the views taken before and after it. None: the field corrects nothing."""
+        ...
 
 
 class Renderer(Protocol):

@@ -47,6 +47,7 @@ class Publication:
     psnr_db to truth_gap_ms: None until the held-out truth nearest to the present has arrived, or where there
     is nothing to score. truth_gap_ms: time from the present to that truth.
     scored_on: held-out camera, or SELECTED where nothing is held out (6.21-6.22).
+    psnr_refined_db, ssim_refined: see ``fidelity.scorer.Score``.
     """
 
     number: int
@@ -67,6 +68,8 @@ class Publication:
     truth_gap_ms: float | None = None
     scored_on: str | None = None
     network_ms: float | None = None
+    psnr_refined_db: float | None = None
+    ssim_refined: float | None = None
 
     @property
     def views(self) -> float:
@@ -83,6 +86,8 @@ class Publication:
             lpips=score.lpips,
             truth_gap_ms=score.truth_gap_ms,
             scored_on=score.camera if score.on == "held-out" else SELECTED,
+            psnr_refined_db=score.psnr_refined_db,
+            ssim_refined=score.ssim_refined,
         )
 
 

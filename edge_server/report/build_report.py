@@ -18,7 +18,7 @@ from edge_server.run_records import AgesRow, Baseline, DepthStatus, EdgeStatus, 
 from freshfield.files import write_json, write_text
 from freshfield.machine_load import outside_load
 
-METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
+METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "psnr_refined_db", "ssim_refined")
 SERIES = ("t_s", *METRICS, "aaoi_ms", "selected", "update_ms", "truth_gap_ms")
 # ``final`` is the mean of this last share of the run.
 FINAL_SHARE = 0.2

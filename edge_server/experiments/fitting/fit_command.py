@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Score, Scorer
 from edge_server.fields import Field, checkpoint
 from edge_server.fields.registry import efforts_of, field_names, option_help, settings_of
+from edge_server.fields.splat.scan.settings import scan_options
 from edge_server.live.scoring_thread import to_bytes
 from edge_server.run_records import UpdateRow
 from freshfield.files import out_folder, write_json
@@ -138,6 +139,7 @@ def run(request: argparse.Namespace) -> dict[str, Any]:
     if any(v.image.shape[2] == 4 for v in data.training):
         options = {"background": request.background, **options}
     try:
+        options = {**_scan_options(request, data, options), **options}
         model = make_field(request.field, options, seed=request.seed)
     except (ValueError, TypeError) as error:
         raise OptionError(f"--field {request.field}: {error}") from None
@@ -157,6 +159,20 @@ def run(request: argparse.Namespace) -> dict[str, Any]:
         print(request.chosen, flush=True)
     print(f"kernels ready after {model.warm_up():.1f} s", flush=True)
     return run_.go()
+
+
+def _scan_options(request: argparse.Namespace, data: MultiviewStill, options: Mapping[str, Any]) -> dict[str, Any]:
+    """What the data set says of how to learn it: see ``MultiviewStill.carried`` and ``timed``."""
+    if not data.carried or "scan" not in option_help(request.field):
+        return {}
+    note = "a scan: one camera, carried about a scene that stands still"
+    if data.timed:
+        note += "; its frames have times, so a tracker gave their poses: poses and exposures are refined"
+    request.chosen = "; ".join(filter(None, (request.chosen, note)))
+    found = scan_options(data.training[0].image[..., 0].size, data.timed)
+    if "effort" in options:  # says how many Gaussians
+        del found["gaussians"]
+    return found
 
 
 def _is_scene(data: Path) -> bool:
@@ -256,6 +272,8 @@ class _Run:
                 psnr_db=score.psnr_db,
                 ssim=score.ssim,
                 lpips=score.lpips,
+                psnr_refined_db=score.psnr_refined_db,
+                ssim_refined=score.ssim_refined,
                 selected=len(self.data.training),
                 update_ms=at.slice_s * 1e3,
                 steps=at.steps,
@@ -315,6 +333,9 @@ def progress_line(at: Scored, outside: float | None, held_out: bool = True) -> s
     words = [f"{at.seconds:7.1f} s {'-' if at.steps is None else at.steps:>7} steps"]
     words.append(f"PSNR {score.psnr_db:5.2f} dB" + (f" on {NOTHING_HELD_OUT}" if not held_out else ""))
     words += [f"SSIM {score.ssim:.3f}"] if score.ssim is not None else []
+    if score.psnr_refined_db is not None:
+        words.append(f"at refined poses {score.psnr_refined_db:5.2f} dB")
+        words += [f"SSIM {score.ssim_refined:.3f}"] if score.ssim_refined is not None else []
     words += [f"LPIPS {score.lpips:.3f}"] if score.lpips is not None else []
     words += [f"(others used {outside:.1f} cores)"] if outside is not None else []
     return "  ".join(words)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from edge_server.experiments.scenes.recorded import LEAST_WEIGHT, MultiviewStill
 from edge_server.fidelity.baselines import baseline
 from edge_server.fidelity.images import BLACK, Color
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
-from edge_server.fields import Field, View
+from edge_server.fields import Field, RefinesCameras, View
 
 WHITE: Color = (1.0, 1.0, 1.0)
 
@@ -53,10 +54,19 @@ def known_options(scene: Scene, nearest_m: float) -> dict[str, Any]:
 
 
 def score_views(field: Field, views: Sequence[View], scorer: Scorer) -> tuple[Score, NDArray[np.float32]]:
-    """Mean score over ``views``, within their masks, and the rendering (H, W, 3) of the first."""
-    renderings = [field.render(v.camera_to_world, v.intrinsics).color for v in views]
-    masks = [None if v.weight is None else v.weight > LEAST_WEIGHT for v in views]
-    scores = [
-        scorer.score(v.camera, image, 0, v.image, 0, mask=mask) for v, image, mask in zip(views, renderings, masks)
-    ]
-    return mean_score(scores), renderings[0]
+    """Mean score over ``views``, within their masks, and the rendering (H, W, 3) of the first, at the field's
+    correction if it has one."""
+    scores, shown = [], None
+    for view in views:
+        mask = None if view.weight is None else view.weight > LEAST_WEIGHT
+        image = field.render(view.camera_to_world, view.intrinsics).color
+        score = scorer.score(view.camera, image, 0, view.image, 0, mask=mask)
+        known = field.correction(view) if isinstance(field, RefinesCameras) else None
+        if known is not None:
+            image = known.exposed(field.render(known.camera_to_world, view.intrinsics).color)
+            refined = scorer.score(view.camera, image, 0, view.image, 0, mask=mask)
+            score = replace(score, psnr_refined_db=refined.psnr_db, ssim_refined=refined.ssim)
+        scores.append(score)
+        shown = image if shown is None else shown
+    assert shown is not None
+    return mean_score(scores), shown

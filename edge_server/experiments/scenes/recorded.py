@@ -26,6 +26,9 @@ class MultiviewStill:
     missing: number of entries of the file whose images do not exist.
     notes: what a user should know of how the files were read.
     background: color behind transparent images.
+    carried: the views are those of one camera that was carried about, photos or frames.
+    timed: they are frames with times: a recording, whose poses come from a tracker. Poses of photos were found from
+        the photos themselves, or are exact.
     """
 
     name: str
@@ -36,6 +39,8 @@ class MultiviewStill:
     missing: int = 0
     notes: tuple[str, ...] = ()
     background: Color = BLACK
+    carried: bool = False
+    timed: bool = False
 
     def describe(self) -> str:
         image = self.training[0].image
@@ -68,7 +73,17 @@ def load_recorded(
     if blank:
         notes += (f"masks leave nothing of {len(blank)} images, first {blank[0]}: they are not used",)
     trained, kept = (tuple(views[k] for k in keys if k not in blank) for keys in (training, held_out))
-    return MultiviewStill(file.resolve().parent.name, trained, kept, file, instant, dataset.missing, notes)
+    return MultiviewStill(
+        file.resolve().parent.name,
+        trained,
+        kept,
+        file,
+        instant,
+        dataset.missing,
+        notes,
+        carried=dataset.cameras == ("",),
+        timed=all(record.time_s is not None for record in dataset),
+    )
 
 
 def split(names: Sequence[str], holdout: str, own: Collection[str] = ()) -> tuple[list[str], list[str]]:
@@ -140,4 +155,10 @@ def _apart_s(records: Sequence[PosedImage]) -> float:
 
 def _view(name: str, record: PosedImage) -> View:
     weight = None if record.weight is None else record.weight()
-    return View(name, record.read(), record.camera_to_world, record.intrinsics, weight=weight)
+    depth = None
+    if record.depth is not None:
+        from edge_server.live.depth_in_image import depth_in_image
+
+        depth = depth_in_image(record.depth(), record.intrinsics, 0)
+    at_ns = round(1e9 * (record.time_s or 0.0))
+    return View(name, record.read(), record.camera_to_world, record.intrinsics, at_ns, weight=weight, depth=depth)

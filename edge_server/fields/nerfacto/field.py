@@ -1,7 +1,7 @@
 """Nerfacto for CPUs (Tancik et al. 2023): the hash grid of ``ngp``, with samples from a learned proposal.
 
 ``trained_field`` does the common part. This file adds samples from a proposal instead of a raster
-(``kernels.proposal``); it alone offers appearance embeddings (``common.appearance``).
+(``kernels.proposal``); it alone offers appearance embeddings (``common.cameras.appearance``).
 """
 
 from __future__ import annotations

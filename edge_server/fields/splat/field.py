@@ -30,7 +30,7 @@ from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_corrections, clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, SH_COLUMNS, TILE
-from edge_server.fields.splat.kernels.rasterize import Targets
+from edge_server.fields.splat.kernels.rasterize import LOSSES, Targets
 from edge_server.fields.splat.seeding import seed_gaussians
 from edge_server.fields.splat.settings import (
     ALIGN_EVERY,
@@ -54,6 +54,7 @@ class StillField(SteppedField[SplatSnapshot]):
     name = "splat"
     shape = ("sh_degree",)
     settings: SplatSettings
+    _rigid: NDArray[np.float64] | None = None  # (6,): steps write force and torque here, see ``RasterBuffers.step``
 
     def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
         super().__init__(settings or SplatSettings(), pool)
@@ -154,7 +155,7 @@ class StillField(SteppedField[SplatSnapshot]):
                 self._forget_parameters()
             assert self.view_store.box is not None
             self._cams = camera_rows(
-                [v.camera_to_world for v in views], [v.intrinsics for v in views], self.view_store.box
+                [self._pose_of(v) for v in views], [v.intrinsics for v in views], self.view_store.box
             )
             self._data: Views = intake.data
             # All of them, where every weight is 0.
@@ -171,6 +172,10 @@ class StillField(SteppedField[SplatSnapshot]):
         if len(self.cloud) == 0:
             self._seed()
         self._snapshot = None
+
+    def _pose_of(self, view: View) -> NDArray[np.float64]:
+        """Where a view is learned from: camera to world (4, 4)."""
+        return view.camera_to_world
 
     def _next_view(self) -> int:
         """The view of this step: all take turns, in an order that is drawn anew for each pass."""
@@ -192,16 +197,16 @@ class StillField(SteppedField[SplatSnapshot]):
         gaussians = cloud.gaussians()
         raster.project_and_bin(camera, gaussians)
         losses = raster.train(self._targets, view)
-        dropped = raster.step(camera, gaussians, cloud.optimizer_state(), self.adam_parameters(progress))
+        dropped = raster.step(camera, gaussians, cloud.optimizer_state(), self.adam_parameters(progress), self._rigid)
+        self._learn_camera(view, losses)
         if self.settings.planar:
             self._planar_step(view)
-        square, broken = losses.sum(axis=0).tolist()
+        square, broken = losses.sum(axis=0)[:LOSSES].tolist()
         if broken:
             self._repair()
         self.step += 1
-        # Not before every view has had a step.
-        if grow and self.step - self._grown >= max(self.settings.densify_every, len(self._asked)):
-            self._grow()
+        if grow:
+            self._grow_if_due()
         pixels = TILE * TILE * len(losses)
         pairs = min(int(raster.lists.needed[0]), raster.lists.pair.shape[1])
         return square / (3 * pixels), pixels, pairs, int(broken) + dropped
@@ -230,6 +235,14 @@ class StillField(SteppedField[SplatSnapshot]):
             (rates * s.rate_end**progress).astype(np.float32), age_corrections(), np.float32(s.epsilon)
         )
 
+    def _learn_camera(self, view: int, losses: NDArray[np.float64]) -> None:
+        """Learn what a step says of the camera of a view. losses: see ``train_tiles``."""
+
+    def _grow_if_due(self) -> None:
+        # Not before every view has had a step.
+        if self.step - self._grown >= max(self.settings.densify_every, len(self._asked)):
+            self._grow()
+
     def _grow(self) -> None:
         self._protect_unsupervised()
         densify_and_prune(self.cloud, self.settings.gaussians, float(self._data.size[:, 0].mean()), self._rng(5))
@@ -249,7 +262,7 @@ class StillField(SteppedField[SplatSnapshot]):
         if not slots and not others:
             return
         cams = np.concatenate(
-            [self._cams[slots], camera_rows([v.camera_to_world for v in others], [v.intrinsics for v in others], box)]
+            [self._cams[slots], camera_rows([self._pose_of(v) for v in others], [v.intrinsics for v in others], box)]
         )
         raster, count = self._render_raster, len(cloud)
         raster.project_and_bin(cams, cloud.gaussians(), differentiate=False)

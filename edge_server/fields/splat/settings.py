@@ -64,10 +64,17 @@ class SplatSettings(FieldSettings, frozen=True):
         bool, about("background plates, a still field and a moving set instead of one field, where cameras stand still")
     ] = False
 
+    scan: Annotated[
+        bool, about("the views are of a scene that stands still, as photos or a video of it: seeds, growth and rates")
+    ] = False
+    refine: Annotated[
+        bool, about("with ``scan``: learn each view's exposure, and correct its pose, as of a camera that was tracked")
+    ] = False
+
     @property
     def module(self) -> str:
-        """Layers are imported only where they are asked for."""
-        return "splat.layers.layered_field" if self.layers else "splat.field"
+        """Layers, and what a scan needs, are imported only where they are asked for."""
+        return "splat.layers.layered_field" if self.layers else "splat.scan.scan_field" if self.scan else "splat.field"
 
     @property
     def planar(self) -> bool:

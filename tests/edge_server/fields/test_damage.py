@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget
-from edge_server.fields.common import camera_refinement
+from edge_server.fields.common.cameras import camera_refinement
 from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT
 from edge_server.fields.common.trained_field import TrainedField
 from edge_server.fields.nerfacto.field import NerfactoField

@@ -63,6 +63,25 @@ def test_a_scene_of_ours_is_fitted_by_its_name(tmp_path, capsys, monkeypatch):
     assert "at 0.4 s" not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("timed", [True, False])
+def test_one_carried_camera_is_a_scan_and_frames_with_times_are_refined(tmp_path, capsys, timed):
+    path = write_photos(tmp_path / "set", 9)
+    if timed:
+        described = json.loads(path.read_text())
+        for k, frame in enumerate(described["frames"]):
+            frame["time"] = 0.5 * k
+        path.write_text(json.dumps(described))
+    out = tmp_path / "out"
+    words = ["--seconds", "1", "--option", "threads=1", "--option", "start=64", "--option", "seed_cells=16"]
+    assert edge_server(["fit", str(path), "--out", str(out), "--field", "splat", *words]) == 0
+    report, printed = report_of(out), capsys.readouterr().out
+    final = report["fidelity"]["final"]
+    assert "a scan: one camera" in report["chosen"] and ("refined" in report["chosen"]) == timed
+    assert (final["psnr_refined_db"] is not None) == timed == ("at refined poses" in printed)
+    state, _ = checkpoint.load(out / "field")
+    assert json.loads(str(state["meta"]))["settings"]["gaussians"] == 8192
+
+
 def test_ctrl_c_where_python_cannot_raise_it_is_not_lost():
     class Deaf:
         """A field whose fits swallow it, as a callback of the garbage collector does."""

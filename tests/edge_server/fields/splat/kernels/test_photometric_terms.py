@@ -82,7 +82,9 @@ def _dissimilarity(rendered: Tensor, image: Tensor, weight: Tensor) -> Tensor:
             r, t, w = (part[y : y + TILE, x : x + TILE] for part in (rendered, image, weight[..., None]))
             share = w / w.sum()
             mr, mt = (share * r).sum((0, 1)), (share * t).sum((0, 1))
-            rr, tt, rt = ((share * a * b).sum((0, 1)) for a, b in ((r - mr, r - mr), (t - mt, t - mt), (r - mr, t - mt)))
+            rr, tt, rt = (
+                (share * a * b).sum((0, 1)) for a, b in ((r - mr, r - mr), (t - mt, t - mt), (r - mr, t - mt))
+            )
             alike = (2 * mr * mt + 1e-4) / (mr**2 + mt**2 + 1e-4) * (2 * rt + 9e-4) / (rr + tt + 9e-4)
             total = total + w.sum() * (0.5 - 0.5 * alike).sum()
     return total

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.common.camera_refinement import PoseCorrections
+from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
 from freshfield.geometry import so3_exp
 from tests.edge_server.fields.small import SEEN, score, small
 
@@ -75,7 +75,7 @@ def test_corrections_repeat_themselves_and_resume_bit_for_bit() -> None:
         np.testing.assert_array_equal(one[name], two[name], err_msg=name)
         np.testing.assert_array_equal(one[name], three[name], err_msg=name)
     assert a._cameras.meta() == b._cameras.meta() == c._cameras.meta()
-    assert any(abs(np.array(t)).max() > 0 for _, t, _ in a._cameras.meta()["poses"].values())
+    assert any(abs(np.array(t)).max() > 0 for _, t, *_ in a._cameras.meta()["poses"].values())
 
 
 def test_what_is_not_finite_or_says_nothing_changes_nothing() -> None:

@@ -1,0 +1,1 @@
+"""What is learned of cameras while a field trains: appearances, and corrections of poses."""

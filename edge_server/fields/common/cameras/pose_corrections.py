@@ -1,0 +1,249 @@
+"""Small corrections of camera poses, found by how pictures differ from what a field renders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+from freshfield.geometry import so3_exp
+
+Array = NDArray[np.float64]
+
+# Of ``correct``: pixels compared; the share of a Gauss-Newton step that is taken; its length in one parameter,
+# pixels; the squared error that a correction at its bound costs (without detail, poses stay as given); the residual
+# from which on a pixel counts less (something moved, or is hidden).
+PIXELS = 384
+_STEP_SHARE = 0.8
+_LONGEST = 1.0
+_PRIOR = 1e-2
+_OUTLIER = 0.15
+# Of ``descend``: the longest step in a parameter, pixels; the squared error that a step of _USUAL (meters, radians)
+# costs, so that what an image hardly tells apart stays as it is; the share of a step that the next view in time makes
+# too, the one after it that share of it again, and so on for _REACH views: errors of tracking vary slowly, and a fit of
+# some seconds looks at each view but a few times.
+_FARTHEST = 1.0
+_DAMPING, _USUAL = 1e-3, np.array([0.03] * 3 + [0.02] * 3)
+_SPREAD, _REACH = 0.8, 8
+
+
+@dataclass
+class _Correction:
+    """given: (4, 4), the pose it belongs to: a camera with another pose starts anew.
+    rotation, shift_m: (3,), a rotation vector in radians and meters, world axes.
+    at_ns: when the view was taken. steps: how many ``descend`` has made for it."""
+
+    given: Array
+    rotation: Array = field(default_factory=lambda: np.zeros(3))
+    shift_m: Array = field(default_factory=lambda: np.zeros(3))
+    at_ns: int = 0
+    steps: int = 0
+
+
+class PoseCorrections:
+    """Bounded corrections of camera poses.
+
+    A correction rotates a camera about its own center by exp(rotation) and shifts it. ``correct`` finds it with any
+    representation that renders pixels, ``descend`` from a gradient.
+
+    most_m, most_deg: largest shift in meters and largest rotation in degrees.
+    """
+
+    def __init__(self, most_m: float, most_deg: float) -> None:
+        self.most_m, self.most_rad = most_m, np.deg2rad(most_deg)
+        self.known: dict[str, _Correction] = {}
+        self._sorted: list[str] = []  # names in the order of time; empty: not known
+        self._ranks: dict[str, int] = {}
+
+    def pose(self, view: View) -> Array:
+        """The corrected camera_to_world (4, 4) of a view."""
+        known = self._of(view)
+        return _corrected(known.given, known.rotation, known.shift_m)
+
+    def pose_between(self, view: View, neighbors: dict[str, float]) -> Array:
+        """The pose (4, 4) of a view from which nothing is learned, by the corrections of others.
+
+        neighbors: the others and their weights, see ``neighbors_in_time``; none: the pose as given.
+        """
+        given = np.asarray(view.camera_to_world, dtype=np.float64)
+        rotation, shift_m = np.zeros(3), np.zeros(3)
+        for name, share in neighbors.items():
+            other = self.known[name]
+            # In the camera's axes: what a wrong calibration adds turns with the camera.
+            rotation += share * (given[:3, :3] @ (other.given[:3, :3].T @ other.rotation))
+            shift_m += share * (given[:3, :3] @ (other.given[:3, :3].T @ other.shift_m))
+        return _corrected(given, rotation, shift_m)
+
+    def _of(self, view: View) -> _Correction:
+        given = np.asarray(view.camera_to_world, dtype=np.float64)
+        known = self.known.get(view.camera)
+        if known is None or not np.allclose(known.given, given, atol=1e-3):
+            known = self.known[view.camera] = _Correction(given, at_ns=view.generated_ns)
+            self._sorted = []
+        return known
+
+    def correct(
+        self,
+        view: View,
+        render: Callable[[Array, Array], NDArray[np.float32]],
+        pixel_m: float,
+        rng: np.random.Generator,
+        background: NDArray[np.float32],
+    ) -> None:
+        """One Gauss-Newton step for one camera, with finite differences of the rendered colors by small motions of
+        the camera. The mean correction of all cameras is kept at 0: the scene stays where it is.
+
+        view: the camera's view. render: (pose (4, 4), image points (N, 2)) -> colors (N, 3).
+        pixel_m: width of a pixel at the scene, the scale of all parameters.
+        rng: chooses the pixels. background: float32 (3,), behind transparent pixels.
+        """
+        known, camera = self._of(view), view.intrinsics
+        column = rng.integers(0, camera.width, PIXELS)
+        row = rng.integers(0, camera.height, PIXELS)
+        points = np.stack([column + 0.5, row + 0.5], axis=-1)
+        seen = view.image[row, column] / 255.0
+        if seen.shape[1] == 4:
+            seen = seen[:, :3] * seen[:, 3:] + background * (1.0 - seen[:, 3:])
+        scale = np.array([1.0 / camera.fx] * 3 + [pixel_m] * 3)
+        base = self.pose(view)
+        here = render(base, points).astype(np.float64)
+        slopes = np.empty((6, *here.shape))
+        for k in range(6):
+            moved, by = base.copy(), 0.5 * scale[k]
+            axis = np.eye(3)[k % 3] * by
+            if k < 3:
+                moved[:3, :3] = so3_exp(axis) @ base[:3, :3]
+            else:
+                moved[:3, 3] += axis
+            slopes[k] = (render(moved, points) - here) / 0.5  # per pixel's worth of motion
+        error = here - seen
+        robust = 1.0 / (1.0 + (np.square(error).sum(axis=1, keepdims=True) / _OUTLIER**2))
+        # Sums by einsum without BLAS: its order of summation depends on the number of threads.
+        total = np.concatenate([known.rotation, known.shift_m]) / scale
+        hessian = np.einsum("inc,jnc,nk->ij", slopes, slopes, robust, optimize=False) / PIXELS
+        gradient = np.einsum("inc,nc,nk->i", slopes, error, robust, optimize=False) / PIXELS
+        # The prior follows the bounds: without it, rotations and shifts, which look alike from afar, would be
+        # confused.
+        bounds = np.array([self.most_rad] * 3 + [self.most_m] * 3) / scale
+        prior = _PRIOR / np.square(np.maximum(bounds, 1e-3))
+        step = -_STEP_SHARE * np.linalg.solve(hessian + np.diag(prior), gradient + prior * total)
+        if not np.isfinite(step).all():
+            return
+        step = np.clip(step, -_LONGEST, _LONGEST) * scale
+        known.rotation, known.shift_m = known.rotation + step[:3], known.shift_m + step[3:]
+        everyone = list(self.known.values())
+        mean_rotation = np.mean([c.rotation for c in everyone], axis=0)
+        mean_shift = np.mean([c.shift_m for c in everyone], axis=0)
+        for c in everyone:
+            c.rotation = _at_most(c.rotation - mean_rotation, self.most_rad)
+            c.shift_m = _at_most(c.shift_m - mean_shift, self.most_m)
+
+    def descend(self, view: View, gradient: Array, normal: Array, pixel_m: float) -> list[str]:
+        """A Gauss-Newton step for one camera, with the slopes of its image in place of the rendering's (inverse
+        compositional, Baker and Matthews 2004): they are known beforehand, and do not vanish while the rendering is
+        blurred. Steps get short by themselves where poses are exact. Returns which views' corrections changed; none
+        where the gradient is not finite.
+
+        gradient: (6,), of a sum of squared errors by the camera's shift per meter and its rotation per radian, world
+            axes.
+        normal: (6, 6), see ``normal_matrix``.
+        pixel_m: shift that moves what the camera sees by a pixel.
+        """
+        if not np.isfinite(gradient).all():
+            return []
+        known = self._of(view)
+        axes = known.given[:3, :3]  # a correction is too small to matter here
+        local = np.concatenate([axes.T @ gradient[:3], axes.T @ gradient[3:]])
+        damped = normal + np.diag(_DAMPING * view.image[..., :3].size / np.square(_USUAL))
+        farthest = _FARTHEST * np.array([pixel_m] * 3 + [1.0 / view.intrinsics.fx] * 3)
+        step = np.clip(-0.5 * np.linalg.solve(damped, local), -farthest, farthest)
+        known.steps += 1
+        changed = self._around(view.camera)
+        for name, share in changed.items():
+            other = self.known[name]
+            axes = other.given[:3, :3]
+            other.shift_m = _at_most(other.shift_m + share * (axes @ step[:3]), self.most_m)
+            other.rotation = _at_most(other.rotation + share * (axes @ step[3:]), self.most_rad)
+        return list(changed)
+
+    def _around(self, camera: str) -> dict[str, float]:
+        """A view, those taken shortly before and after, and how much of its step they make too: the less, the more
+        steps they have made for themselves. Without times that tell views apart, the view alone."""
+        if not self._sorted:
+            self._sorted = sorted(self.known, key=lambda name: (self.known[name].at_ns, name))
+            self._ranks = {name: k for k, name in enumerate(self._sorted)}
+        if self.known[self._sorted[0]].at_ns == self.known[self._sorted[-1]].at_ns:
+            return {camera: 1.0}
+        rank = self._ranks[camera]
+        near = range(max(rank - _REACH, 0), min(rank + _REACH + 1, len(self._sorted)))
+        steps = {k: self.known[self._sorted[k]].steps for k in near}
+        return {self._sorted[k]: _SPREAD ** abs(k - rank) / (1 + steps[k]) if k != rank else 1.0 for k in near}
+
+    def take_back(self, share: float) -> None:
+        """Take back a share of the cameras' mean shift: they and the scene may wander together."""
+        mean = np.mean([c.shift_m for c in self.known.values()] or [np.zeros(3)], axis=0)
+        for c in self.known.values():
+            c.shift_m = c.shift_m - share * mean
+
+    def meta(self) -> dict[str, Any]:
+        """What a state keeps: exact, ready for JSON."""
+        return {
+            name: [c.given.tolist(), c.rotation.tolist(), c.shift_m.tolist(), c.at_ns, c.steps]
+            for name, c in self.known.items()
+        }
+
+    def load(self, meta: dict[str, Any]) -> None:
+        """Restore what ``meta`` returned."""
+        self.known, self._sorted = {}, []
+        for name, (given, rotation, shift_m, at_ns, steps) in meta.items():
+            given, rotation, shift_m = (np.array(each, dtype=np.float64) for each in (given, rotation, shift_m))
+            self.known[name] = _Correction(given, rotation, shift_m, int(at_ns), int(steps))
+
+    def neighbors_in_time(self, view: View) -> dict[str, float]:
+        """The known views taken last before and first after ``view``, and how much each counts, the nearer one more.
+        Empty where times do not tell views apart."""
+        times = sorted((c.at_ns, name) for name, c in self.known.items() if name != view.camera)
+        if not times or times[0][0] == times[-1][0]:
+            return {}
+        before = [each for each in times if each[0] <= view.generated_ns][-1:]
+        after = [each for each in times if each[0] > view.generated_ns][:1]
+        if not before or not after:
+            return {(before or after)[0][1]: 1.0}
+        (first_ns, first), (last_ns, last) = before[0], after[0]
+        share = (view.generated_ns - first_ns) / (last_ns - first_ns)
+        return {first: 1.0 - share, last: share}
+
+
+def _corrected(given: Array, rotation: Array, shift_m: Array) -> Array:
+    pose = given.copy()
+    pose[:3, :3] = so3_exp(rotation) @ given[:3, :3]
+    pose[:3, 3] += shift_m
+    return pose
+
+
+def _at_most(vector: Array, most: float) -> Array:
+    length = float(np.linalg.norm(vector))
+    return vector if length <= most else vector * (most / length)
+
+
+def normal_matrix(view: View, depth_m: NDArray[np.float32]) -> Array:
+    """J^T J (6, 6), J the slopes of a view's image, all channels, by the camera's shift in meters and its rotation in
+    radians, camera axes. Every fourth pixel in x and y stands for sixteen; the lens's distortion is left out.
+
+    depth_m: of its pixels, (H, W), above 0, along the optical axis.
+    """
+    lens, image = view.intrinsics, view.image[..., :3].astype(np.float32) * np.float32(1.0 / 255.0)
+    down, across = np.gradient(image, axis=(0, 1)) if min(image.shape[:2]) > 1 else (image * 0, image * 0)
+    down, across = down[2::4, 2::4] * np.float32(lens.fy), across[2::4, 2::4] * np.float32(lens.fx)
+    y, x = np.mgrid[2 : lens.height : 4, 2 : lens.width : 4].astype(np.float32)
+    x, y = (x + np.float32(0.5 - lens.cx)) / np.float32(lens.fx), (y + np.float32(0.5 - lens.cy)) / np.float32(lens.fy)
+    zero, near = np.zeros_like(x), 1.0 / depth_m[2::4, 2::4]
+    flow_x = (-near, zero, x * near, x * y, -(1.0 + x * x), y)
+    flow_y = (zero, -near, y * near, 1.0 + y * y, -x * y, -x)
+    slopes = np.stack([(u[..., None] * across + v[..., None] * down).reshape(-1) for u, v in zip(flow_x, flow_y)])
+    # Without BLAS: its order of summation depends on the number of threads.
+    return 16.0 * np.einsum("in,jn->ij", slopes, slopes, optimize=False).astype(np.float64)

@@ -1,0 +1,223 @@
+"""The Gaussian field of a scan: many views, usually of one camera that is carried about, of a scene that stands still.
+
+First Gaussians lie on measured depth, where views bring some. Further ones come where the residual is large, at the
+depth that is rendered there. Each learns at a rate that falls with its own age. With ``refine``, each view has an
+exposure and a correction of its pose: both follow from sums that a step makes anyway.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import Correction, View
+from edge_server.fields.common.camera_rows import camera_rows
+from edge_server.fields.common.cameras.pose_corrections import PoseCorrections, normal_matrix
+from edge_server.fields.common.plane_sweep import foreground_mask
+from edge_server.fields.common.view_store import Arrays, same_views
+from edge_server.fields.splat.densification import GaussianCloud, opacity
+from edge_server.fields.splat.field import StillField
+from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_corrections, clamp_gaussians
+from edge_server.fields.splat.kernels.project import BASE, COLOR, QUATERNION, SCALE, SH_COLUMNS
+from edge_server.fields.splat.kernels.rasterize import LOSSES, MOMENTS, render_tiles
+from edge_server.fields.splat.scan import settings as tuned
+from edge_server.fields.splat.scan.discs import discs, filled, quadtree, without_jumps
+from edge_server.fields.splat.scan.exposures import Exposures
+from edge_server.fields.splat.settings import PRUNE_OPACITY
+
+
+class Shown(NamedTuple):
+    """What a view's camera sees of the field. color: float32 (H, W, 3), at the field's exposure. depth: float32
+    (H, W), along the optical axis, meters, 0 where empty. opacity: float32 (H, W)."""
+
+    color: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    opacity: NDArray[np.float32]
+
+
+class ScanField(StillField):
+    """See ``StillField``."""
+
+    # --- cameras ------------------------------------------------------------------------------
+
+    def correction(self, view: View) -> Correction | None:
+        """See ``fields.RefinesCameras``."""
+        with self._lock:
+            if self._rigid is None:
+                return None
+            if view.camera in self._poses.known:
+                return Correction(self._poses.pose(view), *self._exposures.of(view.camera))
+            neighbors = self._poses.neighbors_in_time(view)
+            return Correction(self._poses.pose_between(view, neighbors), *self._exposures.between(neighbors))
+
+    def _pose_of(self, view: View) -> NDArray[np.float64]:
+        return super()._pose_of(view) if self._rigid is None else self._poses.pose(view)
+
+    def _learn_camera(self, view: int, losses: NDArray[np.float64]) -> None:
+        if self._rigid is None:
+            return
+        now, box = self._views[view], self.view_store.box
+        assert box is not None
+        if self.step >= tuned.EXPOSED_FROM:
+            self._exposures.learn(now.camera, losses[:, LOSSES:].sum(axis=0).reshape(3, MOMENTS))
+            self._targets.exposure[view] = self._exposures.row(now.camera)
+        gradient = -self._rigid / np.array([box.radius_m] * 3 + [1.0] * 3)
+        changed = self._poses.descend(now, gradient, *self._aims[view])
+        if self.step % tuned.GAUGE_EVERY == 0:
+            self._exposures.center()
+            self._poses.take_back(tuned.GAUGE_SHARE)
+            self._targets.exposure[:] = [self._exposures.row(v.camera) for v in self._views]
+            changed = list(self._index)
+        places = [self._index[name] for name in changed if name in self._index]
+        moved = [self._views[k] for k in places]
+        self._cams[places] = camera_rows([self._pose_of(v) for v in moved], [v.intrinsics for v in moved], box)
+
+    # --- what StillField asks for -------------------------------------------------------------
+
+    def _forget_parameters(self) -> None:
+        super()._forget_parameters()
+        box = self.view_store.box
+        distance_m = 1.0 if box is None else box.distance_m
+        if box is not None and box.contracted and self.settings.near_m is None:
+            self.view_store.box = replace(box, near_m=tuned.NEAR_SHARE * distance_m)
+        self._poses = PoseCorrections(tuned.MOST_SHARE * distance_m, tuned.MOST_DEG)
+        self._exposures = Exposures()
+        self._rigid = np.zeros(6) if self.settings.refine else None
+        self._rule: AdamParameters | None = None
+
+    def _ingest(self, views: Sequence[View]) -> None:
+        news = not same_views(views, self._views)
+        super()._ingest(views)
+        if not news:
+            return
+        self._rule = None
+        self._targets = self._targets._replace(dissimilarity=np.float32(tuned.DISSIMILARITY))
+        if self._rigid is None:
+            return
+        assert self.view_store.box is not None
+        usual_m = self.view_store.box.distance_m
+        self._aims = [_aim(v, usual_m) for v in views]
+        self._index = {v.camera: k for k, v in enumerate(views)}
+        rows = [self._exposures.row(v.camera) for v in views]
+        self._targets = self._targets._replace(exposure=np.stack(rows))
+
+    def adam_parameters(self, progress: float) -> AdamParameters:
+        if self._rule is None:
+            rule = super().adam_parameters(0.0)
+            box = self.view_store.box
+            assert box is not None
+            rates = rule.rates.copy()
+            rates[:SCALE] = tuned.POSITION_PX * box.pixel_m / box.radius_m
+            rates[COLOR:BASE] = tuned.COLOR
+            self._rule = rule._replace(rates=rates, corrections=age_corrections(tuned.SETTLE_STEPS))
+        return self._rule
+
+    def _counters(self) -> dict[str, Any]:
+        return {**super()._counters(), "poses": self._poses.meta(), "exposures": self._exposures.meta()}
+
+    def _load(self, meta: dict[str, Any], state: Arrays) -> None:
+        super()._load(meta, state)
+        self._poses.load(meta["poses"])
+        self._exposures.load(meta["exposures"])
+
+    # --- Gaussians ----------------------------------------------------------------------------
+
+    def _seed(self) -> None:
+        """Seed on measured depth, in the order of the views; without any, where the cameras agree on colors."""
+        measured = [view for view in self._views if view.depth is not None and (view.depth > 0).any()]
+        if not measured:
+            return super()._seed()
+        self.cloud = GaussianCloud.empty(self.settings)
+        some = np.unique(np.linspace(0, len(measured) - 1, tuned.SEED_VIEWS).astype(int))
+        for view in (measured[k] for k in some):
+            self._add(self._seeds_of(view))
+
+    def _seeds_of(self, view: View) -> NDArray[np.float32]:
+        """Gaussians where the field lacks the surface that a view measures, or shows none at all."""
+        assert view.depth is not None
+        shown, depth = self._look(view), without_jumps(view.depth)
+        behind = shown.depth > depth * np.float32(1.0 + tuned.BEHIND_SHARE) + np.float32(tuned.BEHIND_M)
+        wanted = (shown.opacity < tuned.COVERED) | (behind & (depth > 0))
+        color, there = self._as_rendered(view)
+        leaves = quadtree(color, wanted & there, tuned.CELLS, tuned.DETAIL)
+        at = tuple(np.minimum(k + leaves.side // 2, n - 1) for k, n in zip((leaves.row, leaves.column), depth.shape))
+        alpha = np.where(depth[at] > 0, np.float32(tuned.OPACITY), np.float32(tuned.GUESSED_OPACITY))
+        return discs(color, filled(depth), leaves, view.intrinsics, self._pose_of(view), tuned.WIDTH, alpha)
+
+    def _grow_if_due(self) -> None:
+        if self.step % tuned.PRUNE_EVERY == 0:
+            self.cloud.keep(opacity(self.cloud.params) >= PRUNE_OPACITY)
+            if not len(self.cloud):
+                self._seed()
+        if self.step % tuned.GROW_EVERY == 0 and len(self.cloud) < self.settings.gaussians:
+            self._grow()
+
+    def _grow(self) -> None:
+        """Insert Gaussians where the view that comes next shows what the field does not."""
+        view = self._views[self._next_view()]
+        shown = self._look(view)
+        color, there = self._as_rendered(view)
+        error = cv2.blur(np.abs(shown.color - color).mean(axis=2), (3, 3))
+        depth = shown.depth
+        if view.depth is not None:
+            agrees = np.abs(view.depth - depth) < tuned.AGREES * depth
+            depth = np.where(agrees, np.minimum(view.depth, depth), depth)
+        wanted = (error > tuned.GROWN_ERROR) & (shown.opacity >= 0.5) & (depth > 0) & there
+        leaves = quadtree(color, wanted, tuned.GROWN_CELLS, tuned.GROWN_DETAIL)
+        if len(leaves.row) > tuned.GROWN_MOST:
+            drawn = np.sort(self._rng(6).choice(len(leaves.row), tuned.GROWN_MOST, replace=False))
+            leaves = type(leaves)(*(part[drawn] for part in leaves))
+        nearer = np.float32(1.0 - tuned.NEARER)
+        alpha = np.full(len(leaves.row), tuned.GROWN_OPACITY, np.float32)
+        pose = self._pose_of(view)
+        self._add(discs(color, filled(depth) * nearer, leaves, view.intrinsics, pose, tuned.GROWN_WIDTH, alpha))
+
+    def _add(self, params: NDArray[np.float32]) -> None:
+        """Add Gaussians given in meters, as many as there is room for."""
+        params = params[: max(self.settings.gaussians - len(self.cloud), 0)]
+        box = self.view_store.box
+        assert box is not None
+        if not len(params):
+            return
+        params = params.copy()
+        params[:, :3] = box.normalise(params[:, :3].astype(np.float64))
+        params[:, SCALE:QUATERNION] -= np.float32(np.log(box.radius_m))
+        further = np.zeros((len(params), SH_COLUMNS * self.settings.sh_degree), np.float32)
+        params = np.concatenate([params, further], axis=1)
+        clamp_gaussians(params)
+        self.cloud.add(GaussianCloud.new(params))
+
+    def _look(self, view: View) -> Shown:
+        """Render the field from a view's corrected pose."""
+        box, lens = self.view_store.box, view.intrinsics
+        assert box is not None
+        h, w = lens.height, lens.width
+        color, depth, alpha = (np.zeros((h, w, *more), np.float32) for more in ((3,), (), ()))
+        if len(self.cloud):
+            raster = self._render_raster
+            raster.project_and_bin(camera_rows([self._pose_of(view)], [lens], box), self.cloud.gaussians(), False)
+            self.pool.run(render_tiles, raster.first, self.view_store.background(), color, depth, alpha)
+        return Shown(color, depth * np.float32(box.radius_m), alpha)
+
+    def _as_rendered(self, view: View) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """A view's image (H, W, 3) at the field's exposure, and which of its pixels supervise and show something."""
+        gain, bias = self._exposures.of(view.camera)
+        color = (view.image[..., :3] * (1.0 / 255.0) - bias) / gain
+        there = foreground_mask(view.image, None)
+        return color.astype(np.float32), there if view.weight is None else there & (view.weight > 0)
+
+
+def _aim(view: View, usual_m: float) -> tuple[NDArray[np.float64], float]:
+    """What ``PoseCorrections.descend`` needs of a view: the normal matrix, and the shift of a pixel in meters."""
+    depth = np.full(view.image.shape[:2], usual_m, np.float32)
+    if view.depth is not None and (view.depth > 0).any():
+        depth = filled(view.depth)
+    return normal_matrix(view, depth), float(np.median(depth)) / view.intrinsics.fx
+
+
+make = ScanField

@@ -1,0 +1,51 @@
+"""Numbers of a scan's field, tuned once on recorded footage. None is an option; ``scan_options`` says which options a
+data set asks for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+# --- rates: no schedule, so that a fit may go on for as long as it likes ---
+SETTLE_STEPS = 80  # of a Gaussian at full rates, then they fall as 1 / steps
+POSITION_PX, COLOR = 0.2, 0.012  # lower than where things move: seeds lie on surfaces already
+DISSIMILARITY = 0.02  # weight of (1 - SSIM) / 2 in the loss; three times as much raises SSIM and costs PSNR
+
+# --- how many Gaussians ---
+PER_PIXEL = 0.78  # of one image, at most; more cost time in every step, and sharpen little
+LEAST, MOST = 8192, 1 << 18  # whatever the images; the most take 60 MB, and steps of a tenth of a second
+NEAR_SHARE = 0.1  # of the cameras' distance to the scene: a near plane for cameras that are carried close to things
+
+# --- seeds from measured depth ---
+SEED_VIEWS = 60  # from at most so many views: the others see hardly anything new
+CELLS = (16, 8, 4)  # pixels a side of a quadtree's leaves
+DETAIL = 0.06  # standard deviation of a leaf's color, over channels, above which it is divided
+MIXED = (0.01, 0.75)  # shares of a leaf's pixels between which it is divided; below the first it is left out
+COVERED = 0.6  # opacity above which a pixel shows a surface
+BEHIND_SHARE, BEHIND_M = 0.07, 0.02  # what is shown lies behind what is measured by more: the nearer is missing
+JUMP_SHARE, JUMP_M = 0.05, 0.02  # depth that spans more within 3 x 3 pixels is of two surfaces, or of none
+WIDTH, FLATNESS, OPACITY = 0.6, 0.2, 0.8  # a seed's standard deviation in sides of its leaf, and thickness in that
+STEEPEST = 0.3  # least cosine to the view: nothing is stretched along a surface further than this says
+GUESSED_OPACITY = 0.5  # of seeds at a depth that is guessed
+
+# --- growth where the residual is large ---
+GROW_EVERY = 10  # steps
+GROWN_ERROR = 0.08  # color error, blurred over 3 x 3 pixels, above which detail is missing
+GROWN_CELLS, GROWN_DETAIL = (8, 4, 2), 0.05
+GROWN_WIDTH, GROWN_OPACITY = 0.5, 0.5
+GROWN_MOST = 400  # a time
+AGREES = 0.1  # share by which measured and rendered depth differ where they are of the same surface
+NEARER = 0.003  # share by which new Gaussians lie before what is rendered
+PRUNE_EVERY = 100  # steps
+
+# --- exposures and poses ---
+EXPOSED_FROM = 31  # step, from which exposures are estimated: before, the field shows no colors
+TOWARDS_ONE = 0.02  # damping of the least squares towards gain 1 and bias 0, squared colors
+EXPOSURE_SHARE = 0.3  # of the way to a new estimate
+GAINS, MOST_BIAS = (0.4, 2.5), 0.3
+GAUGE_EVERY, GAUGE_SHARE = 40, 0.04  # steps between corrections of the gauge; share of the mean shift taken back
+MOST_DEG, MOST_SHARE = 5.0, 0.1  # largest correction of a pose; share of the cameras' distance to the scene
+
+
+def scan_options(pixels: int, tracked: bool) -> dict[str, Any]:
+    """Options of a field for a scan. pixels: of one image. tracked: its poses come from a tracker."""
+    return {"scan": True, "refine": tracked, "gaussians": min(max(int(PER_PIXEL * pixels), LEAST), MOST)}
