@@ -84,6 +84,7 @@ FEW = 32  # Gaussians: all foreground needs new ones below this
 # Accelerations and speeds are at most the cameras' distance to the scene, a second squared and a second: what is seen
 # from near is small and slow.
 FEW_CAMERAS = 4
+STEREO_CAMERAS = 6  # up to so many, stereo of the plates helps the still field where no depth is measured
 FEW_ANCHORS, FEW_ACCELERATION_M_PER_S2, FEW_NEIGHBOR_M_PER_S, FEW_SEED_EVERY_S = 32, 3.0, 3.0, 0.07
 
 # --- following motion (tracker) ---
@@ -112,18 +113,3 @@ MOST_ITERATIONS = 60  # of conjugate gradients
 # The solution is found when the estimated distance to it, over all unknowns together, is this many of its
 # standard deviations.
 TOLERANCE = 0.02
-
-# --- stereo of plates (plate_stereo), found on ``room`` with two to six cameras and on recordings ---
-SWEEP_STEPS = 128  # inverse depths, from 0: more find finer depth, but also more that is wrong
-SWEEP_NEAR = 0.3  # nearest depth, share of the cameras' distance to the scene
-SWEEP_PIXELS = 1 << 17  # of a plate that is matched as it is: a pixel takes 5 bytes a step
-SWEEP_LEAST_PX = 8.0  # least parallax over all steps: two cameras at one place tell nothing
-SWEEP_FAR_PX = 1.0  # parallax at the farthest depth that another camera can confirm
-SWEEP_BLUR_PX = 0.7  # interpolation blurs the other image about as much
-SWEEP_BOUND = 0.15  # difference of a channel beyond which it does not matter how different
-SWEEP_UNSEEN = 0.5  # cost, in those of SWEEP_BOUND, where no other camera sees
-SWEEP_SECOND_OF, SWEEP_SECOND = 3, 0.3  # other cameras from which on the second best counts, and its share
-SWEEP_SMALL, SWEEP_LARGE = 0.03, 8.0  # penalties of one step of depth between neighbors, and of more
-SWEEP_EDGE = 10.0  # the latter falls to half at a change of gray of the inverse of this
-SWEEP_DISTINCT = 0.02  # cost, in the same unit, by which depths must be better than others: walls of one color are not
-SWEEP_AGREE = 0.05  # difference of log depth at which another camera confirms

@@ -50,6 +50,7 @@ class StaticSupervision:
         self.fine = False
         self.exposure_rounds = 0
         self.anew = self.with_depth = self.early = False
+        self.warned = False  # that one camera alone tells no depth
         self.depth: DepthSupervision | None = None
         self.earlier: SplatSnapshot | None = None
 
@@ -95,6 +96,11 @@ class StaticSupervision:
         known = [c.depth.is_known(c.plate.known) for c in observed if c.depth is not None and c.depth.count.any()]
         return 2 * len(known) >= max(len(observed), 1) and all(known)
 
+    def _stereo_helps(self, cameras: Cameras) -> bool:
+        """Whether no camera has measured depth, and few of them see the scene."""
+        few = tuned.LEAST_CAMERAS <= len(cameras) <= tuned.STEREO_CAMERAS
+        return few and not any(c.depth is not None and c.depth.count.any() for c in cameras.values())
+
     # --- when layers begin --------------------------------------------------------------------
 
     def plates_are_known(self, cameras: Cameras, observations: Observations) -> bool:
@@ -107,7 +113,13 @@ class StaticSupervision:
             from edge_server.fields.splat.layers.depth.settings import PLATE_S
 
             return observations.newest_s >= PLATE_S
-        return len(cameras) >= tuned.LEAST_CAMERAS and observations.newest_s >= tuned.PLATE_S
+        if observations.newest_s < tuned.PLATE_S:
+            return False
+        alone = len(cameras) < tuned.LEAST_CAMERAS
+        if alone and not self.warned:
+            self.warned = True
+            log.warning("one camera without a depth sensor tells no depth: only its own view will be right")
+        return not alone
 
     def exposures_agree(self, cameras: Cameras, observations: Observations) -> bool:
         """Begin with the plates, and correct the cameras' exposures where they differ; the field that shows that they
@@ -166,12 +178,12 @@ class StaticSupervision:
         beside: in a thread, until it has learned them; or else only note that there is something to learn.
         """
         begun, now_s = self.times.now(), observations.newest_s
+        stereo = self._stereo_helps(cameras)
+        if stereo:
+            self.make_depth()
         if self.depth is not None and not self.anew:
             certain = self.early and now_s >= tuned.PLATE_S
-            new = not self.with_depth and self._depth_is_known(
-                [cameras[name] for name in {o.camera for o in observations}]
-            )
-            if certain or new:
+            if certain or (not self.with_depth and (stereo or self._depth_is_known(_observed(cameras, observations)))):
                 self._begin_with_depth(cameras, observations)
         self._correct(cameras, observations)
         if not self.fine and self._fine_plates_are_known(cameras, observations):

@@ -10,16 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.scene_box import SceneBox, scene_box
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.layers.depth import settings as tuned
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
 from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
 from edge_server.fields.splat.layers.depth.kernels.surfaces import Meshes
 from edge_server.fields.splat.layers.depth.overlaps import contradicting, exposures
+from edge_server.fields.splat.layers.depth.plate_stereo import fill_by_stereo
 from edge_server.fields.splat.layers.depth.registration import Correction, register
 from edge_server.fields.splat.layers.depth.surfaces import Surface, SurfaceScene
 from edge_server.fields.splat.layers.depth.virtual_plates import virtual_plates
+from edge_server.fields.splat.layers.settings import LEAST_CAMERAS, STEREO_CAMERAS
 from edge_server.fields.splat.layers.static_layer import PlateImage
 from edge_server.fields.splat.settings import SplatSettings
 
@@ -115,20 +117,32 @@ class DepthSupervision:
             log.warning("depth that contradicts the other cameras' is not used: %s", ", ".join(wrong) or "now none")
             self.wrong = wrong
         used = [camera for camera in cameras if camera.name not in wrong and inverse[camera.name].any()]
-        surfaces = [camera.surface(*smooth(inverse[camera.name], camera.plate.color, self.pool)) for camera in used]
+        measured = {c.name: c.surface(*smooth(inverse[c.name], c.plate.color, self.pool)) for c in used}
         if anew:
-            self._register([camera.name for camera in used], surfaces)
-        fix = self.corrections
-        surfaces = [fix[c.name].applied(s) if c.name in fix else s for c, s in zip(used, surfaces)]
-        poses = [fix[c.name].pose if c.name in fix else c.reported for c in cameras]
+            self._register(list(measured), list(measured.values()))
+        surfaces = [self._corrected(c, measured.get(c.name)) for c in cameras]
+        poses = [surface.pose for surface in surfaces]
+        whole = _are_whole(cameras, surfaces)
+        if not whole and LEAST_CAMERAS <= len(cameras) <= STEREO_CAMERAS:
+            whole = True  # what stereo does not find no other camera sees either
+            distance_m = scene_box([camera.plate.view for camera in cameras]).distance_m
+            surfaces = fill_by_stereo(surfaces, distance_m, self.pool)
+        surfaces = [surface for surface in surfaces if surface.inverse.any()]
         plates = [
             camera.learned._replace(view=replace(camera.learned.view, camera_to_world=pose))
             for camera, pose in zip(cameras, poses)
         ]
         self.scene = SurfaceScene.of(surfaces) if surfaces else None
         if self.scene is not None:
-            plates += virtual_plates(self.scene, surfaces, poses, _are_whole(cameras, surfaces), self.pool)
+            plates += virtual_plates(self.scene, surfaces, poses, whole, self.pool)
         return plates, surfaces
+
+    def _corrected(self, camera: CameraPlates, measured: Surface | None) -> Surface:
+        """What a camera sees, where it stands. measured: None: without depth."""
+        if measured is None:
+            measured = camera.surface(np.zeros(camera.plate.known.shape, np.float32))
+        found = self.corrections.get(camera.name)
+        return measured if found is None else found.applied(measured)
 
     def _register(self, names: Sequence[str], surfaces: Sequence[Surface]) -> None:
         before = self.displaced

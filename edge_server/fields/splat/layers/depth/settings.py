@@ -76,3 +76,19 @@ NEAR_GRAY, GRAY_NOISE = 0.08, 0.03  # as NEAR_M, and deviation, of brightness in
 GRAY_WEIGHT = 0.15  # of a difference of brightness
 ERR_ALIKE = 25.0  # neighboring pixels err alike: so many count as one
 LARGE_TURN_DEG, LARGE_SHIFT_M, LARGE_LOG_SCALE = 1.0, 0.03, 0.025  # corrections above any of these are reported
+
+# --- stereo of plates (plate_stereo), where cameras measure none; found on `room` and on a recorded kitchen ---
+SWEEP_NOISE = 0.5  # steps: as NOISE, of what stereo finds
+SWEEP_STEPS = 128  # inverse depths, from 0: more find finer depth, but also more that is wrong
+SWEEP_NEAR = 0.3  # nearest depth, share of the cameras' distance to the scene
+SWEEP_PIXELS = 1 << 17  # of a plate that is matched as it is: a pixel takes 5 bytes a step
+SWEEP_LEAST_PX = 8.0  # least parallax over all steps: two cameras at one place tell nothing
+SWEEP_FAR_PX = 1.0  # parallax at the farthest depth that another camera can confirm
+SWEEP_BLUR_PX = 0.7  # interpolation blurs the other image about as much
+SWEEP_BOUND = 0.15  # difference of a channel beyond which it does not matter how different
+SWEEP_UNSEEN = 0.5  # cost, in those of SWEEP_BOUND, where no other camera sees
+SWEEP_SECOND_OF, SWEEP_SECOND = 3, 0.3  # other cameras from which on the second best counts, and its share
+SWEEP_SMALL, SWEEP_LARGE = 0.03, 8.0  # penalties of one step of depth between neighbors, and of more
+SWEEP_EDGE = 10.0  # the latter falls to half at a change of gray of the inverse of this
+SWEEP_DISTINCT = 0.02  # cost, in the same unit, by which depths must be better than others: walls of one color are not
+SWEEP_AGREE = 0.05  # difference of log depth at which another camera confirms

@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
+from edge_server.fields.splat.layers import settings as layer_settings
 from edge_server.fields.splat.layers.depth import settings as depth_settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.settings import SplatSettings
@@ -29,6 +30,7 @@ Spoil = Callable[[int, int, NDArray[np.float32]], NDArray[np.float32] | None]
 @pytest.fixture(autouse=True)
 def _shown_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(depth_settings, "SHOWN_AFTER", (20, 40))
+    monkeypatch.setattr(layer_settings, "STEREO_CAMERAS", 0)  # what is measured alone counts here
 
 
 def _ball_m(instant_s: float) -> NDArray[np.float64]:

@@ -14,11 +14,11 @@ from camera_node.synthetic import make_scene
 from edge_server.fields import View
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.threads.thread_pool import shared_pool
-from edge_server.fields.splat.layers.plate_stereo import sweep_plates
-from edge_server.fields.splat.layers.static_layer import PlateImage
+from edge_server.fields.splat.layers.depth.plate_stereo import fill_by_stereo, sweep_plates
+from edge_server.fields.splat.layers.depth.surfaces import Surface
 from freshfield.geometry import Pinhole
 
-Plates = list[PlateImage]
+Plates = list[Surface]
 
 
 @cache
@@ -28,28 +28,36 @@ def _room(count: int, size: int = 128) -> tuple[Plates, NDArray[np.float64]]:
     plates, depths = [], []
     for name, (lens, pose) in list(scene.cameras.items())[1:]:
         renderer = scene.renderer(name)
-        plates.append(_plate(View(name, renderer.image(0.0), pose, lens)))
+        plates.append(_plate(renderer.image(0.0), pose, lens))
         # Of the four rays around a pixel's center.
         fine = renderer.distance() * lens.scaled(2).rays()[..., 2]
         depths.append(fine.reshape(size, 2, size, 2).mean(axis=(1, 3)))
     return plates, np.stack(depths)
 
 
-def _plate(view: View) -> PlateImage:
-    return PlateImage(view, view.image.astype(np.float32), np.ones(view.image.shape[:2], bool))
+def _plate(image: NDArray[np.uint8], pose: NDArray[np.float64], lens: Pinhole) -> Surface:
+    shape = image.shape[:2]
+    nothing = np.zeros((*shape, 2), np.float32)
+    return Surface(lens, pose, image.astype(np.float32), np.ones(shape, bool), nothing[..., 0], nothing)
 
 
-def _sweep(plates: Sequence[PlateImage]) -> NDArray[np.float32]:
+def _distance_m(plates: Sequence[Surface]) -> float:
+    views = [View(str(k), np.zeros((8, 8, 3), np.uint8), p.pose, p.lens) for k, p in enumerate(plates)]
+    return scene_box(views).distance_m
+
+
+def _sweep(plates: Sequence[Surface]) -> NDArray[np.float32]:
     """Depths (N, H, W) of the plates that are as large as the first."""
-    found = sweep_plates(plates, scene_box([p.view for p in plates]), shared_pool())
-    assert all(depth.dtype == np.float32 and depth.shape == p.known.shape for depth, p in zip(found, plates))
-    assert all(np.isfinite(depth).all() and (depth >= 0).all() for depth in found)
-    return np.stack([depth for depth in found if depth.shape == found[0].shape])
+    found = sweep_plates(plates, _distance_m(plates), shared_pool())
+    assert all(inverse.dtype == np.float32 and inverse.shape == p.known.shape for inverse, p in zip(found, plates))
+    assert all(np.isfinite(inverse).all() and (inverse >= 0).all() for inverse in found)
+    inverses = np.stack([inverse for inverse in found if inverse.shape == found[0].shape])
+    return np.where(inverses > 0, 1.0 / np.maximum(inverses, 1e-12), 0.0).astype(np.float32)
 
 
 def _changed(plates: Plates, change: dict[int, NDArray]) -> Plates:
     """Plates with other colors, by number."""
-    return [p._replace(color=np.asarray(change.get(k, p.color), np.float32)) for k, p in enumerate(plates)]
+    return [replace(p, color=np.asarray(change.get(k, p.color), np.float32)) for k, p in enumerate(plates)]
 
 
 @pytest.mark.parametrize(("count", "share", "median", "right"), [(3, 0.5, 0.015, 0.75), (4, 0.75, 0.01, 0.88)])
@@ -66,31 +74,44 @@ def test_what_is_unknown_has_no_depth_and_says_nothing() -> None:
     plates, _ = _room(3, 64)
     known = np.ones((64, 64), bool)
     known[20:50, 20:50] = False
-    hidden = [plates[0]._replace(known=known), *plates[1:]]
+    hidden = [replace(plates[0], known=known), *plates[1:]]
     found = _sweep(hidden)
     assert (found[0][~known] == 0).all() and (found[0][known] > 0).mean() > 0.3
     # Whatever stands there: nothing is compared with it.
     color = plates[0].color.copy()
     color[22:48, 22:48] = np.nan
-    np.testing.assert_array_equal(found, _sweep([hidden[0]._replace(color=color), *plates[1:]]))
+    np.testing.assert_array_equal(found, _sweep([replace(hidden[0], color=color), *plates[1:]]))
 
 
 def test_large_plates_are_matched_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
     plates, truth = _room(4)
-    monkeypatch.setattr("edge_server.fields.splat.layers.settings.SWEEP_PIXELS", 64 * 64)
+    monkeypatch.setattr("edge_server.fields.splat.layers.depth.settings.SWEEP_PIXELS", 64 * 64)
     found = _sweep(plates)
     there = found > 0
     assert there.mean() > 0.6 and np.median(np.abs(found - truth)[there] / truth[there]) < 0.03
+
+
+def test_measured_depth_stays_and_holes_are_filled() -> None:
+    plates, truth = _room(4, 64)
+    measured = (1.0 / truth).astype(np.float32)
+    measured[:, 10:40, 10:50] = 0.0
+    holes = [replace(p, inverse=inverse) for p, inverse in zip(plates, measured)]
+    found = fill_by_stereo(holes, _distance_m(plates), shared_pool())
+    filled = np.stack([s.inverse for s in found])
+    np.testing.assert_array_equal(filled[measured > 0], measured[measured > 0])
+    there = (measured == 0) & (filled > 0)
+    assert there.sum() > 0.6 * (measured == 0).sum()
+    assert np.median(np.abs(filled * truth - 1.0)[there]) < 0.03
 
 
 @pytest.mark.stability
 @pytest.mark.parametrize("unit", [1.0 / 3.0, 2.0, 1e-3, 1e4])
 def test_other_units_change_nothing(unit: float) -> None:
     plates, _ = _room(3, 64)
-    poses = [p.view.camera_to_world * np.array([1.0, 1.0, 1.0, unit]) for p in plates]
+    poses = [p.pose * np.array([1.0, 1.0, 1.0, unit]) for p in plates]
     for pose in poses:
         pose[3, 3] = 1.0
-    scaled = [p._replace(view=replace(p.view, camera_to_world=pose)) for p, pose in zip(plates, poses)]
+    scaled = [replace(p, pose=pose) for p, pose in zip(plates, poses)]
     before, after = _sweep(plates), _sweep(scaled) / unit
     both = (before > 0) & (after > 0)
     assert both.sum() > 0.99 * max((before > 0).sum(), (after > 0).sum())
@@ -102,15 +123,15 @@ def test_cameras_that_tell_no_depth() -> None:
     """One alone, two at one place, and two that see nothing in common."""
     plates, _ = _room(4, 64)
     assert (_sweep(plates[:1]) == 0).all()
-    pose = plates[0].view.camera_to_world.copy()
+    pose = plates[0].pose.copy()
     pose[:3, 3] += 2e-3
     noise = np.random.default_rng(1).normal(0.0, 2.0, plates[0].color.shape)
-    same = plates[0]._replace(view=replace(plates[0].view, camera="same", camera_to_world=pose))
-    assert (_sweep([plates[0], same._replace(color=same.color + noise)]) == 0).all()
-    away = plates[0].view.camera_to_world.copy()
-    away[:3, 3] += 8.0 * (plates[0].view.camera_to_world[:3, 3] - away[:3, 2])
+    same = replace(plates[0], pose=pose)
+    assert (_sweep([plates[0], replace(same, color=same.color + noise)]) == 0).all()
+    away = plates[0].pose.copy()
+    away[:3, 3] += 8.0 * (plates[0].pose[:3, 3] - away[:3, 2])
     away[:3, [0, 2]] *= -1.0
-    turned = plates[1]._replace(view=replace(plates[1].view, camera_to_world=away))
+    turned = replace(plates[1], pose=away)
     assert (_sweep([plates[0], turned]) == 0).all()
     # The second of two at one place takes nothing from what the others tell.
     assert (_sweep([*plates, same])[:4] > 0).mean() > 0.98 * (_sweep(plates) > 0).mean()
@@ -133,6 +154,6 @@ def test_what_no_plate_can_show_costs_its_own_pixels_only() -> None:
     for bad in (np.nan, np.inf, -np.inf, 1e30):
         broken = _sweep(_changed(plates, {0: np.full((64, 64, 3), bad)}))
         assert ((broken[1:] > 0).mean() > 0.5 * (whole[1:] > 0).mean()) and ((broken[0] > 0).mean() < 0.01)
-    lens, pose = Pinhole.from_fov(1, 1, 60.0), plates[0].view.camera_to_world
-    speck = _plate(View("speck", np.full((1, 1, 3), 9, np.uint8), pose, lens))
+    lens, pose = Pinhole.from_fov(1, 1, 60.0), plates[0].pose
+    speck = _plate(np.full((1, 1, 3), 9, np.uint8), pose, lens)
     assert (_sweep([*plates, speck])[0] > 0).any()

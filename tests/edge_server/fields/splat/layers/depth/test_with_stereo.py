@@ -1,0 +1,88 @@
+"""The field in layers where few cameras measure no depth: stereo of their plates takes its place."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from edge_server.fields import Budget, View
+from edge_server.fields.splat.layers import settings as layer_settings
+from edge_server.fields.splat.layers.depth import settings as depth_settings
+from edge_server.fields.splat.layers.layered_field import LayeredField
+from edge_server.fields.splat.settings import SplatSettings
+from tests.edge_server.fields.scenes import psnr, ring, seen
+from tests.edge_server.fields.small import same_state
+
+SMALL = SplatSettings(gaussians=1200, start=700, seed_cells=32, densify_every=20, threads=2)
+RIG = ring(9, 64)
+CAMERAS, HELD = [RIG[0], RIG[1], RIG[3]], RIG[2]
+FRAME_S, FRAMES = 1.0 / 15.0, 36
+
+
+@pytest.fixture(autouse=True)
+def _shown_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(depth_settings, "SHOWN_AFTER", (20, 40))
+
+
+def _ball_m(instant_s: float) -> NDArray[np.float64]:
+    return np.array([0.25 * np.cos(3 * instant_s), 0.25 * np.sin(3 * instant_s), 0.5])
+
+
+@cache
+def _frame(camera: int, frame: int) -> View:
+    view, instant_s = CAMERAS[camera], (frame + camera / len(CAMERAS)) * FRAME_S
+    image, _ = seen(view.intrinsics, view.camera_to_world, _ball_m(instant_s))
+    return replace(view, image=image, generated_ns=round(instant_s * 1e9))
+
+
+def _run(field: LayeredField, frames: range, cameras: int = 3, steps: int = 20) -> None:
+    for frame in frames:
+        field.fit([_frame(k, frame) for k in range(cameras)], Budget(steps=steps))
+
+
+def _score(field: LayeredField) -> float:
+    truth, _ = seen(HELD.intrinsics, HELD.camera_to_world, _ball_m((FRAMES - 1) * FRAME_S))
+    return psnr(field.snapshot().render(HELD.camera_to_world, HELD.intrinsics).color, truth / 255.0)
+
+
+def test_stereo_shows_what_is_between_few_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = []
+    for most in (0, layer_settings.STEREO_CAMERAS):
+        monkeypatch.setattr(layer_settings, "STEREO_CAMERAS", most)
+        field = LayeredField(SMALL)
+        _run(field, range(FRAMES))
+        assert field.supervision.with_depth == (most > 0)
+        scores.append(_score(field))
+    assert scores[1] > scores[0] + 1.0
+
+
+def test_it_resumes_bit_for_bit() -> None:
+    field, other = LayeredField(SMALL), LayeredField(SMALL)
+    _run(field, range(20), steps=5)
+    assert field.supervision.with_depth
+    other.load_state(field.state())
+    for each in (field, other):
+        _run(each, range(20, 26), steps=5)
+    same_state(field, other)
+
+
+def test_with_a_budget_in_seconds_it_is_found_beside() -> None:
+    field = LayeredField(SMALL)
+    for frame in range(20):
+        field.fit([_frame(k, frame) for k in range(3)], Budget(seconds=0.02))
+    while field.static.training and not field.static.ready:
+        field.fit([_frame(k, 20) for k in range(3)], Budget(seconds=0.02))
+    assert field.static.ready and len(field.still.views) > 3
+    field.static.stop()
+
+
+def test_one_camera_alone_is_told_what_it_cannot_do(caplog: pytest.LogCaptureFixture) -> None:
+    field = LayeredField(SMALL)
+    with caplog.at_level(logging.WARNING):
+        _run(field, range(20), cameras=1, steps=1)
+    assert field.tracker is None and caplog.text.count("tells no depth") == 1
