@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from freshfield.depth import DepthImage
-from freshfield.geometry import Pinhole
+from freshfield.geometry import Pinhole, Pose
 from freshfield.limits import MAX_DEPTH_LENSES
 
 
@@ -43,29 +43,28 @@ def _moved(depth: DepthImage, sensor: Pinhole, grid: Pinhole) -> NDArray[np.floa
     """Depth in the pixels of ``grid``, the image's lens at some resolution, meters."""
     step = max(1, int(min(sensor.fx / grid.fx, sensor.fy / grid.fy)))
     z = depth.counts[step // 2 :: step, step // 2 :: step] * np.float32(depth.meters_per_count)
-    measured = z > 0
-    plane, ahead_m = _plane_points(sensor, step)[measured], z[measured, None]
-    points = np.concatenate([plane * ahead_m, ahead_m], 1)
+    points = _directions(sensor, depth.to_camera, step) * z[..., None]
     if depth.to_camera is not None:
-        pose = depth.to_camera.matrix().astype(np.float32)
-        points = points @ pose[:3, :3].T + pose[:3, 3]
+        points += np.asarray(depth.to_camera.translation_m, np.float32)
+    seen = z > 0
     if grid.distorted:  # far outside its image such a lens may lead back into it
-        points = points[np.hypot(points[:, 0], points[:, 1]) <= points[:, 2] * _reach(grid)]
-    column, row = np.floor(grid.project(points)).T
-    inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
+        seen &= np.hypot(points[..., 0], points[..., 1]) <= points[..., 2] * _reach(grid)
+    column, row = np.moveaxis(np.floor(grid.project(points)), -1, 0)
+    seen &= (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
     out = np.full(grid.height * grid.width, np.inf, np.float32)
-    place = (row[inside] * grid.width + column[inside]).astype(np.intp)
-    np.minimum.at(out, place, points[inside, 2].astype(np.float32))
+    place = (row[seen] * grid.width + column[seen]).astype(np.intp)
+    np.minimum.at(out, place, points[..., 2][seen])
     out[np.isinf(out)] = 0.0
     return out.reshape(grid.height, grid.width)
 
 
 @lru_cache(MAX_DEPTH_LENSES)
-def _plane_points(sensor: Pinhole, step: int) -> NDArray[np.float32]:
-    """x and y at depth 1 of each ``step``-th pixel's center, float32 (H, W, 2), sensor axes."""
+def _directions(sensor: Pinhole, to_camera: Pose | None, step: int) -> NDArray[np.float32]:
+    """Each ``step``-th pixel's point at depth 1, turned into the camera's axes, float32 (H, W, 3)."""
     u, v = np.meshgrid(np.arange(step // 2, sensor.width, step), np.arange(step // 2, sensor.height, step))
     rays = sensor.rays(np.stack([u, v], -1) + 0.5)
-    return (rays[..., :2] / rays[..., 2:]).astype(np.float32)
+    turned = rays if to_camera is None else rays @ to_camera.matrix()[:3, :3].T
+    return (turned / rays[..., 2:]).astype(np.float32)
 
 
 @lru_cache(MAX_DEPTH_LENSES)

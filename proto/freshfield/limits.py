@@ -26,7 +26,7 @@ METERS_PER_COUNT = (1e-6, 1.0)
 """Scale of depth in 16 bits: at the least its range is 6.5 cm, less than any sensor's, at the most 65 km."""
 
 MAX_DEPTH_LENSES = 24
-"""Lenses of depth sensors of which the edge keeps the rays, up to 13 MB each: more cameras than any rig here has, and
+"""Lenses of depth sensors of which the edge keeps the rays, up to 20 MB each: more cameras than any rig here has, and
 few, because a hostile sender's lens may differ in each frame."""
 
 MAX_DEPTH_GAP_NS = 10**10
