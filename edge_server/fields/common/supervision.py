@@ -82,6 +82,12 @@ def check_view(view: View) -> None:
             f"camera {view.camera}: weight must be float32 of shape {image.shape[:2]} within 0..1, "
             f"not {weight.dtype} of shape {weight.shape}"
         )
+    depth = view.depth
+    if depth is not None and not (depth.dtype == np.float32 and depth.shape == image.shape[:2]):
+        raise ValueError(
+            f"camera {view.camera}: depth must be float32 of shape {image.shape[:2]}, "
+            f"not {depth.dtype} of shape {depth.shape}"
+        )
 
 
 def moved_pixels(before: View, now: View) -> NDArray[np.bool_] | None:

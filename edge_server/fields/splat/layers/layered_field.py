@@ -373,7 +373,8 @@ class LayeredField:
         begun, moving = self.now(), tracker.moving
         shown = MovingSnapshot.of(moving, self.origin_ns, self.observations.newest_s) if moving.alive else None
         exposed = self._at_present_exposure(still)
-        self._published = LayeredSnapshot.of(still, exposed, shown)
+        depth = self.supervision.depth
+        self._published = LayeredSnapshot.of(still, exposed, shown, None if depth is None else depth.scene)
         self.part_s.add("publication", begun)
 
     def _at_present_exposure(self, shown: SplatSnapshot) -> Gaussians:

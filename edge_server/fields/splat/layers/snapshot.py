@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,10 @@ from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.motion import Motion
 from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.snapshot import SplatSnapshot
+from freshfield.geometry import Pinhole
+
+if TYPE_CHECKING:
+    from edge_server.fields.splat.layers.depth.surfaces import SurfaceScene
 
 
 @dataclass(frozen=True)
@@ -54,17 +59,30 @@ class LayeredSnapshot(SplatSnapshot):
     """The static field and the moving set at one instant; ``at`` shows another.
 
     static: float32 (N, P), the Gaussians of the static field. moving: None where nothing moves.
+    surfaces: what the cameras' depth says of what stands still; None without depth.
     """
 
     static: NDArray[np.float32] | None = None
     moving: MovingSnapshot | None = None
+    surfaces: SurfaceScene | None = None
 
     @classmethod
-    def of(cls, still: SplatSnapshot, exposed: Gaussians, moving: MovingSnapshot | None) -> LayeredSnapshot:
+    def of(
+        cls,
+        still: SplatSnapshot,
+        exposed: Gaussians,
+        moving: MovingSnapshot | None,
+        surfaces: SurfaceScene | None = None,
+    ) -> LayeredSnapshot:
         """A snapshot of the newest frame's instant. still: what the static field shows. exposed: its Gaussians at the
         exposure to show."""
         parts = still.box, exposed, still.background, still.pool, still.step
-        return cls(*parts, planar=still.planar, static=exposed.params, moving=moving)
+        return cls(*parts, planar=still.planar, static=exposed.params, moving=moving, surfaces=surfaces)
+
+    def unseen(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> NDArray[np.bool_] | None:
+        """The pixels of a rendering whose background no camera has measured, bool (H, W); None without depth. What is
+        shown there is a guess. Distortion is ignored. Takes some milliseconds."""
+        return None if self.surfaces is None else self.surfaces.unseen(camera_to_world, intrinsics, self.pool)
 
     def at(self, present_ns: int | None) -> LayeredSnapshot:
         """The snapshot of another instant; None: that of the newest frame."""

@@ -78,11 +78,12 @@ class StaticSupervision:
         return camera.depth
 
     def make_depth(self) -> DepthSupervision:
-        """Supervision with depth, made once a frame brings some."""
+        """Supervision with depth, made once a frame brings some. Compiles its kernels, or loads them."""
         if self.depth is None:
             from edge_server.fields.splat.layers.depth.depth_supervision import DepthSupervision
 
             self.depth = DepthSupervision(self.static.field.settings, self.static.field.pool)
+            self.depth.warm_up()
         return self.depth
 
     def forget_camera(self, camera: str) -> None:

@@ -44,6 +44,7 @@ class DepthPlate:
 
     def take(self, depth: NDArray[np.float32], foreground: NDArray[np.bool_], pool: Pool) -> None:
         """Take in the depth of a frame. See ``kernels.depth_plate.remember_depths``."""
+        depth = np.array(depth, np.float32)  # another layout, or one that may not be written, would be compiled anew
         pool.run(remember_depths, depth, foreground, self.samples, self.count)
 
     def is_known(self, plate: NDArray[np.bool_]) -> bool:

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields import View
 from edge_server.fields.common.scene_box import SceneBox, scene_box
-from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.fields.common.threads.thread_pool import Pool, compile_kernels
 from edge_server.fields.splat.layers.depth import settings as tuned
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
 from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
@@ -24,6 +25,7 @@ from edge_server.fields.splat.layers.depth.virtual_plates import virtual_plates
 from edge_server.fields.splat.layers.settings import LEAST_CAMERAS, STEREO_CAMERAS
 from edge_server.fields.splat.layers.static_layer import PlateImage
 from edge_server.fields.splat.settings import SplatSettings
+from freshfield.geometry import Pinhole
 
 log = logging.getLogger(__name__)
 
@@ -78,6 +80,10 @@ class DepthSupervision:
         self.corrections: dict[str, Correction] = {}
         self.scene: SurfaceScene | None = None
         self._learned: dict[str, NDArray[np.float32]] = {}  # camera -> inverse depths as learned
+
+    def warm_up(self) -> None:
+        """Compile every kernel of depth, or load it from numba's cache."""
+        compile_kernels(_run_kernels)
 
     def forget_camera(self, camera: str) -> None:
         """Forget what was learned of a camera that stands somewhere else now."""
@@ -189,3 +195,14 @@ def _are_whole(cameras: Sequence[CameraPlates], surfaces: Sequence[Surface]) -> 
     """Whether nearly all of what the plates show has depth."""
     known = sum(int(np.count_nonzero(camera.plate.known)) for camera in cameras)
     return sum(int(np.count_nonzero(s.depth())) for s in surfaces) >= (1.0 - tuned.MOST_HOLES) * known
+
+
+def _run_kernels(pool: Pool) -> None:
+    """Run every kernel once, on a small wall."""
+    lens, shape = Pinhole.from_fov(16, 16, 60.0), (16, 16)
+    view = View("warm-up", np.zeros((*shape, 3), np.uint8), np.eye(4), lens)
+    plate = PlateImage(view, np.zeros((*shape, 3), np.float32), np.ones(shape, bool))
+    depth = DepthPlate.empty(*shape)
+    for _ in range(tuned.LEAST):
+        depth.take(np.ones(shape, np.float32), np.zeros(shape, bool), pool)
+    DepthSupervision(SplatSettings(), pool).plates([CameraPlates(plate, plate, depth, np.eye(4))], anew=True)

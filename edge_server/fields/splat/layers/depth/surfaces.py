@@ -114,6 +114,11 @@ class SurfaceScene:
         )
         return cls(center, meshes)
 
+    def unseen(self, pose: Array, lens: Pinhole, pool: Pool) -> NDArray[np.bool_]:
+        """The pixels that no camera says anything about, bool (H, W), from a pose, camera-to-world (4, 4)."""
+        (agreement,) = self.render([pose], replace(lens, distortion=(0.0, 0.0, 0.0, 0.0)), pool)[1]
+        return np.asarray(agreement <= tuned.SURE)
+
     def render(
         self, poses: Sequence[Array], lens: Pinhole, pool: Pool
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

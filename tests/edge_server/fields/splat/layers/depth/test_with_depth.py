@@ -82,6 +82,9 @@ def test_depth_lets_layers_begin_sooner_and_shows_what_is_between_the_cameras() 
     _run(field, range(13, 40))
     assert not field.supervision.early and field.supervision.with_depth
     assert _score(field, 39) > _usual("none") + 0.3
+    unseen = field.snapshot().unseen(HELD.camera_to_world, HELD.intrinsics)
+    _, distance = seen(HELD.intrinsics, HELD.camera_to_world)
+    assert unseen is not None and unseen[~np.isfinite(distance)].mean() > 0.9 > 0.5 > unseen[distance < 9].mean()
 
 
 def test_one_camera_with_depth_has_layers() -> None:
@@ -139,6 +142,12 @@ _SPOILED: dict[str, Spoil] = {
     "ten times too far, later": lambda camera, frame, depth: depth * np.float32(10.0 if frame > 20 else 1.0),
     "half of the image": lambda camera, frame, depth: np.where(np.arange(48) < 24, depth, 0).astype(np.float32),
 }
+
+
+def test_depth_of_another_size_is_refused() -> None:
+    view = replace(_frame(0, 0), depth=np.ones((3, 4), np.float32))
+    with pytest.raises(ValueError, match="cam00: depth must be float32 of shape"):
+        LayeredField(SMALL).fit([view], Budget(steps=1))
 
 
 @pytest.mark.stability
