@@ -292,14 +292,10 @@ class LayeredField:
             self.supervision.take_depth(camera, view, foreground)
         if camera.anew:
             return  # against an empty plate nothing is foreground
-        self.observations.add(
-            Observation(
-                (view.generated_ns - self.origin_ns) / 1e9,
-                view.camera,
-                replace(view, camera_to_world=camera.view.camera_to_world),
-                foreground,
-            )
-        )
+        depth = view.depth if self.supervision.trusts_depth(view.camera) else None
+        view = replace(view, camera_to_world=camera.view.camera_to_world, depth=depth)
+        instant_s = (view.generated_ns - self.origin_ns) / 1e9
+        self.observations.add(Observation(instant_s, view.camera, view, foreground))
 
     def _move_camera(self, view: View) -> FixedCamera:
         """Begin a camera anew where it stands now, at the exposure that it had; the others go on."""

@@ -54,8 +54,8 @@ def pack(field: Any) -> Arrays:
     for k, o in enumerate(field.observations):
         observations.append({**_facts(o.view), "instant_s": o.instant_s, "fresh": o.fresh})
         arrays = {"image": o.view.image, "foreground": o.foreground}
-        if o.view.weight is not None:
-            arrays["given"] = o.view.weight
+        given = {"given": o.view.weight, "depth": o.view.depth, "body_m": o.body_m}
+        arrays |= {name: array for name, array in given.items() if array is not None}
         if o.weight is not None:
             arrays["weight"] = _half(o.weight)
         if o.row is not None:
@@ -136,6 +136,7 @@ def _observation(field: Any, facts: dict[str, Any], arrays: Arrays) -> Observati
         image=found["image"],
         generated_ns=facts["generated_ns"],
         weight=found.get("given"),
+        depth=found.get("depth"),
     )
     row = None
     if "matrix" in found:
@@ -147,6 +148,7 @@ def _observation(field: Any, facts: dict[str, Any], arrays: Arrays) -> Observati
         found["foreground"],
         found["weight"].astype(np.float32) if "weight" in found else None,
         row,
+        body_m=found.get("body_m"),
         fresh=facts["fresh"],
     )
 

@@ -168,21 +168,33 @@ class MovingSet:
                     return found
         return []
 
-    def remove_outside(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:
+    def remove_outside(
+        self, frames: Sequence[Observation], cameras: dict[str, FixedCamera], measured: bool = False
+    ) -> None:
         """Remove the Gaussians that lie outside the foregrounds that should hold them. If that is most of
-        them, remove all, with their motion: new ones are then seeded at rest."""
+        them, remove all, with their motion: new ones are then seeded at rest.
+
+        measured: remove those that a frame's depth sees through, too.
+        """
         if len(self.cloud):
             places = [self.places(o.instant_s) for o in frames]
             keep = self._inside(places, frames, cameras, tuned.KEEP_DILATION_PX) >= tuned.KEEP_INSIDE
             if keep.mean() < tuned.LOST_BELOW:
                 keep[:] = False
                 self.motion.forget()
+            elif measured:
+                from edge_server.fields.splat.layers.depth.body_depth import seen_through
+
+                keep &= ~seen_through(places, frames, cameras, self.box, self.pool)
             self._keep(keep)
 
     def seed_missing(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:
         """Seed Gaussians in foreground that is rendered wrongly. Where that is follows from the moving set
         as rendered for each frame (``Observation.shown``)."""
-        missing = [o.foreground & _is_wrong(o) if len(self.cloud) > tuned.FEW else o.foreground for o in frames]
+        missing = [
+            o.foreground & o.shown_wrongly(tuned.MISSING_ERROR) if len(self.cloud) > tuned.FEW else o.foreground
+            for o in frames
+        ]
         pixels = sum(int(mask.sum()) for mask in missing)
         count = min(int(tuned.SEEDS_A_PIXEL * pixels), self.capacity - len(self.cloud))
         if count <= 4:
@@ -199,21 +211,51 @@ class MovingSet:
             self._rng(2),
             [o.foreground for o in frames],
         )
-        places = [params[:, :3]] * len(frames)
+        places, attached = [params[:, :3]] * len(frames), None
         if len(params) and self.motion.anchors is not None:
-            anchor, share = self.motion.attach(params[:, :3], instant_s)
-            shift = self.motion.displaced(np.zeros_like(params[:, :3]), anchor, share, instant_s)
-            params[:, :3] -= shift
-            places = [self.motion.displaced(params[:, :3], anchor, share, o.instant_s) for o in frames]
+            attached = self._attach(params, instant_s)
+            places = [self.motion.displaced(params[:, :3], *attached, o.instant_s) for o in frames]
         inside = self._inside(places, frames, cameras, tuned.SEED_DILATION_PX) >= tuned.SEED_INSIDE
-        if not inside.any():
+        if attached is not None:
+            attached = attached[0][inside], attached[1][inside]
+        self._add(params[inside], attached, instant_s)
+
+    def seed_at_depth(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:
+        """Seed Gaussians from frames with ``body_m``, the newest first. See ``body_depth.seed_at_depth``."""
+        from edge_server.fields.splat.layers.depth.body_depth import seed_at_depth
+
+        few = len(self.cloud) <= tuned.FEW
+        for o in sorted(frames, key=lambda o: -o.instant_s):
+            room = self.capacity - len(self.cloud)
+            if o.body_m is None or room <= 0:
+                continue
+            params = seed_at_depth(o, cameras[o.camera], self.box, self.cloud.params.shape[1], few)
+            if len(params) > room:
+                params = params[np.sort(self._rng(4).choice(len(params), room, replace=False))]
+            attached = None if self.motion.anchors is None else self._attach(params, o.instant_s)
+            self._add(params, attached, o.instant_s)
+
+    def _attach(self, params: NDArray[np.float32], instant_s: float) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Anchors and shares of Gaussians, whose parameters (N, P) at an instant become those at rest."""
+        anchor, share = self.motion.attach(params[:, :3], instant_s)
+        params[:, :3] -= self.motion.displaced(np.zeros_like(params[:, :3]), anchor, share, instant_s)
+        return anchor, share
+
+    def _add(
+        self,
+        params: NDArray[np.float32],
+        attached: tuple[NDArray[np.int64], NDArray[np.float32]] | None,
+        instant_s: float,
+    ) -> None:
+        """Add Gaussians. attached: see ``_attach``; None: there are no anchors yet, which are chosen then."""
+        if not len(params):
             return
-        self.cloud.add(GaussianCloud.new(params[inside]))
-        if self.motion.anchors is None:
+        self.cloud.add(GaussianCloud.new(params))
+        if attached is None:
             self.renew_anchors(instant_s)
         else:
-            self.anchor = np.concatenate([self.anchor, anchor[inside]])
-            self.share = np.concatenate([self.share, share[inside]])
+            self.anchor = np.concatenate([self.anchor, attached[0]])
+            self.share = np.concatenate([self.share, attached[1]])
 
     def renew_anchors(self, instant_s: float) -> None:
         """Choose anchors anew; parameters then hold at ``instant_s``. All frames must be aligned again."""
@@ -281,11 +323,3 @@ def _over_plate(observation: Observation, camera: FixedCamera) -> Targets:
         camera.plate.picture.reshape(-1, 3),
         np.zeros(3, np.float32),
     )
-
-
-def _is_wrong(observation: Observation) -> NDArray[np.bool_]:
-    """The pixels of a frame that the moving set does not show as they are, bool (H, W)."""
-    if observation.shown is None:
-        return np.ones(observation.foreground.shape, bool)
-    error = np.abs(observation.shown - observation.view.image[..., :3] * np.float32(1.0 / 255.0))
-    return np.asarray(error.max(axis=2) > tuned.MISSING_ERROR)

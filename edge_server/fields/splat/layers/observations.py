@@ -124,6 +124,7 @@ class Observation:
     weight: float32 (H, W), how much each pixel counts.
     row: see ``motion.ViewRow``; None: to be aligned. fresh: not aligned since its arrival.
     shown: float32 (H, W, 3) in [0, 1], the moving set over the plate when it was aligned.
+    body_m: float32 (H, W), depth of what moves as ``view.depth`` says it, 0 elsewhere; None: not looked for yet.
     """
 
     instant_s: float
@@ -133,6 +134,7 @@ class Observation:
     weight: NDArray[np.float32] | None = field(default=None, compare=False)
     row: ViewRow | None = field(default=None, compare=False)
     shown: NDArray[np.float32] | None = field(default=None, compare=False)
+    body_m: NDArray[np.float32] | None = field(default=None, compare=False)
     fresh: bool = field(default=True, compare=False)
     share: float = field(init=False, compare=False)
 
@@ -143,6 +145,13 @@ class Observation:
     def knot(self) -> int:
         """The knot at or before the instant."""
         return knot_of(self.instant_s)
+
+    def shown_wrongly(self, most: float) -> NDArray[np.bool_]:
+        """The pixels that the moving set does not show, or with an error above ``most`` in a channel, bool (H, W)."""
+        if self.shown is None:
+            return np.ones(self.foreground.shape, bool)
+        error = np.abs(self.shown - self.view.image[..., :3] * np.float32(1.0 / 255.0))
+        return np.asarray(error.max(axis=2) > most)
 
 
 def knot_of(instant_s: float) -> int:

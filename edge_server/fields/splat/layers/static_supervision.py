@@ -86,6 +86,10 @@ class StaticSupervision:
             self.depth.warm_up()
         return self.depth
 
+    def trusts_depth(self, camera: str) -> bool:
+        """Whether a camera measures depth that does not contradict the others'."""
+        return self.depth is not None and camera not in self.depth.wrong
+
     def forget_camera(self, camera: str) -> None:
         """Forget what was learned of a camera that stands somewhere else now."""
         self.static.forget_camera(camera)

@@ -146,22 +146,33 @@ class MotionTracker:
         return steps, rays, samples
 
     def _seed(self) -> None:
-        """Remove what lies outside foregrounds, and seed what is missing, at the newest instant that most
-        cameras have seen."""
-        moving = self.moving
-        frames = moving.seeding_frames(self.observations, len(self.cameras))
+        """Remove what lies outside foregrounds, and seed what is missing: where frames measured depth of what moves,
+        there, or else at the newest instant that most cameras have seen."""
+        moving, measured = self.moving, self._measured_frames()
+        frames = measured or moving.seeding_frames(self.observations, len(self.cameras))
         if not frames:
             return
         pixels = sum(int(o.foreground.sum()) for o in frames)
         if pixels < tuned.LEAST_FOREGROUND * frames[0].foreground.size * len(self.cameras):
             return
-        moving.remove_outside(frames, self.cameras)
+        moving.remove_outside(frames, self.cameras, bool(measured))
         if moving.motion.anchors is None:
             self._forget_rows()
         if moving.alive:
             for o in frames:
                 self._align(o, exclude=False)
-        moving.seed_missing(frames, self.cameras)
+        if measured:
+            moving.seed_at_depth(measured, self.cameras)
+        else:
+            moving.seed_missing(frames, self.cameras)
+
+    def _measured_frames(self) -> list[Observation]:
+        """See ``body_depth.measured_frames``."""
+        if all(o.view.depth is None for o in self.observations):
+            return []
+        from edge_server.fields.splat.layers.depth.body_depth import measured_frames
+
+        return measured_frames(self.observations, self.cameras, self.moving.pool)
 
     def _renew_anchors(self, instant_s: float) -> None:
         self.moving.renew_anchors(instant_s)

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.scene_box import SceneBox, scene_box
 from edge_server.fields.common.threads.thread_pool import Pool, compile_kernels
 from edge_server.fields.splat.layers.depth import settings as tuned
+from edge_server.fields.splat.layers.depth.body_depth import body_depth, seen_through
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
 from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
 from edge_server.fields.splat.layers.depth.kernels.surfaces import Meshes
@@ -22,6 +24,8 @@ from edge_server.fields.splat.layers.depth.plate_stereo import fill_by_stereo
 from edge_server.fields.splat.layers.depth.registration import Correction, register
 from edge_server.fields.splat.layers.depth.surfaces import Surface, SurfaceScene
 from edge_server.fields.splat.layers.depth.virtual_plates import virtual_plates
+from edge_server.fields.splat.layers.observations import FixedCamera, Observation
+from edge_server.fields.splat.layers.plates import Plate
 from edge_server.fields.splat.layers.settings import LEAST_CAMERAS, STEREO_CAMERAS
 from edge_server.fields.splat.layers.static_layer import PlateImage
 from edge_server.fields.splat.settings import SplatSettings
@@ -206,3 +210,8 @@ def _run_kernels(pool: Pool) -> None:
     for _ in range(tuned.LEAST):
         depth.take(np.ones(shape, np.float32), np.zeros(shape, bool), pool)
     DepthSupervision(SplatSettings(), pool).plates([CameraPlates(plate, plate, depth, np.eye(4))], anew=True)
+    box = scene_box([view])
+    camera = FixedCamera(view, Plate(*shape, pool), row=camera_rows([np.eye(4)], [lens], box), depth=depth)
+    frame = Observation(0.0, "warm-up", replace(view, depth=depth.samples[..., 0].copy()), np.ones(shape, bool))
+    frame.body_m = body_depth(frame, camera, pool)
+    seen_through([np.zeros((1, 3), np.float32)], [frame], {"warm-up": camera}, box, pool)

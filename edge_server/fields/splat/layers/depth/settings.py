@@ -60,6 +60,20 @@ LEAST_AGREE = 0.5  # share of the shared points that agree, below which a camera
 HIDDEN_WEIGHT = 0.1  # in it, of points behind what the other camera measures: those may be hidden, but not nearly all
 DARK, BRIGHT = 20.0, 235.0  # only plates between these are used to estimate exposures, steps of 255
 
+# --- depth of what moves (body_depth) ---
+# Foreground is wider than what moves, and holds its shadow: what moves differs from the plate by more than this (of
+# 255), and is nearer by so many meters and by so large a share of the plate's depth.
+BODY_OFF_PLATE, BODY_NEARER_M, BODY_NEARER = 16.0, 0.1, 0.03
+BODY_RADIUS_PX = 2  # pixels about one whose median says whether it was measured well, and whose mean its depth is
+BODY_LEAST = 4  # of them, that must have measured
+BODY_FLYING = 0.5 / _DISPARITY_PX_M  # 1 / m: farther from the median it flies between two surfaces
+BODY_PIXELS = 8  # fewest pixels with depth of what moves, of all frames together, from which Gaussians are seeded
+BODY_AGE_S = 0.25  # oldest frame from whose depth they are
+BODY_WRONG = 0.1  # color error, in the worst channel, above which a pixel seeds one
+BODY_SEED_PX, BODY_OPACITY = 0.8, 0.6  # its standard deviation in pixels, and its opacity
+# Depth that lies farther behind a Gaussian than their sum (the second is a share of the distance) sees through it.
+BODY_THROUGH_M, BODY_THROUGH = 0.06, 0.02
+
 # --- when what begins ---
 PLATE_S = 0.6  # as ``layers.settings.PLATE_S``, where most of the cameras have depth
 SHOWN_AFTER = 50, 200  # steps after which the first field, and one that began anew, is shown

@@ -37,9 +37,29 @@ def remember_depths(counter, worker, depth, foreground, samples, count):
                     count[y, x] += 1
 
 
+@device_function
+def pixel_median(samples, count, y, x, ranked):
+    """The median of a pixel's depths, 1 / m; 0 if it has too few, or many of them are not alike. ranked: float32
+    (KEPT,), scratch."""
+    n = min(count[y, x], samples.shape[2])
+    if n < tuned.LEAST:
+        return _F0
+    for k in range(n):  # insertion sort
+        value, i = samples[y, x, k], k
+        while i > 0 and ranked[i - 1] > value:
+            ranked[i] = ranked[i - 1]
+            i -= 1
+        ranked[i] = value
+    median = np.float32(0.5) * (ranked[(n - 1) // 2] + ranked[n // 2])
+    near = 0
+    for k in range(n):
+        near += np.int32(abs(ranked[k] - median) < np.float32(tuned.STEADY))
+    return median if 3 * near >= 2 * n else _F0
+
+
 @kernel
 def find_medians(counter, worker, samples, count, inverse):
-    """The median of each pixel's depths, if it has enough and most of them are alike. Tasks are runs of rows.
+    """The median of each pixel's depths, see ``pixel_median``. Tasks are runs of rows.
 
     samples, count: see ``remember_depths``. inverse: float32 (H, W), written.
     """
@@ -51,22 +71,7 @@ def find_medians(counter, worker, samples, count, inverse):
             return
         for y in range(top, min(top + _ROWS, height)):
             for x in range(width):
-                n = min(count[y, x], kept)
-                inverse[y, x] = _F0
-                if n < tuned.LEAST:
-                    continue
-                for k in range(n):  # insertion sort
-                    value, i = samples[y, x, k], k
-                    while i > 0 and ranked[i - 1] > value:
-                        ranked[i] = ranked[i - 1]
-                        i -= 1
-                    ranked[i] = value
-                median = np.float32(0.5) * (ranked[(n - 1) // 2] + ranked[n // 2])
-                near = 0
-                for k in range(n):
-                    near += np.int32(abs(ranked[k] - median) < np.float32(tuned.STEADY))
-                if 3 * near >= 2 * n:
-                    inverse[y, x] = median
+                inverse[y, x] = pixel_median(samples, count, y, x, ranked)
 
 
 @device_function
