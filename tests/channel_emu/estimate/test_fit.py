@@ -13,6 +13,7 @@ import yaml
 from channel_emu.cli import main
 from channel_emu.estimate import recording as recordings
 from channel_emu.estimate.fit import Fit, IntervalEstimate, fit
+from channel_emu.estimate.report import format_fit
 from channel_emu.model.link import FITTED_DISCIPLINES
 from channel_emu.model.settings import channel_from_mapping
 from freshfield import scenario
@@ -60,6 +61,11 @@ def test_a_slow_chain_from_delays_alone(tmp_path: Path) -> None:
     section = channel_from_mapping(found.channel)
     assert section.discipline == "drop-new" and section.arrivals.period_ms == pytest.approx(30)
     assert "faults" not in found.channel and found.channel["service"]["law"] == "exponential"
+    mu1, mu2 = (found.parameters[f"mu{k}_per_ms"].value for k in (1, 2))
+    low, high = found.channel["chain"]["states"]
+    visits = f"  a visit lasts {1 / mu1:.4g} ms in {low}, {1 / mu2:.4g} ms in {high}; "
+    shares = f"shares of time {mu2 / (mu1 + mu2):.3f}, {mu1 / (mu1 + mu2):.3f}"
+    assert visits + shares in format_fit(found).splitlines()
 
 
 @pytest.mark.parametrize("kind", ["trace", "rows"])
