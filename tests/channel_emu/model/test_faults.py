@@ -54,6 +54,9 @@ def test_corruption_flips_the_bytes_it_says() -> None:
         changed = sum(a != b for a, b in zip(payload, damaged))
         assert len(t.flips) == 3 and len(damaged) == len(payload) and 1 <= changed <= 3
     assert damage(b"", hit[0].flips) == b""
+    masks = [mask for t in hit for _, mask in t.flips]  # even from 1 to 255
+    assert (min(masks), max(masks)) == (1, 255) and len(set(masks)) > 240
+    assert np.mean(masks) == pytest.approx(128, abs=4 * 73.6 / len(masks) ** 0.5)
 
 
 def test_blackout_loses_what_is_on_the_way_during_a_window() -> None:
