@@ -86,3 +86,49 @@ def test_one_camera_alone_is_told_what_it_cannot_do(caplog: pytest.LogCaptureFix
     with caplog.at_level(logging.WARNING):
         _run(field, range(20), cameras=1, steps=1)
     assert field.tracker is None and caplog.text.count("tells no depth") == 1
+
+
+@cache
+def _usual() -> float:
+    field = LayeredField(SMALL)
+    _run(field, range(FRAMES))
+    return _score(field)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("unit", [1.0 / 3.0, 2.0])
+def test_other_units_cost_little(unit: float) -> None:
+    def scaled(view: View) -> View:
+        pose = view.camera_to_world.copy()
+        pose[:3, 3] *= unit
+        return replace(view, camera_to_world=pose)
+
+    field = LayeredField(SMALL)
+    for frame in range(FRAMES):
+        field.fit([scaled(_frame(k, frame)) for k in range(3)], Budget(steps=20))
+    truth, _ = seen(HELD.intrinsics, HELD.camera_to_world, _ball_m((FRAMES - 1) * FRAME_S))
+    held = scaled(HELD)
+    color = field.snapshot().render(held.camera_to_world, held.intrinsics).color
+    assert psnr(color, truth / 255.0) > _usual() - 0.5
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("level", [0, 128])
+def test_where_stereo_finds_nothing_the_plates_are_learned_alone(level: int) -> None:
+    """Darkness, and a wall of one color before all cameras."""
+    field = LayeredField(SMALL)
+    for frame in range(20):
+        views = [_frame(k, frame) for k in range(3)]
+        field.fit([replace(v, image=np.full_like(v.image, level)) for v in views], Budget(steps=5))
+    color = field.snapshot().render(HELD.camera_to_world, HELD.intrinsics).color
+    assert len(field.still.views) == 3 and np.isfinite(color).all()
+
+
+@pytest.mark.stability
+def test_the_image_recovers_when_light_was_off() -> None:
+    field = LayeredField(SMALL)
+    for frame in range(FRAMES):
+        views = [_frame(k, frame) for k in range(3)]
+        dark = 18 <= frame < 22
+        field.fit([replace(v, image=v.image // 40 if dark else v.image) for v in views], Budget(steps=20))
+    assert field.tracker is not None and _score(field) > _usual() - 1.0
