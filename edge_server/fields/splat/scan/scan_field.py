@@ -158,7 +158,8 @@ class ScanField(StillField):
             self._grow()
 
     def _grow(self) -> None:
-        """Insert Gaussians where the view that comes next shows what the field does not."""
+        """Insert Gaussians where the view that comes next shows what the field does not: at the depth that is rendered
+        there, or beside it where nothing is."""
         view = self._views[self._next_view()]
         shown = self._look(view)
         color, there = self._as_rendered(view)
@@ -167,7 +168,8 @@ class ScanField(StillField):
         if view.depth is not None:
             agrees = np.abs(view.depth - depth) < tuned.AGREES * depth
             depth = np.where(agrees, np.minimum(view.depth, depth), depth)
-        wanted = (error > tuned.GROWN_ERROR) & (shown.opacity >= 0.5) & (depth > 0) & there
+        depth = filled(np.where(shown.opacity >= tuned.COVERED, depth, np.float32(0.0)))
+        wanted = (error > tuned.GROWN_ERROR) & (depth > 0) & there
         leaves = quadtree(color, wanted, tuned.GROWN_CELLS, tuned.GROWN_DETAIL)
         if len(leaves.row) > tuned.GROWN_MOST:
             drawn = np.sort(self._rng(6).choice(len(leaves.row), tuned.GROWN_MOST, replace=False))
@@ -175,7 +177,7 @@ class ScanField(StillField):
         nearer = np.float32(1.0 - tuned.NEARER)
         alpha = np.full(len(leaves.row), tuned.GROWN_OPACITY, np.float32)
         pose = self._pose_of(view)
-        self._add(discs(color, filled(depth) * nearer, leaves, view.intrinsics, pose, tuned.GROWN_WIDTH, alpha))
+        self._add(discs(color, depth * nearer, leaves, view.intrinsics, pose, tuned.GROWN_WIDTH, alpha))
 
     def _add(self, params: NDArray[np.float32]) -> None:
         """Add Gaussians given in meters, as many as there is room for."""
