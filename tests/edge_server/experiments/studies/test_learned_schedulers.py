@@ -58,6 +58,8 @@ def test_cases_judge_by_cameras_that_neither_reward_nor_train(tmp_path: Path):
             assert set(case.setting.judging).isdisjoint(case.setting.rewarding)
             assert apart.isdisjoint(case.setting.scenario.training)
             assert all((t.setting or case.setting).rewarding == case.setting.rewarding for t in case.trainings)
+            rewards = [*case.rewards.values(), *(t.reward for t in case.trainings if t.reward is not None)]
+            assert rewards and all(reward.weights.get("age", -1.0) < 0.0 for reward in rewards), "age is a cost"
 
 
 @pytest.mark.parametrize(("level", "said"), [(3.0, "holds"), (-3.0, "does not hold")])
