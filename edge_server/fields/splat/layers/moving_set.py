@@ -263,6 +263,7 @@ class MovingSet:
             self.cloud.params[:, :3] = self.places(instant_s)
         places = self.cloud.params[:, :3]
         count = round((tuned.FEW_ANCHORS if self.few else tuned.ANCHORS) * self.capacity_factor)
+        count = min(count, tuned.FEW_MOST_ANCHORS) if self.few else count
         count = min(count, max(1, len(places) // tuned.GAUSSIANS_AN_ANCHOR))
         self.motion.choose_anchors(places, opacity(self.cloud.params), count, instant_s)
         self.anchor, self.share = self.motion.attach(places, instant_s)

@@ -86,6 +86,7 @@ FEW = 32  # Gaussians: all foreground needs new ones below this
 FEW_CAMERAS = 4
 STEREO_CAMERAS = 6  # up to so many, stereo of the plates helps the still field where no depth is measured
 FEW_ANCHORS, FEW_ACCELERATION_M_PER_S2, FEW_NEIGHBOR_M_PER_S, FEW_SEED_EVERY_S = 32, 3.0, 3.0, 0.07
+FEW_MOST_ANCHORS = 48  # however large the foreground: the time of an update grows with their square
 
 # --- following motion (tracker) ---
 # Most passes of Gauss-Newton over a stride, and the median movement of anchors that calls for another one.

@@ -65,6 +65,15 @@ def test_motion_of_few_cameras_is_bound_by_their_distance(
     assert (moving.motion.acceleration_m_per_s2, moving.motion.neighbor_m_per_s) == bounds
 
 
+@pytest.mark.parametrize(("cameras", "anchors"), [(4, 48), (5, 60)])
+def test_anchors_grow_with_the_foreground_up_to_a_bound_for_few_cameras(cameras: int, anchors: int) -> None:
+    moving = _set_of(np.random.default_rng(2).uniform(-0.5, 0.5, (700, 3)))
+    moving.bind(cameras)
+    moving.follow_foreground(1.0)
+    moving.renew_anchors(INSTANT_S)
+    assert moving.motion.anchors is not None and len(moving.motion.anchors) == anchors
+
+
 @pytest.mark.parametrize(("outside", "left"), [(6, 14), (14, 0)])
 def test_a_set_that_has_lost_most_of_its_gaussians_forgets_its_motion(outside: int, left: int) -> None:
     """Of 20; those outside are in sight of all cameras, beside the ball."""
