@@ -185,6 +185,7 @@ class EdgeServer:
             field_name=config.field,
             chosen=described(scenario, config, self._moving),
             decision=lambda: self.updater.policy.last_decision,
+            troubles=lambda: getattr(self.updater.field, "troubles", ()),
         )
         log.info("%s", self.state.chosen)
         write_json(options.out / "frontier.json", msgspec.to_builtins(self.frontier))

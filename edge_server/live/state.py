@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
@@ -134,6 +134,7 @@ class EdgeState:
     decision: the newest decision of a learned policy, with what it saw; None with other policies.
     frontier: what accuracy costs in time, as measured.
     chosen: how the edge works and why, in one line (``config.described``).
+    troubles: what the field finds wrong with poses and measured depth, for people.
     warnings: what other machines can do here that they should not, in words (--insecure).
     status_line: what the loop is doing, in one line for people, e.g. waiting for a first frame.
     """
@@ -148,6 +149,7 @@ class EdgeState:
     save_snapshot: Callable[[], Path]
     channel: Callable[[], dict | None] = lambda: None
     decision: Callable[[], Decision | None] = lambda: None
+    troubles: Callable[[], Sequence[str]] = tuple
     frontier: Frontier | None = None
     field_name: str = ""
     chosen: str = ""

@@ -38,6 +38,7 @@ class Panel:
         gui.add_html(markup.INTRO)
         if state.warnings:
             gui.add_html(markup.warning(f"Insecure: {'; '.join(state.warnings)}."))
+        self._troubles = gui.add_html("", visible=False)
         self._status = gui.add_html("")
         self._caption = gui.add_html(markup.note("Waiting for a held-out frame to compare with."))
         self._pair: Any = None
@@ -71,6 +72,9 @@ class Panel:
         """Show the current state."""
         last = publications[-1] if publications else None
         self._status.content = markup.status(summary(self._state, cameras, publications))
+        troubles = self._state.troubles()
+        self._troubles.visible = bool(troubles)
+        self._troubles.content = markup.warning("; ".join(troubles)) if troubles else ""
         self._table.content = markup.table(cameras, last.selected if last else ())
         self._waiting.visible = last is None
         if channel is not None:

@@ -12,7 +12,7 @@ import threading
 from dataclasses import dataclass
 from itertools import pairwise
 from time import perf_counter
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,13 @@ from edge_server.page.viewpoint import row_band, visitor_camera
 from freshfield.geometry import Pinhole
 
 log = logging.getLogger(__name__)
+
+
+@runtime_checkable
+class TellsUnseen(Protocol):
+    """A snapshot that knows what no camera has seen, such as ``LayeredSnapshot``."""
+
+    def unseen(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> NDArray[np.bool_] | None: ...
 
 
 @dataclass(frozen=True)
@@ -48,6 +55,8 @@ LEAST_S = 0.03
 BAND_S = 0.1
 MIN_GAP_S = 0.05
 SETTLE_S = 0.25
+STRIPE_PX, SHADE = 6, 0.7  # width and brightness of the stripes over what no camera has seen
+COARSE = 4  # that is asked at so many times fewer pixels a side: it takes a few milliseconds then
 BACKDROP = np.array([18, 20, 24], np.float32) / 255
 
 
@@ -188,6 +197,8 @@ class RenderLoop:
         if image is None:
             return
         self._adapt(level, spent)
+        if level and isinstance(shown, TellsUnseen):
+            image = hatched(image, shown.unseen(pose, camera.scaled(1.0 / COARSE)))
         if visitor.client.client_id not in self._visitors:  # has left meanwhile
             return
         visitor.client.scene.set_background_image(browser_image(image), format="jpeg", jpeg_quality=85)
@@ -232,6 +243,20 @@ class RenderLoop:
             self._last_error = text
         until = perf_counter() + 1.0
         self._not_before = [max(t, until) for t in self._not_before]
+
+
+def hatched(image: NDArray[np.float32], unseen: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+    """A rendering (H, W, 3) with dark stripes where no camera has seen what it shows.
+
+    unseen: bool, at a lower resolution; None: not known.
+    """
+    if unseen is None or not unseen.any():
+        return image
+    height, width = image.shape[:2]
+    y, x = np.arange(height), np.arange(width)
+    there = unseen[(y * unseen.shape[0] // height)[:, None], x * unseen.shape[1] // width]
+    stripe = (x + y[:, None]) // STRIPE_PX % 2 == 0
+    return np.where((there & stripe)[..., None], image * np.float32(SHADE), image)
 
 
 def browser_image(color: NDArray[np.float32]) -> NDArray[np.uint8]:

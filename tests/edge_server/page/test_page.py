@@ -23,7 +23,7 @@ from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, 
 from edge_server.page import Page, PageError, page_url, panel, start_page
 from edge_server.page.controls import ControlPanel
 from edge_server.page.panel import PAIR_WIDTH, side_by_side
-from edge_server.page.rendering import LEVELS, MOVING, NEWER, ClientState, RenderLoop, browser_image
+from edge_server.page.rendering import LEVELS, MOVING, NEWER, ClientState, RenderLoop, browser_image, hatched
 from edge_server.page.scene import Scene, thumbnail
 from freshfield import payload
 from freshfield.geometry import Pinhole, Pose, look_at
@@ -377,3 +377,11 @@ def _decode(visitor: Visitor) -> np.ndarray:
     image = cv2.imdecode(data, cv2.IMREAD_COLOR)
     assert image is not None
     return image
+
+
+def test_what_no_camera_has_seen_is_hatched():
+    image, unseen = np.ones((48, 64, 3), np.float32), np.zeros((12, 16), bool)
+    assert hatched(image, None) is image and hatched(image, unseen) is image
+    unseen[:, 8:] = True
+    shaded = hatched(image, unseen) < 1.0
+    assert not shaded[:, :32].any() and 0.4 < shaded[:, 32:].mean() < 0.6

@@ -101,6 +101,12 @@ class LayeredField:
         return tuned.MOST_PIXELS if self.layered else None
 
     @property
+    def troubles(self) -> tuple[str, ...]:
+        """What is wrong with poses and measured depth, for people."""
+        depth = self.supervision.depth
+        return () if depth is None else depth.troubles
+
+    @property
     def views(self) -> tuple[View, ...]:
         """What the still field learns from: a view of each camera, or its background plate."""
         return tuple(view for view in self.still.views if not self.cameras or view.camera in self.cameras)

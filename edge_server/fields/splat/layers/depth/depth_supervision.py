@@ -99,6 +99,12 @@ class DepthSupervision:
         """Cameras that stand elsewhere than their frames say, or whose depth is of another scale."""
         return {name: found for name, found in self.corrections.items() if found.is_large}
 
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """What is wrong with poses and depth, for people."""
+        against = [f"the depth of {name} contradicts the other cameras' and is not used" for name in self.wrong]
+        return (*against, *(f"{name} {found}" for name, found in self.displaced.items()))
+
     def exposures(self, cameras: Sequence[CameraPlates]) -> Mapping[str, NDArray[np.float64]]:
         """Camera -> log of its exposure over the mean of all, (3,)."""
         surfaces = [camera.surface(camera.inverse(self.pool)) for camera in cameras]
@@ -159,7 +165,7 @@ class DepthSupervision:
         self.corrections = dict(zip(names, register(surfaces))) if len(names) > 1 else {}
         for name, found in self.displaced.items():
             if name not in before:
-                log.warning("%s does not stand where its frames say, or its depth is of another scale: %s", name, found)
+                log.warning("%s %s", name, found)
 
     def first_gaussians(self, surfaces: Sequence[Surface], box: SceneBox) -> NDArray[np.float32] | None:
         """Parameters of the static field's first Gaussians; None: it has to find them itself."""

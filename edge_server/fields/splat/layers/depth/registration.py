@@ -41,7 +41,10 @@ class Correction:
         return bool(max(*off, abs(np.log(self.scale)) / tuned.LARGE_LOG_SCALE) > 1.0)
 
     def __str__(self) -> str:
-        return f"{self.turn_deg:.1f} degrees, {100 * self.shift_m:.1f} cm, depth times {self.scale:.3f}"
+        return (
+            f"stands {self.turn_deg:.1f} degrees and {100 * self.shift_m:.1f} cm from where its frames say; its depth "
+            f"is {self.scale:.3f} times what the others measure"
+        )
 
     def applied(self, surface: Surface) -> Surface:
         """The surface of the camera at its pose and scale."""
