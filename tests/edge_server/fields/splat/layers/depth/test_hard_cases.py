@@ -120,8 +120,8 @@ def test_what_moves_is_shown_as_well_as_before_half_a_second_after(name: str) ->
     case = CASES[name]
     stage = _begun().going_on_as(case)
     stage.run(case.fresh_s + BACK_S + SCORED_S)  # a whole round
-    before_db, _, _ = stage.median_db(-SCORED_S, 0.0)
-    after_db, _, empty_db = stage.median_db(case.fresh_s + BACK_S, case.fresh_s + BACK_S + SCORED_S)
+    before_db, _ = stage.median_db(-SCORED_S, 0.0)
+    after_db, empty_db = stage.median_db(case.fresh_s + BACK_S, case.fresh_s + BACK_S + SCORED_S)
     assert after_db > empty_db + 3.0
     assert after_db > before_db - BACK_DB
 
