@@ -294,11 +294,10 @@ class LayeredField:
             self.refused = refused
             return
         self.refused -= {view.camera}
-        if view.depth is not None:
-            self.supervision.take_depth(camera, view, foreground)
+        believed = view.depth is not None and self.supervision.take_depth(camera, view, foreground)
         if camera.anew:
             return  # against an empty plate nothing is foreground
-        depth = view.depth if self.supervision.trusts_depth(view.camera) else None
+        depth = view.depth if believed else None
         view = replace(view, camera_to_world=camera.view.camera_to_world, depth=depth)
         instant_s = (view.generated_ns - self.origin_ns) / 1e9
         self.observations.add(Observation(instant_s, view.camera, view, foreground))

@@ -61,12 +61,18 @@ class StaticSupervision:
 
     # --- depth --------------------------------------------------------------------------------
 
-    def take_depth(self, camera: FixedCamera, view: View, foreground: NDArray[np.bool_]) -> None:
-        """Take in the depth of a frame that was taken into the camera's plate."""
+    def take_depth(self, camera: FixedCamera, view: View, foreground: NDArray[np.bool_]) -> bool:
+        """Take in the depth of a frame that was taken into the camera's plate. Returns whether it can be believed: it
+        contradicts neither the camera's earlier depth nor the other cameras'."""
         begun = self.times.now()
         assert view.depth is not None
-        self.make_depth_plate(camera).take(view.depth, foreground, camera.plate.pool)
+        plate = self.make_depth_plate(camera)
+        before = plate.refused
+        taken = plate.take(view.depth, foreground, camera.plate.pool)
+        if not taken and before == 0:
+            log.warning("%s: its depth contradicts what it measured before, and is left out", view.camera)
         self.times.add("depth plates", begun)
+        return taken and self.trusts_depth(view.camera)
 
     def make_depth_plate(self, camera: FixedCamera) -> DepthPlate:
         """A camera's depth plate, made once a frame of it brings depth."""

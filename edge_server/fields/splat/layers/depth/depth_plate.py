@@ -24,7 +24,7 @@ from edge_server.fields.splat.layers.depth.kernels.depth_plate import (
 )
 
 Arrays = dict[str, NDArray[Any]]
-_KEPT = ("samples", "count")  # of a state
+_KEPT = ("samples", "count", "refused")  # of a state
 
 
 @dataclass
@@ -32,20 +32,45 @@ class DepthPlate:
     """The last depths of each pixel of one camera.
 
     samples: float32 (H, W, KEPT), a ring of inverse depths, 1 / m. count: int32 (H, W), depths taken in.
+    refused: images in a row that contradicted it.
     """
 
     samples: NDArray[np.float32]
     count: NDArray[np.int32]
+    refused: int = 0
 
     @classmethod
     def empty(cls, height: int, width: int) -> DepthPlate:
         """A plate of a camera that has measured nothing yet."""
         return cls(np.zeros((height, width, tuned.KEPT), np.float32), np.zeros((height, width), np.int32))
 
-    def take(self, depth: NDArray[np.float32], foreground: NDArray[np.bool_], pool: Pool) -> None:
-        """Take in the depth of a frame. See ``kernels.depth_plate.remember_depths``."""
+    def take(self, depth: NDArray[np.float32], foreground: NDArray[np.bool_], pool: Pool) -> bool:
+        """Take in the depth of a frame, see ``kernels.depth_plate.remember_depths``.
+
+        Returns False, and takes nothing in, if it contradicts what was measured before. After MOST_REFUSED such images
+        in a row the plate begins anew.
+        """
         depth = np.array(depth, np.float32)  # another layout, or one that may not be written, would be compiled anew
+        if self._contradicts(depth, foreground):
+            self.refused += 1
+            if self.refused <= tuned.MOST_REFUSED:
+                return False
+            self.count[:] = 0
+        self.refused = 0
         pool.run(remember_depths, depth, foreground, self.samples, self.count)
+        return True
+
+    def _contradicts(self, depth: NDArray[np.float32], foreground: NDArray[np.bool_]) -> bool:
+        """Whether most of what stands still, looked at in some pixels, is far from where it was measured last: depth of
+        another unit, or of another camera."""
+        some = np.s_[:: tuned.LOOKED_AT, :: tuned.LOOKED_AT]
+        now, count = depth[some], self.count[some]
+        last = np.take_along_axis(self.samples[some], ((count - 1) % tuned.KEPT)[..., None], axis=2)[..., 0]
+        with np.errstate(invalid="ignore", over="ignore"):
+            both = (count >= tuned.LEAST) & ~foreground[some] & (now > 0.0) & np.isfinite(now)
+            ratio = (now * last)[both]
+        alike = np.count_nonzero((ratio > tuned.ALIKE) & (ratio < 1.0 / tuned.ALIKE))
+        return bool(ratio.size >= tuned.LEAST_LOOKED_AT and 2 * alike < ratio.size)
 
     def is_known(self, plate: NDArray[np.bool_]) -> bool:
         """Whether most of the pixels that measure anything have enough depths for a median. Others may be beyond the
@@ -64,7 +89,7 @@ class DepthPlate:
 
     def copied(self) -> DepthPlate:
         """The same with arrays of its own, for another thread."""
-        return DepthPlate(self.samples.copy(), self.count.copy())
+        return DepthPlate(self.samples.copy(), self.count.copy(), self.refused)
 
     def medians(self, pool: Pool) -> NDArray[np.float32]:
         """Inverse depth of each pixel, float32 (H, W), 1 / m; 0 unknown."""

@@ -14,6 +14,7 @@ from edge_server.fields import View
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.scene_box import SceneBox, scene_box
 from edge_server.fields.common.threads.thread_pool import Pool, compile_kernels
+from edge_server.fields.splat.layers import settings as of_layers
 from edge_server.fields.splat.layers.depth import settings as tuned
 from edge_server.fields.splat.layers.depth.body_depth import body_depth, seen_through
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
@@ -26,7 +27,6 @@ from edge_server.fields.splat.layers.depth.surfaces import Surface, SurfaceScene
 from edge_server.fields.splat.layers.depth.virtual_plates import virtual_plates
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation
 from edge_server.fields.splat.layers.plates import Plate
-from edge_server.fields.splat.layers.settings import LEAST_CAMERAS, STEREO_CAMERAS
 from edge_server.fields.splat.layers.static_layer import PlateImage
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import Pinhole
@@ -139,7 +139,7 @@ class DepthSupervision:
         surfaces = [self._corrected(c, measured.get(c.name)) for c in cameras]
         poses = [surface.pose for surface in surfaces]
         whole = _are_whole(cameras, surfaces)
-        if not whole and LEAST_CAMERAS <= len(cameras) <= STEREO_CAMERAS:
+        if not whole and of_layers.LEAST_CAMERAS <= len(cameras) <= of_layers.STEREO_CAMERAS:
             whole = True  # what stereo does not find no other camera sees either
             distance_m = scene_box([camera.plate.view for camera in cameras]).distance_m
             surfaces = fill_by_stereo(surfaces, distance_m, self.pool)

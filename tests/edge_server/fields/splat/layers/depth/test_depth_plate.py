@@ -133,3 +133,21 @@ def test_most_pixels_that_measure_anything_must_have_depth() -> None:
         assert not plate.is_known(everywhere)
         plate.take(depth, nothing, POOL)
     assert plate.is_known(everywhere) and not plate.is_known(nothing)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("factor", [10.0, 0.1, 1000.0, 0.3048])
+def test_depth_of_another_unit_is_refused_until_it_stays(factor: float) -> None:
+    depth, nothing = np.full((24, 24), 2.0, np.float32), np.zeros((24, 24), bool)
+    plate, pool = DepthPlate.empty(24, 24), CallerPool()
+    assert all(plate.take(depth, nothing, pool) for _ in range(4))
+    # A person in the middle is no other unit, nor are holes.
+    near = depth.copy()
+    near[8:16] = 0.8
+    near[16:20] = 0.0
+    assert plate.take(near, nothing, pool)
+    wrong = depth * np.float32(factor)
+    assert not any(plate.take(wrong, nothing, pool) for _ in range(settings.MOST_REFUSED))
+    np.testing.assert_allclose(plate.medians(pool), 0.5)
+    assert all(plate.take(wrong, nothing, pool) for _ in range(4)) and plate.refused == 0
+    np.testing.assert_allclose(plate.medians(pool), 0.5 / factor, rtol=1e-5)
