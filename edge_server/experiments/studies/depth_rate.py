@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 from camera_node.capture import Camera
 from edge_server.experiments.common.folders import Folders
-from edge_server.experiments.common.seed_table import Row
+from edge_server.experiments.common.seed_table import Row, SeedTable
 from edge_server.experiments.common.tables import mean_or_none
-from edge_server.experiments.studies.drawing import curves
+from edge_server.experiments.studies.drawing import curves, draw_images, several
 from edge_server.experiments.studies.findings import better
 from edge_server.experiments.studies.study import Claim, Study, StudyRequest, open_engine
 from edge_server.experiments.studies.trial import scenario_of, scenes_here
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
 from edge_server.experiments.virtual.simulate import usual_settings
+from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.scorer import SHOWN
+from edge_server.live.scoring_thread import to_bytes
 from edge_server.settings import read_config
 from freshfield.frame import Frame, to_request
 from freshfield.scenario import Scenario
@@ -25,6 +28,7 @@ NONE, SOME, EACH = 0, 5, 1  # every n-th frame brings depth
 WIDTHS_MBIT = (0.0, 8.0, 2.0)  # of each camera's line; 0: unbounded
 _SECONDS, _QUICK_SECONDS = 12.0, 6.0
 _SCORED_FROM = 2.0 / 3.0  # of the run
+_OF_FRAMES = {NONE: "no frame", SOME: "each fifth frame", EACH: "each frame"}
 METRICS = ("shown_psnr_db", "shown_psnr_moving_db", "aaoi_ms", "kilobytes_per_s")
 
 
@@ -86,10 +90,7 @@ def run_with_depth(run: DepthRun, folders: Folders) -> Row:
     shown_psnr_db, shown_psnr_moving_db: of what is shown at random instants. aaoi_ms: mean age of used views.
     kilobytes_per_s: what all cameras send. fps: of each. Raises ScenarioError or DatasetError.
     """
-    scenario = run.scenario()
-    cameras = training_cameras(scenario, folders.data)
-    deployment = build_deployment(scenario, usual_settings(read_config(scenario)), cameras=cameras, data=folders.data)
-    deployment.run(run.seconds)
+    deployment, cameras = _deployed(run, folders)
     since_s = _SCORED_FROM * run.seconds
     shown = [score for score in deployment.shown if score.published_ns >= 1e9 * since_s]
     ages = [p.aaoi_ms for p in deployment.publications if p.t_s >= since_s]
@@ -100,6 +101,32 @@ def run_with_depth(run: DepthRun, folders: Folders) -> Row:
         "kilobytes_per_s": 1e-3 * fps * sum(_message_bytes(camera) for camera in cameras),
         "fps": fps,
     }
+
+
+def _deployed(run: DepthRun, folders: Folders) -> tuple[VirtualDeployment, list[Camera]]:
+    """The deployment at the end of the run, and its training cameras."""
+    scenario = run.scenario()
+    cameras = training_cameras(scenario, folders.data)
+    deployment = build_deployment(scenario, usual_settings(read_config(scenario)), cameras=cameras, data=folders.data)
+    deployment.run(run.seconds)
+    return deployment, cameras
+
+
+def _draw_images(request: StudyRequest, table: SeedTable) -> None:
+    """Draw the last instant of each scene to OUT/depth-pictures.png: the truth, and what is shown by rate of depth."""
+    rows: list[tuple[str, list[tuple[str, Any]]]] = []
+    for run in _cases(replace(request, seeds=1)):
+        if run.megabits_per_s:
+            continue
+        deployment, _ = _deployed(run, request.folders)
+        present_ns, truth = deployment.clock.now_ns(), deployment.truth
+        assert truth is not None  # studies take scenes of which some camera is held out
+        image, lens, pose = truth.view(run.scenario().held_out[0], truth.nearest_ns(present_ns))
+        color = deployment.updates.field.snapshot(present_ns).render(pose, lens).color
+        if run.every == NONE:
+            rows.append((run.scene, [("truth", image)]))
+        rows[-1][1].append((f"depth of {_OF_FRAMES[run.every]}", to_bytes(color)))
+    draw_images(request.out / "depth-pictures.png", rows)
 
 
 def _message_bytes(camera: Camera) -> float:
@@ -133,5 +160,5 @@ DEPTH = Study(
         ),
     ),
     ("scene", "line"),
-    curves("depth", "depth_hz", "frames with depth a second", METRICS, "line"),
+    several(curves("depth", "depth_hz", "frames with depth a second", METRICS, "line"), _draw_images),
 )

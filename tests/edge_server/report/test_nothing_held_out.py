@@ -78,7 +78,7 @@ def metrics(folder: Path, on: str) -> str:
     newest = replace(publication(0), psnr_db=20.0, scored_on=on)
     state = SimpleNamespace(cameras=list, newest=lambda scored=False: newest)
     buffer = SimpleNamespace(shed=0)
-    ingest = SimpleNamespace(rejected={}, buffer=buffer, check_ms=SimpleNamespace(percentile=lambda _: None))
+    ingest = SimpleNamespace(rejected={}, depth={}, buffer=buffer, check_ms=SimpleNamespace(percentile=lambda _: None))
     found = EdgeCollector(state, ingest).collect()
     return next(family.documentation for family in found if family.name == "freshfield_psnr_db")
 

@@ -140,9 +140,10 @@ class DepthSupervision:
         poses = [surface.pose for surface in surfaces]
         whole = _are_whole(cameras, surfaces)
         if not whole and of_layers.LEAST_CAMERAS <= len(cameras) <= of_layers.STEREO_CAMERAS:
-            whole = True  # what stereo does not find no other camera sees either
             distance_m = scene_box([camera.plate.view for camera in cameras]).distance_m
-            surfaces = fill_by_stereo(surfaces, distance_m, self.pool)
+            filled = fill_by_stereo(surfaces, distance_m, self.pool)
+            if filled is not None:
+                surfaces, whole = filled, True  # what stereo does not find no other camera sees either
         surfaces = [surface for surface in surfaces if surface.inverse.any()]
         plates = [
             camera.learned._replace(view=replace(camera.learned.view, camera_to_world=pose))

@@ -26,14 +26,23 @@ from freshfield.geometry import Pinhole, se3_inverse
 Image = NDArray[np.float32]
 
 
-def fill_by_stereo(surfaces: Sequence[Surface], distance_m: float, pool: Pool) -> list[Surface]:
-    """The surfaces with the depth that stereo finds where they have none. distance_m: see ``sweep_plates``."""
+def fill_by_stereo(surfaces: Sequence[Surface], distance_m: float, pool: Pool) -> list[Surface] | None:
+    """The surfaces with the depth that stereo finds where they have none; None where it cannot be believed: it finds
+    little, or sensors measured something else at too many of its pixels. distance_m: see ``sweep_plates``."""
+    swept = sweep_plates(surfaces, distance_m, pool)
+    if sum(map(np.count_nonzero, swept)) < tuned.SWEEP_LEAST * sum(np.count_nonzero(s.known) for s in surfaces):
+        return None
+    pairs = [np.stack([s.inverse, found])[:, (s.inverse > 0) & (found > 0)] for s, found in zip(surfaces, swept)]
+    measured, ours = np.concatenate(pairs, axis=1)
+    agree = np.count_nonzero(np.abs(np.log(ours / measured)) < tuned.SWEEP_AGREE)
+    if agree < tuned.SWEEP_TRUSTED * len(ours):
+        return None
     out, noise = [], tuned.SWEEP_NOISE / (tuned.SWEEP_STEPS * tuned.SWEEP_NEAR * distance_m)
-    for surface, found in zip(surfaces, sweep_plates(surfaces, distance_m, pool)):
+    for surface, found in zip(surfaces, swept):
         inverse, slope = smooth(found, surface.color, pool, noise)
-        measured = surface.inverse > 0
-        inverse = np.where(measured, surface.inverse, inverse)
-        out.append(replace(surface, inverse=inverse, slope=np.where(measured[..., None], surface.slope, slope)))
+        known = surface.inverse > 0
+        inverse = np.where(known, surface.inverse, inverse)
+        out.append(replace(surface, inverse=inverse, slope=np.where(known[..., None], surface.slope, slope)))
     return out
 
 

@@ -109,3 +109,5 @@ SWEEP_SMALL, SWEEP_LARGE = 0.03, 8.0  # penalties of one step of depth between n
 SWEEP_EDGE = 10.0  # the latter falls to half at a change of gray of the inverse of this
 SWEEP_DISTINCT = 0.02  # cost, in the same unit, by which depths must be better than others: walls of one color are not
 SWEEP_AGREE = 0.05  # difference of log depth at which another camera confirms
+SWEEP_TRUSTED = 0.5  # least share of what stereo finds that sensors, where they measure, must confirm as far as that
+SWEEP_LEAST = 0.15  # least share of the plates whose depth stereo finds: .36 with two cameras of `room`

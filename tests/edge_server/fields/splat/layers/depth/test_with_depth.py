@@ -12,7 +12,6 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
-from edge_server.fields.splat.layers import settings as layer_settings
 from edge_server.fields.splat.layers.depth import settings as depth_settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.settings import SplatSettings
@@ -30,7 +29,6 @@ Spoil = Callable[[int, int, NDArray[np.float32]], NDArray[np.float32] | None]
 @pytest.fixture(autouse=True)
 def _shown_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(depth_settings, "SHOWN_AFTER", (20, 40))
-    monkeypatch.setattr(layer_settings, "STEREO_CAMERAS", 0)  # what is measured alone counts here
 
 
 def _ball_m(instant_s: float) -> NDArray[np.float64]:
@@ -122,7 +120,9 @@ def test_with_a_budget_in_seconds_the_long_work_is_done_beside() -> None:
     field = LayeredField(SMALL)
     for frame in range(20):
         field.fit([_frame(k, frame) for k in range(3)], Budget(seconds=0.02))
-    while field.static.training and not field.static.ready:
+    for _ in range(1500):  # where the machine is busy, the work beside begins late
+        if field.static.ready:
+            break
         field.fit([_frame(k, 20) for k in range(3)], Budget(seconds=0.02))
     assert field.static.ready and field.supervision.with_depth
     field.static.stop()
