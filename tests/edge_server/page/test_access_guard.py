@@ -131,7 +131,7 @@ def metrics() -> int:
 
 POINTS = np.random.default_rng(0).random((300_000, 3), np.float32)  # 4.5 MB to send
 INGEST = SimpleNamespace(
-    rejected={}, buffer=SimpleNamespace(shed=0), check_ms=SimpleNamespace(percentile=lambda percent: None)
+    rejected={}, depth={}, buffer=SimpleNamespace(shed=0), check_ms=SimpleNamespace(percentile=lambda percent: None)
 )
 
 
