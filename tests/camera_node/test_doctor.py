@@ -12,6 +12,7 @@ import yaml
 
 from camera_node import doctor
 from camera_node.cli import main
+from camera_node.coverage_check import REACHED, REACHED_WITH_DEPTH
 from freshfield.clock import WallClock
 from freshfield.scenario import load
 from freshfield.transport import Transport
@@ -19,6 +20,7 @@ from tests.camera_node.robot.arm.simulated import simulated_arm
 from tests.camera_node.sources.datasets.photos import write_photos
 from tests.camera_node.sources.devices.mjpeg import NetworkCamera
 from tests.camera_node.sources.devices.test_live import CALIBRATION
+from tests.conftest import ROOT
 from tests.integration.peer import Peer
 
 
@@ -190,3 +192,11 @@ def test_what_fixed_cameras_see_is_reckoned_and_drawn(capsys, tmp_path):
     _, parts = examined(capsys, "quad", "--plan", str(drawn))
     assert parts["coverage"][0] and "50 % by two or more, 54 degrees apart. One more camera" in parts["coverage"][1]
     assert drawn.read_text().count("<polygon") == 4 + 1
+    assert "before 4 cameras with depth sensors was shown at 26 dB, 22 where it moves" in parts["coverage"][1]
+
+
+def test_what_doctor_promises_was_measured():
+    rigs = json.loads((ROOT / "docs/results/few-cameras.json").read_text())["rigs"]
+    measured = {n: (rigs[k]["mean_db"], rigs[k]["mean_moving_db"]) for n, k in ((2, "duo"), (3, "room3"), (4, "quad"))}
+    assert measured == REACHED_WITH_DEPTH
+    assert REACHED[4] == (rigs["room4plain"]["mean_db"], rigs["room4plain"]["mean_moving_db"])
