@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
-from freshfield.limits import MAX_DEPTH_LENSES
+from freshfield.limits import MAX_DEPTH_POINTS, MAX_DEPTH_RAYS_BYTES
+
+_Lens = tuple[Pinhole, Pose | None, int]
+_kept: dict[_Lens, NDArray[np.float32]] = {}  # rays of lenses, the one that was used longest ago first
+_keeping = Lock()
 
 
 def depth_in_image(depth: DepthImage, lens: Pinhole, halvings: int) -> NDArray[np.float32]:
@@ -19,14 +25,17 @@ def depth_in_image(depth: DepthImage, lens: Pinhole, halvings: int) -> NDArray[n
 
     Each pixel takes the measurement nearest to its center: a mean over pixels would lie between two surfaces. Depth
     of a lens of its own is first moved into the image, at the coarser of both resolutions, so that no gaps open
-    between its pixels; of what lands on one pixel the nearest surface counts.
+    between its pixels; of what lands on one pixel the nearest surface counts. Of depth with more than
+    ``MAX_DEPTH_POINTS`` pixels for each of the image's, only each n-th row and column is moved.
     """
     image = lens.halved(halvings)
     if depth.intrinsics is None:
         height, width = depth.counts.shape
         return _sampled(depth.meters(), image, 2.0**halvings * width / lens.width, 2.0**halvings * height / lens.height)
-    grid = image.scaled(min(1.0, depth.intrinsics.fx / image.fx, depth.intrinsics.fy / image.fy))
-    moved = _moved(depth, depth.intrinsics, grid)
+    sensor = depth.intrinsics
+    step = _step(sensor, image)
+    grid = image.scaled(min(1.0, sensor.fx / (step * image.fx), sensor.fy / (step * image.fy)))
+    moved = _moved(depth, sensor, grid, step)
     return _sampled(moved, image, grid.width / image.width, grid.height / image.height)
 
 
@@ -39,9 +48,14 @@ def _sampled(depth: NDArray[np.float32], image: Pinhole, per_column: float, per_
     return depth[rows[:, None], columns]
 
 
-def _moved(depth: DepthImage, sensor: Pinhole, grid: Pinhole) -> NDArray[np.float32]:
-    """Depth in the pixels of ``grid``, the image's lens at some resolution, meters."""
-    step = max(1, int(min(sensor.fx / grid.fx, sensor.fy / grid.fy)))
+def _step(sensor: Pinhole, image: Pinhole) -> int:
+    """Every so many-th row and column of the sensor is moved. A wide sensor's resolution alone would not bound them."""
+    points = sensor.width * sensor.height / (MAX_DEPTH_POINTS * image.width * image.height)
+    return max(1, int(min(sensor.fx / image.fx, sensor.fy / image.fy)), math.ceil(math.sqrt(points)))
+
+
+def _moved(depth: DepthImage, sensor: Pinhole, grid: Pinhole, step: int) -> NDArray[np.float32]:
+    """Depth in the pixels of ``grid``, the image's lens at some resolution, meters; of each ``step``-th pixel."""
     z = depth.counts[step // 2 :: step, step // 2 :: step] * np.float32(depth.meters_per_count)
     points = _directions(sensor, depth.to_camera, step) * z[..., None]
     if depth.to_camera is not None:
@@ -58,16 +72,31 @@ def _moved(depth: DepthImage, sensor: Pinhole, grid: Pinhole) -> NDArray[np.floa
     return out.reshape(grid.height, grid.width)
 
 
-@lru_cache(MAX_DEPTH_LENSES)
 def _directions(sensor: Pinhole, to_camera: Pose | None, step: int) -> NDArray[np.float32]:
-    """Each ``step``-th pixel's point at depth 1, turned into the camera's axes, float32 (H, W, 3)."""
+    """Each ``step``-th pixel's point at depth 1, turned into the camera's axes, float32 (H, W, 3).
+
+    Those of the lenses used last are kept, up to ``MAX_DEPTH_RAYS_BYTES`` in all.
+    """
+    lens = (sensor, to_camera, step)
+    with _keeping:
+        found = _kept.pop(lens, None)
+        if found is None:
+            found = _turned_rays(sensor, to_camera, step)
+        _kept[lens] = found
+        while sum(rays.nbytes for rays in _kept.values()) > MAX_DEPTH_RAYS_BYTES:
+            del _kept[next(iter(_kept))]
+    return found
+
+
+def _turned_rays(sensor: Pinhole, to_camera: Pose | None, step: int) -> NDArray[np.float32]:
+    """See ``_directions``."""
     u, v = np.meshgrid(np.arange(step // 2, sensor.width, step), np.arange(step // 2, sensor.height, step))
     rays = sensor.rays(np.stack([u, v], -1) + 0.5)
     turned = rays if to_camera is None else rays @ to_camera.matrix()[:3, :3].T
     return (turned / rays[..., 2:]).astype(np.float32)
 
 
-@lru_cache(MAX_DEPTH_LENSES)
+@lru_cache
 def _reach(image: Pinhole) -> float:
     """Tangent of the largest angle between the optical axis and a pixel's corner."""
     u, v = np.meshgrid(np.linspace(0, image.width, 33), np.linspace(0, image.height, 33))

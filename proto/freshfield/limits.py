@@ -25,9 +25,13 @@ and OAK cameras have 1280 columns at most."""
 METERS_PER_COUNT = (1e-6, 1.0)
 """Scale of depth in 16 bits: at the least its range is 6.5 cm, less than any sensor's, at the most 65 km."""
 
-MAX_DEPTH_LENSES = 24
-"""Lenses of depth sensors of which the edge keeps the rays, up to 20 MB each: more cameras than any rig here has, and
-few, because a hostile sender's lens may differ in each frame."""
+MAX_DEPTH_POINTS = 6
+"""Pixels of depth, for each of its image, that the edge moves there: all of 848 x 480 in an image of 320 x 240.
+Without a bound, 1280 x 1280 in a small image cost .3 to .5 s, and may be a payload of 133 bytes."""
+
+MAX_DEPTH_RAYS_BYTES = 96 << 20
+"""Rays of depth sensors' lenses that the edge keeps, 12 bytes for each pixel that it moves into the image: those of 24
+lenses of 640 x 480 or 8 of 1280 x 720. Bounded, because a hostile sender's lens may differ in each frame."""
 
 MAX_DEPTH_GAP_NS = 10**10
 """Time between an image and its depth. Streams of a camera are some 100 ms apart, replays of a slow sensor seconds."""

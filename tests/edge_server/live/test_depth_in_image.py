@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edge_server.live import depth_in_image as module
 from edge_server.live.depth_in_image import depth_in_image
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
+from freshfield.limits import MAX_DEPTH_POINTS
 
 IMAGE = Pinhole.from_fov(64, 48, 70.0)
 SENSOR = Pinhole(80, 60, 70.0, 70.0, 41.0, 29.0)
@@ -122,3 +124,32 @@ def test_a_lens_with_distortion_takes_in_only_what_it_sees():
     assert outside.any()
     found = depth_in_image(depth(np.where(outside, 500, 2000), intrinsics=wide), lens, 0)
     assert not (found == np.float32(0.5)).any() and (found == np.float32(2.0)).mean() > 0.5
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("fov_deg", [70.0, 100.0, 175.0])
+def test_large_depth_costs_about_as_much_as_its_small_image(fov_deg):
+    """Fine, wide and very wide: few points are moved, and they leave no gaps."""
+    image, sensor = Pinhole.from_fov(128, 128, 60.0), Pinhole.from_fov(1280, 1280, fov_deg)
+    module._kept.clear()
+    found = depth_in_image(depth(np.full((1280, 1280), 2000), intrinsics=sensor), image, 0)
+    (rays,) = module._kept.values()
+    assert rays[..., 0].size <= 1.02 * MAX_DEPTH_POINTS * found.size < 1280 * 1280 / 16
+    assert (found == np.float32(2.0)).mean() > 0.97
+
+
+@pytest.mark.stability
+def test_lenses_that_differ_in_each_frame_do_not_fill_the_memory(monkeypatch):
+    counts = np.full((60, 80), 2000)
+    rays_bytes = 60 * 80 * 12
+    monkeypatch.setattr(module, "MAX_DEPTH_RAYS_BYTES", 3 * rays_bytes)
+    module._kept.clear()
+    lenses = [replace(SENSOR, cx=40.0 + 0.01 * k) for k in range(9)]
+    for lens in lenses:
+        for each in (lens, lenses[0]):  # the first is used all the time, and stays
+            assert (depth_in_image(depth(counts, intrinsics=each), IMAGE, 0) > 0).mean() > 0.6
+    kept = [lens for lens, _, _ in module._kept]
+    assert kept == [*lenses[-2:], lenses[0]]
+    monkeypatch.setattr(module, "MAX_DEPTH_RAYS_BYTES", rays_bytes - 1)
+    assert (depth_in_image(depth(counts, intrinsics=lenses[1]), IMAGE, 0) > 0).mean() > 0.6
+    assert not module._kept
