@@ -297,7 +297,7 @@ class LayeredField:
         believed = view.depth is not None and self.supervision.take_depth(camera, view, foreground)
         if camera.anew:
             return  # against an empty plate nothing is foreground
-        depth = view.depth if believed else None
+        depth = view.depth if believed and _is_measured_with(view) else None
         view = replace(view, camera_to_world=camera.view.camera_to_world, depth=depth)
         instant_s = (view.generated_ns - self.origin_ns) / 1e9
         self.observations.add(Observation(instant_s, view.camera, view, foreground))
@@ -387,6 +387,13 @@ class LayeredField:
             params[:, COLOR:] *= np.tile(gain, (params.shape[1] - COLOR) // 3)
             self._exposed = (shown, gain.tobytes(), Gaussians(params, self.settings.sh_degree))
         return self._exposed[2]
+
+
+def _is_measured_with(view: View) -> bool:
+    """Whether a view's depth shows what moves where its image does."""
+    from edge_server.fields.splat.layers.depth.settings import BODY_GAP_NS  # only where a camera measures depth
+
+    return view.depth_ns is None or abs(view.depth_ns - view.generated_ns) <= BODY_GAP_NS
 
 
 make = LayeredField

@@ -67,6 +67,9 @@ DARK, BRIGHT = 20.0, 235.0  # only plates between these are used to estimate exp
 # Foreground is wider than what moves, and holds its shadow: what moves differs from the plate by more than this (of
 # 255), and is nearer by so many meters and by so large a share of the plate's depth.
 BODY_OFF_PLATE, BODY_NEARER_M, BODY_NEARER = 16.0, 0.1, 0.03
+# Depth measured longer before or after its image tells nothing of what moves: at 1 m / s it is 5 cm off, about as much
+# as BODY_THROUGH_M. What stands still is learned from it all the same.
+BODY_GAP_NS = 50_000_000
 BODY_RADIUS_PX = 2  # pixels about one whose median says whether it was measured well, and whose mean its depth is
 BODY_LEAST = 4  # of them, that must have measured
 BODY_FLYING = 0.5 / _DISPARITY_PX_M  # 1 / m: farther from the median it flies between two surfaces

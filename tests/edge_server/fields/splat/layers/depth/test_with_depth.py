@@ -100,6 +100,20 @@ def test_each_fifth_depth_does() -> None:
     assert _score(field, 39) > _usual("exact") - 1.0
 
 
+def test_depth_of_another_instant_says_nothing_of_what_moves() -> None:
+    """The plates keep it; the moving set takes only what was measured within BODY_GAP_NS of the image."""
+    gaps_ns = (0, depth_settings.BODY_GAP_NS, -depth_settings.BODY_GAP_NS - 1)
+    field = LayeredField(SMALL)
+    for frame in range(16):
+        views = [_frame(k, frame) for k in range(3)]
+        late = [replace(v, depth_ns=v.generated_ns + gap_ns) for v, gap_ns in zip(views, gaps_ns)]
+        field.fit(late, Budget(steps=5))
+    measured = {o.camera for o in field.observations if o.view.depth is not None}
+    assert measured == {view.camera for view in CAMERAS[:2]}
+    plate = field.cameras[CAMERAS[2].camera].depth
+    assert field.tracker is not None and plate is not None and plate.count.any()
+
+
 def test_a_camera_without_depth_beside_others_is_learned_too() -> None:
     field = LayeredField(SMALL)
     _run(field, range(40), lambda camera, frame, depth: None if camera == 1 else depth)
