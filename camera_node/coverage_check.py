@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from camera_node.settings import LiveConfig, SourceConfig
+from camera_node.sources.base import Source
 from camera_node.sources.registry import open_sources
 from freshfield.coverage import Camera, plan_svg, reckon
 from freshfield.scenario import Scenario
@@ -13,7 +15,7 @@ from freshfield.scenario import Scenario
 # (docs/results/few-cameras.json), and without (docs/fields.md).
 REACHED_WITH_DEPTH = {2: (22.2, 18.4), 3: (24.5, 21.2), 4: (26.0, 22.0)}
 REACHED = {2: (15.2, 16.1), 3: (18.1, 19.4), 4: (20.2, 21.4), 6: (25.2, 23.4), 8: (27.0, 24.6), 12: (29.2, 25.3)}
-_LATER = 30  # shots from the first to the one that tells whether a camera moves
+_TICKS = (0, 7, 30)  # whose shots tell whether a camera moves that never repeats one
 
 
 def check(scenario: Scenario, config: SourceConfig, data: Path | None, plan: Path | None) -> str:
@@ -61,9 +63,16 @@ def _fixed_cameras(scenario: Scenario, config: SourceConfig, data: Path | None) 
         return {c: (k.intrinsics, k.pose.matrix()) for c, k in known.items() if c in training and k.pose is not None}
     found: dict[str, Camera] = {}
     for camera, source in open_sources(scenario, config, training, data).items():
-        first, later = (source.read(source.content(tick)) for tick in (0, _LATER))
+        first, *later = (source.read(content) for content in _compared(source))
         source.release()
-        if first.pose != later.pose:
+        if any(shot.pose != first.pose for shot in later):
             return None
         found[camera] = (first.intrinsics, first.pose.matrix())
     return found
+
+
+def _compared(source: Source) -> Sequence[int]:
+    """Numbers of the shots whose poses are compared: up to three, spread over those that repeat."""
+    if source.contents is None:
+        return [source.content(tick) for tick in _TICKS]
+    return range(0, source.contents, -(-source.contents // 3))

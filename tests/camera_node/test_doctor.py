@@ -10,14 +10,16 @@ from pathlib import Path
 import pytest
 import yaml
 
-from camera_node import doctor
+from camera_node import coverage_check, doctor
 from camera_node.cli import main
 from camera_node.coverage_check import REACHED, REACHED_WITH_DEPTH
+from camera_node.settings import source_config
+from camera_node.sources.registry import open_sources
 from freshfield.clock import WallClock
 from freshfield.scenario import load
 from freshfield.transport import Transport
 from tests.camera_node.robot.arm.simulated import simulated_arm
-from tests.camera_node.sources.datasets.photos import write_photos
+from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 from tests.camera_node.sources.devices.mjpeg import NetworkCamera
 from tests.camera_node.sources.devices.test_live import CALIBRATION
 from tests.conftest import ROOT
@@ -200,3 +202,23 @@ def test_what_doctor_promises_was_measured():
     measured = {n: (rigs[k]["mean_db"], rigs[k]["mean_moving_db"]) for n, k in ((2, "duo"), (3, "room3"), (4, "quad"))}
     assert measured == REACHED_WITH_DEPTH
     assert REACHED[4] == (rigs["room4plain"]["mean_db"], rigs["room4plain"]["mean_moving_db"])
+
+
+@pytest.mark.parametrize(("count", "carried"), [(3, 2), (7, 6), (35, 30)])
+def test_a_camera_that_is_carried_is_not_taken_for_a_fixed_one(tmp_path, count, carried):
+    """Its photos loop: shot 30 of 2, 6 or 30 of them is shot 0 again. Each eighth is a held-out camera's."""
+    file = write_photos(tmp_path / "set", count)
+
+    def said(loop):
+        scenario = photo_scenario(file, 2, loop=loop)
+        config = source_config(scenario)
+        assert open_sources(scenario, config, ["cam01"], None)["cam01"].contents == carried
+        return coverage_check.check(scenario, config, None, None)
+
+    for loop in ("back-and-forth", "restart"):
+        assert said(loop) == "not reckoned: the cameras move"
+    data = json.loads(file.read_text())
+    for frame in data["frames"]:
+        frame["transform_matrix"] = data["frames"][0]["transform_matrix"]
+    file.write_text(json.dumps(data))
+    assert not said("restart").startswith("not reckoned")
