@@ -11,6 +11,7 @@ one transform stands still. Needs the extra ``mcap``.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -43,7 +44,8 @@ _POSE_NEAR_NS = 50_000_000
 
 @dataclass
 class _Camera:
-    """What a file holds of one camera. images, depths: stamp (ns), topic and log time, by which it is read again."""
+    """What a file holds of one camera. images, depths: stamp (ns), topic and log time, by which it is read again; in
+    the order of time."""
 
     images: list[tuple[int, str, int]] = field(default_factory=list)
     depths: list[tuple[int, str, int]] = field(default_factory=list)
@@ -70,8 +72,7 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
                 unposed += 1
                 continue
             read = partial(_read_image, file, at, camera.lens, options)
-            near = min(camera.depths, key=lambda d, t_ns=t_ns: abs(d[0] - t_ns), default=None)  # type: ignore[misc]
-            depth = None
+            depth, near = None, _nearest(camera.depths, t_ns)
             if near is not None and abs(near[0] - t_ns) <= _NEAR_NS:
                 depth = partial(_read_depth, file, near[1:], camera.lens, options, near[0] - t_ns)
             t_s = (t_ns - start_ns) / 1e9
@@ -84,7 +85,7 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
 
 
 def _index(file: Path) -> dict[str, _Camera]:
-    """The cameras by ``frame_id``, their images in the order of time."""
+    """The cameras by ``frame_id``."""
     cameras: dict[str, _Camera] = {}
     for kind, message, topic, log_ns in _messages(file):
         stamp_ns = message.timestamp.ToNanoseconds() if message.HasField("timestamp") else log_ns
@@ -104,7 +105,14 @@ def _index(file: Path) -> dict[str, _Camera]:
             camera.images.append((stamp_ns, topic, log_ns))
     for camera in cameras.values():
         camera.images.sort()
+        camera.depths.sort()
     return cameras
+
+
+def _nearest(ordered: Sequence[tuple[int, str, int]], t_ns: int) -> tuple[int, str, int] | None:
+    """Of messages in the order of time the one stamped nearest to ``t_ns``; of two as near the earlier."""
+    after = bisect_left(ordered, (t_ns,))
+    return min(ordered[max(0, after - 1) : after + 1], key=lambda message: abs(message[0] - t_ns), default=None)
 
 
 def _messages(file: Path, **chosen: Any) -> Iterator[tuple[str, Any, str, int]]:

@@ -10,6 +10,7 @@ import pytest
 
 from camera_node.sources.datasets.formats import open_dataset
 from camera_node.sources.datasets.records import DatasetError
+from camera_node.sources.datasets.rgbd.foxglove import _nearest
 from freshfield.geometry import Pose, look_at
 
 mcap = pytest.importorskip("mcap_protobuf.writer", reason="needs the extra mcap")
@@ -81,6 +82,17 @@ def test_images_depth_and_poses_of_a_recording(tmp_path, encoding):
         assert measured.after_image_ns == 8_000_000 and measured.intrinsics is None
     small = open_dataset(file, scale=2.0)[1][0]
     assert small.read().shape == (12, 16, 3) and small.depth().counts.shape == (12, 16)
+
+
+def test_an_image_gets_the_depth_nearest_in_time():
+    rng = np.random.default_rng(2)
+    for count in (0, 1, 2, 40):
+        messages = sorted((int(t_ns), "/depth", n) for n, t_ns in enumerate(rng.integers(0, 100, count)))
+        for t_ns in range(-3, 103):
+            found = _nearest(messages, t_ns)
+            distances = [abs(message[0] - t_ns) for message in messages]
+            assert (found is None) == (not messages)
+            assert found is None or abs(found[0] - t_ns) == min(distances)
 
 
 @pytest.mark.stability
