@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import logging
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -19,6 +20,8 @@ from freshfield import payload
 from freshfield.clock import Clock
 from freshfield.depth import EncodedDepth
 from freshfield.scenario import Scenario
+
+log = logging.getLogger("camera-node")
 
 
 class ShotCache:
@@ -54,6 +57,8 @@ class Camera:
     config: gives codec and quality. cache: shared by the process's cameras.
     clock_error: makes the camera's clock wrong; None: it is right.
     depth_every: of so many shots of the source one is sent with its depth, where it has any; 0: none.
+
+    depth_failed: number of shots made whose depth could not be made or sent, and which go without.
     """
 
     def __init__(
@@ -76,6 +81,7 @@ class Camera:
         self._cache = cache
         self._clock_error = clock_error
         self._depth_every = depth_every
+        self.depth_failed = 0
 
     def clock(self, true: Clock) -> NodeClock:
         """The clock with which this camera stamps frames. true: tells the true time."""
@@ -101,7 +107,8 @@ class Camera:
         """The tick's shot, from the cache or newly made. Making it takes milliseconds: do not call this on
         the event loop.
 
-        Raises ValueError if the source has no such shot or it cannot be sent, OSError if its file is gone.
+        Raises ValueError if the source has no such shot or its image cannot be sent, OSError if its file is gone. A
+        shot whose depth alone fails comes without depth.
         """
         return self.shot(self.source.content(tick))
 
@@ -135,14 +142,24 @@ class Camera:
         if not isinstance(data, bytes):
             data = payload.encode(data, self.codec, self._quality)
         payload.check(data, self.codec, shot.intrinsics.width, shot.intrinsics.height)
-        depth = self._encode_depth(content, shot)
-        if depth is not None:
-            depth.check(shot.intrinsics, len(data))
+        depth = self._depth_to_send(content, shot, len(data)) if self._depth_every else None
         return replace(shot, image=data, depth=None, encoded_depth=depth)
 
-    def _encode_depth(self, content: int, shot: Shot) -> EncodedDepth | None:
-        if not self._depth_every:
+    def _depth_to_send(self, content: int, shot: Shot, image_bytes: int) -> EncodedDepth | None:
+        """The shot's depth; None where it brings none, or only such as cannot be sent: that costs the depth alone, is
+        counted, and logged the first time."""
+        try:
+            depth = self._encode_depth(content, shot)
+            if depth is not None:
+                depth.check(shot.intrinsics, image_bytes)
+        except (ValueError, OSError) as error:
+            if not self.depth_failed:
+                log.warning("%s: a frame without its depth: %s (further ones are only counted)", self.name, error)
+            self.depth_failed += 1
             return None
+        return depth
+
+    def _encode_depth(self, content: int, shot: Shot) -> EncodedDepth | None:
         if isinstance(self.source, ScheduledSource):  # replayed as it came
             return shot.encoded_depth
         wanted = content * DEPTH_STEP % 2**32 * self._depth_every < 2**32

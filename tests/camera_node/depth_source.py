@@ -15,11 +15,20 @@ LENS = Pinhole.from_fov(32, 24, 60.0)
 
 
 class DepthSource(Source):
-    """contents: see ``Source``. depth: keys of each shot's ``DepthImage``, whose counts are the shot's number + 1."""
+    """contents: see ``Source``. unit: meters a count. error: raised instead of giving depth. depth: further keys of
+    each shot's ``DepthImage``, whose counts are the shot's number + 1."""
 
-    def __init__(self, camera: str, contents: int | None = None, fps: float = 10.0, **depth) -> None:
+    def __init__(
+        self,
+        camera: str,
+        contents: int | None = None,
+        fps: float = 10.0,
+        unit: float = 0.001,
+        error: Exception | None = None,
+        **depth,
+    ) -> None:
         self.camera, self.contents, self.fps, self.intrinsics = camera, contents, Fraction(fps), LENS
-        self._depth = depth
+        self._unit, self._error, self._depth = unit, error, depth
 
     def content(self, tick: int) -> int:
         return tick if self.contents is None else tick % self.contents
@@ -27,4 +36,9 @@ class DepthSource(Source):
     def read(self, content: int) -> Shot:
         image = np.full((24, 32, 3), content % 200, np.uint8)
         counts = np.full((24, 32), content + 1, np.uint16)
-        return Shot(image, POSE, LENS, depth=DepthImage(counts, 0.001, **self._depth))
+        return Shot(image, POSE, LENS, depth=DepthImage(counts, self._unit, **self._depth))
+
+    def depth(self, content: int, shot: Shot) -> DepthImage | None:
+        if self._error is not None:
+            raise self._error
+        return super().depth(content, shot)

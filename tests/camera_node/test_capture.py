@@ -11,11 +11,11 @@ from camera_node.capture import Camera, ShotCache, build_cameras, prepare
 from camera_node.outbox import Outbox
 from camera_node.settings import DEPTH_STEP, WorldConfig, source_config
 from camera_node.sources.base import Shot
+from camera_node.sources.datasets.records import DatasetError
 from freshfield import ledger
 from freshfield.clock import VirtualClock
 from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose
-from freshfield.payload import PayloadError
 from tests.camera_node.depth_source import DepthSource
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 
@@ -97,11 +97,29 @@ def test_depth_is_cached_encoded_and_its_bytes_count():
         assert depth_camera(5, 10, ShotCache(room)).fits() == fits
 
 
-def test_depth_that_cannot_be_sent_is_an_error_of_that_frame():
-    for wrong, message in (({"after_image_ns": 10**11}, "100 s after its image"), ({"intrinsics": LENS}, "a lens of")):
-        with pytest.raises(PayloadError, match=message):
-            depth_camera(5, **wrong).capture(0)
-        assert depth_camera(0, **wrong).capture(0).depth is None
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"after_image_ns": 10**11}, "100 s after its image"),
+        ({"intrinsics": LENS}, "a lens of"),
+        ({"unit": 1.5}, "1.5 m a count is not within"),
+        ({"unit": float("nan")}, "nan m a count is not within"),
+        ({"error": OSError("depth/007.png: no such file")}, "depth/007.png: no such file"),
+        ({"error": DatasetError("depth/007.png: cut short")}, "depth/007.png: cut short"),
+    ],
+)
+def test_depth_that_cannot_be_sent_costs_only_the_depth(caplog, wrong, message):
+    camera = depth_camera(1, **wrong)
+    whole = depth_camera(1).capture(0)
+    for tick in range(3):
+        shot = camera.capture(tick)
+        assert shot.encoded_depth is None and camera.depth_failed == tick + 1
+        assert tick or shot.payload == whole.payload
+    (record,) = caplog.records
+    assert record.getMessage().startswith("cam01: a frame without its depth: ") and message in record.getMessage()
+    unasked = depth_camera(0, **wrong)
+    assert unasked.capture(0).encoded_depth is None and not unasked.depth_failed
 
 
 def frame(sequence: int) -> Frame:

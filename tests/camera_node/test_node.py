@@ -25,6 +25,7 @@ from freshfield.limits import MAX_REASONS
 from freshfield.scenario import load
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
+from tests.camera_node.depth_source import DepthSource
 from tests.integration.peer import Answer, Peer, answer, silence
 
 POSE, LENS = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Pinhole.from_fov(8, 8, 60)
@@ -65,6 +66,15 @@ def test_cameras_that_wait_for_their_devices_keep_no_other_waiting():
         return waiting
 
     assert asyncio.run(run()) == 0
+
+
+@pytest.mark.stability
+def test_frames_that_go_without_their_depth_are_counted():
+    camera = Camera(DepthSource("cam01", 10, unit=2.0), CameraConfig(kind="camera"), ShotCache(10**6), depth_every=1)
+    node = Node(load("room"), [camera], NodeOptions(to=NOBODY, transport=Transport(), seconds=0.5))
+    asyncio.run(node.run())
+    status = node.status()["cameras"]["cam01"]
+    assert status["depth_failed"] == 10 and status["captured"] > 0 and status["failed"] == 0
 
 
 @pytest.mark.parametrize(

@@ -65,13 +65,17 @@ def load_recorded(
     found, instant = _records(dataset, frame)
     own = [key for key, record in found.items() if record.name in dataset.held_out]
     training, held_out = split(list(found), holdout or (OWN_SPLIT if own else "8"), own)
-    views = {key: _view(key, found[key]) for key in (*training, *held_out)}
+    wrong: dict[str, Exception] = {}
+    views = {key: _view(key, found[key], wrong) for key in (*training, *held_out)}
     blank = [key for key, v in views.items() if v.weight is not None and not (v.weight > LEAST_WEIGHT).any()]
     if not set(training) - set(blank):
         raise DatasetError(f"{file}: masks leave nothing of the training images: are they inverted?")
     notes = dataset.notes
     if blank:
         notes += (f"masks leave nothing of {len(blank)} images, first {blank[0]}: they are not used",)
+    if wrong:
+        first, error = next(iter(wrong.items()))
+        notes += (f"the depth of {len(wrong)} images cannot be used, first {first}: {error}",)
     trained, kept = (tuple(views[k] for k in keys if k not in blank) for keys in (training, held_out))
     return MultiviewStill(
         file.resolve().parent.name,
@@ -153,12 +157,16 @@ def _apart_s(records: Sequence[PosedImage]) -> float:
     return ((records[-1].time_s or 0.0) - (records[0].time_s or 0.0)) / max(1, len(records) - 1)
 
 
-def _view(name: str, record: PosedImage) -> View:
+def _view(name: str, record: PosedImage, wrong: dict[str, Exception]) -> View:
+    """wrong: gets what is wrong with the image's depth, if the view has to do without it."""
     weight = None if record.weight is None else record.weight()
     depth = None
     if record.depth is not None:
         from edge_server.live.depth_in_image import depth_in_image
 
-        depth = depth_in_image(record.depth(), record.intrinsics, 0)
+        try:
+            depth = depth_in_image(record.depth(), record.intrinsics, 0)
+        except (ValueError, OSError) as error:
+            wrong[name] = error
     at_ns = round(1e9 * (record.time_s or 0.0))
     return View(name, record.read(), record.camera_to_world, record.intrinsics, at_ns, weight=weight, depth=depth)

@@ -164,6 +164,24 @@ def test_images_of_which_masks_leave_nothing_are_said_and_not_used(tmp_path):
         load_recorded(tmp_path, "2")
 
 
+@pytest.mark.stability
+def test_damaged_depth_costs_only_the_depth_of_its_view(tmp_path):
+    file = write_photos(tmp_path, 4, 32)
+    data = json.loads(file.read_text())
+    for k, frame in enumerate(data["frames"]):
+        frame["depth_file_path"] = f"{k}.png"
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((32, 32), 2000, np.uint16))
+    file.write_text(json.dumps(data))
+    assert not load_recorded(tmp_path, "0").notes
+    (tmp_path / "1.png").write_bytes((tmp_path / "1.png").read_bytes()[:40])
+    cv2.imwrite(str(tmp_path / "2.png"), np.full((32, 32), 3, np.uint16))  # 3 mm: another unit
+    found = load_recorded(tmp_path, "0")
+    assert [view.depth is None for view in found.training] == [False, True, True, False]
+    assert found.training[0].depth == pytest.approx(np.full((32, 32), 2.0))
+    (note,) = found.notes
+    assert note.startswith("the depth of 2 images cannot be used, first images/001: ") and "1.png" in note
+
+
 def test_a_frame_of_what_has_none_is_refused(tmp_path):
     write_photos(tmp_path, 3)
     with pytest.raises(DatasetError, match="--frame 5: this data set has no frames of several cameras"):
