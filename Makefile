@@ -45,7 +45,7 @@ PY := .venv/bin/python
 export PYTHONPYCACHEPREFIX := $(abspath .venv)/byte-code
 unexport PYTHONDONTWRITEBYTECODE
 INSTALL := $(PY) -m pip --disable-pip-version-check -q install --no-compile
-WARM_UP = PYTHONPATH=proto:. $(PY) -c 'from edge_server.fields.registry import make_field; make_field("$(1)", $(2)).warm_up()'
+WARM_UP = PYTHONPATH=proto:. $(PY) -c 'from edge_server.fields.registry import make_field; make_field("$(1)", $(2)).warm_up($(3))'
 KERNELS := $(wildcard edge_server/fields/*/kernels/*.py edge_server/fields/*/*/kernels/*.py)
 # The line of pyproject.toml that starts with a name.
 wanted = $(shell sed -n 's/^ *"\($(1)[^"]*\)",*$$/\1/p' pyproject.toml | head -n 1)
@@ -176,7 +176,7 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 # installation of everything else than after it, and again where they have changed. Should it fail here, the edge
 # server tries again.
 .venv/.ok-kernels: .venv/.ok-numba $(KERNELS)
-	@echo "compiling the field's kernels"; $(call WARM_UP,splat,{"layers": True}) >.venv/kernels.log 2>&1 || \
+	@echo "compiling the field's kernels"; $(call WARM_UP,splat,{"layers": True},cameras=2) >.venv/kernels.log 2>&1 || \
 	  echo "the kernels were not compiled ahead (.venv/kernels.log): the edge server will do it at its start"
 	@touch $@
 

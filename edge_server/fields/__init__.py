@@ -162,8 +162,11 @@ class Field(Renderer, Protocol):
         """
         ...
 
-    def warm_up(self) -> float:
-        """Compile or load every kernel, so that the first fit is as fast as others; returns the seconds."""
+    def warm_up(self, cameras: int | None = None) -> float:
+        """Compile or load every kernel, so that the first fit is as fast as others; returns the seconds.
+
+        cameras: how many there will be, where that is known: few may need kernels of their own.
+        """
         ...
 
     def state(self) -> dict[str, NDArray]:

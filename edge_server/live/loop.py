@@ -91,7 +91,7 @@ class UpdateLoop:
     def _main(self) -> None:
         try:
             self._on_status("compiling the field's kernels")
-            self._updater.field.warm_up()
+            self._updater.field.warm_up(len(self._updater.buffer.cameras))
             self._await_cameras()
             while not self._stop.is_set():
                 self._update_once()

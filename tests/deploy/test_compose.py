@@ -102,9 +102,9 @@ def test_an_image_runs_as_nobody_in_particular(name: str) -> None:
 def test_the_edges_image_compiles_the_kernels_of_a_field_that_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
     (line,) = re.findall(r"^RUN python -c '(.*)'$", (ROOT / "deploy" / "edge.Dockerfile").read_text(), re.MULTILINE)
     compiled = list[str]()
-    monkeypatch.setattr(LayeredField, "warm_up", lambda field: compiled.append("layers"))
+    monkeypatch.setattr(LayeredField, "warm_up", lambda field, cameras: compiled.append(cameras))
     exec(line, {})
-    assert compiled == ["layers"]
+    assert compiled == [4]
 
 
 def engine() -> tuple[list[str], str]:

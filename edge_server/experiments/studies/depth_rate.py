@@ -76,7 +76,7 @@ def _measure(runs: Sequence[DepthRun], request: StudyRequest) -> list[Row]:
             "scene": run.scene,
             "line": f"{run.megabits_per_s:g} Mbit/s a camera" if run.megabits_per_s else "unbounded",
             "depth_every": run.every,
-            "depth_hz": found.pop("fps") / run.every if run.every else 0.0,
+            "depth_hz": found["fps"] / run.every if run.every else 0.0,
             "seed": run.seed,
             **found,
         }

@@ -125,7 +125,7 @@ def _timed(scenario: Scenario, share: float, seconds: float, data: Path | None) 
             rows.append((done[1].steps, selection.arrivals, 1e3 * spent_s))
         return done
 
-    updates.field.warm_up()
+    updates.field.warm_up(len(updates.buffer.cameras))
     updates.fit = timed  # type: ignore[method-assign]
     deployment.run(seconds)
     if len(rows) < 2:

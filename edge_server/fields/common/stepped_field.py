@@ -114,7 +114,7 @@ class SteppedField(ABC, Generic[S]):
             known = self._snapshot
         return known if present_ns is None else known.at(present_ns)
 
-    def warm_up(self) -> float:
+    def warm_up(self, cameras: int | None = None) -> float:
         """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds.
 
         Trains small fields of its own; this field's state is not touched.

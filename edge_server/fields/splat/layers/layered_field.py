@@ -199,9 +199,14 @@ class LayeredField:
         published = self._published
         return self.still.snapshot(present_ns) if published is None else published.at(present_ns)
 
-    def warm_up(self) -> float:
+    def warm_up(self, cameras: int | None = None) -> float:
         """Compile every kernel, or load it from numba's cache; returns the seconds taken."""
-        return self.still.warm_up() + compile_kernels(self._run_kernels)
+        seconds = self.still.warm_up() + compile_kernels(self._run_kernels)
+        if cameras is not None and cameras <= tuned.STEREO_CAMERAS:  # their depth is measured, or found by stereo
+            from edge_server.fields.splat.layers.depth.depth_supervision import warm_up
+
+            seconds += warm_up()
+        return seconds
 
     def _run_kernels(self, pool: Pool) -> None:
         """Run every kernel of the layers once, in a small field of its own."""

@@ -86,10 +86,10 @@ class StaticSupervision:
     def make_depth(self) -> DepthSupervision:
         """Supervision with depth, made once a frame brings some. Compiles its kernels, or loads them."""
         if self.depth is None:
-            from edge_server.fields.splat.layers.depth.depth_supervision import DepthSupervision
+            from edge_server.fields.splat.layers.depth.depth_supervision import DepthSupervision, warm_up
 
+            warm_up()
             self.depth = DepthSupervision(self.static.field.settings, self.static.field.pool)
-            self.depth.warm_up()
         return self.depth
 
     def trusts_depth(self, camera: str) -> bool:

@@ -14,6 +14,7 @@ from edge_server.fields.splat.scan import settings as tuned
 from freshfield.geometry import Pinhole, matrix_to_quaternion, quaternion_multiply
 
 Array = NDArray[np.float64]
+LEAST_SIDE = 5  # pixels of an image: normals come from differences over so many
 
 
 class Leaves(NamedTuple):
@@ -50,12 +51,16 @@ def quadtree(color: NDArray[np.float32], wanted: NDArray[np.bool_], cells: tuple
     return Leaves(*(np.concatenate(parts) for parts in zip(*found)))
 
 
-def without_jumps(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depth (H, W), meters, 0 where it is unknown or lies between two surfaces."""
+def usable_depth(depth: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+    """Depth (H, W), meters, 0 where it is unknown, cannot be, or lies between two surfaces; None if nothing is left."""
+    if depth is None or min(depth.shape) < LEAST_SIDE:
+        return None
+    depth = np.where((depth > tuned.DEPTH_M[0]) & (depth < tuned.DEPTH_M[1]), depth, np.float32(0.0))
     kernel = np.ones((3, 3), np.uint8)
     nearest = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), kernel)
     span = cv2.dilate(depth, kernel) - nearest
-    return np.where(span > tuned.JUMP_SHARE * depth + tuned.JUMP_M, np.float32(0.0), depth)
+    depth = np.where(span > tuned.JUMP_SHARE * depth + tuned.JUMP_M, np.float32(0.0), depth)
+    return depth if depth.any() else None
 
 
 def filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:

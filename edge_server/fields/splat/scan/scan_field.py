@@ -26,7 +26,7 @@ from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_
 from edge_server.fields.splat.kernels.project import BASE, COLOR, QUATERNION, SCALE, SH_COLUMNS
 from edge_server.fields.splat.kernels.rasterize import LOSSES, MOMENTS, render_tiles
 from edge_server.fields.splat.scan import settings as tuned
-from edge_server.fields.splat.scan.discs import discs, filled, quadtree, without_jumps
+from edge_server.fields.splat.scan.discs import LEAST_SIDE, discs, filled, quadtree, usable_depth
 from edge_server.fields.splat.scan.exposures import Exposures
 from edge_server.fields.splat.settings import PRUNE_OPACITY
 
@@ -87,14 +87,16 @@ class ScanField(StillField):
             self.view_store.box = replace(box, near_m=tuned.NEAR_SHARE * distance_m)
         self._poses = PoseCorrections(tuned.MOST_SHARE * distance_m, tuned.MOST_DEG)
         self._exposures = Exposures()
+        self._given: tuple[View, ...] = ()  # the newest views, with depth as it came
         self._rigid = np.zeros(6) if self.settings.refine else None
         self._rule: AdamParameters | None = None
 
     def _ingest(self, views: Sequence[View]) -> None:
-        news = not same_views(views, self._views)
+        if same_views(views, self._given):
+            return super()._ingest(self._views)
+        self._given = tuple(views)
+        views = [replace(view, depth=usable_depth(view.depth)) for view in views]
         super()._ingest(views)
-        if not news:
-            return
         self._rule = None
         self._targets = self._targets._replace(dissimilarity=np.float32(tuned.DISSIMILARITY))
         if self._rigid is None:
@@ -129,7 +131,7 @@ class ScanField(StillField):
 
     def _seed(self) -> None:
         """Seed on measured depth, in the order of the views; without any, where the cameras agree on colors."""
-        measured = [view for view in self._views if view.depth is not None and (view.depth > 0).any()]
+        measured = [view for view in self._views if view.depth is not None]
         if not measured:
             return super()._seed()
         self.cloud = GaussianCloud.empty(self.settings)
@@ -140,7 +142,7 @@ class ScanField(StillField):
     def _seeds_of(self, view: View) -> NDArray[np.float32]:
         """Gaussians where the field lacks the surface that a view measures, or shows none at all."""
         assert view.depth is not None
-        shown, depth = self._look(view), without_jumps(view.depth)
+        shown, depth = self._look(view), view.depth
         behind = shown.depth > depth * np.float32(1.0 + tuned.BEHIND_SHARE) + np.float32(tuned.BEHIND_M)
         wanted = (shown.opacity < tuned.COVERED) | (behind & (depth > 0))
         color, there = self._as_rendered(view)
@@ -161,6 +163,8 @@ class ScanField(StillField):
         """Insert Gaussians where the view that comes next shows what the field does not: at the depth that is rendered
         there, or beside it where nothing is."""
         view = self._views[self._next_view()]
+        if min(view.image.shape[:2]) < LEAST_SIDE:
+            return
         shown = self._look(view)
         color, there = self._as_rendered(view)
         error = cv2.blur(np.abs(shown.color - color).mean(axis=2), (3, 3))
@@ -217,7 +221,7 @@ class ScanField(StillField):
 def _aim(view: View, usual_m: float) -> tuple[NDArray[np.float64], float]:
     """What ``PoseCorrections.descend`` needs of a view: the normal matrix, and the shift of a pixel in meters."""
     depth = np.full(view.image.shape[:2], usual_m, np.float32)
-    if view.depth is not None and (view.depth > 0).any():
+    if view.depth is not None:
         depth = filled(view.depth)
     return normal_matrix(view, depth), float(np.median(depth)) / view.intrinsics.fx
 

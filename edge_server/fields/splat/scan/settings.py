@@ -22,6 +22,7 @@ DETAIL = 0.06  # standard deviation of a leaf's color, over channels, above whic
 MIXED = (0.01, 0.75)  # shares of a leaf's pixels between which it is divided; below the first it is left out
 COVERED = 0.6  # opacity above which a pixel shows a surface
 BEHIND_SHARE, BEHIND_M = 0.07, 0.02  # what is shown lies behind what is measured by more: the nearer is missing
+DEPTH_M = 1e-3, 1e4  # what lies beyond was measured by nothing; NaN is neither
 JUMP_SHARE, JUMP_M = 0.05, 0.02  # depth that spans more within 3 x 3 pixels is of two surfaces, or of none
 WIDTH, FLATNESS, OPACITY = 0.6, 0.2, 0.8  # a seed's standard deviation in sides of its leaf, and thickness in that
 STEEPEST = 0.3  # least cosine to the view: nothing is stretched along a surface further than this says

@@ -21,7 +21,7 @@ from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
 from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
 from edge_server.fields.splat.layers.depth.kernels.surfaces import Meshes
 from edge_server.fields.splat.layers.depth.overlaps import contradicting, exposures
-from edge_server.fields.splat.layers.depth.plate_stereo import fill_by_stereo
+from edge_server.fields.splat.layers.depth.plate_stereo import fill_by_stereo, sweep_plates
 from edge_server.fields.splat.layers.depth.registration import Correction, register
 from edge_server.fields.splat.layers.depth.surfaces import Surface, SurfaceScene
 from edge_server.fields.splat.layers.depth.virtual_plates import virtual_plates
@@ -84,10 +84,6 @@ class DepthSupervision:
         self.corrections: dict[str, Correction] = {}
         self.scene: SurfaceScene | None = None
         self._learned: dict[str, NDArray[np.float32]] = {}  # camera -> inverse depths as learned
-
-    def warm_up(self) -> None:
-        """Compile every kernel of depth, or load it from numba's cache."""
-        compile_kernels(_run_kernels)
 
     def forget_camera(self, camera: str) -> None:
         """Forget what was learned of a camera that stands somewhere else now."""
@@ -208,6 +204,11 @@ def _are_whole(cameras: Sequence[CameraPlates], surfaces: Sequence[Surface]) -> 
     return sum(int(np.count_nonzero(s.depth())) for s in surfaces) >= (1.0 - tuned.MOST_HOLES) * known
 
 
+def warm_up() -> float:
+    """Compile every kernel of depth, or load it from numba's cache; returns the seconds taken."""
+    return compile_kernels(_run_kernels)
+
+
 def _run_kernels(pool: Pool) -> None:
     """Run every kernel once, on a small wall."""
     lens, shape = Pinhole.from_fov(16, 16, 60.0), (16, 16)
@@ -222,3 +223,7 @@ def _run_kernels(pool: Pool) -> None:
     frame = Observation(0.0, "warm-up", replace(view, depth=depth.samples[..., 0].copy()), np.ones(shape, bool))
     frame.body_m = body_depth(frame, camera, pool)
     seen_through([np.zeros((1, 3), np.float32)], [frame], {"warm-up": camera}, box, pool)
+    aside = np.eye(4)
+    aside[0, 3] = 0.5
+    nothing = np.zeros(shape, np.float32)
+    sweep_plates([CameraPlates(plate, plate, None, pose).surface(nothing) for pose in (np.eye(4), aside)], 1.0, pool)

@@ -14,7 +14,9 @@ KEPT = 15  # depths a pixel remembers: a second of frames at 15 a second
 LEAST = 3  # depths of a pixel that make its median known
 LOOKED_AT, LEAST_LOOKED_AT = 3, 12  # each so many-th pixel tells whether an image contradicts the plate; fewest of them
 ALIKE = 0.75  # ratio of depths: sensors err by less
-MOST_REFUSED = 45  # images in a row: a sensor that was set to another unit is believed again after some seconds
+MOST_REFUSED = (
+    45  # images in a row: a sensor that was set to another unit is believed again, after 15 s of each fifth frame
+)
 STEADY = 0.4 / _DISPARITY_PX_M  # 1 / m: two thirds lie this near their median, or the pixel flies between two surfaces
 RADIUS = 3  # pixels, of the window in which a plane is fitted
 SPREAD_PX = 2.1  # deviation of the window's Gaussian

@@ -7,7 +7,7 @@ import pytest
 
 from edge_server.fields.splat.kernels.project import BASE, COLOR, QUATERNION, SCALE
 from edge_server.fields.splat.scan import settings as tuned
-from edge_server.fields.splat.scan.discs import Leaves, discs, filled, quadtree, without_jumps
+from edge_server.fields.splat.scan.discs import Leaves, discs, filled, quadtree, usable_depth
 from freshfield.geometry import Pinhole, look_at, quaternion_to_matrix
 
 LENS = Pinhole(50, 38, 40.0, 40.0, 25.0, 19.0, (-0.05, 0.01, 0.0, 0.0))
@@ -62,14 +62,14 @@ def test_discs_lie_flat_on_the_surface(slope: float) -> None:
 def test_depth_at_jumps_is_of_no_surface_and_holes_take_the_nearest() -> None:
     depth = np.full((20, 20), 1.0, np.float32)
     depth[:, 10:] = 3.0
-    kept = without_jumps(depth)
+    kept = usable_depth(depth)
     assert (kept[:, 9:11] == 0).all() and (kept[:, :8] == 1.0).all() and (kept[:, 12:] == 3.0).all()
     whole = filled(kept)
     assert set(np.unique(whole)) == {1.0, 3.0} and (whole[:, 12:] == 3.0).all()
     nothing = np.zeros((5, 5), np.float32)
     np.testing.assert_array_equal(filled(nothing), nothing)
     depth[4, 4] = 0.0
-    assert without_jumps(depth)[4, 4] == 0.0 and without_jumps(depth)[4, 6] == 1.0
+    assert usable_depth(depth)[4, 4] == 0.0 and usable_depth(depth)[4, 6] == 1.0
 
 
 @pytest.mark.stability
@@ -81,3 +81,20 @@ def test_extreme_depth_and_a_normal_along_the_vertical_stay_finite(depth_m: floa
     leaves = Leaves(*(np.array(each) for each in ([0, 4, 4], [0, 0, 4], [4, 4, 4])))
     params = discs(np.zeros((8, 8, 3), np.float32), depth, leaves, lens, np.eye(4), 0.6, np.full(3, 0.8, np.float32))
     assert np.isfinite(params).all()
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0, 0.0, 1e-30, 1e30])
+def test_depth_that_cannot_be_is_none(value: float) -> None:
+    assert usable_depth(np.full((12, 16), value, np.float32)) is None
+    some = np.full((12, 16), 2.0, np.float32)
+    some[:, 3] = value
+    found = usable_depth(some)
+    assert found is not None and (found[:, 3] == 0.0).all() and (found[:, 8:] == 2.0).all()
+
+
+@pytest.mark.stability
+def test_depth_that_is_all_jumps_or_of_a_tiny_image_is_none() -> None:
+    y, x = np.indices((12, 16))
+    assert usable_depth(np.where((x + y) % 2, 1.0, 5.0).astype(np.float32)) is None
+    assert usable_depth(np.ones((4, 64), np.float32)) is None and usable_depth(None) is None
