@@ -26,20 +26,24 @@ SCENES = {
 VIEWS = (("cam00", 0.0), ("cam04", 1.3), ("cam08", 2.9), ("cam12", 5.0))
 
 
-def views(name: str) -> Image:
+# A ray that just hits or misses a moving part does the other a nanosecond earlier or later, as on another kind of
+# processor, which rounds the last bits differently.
+INSTANTS_S = (0.0, 1e-9, -1e-9)
+
+
+def views(name: str, later_s: float = 0.0) -> Image:
     """Four views of a scene, side by side."""
     kind, params = SCENES[name]
     scene = make_scene(kind, {**params, "width": 96, "height": 72})
-    return np.hstack([scene.render(camera, t_s) for camera, t_s in VIEWS])
+    return np.hstack([scene.render(camera, t_s + later_s) for camera, t_s in VIEWS])
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_looks_as_it_did(name):
-    """Kinds of processors round the last bits differently: a level of gray, and at edges of moving parts, where a ray
-    hits or misses, up to a few pixels of 27,648."""
+    """Of the instants the nearest counts at each pixel, to a level of gray."""
     golden = cv2.imread(str(GOLDEN / f"{name}.png"))[..., ::-1].astype(np.int16)
-    off = np.abs(views(name).astype(np.int16) - golden).max(axis=2)
-    assert (off > 1).sum() <= 12
+    off = np.min([np.abs(views(name, s).astype(np.int16) - golden).max(axis=2) for s in INSTANTS_S], axis=0)
+    assert (off > 1).sum() <= 3
 
 
 if __name__ == "__main__":
