@@ -339,10 +339,12 @@ def test_who_clicks_a_camera_looks_through_it(tmp_path):
         click = {"instance_index": None, "screen_pos": [0.5, 0.5], "modifier": None}
         visitor.send("SceneNodeClickMessage", name="/cameras/cam02", ray_origin=[0] * 3, ray_direction=[1] * 3, **click)
         pose = preview._poses["cam02"]
-        wait_until(lambda: np.allclose(client.camera.position, pose[:3, 3]), "not at the camera")
+        fov = pytest.approx(2 * np.arctan(0.5 * LENS.height / LENS.fy))
+        # The field of view is set last, on a thread of the page's own.
+        wait_until(lambda: client.camera.fov == fov, "the field of view is not the camera's")
+        assert np.allclose(client.camera.position, pose[:3, 3])
         ahead = client.camera.look_at - pose[:3, 3]
         assert np.allclose(ahead / np.linalg.norm(ahead), pose[:3, 2], atol=1e-6)
-        assert client.camera.fov == pytest.approx(2 * np.arctan(0.5 * LENS.height / LENS.fy))
 
 
 def test_a_state_that_fails_to_answer_is_reported_once_and_survived(caplog):
