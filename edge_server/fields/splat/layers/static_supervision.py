@@ -215,13 +215,18 @@ class StaticSupervision:
         self.times.add("static field", begun)
 
     def _correct(self, cameras: Cameras, observations: Observations) -> None:
-        """Have cameras and frames take over the poses that registration has found."""
-        for name, found in ({} if self.depth is None else self.depth.corrections).items():
-            if not np.array_equal(cameras[name].view.camera_to_world, found.pose):
-                cameras[name].correct(found.pose, found.scale)
+        """Have cameras and frames take over what registration has found, or no longer finds."""
+        if self.depth is None:
+            return
+        corrections = self.depth.corrections
+        for name, camera in cameras.items():
+            found = corrections.get(name)
+            pose, scale = (camera.reported_pose, 1.0) if found is None else (found.pose, found.scale)
+            if camera.depth_scale != scale or not np.array_equal(camera.view.camera_to_world, pose):
+                camera.correct(pose, scale)
                 for o in observations:
                     if o.camera == name:
-                        o.view, o.row = replace(o.view, camera_to_world=found.pose), None
+                        o.view, o.row = replace(o.view, camera_to_world=pose), None
 
     def _begin_anew(self, cameras: Cameras, beside: bool) -> None:
         """Begin with the plates and their depth, from nothing: a field that has begun early knows people as background,

@@ -120,7 +120,7 @@ class DepthSupervision:
 
     def plates(self, cameras: Sequence[CameraPlates], anew: bool) -> tuple[list[PlateImage], list[Surface]]:
         """What to learn: the cameras' plates, and virtual ones; and the surfaces that these show. anew: whether to find
-        ``corrections`` first."""
+        ``corrections`` first, as for a camera that has joined or stands somewhere else."""
         inverse = {camera.name: camera.inverse(self.pool) for camera in cameras}
         self._learned = inverse
         rough = [camera.surface(inverse[camera.name]) for camera in cameras]
@@ -130,7 +130,7 @@ class DepthSupervision:
             self.wrong = wrong
         used = [camera for camera in cameras if camera.name not in wrong and inverse[camera.name].any()]
         measured = {c.name: c.surface(*smooth(inverse[c.name], c.plate.color, self.pool)) for c in used}
-        if anew:
+        if anew or not self.corrections.keys() >= measured.keys():
             self._register(list(measured), list(measured.values()))
         surfaces = [self._corrected(c, measured.get(c.name)) for c in cameras]
         poses = [surface.pose for surface in surfaces]

@@ -4,41 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from camera_node.synthetic import make_scene
 from edge_server.fields import View
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.threads.thread_pool import shared_pool
 from edge_server.fields.splat.layers.depth.plate_stereo import fill_by_stereo, sweep_plates
 from edge_server.fields.splat.layers.depth.surfaces import Surface
 from freshfield.geometry import Pinhole
+from tests.edge_server.fields.splat.layers.depth.room_plates import plate_of, room_plates
 
 Plates = list[Surface]
-
-
-@cache
-def _room(count: int, size: int = 128) -> tuple[Plates, NDArray[np.float64]]:
-    """Plates of the room without a person, and their depths (N, H, W)."""
-    scene = make_scene("room", {"count": count + 1, "width": size, "height": size, "people": 0, "supersample": 2})
-    plates, depths = [], []
-    for name, (lens, pose) in list(scene.cameras.items())[1:]:
-        renderer = scene.renderer(name)
-        plates.append(_plate(renderer.image(0.0), pose, lens))
-        # Of the four rays around a pixel's center.
-        fine = renderer.distance() * lens.scaled(2).rays()[..., 2]
-        depths.append(fine.reshape(size, 2, size, 2).mean(axis=(1, 3)))
-    return plates, np.stack(depths)
-
-
-def _plate(image: NDArray[np.uint8], pose: NDArray[np.float64], lens: Pinhole) -> Surface:
-    shape = image.shape[:2]
-    nothing = np.zeros((*shape, 2), np.float32)
-    return Surface(lens, pose, image.astype(np.float32), np.ones(shape, bool), nothing[..., 0], nothing)
 
 
 def _distance_m(plates: Sequence[Surface]) -> float:
@@ -63,7 +42,7 @@ def _changed(plates: Plates, change: dict[int, NDArray]) -> Plates:
 @pytest.mark.parametrize(("count", "share", "median", "right"), [(3, 0.5, 0.015, 0.75), (4, 0.75, 0.01, 0.88)])
 def test_most_of_the_room_is_found(count: int, share: float, median: float, right: float) -> None:
     """share: of the pixels with depth; median: relative error; right: share of these within 5 %."""
-    plates, truth = _room(count)
+    plates, truth = room_plates(count)
     found = _sweep(plates)
     there = found > 0
     error = np.abs(found - truth)[there] / truth[there]
@@ -71,7 +50,7 @@ def test_most_of_the_room_is_found(count: int, share: float, median: float, righ
 
 
 def test_what_is_unknown_has_no_depth_and_says_nothing() -> None:
-    plates, _ = _room(3, 64)
+    plates, _ = room_plates(3, 64)
     known = np.ones((64, 64), bool)
     known[20:50, 20:50] = False
     hidden = [replace(plates[0], known=known), *plates[1:]]
@@ -84,7 +63,7 @@ def test_what_is_unknown_has_no_depth_and_says_nothing() -> None:
 
 
 def test_large_plates_are_matched_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
-    plates, truth = _room(4)
+    plates, truth = room_plates(4)
     monkeypatch.setattr("edge_server.fields.splat.layers.depth.settings.SWEEP_PIXELS", 64 * 64)
     found = _sweep(plates)
     there = found > 0
@@ -92,7 +71,7 @@ def test_large_plates_are_matched_smaller(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_measured_depth_stays_and_holes_are_filled() -> None:
-    plates, truth = _room(4, 64)
+    plates, truth = room_plates(4, 64)
     measured = (1.0 / truth).astype(np.float32)
     measured[:, 10:40, 10:50] = 0.0
     holes = [replace(p, inverse=inverse) for p, inverse in zip(plates, measured)]
@@ -107,7 +86,7 @@ def test_measured_depth_stays_and_holes_are_filled() -> None:
 @pytest.mark.stability
 @pytest.mark.parametrize("unit", [1.0 / 3.0, 2.0, 1e-3, 1e4])
 def test_other_units_change_nothing(unit: float) -> None:
-    plates, _ = _room(3, 64)
+    plates, _ = room_plates(3, 64)
     poses = [p.pose * np.array([1.0, 1.0, 1.0, unit]) for p in plates]
     for pose in poses:
         pose[3, 3] = 1.0
@@ -121,7 +100,7 @@ def test_other_units_change_nothing(unit: float) -> None:
 @pytest.mark.stability
 def test_cameras_that_tell_no_depth() -> None:
     """One alone, two at one place, and two that see nothing in common."""
-    plates, _ = _room(4, 64)
+    plates, _ = room_plates(4, 64)
     assert (_sweep(plates[:1]) == 0).all()
     pose = plates[0].pose.copy()
     pose[:3, 3] += 2e-3
@@ -141,7 +120,7 @@ def test_cameras_that_tell_no_depth() -> None:
 @pytest.mark.parametrize("level", [0.0, 3.0, 128.0, 255.0])
 @pytest.mark.parametrize("noise", [0.0, 1.0, 2.0])
 def test_walls_of_one_color_and_darkness_have_no_depth(level: float, noise: float) -> None:
-    plates, _ = _room(4, 64)
+    plates, _ = room_plates(4, 64)
     rng = np.random.default_rng(2)
     flat = {k: np.clip(level + rng.normal(0.0, noise, (64, 64, 3)), 0.0, 255.0) for k in range(4)}
     assert (_sweep(_changed(plates, flat)) > 0).mean() < 0.01
@@ -149,11 +128,11 @@ def test_walls_of_one_color_and_darkness_have_no_depth(level: float, noise: floa
 
 @pytest.mark.stability
 def test_what_no_plate_can_show_costs_its_own_pixels_only() -> None:
-    plates, _ = _room(4, 64)
+    plates, _ = room_plates(4, 64)
     whole = _sweep(plates)
     for bad in (np.nan, np.inf, -np.inf, 1e30):
         broken = _sweep(_changed(plates, {0: np.full((64, 64, 3), bad)}))
         assert ((broken[1:] > 0).mean() > 0.5 * (whole[1:] > 0).mean()) and ((broken[0] > 0).mean() < 0.01)
     lens, pose = Pinhole.from_fov(1, 1, 60.0), plates[0].pose
-    speck = _plate(np.full((1, 1, 3), 9, np.uint8), pose, lens)
+    speck = plate_of(np.full((1, 1, 3), 9, np.uint8), pose, lens)
     assert (_sweep([*plates, speck])[0] > 0).any()

@@ -1,0 +1,33 @@
+"""Plates of the synthetic room from fixed cameras, with their exact depth."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.synthetic import make_scene
+from edge_server.fields.splat.layers.depth.surfaces import Surface
+from freshfield.geometry import Pinhole
+
+
+@cache
+def room_plates(count: int, size: int = 128) -> tuple[list[Surface], NDArray[np.float64]]:
+    """Plates of the room without a person, and their depths (N, H, W)."""
+    scene = make_scene("room", {"count": count + 1, "width": size, "height": size, "people": 0, "supersample": 2})
+    plates, depths = [], []
+    for name, (lens, pose) in list(scene.cameras.items())[1:]:
+        renderer = scene.renderer(name)
+        plates.append(plate_of(renderer.image(0.0), pose, lens))
+        # Of the four rays around a pixel's center.
+        fine = renderer.distance() * lens.scaled(2).rays()[..., 2]
+        depths.append(fine.reshape(size, 2, size, 2).mean(axis=(1, 3)))
+    return plates, np.stack(depths)
+
+
+def plate_of(image: NDArray[np.uint8], pose: NDArray[np.float64], lens: Pinhole) -> Surface:
+    """A plate of which no depth is known."""
+    shape = image.shape[:2]
+    nothing = np.zeros((*shape, 2), np.float32)
+    return Surface(lens, pose, image.astype(np.float32), np.ones(shape, bool), nothing[..., 0], nothing)

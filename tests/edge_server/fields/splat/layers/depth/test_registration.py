@@ -1,0 +1,125 @@
+"""Registration of poses and depth scales, on the exact depth of the synthetic room."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_server.fields import View
+from edge_server.fields.common.threads.thread_pool import shared_pool
+from edge_server.fields.splat.layers.depth import registration, settings
+from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
+from edge_server.fields.splat.layers.depth.depth_supervision import CameraPlates, DepthSupervision
+from edge_server.fields.splat.layers.depth.registration import Correction, register
+from edge_server.fields.splat.layers.depth.surfaces import Surface
+from edge_server.fields.splat.layers.static_layer import PlateImage
+from edge_server.fields.splat.settings import SplatSettings
+from freshfield.geometry import se3, so3_exp
+from tests.edge_server.fields.splat.layers.depth.room_plates import room_plates
+
+SIZE = 96
+TURN_DEG = (2.0, -1.5, 1.0)
+
+
+def _surfaces(count: int) -> list[Surface]:
+    plates, depths = room_plates(count, SIZE)
+    found = []
+    for plate, depth in zip(plates, depths):
+        inverse, slope = smooth((1.0 / depth).astype(np.float32), plate.color, shared_pool())
+        found.append(replace(plate, inverse=inverse, slope=slope))
+    return found
+
+
+def _bumped(surface: Surface, shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Surface:
+    pose = surface.pose
+    return replace(surface, pose=se3(so3_exp(np.deg2rad(TURN_DEG)) @ pose[:3, :3], pose[:3, 3] + shift_m))
+
+
+def _cost_of(surfaces: list[Surface], poses: list[np.ndarray], scales: list[float]) -> float:
+    return registration._cost([registration._Camera.of(s) for s in surfaces], poses, np.array(scales))
+
+
+def _off(found: Correction, true_pose: np.ndarray) -> tuple[float, float]:
+    """Degrees and meters from the true pose."""
+    turn = np.arccos(np.clip((np.trace(found.pose[:3, :3] @ true_pose[:3, :3].T) - 1.0) / 2.0, -1.0, 1.0))
+    return float(np.rad2deg(turn)), float(np.linalg.norm(found.pose[:3, 3] - true_pose[:3, 3]))
+
+
+def test_right_poses_and_scales_stay() -> None:
+    surfaces = _surfaces(4)
+    for found, surface in zip(register(surfaces), surfaces):
+        turn_deg, shift_m = _off(found, surface.pose)
+        assert turn_deg < 0.06 and shift_m < 0.004 and abs(found.scale - 1.0) < 0.003
+        assert not found.is_large
+
+
+def test_a_camera_that_was_bumped_is_found() -> None:
+    surfaces = _surfaces(4)
+    found = register([*surfaces[:2], _bumped(surfaces[2]), surfaces[3]])
+    assert [c.is_large for c in found] == [False, False, True, False]
+    turn_deg, shift_m = _off(found[2], surfaces[2].pose)
+    assert turn_deg < 0.2 and shift_m < 0.004
+    # What it says of the correction is measured from the pose that was reported.
+    assert found[2].turn_deg == pytest.approx(float(np.linalg.norm(TURN_DEG)), abs=0.2) and found[2].shift_m < 0.004
+    assert f"stands {found[2].turn_deg:.1f} degrees" in str(found[2])
+
+
+def test_surfaces_come_to_lie_on_one_another_where_a_shift_passes_for_a_turn() -> None:
+    """From three meters, five centimeters aside look like a turn of a degree: the surfaces cannot tell them apart."""
+    surfaces = _surfaces(4)
+    wrong = [*surfaces[:2], _bumped(surfaces[2], (0.03, -0.04, 0.02)), surfaces[3]]
+    found, truth = register(wrong), [s.pose for s in surfaces]
+    right = _cost_of(surfaces, truth, [1.0] * 4)
+    before = _cost_of(wrong, [s.pose for s in wrong], [1.0] * 4)
+    after = _cost_of(wrong, [c.pose for c in found], [c.scale for c in found])
+    assert after - right < 0.15 * (before - right) and found[2].is_large
+
+
+@pytest.mark.parametrize("scale", [0.95, 1.05])
+def test_depth_of_another_scale_is_found(scale: float) -> None:
+    surfaces = _surfaces(4)
+    first = surfaces[0]
+    by = np.float32(1.0 / scale)
+    found = register([replace(first, inverse=first.inverse * by, slope=first.slope * by), *surfaces[1:]])
+    assert found[0].scale == pytest.approx(1.0 / scale, rel=0.006) and found[0].is_large
+    assert not any(c.is_large for c in found[1:])
+    corrected = found[0].applied(replace(first, inverse=first.inverse * by, slope=first.slope * by))
+    known = first.inverse > 0
+    np.testing.assert_allclose(corrected.inverse[known], first.inverse[known], rtol=0.006)
+
+
+@pytest.mark.stability
+def test_cameras_that_share_nothing_stay_as_they_were_reported() -> None:
+    surfaces = _surfaces(2)
+    away = replace(surfaces[1], pose=se3(surfaces[1].pose[:3, :3], surfaces[1].pose[:3, 3] + [50.0, 0.0, 0.0]))
+    blank = replace(surfaces[0], inverse=np.zeros_like(surfaces[0].inverse))
+    for pair in ([surfaces[0], away], [blank, surfaces[1]]):
+        for found, surface in zip(register(pair), pair):
+            np.testing.assert_allclose(found.pose, surface.pose, atol=1e-9)
+            assert found.scale == 1.0
+
+
+def _plates(k: int, surface: Surface) -> CameraPlates:
+    view = View(f"cam{k:02d}", surface.color.astype(np.uint8), surface.pose, surface.lens)
+    plate, depth = PlateImage(view, surface.color, surface.known), DepthPlate.empty(SIZE, SIZE)
+    meters = np.where(surface.inverse > 0, 1.0 / np.maximum(surface.inverse, 1e-6), 0.0).astype(np.float32)
+    for _ in range(settings.LEAST):
+        depth.take(meters, np.zeros((SIZE, SIZE), bool), shared_pool())
+    return CameraPlates(plate, plate, depth, surface.pose)
+
+
+def test_a_camera_that_joins_is_registered_with_the_others() -> None:
+    surfaces = _surfaces(3)
+    cameras = [_plates(k, s) for k, s in enumerate([*surfaces[:2], _bumped(surfaces[2])])]
+    depth = DepthSupervision(SplatSettings(), shared_pool())
+    depth.plates(cameras[:2], anew=True)
+    assert set(depth.corrections) == {"cam00", "cam01"} and not depth.troubles
+    before = depth.corrections
+    depth.plates(cameras[:2], anew=False)
+    assert depth.corrections is before
+    depth.plates(cameras, anew=False)
+    assert set(depth.displaced) == {"cam02"} and "cam02 stands" in depth.troubles[0]
+    turn_deg, _ = _off(depth.corrections["cam02"], surfaces[2].pose)
+    assert turn_deg < 0.4
