@@ -71,7 +71,7 @@ ARM := $(if $(shell grep -ls '^ *arm:' $(SCENARIO) deploy/scenarios/$(SCENARIO).
 MESH := $(if $(shell grep -ls '^ *export:' $(SCENARIO) deploy/scenarios/$(SCENARIO).yaml),.venv/.ok-mesh)
 
 demo: .venv/.ok-run .venv/.ok-kernels $(ARM) $(MESH)  ## run a scenario: SCENARIO=FILE FOR=60s OUT=runs/demo PORT=8080 DATA=FOLDER
-	@.venv/bin/freshfield-up $(SCENARIO) --for=$(FOR) --out $(OUT) --port $(PORT) $(if $(DATA),--data $(DATA))
+	@.venv/bin/freshfield demo $(SCENARIO) --for=$(FOR) --out $(OUT) --port $(PORT) $(if $(DATA),--data $(DATA))
 
 # Two passes: what only computes on all cores, then what meets clocks and ports. 5: nothing was selected.
 CHOSEN = ($(SELECT))$(if $(BROWSER),, and not browser)

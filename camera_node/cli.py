@@ -1,4 +1,4 @@
-"""The commands of ``camera-node``: run the cameras of a scenario, list the kinds of sources, and more."""
+"""The commands of ``camera-node``: run the cameras of a scenario, calibrate them, check a setup, and more."""
 
 from __future__ import annotations
 
@@ -25,8 +25,6 @@ EXAMPLES = """examples:
   camera-node run fox --all --to :7001 --data ~/data         recorded data, from the folder --data
   camera-node prepare room --all                             render ahead, so that run starts quickly
   camera-node calibrate hand-eye --help                      pose of a camera on an arm
-  camera-node sources                                        keys of a scenario's source section
-  camera-node effects                                        effects that a source section can list
   camera-node simulate-arm cell                              a simulated arm for the scenario "cell"
   camera-node drive-arm cell                                 move its camera around the target
   camera-node teleop cell --stylus keyboard                  an operator moves it; or network:PORT
@@ -69,10 +67,6 @@ def main(arguments: list[str] | None = None) -> int:
     prepare.add_argument("-q", "--quiet", action="store_true", help="print only warnings")
     prepare.set_defaults(run=_prepare)
     calibrate_command.add_arguments(commands.add_parser("calibrate", help="hand-eye and intrinsic calibration"))
-    sources = commands.add_parser("sources", help="list the kinds of sources and their keys")
-    effects = commands.add_parser("effects", help="list effects and their parameters")
-    for each in (sources, effects):
-        each.set_defaults(run=_print_list)
     arm_cli.add_commands(commands)
     _add_doctor(
         commands.add_parser(
@@ -160,13 +154,6 @@ def _open(args: argparse.Namespace, cache_mb: float) -> tuple[Scenario, list[Cam
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from None
     return scenario, cameras
-
-
-def _print_list(args: argparse.Namespace) -> int:
-    from camera_node import listing
-
-    print(listing.sources() if args.command == "sources" else listing.effects())
-    return 0
 
 
 def _doctor(args: argparse.Namespace) -> int:

@@ -1,8 +1,8 @@
 """The scenario's ``source:`` section: what the cameras see, their frame rate, and how frames are compressed.
 
-``kind`` chooses the struct in ``MODELS``, whose docstring and keys ``camera-node sources`` prints. All keys are
-checked here, with file and key in the message. Checks that need the data itself (does the folder hold this
-camera?) are made when the source opens.
+``kind`` chooses the struct in ``MODELS``, whose docstring and keys ``freshfield scenario keys source`` prints. All keys
+are checked here, with file and key in the message. Checks that need the data itself (does the folder hold this camera?)
+are made when the source opens.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MAX_LATENCY_MS = 6e4
 
 class SourceConfig(Settings, frozen=True, kw_only=True):
     """Keys of every kind. fps: not given, it is the recording's own, 15 for a world, 10 for photos. effects: name ->
-    parameters, or null (see ``camera-node effects``).
+    parameters, or null (see ``freshfield scenario keys effects``).
     """
 
     kind: str

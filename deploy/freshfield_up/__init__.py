@@ -1,4 +1,4 @@
-"""The command ``freshfield-up``: starts and supervises every process of a scenario on one machine.
+"""The command ``freshfield``. Its ``demo`` starts and supervises every process of a scenario on one machine.
 
 ``console`` holds the entry points of all commands.
 """

@@ -1,107 +1,84 @@
-"""Starts every process of a scenario on this machine, supervises them, and writes the report at the end.
+"""Runs scenarios on this machine, writes and checks scenario files, tells what a machine lacks.
 
-    freshfield-up SCENARIO [--for 60s] [--out DIR] [--port 8080] [--data DIR] [--seed N]
-                           [--policy NAME[:VALUE]]
-
-It starts the three commands that otherwise run by hand on separate machines: camera-node, channel-emu and
-edge-server. Ctrl-C, SIGTERM, a closed terminal or the end of --for stops them in the order of the data. Exit code: 0
-for a run that ended as asked, 1 if a process died, 2 if the run could not start.
+The programs of a deployment on several machines are commands of their own: camera-node, channel-emu and edge-server.
 """
 
 from __future__ import annotations
 
 import argparse
-import re
 import sys
-from pathlib import Path
+from collections.abc import Sequence
+from importlib.metadata import version
 
-from freshfield import scenario as scenarios
+from freshfield.scenario import ScenarioError
+from freshfield_up import demo_command, scenario_command
 from freshfield_up.commands import MissingCommand
 from freshfield_up.folder import FolderError
-from freshfield_up.net import is_free
-from freshfield_up.run import Launcher, Options
+
+EXAMPLES = """examples:
+  freshfield demo                              the default scenario for a minute, page on http://127.0.0.1:8080
+  freshfield demo quad --for 5m --out runs/quad
+  freshfield scenario list                     what ships
+  freshfield scenario init mine.yaml --like quad
+  freshfield scenario keys edge                what a section may say
+  freshfield scenario check mine.yaml
+  freshfield doctor mine.yaml                  what this machine lacks for it
+  freshfield completion bash > ~/.local/share/bash-completion/completions/freshfield
+
+One program a machine: camera-node, channel-emu, edge-server; each has --help.
+"""
 
 
-def main(arguments: list[str] | None = None) -> int:
-    args = _parser().parse_args(arguments)
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status: 0, 1 (a process died, or something is missing) or 2 (bad
+    input)."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words[:1] == ["doctor"]:
+        from camera_node.cli import main as camera_node
+
+        return camera_node(words)
+    args = parser().parse_args(words)
     try:
-        scenario = scenarios.load(args.scenario, args.seed)
-        if not is_free(args.port):
-            return _refuse(f"port {args.port} is taken by another program; choose one with --port (PORT=)")
-        if args.data is not None and not args.data.is_dir():
-            return _refuse(f"{args.data}: no such folder of recorded data (--data)")
-        if _is_inside(args.policy, args.out):
-            return _refuse(f"--policy {args.policy}: {args.out} is emptied first; choose another --out")
-        options = Options(
-            out=args.out,
-            duration_s=args.duration_s,
-            port=args.port,
-            data=args.data,
-            seed=args.seed,
-            restart=args.restart,
-            process_per_camera=args.process_per_camera,
-            edge=() if args.policy is None else (f"--policy={args.policy}",),
-        )
-        return Launcher(scenario, options).run()
-    except (scenarios.ScenarioError, FolderError, MissingCommand) as error:
-        return _refuse(str(error))
+        return int(args.run(args))
+    except (ScenarioError, FolderError, MissingCommand) as error:
+        print(f"freshfield: {error}", file=sys.stderr)
+        return 2
 
 
-def seconds(text: str) -> float:
-    """``90``, ``90s``, ``1.5m``, ``2h``; 0 means no end."""
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|min|h|)", text.strip())
-    if not found:
-        raise argparse.ArgumentTypeError(f"expected a time such as 60s, 5m or 0 (no end), got {text!r}")
-    return float(found[1]) * {"": 1, "s": 1, "m": 60, "min": 60, "h": 3600}[found[2]]
-
-
-def _port(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 65535:
-        raise argparse.ArgumentTypeError(f"expected a port from 1 to 65535, got {text!r}")
-    return int(text)
-
-
-def _is_inside(policy: str | None, out: Path) -> bool:
-    """Whether the learned policy is a file of the earlier run that this one replaces."""
-    kind, _, file = (policy or "").partition(":")
-    return kind == "bandit" and Path(file).expanduser().resolve().is_relative_to(out.resolve())
-
-
-def _refuse(message: str) -> int:
-    print(f"freshfield-up: {message}", file=sys.stderr)
-    return 2
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="freshfield-up", description=__doc__.split("\n")[0])
-    add = parser.add_argument
-    add("scenario", help="scenario file, or the name of a shipped one (room, tile, ideal, ...)")
-    add(
-        "--for",
-        dest="duration_s",
-        type=seconds,
-        default=60.0,
-        metavar="TIME",
-        help="end after this long: 90s, 5m, 2h; 0: on Ctrl-C [60s]",
+def parser() -> argparse.ArgumentParser:
+    """The parser of ``freshfield``."""
+    found = argparse.ArgumentParser(
+        prog="freshfield",
+        description=__doc__.split("\n")[0],
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add(
-        "--out",
-        type=Path,
-        default=Path("runs/demo"),
-        metavar="DIR",
-        help="folder to write; replaces an earlier run in it [%(default)s]",
+    found.add_argument("--version", action="version", version=f"freshfield {version('freshfield')}")
+    commands = found.add_subparsers(metavar="COMMAND", required=True)
+    demo = commands.add_parser(
+        "demo",
+        help="run a scenario on this machine: all its processes, the page, then a report",
+        description="Starts every process of a scenario on this machine, shows its page and writes a report at the "
+        "end. Ctrl-C or --for ends it. Exit status: 0 ended as asked, 1 a process died, 2 it could not start.",
     )
-    add("--port", type=_port, default=8080, help="port of the page on 127.0.0.1 [%(default)s]")
-    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
-    add("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
-    add(
-        "--policy",
-        metavar="NAME[:VALUE]",
-        help="in place of the scenario's: all, threshold:120, bandit:FILE (docs/scheduling.md)",
+    demo_command.add_arguments(demo)
+    scenario_command.add_arguments(
+        commands.add_parser("scenario", help="list, show, start, check scenario files; their keys")
     )
-    add("--restart", action="store_true", help="start a process again when it dies, instead of ending the run")
-    add("--process-per-camera", action="store_true", help="one camera-node process for each camera [one for all]")
-    return parser
+    commands.add_parser("doctor", add_help=False, help="check this machine's part of a scenario (camera-node doctor)")
+    completion = commands.add_parser("completion", help="print a shell's completion of this command (needs shtab)")
+    completion.add_argument("shell", choices=("bash", "zsh", "tcsh"))
+    completion.set_defaults(run=_completion)
+    return found
+
+
+def _completion(args: argparse.Namespace) -> int:
+    try:
+        import shtab
+    except ImportError:
+        raise ScenarioError("completion needs the package shtab: pip install shtab") from None
+    print(shtab.complete(parser(), shell=args.shell))
+    return 0
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import sys
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status after Ctrl-C, as shells report it."""
 NOBODY_READS = 128 + signal.SIGPIPE
-"""Exit status after the reader of the output has gone (``camera-node effects | head -1``)."""
+"""Exit status after the reader of the output has gone (``channel-emu presets | head -1``)."""
 
 
 def run(module: str) -> int:
@@ -54,5 +54,5 @@ def edge_server() -> int:
     return run("edge_server.cli")
 
 
-def freshfield_up() -> int:
+def freshfield() -> int:
     return run("freshfield_up.cli")

@@ -49,7 +49,7 @@ class Cameras(Settings, frozen=True):
     phase: Literal["locked", "spread"] = "locked"
 
 
-class _File(Settings, frozen=True):
+class ScenarioFile(Settings, frozen=True):
     """What a scenario file may hold; each package reads its own section."""
 
     cameras: Cameras = msgspec.field(default_factory=Cameras)
@@ -150,7 +150,7 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
     """
     if seed is not None and isinstance(data, dict):
         data = {**data, "seed": seed}
-    file_settings = read_settings(_File, data, f"{file}: ")
+    file_settings = read_settings(ScenarioFile, data, f"{file}: ")
     found = file_settings.cameras
     if bool(found.ids) == bool(found.count):
         raise ScenarioError(f"{file}: cameras: expected either count (1 to {MAX_CAMERAS}) or ids")

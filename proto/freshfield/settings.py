@@ -119,7 +119,7 @@ def _message(error: msgspec.ValidationError, model: type, mapping: dict[str, Any
     kind: Any = model
     value: Any = mapping
     for step in _STEP.finditer(found["path"] or ""):
-        kind = _bare(kind)
+        kind = bare_type(kind)
         if step["name"]:
             kind = next(f.type for f in msgspec.structs.fields(kind) if f.encode_name == step["name"])
             value, path = value[step["name"]], _joined(path, step["name"])
@@ -132,7 +132,7 @@ def _message(error: msgspec.ValidationError, model: type, mapping: dict[str, Any
             key = next(k for k, v in value.items() if _refused(kind, v))
             value, path = value[key], f"{path}.{key}"
     if unknown := re.match(r"Object contains unknown field `(.*)`", what):
-        known = [f.name for f in msgspec.structs.fields(_bare(kind))]
+        known = [f.name for f in msgspec.structs.fields(bare_type(kind))]
         near = difflib.get_close_matches(unknown[1], known, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(known)}"
         return f"{_joined(path, unknown[1])}: unknown key; {hint}"
@@ -156,12 +156,12 @@ def _refused(kind: Any, value: Any) -> bool:
     return False
 
 
-def _bare(kind: Any) -> Any:
+def bare_type(kind: Any) -> Any:
     """A type without bounds and without None."""
     if typing.get_origin(kind) is Annotated:
-        return _bare(typing.get_args(kind)[0])
+        return bare_type(typing.get_args(kind)[0])
     options = [k for k in typing.get_args(kind) if k is not type(None)]
-    return _bare(options[0]) if type(None) in typing.get_args(kind) else kind
+    return bare_type(options[0]) if type(None) in typing.get_args(kind) else kind
 
 
 def _metas(kind: Any) -> list[Meta]:
@@ -174,7 +174,7 @@ def _metas(kind: Any) -> list[Meta]:
 
 def _allowed(kind: Any) -> str:
     """The bounds or choices of a type in words; empty if it has none."""
-    bare = _bare(kind)
+    bare = bare_type(kind)
     if typing.get_origin(bare) is typing.Literal:
         return f"one of {', '.join(map(str, typing.get_args(bare)))}"
     for meta in _metas(kind):
@@ -199,5 +199,5 @@ def _expected(what: str, kind: Any) -> str:
     if allowed.startswith("one of"):
         return allowed
     name = re.match(r"Expected `(\w+)", what)
-    word = name[1] if name else getattr(_bare(kind), "__name__", "value")
+    word = name[1] if name else getattr(bare_type(kind), "__name__", "value")
     return ", ".join(part for part in (_KINDS.get(word, word), allowed) if part)

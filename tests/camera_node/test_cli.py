@@ -43,15 +43,6 @@ def test_mistakes_are_one_line_and_exit_code_2(capsys, tmp_path, monkeypatch):
     assert "bad.yaml: source: " in fails(capsys, "run", str(tmp_path / "bad.yaml"), "--all", *to)
 
 
-def test_lists_say_what_there_is(capsys):
-    assert main(["sources"]) == 0
-    said = capsys.readouterr().out
-    assert all(word in said for word in ("kind: world", "kind: transforms", "kind: video", "background", "fps"))
-    assert main(["effects"]) == 0
-    said = capsys.readouterr().out
-    assert all(word in said for word in ("sensor_noise", "motion_blur", "clock_drift", "offset_ms"))
-
-
 def test_help_teaches_with_examples(capsys):
     with pytest.raises(SystemExit) as end:
         main(["run", "--help"])

@@ -18,7 +18,7 @@ COMMANDS = {
     "camera-node": ["run", "room", "--all", "--to", "127.0.0.1:1", "--quiet"],
     "channel-emu": ["simulate", "--preset", "ch6", "--seconds", "1e6"],
     "edge-server": ["run", "tile", "--listen", "127.0.0.1:0"],
-    "freshfield-up": ["no-such-scenario"],
+    "freshfield": ["demo", "no-such-scenario"],
 }
 
 
@@ -50,11 +50,11 @@ def test_ctrl_c_while_it_starts_prints_no_traceback(command, tmp_path):
 @pytest.mark.parametrize(
     ("command", "words", "unbuffered"),
     [
-        ("camera-node", ["effects"], ""),
+        ("freshfield", ["scenario", "keys", "effects"], ""),
         ("camera-node", ["calibrate", "target", "chessboard:9x6:20mm", "--dpi", "20", "--out", "board.png"], "1"),
         ("channel-emu", ["presets"], "1"),
         ("edge-server", ["report", "."], "1"),
-        ("freshfield-up", ["--help"], ""),
+        ("freshfield", ["--help"], ""),
     ],
 )
 def test_output_that_nobody_reads_ends_it_without_a_word(command, words, unbuffered, tmp_path, monkeypatch):
@@ -72,5 +72,5 @@ def test_output_that_nobody_reads_ends_it_without_a_word(command, words, unbuffe
 
 
 def test_the_status_of_a_command_is_passed_on():
-    process = start("freshfield-up", COMMANDS["freshfield-up"], stdout=subprocess.DEVNULL)
+    process = start("freshfield", COMMANDS["freshfield"], stdout=subprocess.DEVNULL)
     assert b"no-such-scenario" in process.communicate(timeout=30)[1] and process.returncode == 2

@@ -16,9 +16,15 @@ import pytest
 from camera_node.cli import main as camera_node
 from channel_emu.cli import main as channel_emu
 from edge_server.cli import main as edge_server
+from freshfield_up.cli import main as freshfield
 from tests.conftest import ROOT
 
-PROGRAMS = {"camera-node": camera_node, "channel-emu": channel_emu, "edge-server": edge_server}
+PROGRAMS = {
+    "camera-node": camera_node,
+    "channel-emu": channel_emu,
+    "edge-server": edge_server,
+    "freshfield": freshfield,
+}
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md")), ROOT / "deploy" / "lab" / "README.md"]
 # Measured results, and what was tried and left, name commands and files as they were under a tag.
@@ -90,7 +96,7 @@ def test_commands_exist_with_the_options_they_are_given(page: Path) -> None:
             words = shlex.split(rest.replace("'", ""))
             if not words or not re.fullmatch(r"[a-z][a-z-]*", words[0]):
                 continue  # a name in a sentence
-            command = tuple(words[: 2 if words[0] == "calibrate" else 1])
+            command = tuple(words[: 2 if words[0] in ("calibrate", "scenario") else 1])
             known = help_of(program, *command)
             assert known is not None, f"{name(page)}: {program} {' '.join(command)}"
             given = {word.partition("=")[0] for word in words if re.match(r"--[a-z]", word)}

@@ -49,7 +49,7 @@ class Up:
         self._log = folder / "output.txt"
         words = [str(file), "--out", str(self.out), "--port", str(self.port), *options]
         with self._log.open("wb") as log:
-            command = [sys.executable, "-m", "freshfield_up.cli", *words]
+            command = [sys.executable, "-m", "freshfield_up.cli", "demo", *words]
             self.process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
 
     @property
@@ -159,7 +159,7 @@ def test_a_process_that_dies_ends_the_run_is_named_and_the_others_are_stopped(
 
 
 def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """``freshfield-up room | head -3``; processes that only sleep stand for edge, emulator and node."""
+    """``freshfield demo room | head -3``; processes that only sleep stand for edge, emulator and node."""
     monkeypatch.setattr(launcher.signal, "signal", lambda *_: None)
     reader, writer = os.pipe()
     sleeps = [sys.executable, "-c", "import time; time.sleep(60)"]
@@ -232,7 +232,7 @@ def test_with_restart_a_run_survives_the_death_of_any_process(up: Callable[..., 
 
 def refusal(*words: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", "freshfield_up.cli", *words], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "freshfield_up.cli", "demo", *words], capture_output=True, text=True, timeout=60
     )
     assert done.returncode == 2, done.stdout + done.stderr
     assert done.stderr.count("\n") == 1, "the message is one line"

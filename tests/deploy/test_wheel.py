@@ -63,8 +63,8 @@ def test_the_wheel_carries_scenarios_models_and_launcher(wheel: Path) -> None:
 
 
 def test_the_launcher_runs_a_shipped_scenario_by_name(machine: Path, tmp_path: Path) -> None:
-    words = ["quad", "--for", "5s", "--out", "runs/up", "--port", str(free_port())]
-    done = run([str(machine / "freshfield-up"), *words], tmp_path)
+    words = ["demo", "quad", "--for", "5s", "--out", "runs/up", "--port", str(free_port())]
+    done = run([str(machine / "freshfield"), *words], tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((tmp_path / "runs/up/report.json").read_text())
     assert report["frames"]["closes"] and report["frames"]["delivered"] > 0

@@ -91,7 +91,7 @@ def training_cameras(scenario: Scenario, data: Path | None = None) -> list[Camer
     if isinstance(source, LiveConfig) or getattr(source, "arm", None) is not None:
         raise ScenarioError(
             f"{scenario.path}: source: its cameras or its arm keep real time and cannot be run in virtual "
-            "time: use freshfield-up, or camera-node and edge-server run"
+            "time: use freshfield demo, or camera-node and edge-server run"
         )
     return build_cameras(scenario, source, scenario.training, data, _CACHE_BYTES)
 

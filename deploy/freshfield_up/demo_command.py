@@ -1,0 +1,97 @@
+"""``freshfield demo``: starts every process of a scenario on this machine, supervises them, and writes the report.
+
+It starts the three commands that otherwise run by hand on separate machines: camera-node, channel-emu and
+edge-server. Ctrl-C, SIGTERM, a closed terminal or the end of --for stops them in the order of the data. Exit code: 0
+for a run that ended as asked, 1 if a process died, 2 if the run could not start.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+from freshfield import scenario as scenarios
+from freshfield.scenario import ScenarioError
+from freshfield_up.net import is_free
+from freshfield_up.run import Launcher, Options
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the scenario and return the exit status. Raises ScenarioError, FolderError or MissingCommand where the run
+    cannot start."""
+    scenario = scenarios.load(args.scenario, args.seed)
+    if not is_free(args.port):
+        raise ScenarioError(f"port {args.port} is taken by another program; choose one with --port (PORT=)")
+    if args.data is not None and not args.data.is_dir():
+        raise ScenarioError(f"{args.data}: no such folder of recorded data (--data)")
+    if _is_inside(args.policy, args.out):
+        raise ScenarioError(f"--policy {args.policy}: {args.out} is emptied first; choose another --out")
+    options = Options(
+        out=args.out,
+        duration_s=args.duration_s,
+        port=args.port,
+        data=args.data,
+        seed=args.seed,
+        restart=args.restart,
+        process_per_camera=args.process_per_camera,
+        edge=() if args.policy is None else (f"--policy={args.policy}",),
+    )
+    return Launcher(scenario, options).run()
+
+
+def seconds(text: str) -> float:
+    """``90``, ``90s``, ``1.5m``, ``2h``; 0 means no end."""
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|min|h|)", text.strip())
+    if not found:
+        raise argparse.ArgumentTypeError(f"expected a time such as 60s, 5m or 0 (no end), got {text!r}")
+    return float(found[1]) * {"": 1, "s": 1, "m": 60, "min": 60, "h": 3600}[found[2]]
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 65535:
+        raise argparse.ArgumentTypeError(f"expected a port from 1 to 65535, got {text!r}")
+    return int(text)
+
+
+def _is_inside(policy: str | None, out: Path) -> bool:
+    """Whether the learned policy is a file of the earlier run that this one replaces."""
+    kind, _, file = (policy or "").partition(":")
+    return kind == "bandit" and Path(file).expanduser().resolve().is_relative_to(out.resolve())
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``freshfield demo``."""
+    add = parser.add_argument
+    add(
+        "scenario",
+        nargs="?",
+        default="card",
+        help="scenario file, or the name of a shipped one (freshfield scenario list) [%(default)s]",
+    )
+    add(
+        "--for",
+        dest="duration_s",
+        type=seconds,
+        default=60.0,
+        metavar="TIME",
+        help="end after this long: 90s, 5m, 2h; 0: on Ctrl-C [60s]",
+    )
+    add(
+        "--out",
+        type=Path,
+        default=Path("runs/demo"),
+        metavar="DIR",
+        help="folder to write; replaces an earlier run in it [%(default)s]",
+    )
+    add("--port", type=_port, default=8080, help="port of the page on 127.0.0.1 [%(default)s]")
+    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    add("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
+    add(
+        "--policy",
+        metavar="NAME[:VALUE]",
+        help="in place of the scenario's: all, threshold:120, bandit:FILE (docs/scheduling.md)",
+    )
+    add("--restart", action="store_true", help="start a process again when it dies, instead of ending the run")
+    add("--process-per-camera", action="store_true", help="one camera-node process for each camera [one for all]")
+    parser.set_defaults(run=run)

@@ -1,0 +1,117 @@
+"""``freshfield scenario``: list, show, start and check scenario files, and tell their keys."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shutil
+from pathlib import Path
+
+from freshfield.scenario import SCENARIO_FOLDER, Scenario, ScenarioError, load
+
+COMMANDS = ("list", "show", "init", "check", "keys", "schema")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The commands below ``freshfield scenario``."""
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    shipped = commands.add_parser("list", help="the shipped scenarios, and which of them need recorded data")
+    shipped.set_defaults(run=_list)
+    show = commands.add_parser("show", help="print a scenario file")
+    show.add_argument("scenario", help="the name of a shipped one, or a file")
+    show.set_defaults(run=_show)
+    init = commands.add_parser("init", help="write a scenario file of your own, to edit")
+    init.add_argument("file", type=Path, help="the file to write, mine.yaml; an existing one is refused")
+    init.add_argument("--like", default="room", metavar="NAME", help="the shipped scenario to start from [%(default)s]")
+    init.set_defaults(run=_init)
+    check = commands.add_parser("check", help="read every section of a file; opens no data, camera or port")
+    check.add_argument("scenario", help="file, or the name of a shipped one")
+    check.set_defaults(run=_check)
+    keys = commands.add_parser("keys", help="what a section may say: keys, bounds, defaults")
+    keys.add_argument("section", nargs="?", help="cameras, source, effects, channel, faults or edge [all]")
+    keys.set_defaults(run=_keys)
+    schema = commands.add_parser("schema", help="print the JSON Schema of scenario files, for editors")
+    schema.set_defaults(run=_schema)
+
+
+def _list(_: argparse.Namespace) -> int:
+    for file in sorted(SCENARIO_FOLDER.glob("*.yaml")):
+        scenario = load(file)
+        data = scenario.source.get("data")
+        print(f"{scenario.name:12} {scenario.description}{f' [--data: {data}]' if data else ''}")
+    return 0
+
+
+def _show(args: argparse.Namespace) -> int:
+    print(load(args.scenario).path.read_text(encoding="utf-8"), end="")
+    return 0
+
+
+def _init(args: argparse.Namespace) -> int:
+    model = load(args.like)
+    name, beside = args.file.stem, model.path.with_suffix("")
+    if args.file.suffix != ".yaml":
+        raise ScenarioError(f"{args.file}: expected a file name that ends in .yaml")
+    if args.file.exists():
+        raise ScenarioError(f"{args.file}: exists; choose another name, or remove it first")
+    text = model.path.read_text(encoding="utf-8")
+    args.file.parent.mkdir(parents=True, exist_ok=True)
+    if beside.is_dir():  # files that the scenario names
+        shutil.copytree(beside, args.file.parent / beside.name, dirs_exist_ok=True)
+    args.file.write_text(re.sub(r"(?m)^name: .*$", f"name: {name}", text), encoding="utf-8")
+    print(f"wrote {args.file}, like {model.name}; next: freshfield scenario check {args.file}")
+    return 0
+
+
+def _check(args: argparse.Namespace) -> int:
+    scenario = load(args.scenario)
+    print("\n".join(checked(scenario)))
+    return 0
+
+
+def checked(scenario: Scenario) -> list[str]:
+    """What each package makes of its section, a line each. Raises ScenarioError."""
+    from camera_node.settings import source_config
+    from channel_emu.model.settings import channel_from_mapping
+
+    source = source_config(scenario)
+    channel = channel_from_mapping(scenario.channel, f"{scenario.path}: channel", scenario.path.parent)
+    try:
+        from edge_server.edge_defaults import cameras_move
+        from edge_server.fields.registry import settings_of
+        from edge_server.settings import described, read_config
+    except ImportError as error:
+        raise ScenarioError(f"edge: not checked, {error.name} is missing: install the extra edge") from None
+    edge = read_config(scenario)
+    try:
+        settings_of(edge.field, edge.field_options)
+    except ScenarioError:
+        raise
+    except ValueError as error:
+        raise ScenarioError(f"{scenario.path}: edge.field: {error}") from None
+    held = f", {', '.join(scenario.held_out)} held out" if scenario.held_out else ", none held out"
+    states = f", states {', '.join(channel.state_names)}" if channel.chain else ""
+    effects = f" with {', '.join(source.effects)}" if source.effects else ""
+    moving = "a camera" if cameras_move(scenario) else ""
+    return [
+        f"{scenario.path}: valid",
+        f"  cameras  {len(scenario.cameras)}{held}",
+        f"  source   {source.kind}{effects}",
+        f"  channel  {channel.preset}: mean delay {channel.mean_delay_ms:.3g} ms{states}",
+        f"  edge     {described(scenario, edge, moving)}",
+    ]
+
+
+def _keys(args: argparse.Namespace) -> int:
+    from freshfield_up import keys
+
+    print(keys.text(args.section))
+    return 0
+
+
+def _schema(_: argparse.Namespace) -> int:
+    from freshfield_up import keys
+
+    print(json.dumps(keys.schema(), indent=2))
+    return 0
