@@ -94,8 +94,8 @@ class Camera:
 
     @property
     def rate_schedule(self) -> RateSchedule:
-        """The multiples of 1 / fps, shifted by the camera's phase."""
-        return RateSchedule(self.fps, self.source.phase_ns)
+        """The instants of the source's ticks."""
+        return self.source.rate_schedule()
 
     def cached(self, tick: int) -> Shot | None:
         """The tick's shot if it is cached, else None."""

@@ -64,6 +64,26 @@ class RateSchedule:
         return (now_ns - self._phase_ns) * self._rate // self._per_tick
 
 
+class PartialSchedule(RateSchedule):
+    """Of every ``every`` ticks all but the first, which are numbered without a gap: those of a camera that is carried
+    about, some of whose captures are held out."""
+
+    def __init__(self, fps: Fraction, phase_ns: int, every: int) -> None:
+        super().__init__(fps, phase_ns)
+        self._every = every
+
+    def whole(self, tick: int) -> int:
+        """The number of a tick among all of them."""
+        return tick + tick // (self._every - 1) + 1
+
+    def due_ns(self, tick: int) -> int:
+        return super().due_ns(self.whole(tick))
+
+    def _latest(self, now_ns: int) -> int:
+        latest = super()._latest(now_ns)
+        return latest - latest // self._every - 1
+
+
 class OnceSchedule:
     """Captures at ``times_ns`` after ``start_ns``, once and without skipping any, however late the node
     is."""

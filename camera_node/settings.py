@@ -113,6 +113,7 @@ class WorldConfig(SourceConfig, frozen=True, kw_only=True):
     motion_seed: Annotated[int | None, about("draws another motion of the scene")] = None
     params: Annotated[dict[str, Any], about("further parameters of the scene, by name")] = field(default_factory=dict)
     arm: Annotated[ArmConfig | None, about("carries the cameras that it lists")] = None
+    carried: Annotated[tuple[str, ...], about("cameras that somebody carries through the room")] = ()
 
     def scene_parameters(self) -> dict[str, Any]:
         """Parameters of the scene by name: the fields above that were given, and ``params``."""

@@ -21,9 +21,10 @@ CHOSEN = ("field", "layers", "updates", "update_ms", "steps", "keyframes")
 
 
 def cameras_move(scenario: Scenario) -> bool:
-    """Whether a scenario says that its cameras move: an arm or a trajectory carries them. Others may move,
+    """Whether a scenario says that its cameras move: an arm, a trajectory or somebody carries them. Others may move,
     too, which their poses tell."""
-    return any(scenario.source.get(key) is not None for key in ("arm", "trajectory"))
+    carries = any(scenario.source.get(key) for key in ("arm", "trajectory", "carried"))
+    return carries or bool(scenario.held_out_every)
 
 
 def with_defaults(section: Mapping[str, Any], moving: bool) -> dict[str, Any]:

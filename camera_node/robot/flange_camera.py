@@ -111,7 +111,7 @@ class FlangeCamera(Source):
         image = view.image((t_ns % round(self._scene.period_s * 1e9)) * 1e-9)
         if self._effects.image:
             image = self._effects.apply(image, content, t_ns * 1e-9)
-        return Shot(image, self._effects.reported_pose(pose, content), self.intrinsics, gap_ns)
+        return Shot(image, self._effects.reported_pose(pose, content, t_ns * 1e-9), self.intrinsics, gap_ns)
 
     def close(self) -> None:
         """Disconnect from the arm."""

@@ -10,6 +10,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.capture_schedule import RateSchedule
 from freshfield import payload
 from freshfield.depth import DepthImage, EncodedDepth
 from freshfield.geometry import Pinhole, Pose
@@ -63,18 +64,25 @@ class Source(ABC):
     camera: id in the scenario.
     intrinsics: of the shots; a shot's own hold if they differ.
     contents: number of different shots before they repeat; None if they never repeat.
+    repeats_after: number of ticks after which the scene and the camera's path repeat, errors of sensors apart; None if
+        they do not, or it is not known.
     """
 
     camera: str
     fps: Fraction
     intrinsics: Pinhole
     contents: int | None = None
+    repeats_after: int | None = None
     phase_ns: int = 0
 
     def content(self, tick: int) -> int:
         """Number of the shot that a tick shows: 0 to contents - 1, or the tick itself if shots never
         repeat."""
         return tick
+
+    def rate_schedule(self) -> RateSchedule:
+        """The instants of its ticks."""
+        return RateSchedule(self.fps, self.phase_ns)
 
     @abstractmethod
     def read(self, content: int) -> Shot:

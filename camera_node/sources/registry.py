@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,13 @@ def open_sources(
     Raises ScenarioError, DatasetError, CameraError or ArmError.
     """
     effects = effects or {}
+    if scenario.held_out_every and scenario.held_out:
+        from camera_node.sources.shared_path import check_divisible, divide
+
+        check_divisible(scenario, config)
+        whole = replace(scenario, cameras=scenario.training, held_out=())
+        of_paths = {scenario.path_of(camera): effects.get(camera) for camera in cameras}
+        return divide(scenario, open_sources(whole, config, list(of_paths), data, of_paths), cameras)
     if isinstance(config, WorldConfig):
         from camera_node.synthetic.source import open_sources as open_world
 

@@ -19,19 +19,20 @@ if TYPE_CHECKING:
 
 
 def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Effects | None:
-    """The effects of one camera; None, without importing any, if the scenario lists none. Raises
-    ScenarioError for an invalid effect, or one that needs a synthetic world."""
+    """The effects of one camera, or of the camera whose captures it shows; None, without importing any, if the scenario
+    lists none. Raises ScenarioError for an invalid effect, or one that needs a synthetic world."""
     if not config.effects:
         return None
+    camera = scenario.path_of(camera)
     from camera_node.synthetic.effects import load_effects
 
     with errors_of(f"{scenario.path}: source.effects"):
         effects = load_effects(
             config.effects, lambda name: scenario.rng(f"effect {name}", camera), held_out=camera in scenario.held_out
         )
-    if config.kind != "world" and (effects.lens or effects.exposure):
+    if config.kind != "world" and (effects.lens or effects.exposure or effects.delay):
         raise ScenarioError(
-            f"{scenario.path}: source.effects: effects of the kinds lens and exposure need source kind world"
+            f"{scenario.path}: source.effects: effects of the kinds lens, exposure and delay need source kind world"
         )
     return effects
 
@@ -58,10 +59,11 @@ class AffectedSource(Source):
 
     def read(self, content: int) -> Shot:
         shot = self._source.read(self._source.content(content) if self._each_differs else content)
-        shot = dataclasses.replace(shot, pose=self._effects.reported_pose(shot.pose, content))
+        t_s = float(content / self.fps)
+        shot = dataclasses.replace(shot, pose=self._effects.reported_pose(shot.pose, content, t_s))
         if not self._effects.image:
             return shot
-        image = self._effects.apply(pixels(shot, self._codec), content, float(content / self.fps))
+        image = self._effects.apply(pixels(shot, self._codec), content, t_s)
         return dataclasses.replace(shot, image=image)
 
     def depth(self, content: int, shot: Shot) -> DepthImage | None:

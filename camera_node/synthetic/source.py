@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 from camera_node.settings import SourceConfig, WorldConfig, errors_of
 from camera_node.sources.base import Shot, Source, pixels, rate
 from camera_node.synthetic import Scene, make_scene
-from camera_node.synthetic.effects import NO_EFFECTS, Effects
+from camera_node.synthetic.effects import NO_EFFECTS, Effects, Renderer
 from camera_node.synthetic.frame_cache import FrameCache, default_folder, renderer_version
 from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.render import Image
@@ -27,6 +28,7 @@ from freshfield.settings import as_mapping
 
 if TYPE_CHECKING:
     from camera_node.synthetic.depth import DepthRenderer
+    from camera_node.synthetic.walk import Walk
 
 WORLD_FPS = 15.0
 # A sequence with more different frames counts as not repeating: frames are rendered on demand and not kept.
@@ -40,6 +42,7 @@ class WorldSource(Source):
     effects: of this camera, from ``load_effects``.
     codec, quality: of the encoded frames.
     folder: root of the cache of rendered frames; None renders every frame anew.
+    walk: carries the camera, instead of the scene's pose; None: it stands still.
     Raises ValueError for a rate that is not positive, EffectError for effects that do not fit the scene.
 
     Attributes:
@@ -59,6 +62,7 @@ class WorldSource(Source):
         quality: int = 92,
         phase_ns: int = 0,
         folder: Path | None = None,
+        walk: Walk | None = None,
     ) -> None:
         self.scene = effects.extend(scene)
         self.camera, self.camera_id, self.phase_ns = camera, camera_id, phase_ns
@@ -67,7 +71,8 @@ class WorldSource(Source):
             raise ValueError(f"fps must be positive, got {fps}")
         lens, matrix = self.scene.cameras[camera_id]
         self.intrinsics = effects.reported_lens(lens)
-        self.repeats_after = _repeats_after(self.scene, self.fps)
+        self._walk = walk
+        self.repeats_after = _repeats_after(self.scene, self.fps, None if walk is None else walk.lap_s)
         # Frames with equal images but different reported poses are different shots.
         self.contents = None if effects.image or effects.pose_varies else self.repeats_after
         self._pose, self._effects = Pose.from_matrix(matrix), effects
@@ -89,18 +94,22 @@ class WorldSource(Source):
             image = self._effects.apply(self.image(frame), content, self._time_s(content))
         else:
             image = self._stored(frame)
-        return Shot(image, self._effects.reported_pose(self._pose, content), self.intrinsics)
+        t_s, pose = self._time_s(content), self._pose
+        if self._walk is not None:
+            pose = Pose.from_matrix(self._walk.pose(self._effects.pose_instant_s(t_s)))
+        return Shot(image, self._effects.reported_pose(pose, content, t_s), self.intrinsics)
 
     def depth(self, content: int, shot: Shot) -> DepthImage | None:
         """As the listed depth sensor measures it. Of a scene that repeats, measurements repeat too."""
         if not self._effects.depth:
             return None
         lens, matrix = self.scene.cameras[self.camera_id]
-        if self._depth is None:
+        frame = content % self.repeats_after if self.repeats_after else content
+        if self._depth is None or self._walk is not None:
             from camera_node.synthetic.depth import DepthRenderer
 
-            self._depth = DepthRenderer(self.scene.world, lens, matrix)
-        frame = content % self.repeats_after if self.repeats_after else content
+            at = matrix if self._walk is None else self._walk.pose(self._time_s(frame))
+            self._depth = DepthRenderer(self.scene.world, lens, at)
         exact = self._depth.depth(self._time_s(frame))
         return self._effects.depth[0].measure(exact, pixels(shot, self._codec), lens, content)
 
@@ -135,6 +144,8 @@ class WorldSource(Source):
             "renderer": renderer_version(),
             "phase_ns": self.phase_ns,
         }
+        if self._walk is not None:
+            what["walk"] = dataclasses.asdict(self._walk)
         # ``count`` determines which cameras there are, not what one of them sees.
         what["params"].pop("count")
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
@@ -149,17 +160,21 @@ class WorldSource(Source):
         return data
 
     def _render(self, frame: int) -> Image:
-        view = self._effects.with_exposure(self.scene.renderer(self.camera_id))
-        return view.image(self._time_s(frame))
+        if self._walk is None:
+            view: Renderer = self.scene.renderer(self.camera_id)
+        else:
+            view = self._walk.view(self.scene, self.scene.cameras[self.camera_id][0])
+        return self._effects.with_exposure(view).image(self._time_s(frame))
 
     def _time_s(self, frame: int) -> float:
         return float(frame / self.fps) + self.phase_ns / 1e9
 
 
-def _repeats_after(scene: Scene, fps: Fraction) -> int | None:
-    if not scene.moving:
+def _repeats_after(scene: Scene, fps: Fraction, lap_s: float | None) -> int | None:
+    periods_s = [scene.period_s] * scene.moving + ([] if lap_s is None else [lap_s])
+    if not periods_s:
         return 1
-    period = Fraction(round(scene.period_s / PERIOD_UNIT_S)) * Fraction(PERIOD_UNIT_S).limit_denominator(10)
+    period = math.lcm(*(round(s / PERIOD_UNIT_S) for s in periods_s)) * Fraction(PERIOD_UNIT_S).limit_denominator(10)
     # The numerator is the least number of frames that take a whole number of periods.
     frames = (period * fps).numerator
     return frames if frames <= MAX_FRAMES else None
@@ -182,6 +197,7 @@ def open_sources(
     # Training of a scheduler draws hundreds of motions, each used once.
     folder = default_folder() if config.motion_seed is None else None
     fps, made = rate(config.fps or WORLD_FPS), dict[str, WorldSource]()
+    walks = _walks(scenario, config, scene)
     with errors_of(f"{scenario.path}: source.effects"):  # of one that does not fit this scene
         for camera in cameras:
             made[camera] = WorldSource(
@@ -194,6 +210,7 @@ def open_sources(
                 quality=config.quality,
                 phase_ns=scenario.phase_ns(camera, config.fps or WORLD_FPS),
                 folder=folder,
+                walk=walks.get(camera),
             )
     if config.arm is not None and any(camera in config.arm.cameras for camera in cameras):
         from camera_node.robot.flange_camera import open_flange_cameras
@@ -201,6 +218,22 @@ def open_sources(
         seen = {c: (made[c].scene, made[c].scene.cameras[names[c]][0]) for c in cameras if c in config.arm.cameras}
         return {**made, **open_flange_cameras(scenario, config.arm, fps, seen, effects)}
     return {**made}
+
+
+def _walks(scenario: Scenario, config: WorldConfig, scene: Scene) -> dict[str, Walk]:
+    """The walk of each camera that is carried. Raises ScenarioError."""
+    if not config.carried:
+        return {}
+    from camera_node.synthetic.walk import walks_through
+
+    unknown = [camera for camera in config.carried if camera not in scenario.cameras]
+    if unknown or (config.arm is not None and set(config.carried) & set(config.arm.cameras)):
+        raise ScenarioError(
+            f"{scenario.path}: source.carried: expected cameras of this scenario that no arm carries, "
+            f"got {', '.join(unknown or config.carried)}"
+        )
+    with errors_of(f"{scenario.path}: source.carried"):
+        return walks_through(scene, config.carried)
 
 
 def _scene_cameras(scenario: Scenario, scene: Scene) -> dict[str, str]:

@@ -41,12 +41,16 @@ class Cameras(Settings, frozen=True):
 
     phase: of a synthetic world's cameras. ``locked``: all capture at the same instants, as in the thesis;
         ``spread``: each at its own seeded phase, like cameras without a common trigger.
+    held_out_every: for cameras that are carried about: of so many captures of a training camera the first is not its
+        own, but is sent as a frame of the held-out camera of the same place in the lists; 0: held-out cameras are
+        cameras of their own.
     """
 
     count: Annotated[int, within(0, MAX_CAMERAS, "number of cameras, named cam00, cam01, ...")] = 0
     ids: Annotated[list[str], about("names of the cameras, instead of count")] = msgspec.field(default_factory=list)
     held_out: Annotated[list[str], about("cameras that are never trained on")] = msgspec.field(default_factory=list)
     phase: Literal["locked", "spread"] = "locked"
+    held_out_every: Annotated[int, within(0, 10**6, "of so many captures of a moving camera, one is held out")] = 0
 
 
 class ScenarioFile(Settings, frozen=True):
@@ -76,11 +80,18 @@ class Scenario:
     channel: dict[str, Any] = field(default_factory=dict)
     edge: dict[str, Any] = field(default_factory=dict)
     phase: str = "locked"
+    held_out_every: int = 0
 
     @property
     def training(self) -> tuple[str, ...]:
         """The cameras that are not held out."""
         return tuple(c for c in self.cameras if c not in self.held_out)
+
+    def path_of(self, camera: str) -> str:
+        """The camera whose captures ``camera`` sends: itself, unless it is held out and ``held_out_every`` is set."""
+        if not self.held_out_every or camera not in self.held_out:
+            return camera
+        return self.training[self.held_out.index(camera)]
 
     @property
     def max_side_px(self) -> int:
@@ -165,15 +176,22 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
             raise ScenarioError(f"{file}: cameras.held_out: {name!r} is not one of the cameras")
     if len(set(found.held_out)) == len(ids):
         raise ScenarioError(f"{file}: cameras.held_out: every camera is held out, none is left to train on")
+    held_out = tuple(dict.fromkeys(found.held_out))
+    if found.held_out_every == 1 or (found.held_out_every and 2 * len(held_out) != len(ids)):
+        raise ScenarioError(
+            f"{file}: cameras.held_out_every: expected 2 or more, and as many held-out cameras as training cameras: "
+            f"each shows captures of one of those; got {found.held_out_every}, {len(held_out)} of {len(ids)} held out"
+        )
     return Scenario(
         path=file,
         name=file_settings.name or file.stem,
         seed=file_settings.seed,
         cameras=ids,
-        held_out=tuple(dict.fromkeys(found.held_out)),
+        held_out=held_out,
         description=file_settings.description,
         source=file_settings.source,
         channel=file_settings.channel,
         edge=file_settings.edge or {},
         phase=found.phase,
+        held_out_every=found.held_out_every,
     )

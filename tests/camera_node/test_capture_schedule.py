@@ -8,7 +8,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_node.capture_schedule import OnceSchedule, RateSchedule
+from camera_node.capture_schedule import OnceSchedule, PartialSchedule, RateSchedule
 
 NOW_NS = 1_763_000_000_123_456_789
 TIMES = [0, 33_000_000, 66_000_001, 250_000_000]
@@ -48,3 +48,17 @@ def test_a_recording_is_played_once_whole_however_late():
 def test_nothing_is_captured_twice():
     found, _ = walk(RateSchedule(Fraction(30)), NOW_NS, 50, late_ns=40_000_000)
     assert all(b > a for a, b in pairwise(found))
+
+
+@given(st.integers(2, 9), st.integers(0, 2**60), st.integers(0, 10**9))
+def test_captures_that_are_held_out_are_left_out_and_the_others_counted_without_a_gap(every, now_ns, late_ns):
+    whole, part = RateSchedule(Fraction(10), 7), PartialSchedule(Fraction(10), 7, every)
+    tick = part.first(now_ns)
+    at = part.whole(tick)
+    own = [whole.due_ns(k) for k in range(at - every, at + 2 * every + 12) if k % every]
+    assert part.due_ns(tick) == min(due_ns for due_ns in own if due_ns > now_ns)
+    later_ns = part.due_ns(tick) + late_ns
+    after, missed = part.next(tick, later_ns)
+    between = [due_ns for due_ns in own if part.due_ns(tick) < due_ns <= later_ns]
+    assert after is not None and missed == max(0, len(between) - 1)
+    assert part.due_ns(after) == (between[-1] if between else min(due_ns for due_ns in own if due_ns > later_ns))

@@ -31,6 +31,8 @@ NAMES = {
     "thesis",
     "duo",
     "quad",
+    "handheld",
+    "redkitchen",
 }
 
 
@@ -44,9 +46,9 @@ def test_every_package_accepts_its_section(file: Path) -> None:
     assert scenario.name == file.stem, "a report names the scenario: it must lead back to the file"
     assert scenario.description
     arm = getattr(source_config(scenario), "arm", None)
-    # A scene needs views from several sides: of several cameras, of two that measure depth, or of one that an arm
-    # carries round it.
-    least = 2 if "depth_sensor" in source_config(scenario).effects else 3
+    # A scene needs views from several sides: of several cameras, of two that measure depth, or of one that an arm or
+    # somebody carries round it.
+    least = 1 if scenario.held_out_every else 2 if "depth_sensor" in source_config(scenario).effects else 3
     assert len(scenario.training) >= least or set(arm.cameras) >= set(scenario.training)
     channel_from_mapping(scenario.channel, f"{file}: channel")
     edge = read_config(scenario)

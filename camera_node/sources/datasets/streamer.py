@@ -55,6 +55,15 @@ class Playback:
         place = int(position % period)
         return place if place < self.count else period - place
 
+    def whole_groups(self, size: int) -> list[int]:
+        """The frames of the ticks of one pass, the last few left out so that ticks whose number is a multiple of
+        ``size`` show the same frames in every later pass, too. Raises DatasetError for a pass of fewer ticks."""
+        ticks = int((self.count - 1) * self.fps / self.recorded_fps) + 1
+        kept = (ticks - 1) // size * size + 1 if self.back_and_forth else ticks // size * size
+        if kept < size:
+            raise DatasetError(f"of every {size} captures one is held out: {ticks} are too few")
+        return [self.frame(tick) for tick in range(kept)]
+
 
 def open_recorded(
     scenario: Scenario, config: RecordedConfig, cameras: Sequence[str], data: Path | None
@@ -69,8 +78,10 @@ def open_recorded(
             f"{path}: has masks of pixels that must not be learned from, which a stream cannot carry: use edge-server "
             "fit, or leave the masks out"
         )
-    if found.moving or found.per_camera:
-        names = assign_cameras(scenario, config.assignment, cameras, found.cameras)
+    path_of_one = len(scenario.cameras) == 1 == len(found.cameras) and all(image.time_s is not None for image in found)
+    if found.moving or found.per_camera or path_of_one:
+        names = {cameras[0]: found.cameras[0]} if path_of_one else {}
+        names = names or assign_cameras(scenario, config.assignment, cameras, found.cameras)
         shown = {camera: found.of(name) for camera, name in names.items()}
         recorded = {camera: _recorded_fps(found, shown[camera], path) for camera in cameras}
         timeline = Timeline.of(found, path)
@@ -95,6 +106,9 @@ def open_recorded(
         steps_per_s = timeline.fps if camera in order else fps
         back_and_forth = config.loop == "back-and-forth"
         playback = Playback(len(shots), rate(config.fps) if config.fps else fps, steps_per_s, back_and_forth)
+        if scenario.held_out_every:
+            shots = [shots[n] for n in playback.whole_groups(scenario.held_out_every)]
+            playback = Playback(len(shots), playback.fps, playback.fps, back_and_forth)
         sources[camera] = ImageSource(camera, shown[camera], shots, playback, config.codec, poses.get(camera))
     return sources
 

@@ -7,6 +7,7 @@ The kinds, by where they act:
 * ``image``    changes each frame as it is streamed, recorded ones too (costs time a frame);
 * ``clock``    changes the node's clock and so its time stamps;
 * ``pose``     changes the pose that frames report, not the image;
+* ``delay``    changes the instant of that pose, of a camera that moves;
 * ``depth``    measures depth with frames that carry it (costs time for each of those).
 
 To add one, write a file here with a dataclass of the same name (the effect's parameters and ``kind``) and add
@@ -39,6 +40,7 @@ NAMES = (
     "exposure_drift",
     "lens_distortion",
     "motion_blur",
+    "pose_delay",
     "pose_noise",
     "sensor_noise",
 )
@@ -111,8 +113,14 @@ class PoseEffect(Protocol):
         """Whether frames of one camera report different poses."""
         ...
 
-    def reported(self, pose: Pose, index: int) -> Pose:
-        """The pose that frame number ``index``, taken from ``pose``, reports."""
+    def reported(self, pose: Pose, index: int, t_s: float) -> Pose:
+        """The pose that frame number ``index``, taken from ``pose`` at ``t_s`` after the epoch, reports."""
+        ...
+
+
+class DelayEffect(Protocol):
+    def instant_s(self, t_s: float) -> float:
+        """The instant whose pose a frame taken at ``t_s`` reports."""
         ...
 
 
@@ -135,6 +143,7 @@ class Effects:
     image: tuple[ImageEffect, ...] = ()
     clock: tuple[ClockError, ...] = ()
     pose: tuple[PoseEffect, ...] = ()
+    delay: tuple[DelayEffect, ...] = ()
     depth: tuple[DepthEffect, ...] = ()
     rendered: tuple[tuple[str, Any], ...] = ()  # name and parameters of the effects within cached frames
 
@@ -178,11 +187,17 @@ class Effects:
         """Whether the reported poses differ from frame to frame."""
         return any(effect.varies for effect in self.pose)
 
-    def reported_pose(self, pose: Pose, index: int) -> Pose:
-        """The pose that frame number ``index``, taken from ``pose``, reports."""
+    def reported_pose(self, pose: Pose, index: int, t_s: float) -> Pose:
+        """The pose that frame number ``index``, taken from ``pose`` at ``t_s``, reports."""
         for effect in self.pose:
-            pose = effect.reported(pose, index)
+            pose = effect.reported(pose, index, t_s)
         return pose
+
+    def pose_instant_s(self, t_s: float) -> float:
+        """The instant whose pose a frame taken at ``t_s`` reports."""
+        for effect in self.delay:
+            t_s = effect.instant_s(t_s)
+        return t_s
 
 
 NO_EFFECTS = Effects()

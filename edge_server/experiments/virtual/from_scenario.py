@@ -103,7 +103,7 @@ def build_truth(
     out."""
     if not scenario.held_out:
         return None
-    if isinstance(source, WorldConfig):
+    if isinstance(source, WorldConfig) and not scenario.held_out_every:
         worlds = {camera: exact_scene(scenario, source, camera) for camera in scenario.held_out}
         known = next(iter(worlds.values()))[0].cameras
         names = dict(zip(scenario.cameras, scenario.cameras if set(scenario.cameras) <= set(known) else known))

@@ -46,7 +46,7 @@ def pixels(camera: Camera, tick: int) -> np.ndarray:
     return payload.decode(shot.payload, "zstd", shot.intrinsics.width, shot.intrinsics.height)
 
 
-@pytest.mark.parametrize("name", sorted(set(NAMES) - {"clock_drift", "depth_sensor"}))
+@pytest.mark.parametrize("name", sorted(set(NAMES) - {"clock_drift", "depth_sensor", "pose_delay"}))
 def test_an_effect_reaches_the_frames_but_not_the_truth(name):
     """Deterministic by the seed, whoever else is there; in_truth reaches the held-out camera, too."""
     plain, affected, truth = cameras({}), cameras({name: {}}), cameras({name: {"in_truth": True}})
@@ -120,10 +120,10 @@ def test_a_lens_that_does_not_go_with_the_scene_is_one_line_with_the_file_s_name
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["lens_distortion", "motion_blur"])
+@pytest.mark.parametrize("name", ["lens_distortion", "motion_blur", "pose_delay"])
 def test_recordings_have_lenses_of_their_own(tmp_path, name):
     scenario = photo_scenario(write_photos(tmp_path, 24), 3, effects={name: None})
-    with pytest.raises(ScenarioError, match="kinds lens and exposure need source kind world"):
+    with pytest.raises(ScenarioError, match="kinds lens, exposure and delay need source kind world"):
         build_cameras(scenario, source_config(scenario), scenario.cameras)
 
 

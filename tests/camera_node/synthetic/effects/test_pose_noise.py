@@ -27,7 +27,7 @@ def errors(poses: list[Pose]) -> tuple[np.ndarray, np.ndarray]:
 
 def test_the_noise_of_many_frames():
     noise = make(translation_mm=8.0, rotation_deg=0.5)
-    moved, turned = errors([noise.reported(POSE, k) for k in range(4000)])
+    moved, turned = errors([noise.reported(POSE, k, 0.0) for k in range(4000)])
     assert moved.std(axis=0) == pytest.approx([8.0] * 3, rel=0.04)
     assert turned.std(axis=0) == pytest.approx([0.5] * 3, rel=0.04)
     assert np.abs(moved.mean(axis=0)).max() < 0.5 and np.abs(turned.mean(axis=0)).max() < 0.03
@@ -37,10 +37,22 @@ def test_the_noise_of_many_frames():
     assert max(abs(np.corrcoef(e[1:], e[:-1])[0, 1]) for e in both.T) < 0.06
 
 
+def test_correlated_noise_is_as_large_and_smooth():
+    noise = make(translation_mm=8.0, rotation_deg=0.5, correlation_s=2.0)
+    moved, turned = errors([noise.reported(POSE, 0, 0.1 * k) for k in range(40_000)])
+    assert moved.std(axis=0) == pytest.approx([8.0] * 3, rel=0.06)
+    assert turned.std(axis=0) == pytest.approx([0.5] * 3, rel=0.06)
+    for error in (moved / 8.0, turned / 0.5):
+        assert np.abs(np.diff(error, axis=0)).max() < 0.6, "in a twentieth of the time"
+        far = [np.corrcoef(axis[60:], axis[:-60])[0, 1] for axis in error.T]
+        assert np.abs(far).max() < 0.06, "after three times that time nothing is left"
+    assert noise.reported(POSE, 5, 3.7) == noise.reported(POSE, 9, 3.7) != noise.reported(POSE, 5, 3.8)
+
+
 def test_the_bias_is_a_camera_s_own_and_for_good():
     cameras = [make(k, translation_bias_mm=12.0, rotation_bias_deg=0.8) for k in range(2000)]
     assert not cameras[0].varies
-    assert cameras[5].reported(POSE, 0) == cameras[5].reported(POSE, 900)
-    moved, turned = errors([c.reported(POSE, 0) for c in cameras])
+    assert cameras[5].reported(POSE, 0, 0.0) == cameras[5].reported(POSE, 900, 60.0)
+    moved, turned = errors([c.reported(POSE, 0, 0.0) for c in cameras])
     assert moved.std(axis=0) == pytest.approx([12.0] * 3, rel=0.05)
     assert turned.std(axis=0) == pytest.approx([0.8] * 3, rel=0.05)

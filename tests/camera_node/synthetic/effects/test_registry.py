@@ -71,14 +71,14 @@ def test_nothing_listed_passes_everything_through_untouched():
     assert effects.with_exposure(view) is view
     assert effects.node_ns(12345) == 12345
     assert effects.reported_lens(view.camera) is view.camera
-    assert effects.reported_pose(pose, 3) is pose and not effects.pose_varies
+    assert effects.reported_pose(pose, 3, 0.2) is pose and not effects.pose_varies
 
 
 def test_every_file_is_registered_and_follows_the_protocol():
     on_disk = sorted(m.name for m in pkgutil.iter_modules(fx.__path__))
     assert sorted(fx.NAMES) == on_disk
     methods = {"lens": "rendered", "exposure": "expose", "image": "apply", "clock": "node_ns", "pose": "reported"}
-    methods["depth"] = "measure"
+    methods |= {"depth": "measure", "delay": "instant_s"}
     for name in fx.NAMES:
         cls = fx.effect_class(name)
         assert callable(getattr(cls().start(np.random.default_rng(0)), methods[cls.kind]))
@@ -107,6 +107,7 @@ def test_the_held_out_camera_shows_the_truth_unless_in_truth():
         ({"smoke": {}}, "unknown effect 'smoke'; valid effects: clock_drift, depth_sensor, exposure_drift, "),
         ({"sensor_noise": {"sigma": 1}}, "effect sensor_noise.sigma: unknown key; expected one of read_noise"),
         ({"motion_blur": {"exposure_ms": 0}}, "exposure_ms: expected .*1e-06 to 1000"),
+        ({"pose_noise": {"correlation_s": 1e-9}}, "correlation_s must be 0 or at least 0.001"),
         ({"lens_distortion": {"calibrated": "no"}}, "lens_distortion.calibrated"),
     ],
 )
@@ -123,6 +124,7 @@ NEUTRAL: dict[str, dict] = {
     "exposure_drift": {"amplitude_stops": 0.0, "offset_spread_stops": 0.0},
     "lens_distortion": {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0},
     "motion_blur": {"samples": 1},
+    "pose_delay": {"delay_ms": 0.0},
     "pose_noise": {"translation_mm": 0.0, "rotation_deg": 0.0},
     "sensor_noise": {"read_noise_counts": 0.0, "full_well_electrons": 0.0},
 }
@@ -138,7 +140,7 @@ def test_an_effect_of_no_strength_changes_nothing(name):
     assert np.array_equal(image, plain)
     camera, matrix = changed.cameras["cam01"]
     assert effects.reported_lens(camera) == scene.cameras["cam01"][0]
-    assert np.allclose(effects.reported_pose(Pose.from_matrix(matrix), 6).matrix(), matrix, atol=1e-12)
+    assert np.allclose(effects.reported_pose(Pose.from_matrix(matrix), 6, 0.4).matrix(), matrix, atol=1e-12)
     assert effects.node_ns(2 * 10**18 + 1) == 2 * 10**18 + 1
 
 
@@ -151,7 +153,7 @@ def test_frames_repeat_in_any_order_and_leave_what_they_are_given(name):
         made = fx.load_effects({name: {}}, lambda _: np.random.default_rng(seed))
         shown = [made.apply(image[..., :3] if name == "sensor_noise" else image, k, k / 15) for k in numbers]
         assert all((one[..., 3:] == 100).all() for one in shown), "transparency is no color"
-        return [(one.tobytes(), made.reported_pose(pose, k)) for one, k in zip(shown, numbers)]
+        return [(one.tobytes(), made.reported_pose(pose, k, k / 15)) for one, k in zip(shown, numbers)]
 
     first = frames(0, (0, 1, 2**40))
     assert len(set(first)) == 3 and frames(0, (2**40, 1, 0)) == first[::-1]
