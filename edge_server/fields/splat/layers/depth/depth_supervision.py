@@ -21,7 +21,7 @@ from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
 from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
 from edge_server.fields.splat.layers.depth.kernels.surfaces import Meshes
 from edge_server.fields.splat.layers.depth.overlaps import contradicting, exposures
-from edge_server.fields.splat.layers.depth.plate_stereo import fill_by_stereo, sweep_plates
+from edge_server.fields.splat.layers.depth.plate_stereo import PlateStereo
 from edge_server.fields.splat.layers.depth.registration import Correction, register
 from edge_server.fields.splat.layers.depth.surfaces import Surface, SurfaceScene
 from edge_server.fields.splat.layers.depth.virtual_plates import virtual_plates
@@ -76,6 +76,7 @@ class DepthSupervision:
     wrong: cameras whose depth contradicts the others', and is not used.
     corrections: camera -> its pose and the scale of its depth, where registration has found them.
     scene: the surfaces as they were last learned; None before that, or where none can be used.
+    stereo: of the plates; None where it was not needed.
     """
 
     def __init__(self, settings: SplatSettings, pool: Pool) -> None:
@@ -83,6 +84,7 @@ class DepthSupervision:
         self.wrong: tuple[str, ...] = ()
         self.corrections: dict[str, Correction] = {}
         self.scene: SurfaceScene | None = None
+        self.stereo: PlateStereo | None = None
         self._learned: dict[str, NDArray[np.float32]] = {}  # camera -> inverse depths as learned
 
     def forget_camera(self, camera: str) -> None:
@@ -110,7 +112,10 @@ class DepthSupervision:
         return {camera.name: found for camera, found in zip(cameras, logs)}
 
     def has_changed(self, cameras: Sequence[CameraPlates]) -> bool:
-        """Whether depths are known that were not when they were last learned, or differ from those."""
+        """Whether depths are known that were not when they were last learned, or differ from those. May sweep a camera
+        whose plate has changed."""
+        if self.stereo is not None and self._sweep(self.stereo, cameras):
+            return True
         changed = 0
         for camera in cameras:
             now = camera.inverse(self.pool)
@@ -136,8 +141,9 @@ class DepthSupervision:
         poses = [surface.pose for surface in surfaces]
         whole = _are_whole(cameras, surfaces)
         if not whole and of_layers.LEAST_CAMERAS <= len(cameras) <= of_layers.STEREO_CAMERAS:
-            distance_m = scene_box([camera.plate.view for camera in cameras]).distance_m
-            filled = fill_by_stereo(surfaces, distance_m, self.pool)
+            self.stereo = self.stereo or PlateStereo(self.pool)
+            self._sweep(self.stereo, cameras)
+            filled = self.stereo.fill({camera.name: surface for camera, surface in zip(cameras, surfaces)})
             if filled is not None:
                 surfaces, whole = filled, True  # what stereo does not find no other camera sees either
         surfaces = [surface for surface in surfaces if surface.inverse.any()]
@@ -149,6 +155,10 @@ class DepthSupervision:
         if self.scene is not None:
             plates += virtual_plates(self.scene, surfaces, poses, whole, self.pool)
         return plates, surfaces
+
+    def _sweep(self, stereo: PlateStereo, cameras: Sequence[CameraPlates]) -> bool:
+        distance_m = scene_box([camera.plate.view for camera in cameras]).distance_m
+        return stereo.sweep({camera.name: self._corrected(camera, None) for camera in cameras}, distance_m)
 
     def _corrected(self, camera: CameraPlates, measured: Surface | None) -> Surface:
         """What a camera sees, where it stands. measured: None: without depth."""
@@ -182,13 +192,19 @@ class DepthSupervision:
             )
         if self.scene is not None:
             mine |= {"center": self.scene.center, **{f"meshes.{n}": a for n, a in self.scene.meshes._asdict().items()}}
+        if self.stereo is not None:
+            mine |= {f"stereo.{name}": array for name, array in self.stereo.state().items()}
         return {name: np.array(array) for name, array in mine.items()}
 
     def load_state(self, state: Arrays) -> None:
         """Continue from ``state``. KeyError: it lacks something."""
         self.wrong = tuple(str(camera) for camera in state["wrong"])
         self._learned = {n.removeprefix("learned."): np.array(a) for n, a in state.items() if n.startswith("learned.")}
-        self.corrections, self.scene = {}, None
+        self.corrections, self.scene, self.stereo = {}, None, None
+        stereo = {n.removeprefix("stereo."): array for n, array in state.items() if n.startswith("stereo.")}
+        if stereo:
+            self.stereo = PlateStereo(self.pool)
+            self.stereo.load_state(stereo)
         for name, numbers in state.items():
             if name.startswith("correction."):
                 pose, rest = np.array(numbers[:16]).reshape(4, 4), map(float, numbers[16:])
@@ -226,4 +242,7 @@ def _run_kernels(pool: Pool) -> None:
     aside = np.eye(4)
     aside[0, 3] = 0.5
     nothing = np.zeros(shape, np.float32)
-    sweep_plates([CameraPlates(plate, plate, None, pose).surface(nothing) for pose in (np.eye(4), aside)], 1.0, pool)
+    walls = {
+        str(k): CameraPlates(plate, plate, None, pose).surface(nothing) for k, pose in enumerate((np.eye(4), aside))
+    }
+    PlateStereo(pool).sweep(walls, 1.0)

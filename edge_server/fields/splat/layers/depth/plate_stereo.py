@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,59 +22,149 @@ from edge_server.fields.splat.layers.depth.kernels.semi_global import (
     match_costs,
 )
 from edge_server.fields.splat.layers.depth.surfaces import Surface
+from edge_server.fields.splat.layers.settings import CHANGED, SAME_POSE
 from freshfield.geometry import Pinhole, se3_inverse
 
 Image = NDArray[np.float32]
 
-
-def fill_by_stereo(surfaces: Sequence[Surface], distance_m: float, pool: Pool) -> list[Surface] | None:
-    """The surfaces with the depth that stereo finds where they have none; None where it cannot be believed: it finds
-    little, or sensors measured something else at too many of its pixels. distance_m: see ``sweep_plates``."""
-    swept = sweep_plates(surfaces, distance_m, pool)
-    if sum(map(np.count_nonzero, swept)) < tuned.SWEEP_LEAST * sum(np.count_nonzero(s.known) for s in surfaces):
-        return None
-    pairs = [np.stack([s.inverse, found])[:, (s.inverse > 0) & (found > 0)] for s, found in zip(surfaces, swept)]
-    measured, ours = np.concatenate(pairs, axis=1)
-    agree = np.count_nonzero(np.abs(np.log(ours / measured)) < tuned.SWEEP_AGREE)
-    if agree < tuned.SWEEP_TRUSTED * len(ours):
-        return None
-    out, noise = [], tuned.SWEEP_NOISE / (tuned.SWEEP_STEPS * tuned.SWEEP_NEAR * distance_m)
-    for surface, found in zip(surfaces, swept):
-        inverse, slope = smooth(found, surface.color, pool, noise)
-        known = surface.inverse > 0
-        inverse = np.where(known, surface.inverse, inverse)
-        out.append(replace(surface, inverse=inverse, slope=np.where(known[..., None], surface.slope, slope)))
-    return out
+_KEPT = ("images", "poses", "found")  # of a state, by camera
 
 
-def sweep_plates(surfaces: Sequence[Surface], distance_m: float, pool: Pool) -> list[Image]:
-    """Inverse depth of each plate from the other plates, float32 (H, W), 1 / m along the optical axis; 0 where the
-    plate is unknown, where no depth fits best, or where no other plate's depth confirms it.
+class PlateStereo:
+    """Depth of plates from one another, kept: a camera is swept again once its own plate or pose, or that of a camera
+    that it is compared with, differs enough from what was swept.
 
-    surfaces: plates; what they know of depth is not used. Those of more than ``SWEEP_PIXELS`` are matched smaller.
-    distance_m: of the cameras to the scene.
+    Matching uses the plates as they were when they last differed, so what it finds does not change between sweeps.
     """
-    lenses, poses = [_lens(s) for s in surfaces], [s.pose for s in surfaces]
-    images = [_prepare(s, lens) for s, lens in zip(surfaces, lenses)]
-    nearest_m = tuned.SWEEP_NEAR * distance_m
-    steps = np.linspace(0.0, 1.0 / nearest_m, tuned.SWEEP_STEPS).astype(np.float32)
-    flat = np.zeros((len(images), 3, max(image[0].size for image in images)), np.float32)
-    for row, image in zip(flat, images):
-        row[:, : image[0].size] = image.reshape(3, -1)
-    found = []
-    for k, (lens, image) in enumerate(zip(lenses, images)):
-        parallax_px = [_parallax_px(pose, poses[k], its) / nearest_m for pose, its in zip(poses, lenses)]
-        others = [j for j, most in enumerate(parallax_px) if most >= tuned.SWEEP_LEAST_PX]
-        inverse = np.zeros(image.shape[1:], np.float32)
-        if others:
-            here = se3_inverse(poses[k])
-            cameras = camera_rows([here @ poses[j] for j in others], [lenses[j] for j in others], UNIT_BOX)
-            inverse = _match(image, flat[others], cameras, lens, steps, pool)
-        found.append(inverse)
-    confirmed = [_confirmed(k, lenses, poses, found) for k in range(len(surfaces))]
-    sizes = [s.known.shape[::-1] for s in surfaces]
-    out = [cv2.resize(image, size, interpolation=cv2.INTER_NEAREST) for image, size in zip(confirmed, sizes)]
-    return [np.where(s.known, inverse, 0.0).astype(np.float32) for s, inverse in zip(surfaces, out)]
+
+    def __init__(self, pool: Pool) -> None:
+        self.pool = pool
+        self._distance_m = 0.0
+        self._images: dict[str, Image] = {}  # camera -> its plate as it is matched
+        self._poses: dict[str, NDArray[np.float64]] = {}
+        self._found: dict[str, Image] = {}  # camera -> inverse depths, before others confirm them
+        self._due: list[str] = []  # cameras to be swept
+
+    def sweep(self, plates: Mapping[str, Surface], distance_m: float) -> bool:
+        """Sweep every camera that never was, or else at most one of those that are due: an update that needs many is
+        not held up. Returns whether that was the last one.
+
+        plates: of all cameras; what they know of depth is not used. Those of more than ``SWEEP_PIXELS`` are matched
+            smaller.
+        distance_m: of the cameras to the scene.
+        """
+        lenses = {name: _lens(s) for name, s in plates.items()}
+        self._take(plates, lenses, distance_m)
+        now = [name for name in self._due if name not in self._found] or self._due[:1]
+        for name in now:
+            self._found[name] = self._match(name, lenses)
+        self._due = [name for name in self._due if name not in now]
+        return bool(now) and not self._due
+
+    def inverses(self, plates: Mapping[str, Surface]) -> list[Image]:
+        """Inverse depth of each plate that was swept, float32 (H, W), 1 / m along the optical axis; 0 where the plate
+        is unknown, where no depth fits best, or where no other plate's depth confirms it."""
+        lenses, poses = [_lens(s) for s in plates.values()], [self._poses[name] for name in plates]
+        found = [self._found[name] for name in plates]
+        out = []
+        for k, surface in enumerate(plates.values()):
+            size = surface.known.shape[::-1]
+            inverse = cv2.resize(_confirmed(k, lenses, poses, found), size, interpolation=cv2.INTER_NEAREST)
+            out.append(np.where(surface.known, inverse, 0.0).astype(np.float32))
+        return out
+
+    def fill(self, plates: Mapping[str, Surface]) -> list[Surface] | None:
+        """The plates that were swept, with the depth that stereo finds where they have none; None where it cannot be
+        believed: it finds little, or sensors measured something else at too many of its pixels."""
+        swept, surfaces = self.inverses(plates), list(plates.values())
+        if sum(map(np.count_nonzero, swept)) < tuned.SWEEP_LEAST * sum(np.count_nonzero(s.known) for s in surfaces):
+            return None
+        pairs = [np.stack([s.inverse, found])[:, (s.inverse > 0) & (found > 0)] for s, found in zip(surfaces, swept)]
+        measured, ours = np.concatenate(pairs, axis=1)
+        agree = np.count_nonzero(np.abs(np.log(ours / measured)) < tuned.SWEEP_AGREE)
+        if agree < tuned.SWEEP_TRUSTED * len(ours):
+            return None
+        out, noise = [], tuned.SWEEP_NOISE / (tuned.SWEEP_STEPS * tuned.SWEEP_NEAR * self._distance_m)
+        for surface, found in zip(surfaces, swept):
+            inverse, slope = smooth(found, surface.color, self.pool, noise)
+            known = surface.inverse > 0
+            inverse = np.where(known, surface.inverse, inverse)
+            out.append(replace(surface, inverse=inverse, slope=np.where(known[..., None], surface.slope, slope)))
+        return out
+
+    def _take(self, plates: Mapping[str, Surface], lenses: Mapping[str, Pinhole], distance_m: float) -> None:
+        """Take over the plates that differ from those kept, and note which cameras are to be swept again."""
+        if distance_m != self._distance_m:  # another camera: depths are looked for in another range
+            self._distance_m, self._due = distance_m, []
+            self._images, self._poses, self._found = {}, {}, {}
+        changed = [name for name in self._images if name not in plates]
+        for name in changed:
+            del self._images[name], self._poses[name]
+            self._found.pop(name, None)
+        for name, surface in plates.items():
+            image = _prepare(surface, lenses[name])
+            moved = name not in self._poses or not np.allclose(self._poses[name], surface.pose, atol=SAME_POSE)
+            if moved:
+                self._found.pop(name, None)
+            if moved or _differ(self._images[name], image):
+                self._images[name], self._poses[name] = image, surface.pose.copy()
+                changed.append(name)
+        if changed:
+            near = {name: self._compared(name, lenses) for name in plates}
+            gone = any(name not in plates for name in changed)
+            due = [name for name in plates if gone or name in changed or set(near[name]) & set(changed)]
+            self._due = [name for name in self._due if name in plates and name not in due] + due
+
+    def _compared(self, name: str, lenses: Mapping[str, Pinhole]) -> list[str]:
+        """The cameras whose plates tell the depth of a camera's plate."""
+        here, nearest_m = self._poses[name], tuned.SWEEP_NEAR * self._distance_m
+        parallax_px = {other: _parallax_px(self._poses[other], here, lens) for other, lens in lenses.items()}
+        return [other for other, px in parallax_px.items() if px / nearest_m >= tuned.SWEEP_LEAST_PX]
+
+    def _match(self, name: str, lenses: Mapping[str, Pinhole]) -> Image:
+        """Sweep a camera: inverse depth, float32 (H, W), 1 / m, 0 where none fits best. See ``match_costs``."""
+        image, lens, others = self._images[name], lenses[name], self._compared(name, lenses)
+        if not others:
+            return np.zeros(image.shape[1:], np.float32)
+        flat = np.zeros((len(others), 3, max(self._images[other][0].size for other in others)), np.float32)
+        for row, other in zip(flat, others):
+            row[:, : self._images[other][0].size] = self._images[other].reshape(3, -1)
+        here = se3_inverse(self._poses[name])
+        cameras = camera_rows([here @ self._poses[o] for o in others], [lenses[o] for o in others], UNIT_BOX)
+        steps = np.linspace(0.0, 1.0 / (tuned.SWEEP_NEAR * self._distance_m), tuned.SWEEP_STEPS).astype(np.float32)
+        rays = lens.rays()
+        ray_x, ray_y = (np.ascontiguousarray(rays[..., k] / rays[..., 2], dtype=np.float32) for k in (0, 1))
+        cost = np.empty((*ray_x.shape, steps.size), np.uint8)
+        self.pool.run(match_costs, image, flat, cameras, ray_x, ray_y, steps, cost)
+        total = np.empty((2, *cost.shape), np.uint16)
+        self.pool.run(aggregate_paths, cost, np.minimum(image.max(axis=0), 1.0), total)
+        found = np.empty(ray_x.shape, np.float32)
+        self.pool.run(choose_depths, total, steps, found)
+        return np.where((found > 0.5 * steps[1]) & (image[0] <= 1.0), found, 0.0).astype(np.float32)
+
+    # --- state --------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Everything needed to continue bit for bit."""
+        mine: dict[str, NDArray[Any]] = {"due": np.array(self._due, np.str_), "distance_m": np.array(self._distance_m)}
+        for name in _KEPT:
+            mine |= {f"{name}.{camera}": array for camera, array in getattr(self, f"_{name}").items()}
+        return mine
+
+    def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from ``state``. KeyError: it lacks something."""
+        self._due, self._distance_m = [str(camera) for camera in state["due"]], float(state["distance_m"])
+        for name in _KEPT:
+            arrays = {
+                key.removeprefix(f"{name}."): np.array(a) for key, a in state.items() if key.startswith(f"{name}.")
+            }
+            setattr(self, f"_{name}", arrays)
+
+
+def _differ(before: Image, now: Image) -> bool:
+    """Whether two plates, see ``_prepare``, differ enough to change what stereo finds."""
+    differ = np.abs(before - now).max(axis=0) > np.float32(CHANGED / 255.0)  # also where one of them is UNKNOWN
+    return bool(np.count_nonzero(differ) > tuned.CHANGED_SHARE * differ.size)
 
 
 def _lens(surface: Surface) -> Pinhole:
@@ -96,19 +187,6 @@ def _parallax_px(a: NDArray[np.float64], b: NDArray[np.float64], lens: Pinhole) 
     """Parallax of a point 1 m away from cameras at poses a and b; 0 for images of one row or column."""
     wide = min(lens.width, lens.height) > 1
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3])) * lens.fx if wide else 0.0
-
-
-def _match(image: Image, others: Image, cameras: Image, lens: Pinhole, steps: Image, pool: Pool) -> Image:
-    """Inverse depth of one image, float32 (H, W), 1 / m, 0 where none fits best. See ``match_costs``."""
-    rays = lens.rays()
-    ray_x, ray_y = (np.ascontiguousarray(rays[..., k] / rays[..., 2], dtype=np.float32) for k in (0, 1))
-    cost = np.empty((*ray_x.shape, steps.size), np.uint8)
-    pool.run(match_costs, image, others, cameras, ray_x, ray_y, steps, cost)
-    total = np.empty((2, *cost.shape), np.uint16)
-    pool.run(aggregate_paths, cost, np.minimum(image.max(axis=0), 1.0), total)
-    found = np.empty(ray_x.shape, np.float32)
-    pool.run(choose_depths, total, steps, found)
-    return np.where((found > 0.5 * steps[1]) & (image[0] <= 1.0), found, 0.0).astype(np.float32)
 
 
 def _confirmed(k: int, lenses: Sequence[Pinhole], poses: Sequence[NDArray], inverses: Sequence[Image]) -> Image:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.threads.thread_pool import shared_pool
-from edge_server.fields.splat.layers.depth.plate_stereo import fill_by_stereo, sweep_plates
+from edge_server.fields.splat.layers.depth.plate_stereo import PlateStereo
 from edge_server.fields.splat.layers.depth.surfaces import Surface
 from freshfield.geometry import Pinhole
 from tests.edge_server.fields.splat.layers.depth.room_plates import plate_of, room_plates
@@ -25,9 +25,19 @@ def _distance_m(plates: Sequence[Surface]) -> float:
     return scene_box(views).distance_m
 
 
+def _named(plates: Sequence[Surface]) -> dict[str, Surface]:
+    return {str(k): plate for k, plate in enumerate(plates)}
+
+
+def _swept(plates: Sequence[Surface]) -> PlateStereo:
+    stereo = PlateStereo(shared_pool())
+    stereo.sweep(_named(plates), _distance_m(plates))
+    return stereo
+
+
 def _sweep(plates: Sequence[Surface]) -> NDArray[np.float32]:
     """Depths (N, H, W) of the plates that are as large as the first."""
-    found = sweep_plates(plates, _distance_m(plates), shared_pool())
+    found = _swept(plates).inverses(_named(plates))
     assert all(inverse.dtype == np.float32 and inverse.shape == p.known.shape for inverse, p in zip(found, plates))
     assert all(np.isfinite(inverse).all() and (inverse >= 0).all() for inverse in found)
     inverses = np.stack([inverse for inverse in found if inverse.shape == found[0].shape])
@@ -75,12 +85,58 @@ def test_measured_depth_stays_and_holes_are_filled() -> None:
     measured = (1.0 / truth).astype(np.float32)
     measured[:, 10:40, 10:50] = 0.0
     holes = [replace(p, inverse=inverse) for p, inverse in zip(plates, measured)]
-    found = fill_by_stereo(holes, _distance_m(plates), shared_pool())
+    found = _swept(holes).fill(_named(holes))
     filled = np.stack([s.inverse for s in found])
     np.testing.assert_array_equal(filled[measured > 0], measured[measured > 0])
     there = (measured == 0) & (filled > 0)
     assert there.sum() > 0.6 * (measured == 0).sum()
     assert np.median(np.abs(filled * truth - 1.0)[there]) < 0.03
+
+
+def _marked(plate: Surface, size: int) -> Surface:
+    color = plate.color.copy()
+    color[:size, :size] = 255.0 - color[:size, :size]
+    return replace(plate, color=color)
+
+
+def test_a_camera_is_swept_again_where_plates_change_one_a_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    plates, _ = room_plates(4, 64)
+    swept: list[str] = []
+    match = PlateStereo._match
+    monkeypatch.setattr(
+        PlateStereo, "_match", lambda self, name, lenses: swept.append(name) or match(self, name, lenses)
+    )
+    stereo = _swept(plates)
+    assert swept == ["0", "1", "2", "3"]
+
+    def calls(now: Sequence[Surface], count: int) -> tuple[list[str], list[bool]]:
+        """Which cameras are swept in some calls, and whether each says that it was the last one due."""
+        swept.clear()
+        done = [stereo.sweep(_named(now), _distance_m(plates)) for _ in range(count)]
+        return list(swept), done
+
+    noise = np.random.default_rng(1).normal(0.0, 1.0, plates[0].color.shape)
+    for alike in (plates, [_marked(plates[0], 3), *plates[1:]], _changed(plates, {2: plates[2].color + noise})):
+        assert calls(alike, 2) == ([], [False, False])
+    changed = [_marked(plates[0], 20), *plates[1:]]
+    assert calls(changed, 5) == (["0", "1", "2", "3"], [False, False, False, True, False])
+    np.testing.assert_array_equal(stereo.inverses(_named(changed)), _swept(changed).inverses(_named(changed)))
+    pose = plates[3].pose.copy()
+    pose[:3, 3] += 0.01
+    moved = [*changed[:3], replace(plates[3], pose=pose)]
+    assert calls(moved, 5)[0] == ["3", "0", "1", "2"]
+    fewer = moved[:3]
+    assert sorted(calls(fewer, 4)[0]) == ["0", "1", "2"]
+    np.testing.assert_array_equal(stereo.inverses(_named(fewer)), _swept(fewer).inverses(_named(fewer)))
+
+
+def test_what_found_nothing_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    plates, _ = room_plates(3, 32)
+    flat = _changed(plates, {k: np.full((32, 32, 3), 128.0) for k in range(3)})
+    stereo = _swept(flat)
+    assert stereo.fill(_named(flat)) is None
+    monkeypatch.setattr(PlateStereo, "_match", None)
+    assert not stereo.sweep(_named(flat), _distance_m(plates)) and stereo.fill(_named(flat)) is None
 
 
 @pytest.mark.stability
