@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from freshfield_up.status import status_line
+from freshfield_up.summary import summarize
 
 CAMERAS = tuple(f"cam{i:02d}" for i in range(13))
 
@@ -46,3 +49,20 @@ def test_missing_and_damaged_status_files_leave_gaps(tmp_path: Path) -> None:
     (tmp_path / "channel.json").write_text("[1, 2")
     (tmp_path / "edge.json").write_text(json.dumps({"cameras": "none", "updates": {"count": "many"}}))
     assert status_line(tmp_path, 13) == "0/13 cameras; no update yet; no channel yet"
+
+
+@pytest.mark.parametrize(
+    "found, expected",
+    [
+        ({"closes": True}, "; all accounted for\n"),
+        ({"closes": True, "cut_off": 2}, "; all accounted for, 2 of them cut off by the end of a process\n"),
+        (
+            {"closes": False, "doubts": ["2,014 lines of the ledgers were lost", "another"]},
+            "; NOT ALL ACCOUNTED FOR: 2,014 lines of the ledgers were lost; another\n",
+        ),
+    ],
+)
+def test_it_says_whether_all_frames_are_accounted_for(tmp_path, found, expected):
+    frames = {"captured": 3, "sent": 3, "delivered": 3, "rejected": {}, **found}
+    (tmp_path / "report.json").write_text(json.dumps({"frames": frames}))
+    assert expected in summarize(tmp_path)

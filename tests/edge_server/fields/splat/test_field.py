@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,10 +19,12 @@ from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.supervision import pack_cameras
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.splat.field import StillField
+from edge_server.fields.splat.kernels.project import OPACITY
 from edge_server.fields.splat.seeding import seed_gaussians
-from tests.edge_server.fields.scenes import picture
-from tests.edge_server.fields.small import HELD, SEEN, VIEWS, score
-from tests.edge_server.fields.splat.small import SMALL
+from tests.edge_server.fields.bounds import run_with_bounds_checks
+from tests.edge_server.fields.scenes import mean_psnr, picture, ring
+from tests.edge_server.fields.small import HELD, SEEN, VIEWS, healthy, score
+from tests.edge_server.fields.splat.small import SMALL, TINY
 
 
 def test_nothing_begins_at_pixels_without_weight() -> None:
@@ -119,3 +123,82 @@ def test_a_lens_with_distortion_needs_no_undistortion() -> None:
     field.fit(views[:6] + views[7:], Budget(steps=250))
     assert score(field, views[6]) > 20.0
     assert score(field, HELD) > 19.0, "a pinhole camera sees the same scene"
+
+
+TINY_VIEWS = ring(9, size=24)
+
+
+def _parameter(column: int, value: float, every: int = 7) -> Callable[[StillField], None]:
+    def damage(field: StillField) -> None:
+        field.cloud.params[::every, column] = value
+
+    return damage
+
+
+def _moments(field: StillField) -> None:
+    field.cloud.m[::5] = np.inf
+    field.cloud.v[::3] = np.nan
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    "damage",
+    [
+        _parameter(0, np.nan),
+        _parameter(4, np.inf),
+        _parameter(7, np.nan),
+        _parameter(OPACITY, -np.inf),
+        _parameter(12, np.nan),
+        _parameter(12, 1e38),
+        _parameter(3, 1e30),
+        _parameter(3, -1e30),
+        _parameter(1, 1e-41),
+        _moments,
+    ],
+)
+def test_damage_is_healed(damage: Callable[[StillField], None]) -> None:
+    field = StillField(TINY)
+    field.fit(TINY_VIEWS, Budget(steps=40))
+    damage(field)
+    field._snapshot = None
+    out = field.render(TINY_VIEWS[0].camera_to_world, TINY_VIEWS[0].intrinsics)
+    assert np.isfinite(out.color).all() and np.isfinite(out.depth).all()
+    field.fit(TINY_VIEWS, Budget(steps=120))
+    healthy(field, TINY_VIEWS)
+    assert mean_psnr(field, TINY_VIEWS) > 17.0
+    assert field.fit(TINY_VIEWS, Budget(steps=40)).dropped == 0, "still not finite 120 steps later"
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("raw", [-30.0, 30.0])
+def test_everything_faded_or_opaque(raw: float) -> None:
+    field = StillField(TINY)
+    field.fit(TINY_VIEWS, Budget(steps=40))
+    field.cloud.params[:, OPACITY] = raw
+    field.fit(TINY_VIEWS, Budget(steps=200))
+    healthy(field, TINY_VIEWS)
+    assert mean_psnr(field, TINY_VIEWS) > 16.0
+
+
+@pytest.mark.stability
+@pytest.mark.slow
+def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    """A whole fit and rendering with numba's bounds checks, in a process of its own."""
+    code = """
+from dataclasses import replace
+import numpy as np
+from msgspec import structs
+from edge_server.fields import Budget
+from tests.edge_server.fields.splat.test_field import TINY, TINY_VIEWS, StillField
+bent = [replace(v, intrinsics=replace(v.intrinsics, distortion=(-.1, .01, .002, .001))) for v in TINY_VIEWS]
+for extra, views in (({}, TINY_VIEWS), ({"sh_degree": 1, "contracted": True}, bent),
+                     ({"flatten": 0.1, "align": 0.05}, bent)):
+    field = StillField(structs.replace(TINY, **extra))
+    field.fit(views, Budget(steps=25))
+    out = field.render(TINY_VIEWS[0].camera_to_world, replace(TINY_VIEWS[0].intrinsics, width=37, height=19))
+    assert np.isfinite(out.color).all()
+moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in TINY_VIEWS]
+field.fit(moved, Budget(steps=20))
+print("kept")
+"""
+    run_with_bounds_checks(code, tmp_path, request)

@@ -2,11 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
-from numba import njit
+import pytest
+from llvmlite import ir
+from numba import njit, types
+from numba.core.errors import TypingError
+from numba.extending import intrinsic
+from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import FAST
 from edge_server.fields.common.kernels.simd import exp32, log32, uniform
+from edge_server.fields.common.kernels.simd_vectors import (
+    LANES,
+    Vector,
+    any_lane,
+    eight_lane_sums,
+    lane_sum,
+    require_contiguous,
+)
 
 
 def _of_each(function):
@@ -46,3 +62,107 @@ def test_uniform_is_uniform_and_streams_differ() -> None:
     a, b = _draw(np.uint64(1), 20_000), _draw(np.uint64(2), 20_000)
     assert a.min() >= 0.0 and a.max() < 1.0 and abs(a.mean() - 0.5) < 0.01
     assert abs(np.corrcoef(a[:-1], a[1:])[0, 1]) < 0.03 and abs(np.corrcoef(a, b)[0, 1]) < 0.03
+
+
+def _run(work: Callable[[Vector, Vector], Any], a: NDArray[np.float32], b: NDArray[np.float32]) -> Any:
+    """What ``work`` makes of two vectors: 16 numbers, or 8, or one."""
+
+    @intrinsic
+    def code(typingctx: Any, x: Any, y: Any, out: Any) -> Any:
+        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            data = [
+                context.make_array(kind)(context, builder, arg).data
+                for kind, arg in zip(signature.args, args, strict=True)
+            ]
+            result = work(Vector.load(builder, data[0]), Vector.load(builder, data[1]))
+            if isinstance(result, Vector):
+                result.store(data[2])
+            else:
+                place = builder.bitcast(data[2], result.type.as_pointer())
+                builder.store(result, place).align = 4
+            return context.get_dummy_value()
+
+        return types.void(x, y, out), codegen
+
+    @njit(fastmath=FAST)  # as the kernels are
+    def run(x, y, out):
+        code(x, y, out)
+
+    out = np.full(LANES, -7.0, np.float32)
+    run(a, b, out)
+    return out
+
+
+@pytest.fixture
+def pair() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    rng = np.random.default_rng(0)
+    return rng.normal(size=LANES).astype(np.float32), rng.normal(size=LANES).astype(np.float32) + 3.0
+
+
+def test_arithmetic_equals_numpy(pair):
+    a, b = pair
+    got = _run(lambda x, y: (x * y + 2.0 - y) / y + x.one_minus(), a, b)
+    np.testing.assert_allclose(got, (a * b + 2.0 - b) / b + 1.0 - a, rtol=1e-5, atol=1e-6)
+
+
+def test_masks_select_and_combine(pair):
+    a, b = pair
+
+    def chosen(x: Vector, y: Vector) -> Vector:
+        return x.where(x.builder.and_(x.greater_equal(-0.5), x.less(0.5)), 9.0)
+
+    np.testing.assert_array_equal(_run(chosen, a, b), np.where((a >= -0.5) & (a < 0.5), a, np.float32(9.0)))
+
+
+@pytest.mark.parametrize("bound, expected", [(1.0, 1.0), (7.0, 0.0)])
+def test_any_lane_of_a_mask(bound, expected):
+    a = np.zeros(LANES, np.float32)
+    a[11] = 5.0
+
+    def result(x: Vector, y: Vector) -> Any:
+        return x.builder.uitofp(any_lane(x.builder, x.greater_equal(bound)), ir.FloatType())
+
+    assert _run(result, a, a)[0] == expected
+
+
+def test_minimum_and_maximum_replace_nan():
+    a = np.array([np.nan, np.inf, -np.inf, 0.5] * 4, np.float32)
+    np.testing.assert_array_equal(_run(lambda x, y: x.minimum(2.0), a, a), [2.0, 2.0, -np.inf, 0.5] * 4)
+    np.testing.assert_array_equal(_run(lambda x, y: x.maximum(-2.0), a, a), [-2.0, np.inf, -2.0, 0.5] * 4)
+
+
+def test_exp2_is_exact_to_the_last_bits():
+    for given in np.linspace(-63.99, 0.0, 160).astype(np.float32).reshape(-1, LANES):
+        got = _run(lambda x, y: x.exp2(), given, given)
+        np.testing.assert_allclose(got, np.exp2(given.astype(np.float64)), rtol=3e-7)
+
+
+def test_exp2_clamps_its_argument():
+    given = np.array([1.0, 300.0, np.inf, -64.0, -1e3, -3e38, -np.inf, np.nan] * 2, np.float32)
+    least = 2.0**-64
+    got = _run(lambda x, y: x.exp2(), given, given)
+    np.testing.assert_allclose(got, [1, 1, 1, least, least, least, least, least] * 2, rtol=3e-7)
+
+
+def test_lane_sums(pair):
+    a, b = pair
+    assert _run(lambda x, y: lane_sum(x), a, b)[0] == pytest.approx(a.sum(dtype=np.float64), abs=1e-5)
+    got = _run(lambda x, y: eight_lane_sums([x, y, x * y, x + y, x - y, x * x, y * y, x * 3.0]), a, b)
+    expected = [v.sum(dtype=np.float64) for v in (a, b, a * b, a + b, a - b, a * a, b * b, a * 3)]
+    np.testing.assert_allclose(got[:8], expected, rtol=1e-5, atol=1e-4)
+    assert (got[8:] == -7.0).all()
+
+
+def test_strided_arrays_are_refused(pair):
+    @njit
+    def sliced(x):
+        checked(x)
+
+    @intrinsic
+    def checked(typingctx: Any, x: Any) -> Any:
+        require_contiguous(x)
+        return types.void(x), lambda context, builder, signature, args: context.get_dummy_value()
+
+    sliced(pair[0])
+    with pytest.raises(TypingError, match="contiguous"):
+        sliced(pair[0][::2])
