@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from camera_node.settings import WorldConfig, find_data, source_config
-from freshfield.scenario import ScenarioError, load, parse
+from freshfield.scenario import ScenarioError, parse
 
 VIDEO = {"kind": "video", "data": "x"}
 
@@ -52,11 +52,6 @@ def test_errors_name_file_and_key(source, message):
     with pytest.raises(ScenarioError, match=message) as error:
         config(**source)
     assert str(error.value).startswith("s.yaml: source") and "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("name", ["room", "room19", "tile", "tower", "ideal", "fox", "lego", "kitchen", "duo", "quad"])
-def test_shipped_scenarios_have_a_valid_source(name):
-    source_config(load(name))
 
 
 def test_data_is_found_below_the_folder_that_was_given(tmp_path, monkeypatch):

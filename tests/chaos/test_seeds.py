@@ -89,32 +89,6 @@ def test_hostile_messages_are_refused_by_many_reasons_and_counted_apart(tmp_path
     assert list(seeds.accounting(deployment, frame_accounting.account_frames(tmp_path))) == []
 
 
-def test_a_full_disk_keeps_the_account_from_closing(tmp_path: Path) -> None:
-    deployment = run(tmp_path, (Fault(0, "full_disk", 500.0, 300.0, "emulator"),))
-    account = frame_accounting.account_frames(tmp_path)
-    assert account.lines_lost == deployment.lines_lost > 5
-    assert f"{account.lines_lost} lines of the ledgers were lost" in account.doubts
-
-
-@pytest.mark.parametrize("role", ["node", "emulator", "edge"])
-def test_a_process_waits_for_its_slow_disk_and_loses_no_frame_unsaid(tmp_path: Path, role: str) -> None:
-    delivered = []
-    for line_ms in (0.0, 100.0):
-        (folder := tmp_path / str(line_ms)).mkdir()
-        deployment = run(folder, (Fault(0, "slow_disk", 500.0, 1000.0, role, line_ms),))
-        assert list(seeds.accounting(deployment, frame_accounting.account_frames(folder))) == []
-        delivered.append(deployment.really["delivered"])
-    assert delivered[1] < 0.9 * delivered[0]
-
-
-@pytest.mark.parametrize("killed", [False, True])
-def test_a_checkpoint_that_a_kill_cuts_short_is_not_there(tmp_path: Path, killed: bool) -> None:
-    slow = Fault(0, "slow_disk", 400.0, 1000.0, "edge", 10.0)
-    faults = (slow, Fault(1, "checkpoint", 500.0), *((replace(CRASHES[2], at_ms=600.0),) if killed else ()))
-    run(tmp_path, faults)
-    assert (tmp_path / "field.npz").exists() is not killed
-
-
 def lose_a_line(patch: pytest.MonkeyPatch) -> None:
     written = []
     whole = ChaosDeployment._write

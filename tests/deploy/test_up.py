@@ -174,21 +174,6 @@ def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(tmp_path: Path, monkey
     assert made.edge.process is not None and not any(child.running for child in children)
 
 
-@pytest.mark.slow  # 12 s each
-@pytest.mark.parametrize("name, role", [("node", "the camera node"), ("edge", "the edge server")])
-def test_a_killed_process_is_named_and_the_report_still_accounts_for_every_frame(
-    up: Callable[..., Up], name: str, role: str
-) -> None:
-    run = up("--for", "0")
-    run.wait_for_updates()
-    os.kill(run.pid(name), signal.SIGKILL)
-    assert run.end() == 1
-    assert f"{role} was killed by SIGKILL" in run.output
-    assert "The last lines of" in run.output or "It wrote nothing" in run.output
-    assert run.report()["frames"]["closes"]
-    assert not leftovers(run.out)
-
-
 @pytest.mark.slow  # 6 s
 def test_ctrl_c_ends_a_run_with_its_report(up: Callable[..., Up]) -> None:
     run = up("--for", "0", "--process-per-camera")

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from freshfield.geometry import (
-    OPENGL_TO_OPENCV,
     GeometryError,
     Pinhole,
     Pose,
@@ -138,11 +137,6 @@ def test_look_at_refuses_a_point_and_survives_straight_down():
         look_at([1, 1, 1], [1, 1, 1])
     Pose.from_matrix(look_at([0, 0, 5], [0, 0, 0]))
     Pose.from_matrix(look_at([5, 0, 0], [0, 0, 0], up=(1, 0, 0)))
-
-
-def test_the_opengl_flip_is_its_own_inverse_and_a_rotation():
-    np.testing.assert_array_equal(OPENGL_TO_OPENCV @ OPENGL_TO_OPENCV, np.eye(4))
-    assert np.linalg.det(OPENGL_TO_OPENCV[:3, :3]) == pytest.approx(1)
 
 
 def test_interpolated_poses_move_in_a_straight_line():

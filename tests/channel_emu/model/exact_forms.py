@@ -19,11 +19,6 @@ def mm1_fcfs(lam: float, mu: float) -> float:
     return (1 + 1 / rho + rho**2 / (1 - rho)) / mu
 
 
-def mm12(lam: float, mu: float) -> float:
-    """M/M/1/2: one waits, and what comes meanwhile is dropped."""
-    return 1 / lam + 3 / mu - 2 * (lam + mu) / (lam**2 + lam * mu + mu**2)
-
-
 def mm1_newest_waits(lam: float, mu: float) -> float:
     both = lam**2 + lam * mu + mu**2
     return 1 / lam + 2 / mu + lam / (lam + mu) ** 2 + 1 / (lam + mu) - 2 * (lam + mu) / both

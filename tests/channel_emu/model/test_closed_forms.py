@@ -49,11 +49,6 @@ def test_mean_age_and_peak_age(arrivals: str, service: str, discipline: str, age
     assert peak is None or found["peak_age_ms"] == pytest.approx(peak, rel=TOLERANCE)
 
 
-def test_one_waiting_place() -> None:
-    found = summary("poisson:0.7", "exp:1ms", "fcfs", 57, queue_limit=1)
-    assert found["mean_age_ms"] == pytest.approx(exact.mm12(0.7, 1.0), rel=TOLERANCE)
-
-
 def test_the_values_that_were_checked_before() -> None:
     """Against numbers computed elsewhere, so that a formula mistyped here is noticed."""
     assert exact.mm1_fcfs(0.5, 1.0) == pytest.approx(3.5)

@@ -44,15 +44,6 @@ def test_huge_delays_saturate(discipline: str, mean_ms: float) -> None:
     assert found["offered"] == found["in_flight"] + found["dropped_busy"] + found["superseded"]
 
 
-@pytest.mark.parametrize("discipline", DISCIPLINES)
-def test_delays_equal_to_the_period_lose_nothing(discipline: str) -> None:
-    """Every completion falls on the next arrival's instant: the server is free for it."""
-    service = {"law": "deterministic", "mean_ms": 30.0}
-    found = run({"preset": "ch5", "service": service, "discipline": discipline})
-    assert found["offered"] - found["delivered"] - found["in_flight"] == 0
-    assert found["mean_age_ms"] == pytest.approx(45.0, abs=0.1)
-
-
 def test_a_chain_that_always_switches() -> None:
     """40 switches a millisecond: the channel is its average."""
     section = {

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from channel_emu.model.channel import Channel
 from channel_emu.model.link import DISCIPLINES, Event, EventKind, Link
-from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.settings import channel_from_mapping
 
 MS = 10**6
@@ -53,13 +52,6 @@ def test_what_a_busy_link_does_with_a_new_frame(discipline: str) -> None:
 def test_a_fault_that_delays_nothing_leaves_the_delay_to_the_nanosecond() -> None:
     subject = link("fcfs", [10], faults={"corruption": {"probability": 1.0}})
     assert subject.offer(0)[0].due_ns == 10 * MS
-
-
-def test_zero_delay_delivers_at_once() -> None:
-    subject = Channel(channel_from_mapping({}), 0).link("cam00")
-    transit, events = subject.offer(5)
-    assert [e.kind for e in events] == [EventKind.STARTED, EventKind.DELIVERED]
-    assert transit.ended_ns == 5 and subject.in_flight == 0 and subject.next_event_ns == NEVER_NS
 
 
 def test_a_late_caller_gets_the_punctual_decisions() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -54,59 +56,50 @@ def test_held_out_frames_never_reach_the_training_buffer(ingest):
     assert ingest.buffer.newest() == {}
 
 
+def with_payload_damaged(request: pb.PushRequest) -> None:
+    damaged = bytearray(request.payload)
+    damaged[len(damaged) // 2] ^= 1
+    request.payload = bytes(damaged)
+
+
+def with_checksum(change: Callable[[pb.FrameHeader], None]) -> Callable[[pb.PushRequest], None]:
+    """A change of the header with a checksum that fits."""
+
+    def changed(request: pb.PushRequest) -> None:
+        change(request.header)
+        request.crc32c = checksum(request)
+
+    return changed
+
+
+LARGE = Pinhole.from_fov(4096, 4096, 60.0)
+# By reason: what is wrong of the frame, or a change of its message.
+BAD: dict[str, dict[str, Any] | Callable[[pb.PushRequest], None]] = {
+    "crc_mismatch": with_payload_damaged,
+    "bad_pose": with_checksum(lambda header: setattr(header.pose, "qw", 7.0)),
+    "unknown_codec": with_checksum(lambda header: setattr(header, "codec", -7)),  # an enum may be negative
+    "bad_header": with_checksum(lambda header: setattr(header, "role", -7)),
+    "unknown_camera": {"camera": "cam77"},
+    "too_large": {"intrinsics": LARGE, "payload": payload.encode(np.zeros((4096, 4096, 3), np.uint8))},
+    "wrong_role": {"held_out": True},
+    "bad_id": {"camera": "../../etc"},
+    "from_future": {"generated_ns": NOW + 3600 * 10**9},
+    "too_old": {"generated_ns": NOW - 2 * 3600 * 10**9},
+    "size_mismatch": {"intrinsics": dataclasses.replace(frame().intrinsics, width=64)},
+    "bad_payload": {"payload": b"not an image"},
+    "bad_intrinsics": {"intrinsics": dataclasses.replace(frame().intrinsics, fx=float("nan"))},
+}
+
+
 def bad(kind: str) -> pb.PushRequest:
-    base = good(sequence=5)
-    if kind == "crc_mismatch":
-        request = to_request(base)
-        damaged = bytearray(request.payload)
-        damaged[len(damaged) // 2] ^= 1
-        request.payload = bytes(damaged)
-        return request
-    if kind == "bad_pose":
-        request = to_request(base)
-        request.header.pose.qw = 7.0
-        request.crc32c = checksum(request)
-        return request
-    if kind in ("unknown_codec", "bad_header"):  # an enum on the wire may be negative
-        request = to_request(base)
-        setattr(request.header, "codec" if kind == "unknown_codec" else "role", -7)
-        request.crc32c = checksum(request)
-        return request
-    changes = {
-        "unknown_camera": {"camera": "cam77"},
-        "too_large": {
-            "intrinsics": Pinhole.from_fov(4096, 4096, 60.0),
-            "payload": payload.encode(np.zeros((4096, 4096, 3), np.uint8)),
-        },
-        "wrong_role": {"held_out": True},
-        "bad_id": {"camera": "../../etc"},
-        "from_future": {"generated_ns": NOW + 3600 * 10**9},
-        "too_old": {"generated_ns": NOW - 2 * 3600 * 10**9},
-        "size_mismatch": {"intrinsics": dataclasses.replace(base.intrinsics, width=64)},
-        "bad_payload": {"payload": b"not an image"},
-        "bad_intrinsics": {"intrinsics": dataclasses.replace(base.intrinsics, fx=float("nan"))},
-    }[kind]
-    return to_request(dataclasses.replace(base, **changes))
+    wrong, base = BAD[kind], good(sequence=5)
+    if isinstance(wrong, dict):
+        return to_request(dataclasses.replace(base, **wrong))
+    wrong(request := to_request(base))
+    return request
 
 
-KINDS = [
-    "crc_mismatch",
-    "bad_pose",
-    "unknown_camera",
-    "wrong_role",
-    "bad_id",
-    "from_future",
-    "too_old",
-    "size_mismatch",
-    "bad_payload",
-    "bad_intrinsics",
-    "unknown_codec",
-    "bad_header",
-    "too_large",
-]
-
-
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", BAD)
 def test_a_refusal_is_named_counted_and_loses_nothing_else(ingest, kind):
     answer = ingest.take(bad(kind))
     assert (answer.outcome, answer.reason) == (pb.OUTCOME_REJECTED, kind)

@@ -50,11 +50,6 @@ def test_wait_selects_nothing_before_its_horizon_and_goes_on_until_something_qua
     assert [i.sequence for i in u.select(plan, 180 * MS).items] == [1]
 
 
-def test_an_empty_buffer_selects_nothing():
-    u = updates()
-    assert u.select(u.plan(5), 5) is None
-
-
 def test_on_arrivals_nothing_is_selected_twice_and_a_field_that_wants_it_gets_every_frame():
     made = make_policy("all", None, np.random.default_rng(0))
     field = tiny_field()

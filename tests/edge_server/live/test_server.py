@@ -332,15 +332,6 @@ def test_every_port_beyond_this_machine_is_protected_or_named(tmp_path):
     assert [words.split(" on ")[0] for words in named] == ["gRPC", "page", "metrics"]
 
 
-def test_a_taken_port_is_one_clear_error(serve, tmp_path):
-    _, port, _ = serve()
-    grpc.channel_ready_future(Transport().channel(f"127.0.0.1:{port}")).result(30)
-    made = tiny_scenario(tmp_path)
-    second = EdgeServer(made, read_config(made), ServerOptions(f"127.0.0.1:{port}", tmp_path / "second"))
-    with pytest.raises(ValueError, match="cannot listen"):
-        second.run()
-
-
 def test_the_ledger_is_closed_even_if_nothing_else_can_be_written(serve, tmp_path):
     server, port, thread = serve()
     feed = Feed(port, server.scenario.cameras, server.scenario.held_out)

@@ -71,26 +71,6 @@ RUNS = {
         },
         "1 in flight, last written by ledger-emulator",
     ),
-    "each copy": (
-        sent(0, 1, 2),
-        [
-            *((i, event) for i in range(3) for event in ("received", "duplicated", "forwarded")),
-            (0, "forwarded"),
-            (1, "broken"),
-            (2, "in_flight"),
-        ],
-        [(0, "delivered"), (0, "rejected", "replayed_sequence"), (1, "delivered"), (2, "delivered")],
-        {
-            "captured": 3,
-            "sent": 3,
-            "duplicated": 3,
-            "delivered": 3,
-            "rejected": {"replayed_sequence": 1},
-            "broken": 1,
-            "in_flight": 1,
-        },
-        "",
-    ),
     "a node without emulator": (
         sent(0, 1),
         None,
@@ -343,40 +323,9 @@ def test_a_long_run_is_joined_in_little_memory(tmp_path):
     assert peak < 300 * frames, f"{peak / frames:.0f} bytes a frame"
 
 
-EVENTS = {
-    "node": ["captured", "replaced", "waiting", "sent", "broken", "answered"],
-    "emulator": [
-        "received",
-        "skipped",
-        "dropped_busy",
-        "superseded",
-        "lost",
-        "rejected",
-        "forwarded",
-        "duplicated",
-        "broken",
-        "in_flight",
-    ],
-    "edge": ["delivered", "rejected"],
-}
-
-
 # What really becomes of one frame.
 FATES = st.sampled_from(
-    [
-        "waiting",
-        "replaced",
-        "sent",
-        "received",
-        "skipped",
-        "dropped_busy",
-        "superseded",
-        "lost",
-        "forwarded",
-        "delivered",
-        "rejected",
-        "doubled",
-    ]
+    [*LINK_ENDS, "waiting", "replaced", "sent", "received", "forwarded", "delivered", "rejected", "doubled"]
 )
 
 
@@ -416,7 +365,7 @@ def test_counts_are_true_even_if_every_process_is_killed(fates, data):
     torn_role = written[alive - 1][1] if 0 < alive < len(written) and data.draw(st.booleans()) else None
     with tempfile.TemporaryDirectory() as folder:
         kept = []
-        for role in EVENTS:
+        for role in ("node", "emulator", "edge"):
             lines = [line for line in written[:alive] if line[1] == role]
             torn = lines[-1:] if role == torn_role else []
             lines = lines[: len(lines) - len(torn)]

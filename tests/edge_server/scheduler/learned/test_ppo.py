@@ -64,14 +64,6 @@ def test_a_flat_network_learns_as_the_thesis_has_it():
     assert regret(learner, FreshOnes()) < 0.05
 
 
-def test_the_same_seed_gives_the_same_weights_bit_for_bit_and_another_does_not():
-    learners = [Learner(select(), seed) for seed in (5, 5, 6)]
-    for learner in learners:
-        teach(learner, FreshOnes(), 3)
-    assert same(learners[0], learners[1])
-    assert not same(learners[0], learners[2])
-
-
 def test_a_checkpoint_goes_on_bit_for_bit(tmp_path):
     through, stopped = Learner(select(), 3), Learner(select(), 3)
     teach(through, FreshOnes(), 4)
