@@ -1,16 +1,14 @@
 """Every representation made small, and the views that tests fit it to.
 
-``NAME/small.py`` beside this file has the class (FIELD), settings for images of 48 pixels (SMALL) and of 24
-(TINY, for hard cases), and REACHED_DB: the PSNR that a healthy field reaches in these
-tests. Another CPU rounds differently, which costs tenths of a decibel. Where the parameters are not a table
-and a network, it also has FINITE, the arrays of a state that are always finite, and ``check_bounds``.
+``small_rays`` and ``splat.small`` have their classes, settings for images of 48 pixels (SMALL) and of 24 (TINY, for
+hard cases), and REACHED_DB: the PSNR that a healthy field reaches in these tests. Another CPU rounds differently, which
+costs tenths of a decibel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -20,14 +18,15 @@ from msgspec import structs
 from edge_server.fields import View
 from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT
 from edge_server.fields.registry import field_names
+from tests.edge_server.fields import small_rays
 from tests.edge_server.fields.scenes import picture, psnr, ring
+from tests.edge_server.fields.splat import small as splat
 
 NAMES = field_names()
-_MODULES = {name: import_module(f"tests.edge_server.fields.{name}.small") for name in NAMES}
-CLASSES: dict[str, Any] = {name: module.FIELD for name, module in _MODULES.items()}
-SMALL: dict[str, Any] = {name: module.SMALL for name, module in _MODULES.items()}
-TINY: dict[str, Any] = {name: module.TINY for name, module in _MODULES.items()}
-REACHED_DB: dict[str, dict[str, float]] = {name: module.REACHED_DB for name, module in _MODULES.items()}
+CLASSES: dict[str, Any] = {**small_rays.CLASSES, "splat": splat.FIELD}
+SMALL: dict[str, Any] = {**small_rays.SMALL, "splat": splat.SMALL}
+TINY: dict[str, Any] = {**small_rays.TINY, "splat": splat.TINY}
+REACHED_DB: dict[str, dict[str, float]] = {**small_rays.REACHED_DB, "splat": splat.REACHED_DB}
 every_field = pytest.mark.parametrize("name", NAMES)
 
 VIEWS = ring(13)
@@ -54,16 +53,16 @@ def tiny(name: str, **changed: Any) -> Any:
 def healthy(field: Any, views: Sequence[View]) -> None:
     """Whatever has happened: nothing is out of bounds, neither a parameter nor a rendered image."""
     name = next(name for name, kind in CLASSES.items() if type(field) is kind)
-    state, module = field.state(), _MODULES[name]
-    for array in getattr(module, "FINITE", ("table", "net", "density", "behind")):
+    state = field.state()
+    for array in splat.FINITE if name == "splat" else ("table", "net", "density", "behind"):
         assert np.isfinite(state[array]).all(), f"{array} is not finite"
     for view in (views[0], views[-1]):
         out = field.render(view.camera_to_world, view.intrinsics)
         assert all(np.isfinite(part).all() for part in (out.color, out.depth, out.opacity))
         assert out.color.min() >= 0.0 and out.color.max() <= 1.0 and out.depth.min() >= 0.0
         assert out.opacity.min() >= -1e-6 and out.opacity.max() <= 1.0 + 1e-5
-        if hasattr(module, "check_bounds"):
-            module.check_bounds(field, out)
+        if name == "splat":
+            splat.check_bounds(field, out)
         else:
             assert np.abs(state["table"]).max() <= PARAMETER_LIMIT
 

@@ -11,25 +11,25 @@ from msgspec import structs
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget
 from edge_server.fields.nerfacto.field import NerfactoField
-from tests.edge_server.fields.nerfacto.small import SMALL
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.fields.small import HELD, SEEN, score
+from tests.edge_server.fields.small_rays import SMALL
 
 
 def test_samples_are_uniform_at_first_and_then_follow_the_proposal() -> None:
-    field = NerfactoField(structs.replace(SMALL, even=0.4, anneal=40))
+    field = NerfactoField(structs.replace(SMALL["nerfacto"], even=0.4, anneal=40))
     for step, share in ((0, 1.0), (10, 0.85), (40, 0.4), (400, 0.4)):
         field.step = step
         assert field._sampling().uniform_share == pytest.approx(share)
-    assert NerfactoField(structs.replace(SMALL, interlevel=0.0))._sampling().uniform_share == 1.0
+    assert NerfactoField(structs.replace(SMALL["nerfacto"], interlevel=0.0))._sampling().uniform_share == 1.0
 
 
 def test_the_proposal_learns_where_surfaces_are() -> None:
     """Fewer samples do with it than without: that is what it is for. Without a depth guide, which would tell
     both where surfaces are."""
     scores = []
-    for interlevel in (SMALL.interlevel, 0.0):
-        field = NerfactoField(structs.replace(SMALL, interlevel=interlevel, depth_guide=0.0))
+    for interlevel in (SMALL["nerfacto"].interlevel, 0.0):
+        field = NerfactoField(structs.replace(SMALL["nerfacto"], interlevel=interlevel, depth_guide=0.0))
         field.fit(SEEN, Budget(steps=250))
         full = field.snapshot()
         sampling = full.encoding.sampling._replace(samples=4)
@@ -48,7 +48,7 @@ def test_appearances_take_up_what_differs_between_cameras() -> None:
     ]
     scores, looks = [], None
     for appearance in (0, 4):
-        field = NerfactoField(structs.replace(SMALL, appearance=appearance))
+        field = NerfactoField(structs.replace(SMALL["nerfacto"], appearance=appearance))
         field.fit(views, Budget(steps=300))
         scores.append(score(field, still.held_out[0]))
         looks = field._cameras.appearances
@@ -62,6 +62,6 @@ def test_appearances_take_up_what_differs_between_cameras() -> None:
 
 
 def test_appearance_costs_nothing_where_it_is_not_asked_for() -> None:
-    field = NerfactoField(SMALL)
+    field = NerfactoField(SMALL["nerfacto"])
     field.fit(SEEN, Budget(steps=2))
     assert field._cameras.appearances is None and field._batch.d_embeddings.size == 0 and field._net.widths[-1] == 4

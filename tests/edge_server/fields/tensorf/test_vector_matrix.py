@@ -20,7 +20,7 @@ from edge_server.fields.tensorf.kernels.vector_matrix import (
 from edge_server.fields.tensorf.settings import TensorfSettings
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.fields.small import HELD, SEEN
-from tests.edge_server.fields.tensorf.small import SMALL
+from tests.edge_server.fields.small_rays import SMALL
 
 SETTINGS = TensorfSettings(density_rank=8, color_rank=16, resolution_start=9, resolution=17, first=1.0)
 AXES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # the plane's two axes and the line's
@@ -126,7 +126,7 @@ def test_finer_planes_say_the_same(new: int) -> None:
 
 
 def test_upsampling_hardly_changes_the_picture() -> None:
-    field = TensorfField(structs.replace(SMALL, upsample=(60,)))
+    field = TensorfField(structs.replace(SMALL["tensorf"], upsample=(60,)))
     field.fit(SEEN, Budget(steps=59))
     before, table = field.render(HELD.camera_to_world, HELD.intrinsics).color, field._encoding.table
     field.step = 60
