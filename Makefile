@@ -67,10 +67,7 @@ help:  ## what there is to make
 # An arm's client library, where the scenario (a file, or the name of a shipped one) has an arm.
 ARM := $(if $(shell grep -ls '^ *arm:' $(SCENARIO) deploy/scenarios/$(SCENARIO).yaml),.venv/.ok-arm)
 
-# Marching cubes, where it asks for a mesh.
-MESH := $(if $(shell grep -ls '^ *export:' $(SCENARIO) deploy/scenarios/$(SCENARIO).yaml),.venv/.ok-mesh)
-
-demo: .venv/.ok-run .venv/.ok-kernels $(ARM) $(MESH)  ## run a scenario: SCENARIO=FILE FOR=60s OUT=runs/demo PORT=8080 DATA=FOLDER
+demo: .venv/.ok-run .venv/.ok-kernels $(ARM)  ## run a scenario: SCENARIO=FILE FOR=60s OUT=runs/demo PORT=8080 DATA=FOLDER
 	@.venv/bin/freshfield demo $(SCENARIO) --for=$(FOR) --out $(OUT) --port $(PORT) $(if $(DATA),--data $(DATA))
 
 # Two passes: what only computes on all cores, then what meets clocks and ports. 5: nothing was selected.
@@ -187,10 +184,6 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 
 .venv/.ok-arm: .venv/.ok-run
 	@$(INSTALL) -e '.[ur]'
-	@touch $@
-
-.venv/.ok-mesh: .venv/.ok-run
-	@$(INSTALL) -e '.[surface]'
 	@touch $@
 
 .venv/.ok-test: .venv/.ok-run pyproject.toml

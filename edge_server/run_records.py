@@ -203,38 +203,3 @@ class Frontier(Struct):
     points: list[FrontierPoint]
     about: str
     speed_m_per_s: Number = 1.0
-
-
-class MeshDistances(Struct):
-    """A mesh compared with the true surface; distances in millimeters, and the project's targets, from 0.3 m.
-
-    accuracy: from the mesh to the surface (mean, median, 95th percentile).
-    completeness: mean from the surface that two cameras see to the mesh.
-    chamfer: the mean of the two means.
-    complete: share of that surface within ``within_mm`` of the mesh.
-    precise: share of the mesh within ``within_mm`` of the surface.
-    """
-
-    chamfer_mm: Number
-    accuracy_mm: Number
-    accuracy_median_mm: Number
-    accuracy_p95_mm: Number
-    completeness_mm: Number
-    complete: Number
-    precise: Number
-    within_mm: Number = 3.0
-    target_chamfer_mm: Number = 1.5
-    target_complete: Number = 0.95
-
-
-class MeshFacts(Struct):
-    """mesh.json, as ``edge-server export --json`` writes it. measured: None where the surface is unknown."""
-
-    file: str
-    triangles: Count
-    vertices: Count
-    watertight: bool
-    cameras: Count
-    seconds: Number
-    stages_s: dict[str, Number]
-    measured: MeshDistances | None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
@@ -56,17 +55,6 @@ class KeyframesConfig(Settings, frozen=True):
     apart_deg: Annotated[float, within(0.0, math.inf, "angle between keyframes")] = 5.0
 
 
-class ExportConfig(Settings, frozen=True):
-    """What ``edge-server export`` makes of the field at the end of a run of the launcher."""
-
-    mesh: Annotated[str, about("file in the run's folder, .ply or .glb")]
-    voxel_mm: Annotated[float, within(0.01, 1000.0, "side of a voxel; not given: a pixel at the surface")] | None = None
-
-    def __post_init__(self) -> None:
-        if Path(self.mesh).name != self.mesh or Path(self.mesh).suffix.lower() not in (".ply", ".glb"):
-            raise ValueError(f"mesh: expected a file name that ends in .ply or .glb, got {self.mesh!r}")
-
-
 class EdgeConfig(Settings, frozen=True):
     """The edge section of a scenario. What a scenario does not name is neither imported nor computed.
 
@@ -99,7 +87,6 @@ class EdgeConfig(Settings, frozen=True):
     embedding: Annotated[Any, about("for policies that look at what cameras see")] = None
     keyframes: Annotated[KeyframesConfig | None, about("earlier viewpoints of moving cameras go on supervising")] = None
     foreground: Annotated[Any, about("cuts the background out of every view")] = None
-    export: Annotated[ExportConfig | None, about("what the launcher makes of the field when the run ends")] = None
 
 
 def described(scenario: Scenario, config: EdgeConfig, moving: str) -> str:

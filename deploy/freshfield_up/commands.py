@@ -27,7 +27,6 @@ class MissingCommand(RuntimeError):
 class ProcessSet:
     """The processes of one scenario.
 
-    nodes: at least one.
     edge_address, emulator_address: HOST:PORT on which they listen.
     arms: one process if the scenario has a simulated arm, else none. arm_address: HOST:PORT of the arm.
     drivers: one process if that arm has a path, else none.
@@ -35,7 +34,7 @@ class ProcessSet:
 
     edge: Child
     emulator: Child
-    nodes: list[Child]
+    node: Child
     edge_address: str
     emulator_address: str
     arms: list[Child] = field(default_factory=list)
@@ -50,7 +49,7 @@ class ProcessSet:
     @property
     def groups(self) -> list[list[Child]]:
         """``children`` in groups that may stop together."""
-        return [self.drivers, self.nodes, self.arms, [self.emulator], [self.edge]]
+        return [self.drivers, [self.node], self.arms, [self.emulator], [self.edge]]
 
 
 def process_set(
@@ -59,7 +58,6 @@ def process_set(
     page_port: int,
     data: Path | None = None,
     seed: int | None = None,
-    process_per_camera: bool = False,
     edge_options: Sequence[str] = (),
 ) -> ProcessSet:
     """The processes of a run, not started yet, with their commands, addresses and log files.
@@ -68,7 +66,6 @@ def process_set(
     page_port: loopback port of the page.
     data: folder of recorded data, if any.
     seed: replaces the scenario's.
-    process_per_camera: one node for each camera instead of one for all.
     edge_options: further arguments for the edge server.
     Raises MissingCommand.
     """
@@ -110,21 +107,14 @@ def process_set(
         *common,
     )
 
-    def node(name: str, role: str, *cameras: str) -> Child:
-        arguments = (*cameras, "--to", emulator_address, *common, *recorded)
-        return child(name, role, "camera-node", "run", *arguments)
-
-    if process_per_camera:
-        nodes = [node(f"node-{c}", f"the camera node of {c}", "--camera", c) for c in scenario.cameras]
-    else:
-        nodes = [node("node", "the camera node", "--all")]
+    node = child("node", "the camera node", "camera-node", "run", "--all", "--to", emulator_address, *common, *recorded)
     arm = scenario.source.get("arm")
     if not isinstance(arm, dict) or not arm.get("simulated"):
-        return ProcessSet(edge, emulator, nodes, edge_address, emulator_address)
+        return ProcessSet(edge, emulator, node, edge_address, emulator_address)
     arms = [child("arm", "the simulated arm", "camera-node", "simulate-arm")]
     drivers = [child("driver", "the arm's driver", "camera-node", "drive-arm")] if arm.get("path") else []
     arm_address = f"{arm.get('host')}:{_ARM_PORT}"
-    return ProcessSet(edge, emulator, nodes, edge_address, emulator_address, arms, arm_address, drivers)
+    return ProcessSet(edge, emulator, node, edge_address, emulator_address, arms, arm_address, drivers)
 
 
 def program(name: str) -> str:

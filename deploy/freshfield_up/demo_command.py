@@ -33,8 +33,6 @@ def run(args: argparse.Namespace) -> int:
         port=args.port,
         data=args.data,
         seed=args.seed,
-        restart=args.restart,
-        process_per_camera=args.process_per_camera,
         edge=() if args.policy is None else (f"--policy={args.policy}",),
     )
     return Launcher(scenario, options).run()
@@ -92,6 +90,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME[:VALUE]",
         help="in place of the scenario's: all, threshold:120, bandit:FILE (docs/scheduling.md)",
     )
-    add("--restart", action="store_true", help="start a process again when it dies, instead of ending the run")
-    add("--process-per-camera", action="store_true", help="one camera-node process for each camera [one for all]")
     parser.set_defaults(run=run)

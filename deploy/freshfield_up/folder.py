@@ -15,9 +15,9 @@ from freshfield.untrusted import read_json, read_text
 MARKER = "run.json"
 """Written first into every run's folder. Only a folder that holds one, with the key KEY in it, may be replaced."""
 KEY = "freshfield_run"
-"""Names what the scenario adds to WRITTEN."""
+"""Tells the marker from another program's file of that name."""
 WRITTEN = (
-    *("edge.json", "channel.json", "node-*.json", "frontier.json", "mesh.json", "processes.jsonl"),
+    *("edge.json", "channel.json", "node-*.json", "frontier.json", "processes.jsonl"),
     *("series.jsonl", "shown.jsonl", "ages.jsonl", "poses.jsonl", "ledger-*.tsv", "log-*.txt", "decisions"),
     *("field.npz", "snapshot-*.npz", "truth.png", "rendered.png", "figure-*.png", "report.json", "report.html"),
     ".*.part",
@@ -31,12 +31,11 @@ class FolderError(ValueError):
     """The folder cannot be used; the message says what to do."""
 
 
-def prepare(out: Path, about: dict[str, Any], adds: tuple[str, ...] = ()) -> IO[str]:
+def prepare(out: Path, about: dict[str, Any]) -> IO[str]:
     """Make ``out`` an empty run folder with a marker. The folder is locked while the returned file is open.
     Files of an earlier run are moved to ``EARLIER``, where they stay until ``forget_earlier``.
 
     about: contents of the marker, besides KEY.
-    adds: names of files that this scenario's run writes beside WRITTEN.
     Raises FolderError if the folder cannot be used, holds other files than a run's, or a run is still using
     it.
     """
@@ -63,7 +62,7 @@ def prepare(out: Path, about: dict[str, Any], adds: tuple[str, ...] = ()) -> IO[
             path.rename(part / path.name)
         part.rename(earlier)
     lock.truncate(0)
-    json.dump({KEY: list(adds), **about}, lock, indent=1)
+    json.dump({KEY: [], **about}, lock, indent=1)
     lock.flush()
     return lock
 
@@ -80,15 +79,14 @@ def _refuse_a_strangers(out: Path) -> None:
     try:
         text = read_text(out / MARKER)
         # A start that was killed before it wrote its marker leaves an empty one.
-        adds = read_json(text)[KEY] if text or not found <= kept else []
-        if not all(isinstance(name, str) for name in adds):
+        if (text or not found <= kept) and read_json(text)[KEY] != []:
             raise ValueError
     except (ValueError, TypeError, KeyError):
         raise FolderError(
             f"{out}: {MARKER} is not of a run of this version of freshfield, so its files stay; delete the folder, or "
             f"{elsewhere}"
         ) from None
-    known = (*WRITTEN, *adds, *kept)
+    known = (*WRITTEN, *kept)
     if strange := sorted(name for name in found if not any(fnmatchcase(name, pattern) for pattern in known)):
         raise FolderError(f"{out} holds {strange[0]}, which no run wrote; move it, or {elsewhere}")
 

@@ -43,7 +43,6 @@ class Child:
     command: Sequence[str]
     log: Path
     environment: Mapping[str, str] = field(default_factory=dict)
-    restarts: int = 0
     process: subprocess.Popen[bytes] | None = None
     started_s: float = 0.0
     killed: bool = False

@@ -1,4 +1,4 @@
-"""One run from start to report: starts, supervises and stops its processes, then exports and reports."""
+"""One run from start to report: starts, supervises and stops its processes, then reports."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from types import FrameType
 
 from freshfield.machine_load import LoadMeter
 from freshfield.scenario import Scenario
-from freshfield_up import console, folder, mesh, net
+from freshfield_up import console, folder, net
 from freshfield_up.commands import ProcessSet, process_set, program
 from freshfield_up.processes import GRACE_S, Child, kill, stop
 from freshfield_up.status import read_json, status_line
@@ -28,9 +28,7 @@ READY_WITHIN_S = 600.0
 """A first start compiles the field's kernels: a minute, or more on a busy machine."""
 _COMPILING = "compiling"
 """Start of the edge's status text until it can make a first update."""
-MAX_RESTARTS = 20
 REPORT_WITHIN_S = 300.0
-EXPORT_WITHIN_S = 1200.0
 
 
 @dataclass(frozen=True)
@@ -40,8 +38,7 @@ class Options:
     out: folder of the run.
     duration_s: seconds after everything is up; 0: no end.
     port: loopback port of the page.
-    data, seed, process_per_camera: see ``commands.process_set``.
-    restart: restart a process that ends, instead of ending the run.
+    data, seed: see ``commands.process_set``.
     edge: further arguments for the edge server.
     """
 
@@ -50,8 +47,6 @@ class Options:
     port: int = 8080
     data: Path | None = None
     seed: int | None = None
-    restart: bool = False
-    process_per_camera: bool = False
     edge: tuple[str, ...] = ()
 
 
@@ -68,24 +63,14 @@ class Launcher:
         self._ready_s: float | None = None
         self._page_announced = False
         self._failures: list[str] = []
-        self._restart_at: dict[str, float] = {}
 
     def run(self) -> int:
         """Run to the end. Returns the exit code. Raises FolderError or MissingCommand before any process
         starts."""
         options = self.options
-        mesh.check(self.scenario)
-        self.processes = process_set(
-            self.scenario,
-            options.out,
-            options.port,
-            options.data,
-            options.seed,
-            options.process_per_camera,
-            options.edge,
-        )
+        self.processes = process_set(self.scenario, options.out, options.port, options.data, options.seed, options.edge)
         about = {"scenario": str(self.scenario.path), "seed": self.scenario.seed, "port": options.port}
-        lock = folder.prepare(options.out, about, mesh.file_names(self.scenario))
+        lock = folder.prepare(options.out, about)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
                 signal.signal(number, self._on_signal)
@@ -100,7 +85,6 @@ class Launcher:
                     self._supervise()
             finally:
                 self._stop()
-            self._export()
             self._report()
             if (earlier := options.out / folder.EARLIER).exists():
                 _say(f"the run was never up; an earlier run's files are in {earlier}")
@@ -110,17 +94,17 @@ class Launcher:
 
     def _supervise(self) -> None:
         """Start the processes, then check them every tick until there is a reason to stop."""
-        # The nodes render ahead while the edge loads its libraries. The emulator starts last, so that no
+        # The node renders ahead while the edge loads its libraries. The emulator starts last, so that no
         # frame is sent, and lost, before the edge can take it.
         self.processes.edge.start()
         for arm in self.processes.arms:
             arm.start()
         if not self.processes.arms:
-            self._start_nodes()
+            self.processes.node.start()
         load, next_line_s, next_sample_s = LoadMeter(), 0.0, 0.0
         while not self._stop_requested.wait(TICK_S):
             now_s = time.monotonic()
-            if not self._check_alive(now_s):
+            if not self._check_alive():
                 return
             if self._ready_s is None:
                 self._continue_start(now_s)
@@ -138,16 +122,12 @@ class Launcher:
             if self._ready_s and self.options.duration_s and now_s - self._ready_s >= self.options.duration_s:
                 return
 
-    def _start_nodes(self) -> None:
-        for child in self.processes.nodes:
-            child.start()
-
     def _continue_start(self, now_s: float) -> None:
-        """One step of the start: the nodes once their arm answers, the emulator once the edge serves, and the
+        """One step of the start: the node once its arm answers, the emulator once the edge serves, and the
         page's address once the page answers."""
         emulator = self.processes.emulator
-        if self.processes.nodes[0].process is None and net.accepts(self.processes.arm_address):
-            self._start_nodes()
+        if self.processes.node.process is None and net.accepts(self.processes.arm_address):
+            self.processes.node.start()
         if emulator.process is None and net.is_serving(self.processes.edge_address):
             emulator.start()
         if not self._page_announced and net.page_answers(self.options.port):
@@ -171,28 +151,16 @@ class Launcher:
         if not net.is_serving(self.processes.emulator_address):
             return self.processes.emulator
         phases = [read_json(file).get("phase") for file in self.options.out.glob("node-*.json")]
-        if phases.count("streaming") < len(self.processes.nodes):
-            return self.processes.nodes[0]
+        if "streaming" not in phases:
+            return self.processes.node
         doing = str(read_json(self.options.out / "edge.json").get("doing") or _COMPILING)
         return self.processes.edge if doing.startswith(_COMPILING) else None
 
-    def _check_alive(self, now_s: float) -> bool:
-        """Look for processes that ended; with --restart, restart them after a second. Returns False to end
-        the run."""
+    def _check_alive(self) -> bool:
+        """Whether no process has ended."""
         for child in self.processes.children:
-            if child.process is None or child.running:
-                continue
-            due_s = self._restart_at.get(child.name)
-            if due_s is None:
-                if not self.options.restart or child.restarts >= MAX_RESTARTS:
-                    self._fail(child.exit_summary())
-                    continue
-                _say(f"{child.exit_summary()}\nIt is started again in a second (--restart).")
-                self._restart_at[child.name] = now_s + 1.0
-            elif now_s >= due_s:
-                del self._restart_at[child.name]
-                child.restarts += 1
-                child.start()
+            if child.process is not None and not child.running:
+                self._fail(child.exit_summary())
         return not self._failures
 
     def _fail(self, text: str) -> None:
@@ -212,7 +180,7 @@ class Launcher:
         self._stop_requested.set()
 
     def _stop(self) -> None:
-        """Stop nodes first and the edge last, so that frames on the way arrive. A second Ctrl-C kills."""
+        """Stop the node first and the edge last, so that frames on the way arrive. A second Ctrl-C kills."""
         why = {"SIGINT": "Ctrl-C", "SIGTERM": "SIGTERM", "SIGHUP": "the terminal was closed"}
         reason = f" ({why[self._signals[0]]})" if self._signals else ""
         _say(f"stopping{reason}: cameras, channel, edge")
@@ -221,31 +189,6 @@ class Launcher:
             for child in group:
                 if child.killed:
                     _say(f"{child.role} did not end in time and was killed; see {child.log}")
-
-    def _export(self) -> None:
-        """Make the mesh if the scenario asks for one. A further signal cancels it."""
-        export = mesh.export_process(self.scenario, self.options.out)
-        if export is None or self._failures:
-            return
-        if not mesh.possible(self.options.out):
-            _say("no mesh: nothing to export yet, the field was never updated")
-            return
-        _say(f"making the mesh (Ctrl-C cancels it); see {export.log}")
-        signals, begin_s = len(self._signals), time.monotonic()
-        export.start()
-        while export.running:
-            time.sleep(TICK_S)
-            if len(self._signals) > signals:
-                kill(export)
-                _say("no mesh: cancelled")
-                return
-            if time.monotonic() - begin_s > EXPORT_WITHIN_S:
-                kill(export)
-                self._fail(f"the mesh was not ready after {EXPORT_WITHIN_S:.0f} s; see {export.log}")
-                return
-        assert export.process is not None
-        if export.process.returncode != 0:
-            self._fail(export.exit_summary())
 
     def _report(self) -> None:
         """Write the report, also after a failure, if the run was up."""

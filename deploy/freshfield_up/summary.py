@@ -38,7 +38,6 @@ def summarize(out: Path) -> str:
         f"frames     {fmt(frames.get('captured'), 'd')} captured, {fmt(frames.get('sent'), 'd')} sent, "
         f"{fmt(frames.get('delivered'), 'd')} delivered{shed}, {rejected} rejected; "
         f"{_accounted(frames)}",
-        *_mesh(report.get("mesh")),
         f"report     {out / 'report.html'}   {out / 'report.json'}",
     ]
     return "\n".join(lines)
@@ -55,21 +54,6 @@ def _accounted(frames: dict[str, Any]) -> str:
 def _parts(age_ms: dict[str, Any]) -> str:
     """What the age of the views that were shown consists of."""
     return "age of " + " + ".join(f"{fmt(ms, '.0f')} ms {part}" for part, ms in age_ms.items())
-
-
-def _mesh(mesh: dict[str, Any] | None) -> list[str]:
-    """A line if the run made a mesh."""
-    if not mesh:
-        return []
-    found = mesh.get("measured")
-    line = f"mesh       {mesh['file']}: {mesh['triangles']:,} triangles, made in {mesh['seconds']:.0f} s"
-    if found:
-        line += (
-            f"; chamfer {found['chamfer_mm']:.2f} mm (target {found['target_chamfer_mm']:g}), "
-            f"{100 * found['complete']:.0f} % of the surface within {found['within_mm']:g} mm "
-            f"(target {100 * found['target_complete']:g})"
-        )
-    return [line]
 
 
 def _seconds(value_ms: float | None) -> str:

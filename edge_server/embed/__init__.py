@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec.structs import replace
 
@@ -34,13 +34,12 @@ class SizeError(EmbeddingError):
 
 
 class EmbeddingConfig(Settings, frozen=True):
-    """The section ``edge.embedding`` of a scenario. provider: auto uses CUDA if ONNX Runtime has it."""
+    """The section ``edge.embedding`` of a scenario."""
 
     model: Annotated[str, about("a YOLO detection ONNX, relative to the scenario, or default")] = DEFAULT
     dim: Annotated[int, within(1, 4096, "length of an embedding, at most the channels of the tapped layer")] = 32
     size: Annotated[int, within(32, 2048, "side of the model's input, pixels; not given: its own")] | None = None
     tap: Annotated[str | None, about("tensor or module (model.9) to embed; not given: the backbone's end")] = None
-    provider: Literal["auto", "cpu", "cuda"] = "auto"
     threads: Annotated[int, within(1, 256, "CPU threads")] = 1
 
 
@@ -60,7 +59,7 @@ def model_path(name: str) -> Path:
 
 def make_embedder(section: EmbeddingConfig) -> Embedder:
     """Create from a section. EmbeddingError: a library is not installed, the file is not a YOLO detector, or
-    it cannot have this size or provider."""
+    it cannot have this size."""
     try:
         from edge_server.embed.backbone import load_backbone
         from edge_server.embed.embedder import Embedder
@@ -71,4 +70,4 @@ def make_embedder(section: EmbeddingConfig) -> Embedder:
             f"embedding needs {error.name.split('.')[0]}, which is not installed: pip install 'freshfield[embed]'"
         ) from None
     backbone = load_backbone(model_path(section.model), section.tap, section.size)
-    return Embedder(backbone, section.dim, section.provider, section.threads)
+    return Embedder(backbone, section.dim, section.threads)

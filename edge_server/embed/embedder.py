@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
-import logging
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,14 +16,10 @@ from edge_server.embed.backbone import OUTPUT, Backbone
 from edge_server.embed.letterbox import GRAY, blob, checked
 from freshfield.limits import MAX_MODEL_BYTES
 
-log = logging.getLogger(__name__)
-
-# Images per run if the model takes any number. On a CPU, larger batches exceed its caches and take longer per
-# image.
-_BATCH = {"cpu": 4, "cuda": 32}
+# Images per run if the model takes any number: larger batches exceed the caches and take longer per image.
+_BATCH = 4
 # Fixed, so that a model's embeddings do not depend on the scenario's seed.
 _PROJECTION_SEED = 20240631
-_NAMES = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 
 
 class Embedder:
@@ -34,15 +29,15 @@ class Embedder:
     failed: number of images for which the model gave NaN or infinity.
     """
 
-    def __init__(self, backbone: Backbone, dim: int, provider: str = "auto", threads: int = 1) -> None:
-        """dim, provider, threads: as in ``EmbeddingConfig``. Raises EmbeddingError if ``dim`` exceeds the
-        backbone's channels, ONNX Runtime has no such provider, or the model does not run."""
+    def __init__(self, backbone: Backbone, dim: int, threads: int = 1) -> None:
+        """dim, threads: as in ``EmbeddingConfig``. Raises EmbeddingError if ``dim`` exceeds the backbone's channels,
+        or the model does not run."""
         self.backbone, self.dim = backbone, dim
         self._mean, self._axes = _projection(backbone, dim)
         self.failed = 0
         self.name = f"{backbone.name}-{backbone.digest} {backbone.tap} {backbone.width}x{backbone.height} d{dim}"
-        self._session, self.provider = open_session(backbone.model, provider, threads, backbone.name)
-        self.step = backbone.batch or _BATCH[self.provider]
+        self._session = open_session(backbone.model, threads, backbone.name)
+        self.step = backbone.batch or _BATCH
         """Images per run."""
         # A model that cannot run fails here, not at the first decision.
         self.pooled([np.full((8, 8, 3), GRAY, np.uint8)])
@@ -92,16 +87,9 @@ class Embedder:
         return found
 
 
-def open_session(model: bytes, provider: str, threads: int, name: str) -> tuple[ort.InferenceSession, str]:
-    """Open an ONNX model. Returns the session, and where it runs: cpu or cuda. provider, threads: as in
-    ``EmbeddingConfig``. name: the model's name in error messages. Raises EmbeddingError."""
-    available = [short for short, long in _NAMES.items() if long in ort.get_available_providers()]
-    chosen = ("cuda" if "cuda" in available else "cpu") if provider == "auto" else provider
-    if chosen not in available:
-        raise EmbeddingError(
-            f"provider: ONNX Runtime has no {chosen} here, it has {', '.join(available)}; "
-            "for CUDA install onnxruntime-gpu instead of onnxruntime"
-        )
+def open_session(model: bytes, threads: int, name: str) -> ort.InferenceSession:
+    """Open an ONNX model. threads: as in ``EmbeddingConfig``. name: the model's name in error messages. Raises
+    EmbeddingError."""
     options = ort.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.log_severity_level = 4  # errors are raised, not printed too
@@ -109,26 +97,18 @@ def open_session(model: bytes, provider: str, threads: int, name: str) -> tuple[
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     _bound_memory()
     options.add_session_config_entry("session.use_env_allocators", "1")
-    cuda = [] if chosen == "cpu" else [(_NAMES[chosen], {"gpu_mem_limit": str(MAX_MODEL_BYTES)})]
     try:
         # It prints what it then raises.
         with contextlib.redirect_stdout(io.StringIO()):
-            session = ort.InferenceSession(
+            return ort.InferenceSession(
                 model,
                 options,
-                providers=[*cuda, _NAMES["cpu"]],
+                providers=["CPUExecutionProvider"],
                 # It computes constants while loading, with memory that nothing bounds.
                 disabled_optimizers=["ConstantFolding"],
             )
-    except Exception as error:  # as above
+    except Exception as error:  # ONNX Runtime's exceptions share no base class
         raise EmbeddingError(f"{name}: {reason_of(error, 'load')}") from None
-    # If CUDA's libraries do not load, ONNX Runtime falls back to the CPU silently.
-    if chosen == "cuda" and _NAMES["cuda"] not in session.get_providers():
-        if provider == "cuda":
-            raise EmbeddingError("provider: CUDA cannot be used here: its driver or libraries do not load")
-        log.warning("CUDA does not load: embeddings are computed on the CPU")
-        chosen = "cpu"
-    return session, chosen
 
 
 @functools.cache

@@ -10,12 +10,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from msgspec import to_builtins
-
 from edge_server.export import ExportError
-from edge_server.run_records import MeshDistances, MeshFacts
 from edge_server.surface import SurfaceError
-from freshfield.files import out_file, out_folder, write_json
+from freshfield.files import out_file, out_folder
 
 DESCRIPTION = """\
 Write the results of a run or fit as files for other programs. RUN is its folder, or a checkpoint in it.
@@ -37,8 +34,8 @@ a grid from the depth that the cameras see; what no camera saw stays open, or is
 """
 
 
-# scenario -> (mesh, views) -> (distances to the true surface or None, a sentence to print).
-Comparison = Callable[[str], Callable[[Any, Any], tuple[MeshDistances | None, str]]]
+# scenario -> (mesh, views) -> a sentence on the distance to the true surface, to print.
+Comparison = Callable[[str], Callable[[Any, Any], str]]
 
 
 def main(argv: Sequence[str] | None = None, compare: Comparison | None = None) -> int:
@@ -92,12 +89,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar="SCENARIO",
         help="scenario of the run; if its scene is synthetic and static, print the mesh's distance to the true surface",
     )
-    mesh(
-        "--json",
-        type=out_file,
-        metavar="FILE",
-        help="write size, seconds of each stage and distances of --measure to FILE as JSON",
-    )
     return parser
 
 
@@ -107,8 +98,6 @@ class Export:
     def __init__(self, args: argparse.Namespace, compare: Comparison | None = None) -> None:
         self.args, self._compare = args, compare
         self._said = ("", 0.0)
-        self._began = time.perf_counter()
-        self._stages: dict[str, tuple[float, float]] = {}  # name -> start, last progress
 
     @cached_property
     def source(self):
@@ -149,8 +138,8 @@ class Export:
                 raise ExportError(f"--{name} {path}: expected a file that ends in {' or '.join(endings)}")
         if args.count < 1:
             raise ExportError(f"--count {args.count}: expected 1 or more")
-        if args.mesh is None and (args.measure is not None or args.json is not None):
-            raise ExportError("--measure and --json are for --mesh FILE")
+        if args.mesh is None and args.measure is not None:
+            raise ExportError("--measure is for --mesh FILE")
         if args.measure is not None:
             if self._compare is None:
                 raise ExportError("--measure: run it as edge-server export")
@@ -181,7 +170,6 @@ class Export:
     def _mesh(self, path: Path) -> None:
         from edge_server.surface.reconstruct import mesh_from_depth_maps
 
-        begin = time.perf_counter()
         mesh = mesh_from_depth_maps(self.maps, self._settings(), self._progress)
         if path.suffix.lower() == ".glb":
             from edge_server.export.glb import write_mesh
@@ -189,26 +177,10 @@ class Export:
             from edge_server.export.ply import write_mesh
         path.parent.mkdir(parents=True, exist_ok=True)
         write_mesh(path, mesh.vertices, mesh.faces, mesh.color)
-        spent_s = time.perf_counter() - begin
         closed = ", watertight" if mesh.watertight else ""
         print(f"{path}: {len(mesh.faces)} triangles, {len(mesh.vertices)} vertices{closed}", flush=True)
-        found = None
         if self.args.measure is not None:
-            found, words = self._measure(mesh, self.source.views)
-            print(f"  {words}", flush=True)
-        if self.args.json is None:
-            return
-        facts = MeshFacts(
-            file=path.name,
-            triangles=len(mesh.faces),
-            vertices=len(mesh.vertices),
-            watertight=mesh.watertight,
-            cameras=len(self.source.views),
-            seconds=round(spent_s, 3),
-            stages_s={name: round(end - start, 3) for name, (start, end) in self._stages.items()},
-            measured=found,
-        )
-        write_json(self.args.json, to_builtins(facts), indent=1)
+            print(f"  {self._measure(mesh, self.source.views)}", flush=True)
 
     def _points(self, path: Path) -> None:
         from edge_server.export.ply import write_points
@@ -247,9 +219,6 @@ class Export:
         """Print progress once a second, and when a stage ends."""
         name, at = self._said
         now = time.perf_counter()
-        # A stage starts at the last progress of the one before it.
-        begin = max((end for _, end in self._stages.values()), default=self._began)
-        self._stages[what] = (self._stages.get(what, (begin, now))[0], now)
         if share >= 1.0 or what != name or now - at >= 1.0:
             self._said = (what, now)
             print(f"  {what:10} {100 * share:3.0f} %", flush=True)

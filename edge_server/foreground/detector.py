@@ -198,7 +198,7 @@ def open_model(file: Path) -> Any:
     try:
         data = read_bytes(file, MAX_FILE_BYTES)
         parse_model(data, file)
-        return open_session(data, "auto", 1, str(file))[0]
+        return open_session(data, 1, str(file))
     except OSError as error:
         raise ForegroundError(f"{file}: cannot be read: {error.strerror}; name a model in ONNX format") from None
     except EmbeddingError as error:

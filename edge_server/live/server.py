@@ -184,7 +184,6 @@ class EdgeServer:
             frontier=self.frontier,
             field_name=config.field,
             chosen=described(scenario, config, self._moving),
-            decision=lambda: self.updater.policy.last_decision,
             troubles=lambda: getattr(self.updater.field, "troubles", ()),
         )
         log.info("%s", self.state.chosen)

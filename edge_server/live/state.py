@@ -24,7 +24,7 @@ from edge_server.scheduler import Policy
 from freshfield.frame import Frame
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned
-    from edge_server.scheduler.learned.actor import Decision
+    pass
 
 SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages
 
@@ -131,7 +131,6 @@ class EdgeState:
 
     start_ns, now_ns: the instant at which the run began, and the present, on the clock of frames.
     channel: the emulator's status (channel.json) where it runs on the same machine, else None.
-    decision: the newest decision of a learned policy, with what it saw; None with other policies.
     frontier: what accuracy costs in time, as measured.
     chosen: how the edge works and why, in one line (``config.described``).
     troubles: what the field finds wrong with poses and measured depth, for people.
@@ -148,7 +147,6 @@ class EdgeState:
     set_policy: Callable[[str, float | None], None]
     save_snapshot: Callable[[], Path]
     channel: Callable[[], dict | None] = lambda: None
-    decision: Callable[[], Decision | None] = lambda: None
     troubles: Callable[[], Sequence[str]] = tuple
     frontier: Frontier | None = None
     field_name: str = ""

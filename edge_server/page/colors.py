@@ -22,9 +22,9 @@ UNKNOWN: RGB = (125, 131, 143)
 HELD_OUT: RGB = (158, 128, 255)
 """Held-out cameras are outside the age scale because they are never trained on. Violet, because a tritanope
 cannot tell sky blue from the fresh green."""
-FOR: RGB = (0, 114, 178)
-AGAINST: RGB = (213, 94, 0)
-"""Contributions for and against a decision: blue and vermilion, as in the figures."""
+MEASURED: RGB = (0, 114, 178)
+PRESENT: RGB = (213, 94, 0)
+"""Measured lines and the present point of a chart: blue and vermilion, as in the figures."""
 # Frustums change color in steps, so that an idle page sends almost nothing.
 STEPS = 24
 

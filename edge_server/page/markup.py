@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
@@ -15,15 +15,10 @@ from markupsafe import Markup
 from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.frontier import best_point
 from edge_server.live.state import CameraView
-from edge_server.page.colors import AGAINST, FOR, HELD_OUT, RGB, age_color, css, scale_color
+from edge_server.page.colors import HELD_OUT, MEASURED, PRESENT, RGB, age_color, css, scale_color
 from edge_server.page.settings import FRESH_MS, STALE_MS
 from edge_server.run_records import Frontier
 from freshfield.scenario import NOTHING_HELD_OUT
-
-if TYPE_CHECKING:  # loaded only with a learned policy
-    from edge_server.scheduler.learned.explain import Explanation
-
-EXPLAINED_CAMERAS = 6  # in the explanation of a decision
 
 
 @dataclass(frozen=True)
@@ -111,14 +106,6 @@ def chart_caption(title: str, lines: Sequence[tuple[str, RGB]], remark: str = ""
     return str(_panel.chart_caption(title, lines, remark))
 
 
-def decision_explanation(e: Explanation) -> str:
-    """A learned policy's decision: bars of the contributions of parts of the state and of cameras."""
-    largest = sorted(zip(e.names, e.cameras.tolist()), key=lambda pair: -abs(pair[1]))[:EXPLAINED_CAMERAS]
-    groups = list(e.parts.items()), largest
-    widest = max((abs(share) for group in groups for _, share in group), default=0.0)
-    return str(_panel.decision_explanation(e, groups, widest or 1.0))
-
-
 def channel_line(channel: dict[str, Any]) -> str:
     """The emulator's status in one line; values that it does not report are left out."""
     counts = channel.get("counts")
@@ -166,6 +153,6 @@ _environment.filters |= {
     "age_css": lambda age_ms: css(age_color(age_ms)),
     "scale_css": lambda fraction: css(scale_color(fraction)),
 }
-_environment.globals |= {"for_it": css(FOR), "against": css(AGAINST), "held_out": css(HELD_OUT)}
+_environment.globals |= {"measured": css(MEASURED), "present": css(PRESENT), "held_out": css(HELD_OUT)}
 _panel: Any = _environment.get_template("panel.html.j2").module
 INTRO = str(_panel.intro())

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from edge_server.live.state import CameraView, Comparison, EdgeState, Publication
 from edge_server.page import markup
 from edge_server.page.controls import ControlPanel
-from edge_server.page.decision_explanation import DecisionExplanation
 from edge_server.page.settings import AGE_PARTS_OF, POSE_NOISE
 from edge_server.page.timelines import History, Timelines
 from freshfield import coverage
@@ -44,7 +43,6 @@ class Panel:
         self._pair: Any = None
         self._compared_update: int | None = None
         self._refreshes = 0
-        self._explanation = DecisionExplanation(gui, state)
         with gui.add_folder("Controls"):
             self.controls = ControlPanel(server, state)
         side = gui.add_panel()
@@ -85,7 +83,6 @@ class Panel:
         if self._refreshes % 2:  # charts need only one new point a second
             self._timelines.refresh(history, publications)
         self.controls.refresh()
-        self._explanation.refresh()
         comparison = self._state.comparison
         if comparison is not None and comparison.number != self._compared_update:
             held_out = any(c.held_out for c in cameras if c.camera == comparison.camera)

@@ -73,8 +73,6 @@ def assemble(files: RunFiles) -> dict[str, Any]:
     }
     if edge.depth is not None:
         report["depth"] = depth(edge.depth, files.ages)
-    if files.mesh:
-        report["mesh"] = msgspec.to_builtins(files.mesh)
     if edge.kind == "fit":
         data = msgspec.to_builtins(edge.data)
         report |= {"data": data, "frames": None, "age_ms": None, "channel": None, "notes": []}

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from edge_server.run_records import AgesRow, ChannelStatus, EdgeStatus, Frontier, MeshFacts, Number, ShownRow, UpdateRow
+from edge_server.run_records import AgesRow, ChannelStatus, EdgeStatus, Frontier, Number, ShownRow, UpdateRow
 
 T = TypeVar("T")
 
@@ -24,7 +24,7 @@ class RunFiles:
     """Contents of a run's folder.
 
     processes: rows {t_s, name: {rss_mb, cpu, pid}}.
-    frontier: the one that the edge used. mesh: as ``edge-server export --json`` writes it.
+    frontier: the one that the edge used.
     images: those that exist, by name.
     notes: lines for people on whatever was missing or torn.
     """
@@ -37,7 +37,6 @@ class RunFiles:
     ages: list[AgesRow] = field(default_factory=list)
     processes: list[dict[str, Any]] = field(default_factory=list)
     frontier: Frontier | None = None
-    mesh: MeshFacts | None = None
     images: dict[str, Path] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -57,7 +56,6 @@ def read_run_files(out: Path) -> RunFiles:
         shown=_read_rows(out / "shown.jsonl", ShownRow, notes, optional=True),
         frontier=_read(out / "frontier.json", Frontier, notes, optional=True),
         # Only where the scenario asks for one.
-        mesh=_read(out / "mesh.json", MeshFacts, notes, optional=True),
         # Only where one command started all of them.
         processes=_read_rows(out / "processes.jsonl", ProcessRow, notes, optional=True),
         notes=notes,

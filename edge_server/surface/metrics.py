@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.run_records import MeshDistances
 from edge_server.surface import SurfaceError
 from edge_server.surface.mesh import Mesh
 
@@ -31,6 +30,29 @@ class Truth:
 
     points: Points
     cameras: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class MeshDistances:
+    """A mesh compared with the true surface; distances in millimeters, and the project's targets, from 0.3 m.
+
+    accuracy: from the mesh to the surface (mean, median, 95th percentile).
+    completeness: mean from the surface that two cameras see to the mesh.
+    chamfer: the mean of the two means.
+    complete: share of that surface within ``within_mm`` of the mesh.
+    precise: share of the mesh within ``within_mm`` of the surface.
+    """
+
+    chamfer_mm: float
+    accuracy_mm: float
+    accuracy_median_mm: float
+    accuracy_p95_mm: float
+    completeness_mm: float
+    complete: float
+    precise: float
+    within_mm: float = 3.0
+    target_chamfer_mm: float = 1.5
+    target_complete: float = 0.95
 
 
 def thin_points(points: Points, spacing_m: float) -> NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""A scenario with a simulated arm: which processes start in which order, and a mesh of the tile."""
+"""A scenario with a simulated arm: which processes start in which order."""
 
 from __future__ import annotations
 
@@ -31,21 +31,6 @@ def test_a_simulated_arm_and_its_driver_belong_to_the_run(process_set) -> None:
     assert [child.name for child in found.children] == ["driver", "node", "arm", "emulator", "edge"]
 
 
-def test_a_mesh_is_made_where_the_scenario_asks_for_one(monkeypatch, tmp_path: Path) -> None:
-    from freshfield_up import commands, mesh
-
-    monkeypatch.setattr(mesh, "program", lambda name: name)
-    asked = mesh.export_process(CELL, tmp_path)
-    assert asked is not None
-    words = f"edge-server export {tmp_path} --mesh {tmp_path / 'tile.ply'} --measure {CELL.path}"
-    assert " ".join(asked.command) == f"{words} --json {tmp_path / 'mesh.json'}"
-    assert mesh.export_process(load("tile"), tmp_path) is None
-    monkeypatch.setattr(mesh.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(commands.MissingCommand, match=r"edge.export: a mesh needs scikit-image: pip install"):
-        mesh.check(CELL)
-    mesh.check(load("tile"))
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_the_cell_runs_from_one_command(tmp_path: Path) -> None:
@@ -54,10 +39,9 @@ def test_the_cell_runs_from_one_command(tmp_path: Path) -> None:
     text = CELL.path.read_text().replace("../lab/hand-eye-example.yaml", str(mount))
     text = re.sub(r"host: \S+", f"host: {own_address()}", text)
     text = text.replace("width: 128", "width: 48").replace("height: 128", "height: 48")
-    pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
     run = Up(tmp_path, scenario=text)
     try:
-        run.wait_for_updates(30)  # so many viewpoints, or there is nothing to make a mesh of
+        run.wait_for_updates(30)
         run.process.terminate()
         assert run.end(300.0) == 0, run.output
     finally:
@@ -70,6 +54,3 @@ def test_the_cell_runs_from_one_command(tmp_path: Path) -> None:
     last = json.loads((run.out / "processes.jsonl").read_text().splitlines()[-1])
     numbers = int(Path("/proc/sys/kernel/pid_max").read_text())
     assert 0 < (last["driver"]["pid"] - last["emulator"]["pid"]) % numbers < numbers // 2
-    mesh = run.report()["mesh"]
-    assert (run.out / mesh["file"]).stat().st_size > 1000 and 0.0 < mesh["measured"]["complete"] < 1.0
-    assert "mm (target 1.5)" in run.output

@@ -11,8 +11,8 @@ from freshfield_up.folder import EARLIER, KEY, MARKER, FolderError, forget_earli
 
 
 def test_an_earlier_run_is_replaced(tmp_path: Path) -> None:
-    prepare(tmp_path, {"run": 1}, ("room.ply",)).close()
-    for name in ("ledger-edge-edge-1.tsv", "room.ply", ".edge.json.4f.part"):
+    prepare(tmp_path, {"run": 1}).close()
+    for name in ("ledger-edge-edge-1.tsv", "frontier.json", ".edge.json.4f.part"):
         (tmp_path / name).write_text("old")
     (tmp_path / "decisions").mkdir()
     (tmp_path / "decisions" / "000001.npz").write_text("old")

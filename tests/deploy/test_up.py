@@ -176,9 +176,8 @@ def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(tmp_path: Path, monkey
 
 @pytest.mark.slow  # 6 s
 def test_ctrl_c_ends_a_run_with_its_report(up: Callable[..., Up]) -> None:
-    run = up("--for", "0", "--process-per-camera")
+    run = up("--for", "0")
     run.wait_for_updates()
-    assert len({run.pid(f"node-cam0{i}") for i in range(4)}) == 4
     run.process.send_signal(signal.SIGINT)
     assert run.end() == 0, run.output
     assert "stopping (Ctrl-C)" in run.output and "Traceback" not in run.output
@@ -194,25 +193,6 @@ def test_a_start_that_fails_says_why_and_costs_no_earlier_run(tmp_path: Path) ->
     assert "'foo' is not known" in run.output and "PSNR" not in run.output
     assert run.output.endswith(f"the run was never up; an earlier run's files are in {run.out / EARLIER}\n")
     assert (run.out / EARLIER / "report.json").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["node", "emulator", "edge"])
-def test_with_restart_a_run_survives_the_death_of_any_process(up: Callable[..., Up], name: str) -> None:
-    run = up("--for", "0", "--restart")
-    run.wait_for_updates()
-    first = run.pid(name)
-    os.kill(first, signal.SIGKILL)
-    run.wait_until(lambda: "It is started again" in run.output, 10.0)
-    run.wait_until(lambda: run.pid(name) != first)
-    before = sum(c["delivered"] for c in run.status()["cameras"])
-    # An edge that is new counts from zero.
-    run.wait_until(
-        lambda: sum(c["delivered"] for c in run.status()["cameras"]) > (0 if name == "edge" else before) + 10
-    )
-    run.process.send_signal(signal.SIGTERM)
-    assert run.end() == 0, run.output
-    assert run.report()["frames"]["closes"]
 
 
 def refusal(*words: str) -> str:

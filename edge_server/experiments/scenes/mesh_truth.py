@@ -15,9 +15,8 @@ from camera_node.synthetic.render import cast_rays, surface_properties
 from camera_node.synthetic.scene import Scene
 from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.fields import View
-from edge_server.run_records import MeshDistances
 from edge_server.surface.mesh import Mesh
-from edge_server.surface.metrics import STEEPEST_DEG, WITHIN_M, Truth, compare, thin_points
+from edge_server.surface.metrics import STEEPEST_DEG, WITHIN_M, MeshDistances, Truth, compare, thin_points
 from freshfield.geometry import world_rays
 from freshfield.scenario import load
 
@@ -28,17 +27,17 @@ _FINE = 3  # rays per pixel side for the truth, so that they are closer than its
 _SAME = 2e-3  # share of the distance: a ray that ends this near to its target has reached it
 
 
-def compare_with_scene(scenario: str) -> Callable[[Mesh, Sequence[View]], tuple[MeshDistances | None, str]]:
-    """The function with which ``edge-server export --measure`` measures a mesh: it returns ``distances`` and
-    one line of text. Raises ScenarioError immediately, before there is a mesh."""
+def compare_with_scene(scenario: str) -> Callable[[Mesh, Sequence[View]], str]:
+    """The function with which ``edge-server export --measure`` measures a mesh: it returns ``distances`` in one line of
+    text. Raises ScenarioError immediately, before there is a mesh."""
     return partial(_compare, still_scene(scenario))
 
 
-def _compare(scene: Scene | None, mesh: Mesh, views: Sequence[View]) -> tuple[MeshDistances | None, str]:
+def _compare(scene: Scene | None, mesh: Mesh, views: Sequence[View]) -> str:
     if scene is None:
-        return None, "not measured: the true surface is known of synthetic scenes that stand still"
+        return "not measured: the true surface is known of synthetic scenes that stand still"
     found = distances(mesh, scene, views)
-    return found, (
+    return (
         f"chamfer {found.chamfer_mm:.2f} mm (target {found.target_chamfer_mm:g}), "
         f"{100 * found.complete:.1f} % of the surface within {found.within_mm:g} mm "
         f"(target {100 * found.target_complete:g})"

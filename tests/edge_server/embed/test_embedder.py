@@ -23,7 +23,7 @@ def image(height: int, width: int) -> np.ndarray:
 
 
 def embedder(path, **options):
-    return make_embedder(EmbeddingConfig(model=str(path), **{"dim": CHANNELS, "provider": "cpu", **options}))
+    return make_embedder(EmbeddingConfig(model=str(path), **{"dim": CHANNELS, **options}))
 
 
 def test_the_backbones_end_is_what_the_neck_enlarges_and_the_head_is_not_run(tmp_path):
@@ -115,17 +115,6 @@ def test_the_shipped_detectors_go_the_same_way(file):
     assert np.isfinite(rows).all() and np.ptp(rows, axis=0).min() > 0
     with pytest.raises(EmbeddingError, match="dim: "):
         embedder(file, dim=4096)
-
-
-def test_a_provider_that_is_not_there_is_named_with_those_that_are(tmp_path):
-    import onnxruntime
-
-    if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
-        pytest.skip("CUDA is there")
-    path = detector(tmp_path / "d.onnx")
-    assert embedder(path, provider="auto").provider == "cpu"
-    with pytest.raises(EmbeddingError, match="no cuda here, it has cpu"):
-        embedder(path, provider="cuda")
 
 
 def test_a_library_that_is_missing_is_named_with_what_installs_it(monkeypatch):

@@ -36,7 +36,7 @@ HARD = {
 
 @pytest.fixture(scope="module")
 def shipped():
-    return make_embedder(EmbeddingConfig(provider="cpu"))
+    return make_embedder(EmbeddingConfig())
 
 
 @pytest.mark.parametrize("name", HARD)
@@ -70,7 +70,7 @@ def test_a_letterbox_keeps_aspect_and_never_loses_the_picture(shape):
 
 @pytest.mark.parametrize("gain", [np.nan, np.inf, -np.inf, 3e38])
 def test_a_model_that_gives_nan_or_overflows_gives_zero_rows_that_are_counted(tmp_path, gain):
-    made = make_embedder(EmbeddingConfig(str(detector(tmp_path / "d.onnx", gain=gain)), CHANNELS, provider="cpu"))
+    made = make_embedder(EmbeddingConfig(str(detector(tmp_path / "d.onnx", gain=gain)), CHANNELS))
     rows = made.embed([HARD["checkers"], HARD["white"]])
     assert np.isfinite(rows).all() and not rows.any() and made.failed == 2
 
@@ -85,7 +85,7 @@ def overflowing(tmp_path):
 
 
 def test_a_nan_of_one_frame_costs_no_other_frame_of_its_batch(tmp_path):
-    made = make_embedder(EmbeddingConfig(str(overflowing(tmp_path)), CHANNELS, provider="cpu"))
+    made = make_embedder(EmbeddingConfig(str(overflowing(tmp_path)), CHANNELS))
     dark = HARD["black"]
     rows = made.embed([dark, HARD["white"], dark])
     assert np.isfinite(rows).all() and made.failed == 1

@@ -20,7 +20,7 @@ from tests.edge_server.embed.graphs import detector  # noqa: E402
 
 def refused(path, match: str, **options) -> None:
     with pytest.raises(EmbeddingError, match=match) as caught:
-        make_embedder(EmbeddingConfig(model=str(path), **{"dim": 4, "provider": "cpu", **options}))
+        make_embedder(EmbeddingConfig(model=str(path), **{"dim": 4, **options}))
     assert "\n" not in str(caught.value)
 
 
@@ -48,7 +48,7 @@ def test_every_kind_of_damage_ends_in_one_line(tmp_path):
             data[at] = rng.integers(0, 256)
         path.write_bytes(data)
         try:
-            rows = make_embedder(EmbeddingConfig(str(path), 4, provider="cpu")).embed([np.zeros((9, 9, 3), np.uint8)])
+            rows = make_embedder(EmbeddingConfig(str(path), 4)).embed([np.zeros((9, 9, 3), np.uint8)])
         except EmbeddingError as error:
             assert "\n" not in str(error)
             refusals += 1

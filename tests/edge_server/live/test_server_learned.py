@@ -30,7 +30,7 @@ def server_of(tmp_path, layout, embedding=True, port=None):
     edge = {"field": "ngp", "field_options": TINY, "update_ms": 50, "grace_ms": 500, "lpips": "none"}
     edge["policy"] = {"name": "bandit:policy.npz"}
     if embedding:
-        edge["embedding"] = {"model": "d.onnx", "dim": CHANNELS, "provider": "cpu"}
+        edge["embedding"] = {"model": "d.onnx", "dim": CHANNELS}
     data = {"name": "tiny", "seed": 3, "cameras": {"count": 3, "held_out": ["cam00"]}, "edge": edge}
     made = scenario.parse(data, tmp_path / "tiny.yaml")
     return EdgeServer(made, read_config(made), ServerOptions(f"127.0.0.1:{port or free_port()}", tmp_path / "out"))
@@ -45,7 +45,7 @@ def test_it_decides_by_what_cameras_see_and_every_decision_can_be_explained(tmp_
     feed.start()
     try:
         until(lambda: server.updater.number >= 4)
-        decided = server.state.decision()
+        decided = server.updater.policy.last_decision
         assert decided is not None and decided.actor.spec.layout.dim == CHANNELS
         with pytest.raises(ValueError, match="chosen at the start"):
             server.state.set_policy(f"bandit:{tmp_path / 'other.npz'}", None)

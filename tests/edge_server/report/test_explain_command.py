@@ -43,7 +43,7 @@ def test_regions_are_found_with_what_embedded_the_frames(tmp_path, capsys):
     from tests.edge_server.embed.graphs import detector
 
     model = detector(tmp_path / "d.onnx")
-    embedding = {"model": str(model), "dim": 3, "provider": "cpu"}
+    embedding = {"model": str(model), "dim": 3}
     DecisionWriter(tmp_path, embedding).write(a_decision(2))
     asked = [str(tmp_path), "--decision", "2", "--camera", "cam01"]
     assert main(asked) == 0
@@ -56,7 +56,7 @@ def test_regions_are_found_with_what_embedded_the_frames(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("embedding", "says"),
     [
-        ({"model": "/nowhere/d.onnx", "dim": 3, "provider": "cpu"}, "No such file"),
+        ({"model": "/nowhere/d.onnx", "dim": 3}, "No such file"),
         ({"model": "d.onnx", "shutter": "rolling"}, "of another version"),
         (None, "does not say what embedded its frames"),
     ],
