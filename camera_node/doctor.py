@@ -123,6 +123,7 @@ def _source(scenario: Scenario, config: SourceConfig, data: Path | None, plan: P
         yield _check(f"package {extra}", lambda extra=extra: _package(extra))  # type: ignore[misc]
     if isinstance(config, RecordedConfig):
         yield _check("data", lambda: _data(scenario, config, data))
+        yield _check("poses", lambda: _poses(scenario, config, data))
     if isinstance(config, LiveConfig):
         if config.calibration is not None:
             yield _check("calibration", lambda: _calibration(scenario, config))
@@ -178,6 +179,12 @@ def _data(scenario: Scenario, config: RecordedConfig, data: Path | None) -> str:
         for image in found:
             image.read()
     return "; ".join((f"{path}: {len(found)} images of {len(found.cameras)} cameras", *found.notes))
+
+
+def _poses(scenario: Scenario, config: RecordedConfig, data: Path | None) -> str:
+    from camera_node import pose_check
+
+    return pose_check.check(scenario, config, data) or "not compared: no camera moves for 20 captures"
 
 
 def _python() -> str:

@@ -162,11 +162,12 @@ class TransformsConfig(RecordedConfig, frozen=True, kw_only=True):
 
 
 class VideoConfig(RecordedConfig, frozen=True, kw_only=True):
-    """Video files with a calibration JSON. data: the JSON, or the folder that holds it. files: not given, they
-    are ``videos/<camera>.mp4`` or ``<camera>.mp4``.
+    """Video files with a calibration JSON. data: the JSON, or the folder that holds it; or one camera's video, whose
+    lens ``horizontal_fov_deg`` tells. files: not given, they are ``videos/<camera>.mp4`` or ``<camera>.mp4``.
     """
 
     files: Annotated[dict[str, str], about("camera -> video, relative to the JSON")] = field(default_factory=dict)
+    horizontal_fov_deg: Annotated[float, within(5.0, 150.0, "of a video without a calibration")] | None = None
     trajectory: Annotated[TrajectoryConfig | None, about("poses from files")] = None
 
 

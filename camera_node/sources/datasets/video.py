@@ -23,6 +23,7 @@ from camera_node.sources.datasets.records import (
 )
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
 from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
+from freshfield.geometry import Pinhole
 
 import cv2  # isort: skip
 
@@ -38,15 +39,26 @@ _ENDINGS = (4, _SKIP_FRAMES)
 
 
 def load_dataset(
-    path: Path, options: ImageOptions = FULL_SIZE, files: Mapping[str, str] | None = None, require_poses: bool = True
+    path: Path,
+    options: ImageOptions = FULL_SIZE,
+    files: Mapping[str, str] | None = None,
+    require_poses: bool = True,
+    horizontal_fov_deg: float | None = None,
 ) -> Dataset:
     """Every frame of the videos of a calibration JSON, or of the only one in a folder; cameras without a video are
     left out.
 
     files: camera to video file, relative to the JSON, for videos that are not at ``_PLACES``.
     require_poses: False gives NaN as the pose of a camera that has none in the JSON.
+    horizontal_fov_deg: lens of a video that ``path`` is itself, without distortion.
     Raises DatasetError.
     """
+    if path.is_file() and path.suffix.lower() != ".json":
+        if horizontal_fov_deg is None:
+            raise DatasetError(f"{path}: its lens is not known: give horizontal_fov_deg, or a calibration JSON as data")
+        clip = Clip(path)
+        alone = CalibratedCamera(Pinhole.from_fov(clip.width, clip.height, horizontal_fov_deg), None)
+        return rig_dataset({path.stem: (alone, clip)}, path, options, require_poses)
     calibration = path if path.is_file() else _find_calibration(path)
     cameras, files = load_calibration(calibration), files or {}
     for name in files:

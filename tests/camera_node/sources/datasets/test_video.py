@@ -127,6 +127,26 @@ def test_a_trajectory_gives_the_poses(tmp_path):
         opened(video_scenario(file, trajectory={"files": {"cam01": "none.txt"}}))
 
 
+def test_a_carried_camera_s_video_needs_its_field_of_view_and_a_trajectory(tmp_path):
+    write_rig(tmp_path, cameras=1)
+    (tmp_path / "videos" / "poses.txt").write_text("\n".join(f"{k / 10} {k} 0 0 0 0 0 1" for k in range(21)))
+    source = {"kind": "video", "data": str(tmp_path / "videos/cam00.mp4"), "scale": 2}
+    cameras = {"ids": ["hand", "kept"], "held_out": ["kept"], "held_out_every": 8}
+
+    def found(**more):
+        return opened(parse({"cameras": cameras, "source": {**source, **more}}, Path("v.yaml")))
+
+    carried = {"horizontal_fov_deg": 90.0, "trajectory": {"files": {"hand": "poses.txt"}}}
+    hand, kept = found(**carried).values()
+    assert hand.intrinsics.fx == pytest.approx(16.0) and (hand.intrinsics.width, hand.intrinsics.height) == (32, 24)
+    assert [shade(kept.read(kept.content(tick))) for tick in range(3)] == [0, 8, 16]
+    assert hand.read(hand.content(0)).pose.translation_m == pytest.approx((0.5, 0, 0))
+    with pytest.raises(DatasetError, match=r"cam00.mp4: its lens is not known: give horizontal_fov_deg"):
+        found(trajectory=carried["trajectory"])
+    with pytest.raises(ScenarioError, match=r"trajectory.files.hand: missing"):
+        found(horizontal_fov_deg=90.0)
+
+
 def test_the_data_set_lists_every_frame_of_every_camera():
     dataset = load_dataset(data_dir("pose2sim_single_person"), ImageOptions(8))
     assert len(dataset) == 400 and dataset.cameras == ("cam01", "cam02", "cam03", "cam04")
