@@ -96,9 +96,10 @@ def described(scenario: Scenario, config: EdgeConfig, moving: str) -> str:
     moving: what moves, such as a camera's name; empty: nothing.
     """
     layers = " in layers" if config.field_options.get("layers") else ""
+    scan = " as a scan" if config.field_options.get("carried") else ""
     keyframes = " with keyframes" if config.keyframes is not None else ""
     pace = "at arrivals" if config.updates == "arrivals" else "in a cycle"
-    line = f"{config.field}{layers}{keyframes}, updated {pace} for {config.update_ms:g} ms"
+    line = f"{config.field}{layers}{scan}{keyframes}, updated {pace} for {config.update_ms:g} ms"
     options = scenario.edge.get("field_options") or {}
     given = [key for key in CHOSEN if key in scenario.edge or key in options]
     open_keys = {"layers", "updates", "keyframes"} - set(given)
@@ -131,7 +132,8 @@ def read_config(scenario: Scenario, moving: bool | None = None) -> EdgeConfig:
 
     moving: whether a camera moves, as its poses told; None: as the scenario says, else they stand still.
     """
-    section = with_defaults(scenario.edge, cameras_move(scenario) if moving is None else moving)
+    moves = cameras_move(scenario) if moving is None else moving
+    section = with_defaults(scenario.edge, moves, len(scenario.training))
     if section.get("compute") == "zero":
         section["compute"] = {}
     elif isinstance(section.get("compute"), str):

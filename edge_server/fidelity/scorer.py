@@ -98,6 +98,7 @@ class Scorer:
         bound: float = BOUND,
         psnr_only: bool = False,
         mask: NDArray[np.bool_] | None = None,
+        lpips: bool = True,
     ) -> Score:
         """Score one rendering against one truth.
 
@@ -107,6 +108,7 @@ class Scorer:
         bound: difference in [0, 1] above which a pixel moves.
         psnr_only: the other metrics, which cost more, are None.
         mask: (H, W), the pixels to score; None: all.
+        lpips: whether to score by it, too, which costs most.
         Raises ImageError for NaN, infinity or a wrong shape in either image, or a mask of nothing.
         """
         a = to_unit(rendering, "rendering")
@@ -117,6 +119,7 @@ class Scorer:
             raise ImageError("held-out frame: every pixel is masked")
         scored = np.ones_like(moving) if mask is None else mask
         side = 0 if psnr_only else min(a.shape[:2])
+        perceptual = self._lpips if lpips else None
         return Score(
             camera=camera,
             published_ns=published_ns,
@@ -124,7 +127,7 @@ class Scorer:
             psnr_moving_db=psnr(a, b, moving & scored),
             psnr_still_db=psnr(a, b, ~moving & scored),
             ssim=ssim(a, b, mask) if side >= TAPS else None,
-            lpips=self._lpips(a, b, mask) if self._lpips is not None and side >= self._lpips.minimum_side else None,
+            lpips=perceptual(a, b, mask) if perceptual is not None and side >= perceptual.minimum_side else None,
             truth_gap_ms=(generated_ns - published_ns) / 1e6,
             moving_share=float(moving[scored].mean()),
         )

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from edge_server.edge_defaults import cameras_move
+from edge_server.edge_defaults import MOST_CARRIED, SCAN, cameras_move
 from edge_server.settings import EdgeConfig, KeyframesConfig, described, read_config
 from freshfield.scenario import ScenarioError, parse
 
 STILL = EdgeConfig("splat", {"layers": True}, updates="arrivals", update_ms=20.0, steps=10)
-MOVING = EdgeConfig("splat", updates="cycle", update_ms=800.0, steps=100, keyframes=KeyframesConfig(32, 0.03, 5.0))
+MOVING = EdgeConfig("splat", SCAN, updates="cycle", update_ms=200.0, steps=24)
+MANY_MOVING = EdgeConfig("splat", updates="cycle", update_ms=800.0, steps=100, keyframes=KeyframesConfig(32, 0.03, 5.0))
 
 
 def scenario(edge=None, **source):
@@ -19,10 +20,12 @@ def scenario(edge=None, **source):
 
 
 @pytest.mark.parametrize("edge", [None, {}])
-def test_an_empty_section_works_in_layers_before_fixed_cameras_and_with_keyframes_before_moving_ones(edge):
+def test_an_empty_section_works_in_layers_before_fixed_cameras_and_as_a_scan_before_moving_ones(edge):
     assert read_config(scenario(edge)) == STILL
     assert read_config(scenario(edge), moving=True) == MOVING
     assert read_config(parse({"cameras": {"count": 3}}, Path("x.yaml"))) == STILL
+    for count, expected in ((MOST_CARRIED, MOVING), (MOST_CARRIED + 1, MANY_MOVING)):
+        assert read_config(parse({"cameras": {"count": count}}, Path("x.yaml")), moving=True) == expected
 
 
 @pytest.mark.parametrize("key", ["arm", "trajectory"])
@@ -36,15 +39,15 @@ def test_cameras_that_an_arm_or_a_trajectory_carries_are_known_to_move(key):
     ("edge", "still", "moving"),
     [
         ({"updates": "cycle"}, (False, "cycle", 800.0, 100, False), (False, "cycle", 800.0, 100, True)),
-        ({"update_ms": 50}, (True, "arrivals", 50.0, 10, False), (False, "cycle", 50.0, 100, True)),
-        ({"steps": 7}, (True, "arrivals", 20.0, 7, False), (False, "cycle", 800.0, 7, True)),
+        ({"update_ms": 50}, (True, "arrivals", 50.0, 10, False), (False, "cycle", 50.0, 24, False)),
+        ({"steps": 7}, (True, "arrivals", 20.0, 7, False), (False, "cycle", 200.0, 7, False)),
         ({"field": "ngp"}, (False, "cycle", 800.0, 100, False), (False, "cycle", 800.0, 100, True)),
-        ({"field_options": {"layers": False}}, (False, "cycle", 800.0, 100, False), (False, "cycle", 800.0, 100, True)),
+        ({"field_options": {"layers": False}}, (False, "cycle", 800.0, 100, False), (False, "cycle", 200.0, 24, False)),
         ({"field_options": {"layers": True}}, (True, "arrivals", 20.0, 10, False), (True, "arrivals", 20.0, 10, False)),
         (
             {"field_options": {"gaussians": 900}},
             (True, "arrivals", 20.0, 10, False),
-            (False, "cycle", 800.0, 100, True),
+            (False, "cycle", 200.0, 24, False),
         ),
         (
             {"field_options": {"layers": True}, "updates": "cycle"},
@@ -60,8 +63,9 @@ def test_what_a_scenario_says_wins(edge, still, moving):
         found = read_config(scenario(edge), moving=moves)
         layers = bool(found.field_options.get("layers"))
         assert (layers, found.updates, found.update_ms, found.steps, found.keyframes is not None) == expected
+        scan = SCAN if found.field_options.get("carried") else {}
         assert {k: v for k, v in found.field_options.items() if k != "layers"} == {
-            k: v for k, v in edge.get("field_options", {}).items() if k != "layers"
+            k: v for k, v in {**scan, **edge.get("field_options", {})}.items() if k != "layers"
         }
     if edge.get("keyframes"):
         assert found.keyframes.most == 5
@@ -76,7 +80,8 @@ def test_a_section_of_another_kind_is_refused_by_name():
 def test_one_line_says_what_was_chosen_and_why():
     at = scenario({})
     assert described(at, STILL, "") == "splat in layers, updated at arrivals for 20 ms: no camera moves"
-    assert described(at, MOVING, "cam01") == "splat with keyframes, updated in a cycle for 800 ms: cam01 moves"
+    assert described(at, MOVING, "cam01") == "splat as a scan, updated in a cycle for 200 ms: cam01 moves"
+    assert described(at, MANY_MOVING, "cam01") == "splat with keyframes, updated in a cycle for 800 ms: cam01 moves"
     given = {"field": "ngp", "updates": "cycle", "update_ms": 300, "keyframes": None}
     line = described(scenario(given), read_config(scenario(given)), "")
     assert line == (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,9 @@ from camera_node.synthetic.scene import HELD_OUT, Scene
 from edge_server.experiments.scenes.recorded import LEAST_WEIGHT, MultiviewStill
 from edge_server.fidelity.baselines import baseline
 from edge_server.fidelity.images import BLACK, Color
+from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
-from edge_server.fields import Field, RefinesCameras, View
+from edge_server.fields import Field, View
 
 WHITE: Color = (1.0, 1.0, 1.0)
 
@@ -61,12 +61,8 @@ def score_views(field: Field, views: Sequence[View], scorer: Scorer) -> tuple[Sc
         mask = None if view.weight is None else view.weight > LEAST_WEIGHT
         image = field.render(view.camera_to_world, view.intrinsics).color
         score = scorer.score(view.camera, image, 0, view.image, 0, mask=mask)
-        known = field.correction(view) if isinstance(field, RefinesCameras) else None
-        if known is not None:
-            image = known.exposed(field.render(known.camera_to_world, view.intrinsics).color)
-            refined = scorer.score(view.camera, image, 0, view.image, 0, mask=mask)
-            score = replace(score, psnr_refined_db=refined.psnr_db, ssim_refined=refined.ssim)
-        scores.append(score)
-        shown = image if shown is None else shown
+        refined = render_refined(field, view)
+        scores.append(with_refined(score, refined, view, scorer, mask))
+        shown = (image if refined is None else refined) if shown is None else shown
     assert shown is not None
     return mean_score(scores), shown

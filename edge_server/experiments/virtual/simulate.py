@@ -220,8 +220,8 @@ def _settings(config: EdgeConfig, args: argparse.Namespace) -> RunSettings:
 
 
 def _epoch_ms(config: EdgeConfig) -> float:
-    """Least time between two decisions: a live update's time if updates follow arrivals, else _CYCLE_MS."""
-    return config.update_ms if config.updates == "arrivals" else _CYCLE_MS
+    """Least time between two decisions: a live update's time if updates follow arrivals, else at most _CYCLE_MS."""
+    return config.update_ms if config.updates == "arrivals" else min(config.update_ms, _CYCLE_MS)
 
 
 def _compute(text: str) -> ComputeConfig:

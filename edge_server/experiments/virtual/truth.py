@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from camera_node.capture import Camera
 from camera_node.sources.base import Shot
 from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags
+from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
+from edge_server.fields import View
 from freshfield import payload
 from freshfield.geometry import Pinhole
 
@@ -56,7 +58,9 @@ class ExactTruth:
             truth = self.image(camera, present_ns / 1e9)
             earlier = [self.image(camera, (present_ns - lag) / 1e9) for lag in lags_ns]
             shown = field.render(pose, intrinsics).color
-            scores.append(self.scorer.score(camera, shown, present_ns, truth, present_ns, earlier))
+            score = self.scorer.score(camera, shown, present_ns, truth, present_ns, earlier)
+            view = View(camera, truth, pose, intrinsics, present_ns)
+            scores.append(with_refined(score, render_refined(field, view), view, self.scorer))
         return mean_score(scores)
 
 
@@ -102,11 +106,10 @@ class CapturedTruth:
             before = [camera.capture(k) for k in lags]
             earlier = [_image(camera, b) for b in before if b.pose == shot.pose]
             shown = field.render(shot.pose.matrix(), shot.intrinsics).color
-            scores.append(
-                self._scorer.score(
-                    camera.name, shown, present_ns, _image(camera, shot), times[-1], earlier, self._bounds[camera.name]
-                )
-            )
+            image, bound = _image(camera, shot), self._bounds[camera.name]
+            score = self._scorer.score(camera.name, shown, present_ns, image, times[-1], earlier, bound)
+            view = View(camera.name, image, shot.pose.matrix(), shot.intrinsics, times[-1])
+            scores.append(with_refined(score, render_refined(field, view), view, self._scorer))
         return mean_score(scores)
 
 

@@ -196,7 +196,7 @@ class StillField(SteppedField[SplatSnapshot]):
         camera, cloud, raster = self._cams[[view]], self.cloud, self._raster
         gaussians = cloud.gaussians()
         raster.project_and_bin(camera, gaussians)
-        losses = raster.train(self._targets, view)
+        losses = self._compare(view)
         dropped = raster.step(camera, gaussians, cloud.optimizer_state(), self.adam_parameters(progress), self._rigid)
         self._learn_camera(view, losses)
         if self.settings.planar:
@@ -210,6 +210,10 @@ class StillField(SteppedField[SplatSnapshot]):
         pixels = TILE * TILE * len(losses)
         pairs = min(int(raster.lists.needed[0]), raster.lists.pair.shape[1])
         return square / (3 * pixels), pixels, pairs, int(broken) + dropped
+
+    def _compare(self, view: int) -> NDArray[np.float64]:
+        """Compare a view with what its camera sees, and find the gradients. Returns ``losses``, see ``train_tiles``."""
+        return self._raster.train(self._targets, view)
 
     def _planar_step(self, view: int) -> None:
         """Flatten the Gaussians, and align them with the normals that ``view`` shows."""

@@ -71,10 +71,16 @@ class SplatSettings(FieldSettings, frozen=True):
         bool, about("with ``scan``: learn each view's exposure, and correct its pose, as of a camera that was tracked")
     ] = False
 
+    carried: Annotated[
+        bool, about("with ``scan``: views come one after the other, from cameras that move, and keyframes are chosen")
+    ] = False
+
     @property
     def module(self) -> str:
         """Layers, and what a scan needs, are imported only where they are asked for."""
-        return "splat.layers.layered_field" if self.layers else "splat.scan.scan_field" if self.scan else "splat.field"
+        if self.layers:
+            return "splat.layers.layered_field"
+        return f"splat.scan.{'carried_field' if self.carried else 'scan_field'}" if self.scan else "splat.field"
 
     @property
     def planar(self) -> bool:

@@ -36,7 +36,7 @@ class SplatSnapshot:
         """The same: nothing moves."""
         return self
 
-    def copied(self) -> SplatSnapshot:
+    def copied(self) -> Self:
         """See ``stepped_field.StepSnapshot``."""
         return replace(self, gaussians=self.gaussians._replace(params=self.gaussians.params.copy()))
 

@@ -17,8 +17,10 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
+from edge_server.edge_defaults import SCAN
 from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
+from edge_server.fields.splat.scan.carried_field import CarriedField
 from edge_server.live.loop import STOP_S, UpdateLoop
 from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.settings import read_config
@@ -206,10 +208,10 @@ def test_operators_see_and_change_a_running_server(serve, tmp_path, request):
     channel.close()
 
 
-def test_a_camera_that_moves_begins_the_field_anew_with_keyframes_and_a_resumed_run_knows_it(serve, tmp_path):
+def test_a_camera_that_moves_begins_the_field_anew_as_a_scan_and_a_resumed_run_knows_it(serve, tmp_path):
     small = {"gaussians": 300, "start": 200, "seed_cells": 12}
-    for layers in (True, False):  # compiling may take longer than the test waits for anything
-        make_field("splat", {**small, "layers": layers}).warm_up()
+    for kind in ({"layers": True}, SCAN):  # compiling may take longer than the test waits for anything
+        make_field("splat", {**kind, **small}).warm_up()
     made = tiny_scenario(tmp_path, field="splat", field_options=small)
     server, port, thread = serve(made)
     assert server.state.chosen == (
@@ -220,15 +222,16 @@ def test_a_camera_that_moves_begins_the_field_anew_with_keyframes_and_a_resumed_
     until(lambda: "cam02 moves" in server.state.chosen)
     moved = server.updater.number
     until(lambda: server.updater.number > moved + 1)
-    assert server.updater.keyframes is not None and not server.updater.on_arrivals
+    assert server.updater.keyframes is None and not server.updater.on_arrivals
+    assert isinstance(server.updater.field, CarriedField)
     assert not server.updater.field.frame_s and server.loop.update_ms == 100.0
     feed.stop()
     server.stop()
     thread.join(20)
     status = json.loads((tmp_path / "out" / "edge.json").read_text())
-    assert status["chosen"].startswith("splat with keyframes, updated in a cycle for 100 ms: cam02 moves")
+    assert status["chosen"].startswith("splat as a scan, updated in a cycle for 100 ms: cam02 moves")
     again, _, _ = serve(made, resume=tmp_path / "out" / "field.npz")
-    assert again.state.chosen == status["chosen"] and again.updater.keyframes is not None
+    assert again.state.chosen == status["chosen"] and len(again.updater.field.views) > 0
 
 
 def test_metrics_hold_few_connections_and_answer_beside_half_requests(serve):

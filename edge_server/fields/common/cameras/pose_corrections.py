@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from freshfield.geometry import so3_exp
+from freshfield.geometry import so3_exp, so3_log
 
 Array = NDArray[np.float64]
 
@@ -35,13 +35,14 @@ _SPREAD, _REACH = 0.8, 8
 class _Correction:
     """given: (4, 4), the pose it belongs to: a camera with another pose starts anew.
     rotation, shift_m: (3,), a rotation vector in radians and meters, world axes.
-    at_ns: when the view was taken. steps: how many ``descend`` has made for it."""
+    at_ns: when the view was taken. steps: how many ``descend`` has made for it. track: see ``PoseCorrections``."""
 
     given: Array
     rotation: Array = field(default_factory=lambda: np.zeros(3))
     shift_m: Array = field(default_factory=lambda: np.zeros(3))
     at_ns: int = 0
     steps: int = 0
+    track: str = ""
 
 
 class PoseCorrections:
@@ -50,14 +51,47 @@ class PoseCorrections:
     A correction rotates a camera about its own center by exp(rotation) and shifts it. ``correct`` finds it with any
     representation that renders pixels, ``descend`` from a gradient.
 
+    A track is one camera that moves: its views, whose corrections vary slowly in time. Views that nobody assigned to
+    one are of the track "".
+
     most_m, most_deg: largest shift in meters and largest rotation in degrees.
     """
 
     def __init__(self, most_m: float, most_deg: float) -> None:
         self.most_m, self.most_rad = most_m, np.deg2rad(most_deg)
         self.known: dict[str, _Correction] = {}
-        self._sorted: list[str] = []  # names in the order of time; empty: not known
+        self._sorted: dict[str, list[str]] = {}  # names by track, in the order of time; empty: not known
         self._ranks: dict[str, int] = {}
+
+    def copied(self) -> PoseCorrections:
+        """A copy that later steps do not change."""
+        other = PoseCorrections(self.most_m, 0.0)
+        other.most_rad, other.known = self.most_rad, {name: replace(c) for name, c in self.known.items()}
+        return other
+
+    def begin(self, view: View, track: str) -> None:
+        """Assign a view to a track, with the correction of the one before it there, if any."""
+        before = self.neighbors_in_time(view, track)
+        pose = self.pose_between(view, before)
+        given = np.asarray(view.camera_to_world, dtype=np.float64)
+        self.known[view.camera] = _Correction(given, at_ns=view.generated_ns, track=track)
+        self._sorted = {}
+        self.set_pose(view, pose)
+
+    def set_pose(self, view: View, pose: Array) -> None:
+        """Correct a view to a pose (4, 4), as far as corrections may go."""
+        known = self._of(view)
+        known.rotation = _at_most(so3_log(pose[:3, :3] @ known.given[:3, :3].T), self.most_rad)
+        known.shift_m = _at_most(pose[:3, 3] - known.given[:3, 3], self.most_m)
+
+    def forget(self, camera: str) -> None:
+        """Forget a view's correction."""
+        del self.known[camera]
+        self._sorted = {}
+
+    def tracks(self) -> list[str]:
+        """The tracks that have views, in the order in which they came."""
+        return list(dict.fromkeys(c.track for c in self.known.values()))
 
     def pose(self, view: View) -> Array:
         """The corrected camera_to_world (4, 4) of a view."""
@@ -83,7 +117,7 @@ class PoseCorrections:
         known = self.known.get(view.camera)
         if known is None or not np.allclose(known.given, given, atol=1e-3):
             known = self.known[view.camera] = _Correction(given, at_ns=view.generated_ns)
-            self._sorted = []
+            self._sorted = {}
         return known
 
     def correct(
@@ -173,15 +207,22 @@ class PoseCorrections:
     def _around(self, camera: str) -> dict[str, float]:
         """A view, those taken shortly before and after, and how much of its step they make too: the less, the more
         steps they have made for themselves. Without times that tell views apart, the view alone."""
-        if not self._sorted:
-            self._sorted = sorted(self.known, key=lambda name: (self.known[name].at_ns, name))
-            self._ranks = {name: k for k, name in enumerate(self._sorted)}
-        if self.known[self._sorted[0]].at_ns == self.known[self._sorted[-1]].at_ns:
+        track = self.known[camera].track
+        ordered = self._order(track)
+        if self.known[ordered[0]].at_ns == self.known[ordered[-1]].at_ns:
             return {camera: 1.0}
         rank = self._ranks[camera]
-        near = range(max(rank - _REACH, 0), min(rank + _REACH + 1, len(self._sorted)))
-        steps = {k: self.known[self._sorted[k]].steps for k in near}
-        return {self._sorted[k]: _SPREAD ** abs(k - rank) / (1 + steps[k]) if k != rank else 1.0 for k in near}
+        near = range(max(rank - _REACH, 0), min(rank + _REACH + 1, len(ordered)))
+        steps = {k: self.known[ordered[k]].steps for k in near}
+        return {ordered[k]: _SPREAD ** abs(k - rank) / (1 + steps[k]) if k != rank else 1.0 for k in near}
+
+    def _order(self, track: str) -> list[str]:
+        """The names of a track's views in the order of time."""
+        if track not in self._sorted:
+            names = [name for name, c in self.known.items() if c.track == track]
+            self._sorted[track] = names = sorted(names, key=lambda name: (self.known[name].at_ns, name))
+            self._ranks.update((name, k) for k, name in enumerate(names))
+        return self._sorted[track]
 
     def take_back(self, share: float) -> None:
         """Take back a share of the cameras' mean shift: they and the scene may wander together."""
@@ -192,22 +233,22 @@ class PoseCorrections:
     def meta(self) -> dict[str, Any]:
         """What a state keeps: exact, ready for JSON."""
         return {
-            name: [c.given.tolist(), c.rotation.tolist(), c.shift_m.tolist(), c.at_ns, c.steps]
+            name: [c.given.tolist(), c.rotation.tolist(), c.shift_m.tolist(), c.at_ns, c.steps, c.track]
             for name, c in self.known.items()
         }
 
     def load(self, meta: dict[str, Any]) -> None:
         """Restore what ``meta`` returned."""
-        self.known, self._sorted = {}, []
-        for name, (given, rotation, shift_m, at_ns, steps) in meta.items():
+        self.known, self._sorted = {}, {}
+        for name, (given, rotation, shift_m, at_ns, steps, track) in meta.items():
             given, rotation, shift_m = (np.array(each, dtype=np.float64) for each in (given, rotation, shift_m))
-            self.known[name] = _Correction(given, rotation, shift_m, int(at_ns), int(steps))
+            self.known[name] = _Correction(given, rotation, shift_m, int(at_ns), int(steps), str(track))
 
-    def neighbors_in_time(self, view: View) -> dict[str, float]:
-        """The known views taken last before and first after ``view``, and how much each counts, the nearer one more.
-        Empty where times do not tell views apart."""
-        times = sorted((c.at_ns, name) for name, c in self.known.items() if name != view.camera)
-        if not times or times[0][0] == times[-1][0]:
+    def neighbors_in_time(self, view: View, track: str = "") -> dict[str, float]:
+        """The views of a track taken last before and first after ``view``, and how much each counts, the nearer one
+        more. Empty where times do not tell views apart, unless there is but one."""
+        times = [(self.known[name].at_ns, name) for name in self._order(track) if name != view.camera]
+        if not times or (len(times) > 1 and times[0][0] == times[-1][0]):
             return {}
         before = [each for each in times if each[0] <= view.generated_ns][-1:]
         after = [each for each in times if each[0] > view.generated_ns][:1]

@@ -50,15 +50,16 @@ class Exposures:
         row[:3], row[3:6], row[6] = gain, bias, np.mean(gain * gain)
         return row
 
-    def learn(self, camera: str, sums: Array) -> None:
-        """Move a view's exposure towards the damped least squares of a step. Nothing where sums are not finite, or of
-        no pixels.
+    def learn(self, camera: str, sums: Array, whole: bool = False) -> None:
+        """Move a view's exposure towards the damped least squares of a step, all the way the first time. Nothing where
+        sums are not finite, or of no pixels.
 
         sums: (3, MOMENTS), see ``rasterize.MOMENTS``, at the exposure as known.
+        whole: go all the way.
         """
         if not np.isfinite(sums).all() or sums[:, 0].min() <= 0.0:
             return
-        (gain, bias), fresh = self.of(camera), camera not in self.known
+        (gain, bias), fresh = self.of(camera), whole or camera not in self.known
         r, rr, t, rt = (sums[:, k] / sums[:, 0] for k in range(1, 5))
         image, both = gain * t + bias, gain * rt + bias * r
         a, d = rr + tuned.TOWARDS_ONE, 1.0 + tuned.TOWARDS_ONE

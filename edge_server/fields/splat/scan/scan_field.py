@@ -8,7 +8,7 @@ exposure and a correction of its pose: both follow from sums that a step makes a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -28,6 +28,7 @@ from edge_server.fields.splat.kernels.rasterize import LOSSES, MOMENTS, render_t
 from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.discs import LEAST_SIDE, discs, filled, quadtree, usable_depth
 from edge_server.fields.splat.scan.exposures import Exposures
+from edge_server.fields.splat.scan.refined_cameras import RefinedCameras, ScanSnapshot
 from edge_server.fields.splat.settings import PRUNE_OPACITY
 
 
@@ -50,10 +51,12 @@ class ScanField(StillField):
         with self._lock:
             if self._rigid is None:
                 return None
-            if view.camera in self._poses.known:
-                return Correction(self._poses.pose(view), *self._exposures.of(view.camera))
-            neighbors = self._poses.neighbors_in_time(view)
-            return Correction(self._poses.pose_between(view, neighbors), *self._exposures.between(neighbors))
+            return RefinedCameras(self._poses, self._exposures).correction(view)
+
+    def _live(self) -> ScanSnapshot:
+        plain = super()._live()
+        mine = None if self._rigid is None else RefinedCameras(self._poses, self._exposures)
+        return ScanSnapshot(**{f.name: getattr(plain, f.name) for f in fields(plain)}, cameras=mine)
 
     def _pose_of(self, view: View) -> NDArray[np.float64]:
         return super()._pose_of(view) if self._rigid is None else self._poses.pose(view)
@@ -139,10 +142,12 @@ class ScanField(StillField):
         for view in (measured[k] for k in some):
             self._add(self._seeds_of(view))
 
-    def _seeds_of(self, view: View) -> NDArray[np.float32]:
-        """Gaussians where the field lacks the surface that a view measures, or shows none at all."""
+    def _seeds_of(self, view: View, shown: Shown | None = None) -> NDArray[np.float32]:
+        """Gaussians where the field lacks the surface that a view measures, or shows none at all.
+
+        shown: what its camera sees; None: it is rendered here."""
         assert view.depth is not None
-        shown, depth = self._look(view), view.depth
+        shown, depth = shown or self._look(view), view.depth
         behind = shown.depth > depth * np.float32(1.0 + tuned.BEHIND_SHARE) + np.float32(tuned.BEHIND_M)
         wanted = (shown.opacity < tuned.COVERED) | (behind & (depth > 0))
         color, there = self._as_rendered(view)
@@ -156,7 +161,7 @@ class ScanField(StillField):
             self.cloud.keep(opacity(self.cloud.params) >= PRUNE_OPACITY)
             if not len(self.cloud):
                 self._seed()
-        if self.step % tuned.GROW_EVERY == 0 and len(self.cloud) < self.settings.gaussians:
+        if self.step % tuned.GROW_EVERY == 0 and self._room() > 0:
             self._grow()
 
     def _grow(self) -> None:
@@ -185,7 +190,7 @@ class ScanField(StillField):
 
     def _add(self, params: NDArray[np.float32]) -> None:
         """Add Gaussians given in meters, as many as there is room for."""
-        params = params[: max(self.settings.gaussians - len(self.cloud), 0)]
+        params = params[: max(self._room(), 0)]
         box = self.view_store.box
         assert box is not None
         if not len(params):
@@ -197,6 +202,10 @@ class ScanField(StillField):
         params = np.concatenate([params, further], axis=1)
         clamp_gaussians(params)
         self.cloud.add(GaussianCloud.new(params))
+
+    def _room(self) -> int:
+        """How many Gaussians may still be added."""
+        return self.settings.gaussians - len(self.cloud)
 
     def _look(self, view: View) -> Shown:
         """Render the field from a view's corrected pose."""

@@ -47,6 +47,17 @@ GAUGE_EVERY, GAUGE_SHARE = 40, 0.04  # steps between corrections of the gauge; s
 MOST_DEG, MOST_SHARE = 5.0, 0.1  # largest correction of a pose; share of the cameras' distance to the scene
 
 
+# --- views that come one after the other ---
+STEPS_A_KEYFRAME = 24  # with fewer, new regions stay blurred; with more, they come late
+NEWEST, NEWEST_SHARE = 4, 0.4  # steps on the newest keyframes: with more, earlier ones are forgotten
+KEPT_PIXELS = 1 << 23  # of all keyframes together: 60 MB with their depth
+LEAST_KEPT = 32  # keyframes, however large
+KEPT_CORRECTIONS = 2048  # of keyframes that went, for held-out and late frames of their time
+EXPOSED_OPACITY, EXPOSED_ERROR = 0.7, 0.25  # pixels from which a new view's exposure is found: surfaces, as expected
+EXPOSED_SHARE = 0.2  # of its pixels, at least
+BEGINS = (2, 4, 8, 16)  # numbers of keyframes without depth at which a field begins anew
+
+
 def scan_options(pixels: int, tracked: bool) -> dict[str, Any]:
     """Options of a field for a scan. pixels: of one image. tracked: its poses come from a tracker."""
     return {"scan": True, "refine": tracked, "gaussians": min(max(int(PER_PIXEL * pixels), LEAST), MOST)}

@@ -14,38 +14,12 @@ from edge_server.fields import Budget, RefinesCameras, View
 from edge_server.fields.splat.densification import opacity
 from edge_server.fields.splat.scan.scan_field import ScanField
 from edge_server.fields.splat.settings import SplatSettings
-from freshfield.geometry import Pinhole, look_at, so3_exp, world_rays
-from tests.edge_server.fields.scenes import BALL_M, RADIUS_M, seen
+from tests.edge_server.fields.scenes import BALL_M, RADIUS_M
+from tests.edge_server.fields.splat.scan.walk import WALK, spoiled, walk
 
-LENS = Pinhole.from_fov(48, 40, 55.0)
 SETTINGS = SplatSettings(gaussians=3000, start=500, seed_cells=32, scan=True, threads=2, contracted=False)
 
 
-def _walk(count: int = 80, depth: bool = True) -> list[View]:
-    """Frames of an arc around the scene, 10 a second."""
-    views, ahead = [], world_rays(LENS, np.eye(4))[1][..., 2]
-    for k in range(count):
-        angle = 1.8 * np.pi * k / count
-        pose = look_at(2.2 * np.array([np.cos(angle), np.sin(angle), 0.5]), (0.0, 0.0, 0.3))
-        image, away_m = seen(LENS, pose)
-        measured = np.where(np.isfinite(away_m), away_m * ahead, 0.0).astype(np.float32)
-        views.append(View(f"{k:03d}", image, pose, LENS, k * 100_000_000, depth=measured if depth else None))
-    return views
-
-
-def _spoiled(views: list[View], deg: float = 1.0, shift_m: float = 0.02, gain: float = 0.25) -> list[View]:
-    """With errors of poses and exposures that vary slowly along the way."""
-    out = []
-    for k, view in enumerate(views):
-        phase, pose = 0.25 * k, view.camera_to_world.copy()
-        pose[:3, :3] = pose[:3, :3] @ so3_exp(np.deg2rad(deg) * np.array([np.sin(phase), np.cos(phase), 0.3]))
-        pose[:3, 3] += shift_m * np.array([np.cos(phase), 0.2, np.sin(phase)])
-        image = np.clip(view.image * (1.0 + gain * np.sin(0.4 * k)), 0, 255).astype(np.uint8)
-        out.append(replace(view, camera_to_world=pose, image=image))
-    return out
-
-
-WALK = _walk()
 Spoil = Callable[[list[View]], list[View]]
 HELD = slice(4, None, 8)
 
@@ -70,7 +44,7 @@ def _plain() -> dict:
 
 def test_it_learns_with_measured_depth_and_without() -> None:
     for with_depth, least_db in ((True, 22.5), (False, 22.5)):
-        field, psnr_db, refined_db = _fit(_walk(depth=with_depth))
+        field, psnr_db, refined_db = _fit(walk(depth=with_depth))
         assert psnr_db > least_db and refined_db is None and isinstance(field, RefinesCameras)
         assert len(field.cloud) <= SETTINGS.gaussians and field.correction(WALK[0]) is None
 
@@ -88,13 +62,13 @@ def test_first_gaussians_lie_on_measured_depth() -> None:
 
 
 def test_poses_and_exposures_are_refined_and_held_out_frames_take_their_neighbors() -> None:
-    spoiled = _spoiled(WALK)
-    _, plain_db, none = _fit(spoiled)
-    field, raw_db, refined_db = _fit(spoiled, refine=True)
+    spoiled_walk = spoiled(WALK)
+    _, plain_db, none = _fit(spoiled_walk)
+    field, raw_db, refined_db = _fit(spoiled_walk, refine=True)
     assert none is None and refined_db is not None
     assert refined_db > plain_db + 4.0 and refined_db > raw_db + 4.0
-    held = _split(spoiled)[1][1]
-    before = {name: field.correction(view) for name, view in (("held", held), ("trained", spoiled[0]))}
+    held = _split(spoiled_walk)[1][1]
+    before = {name: field.correction(view) for name, view in (("held", held), ("trained", spoiled_walk[0]))}
     dark = replace(held, image=np.zeros_like(held.image))
     again = field.correction(dark)
     assert before["held"] is not None and again is not None
@@ -102,14 +76,14 @@ def test_poses_and_exposures_are_refined_and_held_out_frames_take_their_neighbor
     np.testing.assert_array_equal(before["held"].gain, again.gain)
 
 
-def test_exact_poses_are_hardly_spoiled() -> None:
+def test_exact_poses_are_hardlyspoiled() -> None:
     _, plain_db, _ = _fit(WALK)
     _, _, refined_db = _fit(WALK, refine=True)
     assert refined_db is not None and refined_db > plain_db - 0.3
 
 
 def test_it_resumes_bit_for_bit_whatever_the_number_of_threads() -> None:
-    training = _split(_spoiled(WALK))[0]
+    training = _split(spoiled(WALK))[0]
     fields = [ScanField(replace_settings(threads)) for threads in (2, 1, 2)]
     for field in fields[:2]:
         field.fit(training, Budget(steps=60))

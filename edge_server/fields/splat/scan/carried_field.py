@@ -1,0 +1,260 @@
+"""The Gaussian field of cameras that are carried about, live: a scan whose views come one after the other.
+
+``fit`` takes the newest view of each camera. Now and then one becomes a keyframe: it continues from the correction and
+the exposure of its predecessor, and seeds Gaussians where the field lacks what its depth measures. Steps are shared
+between the newest keyframes and all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+from edge_server.fields.common.camera_rows import camera_rows
+from edge_server.fields.common.cameras.pose_corrections import normal_matrix
+from edge_server.fields.common.kernels.camera import CAMERA
+from edge_server.fields.common.supervision import CameraMemory, check_view
+from edge_server.fields.common.view_store import Arrays
+from edge_server.fields.splat.densification import GaussianCloud
+from edge_server.fields.splat.kernels.rasterize import EXPOSURE, Targets
+from edge_server.fields.splat.scan import settings as tuned
+from edge_server.fields.splat.scan.discs import filled, usable_depth
+from edge_server.fields.splat.scan.scan_field import ScanField, Shown
+from edge_server.fields.splat.seeding import seed_gaussians
+
+SEPARATOR = "#"  # between a camera and the number of its keyframe: no camera has it in its name
+
+
+class CarriedField(ScanField):
+    """See ``ScanField``. Views of one camera are told apart by their instants; a camera's name never changes."""
+
+    def _forget_parameters(self) -> None:
+        super()._forget_parameters()
+        self._clear_views()
+        self._pixels, self._taken = 0, 0  # of the largest image, and keyframes, so far
+        self._measured = False  # whether any keyframe had depth
+        self._seen: dict[str, View] = {}  # the last view of each camera that became a keyframe, as it was given
+
+    def _ingest(self, views: Sequence[View]) -> None:
+        for view in views:
+            check_view(view)
+        news = [view for view in views if self._is_new(view)]
+        if not self._views and news:
+            self._begin(news)
+        due = self.step // tuned.STEPS_A_KEYFRAME + len(self._seen) - self._taken
+        first = [view for view in news if view.camera not in self._seen]
+        waiting = sorted((v for v in news if v.camera in self._seen), key=lambda v: self._seen[v.camera].generated_ns)
+        for view in [*first, *waiting[: max(due, 0)]]:
+            self._take(view)
+        self._snapshot = None
+
+    def _is_new(self, view: View) -> bool:
+        known = self._seen.get(view.camera)
+        return known is None or not (
+            known.generated_ns == view.generated_ns and np.array_equal(known.image, view.image)
+        )
+
+    def _begin(self, views: Sequence[View]) -> None:
+        """Find the scene's box: where depth is measured, its median is the distance of the scene."""
+        self.view_store.add(views)
+        self.view_store.keep_box()
+        box, depths = self.view_store.box, [usable_depth(view.depth) for view in views]
+        assert box is not None
+        measured = [(view, float(np.median(z[z > 0]))) for view, z in zip(views, depths) if z is not None]
+        if measured and self.settings.centre_m is None:
+            distance_m = float(np.median([z for _, z in measured]))
+            ahead = [v.camera_to_world[:3, 3] + v.camera_to_world[:3, 2] * distance_m for v, _ in measured]
+            x, y, z = map(float, np.mean(ahead, axis=0))
+            lens = measured[0][0].intrinsics
+            box = replace(
+                box, centre_m=(x, y, z), radius_m=distance_m, distance_m=distance_m, pixel_m=distance_m / lens.fx
+            )
+            self.view_store.box = box
+        self.view_store.forget_views()
+        self._forget_parameters()
+
+    def _clear_views(self) -> None:
+        """Begin without keyframes. ``_targets`` holds their exposures; ``_compare`` adds the pixels of one."""
+        self._targets = Targets(
+            np.zeros(2, np.int64),
+            np.zeros((1, 2), np.int64),
+            np.zeros((0, 3), np.uint8),
+            np.zeros(0, np.float32),
+            np.zeros((0, 3), np.float32),
+            self.view_store.background(),
+            np.zeros((0, EXPOSURE), np.float32),
+            np.float32(tuned.DISSIMILARITY),
+        )
+        self._views = ()
+        self._cams = np.zeros((0, CAMERA), np.float32)
+        self._aims: list[tuple[NDArray[np.float64], float]] = []
+        self._index: dict[str, int] = {}
+
+    def _take(self, given: View) -> None:
+        """Make a view a keyframe."""
+        box = self.view_store.box
+        assert box is not None
+        view = replace(given, camera=f"{given.camera}{SEPARATOR}{self._taken}", depth=usable_depth(given.depth))
+        self._seen[given.camera], self._taken = given, self._taken + 1
+        self._pixels = max(self._pixels, view.image.shape[0] * view.image.shape[1])
+        self._follow(view)
+        shown = self._look(view)
+        if self._rigid is not None and len(self.cloud):
+            self._expose(view, shown)
+        if view.depth is not None:
+            self._add(self._seeds_of(view, shown))
+        self._append(view, self._aim(view, shown))
+        self._measured |= view.depth is not None
+        if not self._measured and len(self._views) in tuned.BEGINS:
+            self._begin_anew()
+        while len(self._views) > self._most_kept():
+            self._drop(self._least_needed())
+
+    def _follow(self, view: View) -> None:
+        """Begin with the correction and the exposure of the keyframe before."""
+        if self._rigid is None:
+            return
+        track = view.camera.rpartition(SEPARATOR)[0]
+        before = self._poses.neighbors_in_time(view, track)
+        self._poses.begin(view, track)
+        if before:
+            self._exposures.known[view.camera] = self._exposures.between(before)
+
+    def _begin_anew(self) -> None:
+        """Find the box and the first Gaussians from all keyframes so far: without depth, the first few say little, and
+        a field that was fitted to them is not mended by later ones."""
+        views, known = self._views, (self._pixels, self._taken, self._seen)
+        self._begin(views)
+        self._pixels, self._taken, self._seen = known
+        for view in views:
+            self._follow(view)
+            self._append(view, self._aim(view, None))
+        self._seed()
+
+    def _append(self, view: View, aim: tuple[NDArray[np.float64], float]) -> None:
+        """Learn from a view from now on. Its depth has served."""
+        box = self.view_store.box
+        assert box is not None
+        view = replace(view, depth=None)
+        self._index[view.camera] = len(self._views)
+        self._views = (*self._views, view)
+        self.view_store.memory[view.camera] = CameraMemory(view)
+        self._cams = np.concatenate([self._cams, camera_rows([self._pose_of(view)], [view.intrinsics], box)])
+        row = self._exposures.row(view.camera)[None]
+        self._targets = self._targets._replace(exposure=np.concatenate([self._targets.exposure, row]))
+        self._aims.append(aim)
+
+    def _aim(self, view: View, shown: Shown | None) -> tuple[NDArray[np.float64], float]:
+        """What ``PoseCorrections.descend`` needs of a view."""
+        depth, box = view.depth, self.view_store.box
+        assert box is not None
+        if depth is None and shown is not None:
+            depth = np.where(shown.opacity >= tuned.COVERED, shown.depth, np.float32(0.0))
+        depth = np.zeros(view.image.shape[:2], np.float32) if depth is None else filled(depth)
+        depth = depth if depth.min() > 0 else np.full_like(depth, box.distance_m)
+        return normal_matrix(view, depth), float(np.median(depth)) / view.intrinsics.fx
+
+    def _expose(self, view: View, shown: Shown) -> None:
+        """Find the exposure of a view at its first rendering, from pixels that look as expected."""
+        gain, bias = self._exposures.of(view.camera)
+        image = view.image[::2, ::2, :3].reshape(-1, 3) / 255.0
+        rendered = shown.color[::2, ::2].reshape(-1, 3).astype(np.float64)
+        error = np.abs(rendered * gain + bias - image).mean(axis=1)
+        usual = (shown.opacity[::2, ::2].reshape(-1) > tuned.EXPOSED_OPACITY) & (error < tuned.EXPOSED_ERROR)
+        if usual.mean() < tuned.EXPOSED_SHARE:
+            return
+        r, t = rendered[usual], (image[usual] - bias) / gain
+        sums = np.stack([np.ones_like(r), r, r * r, t, r * t]).sum(axis=1).T
+        self._exposures.learn(view.camera, sums, whole=True)
+
+    # --- which keyframes stay -----------------------------------------------------------------
+
+    def _most_kept(self) -> int:
+        pixels = self._views[-1].image.shape[0] * self._views[-1].image.shape[1]
+        return max(tuned.KEPT_PIXELS // pixels, tuned.LEAST_KEPT)
+
+    def _least_needed(self) -> int:
+        """The older of the two keyframes that were taken nearest to each other, the newest ones apart."""
+        old = self._views[: -tuned.NEWEST]
+        place = np.stack([v.camera_to_world for v in self._views])
+        apart = np.linalg.norm(place[:, None, :3, 3] - place[None, :, :3, 3], axis=2)
+        box = self.view_store.box
+        assert box is not None
+        turned = np.linalg.norm(place[:, None, :3, 2] - place[None, :, :3, 2], axis=2)
+        apart = apart / box.distance_m + turned
+        apart[np.arange(len(apart)), np.arange(len(apart))] = np.inf
+        apart = np.triu(apart)[: len(old)] + np.where(np.tri(len(apart), k=0)[: len(old)] > 0, np.inf, 0.0)
+        return int(np.argmin(apart.min(axis=1)))
+
+    def _drop(self, k: int) -> None:
+        """Learn from a keyframe no longer. Its correction stays, for held-out and late frames of its time."""
+        gone = self._views[k]
+        self._views = (*self._views[:k], *self._views[k + 1 :])
+        del self.view_store.memory[gone.camera], self._aims[k]
+        self._cams = np.delete(self._cams, k, axis=0)
+        self._targets = self._targets._replace(exposure=np.delete(self._targets.exposure, k, axis=0))
+        self._index = {view.camera: n for n, view in enumerate(self._views)}
+        for name in list(self._poses.known)[: -tuned.KEPT_CORRECTIONS]:
+            if name not in self._index:
+                self._poses.forget(name)
+                self._exposures.known.pop(name, None)
+
+    # --- what the field asks for --------------------------------------------------------------
+
+    def _seed(self) -> None:
+        """Seed where the keyframes agree on colors."""
+        s, box = self.settings, self.view_store.box
+        assert box is not None
+        none, first = np.zeros(0, np.float32), min(s.start, s.gaussians)
+        self.cloud = GaussianCloud.new(seed_gaussians(s, self.pool, box, self._views, None, none, first, self._rng(1)))
+
+    def _next_view(self) -> int:
+        """One of the newest keyframes, or any of them, all in turn in an order that is drawn anew for each pass."""
+        rng, count = self._rng(7), len(self._views)
+        newest = min(tuned.NEWEST * len(self._seen), count)
+        if rng.random() < tuned.NEWEST_SHARE:
+            return count - 1 - int(rng.integers(newest))
+        return int(rng.integers(count))
+
+    def _compare(self, view: int) -> NDArray[np.float64]:
+        one = self._views[view]
+        h, w = one.image.shape[:2]
+        weight = np.zeros(0, np.float32) if one.weight is None else one.weight.reshape(-1)
+        target = self._targets._replace(
+            first=np.array([0, h * w]),
+            size=np.array([[w, h]]),
+            pixels=one.image.reshape(h * w, -1),
+            weight=weight,
+            exposure=self._targets.exposure[[view]] if self._rigid is not None else self._targets.exposure[:0],
+        )
+        return self._raster.train(target, 0)
+
+    def _room(self) -> int:
+        return min(super()._room(), max(int(tuned.PER_PIXEL * self._pixels), tuned.LEAST) - len(self.cloud))
+
+    def _counters(self) -> dict[str, Any]:
+        return {**super()._counters(), "taken": self._taken, "pixels": self._pixels, "measured": self._measured}
+
+    def _arrays(self) -> Arrays:
+        aims = [np.append(normal, pixel_m) for normal, pixel_m in self._aims]
+        return {**super()._arrays(), "aims": np.stack(aims) if aims else np.zeros((0, 37))}
+
+    def _load(self, meta: dict[str, Any], state: Arrays) -> None:
+        super()._load(meta, state)
+        self._taken, self._pixels = int(meta["taken"]), int(meta["pixels"])
+        self._measured = bool(meta["measured"])
+        self._clear_views()
+        views, aims = self.view_store.views, np.asarray(state["aims"], np.float64)
+        if aims.shape != (len(views), 37) or not np.isfinite(aims).all():
+            raise ValueError(f"the state's aims must be (V, 37) of {len(views)} keyframes, not {aims.shape}")
+        for view, aim in zip(views, aims):
+            self._append(view, (aim[:36].reshape(6, 6), float(aim[36])))
+            self._seen[view.camera.rpartition(SEPARATOR)[0]] = view
+
+
+make = CarriedField

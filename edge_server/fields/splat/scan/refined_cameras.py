@@ -1,0 +1,65 @@
+"""What a scan has learned of its cameras, and how to render what a camera saw that it does not learn from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from edge_server.fields import Correction, View
+from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
+from edge_server.fields.splat.scan.exposures import Exposures
+from edge_server.fields.splat.snapshot import SplatSnapshot
+
+
+@dataclass(frozen=True)
+class RefinedCameras:
+    """Corrections of poses, and exposures, of the views that are learned from."""
+
+    poses: PoseCorrections
+    exposures: Exposures
+
+    def copied(self) -> RefinedCameras:
+        """A copy that later steps do not change."""
+        exposures = Exposures()
+        exposures.known = dict(self.exposures.known)
+        return RefinedCameras(self.poses.copied(), exposures)
+
+    def correction(self, view: View) -> Correction:
+        """How to render what ``view`` saw: as it was learned, else as its neighbors in time suggest."""
+        if view.camera in self.poses.known:
+            return Correction(self.poses.pose(view), *self.exposures.of(view.camera))
+        neighbors = self.poses.neighbors_in_time(view, self._track_of(view))
+        return Correction(self.poses.pose_between(view, neighbors), *self.exposures.between(neighbors))
+
+    def _track_of(self, view: View) -> str:
+        """The track of the view's own camera, else the one whose views of that time were taken nearest to it: what is
+        held out may be frames of a camera that is carried."""
+        tracks = self.poses.tracks()
+        if view.camera in tracks or len(tracks) < 2:
+            return view.camera if view.camera in tracks else "".join(tracks)
+
+        def apart_m(track: str) -> float:
+            near = [self.poses.known[name].given for name in self.poses.neighbors_in_time(view, track)]
+            return min(
+                (float(np.linalg.norm(pose[:3, 3] - view.camera_to_world[:3, 3])) for pose in near), default=np.inf
+            )
+
+        return min(tracks, key=apart_m)
+
+
+@dataclass(frozen=True)
+class ScanSnapshot(SplatSnapshot):
+    """cameras: what was learned of them; None: nothing was."""
+
+    cameras: RefinedCameras | None = None
+
+    def copied(self) -> Self:
+        gaussians = self.gaussians._replace(params=self.gaussians.params.copy())
+        cameras = None if self.cameras is None else self.cameras.copied()
+        return replace(self, gaussians=gaussians, cameras=cameras)
+
+    def correction(self, view: View) -> Correction | None:
+        """See ``fields.RefinesCameras``."""
+        return None if self.cameras is None else self.cameras.correction(view)

@@ -1,0 +1,129 @@
+"""Views of a carried camera, one after the other, as a live edge gives them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_server.experiments.scenes.multiview_still import score_views
+from edge_server.fidelity.scorer import Scorer
+from edge_server.fields import Budget, View
+from edge_server.fields.splat.scan import settings as tuned
+from edge_server.fields.splat.scan.carried_field import CarriedField
+from edge_server.fields.splat.settings import SplatSettings
+from freshfield.geometry import so3_exp
+from tests.edge_server.fields.splat.scan.walk import WALK, spoiled, walk
+
+HELD = 8  # one in so many frames is held out
+
+
+def _field(threads: int = 2) -> CarriedField:
+    options = {"gaussians": 3000, "start": 500, "seed_cells": 32, "contracted": False}
+    return CarriedField(SplatSettings(scan=True, refine=True, carried=True, threads=threads, **options))
+
+
+def _played(views: list[View], field: CarriedField | None = None, steps: int = tuned.STEPS_A_KEYFRAME) -> CarriedField:
+    """The field after an update with each frame that is not held out, all of one camera."""
+    field = field or _field()
+    for k, view in enumerate(views):
+        if k % HELD:
+            field.fit([replace(view, camera="hand")], Budget(steps=steps))
+    return field
+
+
+def _held(views: list[View]) -> list[View]:
+    return [replace(view, camera="kept") for view in views[::HELD]]
+
+
+def _db(field: CarriedField, views: list[View]) -> tuple[float, float]:
+    """PSNR of held-out frames, as given and refined."""
+    score, _ = score_views(field, _held(views), Scorer())
+    assert score.psnr_refined_db is not None
+    return score.psnr_db, score.psnr_refined_db
+
+
+def test_frames_become_keyframes_and_held_out_ones_take_their_neighbors_corrections() -> None:
+    views = spoiled(WALK)
+    field = _played(views)
+    assert len(field.views) == len(views) - len(views[::HELD])
+    raw_db, refined_db = _db(field, views)
+    assert refined_db > 20.0 and refined_db > raw_db + 4.0
+    snapshot, held = field.snapshot(), _held(views)[3]
+    before = snapshot.correction(held)
+    field.fit([replace(views[1], camera="hand", generated_ns=views[-1].generated_ns + 1)], Budget(steps=30))
+    after = snapshot.correction(held)
+    assert before is not None and after is not None
+    np.testing.assert_array_equal(before.camera_to_world, after.camera_to_world)  # a snapshot never changes
+
+
+def test_without_depth_it_begins_anew_until_it_has_seen_enough() -> None:
+    views = walk(depth=False)
+    field = _played(views)
+    assert _db(field, views)[1] > 18.0
+
+
+def test_a_frame_is_taken_once_and_not_before_its_turn() -> None:
+    field, view = _field(), replace(WALK[1], camera="hand")
+    for _ in range(3):
+        field.fit([view], Budget(steps=tuned.STEPS_A_KEYFRAME))
+    assert len(field.views) == 1
+    for k, expected in ((2, 2), (3, 3), (4, 4), (5, 4)):  # three turns have passed; a new camera needs none
+        field.fit([replace(WALK[k], camera="hand")], Budget(steps=0))
+        assert len(field.views) == expected, k
+    field.fit([replace(WALK[6], camera="other")], Budget(steps=0))
+    assert len(field.views) == 5
+
+
+def test_each_moving_camera_has_corrections_of_its_own() -> None:
+    """One is mounted 1.5 degrees askew, the other is not."""
+    field, askew, turned = _field(), so3_exp(np.array([0.0, np.deg2rad(1.5), 0.0])), {"left": [], "right": []}
+    for k in range(1, 30):
+        right = WALK[k].camera_to_world.copy()
+        right[:3, :3] = right[:3, :3] @ askew
+        field.fit([replace(WALK[k], camera="left")], Budget(steps=24))
+        field.fit([replace(WALK[k], camera="right", camera_to_world=right)], Budget(steps=24))
+    for name, known in field._poses.known.items():
+        assert known.track == name.partition("#")[0]
+        turned[known.track].append(known.given[:3, :3].T @ known.rotation)
+    apart_deg = np.rad2deg(np.mean(turned["right"], axis=0) - np.mean(turned["left"], axis=0))
+    assert -1.9 < apart_deg[1] < -0.75 and np.abs(apart_deg[[0, 2]]).max() < 0.4
+
+
+def test_keyframes_taken_near_each_other_go_first_and_memory_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tuned, "KEPT_PIXELS", 0)
+    monkeypatch.setattr(tuned, "LEAST_KEPT", 20)
+    round_ = WALK + [replace(view, generated_ns=view.generated_ns + 8_000_000_000) for view in WALK]
+    field = _played(round_)
+    assert len(field.views) == len(field._cams) == len(field._aims) == len(field._targets.exposure) == 20
+    at = np.stack([view.camera_to_world[:3, 3] for view in field.views])
+    apart = np.linalg.norm(at[:, None] - at[None], axis=2) + 10.0 * np.eye(len(at))
+    assert apart[: -tuned.NEWEST, : -tuned.NEWEST].min() > 0.25  # spread over the whole round
+    assert _db(field, WALK)[1] > 20.0
+
+
+def test_it_resumes_bit_for_bit_whatever_the_number_of_threads() -> None:
+    views = spoiled(WALK)
+    fields = [_field(threads) for threads in (2, 1, 2)]
+    for field in fields[:2]:
+        _played(views[:20], field)
+    fields[2].load_state(fields[0].state())
+    for field in fields:
+        _played(views[20:30], field)
+    one, *others = (field.state() for field in fields)
+    for other in others:
+        assert one.keys() == other.keys()
+        for name in one.keys() - {"meta"}:
+            np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+    assert fields[0]._poses.meta() == fields[1]._poses.meta() == fields[2]._poses.meta()
+
+
+@pytest.mark.stability
+def test_two_hundred_identical_frames_change_little() -> None:
+    field = _played(WALK)
+    before = _db(field, WALK)[1]
+    last = replace(WALK[-1], camera="hand")
+    for k in range(200):
+        field.fit([replace(last, generated_ns=last.generated_ns + k + 1)], Budget(steps=4))
+    assert _db(field, WALK)[1] > before - 1.0
