@@ -30,8 +30,8 @@ CHOSEN = ("field", "layers", "updates", "update_ms", "steps", "keyframes")
 def cameras_move(scenario: Scenario) -> bool:
     """Whether a scenario says that its cameras move: an arm, a trajectory or somebody carries them. Others may move,
     too, which their poses tell."""
-    carries = any(scenario.source.get(key) for key in ("arm", "trajectory", "carried"))
-    return carries or bool(scenario.held_out_every)
+    known = any(scenario.source.get(key) is not None for key in ("arm", "trajectory"))
+    return known or bool(scenario.source.get("carried")) or bool(scenario.held_out_every)
 
 
 def with_defaults(section: Mapping[str, Any], moving: bool, cameras: int) -> dict[str, Any]:
