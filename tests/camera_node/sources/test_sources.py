@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,7 @@ from camera_node.capture import build_cameras, prepare
 from camera_node.settings import source_config
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.registry import open_sources
-from camera_node.synthetic import make_scene
 from freshfield import payload
-from freshfield.geometry import Pose
 from freshfield.scenario import ScenarioError, parse
 from tests.camera_node.sources.datasets.photos import opencv_pose, photo_scenario, picture, write_photos
 from tests.conftest import data_dir
@@ -87,20 +84,6 @@ def test_a_jpeg_of_the_right_size_is_sent_as_it_lies(tmp_path):
 def world_scenario(**source):
     section = {"kind": "world", "scene": "room", "width": 24, "height": 16, "fps": 10, **source}
     return parse({"cameras": {"count": 3, "held_out": ["cam00"]}, "source": section}, Path("world.yaml"))
-
-
-def test_the_world_repeats_and_is_exact(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    source = opened(world_scenario(codec="zstd"), ["cam01"])["cam01"]
-    scene = make_scene("room", {"count": 3, "width": 24, "height": 16})
-    assert source.contents == Fraction(scene.period_s).limit_denominator(10) * 10
-    far = 17_000_000_000
-    assert source.content(far) == far % source.contents
-    shot = source.read(source.content(7))
-    np.testing.assert_array_equal(rgb(shot, "zstd"), scene.render("cam01", 0.7))
-    assert shot.pose == Pose.from_matrix(scene.cameras["cam01"][1])
-    source.release()
-    np.testing.assert_array_equal(rgb(source.read(8), "zstd"), scene.render("cam01", 0.8))
 
 
 def test_noise_makes_every_tick_its_own_and_spares_the_truth(tmp_path, monkeypatch):

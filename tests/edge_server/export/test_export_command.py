@@ -43,23 +43,9 @@ def export(*words) -> int:
 
 def test_everything_at_once(run, tmp_path, capsys):
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
-    status = export(
-        run,
-        "--mesh",
-        tmp_path / "m.ply",
-        "--splats",
-        tmp_path / "s.ply",
-        "--points",
-        tmp_path / "p.ply",
-        "--colmap",
-        tmp_path / "colmap",
-        "--transforms",
-        tmp_path / "nerf",
-        "--voxel",
-        10,
-        "--count",
-        500,
-    )
+    written = {"mesh": "m.ply", "splats": "s.ply", "points": "p.ply", "colmap": "colmap", "transforms": "nerf"}
+    words = [word for option, name in written.items() for word in (f"--{option}", tmp_path / name)]
+    status = export(run, *words, "--voxel", 10, "--count", 500)
     said = capsys.readouterr().out
     assert status == 0, said
     for name in ("m.ply", "s.ply", "p.ply", "colmap/sparse/0/images.txt", "nerf/transforms.json"):

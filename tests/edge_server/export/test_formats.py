@@ -114,26 +114,8 @@ def test_splats_stand_as_viewers_expect_them(tmp_path, sh_degree):
     assert write_splats(tmp_path / "s.ply", gaussians, box) == 30
     data = read_floats(tmp_path / "s.ply")
     rest = [f"f_rest_{k}" for k in range(3 * extra)]
-    assert list(data) == [
-        "x",
-        "y",
-        "z",
-        "nx",
-        "ny",
-        "nz",
-        "f_dc_0",
-        "f_dc_1",
-        "f_dc_2",
-        *rest,
-        "opacity",
-        "scale_0",
-        "scale_1",
-        "scale_2",
-        "rot_0",
-        "rot_1",
-        "rot_2",
-        "rot_3",
-    ]
+    names = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity"]
+    assert list(data) == [*names, *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
     position = np.stack([data[n] for n in "xyz"], axis=-1)
     np.testing.assert_array_equal(position, (params[:, :3] * np.float64(2.5) + (1.0, -2.0, 0.5)).astype(np.float32))
     np.testing.assert_array_equal(data["opacity"], params[:, 10])

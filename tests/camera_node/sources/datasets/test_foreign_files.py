@@ -248,7 +248,9 @@ def test_what_is_missing_is_named_with_what_lies_beside(tmp_path):
     (tmp_path / "images/001.png").rename(tmp_path / "images/001.webp")
     (tmp_path / "images/003.png").unlink()
     note = f"2 of 5 images are missing, first images/001.png; {tmp_path}/images holds 001.webp and 3 more"
-    assert load_dataset(file).notes == (note,)
+    found = load_dataset(file)
+    assert found.notes == (note,) and found.missing == 2
+    assert [record.name for record in found] == [f"images/{k:03d}.png" for k in (0, 2, 4)]
     (tmp_path / "images").rename(tmp_path / "pictures")
     fails(rf"5 of 5 images are missing, first images/000.png; {tmp_path} holds .*pictures", load_dataset, file)
 

@@ -42,15 +42,6 @@ def test_scale_divides_images_and_intrinsics(tmp_path):
         load_dataset(tmp_path, ImageOptions(0.5))
 
 
-def test_entries_without_a_file_are_counted(tmp_path):
-    file = write_photos(tmp_path, 5)
-    (tmp_path / "images/001.png").unlink()
-    (tmp_path / "images/003.png").unlink()
-    dataset = load_dataset(file)
-    assert [r.name for r in dataset] == ["images/000.png", "images/002.png", "images/004.png"]
-    assert dataset.missing == 2
-
-
 def test_extensions_and_sizes_may_be_left_out(tmp_path):
     def nerf_synthetic(data):
         for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):

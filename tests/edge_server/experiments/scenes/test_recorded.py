@@ -41,22 +41,6 @@ def test_a_moving_set_is_one_instant_of_each_camera(tmp_path):
         load_recorded(tmp_path, "cam00", frame=3)
 
 
-def test_alpha_is_kept_and_scale_shrinks_image_and_lens_alike(tmp_path):
-    write_photos(tmp_path, 3, size=32, alpha=True)
-    view = load_recorded(tmp_path, "0", scale=2).training[0]
-    assert view.image.shape == (16, 16, 4)
-    assert (view.intrinsics.width, view.intrinsics.height) == (16, 16)
-
-
-def test_of_several_files_the_first_whose_images_exist_is_read(tmp_path):
-    path = write_photos(tmp_path, 3)
-    missing = json.loads(path.read_text())
-    for frame in missing["frames"]:
-        frame["file_path"] += "-nowhere"
-    (tmp_path / "transforms.json").write_text(json.dumps(missing))
-    assert load_recorded(tmp_path, "0").file == path
-
-
 @pytest.mark.parametrize(
     ("holdout", "message"), [("nobody", "no image or camera 'nobody'"), ("1", "none is left to train on")]
 )

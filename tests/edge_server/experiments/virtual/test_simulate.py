@@ -46,14 +46,6 @@ def run(path: Path, capsys, *words: str) -> dict[str, Any]:
     return json.loads(capsys.readouterr().out)
 
 
-def test_one_seed_one_digest(tmp_path: Path, capsys):
-    path = write(tmp_path)
-    first = run(path, capsys)
-    assert run(path, capsys) == first
-    assert run(path, capsys, "--seed", "6")["digest"] != first["digest"]
-    assert first["frames"]["lost"] > 0 and first["updates"] >= 4
-
-
 def test_the_charge_is_the_scenarios_or_the_commands(tmp_path: Path, capsys):
     path = write(tmp_path, compute={"ms_per_step": 40.0, "ms_per_update": 20.0})
     assert run(path, capsys)["update_ms"] == pytest.approx(100.0)

@@ -193,15 +193,6 @@ def test_at_twice_the_load_frames_are_left_out_and_what_is_shown_does_not_age() 
     assert ages[1] < 2.0 * ages[0]
 
 
-def test_wait_uses_only_what_was_generated_after_the_decision():
-    edge = {"field": "ngp", "field_options": SMALL, "policy": {"name": "wait", "value": 150.0}}
-    deployment = run(scenario(edge=edge), RunSettings(steps=1, compute=ComputeConfig(ms_per_update=10.0)), seconds=2.0)
-    assert len(deployment.publications) > 3
-    for p in deployment.publications:
-        assert p.update_ms >= 10.0 and max(p.ages_ms) <= 150.0 + 10.0 + 200.0
-        assert p.omega_ms == 150.0
-
-
 def test_a_camera_that_reports_late_is_waited_for_only_as_long_as_the_grace():
     channel = {"service": {"law": "deterministic", "mean_ms": 700.0}}
     settings = RunSettings(steps=1, grace_ms=0.0)
