@@ -1,4 +1,4 @@
-"""``camera-node calibrate``: hand-eye, intrinsics, and a target to print."""
+"""``camera-node calibrate``: hand-eye, intrinsics, a rig of fixed cameras, and a target to print."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from camera_node.robot.calibration import DEFAULT_METHOD, CalibrationError
+from camera_node.robot.calibration.rig import rig_command
 
 EXAMPLES = """examples:
   camera-node calibrate target charuco:7x5:30mm:22mm --out board.png        print it, measure it, fix it flat
   camera-node calibrate intrinsics pictures/ --board charuco:7x5:30mm:22mm --out lens.json
+  camera-node calibrate rig pictures/ --board charuco:7x5:30mm:22mm --out rig.json --plot rig.png
   camera-node calibrate hand-eye handeye/ --board chessboard:9x6:23.6mm     ViSP's layout: pictures and poses
   camera-node calibrate hand-eye --pairs samples.yaml --json                saved by MoveIt's panel
   camera-node calibrate hand-eye --live cell.yaml --camera cam00 --board charuco:7x5:30mm:22mm --out hand.yaml
@@ -53,6 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
     _add_hand_eye(_command(commands, "hand-eye", "pose of a camera on the arm's flange", HAND_EYE))
     _add_intrinsics(_command(commands, "intrinsics", "a camera's intrinsics from pictures of a target", INTRINSICS))
+    rig = _command(commands, "rig", "lenses and poses of several cameras that stand still", rig_command.DESCRIPTION)
+    rig_command.add_arguments(rig, BOARD)
     add = _command(commands, "target", "write an image of a target, to print", "").add_argument
     add("board", metavar="SPEC", help="target, as in hand-eye --board")
     add("--out", type=Path, required=True, metavar="FILE.png", help="image to write")
@@ -104,7 +108,8 @@ def run(args: argparse.Namespace) -> int:
     except ImportError:
         raise CalibrationError("calibration needs scipy (pip install 'freshfield[calibrate]')") from None
     try:
-        return {"hand-eye": _hand_eye, "intrinsics": _intrinsics, "target": _target}[args.what](args)
+        commands = {"hand-eye": _hand_eye, "intrinsics": _intrinsics, "rig": rig_command.run, "target": _target}
+        return commands[args.what](args)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130

@@ -1,0 +1,109 @@
+"""``camera-node calibrate rig``: poses and lenses of cameras that stand still."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from camera_node.robot.calibration import CalibrationError
+
+DESCRIPTION = """Estimates lenses and poses of cameras that stand still, from pictures of one target that somebody moves
+about and holds still: ten to twenty times where at least two cameras see it, and, unless --lens gives the lenses, some
+six times close before each camera, tilted, in the middle and all corners of its picture. The world's axes are the
+target's at the first moment (--origin names another): lay it on the floor then.
+
+input, one of:
+  FOLDER             a folder of pictures a camera, cam00/0007.png: pictures of one moment have one name; or a video a
+                     camera, cam00.mp4, all begun at the same instant
+  --live SCENARIO    the scenario's cameras (kinds camera, oak, realsense), until --seconds or Ctrl-C
+  --colmap MODEL     a COLMAP model that has images of the cameras, named like them (cam00.jpg or cam00/...), scaled by
+                     --length: the distance between two of the cameras
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser, board: str) -> None:
+    """Fill in ``calibrate rig``. board: help of --board."""
+    add = parser.add_argument
+    add("folder", type=Path, nargs="?", metavar="FOLDER", help="pictures or videos by camera, see above")
+    add("--live", metavar="SCENARIO", help="take the pictures with this scenario's cameras")
+    add("--colmap", type=Path, metavar="MODEL", help="folder of a COLMAP model")
+    add("--board", metavar="SPEC", help=board)
+    add("--lens", type=Path, metavar="FILE", help="known intrinsics of all cameras, calibration JSON [estimated]")
+    add("--origin", metavar="MOMENT", help="when the target lay at the world's origin: a picture's name [the first]")
+    add("--length", nargs=3, metavar=("CAM", "CAM", "METERS"), help="with --colmap: distance of two cameras")
+    add("--seconds", type=float, metavar="S", help="with --live: end after S seconds")
+    add("--out", type=Path, metavar="FILE.json", help="file to write, for source.calibration of a scenario")
+    add("--plot", type=Path, metavar="FILE.png", help="picture of the rig to write, seen from above and from the side")
+    add("--json", action="store_true", help="print the calibration as JSON, as --out writes it")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Calibrate, print, write. Raises CalibrationError."""
+    given = [name for name in ("folder", "live", "colmap") if getattr(args, name) is not None]
+    if len(given) != 1:
+        raise CalibrationError("expected one of FOLDER, --live SCENARIO, --colmap MODEL")
+    if args.colmap is not None:
+        from camera_node.robot.calibration.rig.scaled_model import read_scaled_model
+
+        if args.length is None:
+            raise CalibrationError("--length CAM CAM METERS: a COLMAP model has no scale; measure between two lenses")
+        found: Any = read_scaled_model(args.colmap, *args.length)
+    else:
+        if args.board is None:
+            raise CalibrationError("--board SPEC: say what the target is")
+        found = _from_target(args)
+    data = found.to_json()
+    print(json.dumps(data) if args.json else found.show(), flush=True)
+    if args.out is not None:
+        from freshfield import files
+
+        files.write_json(args.out, data, indent=1)
+    if args.plot is not None:
+        from camera_node.robot.calibration.rig.rig_picture import draw_rig
+
+        draw_rig(args.plot, found.poses, getattr(found, "boards", {}))
+    return 0
+
+
+def _from_target(args: argparse.Namespace) -> Any:
+    from camera_node.robot.calibration.lens_calibration import calibrate_lens
+    from camera_node.robot.calibration.rig import rig_inputs
+    from camera_node.robot.calibration.rig.rig_calibration import calibrate_rig
+    from camera_node.robot.calibration.targets import parse_target
+    from camera_node.sources.rig_calibration import load_calibration
+
+    board = parse_target(args.board)
+    if args.live is not None:
+        cameras, close = rig_inputs.open_cameras(args.live)
+        try:
+            views = rig_inputs.watch(cameras, board, args.seconds, lambda line: print(line, file=sys.stderr))
+        finally:
+            close()
+    else:
+        views = rig_inputs.read_folder(args.folder, board, _print_progress)
+    if args.lens is None:
+        lenses = {}
+        for camera, seen in views.corners.items():
+            try:
+                lenses[camera] = calibrate_lens(seen, views.sizes.get(camera, (0, 0)), {}).pinhole
+            except CalibrationError as error:
+                raise CalibrationError(f"{camera}: {error}; or give its intrinsics: --lens FILE") from None
+    else:
+        known = load_calibration(args.lens)
+        if missing := [camera for camera in views.corners if camera not in known]:
+            raise CalibrationError(f"--lens {args.lens}: has no {', '.join(missing)}")
+        lenses = {camera: known[camera].intrinsics for camera in views.corners}
+        for camera, lens in lenses.items():
+            if (size := views.sizes.get(camera)) and size != (lens.width, lens.height):
+                raise CalibrationError(
+                    f"{camera}: pictures of {size[0]} x {size[1]}, but --lens is of {lens.width} x {lens.height}"
+                )
+    return calibrate_rig(views.corners, lenses, args.lens is None, args.origin)
+
+
+def _print_progress(done: int) -> None:
+    if sys.stderr.isatty():
+        print(f"\r{done} pictures ", end="", file=sys.stderr, flush=True)

@@ -1,0 +1,170 @@
+"""What a rig saw of a target: a folder of pictures or a video a camera, or the cameras of a scenario, live."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.inputs import find_corners, list_images
+from camera_node.robot.calibration.settings import MOMENT_S, NEW_SHARE, STILL_PX
+from camera_node.robot.calibration.targets import Corners, Target, to_gray
+
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
+GrayImage = NDArray[np.uint8]
+
+
+@dataclass
+class RigViews:
+    """What was seen. corners: camera -> moment -> corners. sizes: width and height of each camera's images. unused:
+    reason for each image without corners."""
+
+    corners: dict[str, dict[str, Corners]] = field(default_factory=dict)
+    sizes: dict[str, tuple[int, int]] = field(default_factory=dict)
+    unused: dict[str, str] = field(default_factory=dict)
+
+
+def read_folder(folder: Path, target: Target, progress: Callable[[int], None]) -> RigViews:
+    """Views of a folder with one folder of pictures (``cam00/0007.png``: pictures of one moment have one name) or one
+    video (``cam00.mp4``; all begin at the same instant) a camera. Raises CalibrationError."""
+    if not folder.is_dir():
+        raise CalibrationError(f"{folder}: no such folder")
+    entries = sorted(e for e in folder.iterdir() if not e.name.startswith("."))
+    cameras = [e for e in entries if e.is_dir() or e.suffix.lower() in VIDEOS]
+    if len(cameras) < 2:
+        raise CalibrationError(
+            f"{folder}: expected a folder of pictures or a video for each of at least two cameras, found "
+            f"{len(cameras)}: cam00/0001.png, cam01/0001.png, or cam00.mp4, cam01.mp4"
+        )
+    views = RigViews()
+    done = itertools.count(1)
+    for entry in cameras:
+        name = entry.stem if entry.is_file() else entry.name
+        if entry.is_file():
+            views.corners[name], views.sizes[name] = _of_video(entry, target, lambda: progress(next(done)))
+            continue
+        found, unused, size = find_corners(list_images(entry), target, None, lambda _: progress(next(done)))
+        views.corners[name] = {Path(file).stem: corners for file, corners in found.items()}
+        views.sizes[name] = size
+        views.unused |= {f"{name}/{file}": why for file, why in unused.items()}
+    for name, seen in views.corners.items():
+        if not seen:
+            raise CalibrationError(f"{folder}: {name} never sees the target {target.name}")
+    return views
+
+
+def _of_video(file: Path, target: Target, progress: Callable[[], None]) -> tuple[dict[str, Corners], tuple[int, int]]:
+    """Corners by moment, each MOMENT_S, at which the target stood still between two frames; and the images' size."""
+    capture = cv2.VideoCapture(str(file))
+    try:
+        fps = capture.get(cv2.CAP_PROP_FPS)
+        if not capture.isOpened() or not 0 < fps < 1000:
+            raise CalibrationError(f"{file}: cannot be read as a video")
+        every = max(2, round(MOMENT_S * fps))
+        found: dict[str, Corners] = {}
+        size, before = (0, 0), None
+        for index in itertools.count():
+            if not capture.grab():
+                break
+            if index % every > 1:
+                continue
+            ok, image = capture.retrieve()
+            if not ok:
+                raise CalibrationError(f"{file}: frame {index} cannot be decoded")
+            size = (image.shape[1], image.shape[0])
+            corners = target.find(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
+            if index % every == 0:
+                before = corners
+                progress()
+            elif corners is not None and before is not None and moved_px(before, corners) < STILL_PX:
+                found[f"{index / fps:.1f}s"] = corners
+    finally:
+        capture.release()
+    if not size[0]:
+        raise CalibrationError(f"{file}: has no frame")
+    return found, size
+
+
+def moved_px(before: Corners, now: Corners) -> float:
+    """Largest motion of a corner that both have, pixels; infinite if they have none in common."""
+    places = {tuple(point): pixel for point, pixel in zip(before.points, before.pixels)}
+    both = [(places[tuple(point)], pixel) for point, pixel in zip(now.points, now.pixels) if tuple(point) in places]
+    return max((float(np.abs(a - b).max()) for a, b in both), default=np.inf)
+
+
+Grab = Callable[[], GrayImage | None]
+
+
+def watch(cameras: Mapping[str, Grab], target: Target, seconds: float | None, tell: Callable[[str], None]) -> RigViews:
+    """Views taken live while somebody moves the target about and holds it still, until ``seconds`` are over or Ctrl-C.
+
+    cameras: name -> function that returns its newest image, None without one. tell: what to do next, a line each time
+    that a moment was kept.
+    """
+    views = RigViews({name: {} for name in cameras})
+    before: dict[str, Corners | None] = dict.fromkeys(cameras)
+    kept: dict[str, Corners | None] = dict.fromkeys(cameras)
+    began = time.monotonic()
+    try:
+        for moment in itertools.count(1):
+            if seconds is not None and time.monotonic() - began > seconds:
+                break
+            now: dict[str, Corners | None] = {}
+            for name, grab in cameras.items():
+                image = grab()
+                now[name] = None if image is None else target.find(image)
+                if image is not None:
+                    views.sizes[name] = (image.shape[1], image.shape[0])
+            still = {n: c for n, c in now.items() if c and (b := before[n]) and moved_px(b, c) < 2 * STILL_PX}
+            new = [
+                n for n, c in still.items() if (k := kept[n]) is None or moved_px(k, c) > NEW_SHARE * views.sizes[n][0]
+            ]
+            if new and len(still) == sum(c is not None for c in now.values()):
+                for name, corners in still.items():
+                    views.corners[name][f"{moment}"] = kept[name] = corners
+                tell(", ".join(f"{name} {len(seen)}" for name, seen in views.corners.items()))
+            before = now
+    except KeyboardInterrupt:
+        print("stopped; what there is:", file=sys.stderr)
+    return views
+
+
+def open_cameras(scenario_file: str) -> tuple[dict[str, Grab], Callable[[], None]]:
+    """The live cameras of a scenario, before they have a calibration: functions for ``watch``, and one that closes
+    them. Raises ScenarioError, CameraError."""
+    from camera_node.settings import LiveConfig, source_config
+    from camera_node.sources.devices.feed import Feed
+    from camera_node.sources.devices.live import DEFAULT_FPS, open_feed
+    from freshfield.clock import WallClock
+    from freshfield.scenario import load
+
+    loaded = load(scenario_file)
+    config = source_config(loaded)
+    if not isinstance(config, LiveConfig):
+        raise CalibrationError(f"{loaded.path}: source.kind {config.kind}: expected camera, oak or realsense")
+    feeds: dict[str, Feed] = {}
+
+    def close() -> None:
+        for feed in feeds.values():
+            feed.close()
+
+    def newest(feed: Feed) -> GrayImage | None:
+        taken = feed.grab(1.0)
+        return None if taken is None else to_gray(taken[1])
+
+    try:
+        for camera in loaded.cameras:
+            feeds[camera] = open_feed(camera, config, Fraction(config.fps or DEFAULT_FPS), WallClock())
+    except BaseException:
+        close()
+        raise
+    return {camera: lambda feed=feed: newest(feed) for camera, feed in feeds.items()}, close  # type: ignore[misc]

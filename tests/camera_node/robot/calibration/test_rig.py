@@ -1,0 +1,276 @@
+"""Poses and lenses of a rig of fixed cameras, against known ones."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_node.cli import main
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.rig import rig_inputs
+from camera_node.robot.calibration.rig.rig_calibration import RigCalibration, calibrate_rig
+from camera_node.robot.calibration.targets import Corners, opencv_lens, parse_target
+from camera_node.sources.rig_calibration import load_calibration
+from freshfield.geometry import Pinhole, look_at, se3, se3_inverse, so3_exp, so3_log
+
+BOARD = "charuco:8x5:60mm:45mm"
+LENSES = {
+    f"cam{k}": Pinhole(640, 480, 520.0 + 9 * k, 523.0 + 8 * k, 331.0 - 4 * k, 236.0 + 3 * k, (-0.1, 0.03, 1e-3, -1e-3))
+    for k in range(4)
+}
+# Four cameras on a third of a circle of a meter, as on stands around a table.
+POSES = {
+    f"cam{k}": look_at((np.cos(a), np.sin(a), 1.0), (0.0, 0.0, 0.2))
+    for k, a in enumerate(np.radians([-60, -20, 20, 60]))
+}
+
+
+def boards(count: int) -> list[np.ndarray]:
+    """Target to world (4, 4): first flat on the floor, then held towards the cameras, near and far, tilted."""
+    rng = np.random.default_rng(5)
+    found = [se3(np.diag([1.0, -1.0, -1.0]), [-0.24, 0.15, 0.0])]
+    # A target's z looks away from who sees it: from the cameras at +x.
+    facing = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    for _ in range(count - 1):
+        turn = so3_exp(rng.normal(0, 0.35, 3)) @ facing
+        middle = rng.uniform([-0.2, -0.3, 0.1], [0.3, 0.3, 0.5])
+        found.append(se3(turn, middle - turn @ [0.24, 0.15, 0.0]))
+    return found
+
+
+def near(name: str) -> list[np.ndarray]:
+    """Target to world (4, 4), held before one camera, tilted, in the middle and every corner: they tell of its lens."""
+    found = []
+    for k, (x, y) in enumerate([(0, 0), (-1, -1), (1, -1), (-1, 1), (1, 1), (0, 0)]):
+        turn = so3_exp(np.radians(35) * np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.0]))
+        middle = np.array([0.13 * x, 0.1 * y, 0.62])
+        found.append(POSES[name] @ se3(turn, middle - turn @ [0.24, 0.15, 0.0]))
+    return found
+
+
+def sightings(noise_px: float, count: int = 20) -> dict[str, dict[str, Corners]]:
+    """Corners as a detector finds them, those within the image."""
+    rng = np.random.default_rng(1)
+    points = np.array([[x, y, 0.0] for y in np.arange(1, 5) * 0.06 for x in np.arange(1, 8) * 0.06])
+    views: dict[str, dict[str, Corners]] = {name: {} for name in POSES}
+    for k, board in enumerate(boards(count)):
+        for name, pose in POSES.items():
+            at = points @ (se3_inverse(pose) @ board)[:3, :3].T + (se3_inverse(pose) @ board)[:3, 3]
+            pixels = LENSES[name].project(at)
+            inside = np.all((pixels > 0) & (pixels < (640, 480)), axis=1)
+            if inside.sum() >= 6:
+                noisy = pixels[inside] + rng.normal(0, noise_px, pixels[inside].shape)
+                views[name][f"{k:02d}"] = Corners(noisy, points[inside])
+    return views
+
+
+def start() -> dict[str, Pinhole]:
+    return {name: Pinhole.from_fov(640, 480, 63.0) for name in POSES}
+
+
+def errors(poses: dict[str, np.ndarray]) -> tuple[float, float]:
+    """Largest error of a camera's pose relative to cam0's: millimeters and degrees."""
+    worst_mm, worst_deg = 0.0, 0.0
+    for name in poses:
+        off = se3_inverse(se3_inverse(POSES["cam0"]) @ POSES[name]) @ se3_inverse(poses["cam0"]) @ poses[name]
+        worst_mm = max(worst_mm, 1e3 * float(np.linalg.norm(off[:3, 3])))
+        worst_deg = max(worst_deg, float(np.degrees(np.linalg.norm(so3_log(off[:3, :3])))))
+    return worst_mm, worst_deg
+
+
+def test_a_rig_is_exact_from_exact_corners_and_stands_where_the_target_lay():
+    found = calibrate_rig(sightings(0.0), start(), True)
+    assert max(found.error_px.values()) < 1e-3 and found.origin == "00"
+    # The board's top left corner is the origin, x along its top, y up along it: half a board from the world's middle.
+    shift = se3(np.eye(3), [0.24, -0.15, 0.0])
+    for name, pose in found.poses.items():
+        np.testing.assert_allclose(pose, shift @ POSES[name], atol=1e-4)
+        np.testing.assert_allclose(found.lenses[name].distortion, LENSES[name].distortion, atol=1e-3)
+
+
+@pytest.mark.parametrize(("noise_px", "count"), [(0.1, 20), (0.2, 40)])
+def test_errors_are_within_their_own_deviations_and_within_3_mm_and_a_fifth_of_a_degree(noise_px, count):
+    found = calibrate_rig(sightings(noise_px, count), start(), True)
+    mm, deg = errors(dict(found.poses))
+    assert mm < 3.0 and deg < 0.2
+    assert mm < 6 * max(found.std_mm.values()) and deg < 6 * max(found.std_deg.values())
+
+
+def test_an_origin_that_nobody_saw_is_refused():
+    with pytest.raises(CalibrationError, match="--origin 99: no camera saw the target then; there are 00, 01, 02"):
+        calibrate_rig(sightings(0.1), start(), True, "99")
+
+
+@pytest.mark.stability
+def test_a_moment_that_was_mixed_up_is_left_out_and_named():
+    views = sightings(0.1)
+    views["cam2"]["07"] = views["cam2"]["11"]
+    found = calibrate_rig(views, start(), True)
+    assert list(found.unused) == ["cam2 at 07"]
+    del views["cam2"]["07"]
+    assert errors(dict(found.poses)) == pytest.approx(errors(dict(calibrate_rig(views, start(), True).poses)), rel=1e-3)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("wrong", ["apart", "once"])
+def test_a_camera_that_shares_nothing_is_named(wrong):
+    views = sightings(0.1)
+    if wrong == "apart":
+        views["cam3"] = {f"x{moment}": corners for moment, corners in views["cam3"].items()}
+    else:
+        alone = {f"x{moment}": corners for moment, corners in views["cam3"].items()}
+        views["cam3"] = {"00": views["cam3"]["00"], **alone}
+    with pytest.raises(CalibrationError, match="cam3: never saw the target at the same moment as cam0, cam1, cam2"):
+        calibrate_rig(views, start(), True)
+
+
+def photo(name: str, board: np.ndarray, noise: float, seed: int) -> np.ndarray:
+    """Gray picture (480, 640) of a camera without distortion, blurred and noisy."""
+    target = parse_target(BOARD)
+    drawn = target.draw(960)
+    drawn = cv2.copyMakeBorder(drawn, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
+    px = target.size_m[0] / 960
+    # From pixels of the drawing to meters on the target.
+    to_target = np.array([[px, 0, (0.5 - 60) * px], [0, px, (0.5 - 60) * px], [0, 0, 1.0]])
+    pose = se3_inverse(POSES[name]) @ board
+    if pose[2, 2] < 0.2:  # from behind, or along it
+        return np.full((480, 640), 110, np.uint8)
+    lens = plain_lens(name)
+    finer = np.array([[4, 0, 1.5], [0, 4, 1.5], [0, 0, 1]])
+    homography = finer @ opencv_lens(lens)[0] @ pose[:3, [0, 1, 3]] @ to_target
+    image = cv2.warpPerspective(drawn, homography, (2560, 1920), flags=cv2.INTER_LINEAR, borderValue=110)
+    image = cv2.resize(image, (640, 480), interpolation=cv2.INTER_AREA).astype(np.float64)
+    return np.clip(image + np.random.default_rng(seed).normal(0, noise, image.shape), 0, 255).astype(np.uint8)
+
+
+def plain_lens(name: str) -> Pinhole:
+    lens = LENSES[name]
+    return Pinhole(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of pictures a camera: four simulated webcams with noise."""
+    folder = tmp_path_factory.mktemp("rig")
+    for c, name in enumerate(POSES):
+        (folder / name).mkdir()
+        for k, board in enumerate([*boards(16), *(board for each in POSES for board in near(each))]):
+            assert cv2.imwrite(str(folder / name / f"{k:02d}.png"), photo(name, board, 4.0, 100 * c + k))
+    return folder
+
+
+def test_pictures_of_four_noisy_webcams_give_a_file_that_a_scenario_reads(pictures, tmp_path, capsys):
+    out, plot = tmp_path / "rig.json", tmp_path / "rig.png"
+    words = ["calibrate", "rig", str(pictures), "--board", BOARD, "--out", str(out), "--plot", str(plot)]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "world: the target as it lay at 00" in said and "cam0 and cam1 saw the target together at" in said
+    rig = load_calibration(out)
+    mm, deg = errors({name: camera.pose.matrix() for name, camera in rig.items()})
+    assert mm < 3.0 and deg < 0.2
+    assert cv2.imread(str(plot)) is not None
+    # With lenses that are known, and the origin elsewhere.
+    assert main([*words[:5], "--lens", str(out), "--origin", "04", "--json"]) == 0
+    known = json.loads(capsys.readouterr().out)
+    assert known["cam1"]["K"] == json.loads(out.read_text())["cam1"]["K"]
+    assert known["cam1"]["t_world_to_cam"] != json.loads(out.read_text())["cam1"]["t_world_to_cam"]
+
+
+def test_videos_give_the_moments_at_which_the_target_stood_still(tmp_path):
+    """Half a second still, half a second moving, in turn."""
+    places = boards(9)
+    for name in ("cam1", "cam2"):
+        video = cv2.VideoWriter(str(tmp_path / f"{name}.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (640, 480))
+        for k in range(40):
+            at, part = divmod(k, 5)
+            board = places[at + 1].copy()
+            if at % 2:  # carried past
+                board[:3, 3] += [0.0, 0.03 * part, 0.0]
+            video.write(cv2.cvtColor(photo(name, board, 2.0, k), cv2.COLOR_GRAY2BGR))
+        video.release()
+    views = rig_inputs.read_folder(tmp_path, parse_target(BOARD), lambda done: None)
+    assert views.sizes == {"cam1": (640, 480), "cam2": (640, 480)}
+    for seen in views.corners.values():
+        assert seen and set(seen) <= {"0.1s", "1.1s", "2.1s", "3.1s"}
+
+
+def test_a_live_session_keeps_each_new_place_once_the_target_rests():
+    target = parse_target(BOARD)
+    places = boards(3)
+    frames = {n: iter([photo(n, b, 2.0, k) for b in places for k in range(3)]) for n in ("cam1", "cam2")}
+    said: list[str] = []
+
+    def grab(name):
+        try:
+            return next(frames[name])
+        except StopIteration:
+            raise KeyboardInterrupt from None
+
+    views = rig_inputs.watch({n: lambda n=n: grab(n) for n in frames}, target, None, said.append)
+    assert len(said) == len(places) and views.sizes["cam1"] == (640, 480)
+    assert said[-1] == f"cam1 {len(views.corners['cam1'])}, cam2 {len(views.corners['cam2'])}"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "expected one of FOLDER"),
+        (["{folder}"], "--board SPEC"),
+        (["{folder}/none", "--board", BOARD], "no such folder"),
+        (["{folder}/cam0", "--board", BOARD], "for each of at least two cameras, found 0"),
+        (["{folder}", "--board", BOARD], "cam0 never sees the target"),
+        (["--colmap", "{folder}"], "--length CAM CAM METERS"),
+        (["--colmap", "{folder}", "--length", "a", "b", "long"], "--length: expected meters"),
+        (["--live", "room", "--board", BOARD], "expected camera, oak or realsense"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line(words, message, tmp_path, capsys):
+    for name in ("cam0", "cam1"):
+        (tmp_path / name).mkdir()
+        cv2.imwrite(str(tmp_path / name / "1.png"), np.zeros((48, 64), np.uint8))
+    assert main(["calibrate", "rig", *(word.format(folder=tmp_path) for word in words)]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("camera-node: ") and message in error
+
+
+def test_a_colmap_model_is_scaled_by_a_known_length(tmp_path, capsys):
+    (tmp_path / "images").mkdir()
+    lines = []
+    for k, (name, pose) in enumerate(POSES.items(), 1):
+        cv2.imwrite(str(tmp_path / "images" / f"{name}.png"), np.zeros((480, 640), np.uint8))
+        to_camera = se3_inverse(pose)
+        turn = so3_log(to_camera[:3, :3])
+        half = np.linalg.norm(turn) / 2
+        q = [np.cos(half), *(np.sin(half) * turn / np.linalg.norm(turn))]
+        lines += [f"{k} {' '.join(map(str, [*q, *(to_camera[:3, 3] * 4)]))} 1 {name}.png", ""]
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
+    (tmp_path / "images.txt").write_text("\n".join(lines) + "\n")
+    apart = np.linalg.norm(POSES["cam0"][:3, 3] - POSES["cam2"][:3, 3])
+    out = tmp_path / "rig.json"
+    words = ["calibrate", "rig", "--colmap", str(tmp_path), "--length", "cam0", "cam2", f"{apart}", "--out", str(out)]
+    assert main(words) == 0
+    assert "a unit of the model is 0.25 m" in capsys.readouterr().out
+    for name, camera in load_calibration(out).items():
+        np.testing.assert_allclose(camera.pose.matrix(), POSES[name], atol=1e-6)
+    assert main([*words[:6], "cam9", f"{apart}"]) == 2
+    assert "no camera cam9; it has cam0" in capsys.readouterr().err
+
+
+def test_what_is_shown_warns_of_few_common_moments():
+    rig = RigCalibration(
+        POSES,
+        LENSES,
+        dict.fromkeys(POSES, 0.2),
+        dict.fromkeys(POSES, 1.0),
+        dict.fromkeys(POSES, 0.1),
+        {"00": np.eye(4)},
+        {("cam0", "cam1"): 9, ("cam1", "cam2"): 6, ("cam2", "cam3"): 2},
+        "00",
+        {},
+    )
+    notes = [line for line in rig.show().splitlines() if line.startswith("note")]
+    assert notes == ["note: cam3: shares few moments with any other camera: hold the target where two see it"]
