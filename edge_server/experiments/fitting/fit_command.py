@@ -36,7 +36,7 @@ from edge_server.experiments.scenes.recorded import MultiviewStill, load_recorde
 from edge_server.fidelity.images import Color, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Score, Scorer
-from edge_server.fields import Field, checkpoint
+from edge_server.fields import Field, RefinesCameras, checkpoint
 from edge_server.fields.registry import efforts_of, field_names, option_help, settings_of
 from edge_server.fields.splat.scan.settings import scan_options
 from edge_server.live.scoring_thread import to_bytes
@@ -287,6 +287,7 @@ class _Run:
         """Write checkpoint, images and report; returns report.json."""
         from edge_server.report.build_report import build_report  # draws with matplotlib
 
+        self._say_calibration()
         checkpoint.save(self.out / "field", self.model.state(), {**self._about(), "steps": self.spent_steps})
         _write_lines(self.out / "series.jsonl", self.rows)
         _write_lines(self.out / "processes.jsonl", self.processes)
@@ -298,6 +299,18 @@ class _Run:
         report = build_report(self.out)
         print(self.out / "report.html", flush=True)
         return report
+
+    def _say_calibration(self) -> None:
+        """Print and note what the corrections of a carried camera's poses have in common."""
+        if not (self.data.carried and isinstance(self.model, RefinesCameras)):
+            return
+        from edge_server.fields.common.cameras.constant_correction import constant_correction
+
+        refined = [(v, known) for v in self.data.training if (known := self.model.correction(v)) is not None]
+        found = constant_correction([v.camera_to_world for v, _ in refined], [k.camera_to_world for _, k in refined])
+        if found is not None:
+            print(found.words, flush=True)
+            self.request.chosen = "; ".join(filter(None, (self.request.chosen, found.words)))
 
     def _about(self) -> dict[str, Any]:
         return {
