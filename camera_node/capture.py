@@ -160,8 +160,8 @@ class Camera:
         return depth
 
     def _encode_depth(self, content: int, shot: Shot) -> EncodedDepth | None:
-        if isinstance(self.source, ScheduledSource):  # replayed as it came
-            return shot.encoded_depth
+        if isinstance(self.source, ScheduledSource):
+            return self.source.encoded_depth(content)
         wanted = content * DEPTH_STEP % 2**32 * self._depth_every < 2**32
         measured = self.source.depth(content, shot) if wanted else None
         return None if measured is None else measured.encode()

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import Protocol, runtime_checkable
 
+from freshfield.depth import EncodedDepth
+
 
 class CaptureSchedule(Protocol):
     """Numbered captures (ticks), each due at an instant of true time.
@@ -37,6 +39,10 @@ class ScheduledSource(Protocol):
     codec: str
 
     def schedule(self, start_ns: int) -> CaptureSchedule: ...
+
+    def encoded_depth(self, content: int) -> EncodedDepth | None:
+        """The depth that came with shot ``content``, as it came. ValueError: it is damaged."""
+        ...
 
 
 class RateSchedule:

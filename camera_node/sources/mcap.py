@@ -20,6 +20,7 @@ from camera_node.capture_schedule import CaptureSchedule, OnceSchedule
 from camera_node.settings import McapConfig, errors_of, find_data
 from camera_node.sources.base import Shot, Source, assign_cameras
 from camera_node.sources.datasets.records import DatasetError
+from freshfield.depth import EncodedDepth
 from freshfield.frame import CODEC_NAMES, pose_and_lens
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario
@@ -55,8 +56,11 @@ class ReplaySource(Source):
     def read(self, content: int) -> Shot:
         frame = self._frames[content]
         pose, lens = pose_and_lens(frame.header)
-        depth = self._session.depth(frame)
-        return Shot(self._session.payload(frame), pose, lens, frame.header.pose_gap_ns, encoded_depth=depth)
+        return Shot(self._session.payload(frame), pose, lens, frame.header.pose_gap_ns)
+
+    def encoded_depth(self, content: int) -> EncodedDepth | None:
+        """See ``ScheduledSource``."""
+        return self._session.depth(self._frames[content])
 
 
 def open_replay(scenario: Scenario, config: McapConfig, cameras: Sequence[str], data: Path | None) -> dict[str, Source]:

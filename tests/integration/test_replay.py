@@ -201,6 +201,27 @@ def test_a_recorded_run_replays_with_its_depth(tmp_path):
     assert len(got) == 4 and not any(request.HasField("depth") for request in got)
 
 
+@pytest.mark.stability
+def test_depth_that_cannot_be_read_again_costs_only_the_depth(tmp_path):
+    """The file is damaged after it was opened: within, checksums leave whole chunks out."""
+    camera = Camera(DepthSource("cam01", 2), WorldConfig(kind="world"), ShotCache(10**6), depth_every=1)
+    writer = SessionWriter(tmp_path / "a.mcap", {})
+    for k in range(2):
+        shot, at_ns = camera.capture(k), (k + 10) * 10**8
+        frame = Frame("cam01", "s", k, at_ns, shot.pose, shot.intrinsics, "jpeg", shot.payload)
+        writer.frame(to_request(replace(frame, depth=shot.encoded_depth)), at_ns + 5)
+    writer.close({})
+    scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam02": "y"})
+    (replayed,) = build_cameras(scenario, source_config(scenario), ["cam01"])
+    location = Session(tmp_path / "a.mcap").frames["cam01"][0].depth_location
+    with (tmp_path / "a.mcap").open("r+b") as file:
+        file.seek(location.offset + location.size // 2)
+        file.write(b"\xff" * (location.size - location.size // 2))
+    assert replayed.capture(0).payload == camera.capture(0).payload
+    assert replayed.capture(0).encoded_depth is None and replayed.depth_failed == 1
+    assert replayed.capture(1) == camera.capture(1) and replayed.depth_failed == 1
+
+
 @pytest.mark.slow
 def test_a_whole_edge_server_records_what_it_decides(tmp_path):
     """Decisions, and their scores when these are known, beside the frames they were made on."""
