@@ -68,7 +68,7 @@ class EdgeConfig(Settings, frozen=True):
     noisy_truth: the bound of moving pixels follows the noise of held-out frames.
     keyframes: null: earlier viewpoints do not go on supervising.
     embedding, foreground: an ``embed.EmbeddingConfig`` and a ``foreground.ForegroundConfig``, whose modules only a
-        scenario that has them imports.
+        scenario that has them imports; so with depth_network.
     """
 
     field: Annotated[str, about("the representation (edge_server.fields.registry)")] = FIELD
@@ -87,6 +87,9 @@ class EdgeConfig(Settings, frozen=True):
     embedding: Annotated[Any, about("for policies that look at what cameras see")] = None
     keyframes: Annotated[KeyframesConfig | None, about("earlier viewpoints of moving cameras go on supervising")] = None
     foreground: Annotated[Any, about("cuts the background out of every view")] = None
+    depth_network: Annotated[
+        str | None, about("ONNX of relative inverse depth for few fixed cameras, relative to the scenario")
+    ] = None
 
 
 def described(scenario: Scenario, config: EdgeConfig, moving: str) -> str:

@@ -29,6 +29,10 @@ import camera_node.synthetic.source
 from camera_node.synthetic import make_scene
 make_scene("tile", {"width": 16, "height": 16}).render("cam00", 0.0)
 """
+FEW_CAMERAS = """
+import edge_server.fields.splat.layers.layered_field
+import edge_server.fields.splat.layers.depth.depth_supervision
+"""
 EMULATOR = """
 import channel_emu.cli, channel_emu.live.frame_proxy
 import channel_emu.virtual.simulate
@@ -84,9 +88,10 @@ import channel_emu.virtual.simulate
                 "matplotlib",
             ),
         ),
+        (FEW_CAMERAS, ("edge_server.fields.splat.layers.depth.network_depth", "edge_server.embed", "onnx")),
         (EMULATOR, ("torch", "numba", "camera_node", "edge_server")),
     ],
-    ids=("edge", "node", "node without an arm", "tile", "emulator"),
+    ids=("edge", "node", "node without an arm", "tile", "few cameras", "emulator"),
 )
 def test_what_nobody_asks_for_is_not_imported(program: str, unasked: tuple[str, ...]) -> None:
     code = f"{program}\nimport sys\nprint([name for name in sys.modules if name.startswith({unasked})])"

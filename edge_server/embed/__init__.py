@@ -8,7 +8,8 @@ enables it; without that key this package is not imported.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +18,7 @@ from msgspec.structs import replace
 from freshfield.settings import Settings, about, read_settings, within
 
 if TYPE_CHECKING:
+    from edge_server.embed.depth_network import DepthNetwork
     from edge_server.embed.embedder import Embedder
 
 DEFAULT = "default"
@@ -57,17 +59,33 @@ def model_path(name: str) -> Path:
     return MODELS / DETECTOR if name == DEFAULT else Path(name)
 
 
+@contextmanager
+def onnx_libraries(what: str) -> Iterator[None]:
+    """For imports of ONNX's libraries. what: that needs them. EmbeddingError: they are not installed."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        library = (error.name or "").split(".")[0]
+        if library not in ("onnx", "onnxruntime"):
+            raise
+        raise EmbeddingError(
+            f"{what} needs {library}, which is not installed: pip install 'freshfield[embed]'"
+        ) from None
+
+
 def make_embedder(section: EmbeddingConfig) -> Embedder:
     """Create from a section. EmbeddingError: a library is not installed, the file is not a YOLO detector, or
     it cannot have this size."""
-    try:
+    with onnx_libraries("embedding"):
         from edge_server.embed.backbone import load_backbone
         from edge_server.embed.embedder import Embedder
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.split(".")[0] not in ("onnx", "onnxruntime"):
-            raise
-        raise EmbeddingError(
-            f"embedding needs {error.name.split('.')[0]}, which is not installed: pip install 'freshfield[embed]'"
-        ) from None
     backbone = load_backbone(model_path(section.model), section.tap, section.size)
     return Embedder(backbone, section.dim, section.threads)
+
+
+def open_depth_network(file: Path) -> DepthNetwork:
+    """The network of ``edge.depth_network``. EmbeddingError: a library is not installed, or the file holds no such
+    network."""
+    with onnx_libraries("a depth network"):
+        from edge_server.embed.depth_network import DepthNetwork
+    return DepthNetwork(file)

@@ -172,13 +172,13 @@ def parse_model(data: bytes, path: Path) -> onnx.ModelProto:
     try:
         model = onnx.load_model_from_string(data)
     except (DecodeError, ValueError, RuntimeError):
-        raise EmbeddingError(f"{path}: not an ONNX file, or cut short; export the detector again") from None
+        raise EmbeddingError(f"{path}: not an ONNX file, or cut short; export the model again") from None
     if not model.graph.node or not model.opset_import:
-        raise EmbeddingError(f"{path}: not an ONNX model; export the detector with format=onnx")
+        raise EmbeddingError(f"{path}: not an ONNX model; export the model again")
     if len(model.graph.node) > MAX_NODES:
         raise EmbeddingError(
-            f"{path}: has {len(model.graph.node)} nodes, more than any YOLO model ({MAX_NODES}); export the detector "
-            "again"
+            f"{path}: has {len(model.graph.node)} nodes, more than any network of images ({MAX_NODES}); export the "
+            "model again"
         )
     loops = sorted({n.op_type for n in model.graph.node for a in n.attribute if a.HasField("g") or a.graphs})
     if loops or model.functions:
@@ -189,9 +189,9 @@ def parse_model(data: bytes, path: Path) -> onnx.ModelProto:
     words = [w for n in model.graph.node for w in (n.op_type, n.name, *n.input, *n.output)]
     words += [named.name for part in (model.graph.initializer, model.graph.input) for named in part]
     if not all(isinstance(word, str) for word in words):  # bytes: no UTF-8
-        raise EmbeddingError(f"{path}: a damaged ONNX file; export the detector again")
+        raise EmbeddingError(f"{path}: a damaged ONNX file; export the model again")
     if any(t.data_location == TensorProto.EXTERNAL for t in model.graph.initializer):
-        raise EmbeddingError(f"{path}: its weights lie in a second file; export the detector as one file")
+        raise EmbeddingError(f"{path}: its weights lie in a second file; export the model as one file")
     return model
 
 

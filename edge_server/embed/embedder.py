@@ -6,20 +6,24 @@ import contextlib
 import functools
 import io
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError
-from edge_server.embed.backbone import OUTPUT, Backbone
+from edge_server.embed.backbone import MAX_FILE_BYTES, OUTPUT, Backbone, parse_model
 from edge_server.embed.letterbox import GRAY, blob, checked
 from freshfield.limits import MAX_MODEL_BYTES
+from freshfield.untrusted import read_bytes
 
 # Images per run if the model takes any number: larger batches exceed the caches and take longer per image.
 _BATCH = 4
 # Fixed, so that a model's embeddings do not depend on the scenario's seed.
 _PROJECTION_SEED = 20240631
+# What ONNX Runtime calls the types of images that are fed to models.
+INPUT_TYPES: dict[str, type[np.floating]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
 class Embedder:
@@ -85,6 +89,16 @@ class Embedder:
                 f"({len(part)}, {self.backbone.channels})"
             )
         return found
+
+
+def open_model(file: Path) -> ort.InferenceSession:
+    """Open the ONNX model in ``file``, which may come from anywhere. Raises EmbeddingError."""
+    try:
+        data = read_bytes(file, MAX_FILE_BYTES)
+    except OSError as error:
+        raise EmbeddingError(f"{file}: cannot be read: {error.strerror}; name a model in ONNX format") from None
+    parse_model(data, file)
+    return open_session(data, 1, str(file))
 
 
 def open_session(model: bytes, threads: int, name: str) -> ort.InferenceSession:

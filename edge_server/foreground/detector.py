@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError
-from edge_server.embed.backbone import MAX_FILE_BYTES, MAX_SIDE, exported_size, parse_model
-from edge_server.embed.embedder import open_session, reason_of
+from edge_server.embed.backbone import MAX_SIDE, exported_size
+from edge_server.embed.embedder import INPUT_TYPES, open_model, reason_of
 from edge_server.embed.letterbox import blob, checked
 from edge_server.foreground import MODELS, SHIPPED, ForegroundError
-from freshfield.untrusted import read_bytes
 
 Array = NDArray[np.float64]
 
@@ -30,7 +29,6 @@ NMS_IOU = 0.6
 _EXPORT = "yolo export model=yolo11n-seg.pt format=onnx"
 # Least and greatest score, with what float16 rounds.
 _SCORES = (-1e-3, 1.0 + 1e-3)
-_TYPES: dict[str, type[np.floating]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 # Boxes that enter non-maximum suppression, by score.
 _MOST = 300
 
@@ -53,11 +51,14 @@ class Detector:
     def __init__(self, path: str) -> None:
         file = MODELS / SHIPPED[path] if path in SHIPPED else Path(path)
         self.name = file.name
-        self._session = open_model(file)
+        try:
+            self._session = open_model(file)
+        except EmbeddingError as error:
+            raise ForegroundError(str(error)) from None
         image = self._session.get_inputs()[0]
-        if len(self._session.get_inputs()) != 1 or len(image.shape) != 4 or image.type not in _TYPES:
+        if len(self._session.get_inputs()) != 1 or len(image.shape) != 4 or image.type not in INPUT_TYPES:
             raise ForegroundError(f"{file}: expected a model of images (n, 3, height, width)")
-        self._input, self._dtype = image.name, _TYPES[image.type]
+        self._input, self._dtype = image.name, INPUT_TYPES[image.type]
         meta = self._session.get_modelmeta().custom_metadata_map
         self.height, self.width = _size(image.shape, meta, file)
         self.kinds = _kinds(meta)
@@ -191,18 +192,6 @@ def _end_to_end(meta: dict[str, str]) -> bool | None:
     if not any(each is not None for each in says):
         return None
     return any(str(each).lower() == "true" for each in says)
-
-
-def open_model(file: Path) -> Any:
-    """Open the ONNX model in ``file``. Raises ForegroundError."""
-    try:
-        data = read_bytes(file, MAX_FILE_BYTES)
-        parse_model(data, file)
-        return open_session(data, 1, str(file))
-    except OSError as error:
-        raise ForegroundError(f"{file}: cannot be read: {error.strerror}; name a model in ONNX format") from None
-    except EmbeddingError as error:
-        raise ForegroundError(str(error)) from None
 
 
 def _size(shape: list[Any], meta: dict[str, str], file: Path) -> tuple[int, int]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.embed import EmbeddingError
+from edge_server.embed import EmbeddingError, onnx_libraries
 from edge_server.foreground import SHIPPED, WHY, ForegroundConfig, ForegroundError
 
 if TYPE_CHECKING:
@@ -99,17 +99,11 @@ def clipped(box: tuple[float, float, float, float], width: int, height: int) -> 
 def make_foreground(config: ForegroundConfig) -> Foreground:
     """Create from a config. Raises ForegroundError: a library is not installed, or the model is unusable."""
     try:
-        from edge_server.foreground.detector import Detector
-
-        detector = Detector(config.detector)
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.split(".")[0] not in ("onnx", "onnxruntime"):
-            raise
-        package = error.name.split(".")[0]
-        what = "the shipped model" if config.detector in SHIPPED else "an ONNX model"
-        raise ForegroundError(
-            f"{what} needs {package}, which is not installed: pip install 'freshfield[embed]'"
-        ) from None
+        with onnx_libraries("the shipped model" if config.detector in SHIPPED else "an ONNX model"):
+            from edge_server.foreground.detector import Detector
+    except EmbeddingError as error:
+        raise ForegroundError(str(error)) from None
+    detector = Detector(config.detector)
     known = set(detector.kinds.values())
     if known and (unknown := set(config.kinds) - known):
         raise ForegroundError(

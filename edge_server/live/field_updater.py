@@ -6,8 +6,10 @@ the instant at which an update is published: fitting ages the scene as much as t
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +31,8 @@ if TYPE_CHECKING:  # imported at run time only where a policy is learned, or a s
     from edge_server.live.keyframes import Keyframes
     from edge_server.scheduler.learned.state import State
 
+
+log = logging.getLogger(__name__)
 
 INTAKE_SHARE = 0.4  # share of a budget in seconds for taking in new frames, if the field wants every frame
 LEAST_TAKEN = 4  # fewest new frames to take in, however short the budget is
@@ -267,7 +271,7 @@ def open_updater(
 
     resumed: the field has been trained before (see ``Keyframes``).
     embedder: one that several runs share; None opens the scenario's.
-    Nothing of embedder, keyframes and foreground is imported unless asked for. Raises ScenarioError.
+    Nothing of embedder, keyframes, foreground and depth network is imported unless asked for. Raises ScenarioError.
     """
     keyframes = _keyframes(config, resumed)
     foreground: Foreground | None = None
@@ -280,12 +284,28 @@ def open_updater(
         except ForegroundError as error:
             raise ScenarioError(f"{scenario.path}: edge.foreground: {error}") from None
     try:
+        if config.depth_network is not None:
+            _use_depth_network(field, scenario.path.parent / config.depth_network)
         embedder = embedder or open_embedder(embedding_for(config, policy))
         buffer = FrameBuffer(scenario.training)
         on_arrivals = config.updates == "arrivals"
         return FieldUpdater(buffer, policy, field, start_ns, embedder, keyframes, foreground, on_arrivals)
     except ValueError as error:
         raise ScenarioError(f"{scenario.path}: edge: {error}") from None
+
+
+def _use_depth_network(field: Field, file: Path) -> None:
+    """Open it, where the field can use one: ``splat`` in layers. ValueError: the file holds none."""
+    from edge_server.embed import open_depth_network
+
+    use = getattr(field, "use_depth_network", None)
+    if use is None:  # of a run that is resumed cameras may have begun to move
+        log.warning("edge.depth_network is left unused: only splat in layers, of cameras that stand still, can use one")
+        return
+    try:
+        use(open_depth_network(file))
+    except ValueError as error:
+        raise ValueError(f"depth_network: {error}") from None
 
 
 def _keyframes(config: EdgeConfig, resumed: bool = False) -> Keyframes | None:

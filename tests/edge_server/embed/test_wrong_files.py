@@ -112,7 +112,7 @@ BOMBS = {
         for kind in ("Expand", "Tile")
     },
     "concat": (joined_with_themselves, "larger than any backbone's"),
-    "chain": (long_chain, "10007 nodes, more than any YOLO model"),
+    "chain": (long_chain, "10007 nodes, more than any network of images"),
     "padding": (padding, "larger than any backbone's"),
     "claims": (partial(empty_claims, dims=(2**20, 2**20)), "larger than any backbone's"),
     "small claims": (partial(empty_claims, dims=(1, 6, 8, 8)), "cannot load it"),

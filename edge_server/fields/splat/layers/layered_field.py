@@ -15,7 +15,7 @@ import logging
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -47,6 +47,9 @@ from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from freshfield.geometry import Pinhole
 
+if TYPE_CHECKING:
+    from edge_server.fields.splat.layers.depth.network_depth import Network, NetworkDepth
+
 log = logging.getLogger(__name__)
 
 Arrays = dict[str, NDArray]
@@ -70,9 +73,17 @@ class LayeredField:
         self.still = StillField(self.settings, self.pool)
         self.static = StaticLayer(self.still)
         self.part_s = PartTimes(self.now)
-        self.supervision = StaticSupervision(self.static, self.part_s)
+        self.depth_network: NetworkDepth | None = None
         self._frame_time = StepTimer()
         self.reset()
+
+    def use_depth_network(self, network: Network) -> None:
+        """Have a monocular network fill what neither sensors nor stereo find of the plates' depth."""
+        from edge_server.fields.splat.layers.depth.network_depth import NetworkDepth
+
+        self.depth_network = self.supervision.network = NetworkDepth(network)
+        if self.supervision.depth is not None:  # of a state that was loaded
+            self.supervision.depth.network = self.depth_network
 
     # --- the protocol -------------------------------------------------------------------------
 
@@ -86,7 +97,7 @@ class LayeredField:
         self.layered = True  # False: a camera moves, or its frames are none for layers
         self.refused: set[str] = set()  # cameras whose newest frame shows something else than their plate
         self.origin_ns: int | None = None
-        self.supervision = StaticSupervision(self.static, self.part_s)
+        self.supervision = StaticSupervision(self.static, self.part_s, self.depth_network)
         self._published: SplatSnapshot | None = None
         self._exposed: tuple[SplatSnapshot, bytes, Gaussians] | None = None  # see ``_at_present_exposure``
 
@@ -261,7 +272,7 @@ class LayeredField:
             self.still.view_store.forget_views()
         self.layered = False
         self._published, self.tracker, self.observations = None, None, Observations()
-        self.cameras, self.supervision = {}, StaticSupervision(self.static, self.part_s)
+        self.cameras, self.supervision = {}, StaticSupervision(self.static, self.part_s, self.depth_network)
 
     def _take_in(self, views: Sequence[View]) -> list[View]:
         """Plates and foregrounds of the views not seen before. Returns these views."""

@@ -25,6 +25,7 @@ from edge_server.fields.splat.snapshot import SplatSnapshot
 if TYPE_CHECKING:
     from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate
     from edge_server.fields.splat.layers.depth.depth_supervision import CameraPlates, DepthSupervision
+    from edge_server.fields.splat.layers.depth.network_depth import NetworkDepth
 
 log = logging.getLogger(__name__)
 
@@ -44,8 +45,9 @@ class StaticSupervision:
     earlier: what the static field showed before it began anew; None if it has become better than that.
     """
 
-    def __init__(self, static: StaticLayer, times: PartTimes) -> None:
-        self.static, self.times = static, times
+    def __init__(self, static: StaticLayer, times: PartTimes, network: NetworkDepth | None = None) -> None:
+        """network: of monocular depth, where the user has one."""
+        self.static, self.times, self.network = static, times, network
         self.plates_s = self.fine_s = -np.inf
         self.fine = False
         self.exposure_rounds = 0
@@ -89,7 +91,7 @@ class StaticSupervision:
             from edge_server.fields.splat.layers.depth.depth_supervision import DepthSupervision, warm_up
 
             warm_up()
-            self.depth = DepthSupervision(self.static.field.settings, self.static.field.pool)
+            self.depth = DepthSupervision(self.static.field.settings, self.static.field.pool, self.network)
         return self.depth
 
     def trusts_depth(self, camera: str) -> bool:
@@ -108,9 +110,10 @@ class StaticSupervision:
         return 2 * len(known) >= max(len(observed), 1) and all(known)
 
     def _stereo_helps(self, cameras: Cameras) -> bool:
-        """Whether no camera has measured depth, and few of them see the scene."""
+        """Whether few cameras see the scene, and less than half of them have measured depth."""
         few = tuned.LEAST_CAMERAS <= len(cameras) <= tuned.STEREO_CAMERAS
-        return few and not any(c.depth is not None and c.depth.count.any() for c in cameras.values())
+        measure = sum(c.depth is not None and bool(c.depth.count.any()) for c in cameras.values())
+        return few and 2 * measure < len(cameras)
 
     # --- when layers begin --------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,9 @@ from edge_server.fields.splat.layers.plates import Plate
 from edge_server.fields.splat.layers.static_layer import PlateImage
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import Pinhole
+
+if TYPE_CHECKING:
+    from edge_server.fields.splat.layers.depth.network_depth import NetworkDepth
 
 log = logging.getLogger(__name__)
 
@@ -79,8 +82,9 @@ class DepthSupervision:
     stereo: of the plates; None where it was not needed.
     """
 
-    def __init__(self, settings: SplatSettings, pool: Pool) -> None:
-        self.settings, self.pool = settings, pool
+    def __init__(self, settings: SplatSettings, pool: Pool, network: NetworkDepth | None = None) -> None:
+        """network: fills what neither sensors nor stereo find."""
+        self.settings, self.pool, self.network = settings, pool, network
         self.wrong: tuple[str, ...] = ()
         self.corrections: dict[str, Correction] = {}
         self.scene: SurfaceScene | None = None
@@ -101,7 +105,9 @@ class DepthSupervision:
     def troubles(self) -> tuple[str, ...]:
         """What is wrong with poses and depth, for people."""
         against = [f"the depth of {name} contradicts the other cameras' and is not used" for name in self.wrong]
-        return (*against, *(f"{name} {found}" for name, found in self.displaced.items()))
+        refused = {} if self.network is None else self.network.refused
+        unused = [f"the depth network is not used for {name}: {why}" for name, why in refused.items()]
+        return (*against, *(f"{name} {found}" for name, found in self.displaced.items()), *unused)
 
     def exposures(self, cameras: Sequence[CameraPlates]) -> Mapping[str, NDArray[np.float64]]:
         """Camera -> log of its exposure over the mean of all, (3,)."""
@@ -140,12 +146,8 @@ class DepthSupervision:
         surfaces = [self._corrected(c, measured.get(c.name)) for c in cameras]
         poses = [surface.pose for surface in surfaces]
         whole = _are_whole(cameras, surfaces)
-        if not whole and of_layers.LEAST_CAMERAS <= len(cameras) <= of_layers.STEREO_CAMERAS:
-            self.stereo = self.stereo or PlateStereo(self.pool)
-            self._sweep(self.stereo, cameras)
-            filled = self.stereo.fill({camera.name: surface for camera, surface in zip(cameras, surfaces)})
-            if filled is not None:
-                surfaces, whole = filled, True  # what stereo does not find no other camera sees either
+        if not whole and len(cameras) <= of_layers.STEREO_CAMERAS:
+            surfaces, whole = self._filled(cameras, surfaces)
         surfaces = [surface for surface in surfaces if surface.inverse.any()]
         plates = [
             camera.learned._replace(view=replace(camera.learned.view, camera_to_world=pose))
@@ -159,6 +161,21 @@ class DepthSupervision:
     def _sweep(self, stereo: PlateStereo, cameras: Sequence[CameraPlates]) -> bool:
         distance_m = scene_box([camera.plate.view for camera in cameras]).distance_m
         return stereo.sweep({camera.name: self._corrected(camera, None) for camera in cameras}, distance_m)
+
+    def _filled(self, cameras: Sequence[CameraPlates], surfaces: list[Surface]) -> tuple[list[Surface], bool]:
+        """The surfaces with depth by stereo and network where they have none. Whether what still has none is seen by no
+        other camera."""
+        whole, measured = False, [surface.inverse > 0 for surface in surfaces]
+        if len(cameras) >= of_layers.LEAST_CAMERAS:
+            self.stereo = self.stereo or PlateStereo(self.pool)
+            self._sweep(self.stereo, cameras)
+            filled = self.stereo.fill({camera.name: surface for camera, surface in zip(cameras, surfaces)})
+            if filled is not None:
+                surfaces, whole = filled, True
+        if self.network is not None:
+            surfaces = self.network.fill([camera.name for camera in cameras], surfaces, measured, self.pool)
+            whole = whole or _are_whole(cameras, surfaces)
+        return surfaces, whole
 
     def _corrected(self, camera: CameraPlates, measured: Surface | None) -> Surface:
         """What a camera sees, where it stands. measured: None: without depth."""

@@ -18,7 +18,7 @@ class Overlap(NamedTuple):
 
     of, seen_by: numbers of the two cameras.
     depth, measured: (N,), meters along the second camera's axis: of the point, and as it measures there; 0 unknown.
-    colors: (2, N, 3), the plates of both, steps of 255.
+    colors: (2, N, 3), the plates of both, steps of 255. pixels: (2, N), columns and rows in the second camera's image.
     """
 
     of: int
@@ -26,6 +26,7 @@ class Overlap(NamedTuple):
     depth: NDArray[np.float64]
     measured: NDArray[np.float64]
     colors: NDArray[np.float32]
+    pixels: NDArray[np.int64]
 
 
 def overlaps(surfaces: Sequence[Surface]) -> list[Overlap]:
@@ -50,7 +51,8 @@ def overlaps(surfaces: Sequence[Surface]) -> list[Overlap]:
             x, y = x[use], y[use]
             if len(x):
                 colors = np.stack([color[inside][use], theirs.color[y, x]])
-                found.append(Overlap(i, j, local[inside][use][:, 2], depths[j][y, x].astype(float), colors))
+                measured, pixels = depths[j][y, x].astype(float), np.stack([x, y])
+                found.append(Overlap(i, j, local[inside][use][:, 2], measured, colors, pixels))
     return found
 
 

@@ -116,3 +116,18 @@ SWEEP_DISTINCT = 0.02  # cost, in the same unit, by which depths must be better 
 SWEEP_AGREE = 0.05  # difference of log depth at which another camera confirms
 SWEEP_TRUSTED = 0.5  # least share of what stereo finds that sensors, where they measure, must confirm as far as that
 SWEEP_LEAST = 0.15  # least share of the plates whose depth stereo finds: .36 with two cameras of `room`
+
+# --- a depth network of the user's (network_depth) ---
+NETWORK_LEAST = 150  # pixels of a plate that must have another depth: fewer may lie on one small thing
+NETWORK_COLOR = 30.0  # of 255: what another camera knows is taken for a pixel whose color differs by less
+NETWORK_POINTS = 4096  # compared, with
+NETWORK_LINES = 512  # candidates for scale and shift, each through two of them
+NETWORK_AGREE = 0.1  # difference of log depth; aligned networks err by .05 to .08 indoors, by their publications
+NETWORK_TRUSTED = 0.6  # least share that must agree: of a wall's depth half would also agree with one constant
+NETWORK_BETTER = 0.75  # from so much on, stereo that it contradicts is taken for wrong: of `room` up to a fifth is
+NETWORK_NEAR = 0.15  # difference of log depth up to which it does not contradict
+NETWORK_SPREAD = 0.06  # share of the image's width within which its errors are taken to be alike
+NETWORK_BEYOND = 1.5  # farther, or nearer, than the known depths it is not believed by more than this factor
+NETWORK_NOISE = 0.015  # as NOISE, share of the median inverse depth
+NETWORK_EDGE_PX, NETWORK_STEP = 5, 0.12  # window, and share of inverse depth, of a step between surfaces
+NETWORK_END = 0.1  # of the step: what is not as near as this to one of its ends was blurred
