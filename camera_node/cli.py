@@ -28,6 +28,7 @@ EXAMPLES = """examples:
   camera-node simulate-arm cell                              a simulated arm for the scenario "cell"
   camera-node drive-arm cell                                 move its camera around the target
   camera-node teleop cell --stylus keyboard                  an operator moves it; or network:PORT
+  camera-node devices                                        cameras that are plugged in
   camera-node doctor cell                                    what is missing on this machine
 
 In the help of a command, [x] after an option is its default.
@@ -67,6 +68,12 @@ def main(arguments: list[str] | None = None) -> int:
     prepare.add_argument("-q", "--quiet", action="store_true", help="print only warnings")
     prepare.set_defaults(run=_prepare)
     calibrate_command.add_arguments(commands.add_parser("calibrate", help="hand-eye and intrinsic calibration"))
+    devices = commands.add_parser(
+        "devices",
+        help="list the cameras that are plugged in",
+        description="Lists the cameras that are plugged in: the kind of source, and what to write as source.devices.",
+    )
+    devices.set_defaults(run=_devices)
     arm_cli.add_commands(commands)
     _add_doctor(
         commands.add_parser(
@@ -154,6 +161,14 @@ def _open(args: argparse.Namespace, cache_mb: float) -> tuple[Scenario, list[Cam
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from None
     return scenario, cameras
+
+
+def _devices(_: argparse.Namespace) -> int:
+    from camera_node.sources.devices.connected import connected
+
+    for camera in connected():
+        print(f"{camera.kind:10} {camera.device or '-':24} {camera.about}")
+    return 0
 
 
 def _doctor(args: argparse.Namespace) -> int:

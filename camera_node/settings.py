@@ -174,12 +174,13 @@ class VideoConfig(RecordedConfig, frozen=True, kw_only=True):
 class LiveConfig(SourceConfig, frozen=True, kw_only=True):
     """Keys of all kinds with real cameras.
 
-    devices: serial numbers; for kind ``camera`` a number, path or address; needed if there is more than one.
+    devices: serial numbers; for kind ``camera`` a number, path or address (``camera-node devices``). Needed if there is
+        more than one.
     calibration: relative to the scenario; not given: intrinsics are the device's own, if it has any, and poses come
     from ``arm``.
     """
 
-    devices: Annotated[dict[str, str], about("camera -> its device")] = field(default_factory=dict)
+    devices: Annotated[dict[str, str | int], about("camera -> its device")] = field(default_factory=dict)
     width: Annotated[int, within(8, MAX_IMAGE_SIDE_PX, "requested pixels")] = 640
     height: Annotated[int, within(8, MAX_IMAGE_SIDE_PX, "requested pixels")] = 400
     exposure_us: Annotated[int, within(1, 10**6, "fixed exposure; not given: automatic")] | None = None
@@ -308,11 +309,14 @@ def source_config(scenario: Scenario) -> SourceConfig:
 def find_data(name: str, scenario: Scenario, base: Path | None, key: str = "data") -> Path:
     """Locate the file or folder ``name`` that the scenario gives as ``source.key``.
 
-    name: absolute, or relative to the data folder. base: the data folder (--data); None: $FRESHFIELD_DATA.
+    name: absolute, or relative to the scenario's folder, else to the data folder.
+    base: the data folder (--data); None: $FRESHFIELD_DATA.
     Raises ScenarioError if there is no data folder, or nothing at the path.
     """
     where = f"{scenario.path}: source.{key}"
     path = Path(name).expanduser()
+    if (beside := scenario.path.parent / path).exists():
+        return beside
     if not path.is_absolute():
         folder = base or (Path(os.environ["FRESHFIELD_DATA"]) if os.environ.get("FRESHFIELD_DATA") else None)
         if folder is None:

@@ -66,3 +66,11 @@ def test_data_is_found_below_the_folder_that_was_given(tmp_path, monkeypatch):
     assert find_data("set", scenario, None) == tmp_path / "set"
     with pytest.raises(ScenarioError, match="does not exist"):
         find_data("other", scenario, None)
+    # What lies beside the scenario comes first.
+    (tmp_path / "mine/set").mkdir(parents=True)
+    mine = parse({"cameras": {"count": 2}}, tmp_path / "mine/s.yaml")
+    assert find_data("set", mine, tmp_path) == tmp_path / "mine/set"
+
+
+def test_devices_may_be_numbers_as_people_write_them():
+    assert config(kind="camera", devices={"a": 0, "b": "/dev/video2"}).devices == {"a": 0, "b": "/dev/video2"}

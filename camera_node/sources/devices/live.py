@@ -41,7 +41,8 @@ def open_feed(camera: str, config: LiveConfig, fps: Fraction, clock: Clock) -> F
     try:
         module, name = _DRIVERS[config.kind]
         driver = getattr(importlib.import_module(f"camera_node.sources.devices.{module}"), name)
-        opened: Feed = driver(camera, config.devices.get(camera), config, fps, clock)
+        device = config.devices.get(camera)
+        opened: Feed = driver(camera, None if device is None else str(device), config, fps, clock)
         return opened
     except Exception as error:
         raise as_camera_error(camera, error) from None

@@ -1,0 +1,33 @@
+"""The list of cameras that are plugged in, on a machine of files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from camera_node.cli import main
+from camera_node.sources.devices.connected import Connected, connected
+
+
+def test_video_devices_are_listed_with_the_name_that_lasts(tmp_path: Path) -> None:
+    for number, index, name in ((0, 0, "HD Webcam"), (1, 1, "HD Webcam"), (10, 0, "Other")):
+        entry = tmp_path / f"sys/class/video4linux/video{number}"
+        entry.mkdir(parents=True)
+        (entry / "index").write_text(f"{index}\n")
+        (entry / "name").write_text(f"{name}\n")
+        (tmp_path / "dev").mkdir(exist_ok=True)
+        (tmp_path / f"dev/video{number}").touch()
+    links = tmp_path / "dev/v4l/by-id"
+    links.mkdir(parents=True)
+    (links / "usb-HD_Webcam-video-index0").symlink_to("../../video0")
+    found = [camera for camera in connected(tmp_path) if camera.kind == "camera"]
+    assert found == [
+        Connected("camera", "0", "HD Webcam; the same at every start: /dev/v4l/by-id/usb-HD_Webcam-video-index0"),
+        Connected("camera", "10", "Other"),
+    ]
+
+
+def test_kinds_without_a_camera_say_so(tmp_path: Path, capsys) -> None:
+    assert [camera.device for camera in connected(tmp_path) if camera.kind == "camera"] == [""]
+    assert main(["devices"]) == 0
+    kinds = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert list(dict.fromkeys(kinds)) == ["camera", "oak", "realsense"]
