@@ -38,6 +38,14 @@ GRADIENT_LIMIT = 1e6
 # no gradient. At least: a Gaussian ends where its alpha is lower.
 ALPHA_MAX, ALPHA_MIN = 0.99, 1.0 / 255.0
 
+# Semi-global matching (``kernels.semi_global``); found on the plates of `room` and of a recorded kitchen.
+SWEEP_BOUND = 0.15  # difference of a channel beyond which it does not matter how different
+SWEEP_UNSEEN = 0.5  # cost, in those of SWEEP_BOUND, where no other camera sees
+SWEEP_SECOND_OF, SWEEP_SECOND = 3, 0.3  # other cameras from which on the second best counts, and its share
+SWEEP_SMALL, SWEEP_LARGE = 0.03, 8.0  # penalties of one step of depth between neighbors, and of more
+SWEEP_EDGE = 10.0  # the latter falls to half at a change of gray of the inverse of this
+SWEEP_DISTINCT = 0.02  # cost, in the same unit, by which depths must be better than others: walls of one color are not
+
 ALIGN_EVERY = 5  # steps between two alignments with the rendered normals
 
 

@@ -1,15 +1,16 @@
 """The Gaussian field of a scan: many views, usually of one camera that is carried about, of a scene that stands still.
 
-First Gaussians lie on measured depth, where views bring some. Further ones come where the residual is large, at the
-depth that is rendered there. Each learns at a rate that falls with its own age. With ``refine``, each view has an
-exposure and a correction of its pose: both follow from sums that a step makes anyway.
+First Gaussians lie on measured depth, where views bring some, else on depth that a plane sweep of the views finds.
+Further ones come where the residual is large, at the depth that is rendered there. Each learns at a rate that falls
+with its own age. With ``refine``, each view has an exposure and a correction of its pose: both follow from sums that a
+step makes anyway.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from edge_server.fields import Correction, View
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections, normal_matrix
 from edge_server.fields.common.plane_sweep import foreground_mask
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.view_store import Arrays, same_views
 from edge_server.fields.splat.densification import GaussianCloud, opacity
 from edge_server.fields.splat.field import StillField
@@ -29,7 +31,11 @@ from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.discs import LEAST_SIDE, discs, filled, quadtree, usable_depth
 from edge_server.fields.splat.scan.exposures import Exposures
 from edge_server.fields.splat.scan.refined_cameras import RefinedCameras, ScanSnapshot
+from edge_server.fields.splat.scan.sweep import sweep_depth
 from edge_server.fields.splat.settings import PRUNE_OPACITY
+from freshfield.geometry import Pinhole
+
+T = TypeVar("T")
 
 
 class Shown(NamedTuple):
@@ -90,6 +96,7 @@ class ScanField(StillField):
             self.view_store.box = replace(box, near_m=tuned.NEAR_SHARE * distance_m)
         self._poses = PoseCorrections(tuned.MOST_SHARE * distance_m, tuned.MOST_DEG)
         self._exposures = Exposures()
+        self._seen_m = 0.0  # usual depth of what cameras see, where frames tell it and none measure it
         self._given: tuple[View, ...] = ()  # the newest views, with depth as it came
         self._rigid = np.zeros(6) if self.settings.refine else None
         self._rule: AdamParameters | None = None
@@ -105,8 +112,8 @@ class ScanField(StillField):
         if self._rigid is None:
             return
         assert self.view_store.box is not None
-        usual_m = self.view_store.box.distance_m
-        self._aims = [_aim(v, usual_m) for v in views]
+        seen_m = self._seen_m or self.view_store.box.distance_m
+        self._aims = [_aim(v, seen_m) for v in views]
         self._index = {v.camera: k for k, v in enumerate(views)}
         rows = [self._exposures.row(v.camera) for v in views]
         self._targets = self._targets._replace(exposure=np.stack(rows))
@@ -123,33 +130,64 @@ class ScanField(StillField):
         return self._rule
 
     def _counters(self) -> dict[str, Any]:
-        return {**super()._counters(), "poses": self._poses.meta(), "exposures": self._exposures.meta()}
+        return {
+            **super()._counters(),
+            "poses": self._poses.meta(),
+            "exposures": self._exposures.meta(),
+            "seen_m": self._seen_m,
+        }
 
     def _load(self, meta: dict[str, Any], state: Arrays) -> None:
         super()._load(meta, state)
         self._poses.load(meta["poses"])
         self._exposures.load(meta["exposures"])
+        self._seen_m = float(meta["seen_m"])
+
+    def _run_kernels(self, pool: Pool) -> None:
+        super()._run_kernels(pool)
+        lens, beside = Pinhole.from_fov(16, 16, 60.0), np.eye(4)
+        beside[0, 3] = 0.1  # of 1 m: parallax enough
+        views = [View("", np.zeros((16, 16, 3), np.uint8), pose, lens) for pose in (np.eye(4), beside)]
+        sweep_depth(views[0], views[1:], 1.0, pool)
 
     # --- Gaussians ----------------------------------------------------------------------------
 
     def _seed(self) -> None:
-        """Seed on measured depth, in the order of the views; without any, where the cameras agree on colors."""
+        """Seed on measured depth, in the order of the views; without any, on what a plane sweep finds; without that
+        either, where the cameras agree on colors."""
         measured = [view for view in self._views if view.depth is not None]
-        if not measured:
+        views = _some(measured, tuned.SEED_VIEWS) or self._swept()
+        if not views:
             return super()._seed()
         self.cloud = GaussianCloud.empty(self.settings)
-        some = np.unique(np.linspace(0, len(measured) - 1, tuned.SEED_VIEWS).astype(int))
-        for view in (measured[k] for k in some):
-            self._add(self._seeds_of(view))
+        for view in views:
+            self._add(self._seeds_of(view, nearer=bool(measured)))
 
-    def _seeds_of(self, view: View, shown: Shown | None = None) -> NDArray[np.float32]:
-        """Gaussians where the field lacks the surface that a view measures, or shows none at all.
+    def _swept(self) -> list[View]:
+        """Views with depth that others tell, see ``sweep_depth``: none where poses tell nothing. Also learns how far
+        away is what cameras see."""
+        box = self.view_store.box
+        assert box is not None
+        posed = [replace(view, camera_to_world=self._pose_of(view)) for view in self._views]
+        some = _some(range(len(posed)), tuned.SWEPT_VIEWS)
+        depths = [sweep_depth(posed[k], posed, box.distance_m, self.pool) for k in some]
+        found = [replace(self._views[k], depth=usable_depth(depth)) for k, depth in zip(some, depths)]
+        found = [view for view in found if view.depth is not None]
+        if found:
+            self._seen_m = float(np.median([np.median(v.depth[v.depth > 0]) for v in found]))  # type: ignore[index]
+        return found
 
-        shown: what its camera sees; None: it is rendered here."""
+    def _seeds_of(self, view: View, shown: Shown | None = None, nearer: bool = True) -> NDArray[np.float32]:
+        """Gaussians where the field shows no surface.
+
+        shown: what the view's camera sees; None: it is rendered here.
+        nearer: also where what a view measures lies before what is shown. Sensors hardly find surfaces that are none,
+            sweeps do.
+        """
         assert view.depth is not None
         shown, depth = shown or self._look(view), view.depth
         behind = shown.depth > depth * np.float32(1.0 + tuned.BEHIND_SHARE) + np.float32(tuned.BEHIND_M)
-        wanted = (shown.opacity < tuned.COVERED) | (behind & (depth > 0))
+        wanted = (shown.opacity < tuned.COVERED) | (behind & (depth > 0) & nearer)
         color, there = self._as_rendered(view)
         leaves = quadtree(color, wanted & there, tuned.CELLS, tuned.DETAIL)
         at = tuple(np.minimum(k + leaves.side // 2, n - 1) for k, n in zip((leaves.row, leaves.column), depth.shape))
@@ -227,9 +265,16 @@ class ScanField(StillField):
         return color.astype(np.float32), there if view.weight is None else there & (view.weight > 0)
 
 
-def _aim(view: View, usual_m: float) -> tuple[NDArray[np.float64], float]:
-    """What ``PoseCorrections.descend`` needs of a view: the normal matrix, and the shift of a pixel in meters."""
-    depth = np.full(view.image.shape[:2], usual_m, np.float32)
+def _some(items: Sequence[T], most: int) -> list[T]:
+    """At most so many, spread evenly."""
+    return [items[k] for k in np.unique(np.linspace(0, len(items) - 1, most).astype(int))] if items else []
+
+
+def _aim(view: View, seen_m: float) -> tuple[NDArray[np.float64], float]:
+    """What ``PoseCorrections.descend`` needs of a view: the normal matrix, and the shift of a pixel in meters.
+
+    seen_m: depth, where none is measured."""
+    depth = np.full(view.image.shape[:2], seen_m, np.float32)
     if view.depth is not None:
         depth = filled(view.depth)
     return normal_matrix(view, depth), float(np.median(depth)) / view.intrinsics.fx

@@ -28,6 +28,18 @@ WIDTH, FLATNESS, OPACITY = 0.6, 0.2, 0.8  # a seed's standard deviation in sides
 STEEPEST = 0.3  # least cosine to the view: nothing is stretched along a surface further than this says
 GUESSED_OPACITY = 0.5  # of seeds at a depth that is guessed
 
+# --- depth by plane sweep, where none is measured (sweep); found on redkitchen, against its depth camera ---
+SWEPT_VIEWS = 40  # from at most so many
+SWEPT_PIXELS = 20_000  # of an image that is matched as it is; larger ones are matched smaller
+SWEPT_STEPS = 64  # inverse depths, from 0
+SWEPT_NEAR = 0.3  # nearest depth, share of the distance to the scene
+SWEPT_WITH = 4  # other views
+SWEPT_ANGLES_DEG = 1.0, 5.0, 30.0  # parallax of another view: least, best, most
+SWEPT_FACING, SWEPT_TURNED = 0.8, 3.0  # least cosine between two views' axes; what a turn costs in log parallax
+SWEPT_BLUR_PX = 0.7  # interpolation blurs the other image about as much
+CONTRAST_PX = 4.0  # standard deviation of the window by whose mean and contrast an image is normalized
+CONTRAST_NOISE, CONTRAST_GAIN = 0.02, 0.2  # contrast that is noise, of 1; a deviation of one contrast becomes so much
+
 # --- growth where the residual is large ---
 GROW_EVERY = 10  # steps
 GROWN_ERROR = 0.08  # color error, blurred over 3 x 3 pixels, above which detail is missing

@@ -1,4 +1,4 @@
-"""Depth of plates by stereo, where no sensor measures it: see ``kernels.semi_global``."""
+"""Depth of plates by stereo, where no sensor measures it: see ``stereo``."""
 
 from __future__ import annotations
 
@@ -10,20 +10,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.camera_rows import camera_rows
-from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.fields.splat.kernels.semi_global import UNKNOWN
 from edge_server.fields.splat.layers.depth import settings as tuned
 from edge_server.fields.splat.layers.depth.depth_plate import smooth
-from edge_server.fields.splat.layers.depth.kernels.semi_global import (
-    UNKNOWN,
-    aggregate_paths,
-    choose_depths,
-    match_costs,
-)
 from edge_server.fields.splat.layers.depth.surfaces import Surface
 from edge_server.fields.splat.layers.settings import CHANGED, SAME_POSE
-from freshfield.geometry import Pinhole, se3_inverse
+from edge_server.fields.splat.stereo import match_depths
+from freshfield.geometry import Pinhole
 
 Image = NDArray[np.float32]
 
@@ -122,25 +116,16 @@ class PlateStereo:
         return [other for other, px in parallax_px.items() if px / nearest_m >= tuned.SWEEP_LEAST_PX]
 
     def _match(self, name: str, lenses: Mapping[str, Pinhole]) -> Image:
-        """Sweep a camera: inverse depth, float32 (H, W), 1 / m, 0 where none fits best. See ``match_costs``."""
+        """Sweep a camera: inverse depth, float32 (H, W), 1 / m, 0 where none fits best."""
         image, lens, others = self._images[name], lenses[name], self._compared(name, lenses)
         if not others:
             return np.zeros(image.shape[1:], np.float32)
         flat = np.zeros((len(others), 3, max(self._images[other][0].size for other in others)), np.float32)
         for row, other in zip(flat, others):
             row[:, : self._images[other][0].size] = self._images[other].reshape(3, -1)
-        here = se3_inverse(self._poses[name])
-        cameras = camera_rows([here @ self._poses[o] for o in others], [lenses[o] for o in others], UNIT_BOX)
+        cameras = [(self._poses[other], lenses[other]) for other in others]
         steps = np.linspace(0.0, 1.0 / (tuned.SWEEP_NEAR * self._distance_m), tuned.SWEEP_STEPS).astype(np.float32)
-        rays = lens.rays()
-        ray_x, ray_y = (np.ascontiguousarray(rays[..., k] / rays[..., 2], dtype=np.float32) for k in (0, 1))
-        cost = np.empty((*ray_x.shape, steps.size), np.uint8)
-        self.pool.run(match_costs, image, flat, cameras, ray_x, ray_y, steps, cost)
-        total = np.empty((2, *cost.shape), np.uint16)
-        self.pool.run(aggregate_paths, cost, np.minimum(image.max(axis=0), 1.0), total)
-        found = np.empty(ray_x.shape, np.float32)
-        self.pool.run(choose_depths, total, steps, found)
-        return np.where((found > 0.5 * steps[1]) & (image[0] <= 1.0), found, 0.0).astype(np.float32)
+        return match_depths(image, self._poses[name], lens, flat, cameras, steps, self.pool)
 
     # --- state --------------------------------------------------------------------------------
 

@@ -82,8 +82,9 @@ def test_exact_poses_are_hardlyspoiled() -> None:
     assert refined_db is not None and refined_db > plain_db - 0.3
 
 
-def test_it_resumes_bit_for_bit_whatever_the_number_of_threads() -> None:
-    training = _split(spoiled(WALK))[0]
+@pytest.mark.parametrize("depth", [True, False])
+def test_it_resumes_bit_for_bit_whatever_the_number_of_threads(depth: bool) -> None:
+    training = _split(spoiled(WALK if depth else walk(depth=False)))[0]
     fields = [ScanField(replace_settings(threads)) for threads in (2, 1, 2)]
     for field in fields[:2]:
         field.fit(training, Budget(steps=60))

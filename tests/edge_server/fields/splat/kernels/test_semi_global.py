@@ -9,14 +9,8 @@ from numpy.typing import NDArray
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
-from edge_server.fields.splat.layers.depth import settings as tuned
-from edge_server.fields.splat.layers.depth.kernels.semi_global import (
-    COST,
-    UNKNOWN,
-    aggregate_paths,
-    choose_depths,
-    match_costs,
-)
+from edge_server.fields.splat import settings as tuned
+from edge_server.fields.splat.kernels.semi_global import COST, UNKNOWN, aggregate_paths, choose_depths, match_costs
 from freshfield.geometry import Pinhole, look_at, se3_inverse
 
 WIDTH, HEIGHT, STEPS = 21, 18, 11
