@@ -170,12 +170,11 @@ class ScanField(StillField):
         assert box is not None
         posed = [replace(view, camera_to_world=self._pose_of(view)) for view in self._views]
         some = _some(range(len(posed)), tuned.SWEPT_VIEWS)
-        depths = [sweep_depth(posed[k], posed, box.distance_m, self.pool) for k in some]
-        found = [replace(self._views[k], depth=usable_depth(depth)) for k, depth in zip(some, depths)]
-        found = [view for view in found if view.depth is not None]
+        depths = [usable_depth(sweep_depth(posed[k], posed, box.distance_m, self.pool)) for k in some]
+        found = {k: depth for k, depth in zip(some, depths) if depth is not None}
         if found:
-            self._seen_m = float(np.median([np.median(v.depth[v.depth > 0]) for v in found]))  # type: ignore[index]
-        return found
+            self._seen_m = float(np.median([np.median(depth[depth > 0]) for depth in found.values()]))
+        return [replace(self._views[k], depth=depth) for k, depth in found.items()]
 
     def _seeds_of(self, view: View, shown: Shown | None = None, nearer: bool = True) -> NDArray[np.float32]:
         """Gaussians where the field shows no surface.

@@ -64,7 +64,7 @@ def sweep_depth(view: View, others: Sequence[View], distance_m: float, pool: Poo
     inverse = match_depths(image, view.camera_to_world, lens, flat, cameras, steps, pool)
     depth = np.where(inverse > 0, 1.0 / np.where(inverse > 0, inverse, 1.0), 0.0).astype(np.float32)
     size = (view.intrinsics.width, view.intrinsics.height)
-    return cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32)
 
 
 def _prepare(view: View) -> tuple[NDArray[np.float32], Pinhole]:
