@@ -137,7 +137,8 @@ class LayeredField:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
         pace = StepBudget(budget, self.now)
         for view in views:
-            check_view(view)
+            if not self._has_seen(view):
+                check_view(view)
         if self.layered and (reasons := [why for view in views if (why := self._unfit_for_layers(view))]):
             self._give_up_layers(reasons[0])
         if not self.layered:
@@ -165,7 +166,7 @@ class LayeredField:
         self.supervision.compare(self.cameras, self.observations, beside)
         self._find_rows()
         parameters = self.still.adam_parameters(tuned.STEP_PROGRESS)
-        steps, rays, samples = tracker.follow(pace, self._publish, parameters)
+        steps, rays, samples = tracker.follow(pace, parameters)
         loss = 0.0
         if not beside:
             begun = self.now()

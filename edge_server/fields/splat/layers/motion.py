@@ -30,7 +30,7 @@ from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.kernels.solve import BAND, PAIRS, add_row, add_span, solve_knots
 
 WINDOW = tuned.FREE + tuned.FIXED
-_KEPT = ("anchors", "_knots", "_first", "_band")  # of a state
+_KEPT = ("anchors", "_knots", "_first")  # of a state
 # x(k) = x(k-1) + v + r a as differences[0] x(k-3) + ... + differences[3] x(k) = 0
 DIFFERENCES = np.array([-tuned.PERSISTENCE, 1.0 + 2.0 * tuned.PERSISTENCE, -2.0 - tuned.PERSISTENCE, 1.0])
 
@@ -81,9 +81,10 @@ class Motion:
         self.anchors: NDArray[np.float64] | None = None
         self._knots = np.zeros((WINDOW, 0, 3))  # displacements
         self._first = 0  # number of the first knot: its instant times KNOTS_PER_S
+        self._latest: tuple[float, NDArray, NDArray] = (np.nan, self._knots, self._knots)  # of ``at``
         self._reach = 0.3  # typical distance from an anchor to the next
         self._laplacian = np.zeros((0, 0))  # (K, K), of the graph of neighbors
-        self._band = np.zeros((0, BAND, 0, 0), np.float32)  # see ``kernels.solve``, of the last solution
+        self._band = np.zeros((0, BAND, 0, 0), np.float32)  # memory of ``solve``, see ``kernels.solve``
         self._spans: list[_Span] = []
 
     @property
@@ -114,9 +115,13 @@ class Motion:
         return base, w
 
     def at(self, instant_s: float) -> NDArray[np.float64]:
-        """Displacements (K, 3) of the anchors at an instant, scene units."""
-        base, w = self.weights(instant_s)
-        return np.einsum("k,kac->ac", w, self._knots[base : base + 4])
+        """Displacements (K, 3) of the anchors at an instant, scene units; not to be written into."""
+        known_s, knots, found = self._latest
+        if known_s != instant_s or knots is not self._knots:
+            base, w = self.weights(instant_s)
+            found = np.einsum("k,kac->ac", w, self._knots[base : base + 4])
+            self._latest = (instant_s, self._knots, found)
+        return found
 
     def attach(self, points: NDArray[np.floating], instant_s: float) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """The three nearest anchors of points (N, 3) at an instant, int64 (N, 3), and their shares, float32
@@ -133,7 +138,7 @@ class Motion:
         self, points: NDArray[np.float32], anchor: NDArray[np.int64], share: NDArray[np.float32], instant_s: float
     ) -> NDArray[np.float32]:
         """Places (N, 3) of points (N, 3) at an instant. anchor, share: see ``attach``."""
-        moved = np.einsum("nm,nmc->nc", share, self.at(instant_s).astype(np.float32)[anchor])
+        moved = np.einsum("nm,nmc->nc", share, self.at(instant_s).astype(np.float32).take(anchor, axis=0))
         return (points + moved).astype(np.float32)
 
     def choose_anchors(
@@ -194,7 +199,7 @@ class Motion:
         assert self.anchors is not None
         count = len(self.anchors)
         spans = self._sums(rows)
-        self._band = np.zeros((WINDOW, BAND, 3 * count, 3 * count), np.float32)
+        self._band.fill(0.0)  # allocating it costs more: with 48 anchors it has 4 MB
         right = np.zeros((WINDOW, 3 * count))
         for span in spans:
             self.pool.run(add_span, span.base, span.blocks, span.right, self._band, right)
@@ -238,7 +243,7 @@ class Motion:
 
     def copy(self) -> Motion:
         """A copy that later changes of this one do not reach."""
-        return copy.copy(self)  # arrays are replaced as a whole, never written into
+        return copy.copy(self)  # but for the memory of ``solve``, arrays are replaced as a whole, never written into
 
     def state(self) -> dict[str, NDArray]:
         """All of it as plain arrays. Without anchors there are none."""

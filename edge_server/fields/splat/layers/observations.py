@@ -199,7 +199,7 @@ class Observations:
 
 
 def _same_pose(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
-    return bool(np.allclose(a, b, atol=tuned.SAME_POSE))
+    return bool((np.abs(a - b) <= tuned.SAME_POSE).all())
 
 
 def pixel_weights(

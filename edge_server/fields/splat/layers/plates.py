@@ -118,7 +118,7 @@ class Plate:
         votes = np.ones_like(foreground)
         if self.count > 0:
             foreground = clean_mask(self._flags & np.uint8(FOREGROUND))
-            if may_refuse and foreground.mean() > tuned.REFUSED_SHARE:
+            if may_refuse and cv2.countNonZero(foreground) > tuned.REFUSED_SHARE * foreground.size:
                 vars(self).update(before)  # what ``_scale`` has replaced
                 return None
             changing = clean_mask(self._flags & np.uint8(CHANGING)) if self.count > 1 else foreground
@@ -276,7 +276,8 @@ def clean_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     keep = (stats[:, cv2.CC_STAT_AREA] >= tuned.SPECK).astype(np.uint8)
     keep[0] = 0
     by = tuned.CLOSE
-    part = cv2.copyMakeBorder(keep[label], by, by, by, by, cv2.BORDER_CONSTANT, value=0)
+    kept = keep.take(np.asarray(label, np.int32))
+    part = cv2.copyMakeBorder(kept, by, by, by, by, cv2.BORDER_CONSTANT, value=0)
     ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (by, by))
     part = cv2.morphologyEx(part, cv2.MORPH_CLOSE, ellipse)[by:-by, by:-by]
     _, label, stats, _ = cv2.connectedComponentsWithStats(1 - part, connectivity=4)
@@ -290,5 +291,5 @@ def clean_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     )
     fill = ((stats[:, cv2.CC_STAT_AREA] <= tuned.HOLE * mask.size) & ~goes_on).astype(np.uint8)
     fill[0] = 0
-    out[top:bottom, left:right] = part | fill[label]
+    out[top:bottom, left:right] = part | fill.take(np.asarray(label, np.int32))
     return out

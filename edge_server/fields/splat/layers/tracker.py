@@ -47,11 +47,11 @@ class MotionTracker:
         self.fits = 0
         self._step_time, self._seed_time = StepTimer(), StepTimer()
 
-    def follow(self, pace: StepBudget, publish: Callable[[], None], parameters: AdamParameters) -> tuple[int, int, int]:
+    def follow(self, pace: StepBudget, parameters: AdamParameters) -> tuple[int, int, int]:
         """Estimate motion, seed Gaussians where they are missing, train appearance. Returns steps, pixels and
         pairs.
 
-        publish: called when motion is known. parameters: for optimizer steps.
+        parameters: for optimizer steps.
         """
         moving, newest_s = self.moving, self.observations.newest_s
         self.fits += 1
@@ -70,8 +70,6 @@ class MotionTracker:
                     break
             for o in self.observations:
                 o.fresh &= o.instant_s > until_s
-        if moving.alive:
-            publish()
         since_s, begun = newest_s - self.seeded_s, self.times.now()
         has_room = pace.has_room(self._seed_time.seconds, 1.0, 0.0) or since_s >= tuned.SEED_AT_LEAST_EVERY_S
         every_s = tuned.FEW_SEED_EVERY_S if moving.few else tuned.SEED_EVERY_S
