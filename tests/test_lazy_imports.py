@@ -39,58 +39,34 @@ import channel_emu.virtual.simulate
 """
 
 
+UNASKED = {
+    EDGE: (
+        *(
+            f"edge_server.{room}"
+            for room in ("embed", "foreground", "live.depth_in_image", "live.keyframes", "surface")
+        ),
+        *("edge_server.fields.splat.planar", "onnx", "skimage", "matplotlib", "mcap", "torch"),
+    ),
+    NODE: (
+        *("camera_node.robot.teleop", "camera_node.robot.calibration.hand_eye.samples", "scipy", "mcap"),
+        *("torch", "numba", "matplotlib", "edge_server", "channel_emu", "depthai", "pyrealsense2", "rtde"),
+    ),
+    NODE_WITHOUT_ARM: (
+        *(f"camera_node.{room}" for room in ("pose", "robot.flange_camera", "sources.devices.live")),
+        *("rtde", "depthai"),
+    ),
+    TILE: (
+        *("camera_node.synthetic.scenes.room", "camera_node.synthetic.person", "torch", "numba"),
+        *("edge_server", "channel_emu", "scipy", "matplotlib"),
+    ),
+    FEW_CAMERAS: ("edge_server.fields.splat.layers.depth.network_depth", "edge_server.embed", "onnx"),
+    EMULATOR: ("torch", "numba", "camera_node", "edge_server"),
+}
+
+
 @pytest.mark.parametrize(
     ("program", "unasked"),
-    [
-        (
-            EDGE,
-            (
-                "edge_server.embed",
-                "edge_server.foreground",
-                "edge_server.live.depth_in_image",
-                "edge_server.live.keyframes",
-                "edge_server.surface",
-                "edge_server.fields.splat.planar",
-                "onnx",
-                "skimage",
-                "matplotlib",
-                "mcap",
-                "torch",
-            ),
-        ),
-        (
-            NODE,
-            (
-                *("camera_node.robot.teleop", "camera_node.robot.calibration.hand_eye.samples", "scipy", "mcap"),
-                *("torch", "numba", "matplotlib", "edge_server", "channel_emu", "depthai", "pyrealsense2", "rtde"),
-            ),
-        ),
-        (
-            NODE_WITHOUT_ARM,
-            (
-                "camera_node.pose",
-                "camera_node.robot.flange_camera",
-                "camera_node.sources.devices.live",
-                "rtde",
-                "depthai",
-            ),
-        ),
-        (
-            TILE,
-            (
-                "camera_node.synthetic.scenes.room",
-                "camera_node.synthetic.person",
-                "torch",
-                "numba",
-                "edge_server",
-                "channel_emu",
-                "scipy",
-                "matplotlib",
-            ),
-        ),
-        (FEW_CAMERAS, ("edge_server.fields.splat.layers.depth.network_depth", "edge_server.embed", "onnx")),
-        (EMULATOR, ("torch", "numba", "camera_node", "edge_server")),
-    ],
+    UNASKED.items(),
     ids=("edge", "node", "node without an arm", "tile", "few cameras", "emulator"),
 )
 def test_what_nobody_asks_for_is_not_imported(program: str, unasked: tuple[str, ...]) -> None:

@@ -6,7 +6,6 @@ update: what a perfect field would show. Only learning and network are left out.
 
 from __future__ import annotations
 
-import json
 import threading
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Rendering
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication
-from edge_server.scheduler import POLICIES, make_policy
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.frame import Frame
@@ -50,25 +48,24 @@ class BallScene:
 class Preview:
     """The cameras and updates of the toy deployment, on a thread of its own."""
 
-    def __init__(self, folder: Path, cameras: int = CAMERAS, silent: int = 0) -> None:
-        """folder: for snapshots. silent: how many cameras never report. The middle one is held out."""
-        self._folder = folder
+    def __init__(self, silent: int = 0) -> None:
+        """silent: how many cameras never report. The middle one is held out."""
         self._clock = WallClock()
         self._stopped = threading.Event()
-        self.names = tuple(f"cam{i:02d}" for i in range(cameras))
-        self._reporting = self.names[: cameras - silent]
-        self._held_out = self.names[cameras // 2]
-        self._poses = {name: _arc(i, cameras) for i, name in enumerate(self.names)}
+        self.names = tuple(f"cam{i:02d}" for i in range(CAMERAS))
+        self._reporting = self.names[: CAMERAS - silent]
+        self._held_out = self.names[CAMERAS // 2]
+        self._poses = {name: _arc(i) for i, name in enumerate(self.names)}
         self._newest: dict[str, Frame] = {}
         self.state = EdgeState(
             scenario="preview",
-            policies=tuple(POLICIES),
+            policies=("all", "threshold"),
             controls=Controls("threshold", 600.0),
             cameras=self.cameras,
             start_ns=self._clock.now_ns(),
             now_ns=self._clock.now_ns,
-            set_policy=self._set_policy,
-            save_snapshot=self._save_snapshot,
+            set_policy=lambda name, value: None,
+            save_snapshot=lambda: Path("none"),
             channel=lambda: {"preset": "toy", "states": ["low", "high"], "state": "low"},
             field_name="analytic",
         )
@@ -102,35 +99,17 @@ class Preview:
                 )
             truth = _uint8(scene.render(self._poses[self._held_out], LENS))
             used = tuple(name for name in self._reporting if name != self._held_out)
-            publication = Publication(
-                number,
-                self.state.now_s(),
-                now_ns,
-                600.0,
-                used,
-                (50.0,) * len(used),
-                50.0,
-                20.0,
-                psnr_db=30.0,
-                scored_on=self._held_out,
-            )
+            found = {"psnr_db": 30.0, "scored_on": self._held_out}
+            ages = (50.0,) * len(used)
+            publication = Publication(number, self.state.now_s(), now_ns, 600.0, used, ages, 50.0, 20.0, **found)
             self.state.publish(publication, scene)
             self.state.scored(publication, Comparison(self._held_out, truth, truth, number))
             number += 1
 
-    def _set_policy(self, name: str, value: float | None) -> None:
-        policy = make_policy(name, value, np.random.default_rng(0))
-        self.state.controls.policy, self.state.controls.value = policy.name, policy.value
 
-    def _save_snapshot(self) -> Path:
-        path = self._folder / "preview-snapshot.json"
-        path.write_text(json.dumps({"updates": len(self.state.publications())}))
-        return path
-
-
-def _arc(i: int, count: int) -> NDArray[np.float64]:
+def _arc(i: int) -> NDArray[np.float64]:
     """Pose of camera i on an arc of 150 degrees around the middle of the floor."""
-    angle = np.deg2rad(-75.0 + 150.0 * i / max(1, count - 1))
+    angle = np.deg2rad(-75.0 + 150.0 * i / (CAMERAS - 1))
     eye = (3.4 * np.cos(angle), 3.4 * np.sin(angle), 1.5 + 0.35 * (i % 2))
     return look_at(eye, (0.0, 0.0, 0.35))
 

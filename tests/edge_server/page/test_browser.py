@@ -13,9 +13,9 @@ pytestmark = pytest.mark.browser
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory):
+def shown():
     """A preview with its page open in Chromium."""
-    preview = Preview(tmp_path_factory.mktemp("page"), silent=1)
+    preview = Preview(silent=1)
     page = start_page(preview.state, "127.0.0.1", 0)
     preview.start()
     try:

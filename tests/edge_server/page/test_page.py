@@ -34,8 +34,8 @@ from tests.support import wait_until
 
 
 @contextlib.contextmanager
-def preview_page(tmp_path, **options) -> Iterator[tuple[Preview, Page]]:
-    preview = Preview(tmp_path, **options)
+def preview_page() -> Iterator[tuple[Preview, Page]]:
+    preview = Preview()
     page = start_page(preview.state, "127.0.0.1", 0)
     preview.start()
     try:
@@ -262,9 +262,9 @@ def test_a_taken_port_is_reported():
     assert page_url("::1", 8080, tls=True) == "https://[::1]:8080"
 
 
-def test_stop_frees_the_port_and_ends_the_threads(tmp_path, capfd):
+def test_stop_frees_the_port_and_ends_the_threads(capfd):
     before = set(threading.enumerate())
-    with preview_page(tmp_path) as (_, page):
+    with preview_page() as (_, page):
         port = page.port
         with Visitor(port) as visitor:
             visitor.wait_for(lambda: visitor.images > 0, "an image")
@@ -278,8 +278,8 @@ def test_stop_frees_the_port_and_ends_the_threads(tmp_path, capfd):
 # --- visitors ----------------------------------------------------------------------------------
 
 
-def test_a_visitor_is_sent_the_scene_from_where_they_stand(tmp_path):
-    with preview_page(tmp_path) as (preview, page):
+def test_a_visitor_is_sent_the_scene_from_where_they_stand():
+    with preview_page() as (preview, page):
         wait_until(lambda: preview.state.started, "no update")
         preview.state.controls.paused = True
         with Visitor(page.port, (4.0, 0.0, 3.0)) as visitor:
@@ -332,8 +332,8 @@ def test_the_page_outlives_a_broken_field(tmp_path, field):
         page.stop()
 
 
-def test_who_clicks_a_camera_looks_through_it(tmp_path):
-    with preview_page(tmp_path) as (preview, page), Visitor(page.port) as visitor:
+def test_who_clicks_a_camera_looks_through_it():
+    with preview_page() as (preview, page), Visitor(page.port) as visitor:
         visitor.wait_for(lambda: visitor.counts["CameraFrustumMessage"] >= 9, "the frustums")
         (client,) = page._server.get_clients().values()
         click = {"instance_index": None, "screen_pos": [0.5, 0.5], "modifier": None}
