@@ -8,7 +8,7 @@ import numpy as np
 
 from edge_server.live.state import CameraView, Publication
 from edge_server.page import timelines
-from edge_server.page.timelines import MAX_POINTS, History, _decimate, _forward_fill, _latest_value, _stairs
+from edge_server.page.timelines import MAX_POINTS, History, _decimate, _forward_fill, _stairs
 
 
 def views(*ages: float | None) -> list[CameraView]:
@@ -52,13 +52,6 @@ def test_chains_of_each_camera_are_averaged_and_odd_status_files_survived():
     assert history.columns()[3][0] == 0.5 and np.isnan(history.columns()[3][1])
 
 
-def test_value_latest_value():
-    t = np.array([0.0, 1.0, 2.0, 3.0])
-    held = _latest_value(t, [(0.5, 100.0), (2.0, None), (2.5, 50.0)])
-    assert np.isnan(held[[0, 2]]).all() and held[1] == 100.0 and held[3] == 50.0
-    assert np.isnan(_latest_value(t, [])).all()
-
-
 def test_thinning_keeps_the_newest_and_its_place():
     t = np.arange(1000.0)
     thin_t, thin_y = _decimate(t, 2 * t)
@@ -93,6 +86,12 @@ def test_the_charts_show_ages_scored_updates_of_the_window_and_states_by_name(mo
     ]
     timelines.Timelines(MagicMock()).refresh(history, publications)
     (_, t, (mean, worst, omega), _), (title, when, (psnr, _), _), (_, _, (state,), names) = drawn
-    assert t == [0.0, 200.0] and mean == [200.0, 200.0] and worst == [300.0, 300.0] and omega[1] == 50.0
+    assert (
+        t == [0.0, 200.0]
+        and mean == [200.0, 200.0]
+        and worst == [300.0, 300.0]
+        and np.isnan(omega[0])
+        and omega[1] == 50.0
+    )
     assert (when, psnr) == ([90.0, 195.0], [20.0, 22.0]) and title.endswith(", dB")
     assert state == [1.0, 1.0] and names == "0 low, 1 high"

@@ -17,6 +17,7 @@ from channel_emu.model.settings import channel_from_mapping
 from channel_emu.virtual.simulate import simulate
 from edge_server.experiments.virtual.from_scenario import build_deployment, exact_scene, training_cameras
 from edge_server.experiments.virtual.run_settings import RunSettings
+from edge_server.experiments.virtual.simulate import digest
 from edge_server.experiments.virtual.truth import ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.settings import ComputeConfig
@@ -81,6 +82,7 @@ def test_one_seed_gives_the_same_run_bit_for_bit(channel):
     assert a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
     other = run(scenario(channel, seed=4))
     assert [p.ages_ms for p in other.publications] != [p.ages_ms for p in first.publications]
+    assert digest(first) == digest(second) != digest(other)
 
 
 def test_going_on_is_the_same_as_running_through():
