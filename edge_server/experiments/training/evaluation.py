@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from edge_server.experiments.common.folders import Folders
-from edge_server.experiments.common.seed_table import PerSeed, Row, SeedTable, difference
-from edge_server.experiments.common.statistics import crossed, interval, share_closed
+from edge_server.experiments.common.seed_table import PerSeed, Row
 from edge_server.experiments.common.tables import complete_mean
 from edge_server.experiments.engine import Engine
 from edge_server.experiments.rollouts.episode import Outcome, mean_outcome
@@ -38,7 +37,7 @@ BASELINE_POLICIES = (
     "freshest-k:12",
     "age-driven",
 )
-LEARNED, ORACLE = "learned", "oracle"
+ORACLE = "oracle"
 # Fits of every choice: the choice that is best in one is measured by the other, because the maximum of noisy
 # fits is biased upwards.
 FITS = 2
@@ -128,28 +127,6 @@ def evaluate(
         for name in names
     ]
     return Evaluation(list(candidates), fits)
-
-
-def summary(table: SeedTable, kind: str) -> dict[str, Any]:
-    """What a training came to, as JSON values: mean and ends of the 95 % interval over seeds.
-
-    table: rows of an evaluation with the policy ``learned``. kind: threshold or wait, whose best value is compared.
-    """
-    mine, random = (table.runs("reward", policy=name) for name in (LEARNED, "random"))
-    best = table.best_runs("reward", False, "value", policy=kind)
-    limit = table.values("reward", policy=ORACLE)
-    curve = table.curve("value", "reward", policy=kind)
-    means = {x: interval(values.values()).mean for x, values in curve.items()}
-    return {
-        "seeds": crossed(mine).count,
-        "seeds_without_value": len(mine[0]) - crossed(mine).count,
-        "reward": crossed(mine).rounded(6),
-        "over_random": difference(mine, random).rounded(6),
-        "over_best_fixed": difference(mine, best).rounded(6),
-        "best_fixed": f"{kind}:{max(means, key=lambda x: means[x]):g}" if means else None,
-        "share": share_closed(mine[0], random[0], limit).rounded(6),
-        "knowing_the_best_is_worth": difference(table.runs("reward", policy=f"{ORACLE} {kind}"), best).rounded(6),
-    }
 
 
 def _value(reward: Reward, outcome: Outcome) -> float | None:

@@ -11,34 +11,23 @@ from collections.abc import Sequence
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of, run_command
 from edge_server.experiments.common.folders import Folders
-from edge_server.experiments.common.seed_table import SeedTable
-from edge_server.experiments.common.tables import number
-from edge_server.experiments.engine import Engine, EngineError
+from edge_server.experiments.engine import EngineError
 from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
-from edge_server.experiments.training.evaluation import (
-    BASELINE_POLICIES,
-    LEARNED,
-    Candidate,
-    evaluate,
-    fixed_candidates,
-    summary,
-)
 from edge_server.experiments.training.learning_curve import draw_curve
-from edge_server.experiments.training.trainer import REPORTS, TrainingConfig, TrainingError, read_log, train
+from edge_server.experiments.training.trainer import TrainingConfig, TrainingError, read_log, train
 from edge_server.fields.registry import field_names
 from edge_server.scheduler import BANDIT, STATE_PARTS
-from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.rewards import REWARDS
 from edge_server.scheduler.learned.settings import ACTIONS, Spec
 from edge_server.settings import read_config
-from freshfield.files import out_folder, write_csv, write_json
+from freshfield.files import out_folder, write_csv
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario, ScenarioError, load
 
 DESCRIPTION = """\
 Learn when to update the field and from which views: decisions are drawn from the scenario in virtual time,
 each action is carried out by a real field fit and rewarded on a held-out camera at the instant of
-publication. Another camera, which is not trained on either, reports how well the policy has learned.
+publication.
 
   edge-server train-scheduler room19 --out runs/select
   edge-server train-scheduler room19 --kind wait --reward corrected --episodes 200 --out runs/wait
@@ -58,13 +47,12 @@ publication. Another camera, which is not trained on either, reports how well th
 
 An episode is --decisions decisions at random instants. At each, --samples actions are carried out from copies
 of the same field, so that they can be compared: a field that knows the scene, or an empty one (--scratch, as
-in the thesis). In a synthetic scene each episode has its own motion, so that tests are on unseen motions.
+in the thesis). In a synthetic scene each episode has its own motion.
 Images are small (--size) and the field is fast (--field), so that there are many decisions.
 
 OUT/policy.npz is the learned policy, OUT/actor.npz the part of it that decides, OUT/training.csv and .png the
-learning curve with each term of the reward, OUT/evaluation.csv and summary.json its rewards on seeds it was
-not trained on. edge-server compare says what it shows in the whole deployment. After Ctrl-C the same command
-continues, bit for bit, whatever --jobs is.
+learning curve with each term of the reward. edge-server compare says what it shows, on seeds it was not trained
+on. After Ctrl-C the same command continues, bit for bit, whatever --jobs is.
 """
 
 
@@ -81,65 +69,30 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     def work() -> None:
         args.out.mkdir(parents=True, exist_ok=True)  # first, so that an error does not waste the work
-        _train_and_evaluate(args, setting, config, folders)
+        _train(args, setting, config, folders)
 
     stopped = f"what is finished is in {args.out}: the same command goes on"
     return run_command("train-scheduler", work, (ScenarioError, DatasetError, EngineError, TrainingError), stopped)
 
 
-def _train_and_evaluate(args: argparse.Namespace, setting: Setting, config: TrainingConfig, folders: Folders) -> None:
-    print(f"  rewarded from {', '.join(setting.rewarding)}; judged from {', '.join(setting.judging)}")
+def _train(args: argparse.Namespace, setting: Setting, config: TrainingConfig, folders: Folders) -> None:
+    print(f"  rewarded from {', '.join(setting.rewarding)}")
     if config.reward.fidelity == "whole" and not config.reward.age:
         print(
             "  the reward is of the whole image and has no term of age: where little moves it teaches to "
             "ignore how old views are (--on moving)"
         )
     if not setting.draws_motions:
-        print("  every episode has the same motion: it is tested on unseen channels and instants alone")
+        print("  every episode has the same motion")
     learner = train(setting, config, folders, args.jobs, args.out, lambda line: print(f"  {line}", flush=True))
-    # Delete the reports of an earlier call, but only after the training was accepted.
-    for name in REPORTS:
-        (args.out / name).unlink(missing_ok=True)
     rows = read_log(args.out)
-    spent_s = sum(row["seconds"] for row in rows)
     write_csv(args.out / "training.csv", rows)
     learner.actor.save(args.out / "actor.npz")
-    print(f"  {config.episodes} episodes; trained for {spent_s:.0f} s in all", flush=True)
+    print(f"  {config.episodes} episodes; trained for {sum(row['seconds'] for row in rows):.0f} s in all", flush=True)
     draw_curve(args.out / "training.png", rows)
-    if args.test:
-        _evaluate(args, setting, config, folders, learner.actor, spent_s)
-
-
-def _evaluate(
-    args: argparse.Namespace, setting: Setting, config: TrainingConfig, folders: Folders, actor: Actor, spent_s: float
-) -> None:
-    """Evaluate the learned policy beside all others on unseen seeds, to OUT/evaluation.csv and summary.json."""
-    kind = "threshold" if config.spec.action == "select" else config.spec.action
-    candidates = [
-        *fixed_candidates([kind], BASELINE_POLICIES, {kind: config.spec.omegas_ms or OMEGAS_MS["threshold"]}),
-        Candidate({"policy": LEARNED}, actor),
-    ]
-    with Engine(args.out / "evaluations.jsonl", args.jobs, threads=1) as engine:
-        found = evaluate(setting, folders, engine, seeds(config.seed, "test", args.test), candidates)
-    table = SeedTable(found.rows(config.reward, setting.judging))
-    write_csv(args.out / "evaluation.csv", table.rows)
-    kept = summary(table, kind)
-    about = {"reward_name": config.reward.name, "on": config.reward.fidelity, "seconds": round(spent_s, 1)}
-    about |= {"rewarded_from": setting.rewarding, "judged_from": setting.judging, "motions": setting.draws_motions}
-    write_json(args.out / "summary.json", {**kept, **about}, indent=1)
-    lacking = kept["seeds_without_value"]
-    more = f"; {lacking} more have a decision without a reward" if lacking else ""
-    print(f"  reward {_text(kept['reward'])} on {kept['seeds']} unseen seeds, of one training{more}")
-    print(f"  over random {_text(kept['over_random'])}")
-    print(f"  over the best fixed {kind} ({kept['best_fixed']}) {_text(kept['over_best_fixed'])}")
-    print(f"  share of the way from random to the oracle: {_text(kept['share'])}")
-    print(f"  {args.out / 'policy.npz'}: edge-server run SCENARIO --policy {BANDIT}{args.out / 'policy.npz'}")
-
-
-def _text(values: Sequence[float | None]) -> str:
-    """[mean, low, high] for people."""
-    mean, low, high = (number(v, 4) for v in values)
-    return f"{mean} [{low}, {high}]"
+    policy = f"{BANDIT}{args.out / 'policy.npz'}"
+    print(f"  edge-server run {args.scenario} --policy {policy}")
+    print(f"  edge-server compare {args.scenario} all {policy} --seeds 8    # what it is worth")
 
 
 def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
@@ -154,41 +107,15 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
         edge["field"], edge["updates"] = args.field, "cycle"
         edge["field_options"] = {"effort": "low"} if args.field in ("splat", "ngp") else {}
     edge["policy"] = {"name": "all"}
-    report = _reporting(args, scenario)
-    held_out = tuple(c for c in scenario.cameras if c in {*scenario.held_out, *report})
-    given = dataclasses.replace(scenario, source=source, edge=edge, held_out=held_out)
+    given = dataclasses.replace(scenario, source=source, edge=edge)
     return Setting(
         given,
-        report=report,
         steps=(50 if args.scratch else 20) if args.fit_steps is None else args.fit_steps,
         scratch=args.scratch,
         decisions=args.decisions,
         compute=read_config(given).compute,
         parts=_parts(args.parts),
     )
-
-
-def _reporting(args: argparse.Namespace, scenario: Scenario) -> tuple[str, ...]:
-    """Cameras that only report. Default: the last of several held-out cameras, else the middle one of the
-    training cameras, which then is held out, too."""
-    if args.report == "none" or not scenario.held_out:
-        return ()
-    if args.report:
-        asked = tuple(args.report.split(","))
-        if unknown := [c for c in asked if c not in scenario.cameras]:
-            raise ValueError(f"--report: {', '.join(unknown)} is not one of the scenario's cameras")
-        if set(scenario.held_out) <= set(asked):
-            raise ValueError("--report: a held-out camera must be left to reward")
-        return asked
-    if len(scenario.held_out) > 1:
-        return scenario.held_out[-1:]
-    if len(scenario.training) < 3 or args.network == "flat":
-        raise ValueError(
-            "--report: no camera can be spared to report ("
-            + ("--network flat learns for as many as there are" if args.network == "flat" else "too few")
-            + "): hold two out in the scenario, or --report none judges from the one that rewards"
-        )
-    return (scenario.training[len(scenario.training) // 2],)
 
 
 def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> TrainingConfig:
@@ -199,8 +126,6 @@ def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> Tra
         print(f"  {missing}")
     if args.jobs < 1:
         raise TrainingError(f"--jobs: expected at least 1, got {args.jobs}")
-    if not 0 <= args.test <= 10_000:
-        raise TrainingError(f"--test: expected 0 to 10000 seeds, got {args.test}")
     seeds(args.seed, "train", args.episodes)
     if not 0.0 <= args.price < math.inf:
         raise TrainingError(f"--price: expected 0 or more, got {args.price:g}")
@@ -264,12 +189,6 @@ def _parser() -> argparse.ArgumentParser:
         help="cost of each used view, taken off the reward; at 0, policies tend to use all [0]",
     )
     add(
-        "--report",
-        metavar="CAM,...",
-        help="cameras that only report; none: the rewarding one reports [the last of several held-out "
-        "cameras, else one of the training cameras]",
-    )
-    add(
         "--parts",
         default="age,pose",
         metavar="P,...",
@@ -297,7 +216,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--field", default="splat", metavar="NAME", help="representation; '': the scenario's [%(default)s]")
     add("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
-    add("--test", type=int, default=20, metavar="N", help="unseen seeds to test on at the end [%(default)s]")
     add("--jobs", type=int, default=usable_cores(), metavar="N", help="number of worker processes [%(default)s]")
     add_folders(parser)
     add("--out", type=out_folder, required=True, metavar="DIR", help="folder to write")

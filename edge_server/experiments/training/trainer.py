@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 Say = Callable[[str], None]
 _PROGRESS_EVERY_S = 5.0
-# Files that train-scheduler writes after a training.
-REPORTS = ("summary.json", "evaluation.csv")
 
 
 class TrainingError(ValueError):
@@ -103,9 +101,7 @@ def train(setting: Setting, config: TrainingConfig, folders: Folders, jobs: int,
     if first and first < config.batches:
         say(f"going on after {first} of {config.batches} batches")
     if learner is None:
-        # The policy and reports of an earlier training must not be taken for those of this one.
-        for name in ("policy.npz", *REPORTS):
-            (out / name).unlink(missing_ok=True)
+        (out / "policy.npz").unlink(missing_ok=True)  # of an earlier training
         learner = _new_learner(setting, config, folders, jobs)
     for number in range(first, config.batches):
         batch_began = time.monotonic()
