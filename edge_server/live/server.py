@@ -338,7 +338,8 @@ class EdgeServer:
             frame = frames.get(camera)
             age_ms = None if frame is None else (now_ns - frame.generated_edge_ns) / 1e6
             counts = ingest.delivered[camera], ingest.rejected_by_camera[camera]
-            views.append(CameraView(camera, camera in self.scenario.held_out, frame, age_ms, *counts))
+            depth = camera in self.ingest.depth
+            views.append(CameraView(camera, camera in self.scenario.held_out, frame, age_ms, *counts, depth))
         return views
 
     def status(self) -> dict[str, Any]:

@@ -93,7 +93,10 @@ class Publication:
 
 @dataclass(frozen=True)
 class CameraView:
-    """What readers see of a camera: its newest frame (still encoded), its age, its counts."""
+    """What readers see of a camera: its newest frame (still encoded), its age, its counts.
+
+    measures_depth: whether a frame of it has brought depth.
+    """
 
     camera: str
     held_out: bool
@@ -101,6 +104,7 @@ class CameraView:
     age_ms: float | None
     delivered: int
     rejected: int
+    measures_depth: bool = False
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,7 @@ class Panel:
             self._coverage = gui.add_html(markup.note("Reckoned once every camera has sent a frame and stands still."))
             self._places: dict[str, coverage.Camera] = {}  # of the cameras at the last refresh
             self._reckoned_for: dict[str, coverage.Camera] = {}
+            self._reckoned_with_depth = False
         side.dock_left()
         side.set_width(SIDE_WIDTH)
         self._gui = gui
@@ -95,11 +96,13 @@ class Panel:
             return
         known = {name: (frame.intrinsics, frame.pose.matrix()) for name, frame in frames.items()}
         stand_still, self._places = _same_places(known, self._places), known
-        if not stand_still or _same_places(known, self._reckoned_for):
+        depth = 2 * sum(c.measures_depth for c in cameras) >= len(cameras)  # as many as a field begins with
+        if not stand_still or (_same_places(known, self._reckoned_for) and depth == self._reckoned_with_depth):
             return
-        self._reckoned_for = known
+        self._reckoned_for, self._reckoned_with_depth = known, depth
         found = coverage.reckon(list(known.values()))
-        self._coverage.content = markup.coverage(coverage.plan_svg(known, found), found.words)
+        words = f"{found.words}. {coverage.reached(len(cameras), depth)}"
+        self._coverage.content = markup.coverage(coverage.plan_svg(known, found), words)
 
     def _show_comparison(self, comparison: Comparison, publications: list[Publication], held_out: bool) -> None:
         self._compared_update = comparison.number

@@ -23,6 +23,11 @@ MOST_OBLIQUE_DEG = 75.0  # beyond it a camera sees a surface too obliquely to te
 CANDIDATES = 48  # places for a further camera, around the scene
 PLAN = 41  # cells a side of the plan
 
+# What `room` reached with so many cameras, dB of the whole image and where it moves: with depth sensors
+# (docs/results/few-cameras.json), and without (docs/fields.md).
+REACHED_WITH_DEPTH = {2: (22.2, 18.4), 3: (24.5, 21.2), 4: (26.0, 22.0)}
+REACHED = {2: (15.2, 16.1), 3: (18.1, 19.4), 4: (20.2, 21.4), 6: (25.2, 23.4), 8: (27.0, 24.6), 12: (29.2, 25.3)}
+
 Camera = tuple[Pinhole, Array]
 """Lens, and camera-to-world pose (4, 4), meters."""
 
@@ -68,6 +73,20 @@ class Coverage:
             f"of all surfaces around the point that the cameras look at, {_shares_in_words(self.seen_by)}{angle}. One "
             f"more camera helps most at ({x:.2f}, {y:.2f}, {z:.2f}) m: then {_shares_in_words(self.further.seen_by)}"
         )
+
+
+def reached(cameras: int, depth: bool) -> str:
+    """What was measured with as many cameras, or the next fewer, in words. depth: they measure it."""
+    reached = REACHED_WITH_DEPTH if depth else REACHED
+    known = [count for count in reached if count <= cameras]
+    if not known:
+        return "One camera alone shows its own view, and little else"
+    whole_db, moving_db = reached[known[-1]]
+    sensors = "with depth sensors" if depth else "without depth sensors"
+    return (
+        f"The shipped room before {known[-1]} cameras {sensors} was shown at {whole_db:g} dB, {moving_db:g} where it "
+        "moves; above some 25 dB a picture looks right, one mean color reaches some 15"
+    )
 
 
 def reckon(cameras: Sequence[Camera]) -> Coverage:

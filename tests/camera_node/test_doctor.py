@@ -12,10 +12,10 @@ import yaml
 
 from camera_node import coverage_check, doctor
 from camera_node.cli import main
-from camera_node.coverage_check import REACHED, REACHED_WITH_DEPTH
 from camera_node.settings import source_config
 from camera_node.sources.registry import open_sources
 from freshfield.clock import WallClock
+from freshfield.coverage import REACHED, REACHED_WITH_DEPTH
 from freshfield.scenario import load
 from freshfield.transport import Transport
 from tests.camera_node.robot.arm.simulated import simulated_arm

@@ -25,7 +25,7 @@ from edge_server.page.controls import ControlPanel
 from edge_server.page.panel import PAIR_WIDTH, side_by_side
 from edge_server.page.rendering import LEVELS, MOVING, NEWER, ClientState, RenderLoop, browser_image, hatched
 from edge_server.page.scene import Scene, thumbnail
-from freshfield import payload
+from freshfield import coverage, payload
 from freshfield.geometry import Pinhole, Pose, look_at
 from tests.edge_server.frames import frame
 from tests.edge_server.page.preview import LENS, BallScene, Preview
@@ -161,16 +161,18 @@ def test_what_cameras_see_is_reckoned_when_they_stand_still():
     server.gui.add_html.side_effect = lambda content, **_: SimpleNamespace(content=content, visible=True)
     shown = panel.Panel(server, bare_state())
 
-    def coverage_of(*places_m):
+    def coverage_of(*places_m, depth=()):
         poses = [Pose.from_matrix(look_at((x, -3.0, 1.0), (0.0, 0.0, 0.0))) for x in places_m]
         newest = [replace(frame(camera=f"cam0{k}"), pose=pose, intrinsics=LENS) for k, pose in enumerate(poses)]
-        shown._refresh_coverage([CameraView(f.camera, False, f, 1.0, 1, 0) for f in newest])
+        shown._refresh_coverage([CameraView(f.camera, False, f, 1.0, 1, 0, f.camera in depth) for f in newest])
         return shown._coverage.content
 
     assert "every camera has sent" in coverage_of(-1.0, 1.0)
     assert "<svg" in (first := coverage_of(-1.0, 1.0)) and "degrees apart" in first
     assert coverage_of(-1.0, 1.01) == coverage_of(-1.0, 1.2) == first  # noise; one that may be on its way
     assert coverage_of(-1.0, 1.2) != first
+    assert coverage.reached(2, depth=False) in first
+    assert coverage.reached(2, depth=True) in coverage_of(-1.0, 1.2, depth=("cam00",))
 
 
 def test_a_visitor_who_moves_by_a_millimeter_has_moved():
