@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
-from freshfield.limits import MAX_DEPTH_POINTS, MAX_DEPTH_RAYS_BYTES
+from freshfield.limits import MAX_DEPTH_POINTS, MAX_DEPTH_RAYS_BYTES, MOST_DEPTH_MOVED
 
 _Lens = tuple[Pinhole, Pose | None, int]
 _kept: dict[_Lens, NDArray[np.float32]] = {}  # rays of lenses, the one that was used longest ago first
@@ -26,7 +26,8 @@ def depth_in_image(depth: DepthImage, lens: Pinhole, halvings: int) -> NDArray[n
     Each pixel takes the measurement nearest to its center: a mean over pixels would lie between two surfaces. Depth
     of a lens of its own is first moved into the image, at the coarser of both resolutions, so that no gaps open
     between its pixels; of what lands on one pixel the nearest surface counts. Of depth with more than
-    ``MAX_DEPTH_POINTS`` pixels for each of the image's, only each n-th row and column is moved.
+    ``MAX_DEPTH_POINTS`` pixels for each of the image's, or ``MOST_DEPTH_MOVED`` in all, only each n-th row and column
+    is moved.
     """
     image = lens.halved(halvings)
     if depth.intrinsics is None:
@@ -50,8 +51,9 @@ def _sampled(depth: NDArray[np.float32], image: Pinhole, per_column: float, per_
 
 def _step(sensor: Pinhole, image: Pinhole) -> int:
     """Every so many-th row and column of the sensor is moved. A wide sensor's resolution alone would not bound them."""
-    points = sensor.width * sensor.height / (MAX_DEPTH_POINTS * image.width * image.height)
-    return max(1, int(min(sensor.fx / image.fx, sensor.fy / image.fy)), math.ceil(math.sqrt(points)))
+    most = min(MAX_DEPTH_POINTS * image.width * image.height, MOST_DEPTH_MOVED)
+    least = math.ceil(math.sqrt(sensor.width * sensor.height / most))
+    return max(least, int(min(sensor.fx / image.fx, sensor.fy / image.fy)))
 
 
 def _moved(depth: DepthImage, sensor: Pinhole, grid: Pinhole, step: int) -> NDArray[np.float32]:

@@ -29,6 +29,10 @@ MAX_DEPTH_POINTS = 6
 """Pixels of depth, for each of its image, that the edge moves there: all of 848 x 480 in an image of 320 x 240.
 Without a bound, 1280 x 1280 in a small image cost .3 to .5 s, and may be a payload of 133 bytes."""
 
+MOST_DEPTH_MOVED = 1 << 19
+"""Pixels of depth that the edge moves into one image, however large that is: all of 848 x 480, each second row and
+column of 1280 x 720. Without a bound, 1280 x 1280 cost .11 s a frame, and .55 s where its lens was new."""
+
 MAX_DEPTH_RAYS_BYTES = 96 << 20
 """Rays of depth sensors' lenses that the edge keeps, 12 bytes for each pixel that it moves into the image: those of 24
 lenses of 640 x 480 or 8 of 1280 x 720. Bounded, because a hostile sender's lens may differ in each frame."""

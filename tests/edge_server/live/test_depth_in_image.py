@@ -11,7 +11,7 @@ from edge_server.live import depth_in_image as module
 from edge_server.live.depth_in_image import depth_in_image
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
-from freshfield.limits import MAX_DEPTH_POINTS
+from freshfield.limits import MAX_DEPTH_POINTS, MOST_DEPTH_MOVED
 
 IMAGE = Pinhole.from_fov(64, 48, 70.0)
 SENSOR = Pinhole(80, 60, 70.0, 70.0, 41.0, 29.0)
@@ -136,6 +136,19 @@ def test_large_depth_costs_about_as_much_as_its_small_image(fov_deg):
     (rays,) = module._kept.values()
     assert rays[..., 0].size <= 1.02 * MAX_DEPTH_POINTS * found.size < 1280 * 1280 / 16
     assert (found == np.float32(2.0)).mean() > 0.97
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(("width", "height", "step"), [(848, 480, 1), (1280, 720, 2), (1280, 1280, 2)])
+def test_a_large_image_does_not_make_large_depth_dear(width, height, step):
+    """What sensors measure at 848 x 480 is moved whole; of more a part, without gaps."""
+    image, sensor = Pinhole.from_fov(1600, 1200, 60.0), Pinhole.from_fov(width, height, 70.0)
+    module._kept.clear()
+    found = depth_in_image(depth(np.full((height, width), 2000), intrinsics=sensor), image, 0)
+    (rays,) = module._kept.values()
+    assert rays.shape[:2] == (height // step, width // step) and rays[..., 0].size <= MOST_DEPTH_MOVED
+    inside = found[400:800, 400:1200]
+    assert inside.size and (inside == np.float32(2.0)).all()
 
 
 @pytest.mark.stability
