@@ -158,6 +158,14 @@ _SPOILED: dict[str, Spoil] = {
 }
 
 
+# Cameras whose depth the page then says is not used. Noise, and a unit that changes later, are refused by frames.
+_NAMED = {
+    "constant": ("cam00", "cam04"),
+    **dict.fromkeys(("inverted", "ten times too far", "millimeters"), ("cam00", "cam02", "cam04")),
+    "one camera ten times too far": ("cam00",),
+}
+
+
 def test_depth_of_another_size_is_refused() -> None:
     view = replace(_frame(0, 0), depth=np.ones((3, 4), np.float32))
     with pytest.raises(ValueError, match="cam00: depth must be float32 of shape"):
@@ -170,5 +178,6 @@ def test_broken_depth_costs_little(kind: str) -> None:
     field = LayeredField(SMALL)
     _run(field, range(40), _SPOILED[kind])
     assert field.layered and len(field.cameras) == 3
+    assert tuple(said.split()[3] for said in field.troubles) == _NAMED.get(kind, ())
     # A constant depth of the right order of magnitude, before cameras that share little, is believed.
     assert _score(field, 39) > _usual("none") - (2.5 if kind == "constant" else 0.5)

@@ -1,0 +1,170 @@
+"""Four cameras with depth in scenes and rigs that deceive sensors: what depth must still be worth there.
+
+A ball moves on a plate. Each case is compared with the same images without depth, or with the easy scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from edge_server.fields import Budget, View
+from edge_server.fields.splat.layers.depth import settings as depth_settings
+from edge_server.fields.splat.layers.layered_field import LayeredField
+from edge_server.fields.splat.settings import SplatSettings
+from freshfield.geometry import world_rays
+from tests.edge_server.fields.scenes import psnr, ring, seen
+
+pytestmark = pytest.mark.stability
+
+SMALL = SplatSettings(gaussians=1200, start=700, seed_cells=32, densify_every=20, threads=2)
+RIG = ring(9)
+CAMERAS, HELD = [RIG[0], RIG[2], RIG[4], RIG[6]], RIG[1]
+FRAME_S, FRAMES = 1.0 / 15.0, 36
+MIRROR_Y, PANE_Y = 0.85, -0.85  # planes behind and before the plate, as wide as it and 1 m high
+PATCHES = np.kron(np.random.default_rng(4).random((12, 12)) < 0.4, np.ones((4, 4), bool))
+
+Array = NDArray[np.float64]
+World = Callable[[View, Array], View]
+"""What a camera sees, with depth, where the ball is at a place."""
+
+
+def _view(view: View, image: NDArray, distance: Array) -> View:
+    z = np.where(np.isfinite(distance), distance * view.intrinsics.rays()[..., 2], 0.0)
+    return replace(view, image=image.astype(np.uint8), depth=z.astype(np.float32))
+
+
+def _plain(view: View, ball_m: Array) -> View:
+    return _view(view, *seen(view.intrinsics, view.camera_to_world, ball_m))
+
+
+def _in_plane(view: View, y: float) -> Array:
+    """Distance to a pane of 1.6 m x 1 m in the plane of this y, (H, W); inf beside it."""
+    origin, rays = world_rays(view.intrinsics, view.camera_to_world)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away = (y - origin[1]) / rays[..., 1]
+        hit = origin + rays * away[..., None]
+        inside = (away > 0) & (np.abs(hit[..., 0]) < 0.8) & (hit[..., 2] > 0) & (hit[..., 2] < 1)
+    return np.where(inside, away, np.inf)
+
+
+def _mirror(view: View, ball_m: Array) -> View:
+    """Sensors measure how far away what a mirror shows seems to be."""
+    image, distance = seen(view.intrinsics, view.camera_to_world, ball_m)
+    behind = np.diag([1.0, -1.0, 1.0, 1.0])
+    behind[1, 3] = 2.0 * MIRROR_Y
+    mirrored, seems = seen(view.intrinsics, behind @ view.camera_to_world, ball_m)
+    there = _in_plane(view, MIRROR_Y) < distance
+    return _view(view, np.where(there[..., None], mirrored, image), np.where(there, seems, distance))
+
+
+def _glass(view: View, ball_m: Array) -> View:
+    """A pane reflects a fifth of a bright sky. Sensors measure what is behind it, and in some patches the pane."""
+    image, distance = seen(view.intrinsics, view.camera_to_world, ball_m)
+    pane = _in_plane(view, PANE_Y)
+    there = pane < distance
+    shown = np.where(there[..., None], 0.8 * image + 0.2 * 255.0, image)
+    return _view(view, shown, np.where(there & PATCHES, pane, distance))
+
+
+def _turned(view: View, degrees: float) -> View:
+    """The camera turned about its vertical axis."""
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    turn = np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]])
+    return replace(view, camera_to_world=view.camera_to_world @ turn)
+
+
+@dataclass(frozen=True)
+class Case:
+    """world: what is there. placed: where the cameras really stand. told: what reaches the field of camera k's frame.
+    gains_db: how much better than without depth the held-out view must be; None: not compared. below_easy_db: how much
+    worse than in the easy scene it may be."""
+
+    world: World = _plain
+    placed: Callable[[int, View], View] = lambda k, view: view
+    told: Callable[[int, int, View], View] = lambda k, frame, view: view
+    gains_db: float | None = None
+    below_easy_db: float | None = None
+
+
+def _scaled(unit: float) -> Callable[[int, int, View], View]:
+    def told(k: int, frame: int, view: View) -> View:
+        pose = view.camera_to_world.copy()
+        pose[:3, 3] *= unit
+        return replace(view, camera_to_world=pose, depth=view.depth * np.float32(unit))
+
+    return told
+
+
+def _of_first(change: Callable[[View], View]) -> Callable[[int, int, View], View]:
+    return lambda k, frame, view: change(view) if k == 0 else view
+
+
+def _near(k: int, frame: int, view: View) -> View:
+    """The sensor reaches as far as its nearest third of the pixels."""
+    there = view.depth[view.depth > 0]
+    return replace(view, depth=np.where(view.depth < np.quantile(there, 0.33), view.depth, np.float32(0.0)))
+
+
+CASES = {
+    "mirror": Case(_mirror, gains_db=1.5),
+    "glass": Case(_glass, gains_db=1.0),
+    "two thirds out of range": Case(told=_near, gains_db=0.7),
+    "scale 5 % off": Case(told=_of_first(lambda v: replace(v, depth=v.depth * np.float32(1.05))), below_easy_db=1.5),
+    "pose 3 degrees off": Case(told=_of_first(lambda v: _turned(v, 3.0)), gains_db=-0.3),
+    "two at one place": Case(placed=lambda k, view: CAMERAS[1] if k == 0 else view, gains_db=2.0),
+    "nothing in common": Case(placed=lambda k, view: _turned(view, (-24.0, 24.0, -24.0, 24.0)[k]), gains_db=0.4),
+    "light off": Case(
+        told=lambda k, frame, v: replace(v, image=v.image // 40) if 18 <= frame < 22 else v, below_easy_db=1.0
+    ),
+    "a third as large": Case(told=_scaled(1.0 / 3.0), below_easy_db=1.0),
+    "twice as large": Case(told=_scaled(2.0), below_easy_db=1.0),
+}
+
+
+@pytest.fixture(autouse=True)
+def _shown_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(depth_settings, "SHOWN_AFTER", (20, 40))
+
+
+def _ball_m(instant_s: float) -> Array:
+    return np.array([0.25 * np.cos(3 * instant_s), 0.25 * np.sin(3 * instant_s), 0.5])
+
+
+def _shown(case: Case, depth: bool) -> float:
+    """PSNR of the held-out view at the end. depth: whether frames bring it."""
+    field = LayeredField(SMALL)
+    for frame in range(FRAMES):
+        views = []
+        for k, camera in enumerate(CAMERAS):
+            instant_s = (frame + k / len(CAMERAS)) * FRAME_S
+            view = case.world(case.placed(k, camera), _ball_m(instant_s))
+            named = replace(view, camera=camera.camera, generated_ns=round(instant_s * 1e9))
+            told = case.told(k, frame, named)
+            views.append(told if depth else replace(told, depth=None))
+        field.fit(views, Budget(steps=20))
+    truth = case.world(HELD, _ball_m((FRAMES - 1) * FRAME_S))
+    last = case.told(len(CAMERAS), FRAMES, truth)
+    color = field.snapshot().render(last.camera_to_world, last.intrinsics).color
+    assert np.isfinite(color).all() and field.layered and len(field.cameras) == len(CAMERAS)
+    return psnr(color, truth.image / 255.0)
+
+
+@cache
+def _easy_db() -> float:
+    return _shown(Case(), True)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_depth_is_worth_something_where_sensors_are_deceived(name: str) -> None:
+    case = CASES[name]
+    shown_db = _shown(case, True)
+    if case.gains_db is not None:
+        assert shown_db > _shown(case, False) + case.gains_db
+    if case.below_easy_db is not None:
+        assert shown_db > _easy_db() - case.below_easy_db
