@@ -199,13 +199,12 @@ class CameraConfig(LiveConfig, frozen=True, kw_only=True):
 
 
 class OakConfig(LiveConfig, frozen=True, kw_only=True):
-    """Luxonis OAK cameras through depthai 3 (extra ``oak``). A picture that is not rectified carries its lens, as well
-    as four coefficients describe it. Depth of a device with a stereo pair needs ``rectify``.
+    """Luxonis OAK cameras through depthai 3 (extra ``oak``). The device straightens the picture, and measures depth
+    if it has a stereo pair.
     """
 
     socket: Annotated[str, about("which of the device's cameras")] = "CAM_A"
     iso: Annotated[int, within(100, 1600, "with exposure_us")] = 400
-    rectify: Annotated[bool, about("straighten the picture on the device")] = False
 
 
 class RealsenseConfig(LiveConfig, frozen=True, kw_only=True):

@@ -1,15 +1,13 @@
 """Luxonis OAK cameras through depthai 3: color frames stamped at the middle of their exposure (thesis 4.3.1).
 
-The library synchronizes the device's clock with the host's. Intrinsics come from the calibration stored in
-the device, and an autofocus lens is fixed at the position at which it was calibrated.
-
-With ``rectify`` a device that has a stereo pair also measures depth and registers it to the straightened image.
+The library synchronizes the device's clock with the host's. The device straightens the picture by the calibration
+that is stored in it, and an autofocus lens is fixed at the position at which it was calibrated. A device that has a
+stereo pair also measures depth and registers it to the straightened image; one that was never calibrated does neither.
 """
 
 from __future__ import annotations
 
 import datetime
-import logging
 import os
 from fractions import Fraction
 from typing import Any, cast
@@ -25,16 +23,11 @@ from camera_node.sources.devices.feed import (
     intrinsics_or_reason,
     select_device,
 )
-from camera_node.sources.devices.lens_coefficients import fit_opencv_distortion
 from freshfield.clock import Clock
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole
 
-log = logging.getLogger("camera-node")
-
 _SEARCH_MS = "2000"
-# Beyond this error, four coefficients do not describe the lens: better let the device rectify the image.
-_WORST_LENS_PX = 1.0
 # Of the pair's images: what the mono cameras of all models offer, and what depth is computed from.
 _STEREO_SIZE = (640, 400)
 METERS_PER_COUNT = 0.001  # depthai's depth is in millimeters unless told otherwise
@@ -93,23 +86,15 @@ class OakFeed(Feed):
                 node.initialControl.setManualFocus(focus)
             if config.exposure_us is not None:
                 node.initialControl.setManualExposure(config.exposure_us, config.iso)
-            output = node.requestOutput(
-                (config.width, config.height),
-                dai.ImgFrame.Type.BGR888i,
-                fps=float(fps),
-                enableUndistortion=config.rectify,
-            )
-            self._frames = FrameQueue(camera, output.createOutputQueue(maxSize=2, blocking=False), clock)
-            pairs = self._device.getStereoPairs() if config.depth_every else []
-            if pairs and config.rectify:
-                self._depths = DepthQueue(self._measure_depth(pairs[0], output, float(fps)), clock)
-            elif pairs:
-                log.info("%s: it measures depth only with source.rectify: true", camera)
-            self._pipeline.start()
             size = (config.width, config.height)
-            self.intrinsics, self.no_intrinsics = intrinsics_or_reason(
-                lambda: lens(camera, calibration, socket, size, config.rectify)
-            )
+            self.intrinsics, self.no_intrinsics = intrinsics_or_reason(lambda: lens(camera, calibration, socket, size))
+            calibrated = self.intrinsics is not None
+            output = node.requestOutput(size, dai.ImgFrame.Type.BGR888i, fps=float(fps), enableUndistortion=calibrated)
+            self._frames = FrameQueue(camera, output.createOutputQueue(maxSize=2, blocking=False), clock)
+            pairs = self._device.getStereoPairs() if config.depth_every and calibrated else []
+            if pairs:
+                self._depths = DepthQueue(self._measure_depth(pairs[0], output, float(fps)), clock)
+            self._pipeline.start()
         except Exception as error:
             self.close()
             if isinstance(error, CameraError):
@@ -194,33 +179,21 @@ def calibrated_focus(calibration: Any, socket: Any) -> int:
         return 0
 
 
-def lens(camera: str, calibration: Any, socket: Any, size: tuple[int, int], rectified: bool) -> Pinhole:
-    """Intrinsics from the device's calibration.
+def lens(camera: str, calibration: Any, socket: Any, size: tuple[int, int]) -> Pinhole:
+    """Intrinsics of the images that the device straightens, from its calibration.
 
-    size: width and height of the images. rectified: whether the device rectifies them (no distortion).
-    Raises CameraError if the device was never calibrated, or its lens model is not OpenCV's.
+    size: width and height of the images. Raises CameraError if the device was never calibrated.
     """
-    width, height = size
     try:
-        model = calibration.getDistortionModel(socket)
-        matrix = np.array(calibration.getCameraIntrinsics(socket, width, height))
-        distortion = [] if rectified else list(calibration.getDistortionCoefficients(socket))
+        matrix = np.array(calibration.getCameraIntrinsics(socket, *size))
     except RuntimeError as error:
         raise CameraError(
             f"{camera}: the device holds no calibration of this camera ({_first_line(error)}): "
             "calibrate it and name the file in source.calibration"
         ) from None
-    if not rectified and model != library().CameraModel.Perspective:
-        raise CameraError(
-            f"{camera}: its lens is {model.name.lower()}: set source.rectify: true, or calibrate it and name "
-            "the file in source.calibration"
-        )
-    found, off_px = fit_opencv_distortion(width, height, matrix, distortion)
-    if off_px > _WORST_LENS_PX:
-        log.warning(
-            "%s: four coefficients describe this lens to %.1f px only: set source.rectify: true", camera, off_px
-        )
-    return found
+    # Pixel centers are at whole numbers there.
+    fx, fy, cx, cy = map(float, (matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5))
+    return Pinhole(*size, fx, fy, cx, cy)
 
 
 def _first_line(error: Exception) -> str:

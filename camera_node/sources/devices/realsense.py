@@ -27,7 +27,6 @@ from camera_node.sources.devices.feed import (
     intrinsics_or_reason,
     select_device,
 )
-from camera_node.sources.devices.lens_coefficients import fit_opencv_distortion
 from freshfield.clock import Clock, SystemClock
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose, se3
@@ -207,12 +206,14 @@ def lens(camera: str, intrinsics: Any) -> Pinhole:
             f"{camera}: lens model {intrinsics.model} is not supported: calibrate the camera and name "
             "the file in source.calibration"
         )
+    k1, k2, p1, p2, k3 = map(float, intrinsics.coeffs)
     # Color streams of the D400 are rectified; their coefficients describe the inverse, and are zero.
-    distortion = [] if straight and not any(intrinsics.coeffs) else list(intrinsics.coeffs)
-    if straight and distortion:
+    if k3 or (straight and any((k1, k2, p1, p2))):
         raise CameraError(
-            f"{camera}: its pictures are straightened by coefficients that cannot be undone here: calibrate "
+            f"{camera}: its pictures are bent by coefficients that a frame cannot carry: calibrate "
             "the camera and name the file in source.calibration"
         )
-    matrix = [[intrinsics.fx, 0, intrinsics.ppx], [0, intrinsics.fy, intrinsics.ppy], [0, 0, 1]]
-    return fit_opencv_distortion(intrinsics.width, intrinsics.height, matrix, distortion)[0]
+    # Pixel centers are at whole numbers there.
+    center = (float(intrinsics.ppx) + 0.5, float(intrinsics.ppy) + 0.5)
+    size = (intrinsics.width, intrinsics.height)
+    return Pinhole(*size, float(intrinsics.fx), float(intrinsics.fy), *center, (k1, k2, p1, p2))

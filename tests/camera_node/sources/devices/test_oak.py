@@ -79,7 +79,7 @@ def test_it_is_a_source_like_any_other_and_says_when_it_is_gone(replay):
     clock = WallClock()
 
     class Feed(oak.FrameQueue):
-        intrinsics = oak.lens("eye", calibration(), dai.CameraBoardSocket.CAM_A, (WIDTH, HEIGHT), False)
+        intrinsics = oak.lens("eye", calibration(), dai.CameraBoardSocket.CAM_A, (WIDTH, HEIGHT))
         depth = DEPTH
 
         def close(self):
@@ -126,43 +126,25 @@ def test_depth_is_the_newest_frame_in_millimeters_with_its_time():
     assert depths.newest(0) is None, "each once"
 
 
-def calibration(distortion=None):
+def calibration():
     """As it is burnt into a device."""
     handler = dai.CalibrationHandler()
     matrix = [[1500.0, 0.0, 959.5], [0.0, 1500.0, 719.5], [0.0, 0.0, 1.0]]
     handler.setCameraIntrinsics(dai.CameraBoardSocket.CAM_A, matrix, 1920, 1440)
-    handler.setDistortionCoefficients(dai.CameraBoardSocket.CAM_A, distortion or [0.0] * 14)
+    handler.setDistortionCoefficients(dai.CameraBoardSocket.CAM_A, [0.0] * 14)
     return handler
 
 
 def test_intrinsics_are_the_devices_scaled_to_the_picture():
     socket = dai.CameraBoardSocket.CAM_A
-    lens = oak.lens("eye", calibration(), socket, (640, 480), False)
-    assert (lens.width, lens.height) == (640, 480) and not np.any(np.abs(lens.distortion) > 1e-9)
+    lens = oak.lens("eye", calibration(), socket, (640, 480))
+    assert (lens.width, lens.height) == (640, 480) and not lens.distorted
     assert lens.fx == pytest.approx(500.0, abs=1e-3) and lens.cx == pytest.approx(320.0, abs=0.6)
-
-
-def test_a_lens_of_many_coefficients_is_fitted_or_straightened(caplog):
-    socket = dai.CameraBoardSocket.CAM_A
-    rational = [8.0, -20.0, 1e-4, -2e-4, 60.0, 7.8, -19.0, 57.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-    bent = oak.lens("eye", calibration(rational), socket, (640, 480), False)
-    assert any(bent.distortion)
-    straight = oak.lens("eye", calibration(rational), socket, (640, 480), True)
-    assert not np.any(np.abs(straight.distortion) > 1e-9)
 
 
 def test_a_device_that_was_never_calibrated_is_told():
     with pytest.raises(CameraError, match="eye: the device holds no calibration"):
-        oak.lens("eye", dai.CalibrationHandler(), dai.CameraBoardSocket.CAM_A, (640, 480), False)
-
-
-def test_a_fisheye_lens_is_not_taken_for_another():
-    fisheye = calibration([0.05, -0.01, 0.004, -0.001] + [0.0] * 10)
-    fisheye.setCameraType(dai.CameraBoardSocket.CAM_A, dai.CameraModel.Fisheye)
-    with pytest.raises(CameraError, match=r"eye: its lens is fisheye: set source.rectify: true"):
-        oak.lens("eye", fisheye, dai.CameraBoardSocket.CAM_A, (640, 480), False)
-    straight = oak.lens("eye", fisheye, dai.CameraBoardSocket.CAM_A, (640, 480), True)
-    assert not straight.distorted
+        oak.lens("eye", dai.CalibrationHandler(), dai.CameraBoardSocket.CAM_A, (640, 480))
 
 
 def test_a_device_without_calibration_opens_all_the_same(monkeypatch):
@@ -170,13 +152,17 @@ def test_a_device_without_calibration_opens_all_the_same(monkeypatch):
     device = MagicMock()
     device.readCalibration.return_value = dai.CalibrationHandler()
     monkeypatch.setattr(dai, "Device", lambda info: device)
-    monkeypatch.setattr(dai, "Pipeline", MagicMock())
+    pipeline = MagicMock()
+    monkeypatch.setattr(dai, "Pipeline", pipeline)
     monkeypatch.setattr(oak, "find", lambda camera, name: None)
     scenario = plan()
     feed = oak.OakFeed("eye", None, source_config(scenario), Fraction(10), WallClock())
     assert feed.intrinsics is None and "name the file in source.calibration" in feed.no_intrinsics
     device.readCalibration.return_value = calibration()
     assert oak.OakFeed("eye", None, source_config(scenario), Fraction(10), WallClock()).intrinsics
+    asked = pipeline.return_value.create.return_value.build.return_value.requestOutput.call_args_list
+    straightened = [each.kwargs["enableUndistortion"] for each in asked if "enableUndistortion" in each.kwargs]
+    assert straightened == [False, True], "only by a calibration"
 
 
 def test_a_lens_that_can_focus_stays_where_it_was_calibrated(monkeypatch):

@@ -118,8 +118,10 @@ def test_intrinsics_are_the_devices():
 def test_a_lens_that_cannot_be_described_is_refused():
     with pytest.raises(CameraError, match=r"lens model .* is not supported"):
         realsense.lens("eye", intrinsics(rs.distortion.kannala_brandt4))
-    with pytest.raises(CameraError, match="cannot be undone"):
+    with pytest.raises(CameraError, match="a frame cannot carry"):
         realsense.lens("eye", intrinsics(coefficients=(0.1, 0, 0, 0, 0)))
+    with pytest.raises(CameraError, match="a frame cannot carry"):
+        realsense.lens("eye", intrinsics(rs.distortion.brown_conrady, (0.1, 0, 0, 0, 0.2)))
 
 
 class Both:
