@@ -8,10 +8,11 @@ from functools import partial
 from typing import Any
 
 from camera_node.capture import Camera
+from edge_server.experiments.common.drawn_images import draw_images
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row, SeedTable
 from edge_server.experiments.common.tables import mean_or_none
-from edge_server.experiments.studies.drawing import curves, draw_images, several
+from edge_server.experiments.studies.drawing import curves, several
 from edge_server.experiments.studies.findings import better
 from edge_server.experiments.studies.study import Claim, Study, StudyRequest, open_engine
 from edge_server.experiments.studies.trial import scenario_of, scenes_here

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
+from edge_server.experiments.common.drawn_images import Image, draw_images
 from edge_server.experiments.common.seed_table import Curve, Row, SeedTable
 from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.studies.findings import NO_DELAY, USE_ALL
 from edge_server.experiments.studies.study import METRICS, StudyRequest
 from edge_server.experiments.studies.trial import last_images, scenes_here, usual_trial
 from edge_server.report.style import CYCLE, GRAY, figure, label_lines
-
-Image = NDArray[np.uint8]
-_HEIGHT = 220  # pixels of an image in a figure
 
 
 def draw_curve(axes: Axes, curve: Curve, label: str, place: int) -> None:
@@ -122,19 +116,3 @@ def several(*drawings: Draw) -> Draw:
             one(request, table)
 
     return draw
-
-
-def draw_images(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, Image]]]]) -> None:
-    """Draw rows of images (title, [(label, image), ...]), all of one height, to ``path`` (PNG)."""
-    columns = max(len(images) for _, images in rows)
-    with figure(path, len(rows), columns, height_inch=2.3, dpi=80) as (_, axes):
-        for line, (title, images) in zip(axes, rows):
-            for at in line:
-                at.axis("off")
-            for at, (label, image) in zip(line, images):
-                width = round(image.shape[1] * _HEIGHT / image.shape[0])
-                at.imshow(cv2.resize(image, (width, _HEIGHT), interpolation=cv2.INTER_NEAREST))
-                at.set_title(label, fontsize=8, fontweight="normal", loc="center")
-            line[0].text(
-                -0.06, 0.5, title, rotation=90, va="center", ha="right", fontsize=9, transform=line[0].transAxes
-            )

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from edge_server.experiments.common.drawn_images import Image, draw_images
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row, SeedTable
 from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.common.tables import markdown_table, number
-from edge_server.experiments.studies.drawing import Image, draw_curve, draw_images
+from edge_server.experiments.studies.drawing import draw_curve
 from edge_server.experiments.studies.findings import better, trend
 from edge_server.experiments.studies.study import METRICS, Claim, Study, StudyRequest, open_engine
 from edge_server.experiments.studies.trial import scenario_of, scene_label, scenes_here

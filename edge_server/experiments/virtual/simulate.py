@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from camera_node.capture import build_cameras
+from camera_node.settings import source_config
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.edge_defaults import cameras_move
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
@@ -88,6 +90,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         if args.out is not None:
             decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
+        watched = None
+        if scenario.held_out_every:
+            from edge_server.experiments.virtual.now_and_all import NowAndAll
+
+            kept = build_cameras(scenario, source_config(scenario), scenario.held_out, folders.data)
+            watched = NowAndAll(deployment, kept, args.seconds)
         _run(deployment, args.seconds, quiet=args.json)
     except (ScenarioError, DatasetError, ValueError) as error:
         print(f"edge-server simulate: {error}", file=sys.stderr)
@@ -95,8 +103,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     found = {**summary(scenario, deployment, args.seconds), "chosen": chosen}
     if missing:
         found["lpips_missing"] = missing
+    if watched is not None:
+        found["now_and_all"] = watched.means()
     if args.out is not None:
         write_output(args.out, found, deployment.publications)
+        if watched is not None:
+            watched.write(args.out)
     print(json.dumps(found) if args.json else show(found))
     return 0
 
@@ -161,6 +173,11 @@ def show(found: dict[str, Any]) -> str:
         f"  views       {number(found['views'], 1)} an update",
         "  last fifth  " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["last_fifth"].items()),
         "  shown       " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["shown"].items()),
+        *(
+            ["  since 4 s   " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["now_and_all"].items())]
+            if found.get("now_and_all")
+            else []
+        ),
         "  frames      " + ", ".join(f"{k} {v}" for k, v in found["frames"].items() if v),
         f"  digest      {found['digest'][:32]} on {found['processor']}",
     ]

@@ -172,6 +172,11 @@ class VirtualDeployment:
         for link in self._links.values():
             self._take(link.flush(self.clock.now_ns() - self._channel_origin_ns))
 
+    def shown_now(self) -> Snapshot | None:
+        """What a visitor sees: the newest publication, carried on to the clock's instant. None before the first, and if
+        nothing shown is scored."""
+        return None if self._shown is None else self._shown.at(self.clock.now_ns())
+
     @property
     def capture_period_ns(self) -> int:
         """Capture period of the fastest camera."""
@@ -402,9 +407,10 @@ class VirtualDeployment:
 
     def _score_shown(self, now_ns: int) -> None:
         self._show_ns = next(self._instants)
-        if self._shown is None:
+        shown = self.shown_now()
+        if shown is None:
             return
         assert self.truth is not None
-        score = self.truth.score(self._shown.at(now_ns), now_ns)
+        score = self.truth.score(shown, now_ns)
         if score is not None:
             self.shown.append(score)

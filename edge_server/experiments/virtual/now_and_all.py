@@ -1,0 +1,137 @@
+"""Of carried cameras: what is shown now, and all that was shown so far, at regular instants of a run in virtual time.
+
+A held-out camera that moves shows another view each time, so a mean over the run says little. *Now* is the newest
+held-out frame, *all* each held-out frame so far, both rendered from the newest publication, at the poses and exposures
+that the field's corrections of neighboring frames give, where it has any.
+
+  python -m edge_server.experiments.virtual.now_and_all runs/before runs/after --out docs/results/carried
+
+draws runs of ``edge-server simulate SCENARIO --out RUN``: decibels by seconds, and truth beside what each shows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.capture import Camera
+from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
+from edge_server.fidelity.refined import render_refined
+from edge_server.fidelity.scorer import Scorer
+from edge_server.fields import Snapshot, View
+from freshfield import payload
+from freshfield.files import write_json
+
+MARKS_S = 2.0
+SINCE_S = 4.0  # the first seconds are of a field that has seen next to nothing
+_FILE, _IMAGES = "now-and-all.json", "now-and-all.npz"
+_SEEN = 16  # frames of "all" that are kept as images
+
+
+class NowAndAll:
+    """Watches a deployment before it runs. rows: scores by instant.
+
+    cameras: the held-out cameras, opened. seconds: how long it will run.
+    """
+
+    def __init__(self, deployment: VirtualDeployment, cameras: Sequence[Camera], seconds: float) -> None:
+        self.rows: list[dict[str, Any]] = []
+        self._deployment, self._scorer = deployment, Scorer()
+        self._frames: list[View] = []
+        self._images: dict[str, NDArray[np.uint8]] = {}
+        for camera in cameras:
+            schedule, tick = camera.rate_schedule, 0
+            while schedule.due_ns(tick) < 1e9 * seconds:
+                deployment.at(schedule.due_ns(tick), partial(self._take, camera, tick))
+                tick += 1
+        for number in range(1, int(seconds / MARKS_S) + 1):
+            deployment.at(round(1e9 * number * MARKS_S), partial(self._mark, number * MARKS_S))
+
+    def means(self) -> dict[str, float | None]:
+        """Means of the rows from SINCE_S on; empty before."""
+        late = [row for row in self.rows if row["t_s"] >= SINCE_S]
+        return {
+            name: float(np.mean([row[name] for row in late])) for name in (late[0] if late else ()) if name != "t_s"
+        }
+
+    def write(self, out: Path) -> None:
+        """Write rows and images to the folder ``out``. Raises OSError."""
+        write_json(out / _FILE, self.rows)
+        np.savez_compressed(out / _IMAGES, **self._images)  # type: ignore[arg-type]
+
+    def _take(self, camera: Camera, tick: int) -> None:
+        shot = camera.capture(tick)
+        lens = shot.intrinsics
+        image = payload.decode(shot.payload, camera.codec, lens.width, lens.height)[..., :3]
+        self._frames.append(View(camera.name, image, shot.pose.matrix(), lens, self._deployment.clock.now_ns()))
+
+    def _mark(self, t_s: float) -> None:
+        shown = self._deployment.shown_now()
+        if shown is None or not self._frames:
+            return
+        found = [self._shown(shown, frame) for frame in self._frames]
+        scores = [self._scorer.score(f.camera, image, 0, f.image, 0) for f, image in zip(self._frames, found)]
+        row: dict[str, Any] = {
+            "t_s": t_s,
+            "now_db": scores[-1].psnr_db,
+            "all_db": float(np.mean([s.psnr_db for s in scores])),
+        }
+        if all(score.ssim is not None for score in scores):
+            row |= {"now_ssim": scores[-1].ssim, "all_ssim": float(np.mean([s.ssim for s in scores]))}
+        self.rows.append(row)
+        some = np.linspace(0, len(found) - 1, min(_SEEN, len(found))).round().astype(int)
+        self._images = {
+            "truth_now": self._frames[-1].image,
+            "now": _bytes(found[-1]),
+            "truth_all": np.array([self._frames[k].image for k in some]),
+            "all": np.array([_bytes(found[k]) for k in some]),
+        }
+
+    @staticmethod
+    def _shown(shown: Snapshot, frame: View) -> NDArray[np.float32]:
+        refined = render_refined(shown, frame)
+        return shown.render(frame.camera_to_world, frame.intrinsics).color if refined is None else refined
+
+
+def _bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Draw runs side by side; returns the exit status."""
+    from edge_server.experiments.common.drawn_images import draw_images
+    from edge_server.report.style import figure, label_lines
+
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("runs", nargs="+", type=Path, help="folders of runs of one scenario")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="NAME", help="writes NAME-time.png, NAME-pictures.png"
+    )
+    args = parser.parse_args(argv)
+    images = [dict(np.load(run / _IMAGES)) for run in args.runs]
+    with figure(args.out.with_name(f"{args.out.name}-time.png"), 2) as (_, axes):
+        for run in args.runs:
+            rows = json.loads((run / _FILE).read_text())
+            for line, name in zip(axes[:, 0], ("now_db", "all_db")):
+                line.plot([row["t_s"] for row in rows], [row[name] for row in rows], label=run.name)
+        label_lines(axes[0, 0], "now, dB")
+        label_lines(axes[1, 0], "all so far, dB", "seconds")
+    rows = [("now", [("truth", images[0]["truth_now"]), *((r.name, i["now"]) for r, i in zip(args.runs, images))])]
+    for k in (2, 6, 10):
+        kept = [(r.name, i["all"][k]) for r, i in zip(args.runs, images) if k < len(i["all"])]
+        if kept:
+            rows.append(("earlier", [("truth", images[0]["truth_all"][k]), *kept]))
+    draw_images(args.out.with_name(f"{args.out.name}-pictures.png"), rows)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

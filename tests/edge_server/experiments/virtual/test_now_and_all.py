@@ -1,0 +1,41 @@
+"""What is shown of a carried camera, now and all so far: which frames, when, and that the images are those scored."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from edge_server.experiments.virtual import now_and_all
+from edge_server.experiments.virtual.simulate import main
+from edge_server.fidelity.psnr import psnr
+from tests.edge_server.experiments.sets import SMALL
+
+
+def test_newest_and_all_held_out_frames_are_scored_each_two_seconds_and_drawn(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    world = {"kind": "world", "width": 24, "height": 24, "fps": 10, "carried": ["hand"]}
+    section = {
+        "cameras": {"ids": ["hand", "kept"], "held_out": ["kept"], "held_out_every": 8},
+        "source": {**world, "params": {"people": 0, "supersample": 1}},
+        "channel": {"preset": "ch5"},
+        "edge": {"field": "ngp", "field_options": SMALL, "steps": 2},
+    }
+    (tmp_path / "walk.yaml").write_text(yaml.safe_dump(section))
+    assert main([str(tmp_path / "walk.yaml"), "--seconds", "5", "--json", "--out", str(tmp_path / "run")]) == 0
+    found = json.loads(capsys.readouterr().out)["now_and_all"]
+    rows = json.loads((tmp_path / "run" / "now-and-all.json").read_text())
+    assert [row["t_s"] for row in rows] == [2.0, 4.0]
+    assert found == pytest.approx({name: value for name, value in rows[1].items() if name != "t_s"})
+    images = dict(np.load(tmp_path / "run" / "now-and-all.npz"))
+    # Frames of 0, .8, ..., 4.0 s; the newest is the last of all.
+    assert images["all"].shape == (6, 24, 24, 3) and np.array_equal(images["all"][-1], images["now"])
+    each = [psnr(a / 255.0, b / 255.0) for a, b in zip(images["all"], images["truth_all"])]
+    assert rows[1]["now_db"] == pytest.approx(each[-1], abs=0.05) and rows[1]["all_db"] == pytest.approx(
+        np.mean(each), abs=0.05
+    )
+    assert now_and_all.main([str(tmp_path / "run"), str(tmp_path / "run"), "--out", str(tmp_path / "both")]) == 0
+    assert (tmp_path / "both-time.png").stat().st_size > 1000 < (tmp_path / "both-pictures.png").stat().st_size
