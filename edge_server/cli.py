@@ -40,6 +40,7 @@ In the help of a command, [x] after an option is its default.
   edge-server report runs/room
   edge-server explain runs/room --decision 12
   edge-server export runs/room --mesh room.ply
+  edge-server render runs/room --orbit room.mp4
 """
 
 
@@ -99,6 +100,7 @@ _COMMANDS = {
     "study": ("experiments.studies.study_command", "reproduce the thesis's figures, each with a verdict"),
     "explain": ("report.explain_command", "explain a policy's decision: shares of state parts, cameras, image regions"),
     "export": ("export.export_command", "write a run's mesh, splats, points and cameras as files for other programs"),
+    "render": ("export.render_command", "render images and videos of a run from new viewpoints"),
     "keys": ("live.keys", "make a development CA, certificates and tokens for a scenario's processes"),
     "fetch-lpips": ("fidelity.fetch_lpips", "fetch LPIPS weights with the public package and convert them for --lpips"),
 }

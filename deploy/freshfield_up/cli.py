@@ -6,6 +6,7 @@ The programs of a deployment on several machines are commands of their own: came
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -23,20 +24,27 @@ EXAMPLES = """examples:
   freshfield scenario keys edge                what a section may say
   freshfield scenario check mine.yaml
   freshfield doctor mine.yaml                  what this machine lacks for it
+  freshfield render runs/quad --orbit quad.mp4
   freshfield completion bash > ~/.local/share/bash-completion/completions/freshfield
 
 One program a machine: camera-node, channel-emu, edge-server; each has --help.
 """
 
 
+# Commands of another program -> its module.
+_ELSEWHERE = {"doctor": "camera_node.cli", "render": "edge_server.cli"}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status: 0, 1 (a process died, or something is missing) or 2 (bad
     input)."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if words[:1] == ["doctor"]:
-        from camera_node.cli import main as camera_node
-
-        return camera_node(words)
+    if words and words[0] in _ELSEWHERE:
+        try:
+            return int(importlib.import_module(_ELSEWHERE[words[0]]).main(words))
+        except ImportError as error:
+            print(f"freshfield: {error.name} is missing: pip install 'freshfield[edge]'", file=sys.stderr)
+            return 2
     args = parser().parse_args(words)
     try:
         return int(args.run(args))
@@ -66,6 +74,7 @@ def parser() -> argparse.ArgumentParser:
         commands.add_parser("scenario", help="list, show, start, check scenario files; their keys")
     )
     commands.add_parser("doctor", add_help=False, help="check this machine's part of a scenario (camera-node doctor)")
+    commands.add_parser("render", add_help=False, help="images and videos of a run (edge-server render)")
     completion = commands.add_parser("completion", help="print a shell's completion of this command (needs shtab)")
     completion.add_argument("shell", choices=("bash", "zsh", "tcsh"))
     completion.set_defaults(run=_completion)

@@ -35,9 +35,10 @@ class Source:
         """The views as images to write, at the poses that belong to the field's Gaussians: corrected ones, if it
         corrects them."""
         names = file_names([v.camera for v in self.views])
-        return [PosedImage(name, v.image, self._pose(v), v.intrinsics) for name, v in zip(names, self.views)]
+        return [PosedImage(name, v.image, self.pose(v), v.intrinsics) for name, v in zip(names, self.views)]
 
-    def _pose(self, view: View) -> NDArray[np.float64]:
+    def pose(self, view: View) -> NDArray[np.float64]:
+        """Camera to world (4, 4) of a view, corrected where the field corrects it."""
         known = self.field.correction(view) if isinstance(self.field, RefinesCameras) else None
         return np.asarray(view.camera_to_world if known is None else known.camera_to_world, np.float64)
 

@@ -1,0 +1,161 @@
+"""Paths of a rendering camera: about what a run's cameras saw, or as nerfstudio's viewer saved one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.export import ExportError
+from edge_server.fields import View
+from freshfield.geometry import GeometryError, Pinhole, converging_point, look_at
+from freshfield.limits import MAX_IMAGE_SIDE_PX
+from freshfield.untrusted import UntrustedError, read_json, read_text
+
+Matrix = NDArray[np.float64]
+
+# Largest angle without a camera that an orbit crosses: beyond it nobody saw what it would show.
+WIDEST_GAP_DEG = 90.0
+MOST_FRAMES = 20_000  # of a path: ten minutes
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's camera axes: y up, z backward
+
+
+@dataclass(frozen=True)
+class Step:
+    """One image of a path. camera_to_world: (4, 4), OpenCV axes. fov_deg: vertical field of view."""
+
+    camera_to_world: Matrix
+    fov_deg: float
+
+
+def lens(width: int, height: int, fov_deg: float) -> Pinhole:
+    """A pinhole of a vertical field of view."""
+    focal = height / 2 / math.tan(math.radians(fov_deg) / 2)
+    return Pinhole(width, height, focal, focal, width / 2, height / 2)
+
+
+def vertical_fov_deg(camera: Pinhole) -> float:
+    return math.degrees(2 * math.atan(camera.height / 2 / camera.fy))
+
+
+def orbit(views: Sequence[View], count: int, fov_deg: float) -> list[Step]:
+    """A closed path of ``count`` steps at the cameras' median height and distance, looking at what they look at.
+
+    It goes round where cameras stand all round, else to and fro along their arc, so that it shows what was seen.
+    Cameras that look outward or the same way have nothing in common: the path then turns on the spot between them, as
+    far as they look.
+    """
+    poses = np.array([v.camera_to_world for v in views], np.float64)
+    ahead, places = poses[:, :3, 2], poses[:, :3, 3]
+    up = _upward(poses)
+    first = _unit(np.cross(up, [1.0, 0.0, 0.0]), np.cross(up, [0.0, 1.0, 0.0]))
+    axes = np.stack([first, np.cross(up, first)])
+    center = converging_point(places, ahead)
+    outward = center is None
+    middle = np.median(places, axis=0) if center is None else center
+    arms = ahead if center is None else places - center
+    flat = arms @ axes.T
+    angles = _sweep(np.arctan2(flat[:, 1], flat[:, 0]), count)
+    radius, height = float(np.median(np.hypot(*flat.T))), float(np.median(arms @ up))
+    rim = middle + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1) @ axes + height * up
+    # Looking outward, the rim is where it looks; else where it stands.
+    pairs = ((middle, at) for at in rim) if outward else ((at, middle) for at in rim)
+    return [Step(look_at(eye, target, up), fov_deg) for eye, target in pairs]
+
+
+def looking(eye: Sequence[float], target: Sequence[float], fov_deg: float) -> list[Step]:
+    """One step. Raises ExportError if both are one point, or a number is not finite."""
+    if not np.isfinite([*eye, *target]).all():
+        raise ExportError("--pose: expected finite numbers")
+    try:
+        return [Step(look_at(eye, target), fov_deg)]
+    except GeometryError as error:
+        raise ExportError(f"--pose: {error}") from None
+
+
+def read_nerfstudio(file: Path) -> tuple[list[Step], float, tuple[int, int]]:
+    """A ``camera_path.json`` of nerfstudio's viewer: its steps, frames a second, width and height.
+
+    Its poses are read as being in the run's own world. ExportError names the key that is wrong.
+    """
+    try:
+        data = read_json(read_text(file))
+    except (OSError, UntrustedError, ValueError) as error:
+        raise ExportError(f"--path {file}: {error}") from None
+    try:
+        if not isinstance(data, dict):
+            raise ValueError("expected an object")
+        kind = data.get("camera_type", "perspective")
+        if kind != "perspective":
+            raise ValueError(f"camera_type: expected perspective, got {kind!r}")
+        size = tuple(_whole(data, key) for key in ("render_width", "render_height"))
+        entries = data.get("camera_path")
+        if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_FRAMES:
+            raise ValueError(f"camera_path: expected a list of 1 to {MOST_FRAMES} poses")
+        fps = _number(
+            data.get("fps", len(entries) / _number(data.get("seconds", 1), "seconds", 1e-3, 1e5)), "fps", 0.1, 240
+        )
+        return [_step(entry, f"camera_path[{k}]") for k, entry in enumerate(entries)], fps, (size[0], size[1])
+    except ValueError as error:
+        raise ExportError(f"--path {file}: {error}") from None
+
+
+def _step(entry: Any, where: str) -> Step:
+    if not isinstance(entry, dict):
+        raise ValueError(f"{where}: expected an object")
+    try:
+        matrix = np.array(entry.get("camera_to_world"), np.float64).reshape(4, 4)
+    except (TypeError, ValueError):
+        raise ValueError(f"{where}.camera_to_world: expected 16 numbers") from None
+    turn = matrix[:3, :3]
+    if not np.isfinite(matrix).all() or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
+        raise ValueError(f"{where}.camera_to_world: expected a rotation and a translation")
+    return Step(matrix @ _OPENGL, _number(entry.get("fov", 50.0), f"{where}.fov", 1.0, 170.0))
+
+
+def _whole(data: dict[str, Any], key: str) -> int:
+    value = data.get(key)
+    if type(value) is not int or not 2 <= value <= MAX_IMAGE_SIDE_PX:
+        raise ValueError(f"{key}: expected 2 to {MAX_IMAGE_SIDE_PX}, got {value!r}")
+    return value
+
+
+def _number(value: Any, key: str, lowest: float, highest: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not lowest <= value <= highest:
+        raise ValueError(f"{key}: expected {lowest:g} to {highest:g}, got {value!r}")
+    return float(value)
+
+
+def _sweep(azimuths: Matrix, count: int) -> Matrix:
+    """Angles (count,): a full turn, or to and fro over all ``azimuths`` where no camera stands in a wide gap."""
+    ordered = np.sort(azimuths % (2 * np.pi))
+    gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
+    widest = int(np.argmax(gaps))
+    phase = np.arange(count) / count * 2 * np.pi
+    start = ordered[(widest + 1) % len(ordered)]
+    if gaps[widest] < np.radians(WIDEST_GAP_DEG):
+        return start + phase
+    return start + (2 * np.pi - gaps[widest]) * (1 - np.cos(phase)) / 2
+
+
+def _upward(poses: Matrix) -> Matrix:
+    """Direction (3,) that is up for cameras (N, 4, 4).
+
+    People hold cameras level, so their right axes are perpendicular to it. Where these do not tell (one camera, or all
+    side by side), it is the mean of the images' up.
+    """
+    mean = _unit(-poses[:, :3, 1].sum(axis=0), np.array([0.0, 0.0, 1.0]))
+    _, sizes, axes = np.linalg.svd(np.concatenate([poses[:, :3, 0], np.zeros((3, 3))]))
+    if sizes[1] < 0.1 * sizes[0] or abs(axes[2] @ mean) < 0.5:
+        return mean
+    return np.asarray(axes[2] * np.sign(axes[2] @ mean))
+
+
+def _unit(vector: Matrix, otherwise: Matrix) -> Matrix:
+    length = np.linalg.norm(vector)
+    return vector / length if length > 1e-6 else otherwise / np.linalg.norm(otherwise)

@@ -1,0 +1,193 @@
+"""``edge-server render``: images and videos of a run's field from any viewpoint."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.export import ExportError
+from edge_server.export.camera_paths import Step, lens, looking, orbit, read_nerfstudio, vertical_fov_deg
+from edge_server.export.run_source import Source, open_source
+from edge_server.fields import Rendering
+from freshfield.files import out_file
+from freshfield.geometry import Pinhole
+from freshfield.limits import MAX_IMAGE_SIDE_PX
+
+DESCRIPTION = """\
+Renders the field of a run or fit from new viewpoints. RUN is its folder, or a checkpoint in it.
+
+  edge-server render runs/demo --orbit orbit.mp4                     round what the cameras look at
+  edge-server render runs/demo --camera cam03 cam03.png              as one of its cameras sees it
+  edge-server render runs/demo --pose 2 -1 1.5 0 0 1 view.png        from (2, -1, 1.5), looking at (0, 0, 1), meters
+  edge-server render runs/fit --path camera_path.json flight.mp4     a path saved by nerfstudio's viewer
+  edge-server render runs/demo --orbit depth.mp4 --depth
+  edge-server render runs/a --beside runs/b --orbit both.mp4         the same path through both
+
+Files end in .png or .jpg (the first image of a path), or in .mp4.
+"""
+
+Image = NDArray[np.uint8]
+_IMAGES, _VIDEOS = (".png", ".jpg", ".jpeg"), (".mp4",)
+DEFAULT_HEIGHT = 480  # pixels, at the shape of the cameras' images
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    args = _parser().parse_args(argv)
+    try:
+        _render(args)
+    except ExportError as error:
+        print(f"edge-server render: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("edge-server render", description=DESCRIPTION, formatter_class=raw)
+    add = parser.add_argument
+    add("run", type=Path, metavar="RUN", help="folder of a run or fit (its --out), or a checkpoint")
+    which = parser.add_mutually_exclusive_group(required=True).add_argument
+    which("--orbit", action="store_true", help="round what the cameras look at, where they stand")
+    which("--pose", type=float, nargs=6, metavar=("X", "Y", "Z", "AT_X", "AT_Y", "AT_Z"), help="one viewpoint, z up")
+    which("--camera", metavar="ID", help="the viewpoint and lens of one of the run's cameras")
+    which("--path", type=Path, metavar="FILE", help="nerfstudio's camera_path.json, in the run's world")
+    add("file", type=out_file, metavar="FILE", help="image or video to write")
+    add("--beside", type=Path, metavar="RUN", help="another run, rendered to the right")
+    add("--depth", action="store_true", help="depth instead of color: near red, far blue, one scale for the whole path")
+    add("--size", metavar="WxH", help="pixels [the cameras' shape, 480 high; a path's own]")
+    add("--fov", type=float, metavar="DEG", help="vertical field of view [the cameras'; a path's own]")
+    add("--seconds", type=float, default=8.0, metavar="S", help="length of an orbit [%(default)g]")
+    add("--fps", type=float, metavar="N", help="images a second [25; a path's own]")
+    return parser
+
+
+def _render(args: argparse.Namespace) -> None:
+    ending = args.file.suffix.lower()
+    if ending not in (*_IMAGES, *_VIDEOS):
+        raise ExportError(f"{args.file}: expected a file that ends in {', '.join((*_IMAGES, *_VIDEOS))}")
+    for option, value, lowest, highest in (
+        ("seconds", args.seconds, 0.1, 600.0),
+        ("fps", args.fps, 0.1, 240.0),
+        ("fov", args.fov, 1.0, 170.0),
+    ):
+        if value is not None and not lowest <= value <= highest:
+            raise ExportError(f"--{option} {value:g}: expected {lowest:g} to {highest:g}")
+    sources = [open_source(run) for run in (args.run, args.beside) if run is not None]
+    steps, fps, (width, height) = _path(args, sources[0])
+    if ending in _IMAGES:
+        steps = steps[:1]
+    cameras = [lens(width, height, args.fov or step.fov_deg) for step in steps]
+    snapshots = [source.field.snapshot() for source in sources]
+
+    def render(index: int) -> list[Rendering]:
+        return [s.render(steps[index].camera_to_world, cameras[index]) for s in snapshots]
+
+    colors = _depth_colors(render, len(steps)) if args.depth else _colors
+    began = time.monotonic()
+    with _Writer(args.file, fps, (width * len(snapshots), height)) as write:
+        for index in range(len(steps)):
+            write(np.concatenate([colors(each) for each in render(index)], axis=1))
+            _progress(index + 1, len(steps), began)
+    print(f"{args.file}: {len(steps)} image{'s' * (len(steps) > 1)} of {width * len(snapshots)} x {height}")
+
+
+def _path(args: argparse.Namespace, source: Source) -> tuple[list[Step], float, tuple[int, int]]:
+    """Steps, images a second, and an image's width and height."""
+    like = source.views[0].intrinsics
+    if args.path is not None:
+        steps, fps, size = read_nerfstudio(args.path)
+        return steps, args.fps or fps, _size(args.size) or size
+    fps, fov = args.fps or 25.0, vertical_fov_deg(like)
+    if args.camera is not None:
+        shots = {view.camera: view for view in source.views}
+        if args.camera not in shots:
+            raise ExportError(f"--camera {args.camera}: the run has {', '.join(list(shots)[:20])}")
+        view = shots[args.camera]
+        return (
+            [Step(source.pose(view), vertical_fov_deg(view.intrinsics))],
+            fps,
+            _size(args.size) or _shape(view.intrinsics),
+        )
+    size = _size(args.size) or _shape(like)
+    if args.pose is not None:
+        return looking(args.pose[:3], args.pose[3:], fov), fps, size
+    return orbit(source.views, max(1, round(args.seconds * fps)), fov), fps, size
+
+
+def _shape(camera: Pinhole) -> tuple[int, int]:
+    """Even numbers near DEFAULT_HEIGHT: video codecs ask for them."""
+    return 2 * round(DEFAULT_HEIGHT * camera.width / camera.height / 2), DEFAULT_HEIGHT
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    size = (int(found[1]), int(found[2])) if found else (0, 0)
+    if not all(2 <= side <= MAX_IMAGE_SIDE_PX and side % 2 == 0 for side in size):
+        raise ExportError(f"--size {text}: expected even numbers, such as 1280x720")
+    return size
+
+
+def _colors(rendering: Rendering) -> Image:
+    return np.asarray(np.clip(rendering.color * 255 + 0.5, 0, 255), np.uint8)
+
+
+def _depth_colors(render: Callable[[int], list[Rendering]], count: int) -> Callable[[Rendering], Image]:
+    """Colors of depth by nearness (1 / depth), on the scale of eight images of the path."""
+    samples = [
+        r.depth[r.depth > 0] for k in np.unique(np.linspace(0, count - 1, 8).astype(int)) for r in render(int(k))
+    ]
+    near = 1.0 / np.concatenate(samples) if any(len(s) for s in samples) else np.ones(1)
+    low, high = np.percentile(near, [2, 98])
+
+    def colors(rendering: Rendering) -> Image:
+        there = rendering.depth > 0
+        share = (1.0 / np.where(there, rendering.depth, 1.0) - low) / max(high - low, 1e-9)
+        map_bgr = cv2.applyColorMap(np.asarray(np.clip(share, 0, 1) * 255, np.uint8), cv2.COLORMAP_TURBO)
+        return np.asarray(np.where(there[..., None], map_bgr[..., ::-1], 0), np.uint8)
+
+    return colors
+
+
+class _Writer:
+    """Writes an image, or a video one image at a time. ExportError: the file cannot be written."""
+
+    def __init__(self, file: Path, fps: float, size: tuple[int, int]) -> None:
+        self._file, self._video = file, None
+        if file.suffix.lower() in _VIDEOS:
+            self._video = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+            if not self._video.isOpened():
+                raise ExportError(f"{file}: cannot be written: is the folder there, and has OpenCV its video codecs?")
+
+    def __enter__(self) -> Callable[[Image], None]:
+        return self._write
+
+    def __exit__(self, *_: object) -> None:
+        if self._video is not None:
+            self._video.release()
+
+    def _write(self, image: Image) -> None:
+        bgr = np.ascontiguousarray(image[..., ::-1])
+        if self._video is not None:
+            self._video.write(bgr)
+        elif not cv2.imwrite(str(self._file), bgr):
+            raise ExportError(f"{self._file}: cannot be written")
+
+
+def _progress(done: int, count: int, began: float) -> None:
+    """One line in a terminal, nothing in a pipe."""
+    if sys.stderr.isatty() and count > 1:
+        left_s = (time.monotonic() - began) / done * (count - done)
+        print(
+            f"\r{done} of {count} images, {left_s:.0f} s left ", end="\n" * (done == count), file=sys.stderr, flush=True
+        )
