@@ -112,6 +112,24 @@ class FitData(Struct):
     missing: Count
 
 
+class SoFarScores(Struct):
+    """Scores of a held-out camera that moves (``fidelity.so_far``): of its newest frame (now), and of its frames so far
+    from the newest field (all). frames: how many these are. refined: at poses and exposures as the field corrects
+    them."""
+
+    now_psnr_db: Number
+    all_psnr_db: Number
+    now_ssim: Number | None = None
+    all_ssim: Number | None = None
+    frames: Count = 1
+    refined: bool = False
+
+    def words(self) -> str:
+        """In one line, for people."""
+        poses = ", at refined poses" if self.refined else ""
+        return f"now {self.now_psnr_db:.2f} dB, all {self.frames} frames so far {self.all_psnr_db:.2f} dB{poses}"
+
+
 class EdgeStatus(Struct, kw_only=True):
     """What a report takes from edge.json. seconds: of fitting. uptime_s: of a live edge. chosen: how the edge
     works and why, in one line. last_frames: sequence and capture time of the last frame of each camera's sessions."""
@@ -129,6 +147,7 @@ class EdgeStatus(Struct, kw_only=True):
     updates: UpdateCounts | None = None
     foreground: dict[str, Number | None] | None = None
     baseline: Baseline | None = None
+    so_far: SoFarScores | None = None
     depth: DepthStatus | None = None
     data: FitData | None = None
     lpips_missing: str | None = None

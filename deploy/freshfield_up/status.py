@@ -65,14 +65,25 @@ def _channel_line(channel: Status) -> str:
     return ", ".join(parts)
 
 
+def held_out(scores: dict[str, Any]) -> str:
+    """What is shown of held-out cameras that move (``SoFarScores``)."""
+    poses = ", at refined poses" if scores.get("refined") else ""
+    return (
+        f"now {fmt(scores.get('now_psnr_db'), '.2f')} dB, all {fmt(scores.get('frames'), 'd')} frames so far "
+        f"{fmt(scores.get('all_psnr_db'), '.2f')} dB{poses}"
+    )
+
+
 def _edge_line(edge: Status) -> str:
     updates = number(edge, "updates", "count")
     if not updates:
         return str(edge.get("doing") or "no update yet")
     views = f" on {NOTHING_HELD_OUT}" if (edge.get("scores") or {}).get("on") == "selected" else ""
+    so_far = edge.get("so_far")
     parts = [
         f"{updates:.0f} updates",
         f"{fmt(number(edge, 'updates', 'ms_p50'), '.0f')} ms each",
+        *([f"held out {held_out(so_far)}"] if isinstance(so_far, dict) else []),
         f"PSNR {fmt(number(edge, 'scores', 'psnr_db'), '.2f')} dB{views}",
         f"moving {fmt(number(edge, 'scores', 'psnr_moving_db'), '.2f')} dB",
         f"aAoI {fmt(number(edge, 'last', 'aaoi_ms'), '.0f')} ms",

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from freshfield.scenario import NOTHING_HELD_OUT
-from freshfield_up.status import fmt
+from freshfield_up.status import fmt, held_out
 
 
 def summarize(out: Path) -> str:
@@ -21,8 +21,10 @@ def summarize(out: Path) -> str:
     rejected = sum(frames.get("rejected", {}).values())
     shed = f", {n} of them left out for lack of time" if (n := updates.get("shed")) else ""
     idle = updates.get("without_step") or 0
+    so_far = fidelity.get("so_far")
     lines = [
         "",
+        *([f"held out   {held_out(so_far)}"] if so_far else []),
         f"shown      PSNR {fmt(shown.get('psnr_db'), '.2f')} dB over the last fifth of the run "
         f"(moving pixels {fmt(shown.get('psnr_moving_db'), '.2f')} dB, still "
         f"{fmt(shown.get('psnr_still_db'), '.2f')}), {_parts(shown.get('age_ms') or {})}",

@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags
+from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer
-from edge_server.fields import Snapshot
+from edge_server.fidelity.so_far import FrameScore, score_frame, thinned
+from edge_server.fields import Snapshot, View
 from edge_server.live.state import Publication
 from freshfield import payload
 from freshfield.frame import Frame
@@ -56,6 +58,14 @@ class Truth:
             self._image = payload.decode(self.frame.payload, self.frame.codec, k.width, k.height)
         return self._image
 
+    def forget(self) -> None:
+        """Forget the decoded image."""
+        self._image = None
+
+    def view(self, image: NDArray[np.uint8]) -> View:
+        """The frame as a view, with its image."""
+        return View(self.frame.camera, image, self.frame.pose.matrix(), self.frame.intrinsics, self.taken_ns)
+
 
 @dataclass(frozen=True)
 class Scored:
@@ -72,12 +82,14 @@ class HeldOutCamera:
 
     noisy: its frames are real video, so that the bound of moving pixels follows their noise.
     undecodable: number of damaged frames so far.
+    so_far: frames that were taken from other places than the one before, see ``fidelity.so_far``.
     """
 
     def __init__(self, camera: str, scorer: Scorer, noisy: bool = False) -> None:
         self.camera = camera
         self.undecodable = 0
         self.noise = NoiseEstimate()
+        self.so_far: list[Truth] = []
         self.truths: deque[Truth] = deque(maxlen=HISTORY_FRAMES)
         self._scorer, self._noisy = scorer, noisy
         self._pending: deque[tuple[Publication, Image | Snapshot, Pose]] = deque()
@@ -100,6 +112,9 @@ class HeldOutCamera:
         before means a clock jump or a new session, and restarts the history."""
         if self.truths and frame.generated_edge_ns <= self.truths[-1].taken_ns:
             self.truths.clear()
+        if self.truths and self.truths[-1].frame.pose != frame.pose:
+            self.so_far = [*self.so_far, Truth(frame)]
+            self.so_far = [self.so_far[k] for k in thinned(len(self.so_far))]
         self.truths.append(Truth(frame))
         # A waiting publication may be older than the history: the frames it needs are kept.
         waiting_ns = [publication.published_ns for publication, _, _ in self._pending]
@@ -107,6 +122,14 @@ class HeldOutCamera:
         while self.truths[0].taken_ns < oldest_ns:
             self.truths.popleft()
         return self._complete()
+
+    def frame_score(self, truth: Truth, snapshot: Snapshot) -> FrameScore | None:
+        """Score a frame of ``so_far``; None, and it is forgotten, if it cannot be decoded."""
+        if (image := self._decode(truth)) is None:
+            self.so_far = [other for other in self.so_far if other is not truth]
+            return None
+        truth.forget()
+        return score_frame(snapshot, truth.view(image), self._scorer)
 
     def period_ns(self) -> float | None:
         """The median gap of the frames; None before the second."""
@@ -162,10 +185,12 @@ class HeldOutCamera:
         found = [self._decode(truths[i]) for i in lags if truths[i].frame.pose == pose]
         earlier = [each for each in found if each is not None]
         bound = self.noise.bound if self._noisy else BOUND
+        view, refined = truth.view(image), None
         if not isinstance(shown, np.ndarray):
+            refined = render_refined(shown, view)
             shown = shown.render(pose.matrix(), truth.frame.intrinsics).color
         score = self._scorer.score(self.camera, shown, present_ns, image, truth.taken_ns, earlier, bound, psnr_only)
-        return score, shown
+        return with_refined(score, refined, view, self._scorer), shown if refined is None else refined
 
     def _decode(self, truth: Truth) -> NDArray[np.uint8] | None:
         """The frame's image. One that cannot be decoded is removed from the history, so that it fails only once."""

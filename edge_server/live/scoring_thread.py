@@ -24,9 +24,11 @@ from numpy.typing import NDArray
 
 from edge_server.fidelity.baselines import BaselineMean, baseline
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
+from edge_server.fidelity.so_far import FrameScore, so_far
 from edge_server.fields import Snapshot, View
-from edge_server.live.held_out import HeldOutCamera, Scored
+from edge_server.live.held_out import HeldOutCamera, Scored, Truth
 from edge_server.live.state import Comparison, Publication
+from edge_server.run_records import SoFarScores
 from freshfield.frame import Frame
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import seed_sequence
@@ -86,6 +88,11 @@ class ScoringThread:
         self._open: dict[int, list[Score]] = {}  # publications of which some cameras are still to be scored
         self._views: list[View] = []
         self.baselines = BaselineMean()
+        self.so_far: SoFarScores | None = None
+        """Of held-out cameras that move: now, and all frames so far. At the end of a run each of these is rendered from
+        the last field; before, as many as this thread has time for."""
+        self._frame_scores: dict[Truth, FrameScore] = {}
+        self._looked_at = 0  # frames of ``so_far`` scored so far
         self._thread = threading.Thread(target=self._main, name="scoring", daemon=True)
 
     def start(self) -> None:
@@ -136,6 +143,7 @@ class ScoringThread:
                 published = self._new_publications.popleft() if self._new_publications else None
                 frame = self._new_frames.popleft() if published is None and self._new_frames else None
             if published is None and frame is None:
+                self._look_back(whole=True)
                 return
             try:
                 if frame is not None:
@@ -186,6 +194,27 @@ class ScoringThread:
         self._views = views
         for camera in self._held_out.values():
             self._finish(camera.publish(publication, renderer))
+        if self._affordable(_RESERVE_S):
+            self._look_back()
+
+    def _look_back(self, whole: bool = False) -> None:
+        """Score the newest frame of each held-out camera that moves from the newest field, and of its frames so far the
+        next one in turn. whole: all of them."""
+        known = [(camera, truth) for camera in self._held_out.values() for truth in camera.so_far]
+        if not known or not self._recent:
+            return
+        snapshot = self._recent[-1][1]
+        newest = [(camera, camera.so_far[-1]) for camera in self._held_out.values() if camera.so_far]
+        turn = [known[self._looked_at % len(known)]]
+        self._looked_at += 1
+        for camera, truth in known if whole else [*turn, *newest]:
+            if (score := camera.frame_score(truth, snapshot)) is not None:
+                self._frame_scores[truth] = score
+        every = {truth for _, truth in known}
+        self._frame_scores = {truth: score for truth, score in self._frame_scores.items() if truth in every}
+        now = [self._frame_scores[truth] for _, truth in newest if truth in self._frame_scores]
+        if now:
+            self.so_far = so_far(list(self._frame_scores.values()), now[0])
 
     def _forget_snapshots(self) -> None:
         """Drop those that were replaced before the next capture at which what is shown is scored."""

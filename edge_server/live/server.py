@@ -185,6 +185,7 @@ class EdgeServer:
             field_name=config.field,
             chosen=described(scenario, config, self._moving),
             troubles=lambda: getattr(self.updater.field, "troubles", ()),
+            so_far=lambda: self.scoring.so_far,
         )
         log.info("%s", self.state.chosen)
         write_json(options.out / "frontier.json", msgspec.to_builtins(self.frontier))
@@ -381,6 +382,7 @@ class EdgeServer:
             ),
             "foreground": None if (cut := self.updater.decoder.foreground) is None else cut.status(),
             "baseline": msgspec.to_builtins(self.scoring.baselines.mean),
+            "so_far": msgspec.to_builtins(self.scoring.so_far),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else self.config.lpips,
             "held_out": list(self.scenario.held_out),

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from edge_server.fidelity.scorer import SELECTED, Score
 from edge_server.fields import Snapshot
-from edge_server.run_records import Frontier
+from edge_server.run_records import Frontier, SoFarScores
 from edge_server.scheduler import Policy
 from freshfield.frame import Frame
 
@@ -138,6 +138,7 @@ class EdgeState:
     frontier: what accuracy costs in time, as measured.
     chosen: how the edge works and why, in one line (``config.described``).
     troubles: what the field finds wrong with poses and measured depth, for people.
+    so_far: scores of held-out cameras that move.
     warnings: what other machines can do here that they should not, in words (--insecure).
     status_line: what the loop is doing, in one line for people, e.g. waiting for a first frame.
     """
@@ -152,6 +153,7 @@ class EdgeState:
     save_snapshot: Callable[[], Path]
     channel: Callable[[], dict | None] = lambda: None
     troubles: Callable[[], Sequence[str]] = tuple
+    so_far: Callable[[], SoFarScores | None] = lambda: None
     frontier: Frontier | None = None
     field_name: str = ""
     chosen: str = ""

@@ -130,6 +130,9 @@ def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publ
     ages = [c.age_ms for c in cameras if not c.held_out and c.age_ms is not None]
     last = publications[-1] if publications else None
     scored = next((p for p in reversed(publications) if p.psnr_db is not None), None)
+    db, on = (scored.psnr_db, scored.scored_on) if scored else (None, None)
+    if (moving := state.so_far()) is not None:
+        db, on = moving.now_psnr_db, moving.words()
     return markup.Summary(
         scenario=state.scenario,
         field=state.field_name,
@@ -137,8 +140,8 @@ def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publ
         condition="paused" if state.controls.paused else "live" if state.started else "waiting",
         updates=last.number + 1 if last else 0,
         update_ms=last.update_ms if last else None,
-        psnr_db=scored.psnr_db if scored else None,
-        scored_on=scored.scored_on if scored else None,
+        psnr_db=db,
+        scored_on=on,
         mean_age_ms=float(np.mean(ages)) if ages else None,
         worst_age_ms=float(np.max(ages)) if ages else None,
         reporting=sum(c.age_ms is not None for c in cameras),

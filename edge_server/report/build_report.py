@@ -132,13 +132,14 @@ def updates(series: Sequence[UpdateRow], edge: UpdateCounts) -> dict[str, Any]:
 
 def fidelity(series: Sequence[UpdateRow], seconds: float, edge: EdgeStatus) -> dict[str, Any]:
     """Scores against the held-out views at publication: {final, mean, baseline, lpips_missing, lpips_network,
-    scored_on, scored, series}. ``final``: mean over the last fifth of the run's ``seconds``."""
+    so_far: see ``SoFarScores``, scored_on, scored, series}. ``final``: mean over the last fifth of ``seconds``."""
     return {
         "final": _means(_last_fifth(series, seconds), METRICS),
         "mean": _means(series, METRICS),
         "baseline": msgspec.to_builtins(edge.baseline or Baseline()),
         "lpips_missing": edge.lpips_missing,
         "lpips_network": edge.lpips_network,
+        "so_far": msgspec.to_builtins(edge.so_far),
         "scored_on": sorted({row.scored_on for row in series if row.scored_on}),
         "scored": sum(row.psnr_db is not None for row in series),
         "series": [{name: getattr(row, name) for name in SERIES} for row in series],

@@ -50,7 +50,7 @@ class SteppedField(ABC, Generic[S]):
     name: of the representation. shape: options in which a state and the field that loads it must agree.
     """
 
-    frame_s = None
+    frame_s: float | None = None
     most_pixels = None
 
     name: ClassVar[str]

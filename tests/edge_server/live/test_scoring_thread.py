@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 import weakref
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from edge_server.fidelity.scorer import Score, Scorer
+from edge_server.fidelity.so_far import MOST
 from edge_server.fields import Rendering
 from edge_server.live import scoring_thread
 from edge_server.live.scoring_thread import ScoringThread
@@ -195,3 +197,31 @@ def test_baselines_are_of_every_fifth_publication(monkeypatch: Any) -> None:
     for number in range(3, 12):
         thread._score_later(_publication(number, 10 * MS), Brightness(0), ["view"])  # type: ignore[list-item]
     assert found == [1, 1] and thread.baselines.mean == Baseline(1.0, 2.0), "of 5 and 10"
+
+
+def test_of_a_held_out_camera_that_moves_the_newest_frame_and_all_so_far_are_told_apart() -> None:
+    """The field knows how bright it is at half a second, and shows that everywhere."""
+    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
+    assert thread.so_far is None
+    for k in range(100):
+        pose = Pose((1.0, 0.0, 0.0, 0.0), (0.01 * k, 0.0, 0.0))
+        thread._held_out["cam00"].take(replace(_frame(k, 5 * k * MS), pose=pose))
+    thread._held_out["cam00"].take(replace(_frame(100, 500 * MS), payload=b"damaged"))
+    snapshot = Brightness(500 * MS)
+    thread._recent.append((_publication(0, 0), snapshot))
+    thread._look_back()
+    assert thread.so_far is not None and thread.so_far.frames == 2
+    thread._look_back(whole=True)
+    found = thread.so_far
+    assert found.frames == MOST and not found.refined  # spread over the run, the damaged one forgotten
+    assert found.now_psnr_db > 35.0 and 10.0 < found.all_psnr_db < 25.0
+    assert found.words() == f"now {found.now_psnr_db:.2f} dB, all {MOST} frames so far {found.all_psnr_db:.2f} dB"
+
+
+def test_a_held_out_camera_that_stands_still_has_no_earlier_places() -> None:
+    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
+    for k in range(5):
+        thread._held_out["cam00"].take(_frame(k, 5 * k * MS))
+    thread._recent.append((_publication(0, 0), Brightness(0)))
+    thread._look_back(whole=True)
+    assert thread.so_far is None

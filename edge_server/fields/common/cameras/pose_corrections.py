@@ -89,6 +89,10 @@ class PoseCorrections:
         del self.known[camera]
         self._sorted = {}
 
+    def newest(self, track: str, count: int) -> list[_Correction]:
+        """The corrections of a track's newest views, at most ``count``, in the order of time."""
+        return [self.known[name] for name in self._order(track)[-count:]]
+
     def tracks(self) -> list[str]:
         """The tracks that have views, in the order in which they came."""
         return list(dict.fromkeys(c.track for c in self.known.values()))

@@ -20,23 +20,31 @@ from edge_server.fields.common.cameras.pose_corrections import normal_matrix
 from edge_server.fields.common.kernels.camera import CAMERA
 from edge_server.fields.common.supervision import CameraMemory, check_view
 from edge_server.fields.common.view_store import Arrays
-from edge_server.fields.splat.densification import GaussianCloud
+from edge_server.fields.splat.densification import GaussianCloud, opacity
 from edge_server.fields.splat.kernels.rasterize import EXPOSURE, Targets
 from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.discs import filled, usable_depth
+from edge_server.fields.splat.scan.plausibility import moved_in, troubles
 from edge_server.fields.splat.scan.scan_field import ScanField, Shown
+from edge_server.fields.splat.scan.tracking import Alignment, Rendered, align, gray
 from edge_server.fields.splat.seeding import seed_gaussians
 
 SEPARATOR = "#"  # between a camera and the number of its keyframe: no camera has it in its name
 
 
 class CarriedField(ScanField):
-    """See ``ScanField``. Views of one camera are told apart by their instants; a camera's name never changes."""
+    """See ``ScanField``. It asks for every frame: depth may come with each fifth only."""
+
+    frame_s = 0.0
 
     def _forget_parameters(self) -> None:
         super()._forget_parameters()
         self._clear_views()
         self._pixels, self._taken = 0, 0  # of the largest image, and keyframes, so far
+        self._left_out: dict[str, int] = {}  # frames of each camera that show something else
+        self._in_a_row: dict[str, int] = {}
+        self._moving: dict[str, float] = {}  # share of a camera's newest keyframe where something moves
+        self._depths: dict[str, View] = {}  # the newest keyframe of each camera that had depth
         self._measured = False  # whether any keyframe had depth
         self._seen: dict[str, View] = {}  # the last view of each camera that became a keyframe, as it was given
 
@@ -47,8 +55,12 @@ class CarriedField(ScanField):
         if not self._views and news:
             self._begin(news)
         due = self.step // tuned.STEPS_A_KEYFRAME + len(self._seen) - self._taken
-        first = [view for view in news if view.camera not in self._seen]
-        waiting = sorted((v for v in news if v.camera in self._seen), key=lambda v: self._seen[v.camera].generated_ns)
+        best = {}
+        for view in sorted(news, key=lambda view: (view.depth is not None, view.generated_ns)):
+            best[view.camera] = view  # the newest, of those with depth if there are any: only they seed
+        first = [view for view in best.values() if view.camera not in self._seen]
+        waiting = [view for view in best.values() if view.camera in self._seen]
+        waiting.sort(key=lambda view: self._seen[view.camera].generated_ns)
         for view in [*first, *waiting[: max(due, 0)]]:
             self._take(view)
         self._snapshot = None
@@ -100,14 +112,22 @@ class CarriedField(ScanField):
         box = self.view_store.box
         assert box is not None
         view = replace(given, camera=f"{given.camera}{SEPARATOR}{self._taken}", depth=usable_depth(given.depth))
-        self._seen[given.camera], self._taken = given, self._taken + 1
-        self._pixels = max(self._pixels, view.image.shape[0] * view.image.shape[1])
+        self._seen[given.camera] = given
         self._follow(view)
         shown = self._look(view)
+        if self._rigid is not None and len(self.cloud) and self._agreeing(view, shown) < tuned.SURE:
+            if not self._plausible(view, self._track(view)):
+                return
+            shown = self._look(view)
+        self._taken += 1
+        self._pixels = max(self._pixels, view.image.shape[0] * view.image.shape[1])
+        view = self._without_what_moves(view)
         if self._rigid is not None and len(self.cloud):
             self._expose(view, shown)
         if view.depth is not None:
-            self._add(self._seeds_of(view, shown))
+            seeds = self._seeds_of(view, shown)
+            self._make_room(len(seeds))
+            self._add(seeds)
         self._append(view, self._aim(view, shown))
         self._measured |= view.depth is not None
         if not self._measured and len(self._views) in tuned.BEGINS:
@@ -124,6 +144,70 @@ class CarriedField(ScanField):
         self._poses.begin(view, track)
         if before:
             self._exposures.known[view.camera] = self._exposures.between(before)
+
+    def _track(self, view: View) -> Alignment:
+        """Correct the pose of a view by what it shows."""
+        frame = gray(view.image)
+        for _ in range(tuned.ALIGNMENTS):
+            shown, pose = self._look(view, tuned.RENDERED_HALVINGS), self._pose_of(view)
+            lens = view.intrinsics.halved(tuned.RENDERED_HALVINGS)
+            rendered = Rendered(pose, lens, gray(shown.color), shown.depth, shown.opacity)
+            found = align(rendered, frame, view.camera_to_world)
+            self._poses.set_pose(view, found.pose)
+        return found
+
+    def _agreeing(self, view: View, shown: Shown) -> float:
+        """The share of a view's pixels, of those where the field shows a surface, that look as expected."""
+        gain, bias = self._exposures.of(view.camera)
+        expected = shown.color * gain.astype(np.float32) + bias.astype(np.float32)
+        surface = shown.opacity[::2, ::2] >= tuned.ALIGNED_OPACITY
+        error = np.abs(gray(expected[::2, ::2]) - gray(view.image[::2, ::2]))[surface]
+        return float((error < tuned.SOFT).mean()) if error.size else 1.0
+
+    def _plausible(self, view: View, found: Alignment) -> bool:
+        """Whether a view shows what the field does. If not, it is forgotten and counted, unless too many were."""
+        camera = view.camera.rpartition(SEPARATOR)[0]
+        row = self._in_a_row.get(camera, 0)
+        if found.overlap < tuned.LEAST_OVERLAP or found.agreeing >= tuned.LEAST_AGREEING or row >= tuned.PATIENCE:
+            self._in_a_row[camera] = 0
+            return True
+        self._in_a_row[camera] = row + 1
+        self._left_out[camera] = self._left_out.get(camera, 0) + 1
+        self._poses.forget(view.camera)
+        self._exposures.known.pop(view.camera, None)
+        return False
+
+    def _without_what_moves(self, view: View) -> View:
+        """The view, with a weight of 0 where something has come since the last keyframe with depth."""
+        camera = view.camera.rpartition(SEPARATOR)[0]
+        before, self._moving[camera] = self._depths.get(camera), 0.0
+        if view.depth is None:
+            return view
+        self._depths[camera] = view
+        if before is None:
+            return view
+        moved = moved_in(view, self._pose_of(view), before, self._pose_of(before))
+        share = float(moved.mean())
+        if share < tuned.MOVED_LEAST:
+            return view
+        self._moving[camera] = share
+        return replace(view, weight=(~moved).astype(np.float32))
+
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """What is wrong with the cameras' frames and poses, for people."""
+        with self._lock:
+            left_out = [
+                f"{camera}: {count} frames left out: they show something else than is to be seen from their poses"
+                for camera, count in self._left_out.items()
+            ]
+            moving = [
+                f"{camera}: something moves in {100 * share:.0f} % of its picture: left out of learning"
+                for camera, share in self._moving.items()
+                if share > 0.0
+            ]
+            poses = troubles(self._poses) if self._rigid is not None else []
+        return (*left_out, *moving, *poses)
 
     def _begin_anew(self) -> None:
         """Find the box and the first Gaussians from all keyframes so far: without depth, the first few say little, and
@@ -143,7 +227,8 @@ class CarriedField(ScanField):
         view = replace(view, depth=None)
         self._index[view.camera] = len(self._views)
         self._views = (*self._views, view)
-        self.view_store.memory[view.camera] = CameraMemory(view)
+        moved = None if view.weight is None else view.weight == 0.0
+        self.view_store.memory[view.camera] = CameraMemory(view, moved)
         self._cams = np.concatenate([self._cams, camera_rows([self._pose_of(view)], [view.intrinsics], box)])
         row = self._exposures.row(view.camera)[None]
         self._targets = self._targets._replace(exposure=np.concatenate([self._targets.exposure, row]))
@@ -234,8 +319,21 @@ class CarriedField(ScanField):
         )
         return self._raster.train(target, 0)
 
-    def _room(self) -> int:
-        return min(super()._room(), max(int(tuned.PER_PIXEL * self._pixels), tuned.LEAST) - len(self.cloud))
+    def _most(self) -> int:
+        return min(super()._most(), max(int(tuned.PER_PIXEL * self._pixels), tuned.LEAST))
+
+    def _grow(self) -> None:
+        if len(self.cloud) < tuned.GROWN_UPTO * self._most():
+            super()._grow()
+
+    def _make_room(self, count: int) -> None:
+        """Remove the Gaussians that show least, faint and small ones, until ``count`` more may be added."""
+        surplus = len(self.cloud) + min(count, self._most()) - self._most()
+        if surplus > 0:
+            shows = opacity(self.cloud.params) * np.maximum(self.cloud.reach, np.float32(1e-9))
+            kept = np.ones(len(shows), np.bool_)
+            kept[np.argsort(shows, kind="stable")[:surplus]] = False
+            self.cloud.keep(kept)
 
     def _counters(self) -> dict[str, Any]:
         return {**super()._counters(), "taken": self._taken, "pixels": self._pixels, "measured": self._measured}
@@ -253,6 +351,8 @@ class CarriedField(ScanField):
         if aims.shape != (len(views), 37) or not np.isfinite(aims).all():
             raise ValueError(f"the state's aims must be (V, 37) of {len(views)} keyframes, not {aims.shape}")
         for view, aim in zip(views, aims):
+            moved = self.view_store.memory[view.camera].moved
+            view = view if moved is None else replace(view, weight=(~moved).astype(np.float32))
             self._append(view, (aim[:36].reshape(6, 6), float(aim[36])))
             self._seen[view.camera.rpartition(SEPARATOR)[0]] = view
 

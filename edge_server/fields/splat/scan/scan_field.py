@@ -198,7 +198,7 @@ class ScanField(StillField):
             self.cloud.keep(opacity(self.cloud.params) >= PRUNE_OPACITY)
             if not len(self.cloud):
                 self._seed()
-        if self.step % tuned.GROW_EVERY == 0 and self._room() > 0:
+        if self.step % tuned.GROW_EVERY == 0 and len(self.cloud) < self._most():
             self._grow()
 
     def _grow(self) -> None:
@@ -227,7 +227,7 @@ class ScanField(StillField):
 
     def _add(self, params: NDArray[np.float32]) -> None:
         """Add Gaussians given in meters, as many as there is room for."""
-        params = params[: max(self._room(), 0)]
+        params = params[: max(self._most() - len(self.cloud), 0)]
         box = self.view_store.box
         assert box is not None
         if not len(params):
@@ -240,13 +240,13 @@ class ScanField(StillField):
         clamp_gaussians(params)
         self.cloud.add(GaussianCloud.new(params))
 
-    def _room(self) -> int:
-        """How many Gaussians may still be added."""
-        return self.settings.gaussians - len(self.cloud)
+    def _most(self) -> int:
+        """The largest number of Gaussians."""
+        return self.settings.gaussians
 
-    def _look(self, view: View) -> Shown:
-        """Render the field from a view's corrected pose."""
-        box, lens = self.view_store.box, view.intrinsics
+    def _look(self, view: View, halvings: int = 0) -> Shown:
+        """Render the field from a view's corrected pose, at its size or less."""
+        box, lens = self.view_store.box, view.intrinsics.halved(halvings)
         assert box is not None
         h, w = lens.height, lens.width
         color, depth, alpha = (np.zeros((h, w, *more), np.float32) for more in ((3,), (), ()))

@@ -62,12 +62,36 @@ MOST_DEG, MOST_SHARE = 5.0, 0.1  # largest correction of a pose; share of the ca
 # --- views that come one after the other ---
 STEPS_A_KEYFRAME = 24  # with fewer, new regions stay blurred; with more, they come late
 NEWEST, NEWEST_SHARE = 4, 0.4  # steps on the newest keyframes: with more, earlier ones are forgotten
+GROWN_UPTO = 0.7  # share of the Gaussians beyond which none is inserted: new places are seeded with the others
 KEPT_PIXELS = 1 << 23  # of all keyframes together: 60 MB with their depth
 LEAST_KEPT = 32  # keyframes, however large
 KEPT_CORRECTIONS = 2048  # of keyframes that went, for held-out and late frames of their time
 EXPOSED_OPACITY, EXPOSED_ERROR = 0.7, 0.25  # pixels from which a new view's exposure is found: surfaces, as expected
 EXPOSED_SHARE = 0.2  # of its pixels, at least
 BEGINS = (2, 4, 8, 16)  # numbers of keyframes without depth at which a field begins anew
+
+
+# --- the pose of a new frame, by alignment with a rendering ---
+RENDERED_HALVINGS = 1  # half the size is as good: the finest level has it
+LEVELS = ((2, 3), (1, 3), (0, 2))  # further halvings, and iterations: coarse to fine
+ALIGNMENTS = 2  # renderings: the second one from where the first led
+SURE = 0.9  # share of pixels that look as expected at the predecessor's correction: no need to look further
+MOST_ALIGNED, LEAST_ALIGNED = 5000, 50  # pixels a level
+ALIGNED_OPACITY = 0.5  # above which a pixel shows a surface
+SOFT = 0.1  # gray levels: what differs by more disagrees, and counts little
+PRIOR_RAD, PRIOR_M, PRIOR_ERROR = 0.02, 0.03, 1e-3  # so far from the given pose costs as much as that squared error
+LONGEST_RAD = 0.05  # rotation a step
+
+# --- frames and poses that cannot be right ---
+LEAST_OVERLAP, LEAST_AGREEING = 0.3, 0.5  # with this much of the field in view, fewer pixels as expected: left out
+PATIENCE = 10  # frames of a camera left out in a row: then the next one is taken as it is, it may be in a new place
+MOVED_EVERY = 4  # pixels between those that are tested
+MOVED_SHARE, MOVED_M = 0.1, 0.05  # an earlier frame saw further by more: nothing was there
+MOVED_LEAST = 0.005  # share of an image: less is noise of depth
+JUDGED = 24  # newest keyframes of a camera by which its poses are judged
+DRIFT_SHARE = 0.6  # of the largest correction, above which poses drift
+LATE_S, LATE_EXPLAINS = 0.03, 0.4  # least delay of poses that is said, and share of the corrections that it explains
+LONGEST_GAP_S = 1.5  # between two keyframes, for a velocity
 
 
 def scan_options(pixels: int, tracked: bool) -> dict[str, Any]:

@@ -127,3 +127,45 @@ def test_two_hundred_identical_frames_change_little() -> None:
     for k in range(200):
         field.fit([replace(last, generated_ns=last.generated_ns + k + 1)], Budget(steps=4))
     assert _db(field, WALK)[1] > before - 1.0
+
+
+def _other(view: View) -> View:
+    return replace(view, image=np.ascontiguousarray(255 - view.image[::-1]), depth=None)
+
+
+def _leaping(view: View) -> View:
+    pose = view.camera_to_world.copy()
+    pose[:3, 3] += pose[:3, 0]
+    return replace(view, camera_to_world=pose)
+
+
+def _covered(view: View) -> View:
+    return replace(view, image=np.full_like(view.image, 40), depth=np.full_like(view.depth, 0.05))
+
+
+def _bright(view: View) -> View:
+    return replace(view, image=np.clip(view.image * 3.0, 0, 255).astype(np.uint8))
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    ("spoil", "frames", "said"),
+    [(_other, 6, True), (_leaping, 3, True), (_covered, 6, False), (_bright, 6, False)],
+    ids=["another camera under this name", "a pose leaps by a meter", "a hand over the lens", "exposure times three"],
+)
+def test_a_bad_second_costs_little_and_the_picture_recovers(spoil, frames: int, said: bool) -> None:
+    views = list(WALK)
+    views[40 : 40 + frames] = [spoil(view) for view in views[40 : 40 + frames]]
+    field = _played(views)
+    assert np.isfinite(field.cloud.params).all()
+    assert any("left out" in line for line in field.troubles) or not said
+    _, refined_db = _db(field, WALK)
+    assert refined_db > 18.0
+
+
+@pytest.mark.stability
+def test_poses_late_by_a_tenth_of_a_second_are_said_and_mended() -> None:
+    late = [replace(view, camera_to_world=WALK[max(k - 1, 0)].camera_to_world) for k, view in enumerate(WALK)]
+    field = _played(late)
+    _, refined_db = _db(field, late)
+    assert refined_db > 18.0

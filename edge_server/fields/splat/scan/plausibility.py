@@ -1,0 +1,86 @@
+"""What cannot be right of a carried camera's frames: things that move, and poses that are late."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
+from edge_server.fields.splat.scan import settings as tuned
+from freshfield.geometry import se3_inverse, so3_log
+
+Array = NDArray[np.float64]
+
+
+def moved_in(now: View, pose: Array, before: View, before_pose: Array) -> NDArray[np.bool_]:
+    """Pixels, bool (H, W), of surfaces where an earlier frame saw through: they have come since. What stands still is
+    never there, however new it is to the camera. Both views have depth; poses: camera to world (4, 4)."""
+    assert now.depth is not None and before.depth is not None
+    every, lens, other = tuned.MOVED_EVERY, now.intrinsics, before.intrinsics
+    z = now.depth[::every, ::every].astype(np.float64)
+    y, x = np.mgrid[: z.shape[0], : z.shape[1]] * every
+    ray = lens.rays(np.stack([x + 0.5, y + 0.5], axis=-1))
+    to_other = se3_inverse(before_pose) @ pose
+    points = ray / ray[..., 2:] * z[..., None] @ to_other[:3, :3].T + to_other[:3, 3]
+    ahead = points[..., 2]
+    safe = np.maximum(ahead, 1e-6)
+    u = np.floor(other.fx * points[..., 0] / safe + other.cx).astype(np.int64)
+    v = np.floor(other.fy * points[..., 1] / safe + other.cy).astype(np.int64)
+    there = (z > 0) & (ahead > 1e-3) & (u >= 0) & (v >= 0) & (u < other.width) & (v < other.height)
+    # The nearest surface around: edges, and errors of poses, are no free space.
+    known = np.where(before.depth > 0, before.depth, np.float32(0.0))
+    nearest = cv2.erode(known, np.ones((2 * every + 1, 2 * every + 1), np.uint8))
+    seen = nearest[np.clip(v, 0, other.height - 1), np.clip(u, 0, other.width - 1)]
+    through = there & (seen > ahead * (1.0 + tuned.MOVED_SHARE) + tuned.MOVED_M)
+    kernel = np.ones((3, 3), np.uint8)
+    found = cv2.dilate(cv2.morphologyEx(through.astype(np.uint8), cv2.MORPH_OPEN, kernel), kernel)
+    size = (now.image.shape[1], now.image.shape[0])
+    return cv2.resize(found, size, interpolation=cv2.INTER_NEAREST).astype(bool)
+
+
+def troubles(poses: PoseCorrections) -> list[str]:
+    """What corrections of poses say that is wrong with them, a line each."""
+    found = []
+    for track in poses.tracks():
+        newest = poses.newest(track, tuned.JUDGED)
+        if len(newest) < tuned.JUDGED:
+            continue
+        late_s = _lateness_s(newest)
+        if late_s is not None:
+            word = "late" if late_s > 0 else "early"
+            found.append(f"{track}: its poses are {word} by some {1e3 * abs(late_s):.0f} ms")
+        shift_m = float(np.median([np.linalg.norm(c.shift_m) for c in newest]))
+        turn_rad = float(np.median([np.linalg.norm(c.rotation) for c in newest]))
+        if shift_m > tuned.DRIFT_SHARE * poses.most_m or turn_rad > tuned.DRIFT_SHARE * poses.most_rad:
+            off = f"{100 * shift_m:.1f} cm and {np.rad2deg(turn_rad):.1f} degrees"
+            found.append(f"{track}: its poses drift: the picture asks for {off} (median)")
+    return found
+
+
+def _lateness_s(views: Sequence) -> float | None:
+    """By how much poses lag behind images, if that explains their corrections; None if not. views: corrections in the
+    order of time."""
+    moves, corrections = [], []
+    scale = np.array([1.0 / tuned.PRIOR_RAD] * 3 + [1.0 / tuned.PRIOR_M] * 3)
+    for before, now, after in zip(views, views[1:], views[2:]):
+        seconds = (after.at_ns - before.at_ns) / 1e9
+        if not 0.0 < seconds < tuned.LONGEST_GAP_S:
+            continue
+        axes = now.given[:3, :3]
+        turn = so3_log(before.given[:3, :3].T @ after.given[:3, :3])
+        shift = axes.T @ (after.given[:3, 3] - before.given[:3, 3])
+        moves.append(np.concatenate([turn, shift]) * scale / seconds)
+        corrections.append(np.concatenate([axes.T @ now.rotation, axes.T @ now.shift_m]) * scale)
+    if len(moves) < tuned.JUDGED // 2:
+        return None
+    v, c = np.stack(moves), np.stack(corrections)
+    v, c = v - v.mean(axis=0), c - c.mean(axis=0)  # what is constant is a calibration's
+    if not (v * v).sum() > 0.0:
+        return None
+    late_s = float((v * c).sum() / (v * v).sum())
+    explained = 1.0 - float(((c - late_s * v) ** 2).sum()) / max(float((c * c).sum()), 1e-12)
+    return late_s if explained > tuned.LATE_EXPLAINS and abs(late_s) > tuned.LATE_S else None
