@@ -48,6 +48,8 @@ def so_far(scores: Sequence[FrameScore], now: FrameScore) -> SoFarScores:
     )
 
 
-def thinned(count: int) -> list[int]:
-    """Which of ``count`` frames, oldest first, stay: at most MOST, evenly spread, the newest among them."""
-    return sorted({int(k) for k in np.linspace(0, count - 1, min(count, MOST))})
+def stays(number: int, count: int) -> bool:
+    """Whether the frame of this number, counted from 0, stays with ``count`` so far: the newest, and at most MOST
+    others, evenly spread."""
+    stride = 1 << (max(count - 1, 0) // MOST).bit_length()
+    return number % stride == 0 or number == count - 1

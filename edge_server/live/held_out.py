@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags
 from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer
-from edge_server.fidelity.so_far import FrameScore, score_frame, thinned
+from edge_server.fidelity.so_far import FrameScore, score_frame, stays
 from edge_server.fields import Snapshot, View
 from edge_server.live.state import Publication
 from freshfield import payload
@@ -40,10 +40,11 @@ Image = NDArray[np.float32]
 
 @dataclass(eq=False)
 class Truth:
-    """A frame of a held-out camera. compared: with the frame before, for the noise."""
+    """A frame of a held-out camera. compared: with the frame before, for the noise. number: of its place so far."""
 
     frame: Frame
     compared: bool = False
+    number: int = 0
     _image: NDArray[np.uint8] | None = None
 
     @property
@@ -90,6 +91,7 @@ class HeldOutCamera:
         self.undecodable = 0
         self.noise = NoiseEstimate()
         self.so_far: list[Truth] = []
+        self._places = 0
         self.truths: deque[Truth] = deque(maxlen=HISTORY_FRAMES)
         self._scorer, self._noisy = scorer, noisy
         self._pending: deque[tuple[Publication, Image | Snapshot, Pose]] = deque()
@@ -113,8 +115,9 @@ class HeldOutCamera:
         if self.truths and frame.generated_edge_ns <= self.truths[-1].taken_ns:
             self.truths.clear()
         if self.truths and self.truths[-1].frame.pose != frame.pose:
-            self.so_far = [*self.so_far, Truth(frame)]
-            self.so_far = [self.so_far[k] for k in thinned(len(self.so_far))]
+            self._places += 1
+            kept = [truth for truth in self.so_far if stays(truth.number, self._places)]
+            self.so_far = [*kept, Truth(frame, number=self._places - 1)]
         self.truths.append(Truth(frame))
         # A waiting publication may be older than the history: the frames it needs are kept.
         waiting_ns = [publication.published_ns for publication, _, _ in self._pending]
