@@ -30,7 +30,8 @@ Write the results of a run or fit as files for other programs. RUN is its folder
 --transforms   DIR/transforms.json, DIR/images and DIR/points.ply, for nerfstudio and others
 
 Several can be given at once. Lengths in the files are meters, and z points up (in GLB: y). A mesh is fused on
-a grid from the depth that the cameras see; what no camera saw stays open, or is closed with --watertight.
+a grid from the depth that the cameras see; what no camera saw stays open, or is closed with --watertight. Of more
+than 10 million pixels only the depth of those images is sharpened and used that see most together.
 """
 
 
@@ -97,7 +98,7 @@ class Export:
 
     def __init__(self, args: argparse.Namespace, compare: Comparison | None = None) -> None:
         self.args, self._compare = args, compare
-        self._said = ("", 0.0)
+        self._said = ("", 0.0, 0.0)  # stage, when it was last mentioned, when it began
 
     @cached_property
     def source(self):
@@ -217,8 +218,9 @@ class Export:
 
     def _progress(self, what: str, share: float) -> None:
         """Print progress once a second, and when a stage ends."""
-        name, at = self._said
+        name, at, begun = self._said
         now = time.perf_counter()
         if share >= 1.0 or what != name or now - at >= 1.0:
-            self._said = (what, now)
-            print(f"  {what:10} {100 * share:3.0f} %", flush=True)
+            self._said = (what, now, now if what != name else begun)
+            left = f", {(now - begun) * (1.0 / share - 1.0):.0f} s left" if what == name and share < 1.0 else ""
+            print(f"  {what:10} {100 * share:3.0f} %{left}", flush=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,8 +11,8 @@ from edge_server.fields import Renderer, View
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import SOLID, DepthMap, render_depth_maps
 from edge_server.surface.mesh import Mesh, extract_mesh, remove_small_components
-from edge_server.surface.refine_depth import refine_depth
-from edge_server.surface.settings import MIN_WEIGHT, MeshSettings
+from edge_server.surface.refine_depth import GAIN_WITHIN, on_surface, refine_depth
+from edge_server.surface.settings import COVERING_POINTS, MIN_WEIGHT, SHARPENED_PIXELS, MeshSettings
 from edge_server.surface.volume import TRUNCATION, Grid, bounding_box, fuse_maps
 
 GUESS = 0.5  # minimum opacity of a surface as initial depth for refinement
@@ -26,7 +27,8 @@ def silent(what: str, share: float) -> None:
 def make_depth_maps(
     renderer: Renderer, views: Sequence[View], settings: MeshSettings, say: Say = silent
 ) -> list[DepthMap]:
-    """Make the depth maps that ``mesh_from_depth_maps`` fuses.
+    """Make the depth maps that ``mesh_from_depth_maps`` fuses. Where not all are sharpened (``covering_maps``), the
+    others have no trust.
 
     renderer: renders the field. views: the cameras, with their images.
     say: called with each stage and its completed share.
@@ -40,7 +42,33 @@ def make_depth_maps(
     maps = list(render_depth_maps(renderer, cameras, solid, lambda done: say("depth", done / len(views))))
     if not settings.sharpen or len(maps) < 2:
         return maps
-    return refine_depth(maps, [v.image for v in views], None, lambda share: say("sharpen", share))
+    chosen = covering_maps(maps, SHARPENED_PIXELS)
+    photos = [views[k].image for k in chosen]
+    sharp = refine_depth([maps[k] for k in chosen], photos, None, lambda share: say("sharpen", share))
+    untrusted = [replace(found, trust=np.zeros_like(found.trust)) for found in maps]
+    return [dict(zip(chosen, sharp)).get(k, found) for k, found in enumerate(untrusted)]
+
+
+def covering_maps(maps: Sequence[DepthMap], most_pixels: int) -> list[int]:
+    """Numbers of the maps to sharpen, ascending: all, if they have at most ``most_pixels`` together. Else one by one
+    the map that sees most, where a point counts half for each map before that sees it, until no other fits; at least
+    two, because they are compared with each other."""
+    if sum(found.depth.size for found in maps) <= most_pixels:
+        return list(range(len(maps)))
+    points = np.concatenate([found.points()[:: 1 + int(found.seen.sum()) // COVERING_POINTS] for found in maps])
+    sees = np.stack([on_surface(found, points, GAIN_WITHIN) for found in maps])
+    worth = 1.0 / np.maximum(sees.sum(axis=0), 1)  # a surface is sampled by each map that sees it
+    chosen, left = list[int](), most_pixels
+    for _ in maps:
+        gain = sees @ worth
+        gain[chosen] = -1.0
+        best = int(gain.argmax())
+        left -= maps[best].depth.size
+        if left < 0 and len(chosen) >= 2:
+            break
+        chosen.append(best)
+        worth[sees[best]] *= 0.5
+    return sorted(chosen)
 
 
 def mesh_from_depth_maps(maps: Sequence[DepthMap], settings: MeshSettings, say: Say = silent) -> Mesh:

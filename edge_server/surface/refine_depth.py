@@ -136,7 +136,7 @@ def on_surface(found: DepthMap, points: NDArray[np.float64], within: float) -> N
         inside = np.all((at >= 0) & (at < (lens.width, lens.height)), axis=1)
     column, row = np.where(inside[:, None], at, 0.0).astype(np.int64).T
     distance = np.linalg.norm(local, axis=1)
-    shown = np.where(found.seen, found.depth, 0.0)[row, column]
+    shown = found.depth[row, column]  # 0: unknown, infinite: nothing is there
     # The nearest pixel's ray may hit a steep surface a pixel's width nearer or farther.
     tolerance = (within + 1.0 / min(lens.fx, lens.fy)) * distance
     agree: NDArray[np.bool_] = inside & (np.abs(shown - distance) <= tolerance)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from edge_server import fields
+from edge_server.export.point_cloud import sparse_points
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.surface import SurfaceError
+from edge_server.surface import SurfaceError, reconstruct
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels import patch_match
 from edge_server.surface.kernels.patch_images import Images, Planes, View
@@ -25,7 +28,9 @@ from edge_server.surface.kernels.patch_match import (
     WORST,
     choose_sources,
 )
+from edge_server.surface.reconstruct import covering_maps, make_depth_maps
 from edge_server.surface.refine_depth import UNSURE, exposures, refine_depth, smooth_normals
+from edge_server.surface.settings import MeshSettings
 from freshfield.geometry import Pinhole, look_at, world_rays
 
 LENS = Pinhole.from_fov(72, 72, 45.0)
@@ -264,3 +269,36 @@ def test_pictures_must_belong_to_the_maps(rig):
         refine_depth(maps, pictures[:3])
     with pytest.raises(SurfaceError, match="does not belong to a depth map"):
         refine_depth(maps, [p[:10] for p in pictures])
+
+
+@pytest.mark.parametrize(
+    ("most", "chosen"),
+    [
+        (4, [0, 1, 2, 3]),  # all fit
+        (3, [0, 1, 3]),  # what sees nothing is the last to be chosen
+        (2, [0, 3]),  # the second map sees the same as the first
+        (0.5, [0, 3]),  # two are compared with each other, however large they are
+    ],
+)
+def test_only_the_maps_that_see_most_together_are_sharpened(most, chosen) -> None:
+    elsewhere = look_at((5.0, 0.0, 0.25), (5.0, 0.0, 0.0), up=(0, 1, 0))
+    maps = [depth_map(*textured_plane(pose), pose, LENS) for pose in (POSES[0], POSES[0], POSES[0], elsewhere)]
+    maps[2] = replace(maps[2], depth=np.zeros_like(maps[2].depth))
+    assert covering_maps(maps, int(most * maps[0].depth.size)) == chosen
+
+
+def test_what_is_not_sharpened_has_no_trust_and_gives_no_points(monkeypatch) -> None:
+    monkeypatch.setattr(reconstruct, "SHARPENED_PIXELS", 2 * LENS.width * LENS.height)
+    depths, photos = zip(*(textured_plane(pose) for pose in POSES))
+    views = [fields.View("", photo, pose, LENS, k) for k, (photo, pose) in enumerate(zip(photos, POSES))]
+    rendered = {
+        id(pose): fields.Rendering(photo / 255.0, depth, np.ones_like(depth))
+        for pose, photo, depth in zip(POSES, photos, depths)
+    }
+    field = SimpleNamespace(render=lambda pose, lens: rendered[id(pose)])
+    maps = make_depth_maps(field, views, MeshSettings())
+    trusted = [bool(found.trust.any()) for found in maps]
+    assert sum(trusted) == 2
+    cloud = sparse_points(maps, 100)
+    assert len(cloud.points) == 100
+    assert cloud.seen.mean(axis=0).min() > 0.3  # each map tells which points it sees
