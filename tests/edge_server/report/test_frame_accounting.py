@@ -17,6 +17,11 @@ def sent(*sequences):
     return [(i, event) for i in sequences for event in ("captured", "sent")]
 
 
+def told(text):
+    """Lines of a ledger: NUMBER:EVENT or NUMBER:EVENT:DETAIL each."""
+    return [(int(number), *rest) for number, *rest in (word.split(":") for word in text.split())]
+
+
 def counts(out, **expected):
     """Join the ledgers under ``out``; every count not in ``expected`` must be zero."""
     accounting = account_frames(out)
@@ -41,34 +46,15 @@ def test_counts_balance_only_if_both_sums_hold():
 # name -> (lines of node, emulator and edge; every count that is not zero; part of a note, or none)
 RUNS = {
     "every end of a frame": (
-        [*sent(*range(9)), (10, "captured"), (10, "replaced"), (11, "captured"), (11, "waiting")],
+        [*sent(*range(9)), *told("10:captured 10:replaced 11:captured 11:waiting")],
         [
             *((i, "received") for i in range(9)),
-            (0, "skipped"),
-            (1, "dropped_busy"),
-            (2, "superseded"),
-            (3, "lost"),
-            (4, "broken"),
-            (5, "rejected", "crc"),
-            (6, "forwarded"),
-            (7, "forwarded"),
-            (8, "in_flight"),
+            *told("0:skipped 1:dropped_busy 2:superseded 3:lost 4:broken 5:rejected:crc"),
+            *told("6:forwarded 7:forwarded 8:in_flight"),
         ],
-        [(6, "delivered"), (7, "rejected", "time_reversed")],
-        {
-            "captured": 11,
-            "replaced": 1,
-            "waiting": 1,
-            "sent": 9,
-            "skipped": 1,
-            "dropped_busy": 1,
-            "superseded": 1,
-            "lost": 1,
-            "broken": 1,
-            "delivered": 1,
-            "rejected": {"crc": 1, "time_reversed": 1},
-            "in_flight": 1,
-        },
+        told("6:delivered 7:rejected:time_reversed"),
+        dict.fromkeys((*LINK_ENDS, "broken", "replaced", "waiting", "delivered"), 1)
+        | {"captured": 11, "sent": 9, "rejected": {"crc": 1, "time_reversed": 1}},
         "1 in flight, last written by ledger-emulator",
     ),
     "a node without emulator": (
