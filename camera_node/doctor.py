@@ -170,10 +170,10 @@ def _check(part: str, check: Callable[[], str]) -> CheckResult:
 def _data(scenario: Scenario, config: RecordedConfig, data: Path | None) -> str:
     """Open the data set as a node does, and read every image that is a file."""
     from camera_node.sources.datasets.formats import open_configured
-    from camera_node.sources.datasets.streamer import open_recorded
+    from camera_node.sources.registry import open_sources
 
     path = find_data(config.data, scenario, data)
-    open_recorded(scenario, config, scenario.cameras, data)
+    open_sources(scenario, config, scenario.cameras, data)
     found = open_configured(path, config)
     if config.kind not in ("video", "dynerf"):
         for image in found:

@@ -125,10 +125,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         label_lines(axes[0, 0], "now, dB")
         label_lines(axes[1, 0], "all so far, dB", "seconds")
     rows = [("now", [("truth", images[0]["truth_now"]), *((r.name, i["now"]) for r, i in zip(args.runs, images))])]
-    for k in (2, 6, 10):
-        kept = [(r.name, i["all"][k]) for r, i in zip(args.runs, images) if k < len(i["all"])]
-        if kept:
-            rows.append(("earlier", [("truth", images[0]["truth_all"][k]), *kept]))
+    half = len(images[0]["all"]) // 2
+    kept = [(r.name, i["all"][half]) for r, i in zip(args.runs, images)]
+    rows.append(("of all, half-way", [("truth", images[0]["truth_all"][half]), *kept]))
     draw_images(args.out.with_name(f"{args.out.name}-pictures.png"), rows)
     return 0
 
