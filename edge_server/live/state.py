@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +21,6 @@ from edge_server.fields import Snapshot
 from edge_server.run_records import Frontier, SoFarScores
 from edge_server.scheduler import Policy
 from freshfield.frame import Frame
-
-if TYPE_CHECKING:  # imported at run time only where a policy is learned
-    pass
 
 SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages
 

@@ -14,11 +14,13 @@ from markupsafe import Markup
 
 from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.frontier import best_point
-from edge_server.live.state import CameraView
+from edge_server.live.state import CameraView, Publication
 from edge_server.page.colors import HELD_OUT, MEASURED, PRESENT, RGB, age_color, css, scale_color
 from edge_server.page.settings import FRESH_MS, STALE_MS
 from edge_server.run_records import Frontier
 from freshfield.scenario import NOTHING_HELD_OUT
+
+NAMED_CAMERAS = 3  # that a sentence names, of those that an update left out
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,31 @@ def table(cameras: Sequence[CameraView], selected: Sequence[str] = ()) -> str:
 def coverage(plan: str, words: str) -> str:
     """What fixed cameras see. plan: SVG of ``freshfield.coverage.plan_svg``."""
     return str(_panel.coverage(plan, words[:1].upper() + words[1:]))
+
+
+def decision_words(last: Publication, cameras: Sequence[CameraView], policy: str) -> str:
+    """What the newest update used, and what it left out, in words.
+
+    last: the update. cameras: of the run; held-out ones are not counted. policy: its name.
+    """
+    there = {c.camera: c.age_ms for c in cameras if not c.held_out and c.age_ms is not None}
+    unused = sorted((name for name in there if name not in last.selected), key=lambda name: -(there[name] or 0.0))
+    used = len(last.selected)
+    words = f"uses all {used} views" if not unused else f"uses {used} of {used + len(unused)} views"
+    if last.omega_ms is not None:
+        omega = f"{last.omega_ms:.0f} ms"
+        kind = policy.partition("-")[0]
+        words = {"wait": f"waits {omega}, then {words}", "threshold": f"{words}, up to {omega} old"}.get(
+            kind, f"{words}; the policy chose {omega}"
+        )
+    if unused:
+        named = ", ".join(f"{name} ({there[name]:.0f} ms old)" for name in unused[:NAMED_CAMERAS])
+        words += f"; leaves out {named}" + (
+            f" and {len(unused) - NAMED_CAMERAS} more" if unused[NAMED_CAMERAS:] else ""
+        )
+    if last.refused:
+        words += f"; refuses {', '.join(last.refused)}, which contradict the others"
+    return note(f"Update {last.number + 1} {words}.")
 
 
 def comparison_caption(camera: str, psnr_db: float | None, update: int, held_out: bool) -> str:

@@ -39,6 +39,7 @@ class Panel:
             gui.add_html(markup.warning(f"Insecure: {'; '.join(state.warnings)}."))
         self._troubles = gui.add_html("", visible=False)
         self._status = gui.add_html("")
+        self._decision = gui.add_html("", visible=False)
         self._caption = gui.add_html(markup.note("Waiting for a held-out frame to compare with."))
         self._pair: Any = None
         self._compared_update: int | None = None
@@ -74,6 +75,9 @@ class Panel:
         troubles = self._state.troubles()
         self._troubles.visible = bool(troubles)
         self._troubles.content = markup.warning("; ".join(troubles)) if troubles else ""
+        if last is not None:
+            self._decision.content = markup.decision_words(last, cameras, self._state.controls.policy)
+            self._decision.visible = True
         self._table.content = markup.table(cameras, last.selected if last else ())
         self._waiting.visible = last is None
         if channel is not None:

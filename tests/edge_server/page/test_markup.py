@@ -89,6 +89,24 @@ def test_the_table_marks_age_truth_use_and_refusals():
     assert "no frame yet" in rows[2] and "&#10003;" not in rows[2]
 
 
+def test_a_decision_is_told_in_words():
+    ages = {"cam01": 40.0, "cam02": 903.4, "cam03": 55.0, "cam04": 700.0, "cam05": 650.0, "cam06": 800.0}
+    cameras = [CameraView(name, False, None, age, 1, 0) for name, age in ages.items()]
+    cameras += [CameraView("cam00", True, None, 10.0, 1, 0), CameraView("cam09", False, None, None, 0, 0)]
+
+    def words(selected, omega_ms=None, policy="all", **more) -> str:
+        last = Publication(7, 1.0, 0, omega_ms, selected, (1.0,) * len(selected), 1.0, 20.0, **more)
+        return markup.decision_words(last, cameras, policy)
+
+    assert "Update 8 uses all 6 views." in words(tuple(ages))
+    assert "waits 62 ms, then uses all 6 views." in words(tuple(ages), 62.0, "wait-arrived")
+    old = words(("cam01", "cam03"), 120.0, "threshold")
+    assert "uses 2 of 6 views, up to 120 ms old; leaves out cam02 (903 ms old), cam06 (800 ms old)" in old
+    assert "cam04 (700 ms old) and 1 more." in old and "cam00" not in old
+    assert "uses all 6 views; the policy chose 30 ms." in words(tuple(ages), 30.0, "bandit:policy.npz")
+    assert "refuses cam03, which contradict the others" in words(tuple(ages), refused=("cam03",))
+
+
 def test_the_channel_line_shows_only_what_the_emulator_reports():
     line = markup.channel_line(
         {
