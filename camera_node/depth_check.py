@@ -19,7 +19,7 @@ from camera_node.sources.base import pixels
 from camera_node.sources.registry import open_sources
 from camera_node.sources.with_effects import camera_effects
 from freshfield.depth import DepthImage
-from freshfield.geometry import Array, Pinhole, Pose, se3_inverse
+from freshfield.geometry import Array, Pinhole, Pose, se3_inverse, seen_from
 from freshfield.scenario import Scenario
 
 _MOST_POINTS = 4000  # of a camera's that are looked for: the share that agrees is then known to a percent
@@ -160,12 +160,10 @@ def _compared(a: DepthView, b: DepthView) -> tuple[int, int, int]:
     places = np.flatnonzero(chosen)
     chosen.flat[places[np.arange(places.size) % max(1, places.size // _MOST_POINTS) > 0]] = False
     lens, place = b.sensor()
-    to_b = se3_inverse(b.pose.matrix() @ place) @ a.pose.matrix()
-    points = a.points(chosen) @ to_b[:3, :3].T + to_b[:3, 3]
-    points = points[points[:, 2] > 0.0]
-    at = np.floor(lens.project(points)).astype(np.int64)
-    seen = ((at >= 0) & (at < (lens.width, lens.height))).all(axis=1)
-    depth, surface = points[seen, 2], b.depth.meters()[at[seen, 1], at[seen, 0]]
+    a_to_b = se3_inverse(a.pose.matrix()) @ b.pose.matrix() @ place
+    points, at, seen = seen_from(lens, a_to_b, a.points(chosen))
+    column, row = at[seen].astype(np.int64).T
+    depth, surface = points[seen, 2], b.depth.meters()[row, column]
     ratio = depth[surface > 0.0] / surface[surface > 0.0]
     through, hidden = int((ratio < 1.0 - _SAME).sum()), int((ratio > 1.0 + _SAME).sum())
     return len(ratio) - through - hidden, through, hidden

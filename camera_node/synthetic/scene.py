@@ -12,14 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from camera_node.synthetic.camera_rig import PosedCameras
 from camera_node.synthetic.motion import MAX_SPEED_M_PER_S
-from camera_node.synthetic.placement import place_static
-from camera_node.synthetic.render import CameraRenderer, Image, World, cast_rays
-from freshfield.geometry import Array, Pinhole, world_rays
+from camera_node.synthetic.render import CameraRenderer, Image, World
+from freshfield.geometry import Array, Pinhole
 from freshfield.limits import MAX_IMAGE_SIDE_PX
 from freshfield.settings import ScenarioError, Settings, as_mapping, read_settings, within
 
@@ -113,16 +109,6 @@ class Scene:
     def view(self, camera: Pinhole, camera_to_world: Array) -> CameraRenderer:
         """A renderer for any camera. camera_to_world: (4, 4)."""
         return CameraRenderer(self.world, camera, camera_to_world, self.params.supersample)
-
-    def object_mask(self, camera: Pinhole, camera_to_world: Array) -> NDArray[np.bool_]:
-        """Which pixels (H, W) of a camera show the object (``object_parts``), by the rays through their
-        centers; moving parts are ignored."""
-        origin, rays = world_rays(camera, camera_to_world)
-        rays = np.ascontiguousarray(rays.reshape(-1, 3).T)
-        placed = place_static(self.world.static_parts)
-        _, which = cast_rays(origin, rays, placed, np.full(rays.shape[1], np.inf))
-        count = len(placed.parts) if self.object_parts is None else self.object_parts
-        return np.asarray(((which >= 0) & (which < count)).reshape(camera.height, camera.width))
 
     def with_world(self, world: World) -> Scene:
         """The same cameras in another world that repeats after the same time, as effects need it."""

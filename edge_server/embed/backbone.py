@@ -358,8 +358,3 @@ def _projection(meta: dict[str, str], channels: int, path: Path) -> Projection |
     if len(mean) != channels or not np.isfinite(values).all():
         raise EmbeddingError(f"{path}: its projection is damaged: fetch the file again")
     return Projection(mean.astype(np.float32), axes.astype(np.float32))
-
-
-def pack_projection(mean: NDArray[np.float32], axes: NDArray[np.float32]) -> str:
-    """Text for the metadata ``PROJECTION_KEY``. mean: (C,). axes: (C, K)."""
-    return base64.b64encode(mean.astype("<f4").tobytes() + axes.astype("<f4").tobytes()).decode()

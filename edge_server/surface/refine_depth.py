@@ -22,6 +22,7 @@ from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.patch_images import Images, Planes, Search, View
 from edge_server.surface.kernels.patch_match import SOURCES, WORST, choose_sources, confirm, match, offer
+from freshfield.geometry import seen_from
 
 REACH = 0.18  # how far to each side depth is searched, as a share of the initial depth
 GAIN_POINTS, LEAST_SHARED = 500, 50  # points of an image; fewest that two must share to compare brightness
@@ -112,8 +113,8 @@ def exposures(maps: Sequence[DepthMap], grays: Sequence[NDArray[np.float32]]) ->
             both = on_surface(other, points, GAIN_WITHIN) if j != k else np.zeros(0, np.bool_)
             if both.sum() < LEAST_SHARED:
                 continue
-            lens, pose = other.intrinsics, other.camera_to_world
-            column, row = lens.project((points[both] - pose[:3, 3]) @ pose[:3, :3]).astype(np.int64).T
+            _, at_other, _ = seen_from(other.intrinsics, other.camera_to_world, points[both])
+            column, row = at_other.astype(np.int64).T
             pairs.append((k, j))
             ratios.append(np.median(np.log((grays[j][row, column] + 1.0) / (own[both] + 1.0))))
     system = np.eye(len(maps)) * 1e-3  # images that share nothing keep their brightness
@@ -130,10 +131,7 @@ def exposures(maps: Sequence[DepthMap], grays: Sequence[NDArray[np.float32]]) ->
 def on_surface(found: DepthMap, points: NDArray[np.float64], within: float) -> NDArray[np.bool_]:
     """Whether each point (N, 3) lies on a depth map's surface. within: tolerance, share of the distance."""
     lens, pose = found.intrinsics, found.camera_to_world
-    local = (points - pose[:3, 3]) @ pose[:3, :3]
-    with np.errstate(invalid="ignore"):
-        at = lens.project(local)
-        inside = np.all((at >= 0) & (at < (lens.width, lens.height)), axis=1)
+    local, at, inside = seen_from(lens, pose, points)
     column, row = np.where(inside[:, None], at, 0.0).astype(np.int64).T
     distance = np.linalg.norm(local, axis=1)
     shown = found.depth[row, column]  # 0: unknown, infinite: nothing is there

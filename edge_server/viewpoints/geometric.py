@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import Candidates
 from edge_server.viewpoints.registry import CaptureState
+from freshfield.geometry import seen_from
 
 Array = NDArray[np.float64]
 
@@ -59,11 +60,7 @@ def _sight(candidates: Candidates) -> tuple[Array, Array]:
     toward = ray / far[..., None]
     inside = np.empty(far.shape, bool)
     for row, pose in zip(inside, candidates.poses):
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
-        ahead = local[:, 2] > 1e-6
-        pixel = candidates.lens.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
-        size = (candidates.lens.width, candidates.lens.height)
-        row[:] = ahead & ((pixel >= 0) & (pixel < size)).all(axis=1)
+        row[:] = seen_from(candidates.lens, pose, points)[2]
     squarely = np.maximum((toward * normals).sum(axis=-1), 0.0)
     return np.where(inside, squarely * (np.median(far) / far) ** 2, 0.0), toward
 

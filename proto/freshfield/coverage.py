@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from freshfield.geometry import Array, Pinhole, converging_point, look_at, se3_inverse
+from freshfield.geometry import Array, Pinhole, converging_point, look_at, seen_from
 
 PLACES = 9  # a side of the grid of places within the ball
 DIRECTIONS = 48  # of a surface's normal
@@ -154,21 +154,12 @@ def _surfaces(center: Array, radius_m: float) -> tuple[Array, Array]:
     return center + radius_m * grid, np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
 
 
-def _within(camera: Camera, places: Array) -> NDArray[np.bool_]:
-    """bool (P,), whether the image contains each place."""
-    lens, pose = camera
-    inverse = se3_inverse(pose)
-    with np.errstate(invalid="ignore"):
-        u, v = lens.project(places @ inverse[:3, :3].T + inverse[:3, 3]).T
-        return (u >= 0.0) & (u < lens.width) & (v >= 0.0) & (v < lens.height)
-
-
 def _sees(camera: Camera, places: Array, normals: Array) -> NDArray[np.bool_]:
     """bool (P, D), whether a camera sees each surface."""
     to_camera = camera[1][:3, 3] - places
     to_camera = to_camera / np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-9)
     facing = to_camera @ normals.T > np.cos(np.deg2rad(MOST_OBLIQUE_DEG))
-    return facing & _within(camera, places)[:, None]
+    return facing & seen_from(*camera, places)[2][:, None]
 
 
 def _shares(seen: NDArray[np.bool_]) -> tuple[float, ...]:
@@ -219,7 +210,7 @@ def _plan(cameras: Sequence[Camera], center: Array, side: float, right: Array, f
     axis = (np.arange(PLAN) + 0.5) / PLAN - 0.5
     x, y = np.meshgrid(axis, -axis)  # the first row is the farthest
     places = center + side * (x.reshape(-1, 1) * right + y.reshape(-1, 1) * forward)
-    return np.sum([_within(camera, places) for camera in cameras], axis=0).reshape(PLAN, PLAN)
+    return np.sum([seen_from(*camera, places)[2] for camera in cameras], axis=0).reshape(PLAN, PLAN)
 
 
 def plan_svg(cameras: dict[str, Camera], coverage: Coverage) -> str:

@@ -323,6 +323,17 @@ def world_rays(camera: Pinhole, camera_to_world: ArrayLike) -> tuple[Array, Arra
     return m[:3, 3].copy(), camera.rays() @ m[:3, :3].T
 
 
+def seen_from(camera: Pinhole, camera_to_world: ArrayLike, points: ArrayLike) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Points (N, 3) of the world in camera axes, their pixels (N, 2), NaN behind the camera, and whether the image
+    contains each (N,)."""
+    m = np.asarray(camera_to_world, dtype=np.float64)
+    local = (np.asarray(points, dtype=np.float64) - m[:3, 3]) @ m[:3, :3]
+    at = camera.project(local)
+    with np.errstate(invalid="ignore"):
+        inside: NDArray[np.bool_] = np.all((at >= 0.0) & (at < (camera.width, camera.height)), axis=1)
+    return local, at, inside
+
+
 _RASTER_POINTS = 33  # points a side at which a lens is checked
 
 

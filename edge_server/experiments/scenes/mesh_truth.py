@@ -17,7 +17,7 @@ from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.fields import View
 from edge_server.surface.mesh import Mesh
 from edge_server.surface.metrics import STEEPEST_DEG, WITHIN_M, MeshDistances, Truth, compare, thin_points
-from freshfield.geometry import world_rays
+from freshfield.geometry import seen_from, world_rays
 from freshfield.scenario import load
 
 # Spacing of the points of the truth: half the distance that counts as complete; casting the rays then takes
@@ -93,9 +93,7 @@ def _sees(
 ) -> NDArray[np.bool_]:
     """Whether a camera sees each of the surface points (N, 3) with ``normals`` (N, 3); returns (N,)."""
     pose, lens = view.camera_to_world, view.intrinsics
-    with np.errstate(invalid="ignore"):
-        at = lens.project((points - pose[:3, 3]) @ pose[:3, :3])
-        inside = ((at >= 0) & (at < (lens.width, lens.height))).all(axis=1)
+    inside = seen_from(lens, pose, points)[2]
     ray = points - pose[:3, 3]
     distance = np.linalg.norm(ray, axis=1)
     ray /= distance[:, None]

@@ -29,7 +29,9 @@ def seen(distance_m: float, azimuth: float, elevation: float, fov_deg: float, be
     """(image, true mask) of the tile from somewhere."""
     scene = make_scene("tile", {"count": 1, "bench": bench})
     lens, pose = Pinhole.from_fov(128, 128, fov_deg), on_sphere((0.0, 0.0, 0.03), distance_m, azimuth, elevation)
-    return scene.view(lens, pose).image(0.0), scene.object_mask(lens, pose)
+    plain = {"count": 1, "supersample": 1}
+    alone, near = (make_scene("tile", {**plain, "bench": b}).view(lens, pose).distance() for b in (False, bench))
+    return scene.view(lens, pose).image(0.0), np.isfinite(alone) & (alone <= near + 1e-9)
 
 
 def mask_of(foreground: Foreground, image) -> np.ndarray:
