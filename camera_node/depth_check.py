@@ -18,7 +18,7 @@ from camera_node.settings import SourceConfig
 from camera_node.sources.base import pixels
 from camera_node.sources.registry import open_sources
 from camera_node.sources.with_effects import camera_effects
-from freshfield.depth import DepthImage
+from freshfield.depth import USUAL_M, DepthImage
 from freshfield.geometry import Array, Pinhole, Pose, se3_inverse, seen_from
 from freshfield.scenario import Scenario
 
@@ -28,7 +28,6 @@ _SAME = 0.05  # relative difference of depths of one surface: the errors of sens
 _AGREES = 0.75  # least share of points that agree; measured: 0.86 to 1 where depth is right
 _OVERLAPS = 0.2  # least share, of the points in each other's image, that another unit has to make agree
 _FACTORS = (1e-3, 1e-2, 0.1, 0.3048, 1 / 0.3048, 10.0, 100.0, 1e3)  # of mistaken units: mm, cm, dm, feet
-_NEAR_M, _FAR_M = 0.02, 200.0  # half of the depth lies within, or the unit is wrong
 _CONSTANT = 0.95  # share of one number among those measured
 _LEAST_MEASURED = 0.02  # share of the pixels
 _JUMP = 0.1  # of inverse depth between neighbors, relative to the nearer one: an edge
@@ -100,7 +99,7 @@ def check(view: DepthView, others: Sequence[DepthView]) -> str:
     said += f", {near:.2g} to {far:.2g} m"
     if np.bincount(counts[measured]).max() > _CONSTANT * measured.sum():
         raise DepthWrong(f"{said}: nearly all of it is the same, {middle:.3g} m: does the sensor measure at all?")
-    if not _NEAR_M <= middle <= _FAR_M:
+    if not USUAL_M[0] <= middle <= USUAL_M[1]:
         raise DepthWrong(f"{said}: is the unit wrong?")
     shares = {other.camera: Overlap.of(view, other).share for other in others}
     known = {camera: share for camera, share in shares.items() if share is not None}

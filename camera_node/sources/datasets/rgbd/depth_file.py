@@ -14,7 +14,7 @@ from camera_node.sources.datasets.imaging import decode_file, shrink
 from camera_node.sources.datasets.lens import Lens, pinhole, undistort
 from camera_node.sources.datasets.photo import Photo
 from camera_node.sources.datasets.records import DatasetError
-from freshfield.depth import DepthImage
+from freshfield.depth import USUAL_M, DepthImage
 from freshfield.geometry import Pinhole, Pose
 from freshfield.untrusted import check_file
 
@@ -22,8 +22,6 @@ import cv2  # isort: skip
 
 MILLIMETER = 0.001
 _MOST_COUNTS = 65535
-# Half of an image's depth lies between these, or its unit is another: 1 m read as millimeters is 1 km or 1 mm.
-_NEAR_M, _FAR_M = 0.02, 200.0
 # Tolerated difference of aspect ratio between depth and the image it is registered to, both in whole pixels.
 _SAME_SHAPE = 0.05
 
@@ -65,7 +63,7 @@ def to_counts(
     unit = unit_m or (1.0 if values.dtype.kind == "f" else MILLIMETER)
     measured = np.isfinite(values) & (values > 0) & (values != nothing)
     middle_m = float(np.median(values[measured])) * unit if measured.any() else 1.0
-    if not _NEAR_M <= middle_m <= _FAR_M:
+    if not USUAL_M[0] <= middle_m <= USUAL_M[1]:
         raise DatasetError(
             f"{where}: the median of its depth is {middle_m:.3g} m, if a 1 in it is {unit:g} m: say the unit of its "
             "numbers in meters (depth_unit_scale_factor of a transforms.json)"
