@@ -18,7 +18,7 @@ ARRIVALS: dict[str, Any] = {"updates": "arrivals", "update_ms": 20.0, "steps": 1
 """Of a field in layers that follows arrivals."""
 CYCLE: dict[str, Any] = {"updates": "cycle", "update_ms": 800.0, "steps": 100}
 """Of everything else."""
-CARRIED: dict[str, Any] = {"updates": "cycle", "update_ms": 200.0, "steps": 24}
+CARRIED: dict[str, Any] = {"updates": "cycle", "update_ms": 150.0, "steps": 24}
 """Of a scan by cameras that move: a keyframe an update."""
 MOST_CARRIED = 4
 """Cameras: photos that are dealt to twelve (``fox``) are no tracks, and read 8 dB less as a scan (19 against 27)."""

@@ -20,14 +20,14 @@ from edge_server.fields.common.cameras.pose_corrections import normal_matrix
 from edge_server.fields.common.kernels.camera import CAMERA
 from edge_server.fields.common.supervision import CameraMemory, check_view
 from edge_server.fields.common.view_store import Arrays
-from edge_server.fields.splat.densification import GaussianCloud, opacity
+from edge_server.fields.splat.densification import opacity
 from edge_server.fields.splat.kernels.rasterize import EXPOSURE, Targets
 from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.discs import filled, usable_depth
 from edge_server.fields.splat.scan.plausibility import moved_in, troubles
 from edge_server.fields.splat.scan.scan_field import ScanField, Shown
+from edge_server.fields.splat.scan.sweep import sweep_depth
 from edge_server.fields.splat.scan.tracking import Alignment, Rendered, align, gray
-from edge_server.fields.splat.seeding import seed_gaussians
 
 SEPARATOR = "#"  # between a camera and the number of its keyframe: no camera has it in its name
 
@@ -73,7 +73,7 @@ class CarriedField(ScanField):
 
     def _begin(self, views: Sequence[View]) -> None:
         """Find the scene's box: where depth is measured, its median is the distance of the scene."""
-        self.view_store.add(views)
+        self._data = self.view_store.add(views).data  # the first Gaussians may need its weights: none
         self.view_store.keep_box()
         box, depths = self.view_store.box, [usable_depth(view.depth) for view in views]
         assert box is not None
@@ -124,16 +124,27 @@ class CarriedField(ScanField):
         view = self._without_what_moves(view)
         if self._rigid is not None and len(self.cloud):
             self._expose(view, shown)
+        self._measured |= view.depth is not None
+        if not self._measured and len(self.cloud):
+            view = replace(view, depth=self._sweep(view))
         if view.depth is not None:
-            seeds = self._seeds_of(view, shown)
+            seeds = self._seeds_of(view, shown, nearer=self._measured)
             self._make_room(len(seeds))
             self._add(seeds)
         self._append(view, self._aim(view, shown))
-        self._measured |= view.depth is not None
         if not self._measured and len(self._views) in tuned.BEGINS:
             self._begin_anew()
         while len(self._views) > self._most_kept():
             self._drop(self._least_needed())
+
+    def _sweep(self, view: View) -> NDArray[np.float32] | None:
+        """Depth of a view from the keyframes beside it, at the poses that are believed."""
+        posed = [replace(other, camera_to_world=self._pose_of(other)) for other in (view, *self._views)]
+        return usable_depth(sweep_depth(posed[0], posed[1:], self._seen_m or self._distance_m(), self.pool))
+
+    def _distance_m(self) -> float:
+        assert self.view_store.box is not None
+        return self.view_store.box.distance_m
 
     def _follow(self, view: View) -> None:
         """Begin with the correction and the exposure of the keyframe before."""
@@ -290,13 +301,6 @@ class CarriedField(ScanField):
                 self._exposures.known.pop(name, None)
 
     # --- what the field asks for --------------------------------------------------------------
-
-    def _seed(self) -> None:
-        """Seed where the keyframes agree on colors."""
-        s, box = self.settings, self.view_store.box
-        assert box is not None
-        none, first = np.zeros(0, np.float32), min(s.start, s.gaussians)
-        self.cloud = GaussianCloud.new(seed_gaussians(s, self.pool, box, self._views, None, none, first, self._rng(1)))
 
     def _next_view(self) -> int:
         """One of the newest keyframes, or any of them, all in turn in an order that is drawn anew for each pass."""

@@ -68,7 +68,7 @@ LEAST_KEPT = 32  # keyframes, however large
 KEPT_CORRECTIONS = 2048  # of keyframes that went, for held-out and late frames of their time
 EXPOSED_OPACITY, EXPOSED_ERROR = 0.7, 0.25  # pixels from which a new view's exposure is found: surfaces, as expected
 EXPOSED_SHARE = 0.2  # of its pixels, at least
-BEGINS = (2, 4, 8, 16)  # numbers of keyframes without depth at which a field begins anew
+BEGINS = (2, 4, 8)  # numbers of keyframes without depth at which a field begins anew
 
 
 # --- the pose of a new frame, by alignment with a rendering ---
