@@ -15,7 +15,7 @@ from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.studies.drawing import curves, several
 from edge_server.experiments.studies.findings import better
 from edge_server.experiments.studies.study import Claim, Study, StudyRequest, open_engine
-from edge_server.experiments.studies.trial import scenario_of, scenes_here
+from edge_server.experiments.studies.trial import scenario_of, scene_label, scenes_here
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
 from edge_server.experiments.virtual.simulate import usual_settings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
@@ -26,6 +26,7 @@ from freshfield.frame import Frame, to_request
 from freshfield.scenario import Scenario
 
 NONE, SOME, EACH = 0, 5, 1  # every n-th frame brings depth
+PICTURED = ("duo", "quad")
 WIDTHS_MBIT = (0.0, 8.0, 2.0)  # of each camera's line; 0: unbounded
 _SECONDS, _QUICK_SECONDS = 12.0, 6.0
 _SCORED_FROM = 2.0 / 3.0  # of the run
@@ -114,19 +115,20 @@ def _deployed(run: DepthRun, folders: Folders) -> tuple[VirtualDeployment, list[
 
 
 def _draw_images(request: StudyRequest, table: SeedTable) -> None:
-    """Draw the last instant of each scene to OUT/depth-pictures.png: the truth, and what is shown by rate of depth."""
+    """Draw the last instant of each scene to OUT/depth-pictures.png: the truth, and what is shown without depth and
+    with that of each fifth frame, on unbounded lines."""
     rows: list[tuple[str, list[tuple[str, Any]]]] = []
-    for run in _cases(replace(request, seeds=1)):
-        if run.megabits_per_s:
-            continue
-        deployment, _ = _deployed(run, request.folders)
-        present_ns, truth = deployment.clock.now_ns(), deployment.truth
-        assert truth is not None  # studies take scenes of which some camera is held out
-        image, lens, pose = truth.view(run.scenario().held_out[0], truth.nearest_ns(present_ns))
-        color = deployment.updates.field.snapshot(present_ns).render(pose, lens).color
-        if run.every == NONE:
-            rows.append((run.scene, [("truth", image)]))
-        rows[-1][1].append((f"depth of {_OF_FRAMES[run.every]}", to_bytes(color)))
+    for scene in scenes_here(request, PICTURED):
+        shown = []
+        for every in (NONE, SOME):
+            run = DepthRun(scene, 0, every, 0.0, _QUICK_SECONDS if request.quick else _SECONDS)
+            deployment, _ = _deployed(run, request.folders)
+            present_ns, truth = deployment.clock.now_ns(), deployment.truth
+            assert truth is not None  # studies take scenes of which some camera is held out
+            image, lens, pose = truth.view(run.scenario().held_out[0], truth.nearest_ns(present_ns))
+            color = deployment.updates.field.snapshot(present_ns).render(pose, lens).color
+            shown.append((f"depth of {_OF_FRAMES[every]}", to_bytes(color)))
+        rows.append((scene_label(scene), [("truth", image), *shown]))
     draw_images(request.out / "depth-pictures.png", rows)
 
 

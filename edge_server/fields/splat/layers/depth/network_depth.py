@@ -86,7 +86,7 @@ def _seen_by_others(k: int, surfaces: Sequence[Surface]) -> Image:
 def align(relative: Image, inverse: Image) -> tuple[Image, float]:
     """The network's inverse depth in 1 / m, float32 (H, W), and the share of the known depths that agree with it.
 
-    It is 0 where it cannot be believed: between two surfaces, whose edge it blurs, and far beyond the known depths.
+    It is 0 where it cannot be believed: far beyond the known depths.
 
     relative: of the network, float32 (H, W). inverse: known inverse depth, 1 / m, float32 (H, W), 0 unknown.
     ValueError: too little is known, or too little of it agrees with any scale and shift.
@@ -109,7 +109,7 @@ def align(relative: Image, inverse: Image) -> tuple[Image, float]:
     even = cv2.GaussianBlur(error, (0, 0), spread_px) / (cv2.GaussianBlur(right, (0, 0), spread_px) + 1e-2)
     metric = np.nan_to_num(scale * relative + shift) * np.exp(even)
     low, high = np.percentile(q, [1.0, 99.0])
-    believed = (metric > low / tuned.NETWORK_BEYOND) & (metric < high * tuned.NETWORK_BEYOND) & ~_blurred(metric)
+    believed = (metric > low / tuned.NETWORK_BEYOND) & (metric < high * tuned.NETWORK_BEYOND)
     return np.where(believed, metric, 0.0).astype(np.float32), float(agree.mean())
 
 
@@ -131,13 +131,3 @@ def _line(r: NDArray[np.float64], q: NDArray[np.float64]) -> tuple[float, float]
     rows = np.stack([r[agree], np.ones(np.count_nonzero(agree))], axis=1) / q[agree, None]  # even in log depth
     scale, shift = np.linalg.lstsq(rows, np.ones(len(rows)), rcond=None)[0]
     return float(scale), float(shift)
-
-
-def _blurred(metric: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """The pixels on a step of inverse depth that are near neither of its ends, bool (H, W)."""
-    square = np.ones((tuned.NETWORK_EDGE_PX, tuned.NETWORK_EDGE_PX), np.uint8)
-    q = metric.astype(np.float32)
-    high, low = cv2.dilate(q, square), cv2.erode(q, square)
-    at = (q - low) / np.maximum(high - low, 1e-9)
-    step = high - low > tuned.NETWORK_STEP * high
-    return np.asarray(step & (at > tuned.NETWORK_END) & (at < 1.0 - tuned.NETWORK_END))
