@@ -31,6 +31,7 @@ from edge_server.experiments.common.arguments import (
     run_command,
 )
 from edge_server.experiments.fitting.evaluate import Scored, fit_in_slices, marks_s
+from edge_server.experiments.fitting.misfits import misfits
 from edge_server.experiments.scenes.multiview_still import mean_baselines, score_views, synthetic_still
 from edge_server.experiments.scenes.recorded import MultiviewStill, load_recorded
 from edge_server.fidelity.images import Color, to_unit
@@ -288,6 +289,7 @@ class _Run:
         from edge_server.report.build_report import build_report  # draws with matplotlib
 
         self._say_calibration()
+        self._say_misfits()
         checkpoint.save(self.out / "field", self.model.state(), {**self._about(), "steps": self.spent_steps})
         _write_lines(self.out / "series.jsonl", self.rows)
         _write_lines(self.out / "processes.jsonl", self.processes)
@@ -311,6 +313,14 @@ class _Run:
         if found is not None:
             print(found.words, flush=True)
             self.request.chosen = "; ".join(filter(None, (self.request.chosen, found.words)))
+
+    def _say_misfits(self) -> None:
+        """Print and note which training views do not fit the others."""
+        if not self.data.carried:
+            return
+        lines = misfits(self.model, self.data.training, Scorer(None, background=self.background))
+        print("\n".join(lines), end="\n" if lines else "", flush=True)
+        self.request.chosen = "; ".join(filter(None, (self.request.chosen, *lines)))
 
     def _about(self) -> dict[str, Any]:
         return {

@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
+from edge_server.experiments.fitting.misfits import misfits
 from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, RefinesCameras, View
 from edge_server.fields.splat.densification import opacity
 from edge_server.fields.splat.scan.scan_field import ScanField
 from edge_server.fields.splat.settings import SplatSettings
-from tests.edge_server.fields.scenes import BALL_M, RADIUS_M
-from tests.edge_server.fields.splat.scan.walk import WALK, spoiled, walk
+from freshfield.geometry import look_at
+from tests.edge_server.fields.scenes import BALL_M, RADIUS_M, seen
+from tests.edge_server.fields.splat.scan.walk import LENS, WALK, spoiled, walk
 
 SETTINGS = SplatSettings(gaussians=3000, start=500, seed_cells=32, scan=True, threads=2, contracted=False)
 
@@ -142,10 +145,51 @@ def _senseless_depth(views: list[View]) -> list[View]:
     return [replace(view, depth=depth) for view, depth in zip(views, noise)]
 
 
+def _pure_rotation(views: list[View]) -> list[View]:
+    """From one place, turning: pictures of it, so that they fit."""
+    out = []
+    for k, view in enumerate(views):
+        pose = look_at((0.0, -2.2, 0.6), (0.4 * np.sin(0.3 * k), 0.0, 0.4 + 0.1 * np.cos(0.3 * k)))
+        out.append(replace(view, camera_to_world=pose, image=seen(LENS, pose)[0], depth=None))
+    return out
+
+
+def _motion_blur(views: list[View]) -> list[View]:
+    return [replace(v, image=cv2.blur(v.image, (13, 1)) if k % 3 else v.image, depth=None) for k, v in enumerate(views)]
+
+
+def _another_camera(views: list[View]) -> list[View]:
+    other = np.random.default_rng(1).integers(0, 255, views[10].image.shape, np.uint8)
+    return [*views[:10], replace(views[10], image=other), *views[11:]]
+
+
+def _in_another_unit(scale: float) -> Spoil:
+    def scaled(views: list[View]) -> list[View]:
+        poses = [view.camera_to_world * np.array([1.0, 1.0, 1.0, scale]) for view in views]
+        for pose in poses:
+            pose[3, 3] = 1.0
+        return [replace(view, camera_to_world=pose, depth=None) for view, pose in zip(views, poses)]
+
+    return scaled
+
+
+def _without_depth(spoil: Spoil) -> Spoil:
+    return lambda views: [replace(view, depth=None) for view in spoil(views)]
+
+
 @pytest.mark.stability
 @pytest.mark.parametrize(
     ("spoil", "least_db"),
     [
+        (_pure_rotation, 19.5),
+        (_motion_blur, 19.0),
+        (_another_camera, 20.5),
+        (_in_another_unit(10.0), 21.5),
+        (_in_another_unit(0.1), 21.5),
+        (_without_depth(_jumping_exposures), 21.0),
+        (_without_depth(_leap), 20.5),
+        (_without_depth(_white_wall), 50.0),
+        (_without_depth(_identical), 25.0),
         (_jumping_exposures, 17.0),
         (_leap, 17.0),
         (_without_rotation, 10.0),
@@ -170,6 +214,16 @@ def test_hard_footage_leaves_a_finite_field_that_shows_what_it_learned(spoil: Sp
     field.reset()  # what comes afterwards is learned as ever
     field.fit(WALK[::2], Budget(steps=100))
     assert score_views(field, WALK[::9], Scorer())[0].psnr_db > 17.0
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(("spoil", "named"), [(_leap, ["020"]), (_another_camera, ["020"]), (list, [])])
+def test_a_frame_that_does_not_fit_is_named(spoil: Spoil, named: list[str]) -> None:
+    footage = spoil(WALK[::2])
+    field = ScanField(replace_settings(2))
+    field.fit(footage, Budget(steps=200))
+    lines = misfits(field, footage, Scorer())
+    assert [line.split(":")[0] for line in lines] == [f"frame {name}" for name in named]
 
 
 @pytest.mark.stability
