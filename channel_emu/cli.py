@@ -33,7 +33,7 @@ In the help of a command, [x] after an option is its default.
   channel-emu simulate --preset gilbert-elliott --csv frames.csv
   channel-emu simulate --arrivals poisson:1/60ms --service exp:30ms --discipline lcfs-preempt
   channel-emu proxy --preset ch5 --to localhost:50051 --listen 127.0.0.1:50052 --seed 1
-  channel-emu fit trace.jsonl --out fitted.yaml
+  channel-emu fit trace.jsonl --plot fit.png --out fitted.yaml
 """
 
 
@@ -351,6 +351,7 @@ def _add_fit(commands: Any) -> None:
         "--discipline", choices=FITTED_DISCIPLINES, help="for a CSV: what the busy link did with a new frame [drop-new]"
     )
     sub.add_argument("--out", type=out_file, metavar="FILE.yaml", help="write a scenario with the fitted channel")
+    sub.add_argument("--plot", type=out_file, metavar="FILE", help="write a figure: delays over time and the state")
     sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     sub.set_defaults(go=_fit)
 
@@ -363,6 +364,8 @@ def _fit(args: argparse.Namespace) -> int:
     if args.out:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.write_text(report.scenario_text(result))
+    if args.plot:
+        report.plot(result, args.plot)
     print(json.dumps(result.summary()) if args.json else report.format_fit(result))
     return 0
 

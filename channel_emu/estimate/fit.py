@@ -68,6 +68,7 @@ class Fit:
     parameters: by name, in 1/ms and ms.
     bic: by number of states.
     channel: the ``channel:`` section for a scenario.
+    lines: the transmissions, one timeline a chain; second_state: probability of the second state at each.
     """
 
     recording: Recording
@@ -78,6 +79,8 @@ class Fit:
     bic: dict[int, float]
     channel: dict[str, Any]
     warnings: list[str] = field(default_factory=list)
+    lines: list[Transmissions] = field(default_factory=list)
+    second_state: list[NDArray[np.float64]] = field(default_factory=list)
 
     def summary(self) -> dict[str, Any]:
         """The fit as plain values, as the command prints it with --json."""
@@ -170,6 +173,8 @@ def fit(
         {k: each.bic for k, each in best.items()},
         channel,
         warnings,
+        lines,
+        [] if chosen.model is None else _second_state(chosen.model, data, lines, chosen.law),
     )
 
 
@@ -249,11 +254,21 @@ def _two_states(data: Segments, delays_ms: NDArray[np.float64], lost: NDArray[np
     return _Candidate(2, law, bic, one, model.ordered(law != "constant"))
 
 
+def _second_state(model: TwoStates, data: Segments, lines: list[Transmissions], law: str) -> list[NDArray[np.float64]]:
+    """Probability of the second state at each transmission, one array a timeline."""
+    flat = two_states.step(model, data, law)[2][0]
+    found, row = [], 0
+    for start, _, _ in lines:
+        rows = -(-len(start) // two_states.SEGMENT)
+        found.append(flat[row : row + rows].ravel()[: len(start)] if rows > 1 else flat[row][: len(start)])
+        row += rows
+    return found
+
+
 def _reject_two_states(found: _Candidate, data: Segments, lines: list[Transmissions]) -> str | None:
     """The reason to reject two states whatever their likelihood, or None."""
     assert found.model is not None
-    known = ~(np.isnan(data.lost) & np.isnan(data.delay_ms))
-    second = two_states.step(found.model, data, found.law)[2][known]
+    second = np.concatenate(_second_state(found.model, data, lines, found.law))
     frames = min(float(second.sum()), float((1 - second).sum()))
     if frames < _MIN_FRAMES:
         return f"one of them rests on {frames:.0f} frames"

@@ -7,8 +7,8 @@ other link, one frame a line::
     0.0,41.5,cam00
     33.3,,cam00
 
-A frame that never came has no delivered_ms, or 1 in a column lost; the camera may be left out, and delay_ms may stand
-for delivered_ms (``channel_emu.model.table``).
+A frame that never came has no delivered_ms; the camera may be left out, and delay_ms may stand for delivered_ms.
+Columns may be in any order, with their units (``channel_emu.model.table``).
 """
 
 from __future__ import annotations
@@ -133,27 +133,30 @@ def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:
 def _from_rows(path: Path, discipline: str) -> Recording:
     rows: dict[str, list[tuple[float, float]]] = {}
     try:
-        names, read = read_table(path)
-        if not read and len(names) < 2:
+        read = read_table(read_text(path))
+        offered = read.column("offered", "sent", "send_time")
+        delivered = read.column("delivered", "received", "receive_time", "arrived")
+        delay = read.column("delay", "latency", "one_way_delay")
+        if not read.titles and not read.rows:
             raise TableError("there is no frame in it")
-        came = next((name for name in ("delivered_ms", "delay_ms") if name in names), "")
-        if "offered_ms" not in names or not came:
+        if offered is None or (delivered is None and delay is None):
             raise TableError(
-                "expected a header with the columns offered_ms, delivered_ms (or delay_ms) and perhaps camera; it has "
-                + (", ".join(filter(None, names)) or "no header")
+                "expected a header with the columns offered_ms, delivered_ms (or delay_ms) and perhaps camera, in any "
+                f"order, with their units; it has {', '.join(read.titles) or 'no header'}"
             )
-        begin = next((at for row in read if math.isfinite(at := row.time_ms("offered_ms"))), 0.0)  # perhaps since 1970
-        for row in read:
-            at, then = row.time_ms("offered_ms") - begin, row.time_ms(came)
-            then = math.nan if row.lost else at + then if came == "delay_ms" else then - begin
-            where = f"line {row.line}"
+        came = [*read.times_ms(delivered or delay or offered)]
+        camera = read.text("camera")
+        begin = next((at for at in read.times_ms(offered) if math.isfinite(at)), 0.0)  # stamps may be since 1970
+        for (line, row), at, then, lost in zip(read.rows, read.times_ms(offered), came, read.lost()):
+            at -= begin
+            then = math.nan if lost else then - begin if delivered else at + then
             if abs(at) > _MAX_ROWS_MS:
-                raise TableError(f"{where}: offered_ms is decades away from the first: {row['offered_ms']:.100}")
+                raise TableError(f"line {line}: {offered.title} is decades away from the first: {', '.join(row):.100}")
             if math.isnan(at) or then < at:
                 raise TableError(
-                    f"{where}: {came} is before offered_ms, or that is blank: {', '.join(row.values()):.100}"
+                    f"line {line}: delivered_ms is not earlier than offered_ms, or blank: {', '.join(row):.100}"
                 )
-            rows.setdefault(row.get("camera") or "cam00", []).append((at, then))
+            rows.setdefault((row[camera] if camera is not None else "") or "cam00", []).append((at, then))
     except TableError as error:
         raise RecordingError(f"{path}: {error}") from None
     if not rows:

@@ -1,13 +1,18 @@
-"""Presents a fitted channel: as text, as a scenario's YAML."""
+"""Presents a fitted channel: as text, as a scenario's YAML, as a plot."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from channel_emu.estimate.fit import Fit, IntervalEstimate
+from freshfield.files import picture
 from freshfield.untrusted import YamlWriter
+
+_MAX_FRAMES = 2000
 
 
 def format_fit(fit: Fit) -> str:
@@ -38,6 +43,29 @@ def scenario_text(fit: Fit) -> str:
     head = f"# Fitted to {fit.recording.path.name}: {fit.recording.frames} frames, states by {fit.chosen_by}\n"
     document = {"name": "fitted", "seed": 0, "cameras": {"count": len(cameras)}, "channel": fit.channel}
     return head + _yaml(document)
+
+
+def plot(fit: Fit, path: Path) -> None:
+    """Plot the first delays, with the means, and below them the probability of the second state. Raises PlotError."""
+    cameras, two = fit.recording.cameras, fit.states == 2
+    start_s = np.concatenate([c.started_ms for c in cameras]) / 1e3
+    order = np.argsort(start_s, kind="stable")[:_MAX_FRAMES]  # frames that did not start come last
+    start_s, delay_ms = start_s[order], np.concatenate([c.delay_ms for c in cameras])[order]
+    with picture(path, 1 + two, 1, sharex=True, size=(9, 3 + 1.5 * two), height_ratios=[3, 1][: 1 + two]) as axes:
+        top, bottom = axes[0, 0], axes[-1, 0]
+        top.scatter(start_s, delay_ms, s=5, color="#777777")
+        top.set_ylabel("delay (ms)")
+        bottom.set_xlabel("start of transmission (s)")
+        means = {name: value.value for name, value in fit.parameters.items() if name.startswith("mean")}
+        for (name, mean_ms), color in zip(means.items(), ("#0072B2", "#D55E00")):
+            top.axhline(mean_ms, color=color, lw=0.8, label=f"{name}: {mean_ms:.3g}")
+        if means:
+            top.legend(loc="upper right")
+        if two:
+            bottom.set(ylim=(-0.05, 1.05), ylabel=f"P({fit.channel['chain']['states'][1]})")
+            for (at_ms, _, _), states in zip(fit.lines, fit.second_state):
+                shown = at_ms / 1e3 <= np.nanmax(start_s)
+                bottom.plot(at_ms[shown] / 1e3, states[shown], lw=0.8, color="#D55E00")
 
 
 def _bic_difference(bic: dict[int, float]) -> str:

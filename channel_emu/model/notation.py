@@ -8,7 +8,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from channel_emu.model.table import TableError, read_table
+from channel_emu.model.table import Column, TableError, read_table
+from freshfield import untrusted
 from freshfield.untrusted import UntrustedError, read_yaml
 
 _UNITS_MS = {"": 1.0, "us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
@@ -20,6 +21,7 @@ _DISTRIBUTIONS = {
     "trace": "trace",
     "none": "none",
 }
+_MAX_CHARS = 2**26  # in a file: millions of delays
 _PARAMETER = {"gamma": "shape", "lognormal": "sigma"}
 
 
@@ -150,21 +152,35 @@ def chain(text: str) -> dict[str, Any]:
     return found
 
 
+def read_text(path: Path) -> str:
+    """Read a file named on the command line or in a scenario. Raises NotationError if it cannot be read or is
+    too long."""
+    try:
+        text = untrusted.read_text(path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise NotationError(f"{path}: cannot be read: {error}") from None
+    if len(text) > _MAX_CHARS:
+        raise NotationError(f"{path}: more than {_MAX_CHARS} characters")
+    return text
+
+
 def delays_ms(path: Path) -> list[float]:
-    """One-way delays in ms from a file: one number a line, or a CSV file with a column delay_ms (``table``). Rows
-    without a delay, or that a column ``lost`` marks, are left out.
+    """One-way delays in ms from a file: one number a line, or a table (``table``) with a header that names the
+    delay and its unit, such as ``delay_ms``. Rows that a column ``lost`` marks, or without a delay, are left out.
 
     Raises NotationError.
     """
     try:
-        names, rows = read_table(path, "delay_ms")
-        if "delay_ms" not in names:
-            raise TableError(f"expected one delay in ms a line, or a column delay_ms; it has {', '.join(names):.100}")
-        found = [row.time_ms("delay_ms") for row in rows if not row.lost]
-    except (OSError, UnicodeDecodeError) as error:
-        raise NotationError(f"{path}: cannot be read: {error}") from None
+        table = read_table(read_text(path))
+        column = table.column("delay", "latency", "one_way_delay", "owd")
+        if column is None and table.titles:
+            raise TableError(f"expected a column delay_ms (or delay_s, latency [us]); it has {', '.join(table.titles)}")
+        if any(len(row) != 1 for _, row in table.rows) and column is None:
+            raise TableError("expected one delay in ms a line, with a decimal point, or a header that names delay_ms")
+        times = table.times_ms(column or Column("the delay", 0, 1.0))
+        found = [time for time, lost in zip(times, table.lost()) if not lost and not math.isnan(time)]
     except TableError as error:
         raise NotationError(f"{path}: {error}") from None
-    if not (found := [value for value in found if not math.isnan(value)]):
+    if not found:
         raise NotationError(f"{path}: holds no delay")
     return found

@@ -1,74 +1,141 @@
-"""CSV files of times in ms: commas, decimal points, and a header that names the columns, in any order. What is written
-otherwise (decimal commas, other units or separators) is refused, because it could be read in two ways."""
+"""Tables of times as loggers write them. The header is read, not skipped: it names the columns, in any order, and their
+units (``delay_ms``, ``Delay [s]``, ``latency (us)``). What could be read in two ways is refused."""
 
 from __future__ import annotations
 
 import csv
 import math
-from pathlib import Path
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
 
-from freshfield.untrusted import read_text
-
-_FLAGS = {"": False, "0": False, "1": True}
+UNITS_MS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "μs": 1e-3, "ms": 1.0, "msec": 1.0, "s": 1e3, "sec": 1e3}
+UNITS_MS |= {"nanoseconds": 1e-6, "microseconds": 1e-3, "milliseconds": 1.0, "seconds": 1e3}
+_TITLE = re.compile(rf"(?P<name>.+?)(\s*[\[(](?P<in>.+?)[\])]|[\s_/]+(?P<unit>{'|'.join(UNITS_MS)}))?", re.IGNORECASE)
+_NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?")
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")  # or three decimals
+_NOTHING = ("", "-", "na", "n/a", "nan", "none", "null", "inf", "lost", "timeout", "*")
+_FLAGS = {"0": False, "false": False, "no": False, "": False, "1": True, "true": True, "yes": True}
 
 
 class TableError(ValueError):
-    """A table that cannot be read; the message is one line for people."""
+    """A table that cannot be read, or in more than one way; the message is one line for people."""
 
 
-class Row(dict[str, str]):
-    """The fields of a line by column. line: its number, from 1."""
+@dataclass(frozen=True)
+class Column:
+    """A column of times. index: from 0. unit_ms: milliseconds of its unit."""
 
-    def __init__(self, line: int, fields: dict[str, str]) -> None:
-        super().__init__(fields)
-        self.line = line
-
-    def time_ms(self, column: str) -> float:
-        """The number in a column; NaN where it is blank. Raises TableError."""
-        word = self[column]
-        try:
-            value = float(word or "nan")
-        except ValueError:
-            value = math.inf
-        if math.isinf(value) or (word and math.isnan(value)):
-            raise TableError(f"line {self.line}: {column} is {word!r:.40}, expected a number with a decimal point")
-        return value
-
-    @property
-    def lost(self) -> bool:
-        """Whether the column ``lost`` says so, if there is one. Raises TableError."""
-        word = self.get("lost", "")
-        if word not in _FLAGS:
-            raise TableError(f"line {self.line}: lost is {word!r:.40}, expected 0 or 1")
-        return _FLAGS[word]
+    title: str
+    index: int
+    unit_ms: float
 
 
-def read_table(path: Path, column: str = "") -> tuple[list[str], list[Row]]:
-    """Names of the columns and rows of a file. Blank lines and those that begin with # are left out.
+@dataclass(frozen=True)
+class Table:
+    """titles: the header's, empty without one. rows: line number and fields, as many as the header has;
+    those that a row lacks are empty."""
 
-    column: name of the only column of a file without a header; "": there must be one.
-    Raises TableError, OSError or UnicodeDecodeError.
+    titles: tuple[str, ...]
+    rows: tuple[tuple[int, tuple[str, ...]], ...]
+
+    def column(self, *names: str) -> Column | None:
+        """The column of times called one of ``names``, the first that is there. Raises TableError without a unit, or
+        if there are two."""
+        for name in names:
+            found = [(k, unit) for k, (title, unit) in enumerate(map(_title, self.titles)) if title == name]
+            if not found:
+                continue
+            (index, unit), title = found[0], self.titles[found[0][0]]
+            if len(found) > 1:
+                raise TableError(
+                    f"two columns are called {name}: {', '.join(self.titles[k] for k, _ in found)}: keep one"
+                )
+            if unit not in UNITS_MS:
+                raise TableError(
+                    f"the column {title!r} has no unit that is known: call it {name}_ms, {name}_s or {name}_us"
+                )
+            return Column(title, index, UNITS_MS[unit])
+        return None
+
+    def text(self, *names: str) -> int | None:
+        """Index of the column of text called one of ``names``."""
+        return next((k for k, title in enumerate(self.titles) if _title(title)[0] in names), None)
+
+    def lost(self) -> Iterator[bool]:
+        """Whether each row says that it was lost."""
+        index = self.text("lost", "loss", "dropped", "is_lost")
+        for line, row in self.rows:
+            word = "" if index is None else row[index].lower()
+            if word not in _FLAGS:
+                raise TableError(f"line {line}: {self.titles[index or 0]} is {word!r:.40}, expected 0 or 1")
+            yield _FLAGS[word]
+
+    def times_ms(self, column: Column) -> Iterator[float]:
+        """The column's values in ms; NaN for blank and for words of nothing, if there is a header."""
+        for line, row in self.rows:
+            word = row[column.index]
+            if self.titles and word.lower() in _NOTHING:
+                yield math.nan
+                continue
+            if not _NUMBER.fullmatch(word):
+                raise TableError(f"line {line}: {column.title} is {word!r:.40}, expected a number")
+            yield float(word.replace(",", ".")) * column.unit_ms
+
+
+def read_table(text: str) -> Table:
+    """The table in ``text``: separated by tabs, semicolons, commas or blanks. Lines that begin with # are comments; the
+    last one before the numbers may be the header. Decimal commas are understood where commas separate nothing.
+
+    Raises TableError.
     """
-    numbered = [(k, line.strip()) for k, line in enumerate(read_text(path).removeprefix("\ufeff").splitlines(), 1)]
+    numbered = [(k, line.strip()) for k, line in enumerate(text.removeprefix("\ufeff").splitlines(), 1)]
     lines = [(k, line) for k, line in numbered if line and not line.startswith("#")]
-    try:
-        rows = [(k, [word.strip() for word in next(csv.reader([line]))]) for k, line in lines]
-    except csv.Error as error:
-        raise TableError(f"cannot be read as CSV: {error}") from None
-    names = [column]
-    if rows and not _is_number(rows[0][1][0]):
-        names = rows.pop(0)[1]
-    for k, words in rows:
-        if len(words) > len(names):
+    if not lines:
+        return Table((), ())
+    separator = next((mark for mark in "\t;," if mark in lines[0][1]), None)
+    if separator is None and len(lines[-1][1].split()) > 1:
+        separator = " "
+    rows = [(k, _fields(line, separator)) for k, line in lines]
+    titles: tuple[str, ...] = ()
+    comments = [line.lstrip("# ") for k, line in numbered if line.startswith("#") and k < lines[0][0]]
+    if not _is_numbers(rows[0][1]):
+        titles, rows = rows[0][1], rows[1:]
+    elif comments and len(rows[0][1]) > 1 and len(named := _fields(comments[-1], separator)) == len(rows[0][1]):
+        titles = named
+    width = len(titles or rows[0][1])
+    for k, row in rows:
+        if len(row) > width:
             raise TableError(
-                f"line {k} has {len(words)} fields, expected {len(names)}: write decimal points, not commas"
+                f"line {k} has {len(row)} fields, expected {width}: decimal commas need semicolons between"
             )
-    return names, [Row(k, dict(zip(names, words + [""] * len(names)))) for k, words in rows]
+    words = [word for _, row in rows for word in row if _NUMBER.fullmatch(word)]
+    commas = [word for word in words if "," in word]
+    if commas and any("." in word for word in words):
+        raise TableError("numbers are written with decimal points and with commas: use one of them")
+    if commas and all(_THOUSANDS.fullmatch(word) for word in commas):
+        raise TableError(f"{commas[0]} may be thousands or have three decimals: write decimal points, or no commas")
+    return Table(titles, tuple((k, row + ("",) * (width - len(row))) for k, row in rows))
 
 
-def _is_number(word: str) -> bool:
+def _fields(line: str, separator: str | None) -> tuple[str, ...]:
+    if separator == " ":
+        return tuple(line.split())
     try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+        return tuple(
+            word.strip() for word in next(csv.reader([line], delimiter=separator or "\0", skipinitialspace=True))
+        )
+    except csv.Error as error:
+        raise TableError(f"cannot be read as a table: {error}") from None
+
+
+def _is_numbers(words: tuple[str, ...]) -> bool:
+    return all(_NUMBER.fullmatch(word) for word in words)
+
+
+def _title(title: str) -> tuple[str, str]:
+    """A column's name, in lower case with underscores, and its unit, "" without."""
+    found = _TITLE.fullmatch(title.strip())
+    if found is None:
+        return "", ""
+    return re.sub(r"[\s_-]+", "_", found["name"].strip().lower()), (found["in"] or found["unit"] or "").strip().lower()

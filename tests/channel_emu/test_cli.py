@@ -184,6 +184,7 @@ def test_a_path_that_cannot_be_written_is_said_in_one_line(capsys, scenario: Pat
     nowhere, listen = str(tmp_path / "file" / "x"), f"127.0.0.1:{free_port()}"
     for words in (
         ["fit", str(rows), "--states", "1", "--out", nowhere],
+        ["fit", str(rows), "--states", "1", "--plot", nowhere],
         ["simulate", "--seconds", "1", "--csv", nowhere],
         ["run", str(scenario), "--no-priority", "--listen", listen, "--out", nowhere],
         ["proxy", "--no-priority", "--to", "127.0.0.1:1", "--listen", listen, "--trace", nowhere],

@@ -115,7 +115,7 @@ def test_one_line_names_the_key_and_what_was_expected(text: str, expected: str) 
 )
 def test_the_short_notation_stands_for_sections(tmp_path: Path, short: str, long: str) -> None:
     """Files are relative to the given folder; the preset's name alone may differ."""
-    (tmp_path / "delays.csv").write_text("# a link\ntime_s,delay_ms\n0.1,1.5\n0.2,20\n0.3,3\n")
+    (tmp_path / "delays.csv").write_text("# a link\ntime_s, delay_ms\n0.1,1.5\n0.2,20\n0.3,3\n")
     found, expected = [channel_from_mapping(yaml.safe_load(text), "t", tmp_path) for text in (short, long)]
     assert msgspec.structs.replace(found, preset=None) == msgspec.structs.replace(expected, preset=None)
 
