@@ -4,10 +4,14 @@ from __future__ import annotations
 
 # --- when what begins (layered_field, static_layer) ---
 LEAST_CAMERAS = 2  # one alone gives no depth: the still field learns its frames
-PLATE_FRAMES, PLATE_S = 8, 3.2  # frames of each camera, and time since the first, before plates are learned
+PLATE_FRAMES, PLATE_S = 8, 3.2  # frames of each camera, and time since the first, before plates are certain
+# Layers begin with what is known of the plates then: nine tenths in `room`. At PLATE_S the still field begins anew.
+EARLY_S = 1.0
 PLATES_EVERY_S = 0.5  # how often plates are compared with what the still field has learned
 EVIDENCE_S = 0.8  # largest age of a frame from which motion is estimated
 RENDERINGS_A_FIT = 2  # renderings of the still field that plates take over in a fit
+# Steps after which the still field is shown that began early: what it replaces has learned what moves as background.
+EARLY_SHOWN_AFTER = 200
 SHOWN_AFTER = 400  # steps, after which a still field that began anew is better than what was shown before
 MOST_PIXELS = 400_000  # of one image of every camera together, if 15 frames a second of each are taken in
 FRAMES_KNOWN = 256  # instants of earlier frames that are remembered for each camera

@@ -39,8 +39,8 @@ class StaticSupervision:
     fine_s: instant of the frames when one was last taken in at its full resolution.
     fine: whether the static field learns from fine plates.
     exposure_rounds: number of rounds of ``exposures_agree`` so far.
-    anew: whether the static field is to begin anew, with depth.
-    with_depth: whether it has begun with depth. early: whether it then began before plates were certain.
+    anew: whether the static field is to begin anew.
+    with_depth: whether it begins, or has begun, with depth. early: whether it began before plates were certain.
     depth: None as long as no camera has measured depth.
     earlier: what the static field showed before it began anew; None if it has become better than that.
     """
@@ -127,7 +127,7 @@ class StaticSupervision:
             from edge_server.fields.splat.layers.depth.settings import PLATE_S
 
             return observations.newest_s >= PLATE_S
-        if observations.newest_s < tuned.PLATE_S:
+        if observations.newest_s < tuned.EARLY_S:
             return False
         alone = len(cameras) < tuned.LEAST_CAMERAS
         if alone and not self.warned:
@@ -143,6 +143,7 @@ class StaticSupervision:
             agree = self._begin_with_depth(cameras, observations)
         else:
             agree = self.exposure_rounds >= tuned.EXPOSURE_ROUNDS
+            self.early = observations.newest_s < tuned.PLATE_S
             self._begin(self._plates(cameras))
             if not agree:
                 agree = self._equalize(cameras)
@@ -155,7 +156,7 @@ class StaticSupervision:
         self.earlier = self.earlier or self.static.field.snapshot()
         self.static.forget()
         self.static.field.reset()
-        self.static.begin(plates)
+        self.static.begin(plates, tuned.EARLY_SHOWN_AFTER if self.early else None)
 
     def _equalize(self, cameras: Cameras) -> bool:
         """Train for a few steps, and correct exposures by how plates differ from what is shown then. Returns whether
@@ -180,9 +181,14 @@ class StaticSupervision:
                 cameras[name].correct_exposure(np.exp(log_ratio).astype(np.float32))
         self.exposure_rounds = tuned.EXPOSURE_ROUNDS
         self.static.field.keep_box([camera.view for camera in cameras.values()])
-        self.earlier = self.earlier or self.static.shown or self.static.field.snapshot()
-        self.anew, self.early = True, observations.newest_s < tuned.PLATE_S
+        self._keep_showing()
+        self.anew = self.with_depth = True
+        self.early = observations.newest_s < tuned.PLATE_S
         return True
+
+    def _keep_showing(self) -> None:
+        """What is shown is shown until the field that begins anew is better."""
+        self.earlier = self.earlier or self.static.shown or self.static.field.snapshot()
 
     # --- what is learned ----------------------------------------------------------------------
 
@@ -192,13 +198,20 @@ class StaticSupervision:
         beside: in a thread, until it has learned them; or else only note that there is something to learn.
         """
         begun, now_s = self.times.now(), observations.newest_s
+        certain = self.early and now_s >= tuned.PLATE_S
         stereo = self._stereo_helps(cameras)
         if stereo:
             self.make_depth()
-        if self.depth is not None and not self.anew:
-            certain = self.early and now_s >= tuned.PLATE_S
-            if certain or (not self.with_depth and (stereo or self._depth_is_known(_observed(cameras, observations)))):
+        if self.anew:
+            pass
+        elif self.with_depth:
+            if certain:
                 self._begin_with_depth(cameras, observations)
+        elif self.depth is not None and (stereo or self._depth_is_known(_observed(cameras, observations))):
+            self._begin_with_depth(cameras, observations)
+        elif certain:
+            self._keep_showing()
+            self.anew, self.early = True, False
         self._correct(cameras, observations)
         if not self.fine and self._fine_plates_are_known(cameras, observations):
             self.static.stop()
@@ -206,13 +219,17 @@ class StaticSupervision:
             if not self.anew:
                 self.static.refine(self._plates(cameras))
             self.plates_s = now_s
+        due = now_s - self.plates_s >= tuned.PLATES_EVERY_S
+        if due and self.early and not (self.anew or self.with_depth):  # more of the plates is known
+            self.plates_s = now_s
+            self.static.learn(self._plates(cameras))
         if beside and self.static.training:
             if self.anew:
                 self.static.end_soon()
         elif self.anew:
             self._begin_anew(cameras, beside)
             self.plates_s = now_s
-        elif beside if not self.static.finished else now_s - self.plates_s >= tuned.PLATES_EVERY_S:
+        elif beside if not self.static.finished else due:
             self.plates_s = now_s
             self._learn_again(cameras, beside)
         self.times.add("static field", begun)
@@ -232,21 +249,27 @@ class StaticSupervision:
                         o.view, o.row = replace(o.view, camera_to_world=pose), None
 
     def _begin_anew(self, cameras: Cameras, beside: bool) -> None:
-        """Begin with the plates and their depth, from nothing: a field that has begun early knows people as background,
-        and going on with it keeps them."""
-        from edge_server.fields.splat.layers.depth.settings import SHOWN_AFTER
-
-        depth, static, copies = self.make_depth(), self.static, self._copied(cameras)
-        shown_after = SHOWN_AFTER[0 if self.early and not self.with_depth else 1]
-        self.early, self.anew, self.with_depth = self.early and not self.with_depth, False, True
+        """Begin with the plates, and their depth where it is known, from nothing: a field that has begun early knows
+        people as background, and going on with it keeps them."""
+        static, self.anew = self.static, False
         static.forget()
-        box = static.field.view_store.box
-        assert box is not None
+        if self.with_depth:
+            from edge_server.fields.splat.layers.depth.settings import SHOWN_AFTER
 
-        def begin() -> None:
-            plates, surfaces = depth.plates(copies, anew=True)
-            static.field.begin_anew(depth.first_gaussians(surfaces, box))
-            static.begin(plates, shown_after)
+            depth, copies, shown_after = self.make_depth(), self._copied(cameras), SHOWN_AFTER[0 if self.early else 1]
+            box = static.field.view_store.box
+            assert box is not None
+
+            def begin() -> None:
+                plates, surfaces = depth.plates(copies, anew=True)
+                static.field.begin_anew(depth.first_gaussians(surfaces, box))
+                static.begin(plates, shown_after)
+        else:
+            images = self._plates(cameras)
+
+            def begin() -> None:
+                static.field.begin_anew(None)
+                static.begin(images)
 
         if beside:
             static.train_beside(begin, [camera.view for camera in cameras.values()])

@@ -117,7 +117,8 @@ class MotionTracker:
         if exclude and observation.instant_s >= camera.newest_s:
             camera.newest_s = observation.instant_s
             assert observation.shown is not None
-            camera.plate.exclude_explained(observation.view.image, observation.shown, opacity)
+            if observation.instant_s >= tuned.PLATE_S:  # before, what seems to move may be the plate
+                camera.plate.exclude_explained(observation.view.image, observation.shown, opacity)
 
     def _weigh(self, observation: Observation, camera: FixedCamera) -> None:
         if observation.weight is None:

@@ -147,7 +147,7 @@ class DepthSupervision:
         poses = [surface.pose for surface in surfaces]
         whole = _are_whole(cameras, surfaces)
         if not whole and len(cameras) <= of_layers.STEREO_CAMERAS:
-            surfaces, whole = self._filled(cameras, surfaces)
+            surfaces, whole = self._filled(cameras, surfaces, anew)
         surfaces = [surface for surface in surfaces if surface.inverse.any()]
         plates = [
             camera.learned._replace(view=replace(camera.learned.view, camera_to_world=pose))
@@ -158,17 +158,19 @@ class DepthSupervision:
             plates += virtual_plates(self.scene, surfaces, poses, whole, self.pool)
         return plates, surfaces
 
-    def _sweep(self, stereo: PlateStereo, cameras: Sequence[CameraPlates]) -> bool:
+    def _sweep(self, stereo: PlateStereo, cameras: Sequence[CameraPlates], every: bool = False) -> bool:
         distance_m = scene_box([camera.plate.view for camera in cameras]).distance_m
-        return stereo.sweep({camera.name: self._corrected(camera, None) for camera in cameras}, distance_m)
+        return stereo.sweep({camera.name: self._corrected(camera, None) for camera in cameras}, distance_m, every)
 
-    def _filled(self, cameras: Sequence[CameraPlates], surfaces: list[Surface]) -> tuple[list[Surface], bool]:
+    def _filled(
+        self, cameras: Sequence[CameraPlates], surfaces: list[Surface], every: bool
+    ) -> tuple[list[Surface], bool]:
         """The surfaces with depth by stereo and network where they have none. Whether what still has none is seen by no
-        other camera."""
+        other camera. every: see ``PlateStereo.sweep``."""
         whole, measured = False, [surface.inverse > 0 for surface in surfaces]
         if len(cameras) >= of_layers.LEAST_CAMERAS:
             self.stereo = self.stereo or PlateStereo(self.pool)
-            self._sweep(self.stereo, cameras)
+            self._sweep(self.stereo, cameras, every)
             filled = self.stereo.fill({camera.name: surface for camera, surface in zip(cameras, surfaces)})
             if filled is not None:
                 surfaces, whole = filled, True

@@ -39,17 +39,18 @@ class PlateStereo:
         self._found: dict[str, Image] = {}  # camera -> inverse depths, before others confirm them
         self._due: list[str] = []  # cameras to be swept
 
-    def sweep(self, plates: Mapping[str, Surface], distance_m: float) -> bool:
+    def sweep(self, plates: Mapping[str, Surface], distance_m: float, every: bool = False) -> bool:
         """Sweep every camera that never was, or else at most one of those that are due: an update that needs many is
         not held up. Returns whether that was the last one.
 
         plates: of all cameras; what they know of depth is not used. Those of more than ``SWEEP_PIXELS`` are matched
             smaller.
         distance_m: of the cameras to the scene.
+        every: whether to sweep all that are due, as for a field that begins anew.
         """
         lenses = {name: _lens(s) for name, s in plates.items()}
         self._take(plates, lenses, distance_m)
-        now = [name for name in self._due if name not in self._found] or self._due[:1]
+        now = self._due if every else [name for name in self._due if name not in self._found] or self._due[:1]
         for name in now:
             self._found[name] = self._match(name, lenses)
         self._due = [name for name in self._due if name not in now]

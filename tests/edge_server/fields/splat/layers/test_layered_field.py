@@ -22,6 +22,7 @@ from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.layers import settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.layers.layered_state import VERSION
+from edge_server.fields.splat.layers.static_layer import StaticLayer
 from edge_server.fields.splat.settings import SplatSettings
 from tests.edge_server.fields.scenes import picture, psnr, ring
 from tests.edge_server.fields.small import same_state
@@ -124,6 +125,38 @@ def test_what_was_shown_before_the_plates_are_known_is_shown_until_the_still_fie
     np.testing.assert_array_equal(field.snapshot().gaussians.params, params)
     _run(field, range(18, 21), moves=False, steps=10)
     np.testing.assert_array_equal(field.snapshot().gaussians.params, field.still.cloud.params)
+
+
+def test_layers_begin_before_plates_are_certain_and_the_still_field_anew_when_they_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What is shown meanwhile stays until the new still field is better; a part of the plates that becomes known early
+    is learned at once."""
+    monkeypatch.setattr(settings, "EARLY_S", 0.6)
+    monkeypatch.setattr(settings, "PLATE_S", 2.0)
+    monkeypatch.setattr(settings, "EARLY_SHOWN_AFTER", 40)
+    known: list[float] = []
+    learn = StaticLayer.learn
+
+    def told(self: StaticLayer, plates: Any) -> None:
+        known.append(float(np.mean([plate.known.mean() for plate in plates])))
+        learn(self, plates)
+
+    monkeypatch.setattr(StaticLayer, "learn", told)
+    field = LayeredField(SMALL)
+    _run(field, range(14), steps=10)
+    assert field.tracker is not None and field.supervision.early and len(known) <= 6
+    _run(field, range(14, 30), steps=10)
+    assert len(known) > 2 and known[-1] >= known[0] and field.static.ready
+    resumed, score = LayeredField(SMALL), _score(field.snapshot(), 29 * FRAME_S)
+    resumed.load_state(field.state())
+    for each in (field, resumed):
+        _run(each, range(30, 34), steps=10)
+    same_state(field, resumed)
+    assert not field.supervision.early and field.still.step < 60 and not field.static.ready
+    assert _score(field.snapshot(), 33 * FRAME_S) > score - 1.0
+    _run(field, range(34, 45), steps=30)
+    assert field.supervision.earlier is None and _score(field.snapshot(), 44 * FRAME_S) > score - 0.5
 
 
 def test_rates_fall_once_over_the_first_schedule(monkeypatch: pytest.MonkeyPatch) -> None:
