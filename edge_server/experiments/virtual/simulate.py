@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import hashlib
+import itertools
 import json
 import sys
 import time
@@ -25,7 +26,7 @@ from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.scorer import SHOWN, Scorer
+from edge_server.fidelity.scorer import SHOWN, Score, Scorer
 from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.state import Publication
 from edge_server.report.machine import versions
@@ -117,10 +118,13 @@ def summary(scenario: Scenario, deployment: VirtualDeployment, seconds: float) -
     """A run's frame counts, means over its last fifth, and a digest for comparing runs, as plain values.
 
     last_fifth: scores at publication, the thesis's measure. shown: scores of the images at random instants.
+    shown_curve_db: [seconds, PSNR of the image shown, of its moving pixels], means of half a second each.
+    seconds_to_1_db: the first of them from which on a second's mean is within 1 dB of the last fifth's.
     """
     publications = deployment.publications
     shown = [s for s in deployment.shown if s.published_ns >= 0.8e9 * seconds]
     late = [p for p in publications if p.t_s >= 0.8 * seconds]
+    curve, end_db = shown_curve(deployment.shown), mean_or_none([s.psnr_db for s in shown])
     return {
         "scenario": scenario.name,
         "seed": scenario.seed,
@@ -133,12 +137,32 @@ def summary(scenario: Scenario, deployment: VirtualDeployment, seconds: float) -
         "frames": deployment.frames(),
         "last_fifth": {name: mean_or_none([getattr(p, name) for p in late]) for name in _METRICS},
         "shown": {name: mean_or_none([getattr(s, name) for s in shown]) for name in SHOWN},
+        "shown_curve_db": curve,
+        "seconds_to_1_db": None if end_db is None else seconds_to(end_db - 1.0, curve),
         "views": mean_or_none([float(len(p.selected)) for p in publications]),
         "update_ms": mean_or_none([p.update_ms for p in publications]),
         "digest": digest(deployment),
         "processor": processor(),
         "versions": versions(),
     }
+
+
+def shown_curve(shown: Sequence[Score]) -> list[tuple[float, float | None, float | None]]:
+    """See ``summary``. shown: in the order of their instants."""
+    out = []
+    for half, scores in itertools.groupby(shown, lambda score: int(score.published_ns // 500_000_000)):
+        kept = list(scores)
+        whole, moving = (mean_or_none([getattr(s, name) for s in kept]) for name in SHOWN[:2])
+        out.append((half / 2, whole, moving))
+    return out
+
+
+def seconds_to(least_db: float, curve: Sequence[tuple[float, float | None, float | None]]) -> float | None:
+    """The instant of a curve, see ``summary``, from which on a second's mean is ``least_db``; None: never."""
+    for (begin_s, now_db, _), (_, next_db, _) in itertools.pairwise(curve):
+        if now_db is not None and next_db is not None and (now_db + next_db) / 2 >= least_db:
+            return begin_s
+    return None
 
 
 def digest(deployment: VirtualDeployment) -> str:
@@ -178,6 +202,7 @@ def show(found: dict[str, Any]) -> str:
             if found.get("now_and_all")
             else []
         ),
+        f"  seconds until within 1 dB of that: {number(found['seconds_to_1_db'], 1)}",
         "  frames      " + ", ".join(f"{k} {v}" for k, v in found["frames"].items() if v),
         f"  digest      {found['digest'][:32]} on {found['processor']}",
     ]

@@ -15,7 +15,7 @@ from edge_server.experiments.virtual import costs
 from edge_server.experiments.virtual.costs import fitted
 from edge_server.experiments.virtual.costs import main as costs_main
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
-from edge_server.experiments.virtual.simulate import main
+from edge_server.experiments.virtual.simulate import main, seconds_to
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.report.explain_command import main as explain
 from edge_server.scheduler.learned.decision_record import read_decision
@@ -44,6 +44,14 @@ def write(tmp_path: Path, **edge: Any) -> Path:
 def run(path: Path, capsys, *words: str) -> dict[str, Any]:
     assert main([str(path), "--seconds", "1.5", "--json", *words]) == 0
     return json.loads(capsys.readouterr().out)
+
+
+def test_the_curve_of_what_is_shown_and_the_seconds_to_its_end(tmp_path: Path, capsys):
+    found = run(write(tmp_path), capsys)
+    instants, whole, _ = zip(*found["shown_curve_db"])
+    assert instants == (0.0, 0.5, 1.0) and all(np.isfinite(whole))
+    rising = [(0.0, 10.0, None), (0.5, 30.0, None), (1.0, 20.0, None), (1.5, 28.0, None), (2.0, 28.0, None)]
+    assert [seconds_to(least_db, rising) for least_db in (20.0, 28.0, 28.1)] == [0.0, 1.5, None]
 
 
 def test_the_charge_is_the_scenarios_or_the_commands(tmp_path: Path, capsys):
