@@ -48,6 +48,9 @@ _FULL_EVERY = 4  # one in this many scores of what is shown has all metrics, the
 # This thread may use a share of the cores' time, refilling an allowance of CPU seconds. What is shown may use
 # its part of that share; publications are scored only while the reserve, CPU seconds, is left for it.
 _SHARE, _SHOWN_SHARE, _ALLOWANCE_S, _RESERVE_S = 0.03, 0.02, 1.0, 0.1
+# Of held-out cameras that move, all frames so far are scored again and again, 30 ms each at 320 x 240, with this share
+# more. One publication, whose metrics cost some ten times that, is scored for so many of them.
+_LOOK_BACK_SHARE, _LOOKS_A_SCORE = 0.03, 12
 
 
 class ScoringThread:
@@ -93,6 +96,7 @@ class ScoringThread:
         the last field; before, as many as this thread has time for."""
         self._frame_scores: dict[Truth, FrameScore] = {}
         self._looked_at = 0  # frames of ``so_far`` scored so far
+        self._ends_s = np.inf  # when ``stop`` waits no longer
         self._thread = threading.Thread(target=self._main, name="scoring", daemon=True)
 
     def start(self) -> None:
@@ -101,7 +105,7 @@ class ScoringThread:
     def stop(self, timeout_s: float = 10.0) -> None:
         """Score what has arrived, for ``timeout_s`` at most, and end."""
         with self._wake:
-            self._ending = True
+            self._ending, self._ends_s = True, time.monotonic() + timeout_s
             self._wake.notify()
         if self._thread.is_alive():
             self._thread.join(timeout_s)
@@ -140,6 +144,10 @@ class ScoringThread:
         while True:
             with self._wake:
                 self._wake.wait_for(lambda: self._new_frames or self._new_publications or self._ending)
+                if self._ending and self._new_publications and self._moving():
+                    # What the last field shows of all so far counts more than one place of each that waits.
+                    self._recent.append(self._new_publications[-1][:2])
+                    self._new_publications.clear()
                 published = self._new_publications.popleft() if self._new_publications else None
                 frame = self._new_frames.popleft() if published is None and self._new_frames else None
             if published is None and frame is None:
@@ -158,7 +166,8 @@ class ScoringThread:
         """Refill this thread's allowance with its share of the cores' time; whether more than ``reserve_s``
         CPU seconds are left."""
         now_s, used_s = time.monotonic(), time.thread_time()
-        gained_s = _SHARE * usable_cores() * (now_s - self._asked_s) - (used_s - self._used_s)
+        share = _SHARE + (_LOOK_BACK_SHARE if self._moving() else 0.0)
+        gained_s = share * usable_cores() * (now_s - self._asked_s) - (used_s - self._used_s)
         self._allowance_s = min(self._allowance_s + gained_s, _ALLOWANCE_S)
         self._asked_s, self._used_s = now_s, used_s
         return self._allowance_s > reserve_s
@@ -188,14 +197,20 @@ class ScoringThread:
         self._forget_snapshots()
         if not self._affordable(_RESERVE_S):
             return
+        if self._moving() and self._looked_at % _LOOKS_A_SCORE:
+            self._look_back()
+            return
         self._open[publication.number] = []
         while len(self._open) > _OPEN_PUBLICATIONS:
             del self._open[min(self._open)]
         self._views = views
         for camera in self._held_out.values():
             self._finish(camera.publish(publication, renderer))
-        if self._affordable(_RESERVE_S):
-            self._look_back()
+        self._look_back()
+
+    def _moving(self) -> bool:
+        """Whether a held-out camera moves."""
+        return any(camera.so_far for camera in self._held_out.values())
 
     def _look_back(self, whole: bool = False) -> None:
         """Score the newest frame of each held-out camera that moves from the newest field, and of its frames so far the
@@ -205,9 +220,12 @@ class ScoringThread:
             return
         snapshot = self._recent[-1][1]
         newest = [(camera, camera.so_far[-1]) for camera in self._held_out.values() if camera.so_far]
-        turn = [known[self._looked_at % len(known)]]
+        # In turn, so that where time ends those keep their score whose score is youngest.
+        turn = [known[(self._looked_at + k) % len(known)] for k in range(len(known) if whole else 1)]
         self._looked_at += 1
-        for camera, truth in known if whole else [*turn, *newest]:
+        for camera, truth in [*newest, *turn]:
+            if time.monotonic() > self._ends_s:
+                break
             if (score := camera.frame_score(truth, snapshot)) is not None:
                 self._frame_scores[truth] = score
         every = {truth for _, truth in known}

@@ -53,6 +53,7 @@ log = logging.getLogger(__name__)
 _STATUS_PERIOD_S = 0.5
 _AGES_PERIOD_S = 0.2
 _SNAPSHOT_TIMEOUT_S = 30.0
+_LAST_SCORES_S = 4.0  # for what waits at the end, and for all frames of held-out cameras that move: 64 take 2 s
 _UPDATE_TIMES = 4096  # latest update times that percentiles are computed from
 
 
@@ -219,7 +220,7 @@ class EdgeServer:
             self._stopping.set()
             self.loop.stop()
             self._write_field()  # first: who asked for the end does not wait for ever
-            self.scoring.stop(1.0)
+            self.scoring.stop(_LAST_SCORES_S)
             grpc.join(1.0)
             self._write_final()
             if page is not None:
