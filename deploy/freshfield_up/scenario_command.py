@@ -8,6 +8,7 @@ import re
 import shutil
 from pathlib import Path
 
+from freshfield.frame import valid_id
 from freshfield.scenario import SCENARIO_FOLDER, Scenario, ScenarioError, load
 
 COMMANDS = ("list", "show", "init", "check", "keys", "schema")
@@ -51,15 +52,19 @@ def _show(args: argparse.Namespace) -> int:
 def _init(args: argparse.Namespace) -> int:
     model = load(args.like)
     name, beside = args.file.stem, model.path.with_suffix("")
-    if args.file.suffix != ".yaml":
-        raise ScenarioError(f"{args.file}: expected a file name that ends in .yaml")
-    if args.file.exists():
-        raise ScenarioError(f"{args.file}: exists; choose another name, or remove it first")
+    if args.file.suffix != ".yaml" or not valid_id(name):
+        raise ScenarioError(f"{args.file}: expected a name of letters, digits, '.', '_' and '-' that ends in .yaml")
     text = model.path.read_text(encoding="utf-8")
+    targets = [args.file]
+    if model.path.parent == SCENARIO_FOLDER and beside.is_dir():  # files that the scenario names
+        targets.append(args.file.parent / beside.name)
+    for target in targets:
+        if target.exists():
+            raise ScenarioError(f"{target}: exists; choose another name or folder, or remove it first")
     args.file.parent.mkdir(parents=True, exist_ok=True)
-    if beside.is_dir():  # files that the scenario names
-        shutil.copytree(beside, args.file.parent / beside.name, dirs_exist_ok=True)
-    args.file.write_text(re.sub(r"(?m)^name: .*$", f"name: {name}", text), encoding="utf-8")
+    for target in targets[1:]:
+        shutil.copytree(beside, target)
+    args.file.write_text(re.sub(r"(?m)^name: .*$", f'name: "{name}"', text), encoding="utf-8")
     print(f"wrote {args.file}, like {model.name}; next: freshfield scenario check {args.file}")
     return 0
 

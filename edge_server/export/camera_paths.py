@@ -27,10 +27,12 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's camera axes: y up, z b
 
 @dataclass(frozen=True)
 class Step:
-    """One image of a path. camera_to_world: (4, 4), OpenCV axes. fov_deg: vertical field of view."""
+    """One image of a path. camera_to_world: (4, 4), OpenCV axes. fov_deg: vertical field of view. lens: a camera's own,
+    in place of that; None: a plain one."""
 
     camera_to_world: Matrix
     fov_deg: float
+    lens: Pinhole | None = None
 
 
 def lens(width: int, height: int, fov_deg: float) -> Pinhole:
@@ -97,9 +99,9 @@ def read_nerfstudio(file: Path) -> tuple[list[Step], float, tuple[int, int]]:
         entries = data.get("camera_path")
         if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_FRAMES:
             raise ValueError(f"camera_path: expected a list of 1 to {MOST_FRAMES} poses")
-        fps = _number(
-            data.get("fps", len(entries) / _number(data.get("seconds", 1), "seconds", 1e-3, 1e5)), "fps", 0.1, 240
-        )
+        if "fps" not in data:
+            data["fps"] = len(entries) / _number(data.get("seconds", 1), "seconds", 1e-3, 1e5)
+        fps = _number(data["fps"], "fps", 0.1, 240)
         return [_step(entry, f"camera_path[{k}]") for k, entry in enumerate(entries)], fps, (size[0], size[1])
     except ValueError as error:
         raise ExportError(f"--path {file}: {error}") from None

@@ -162,7 +162,8 @@ class Export:
             raise ExportError("--bounds: each lower corner must be below its upper one")
         return MeshSettings(
             method=a.method,
-            sharpen=not a.no_sharpen,
+            # It takes minutes, and points are drawn from the depth as well as it is.
+            sharpen=a.mesh is not None and not a.no_sharpen,
             voxel_m=None if a.voxel is None else 1e-3 * a.voxel,
             bounds=box,
             watertight=a.watertight,
@@ -217,10 +218,13 @@ class Export:
         print(f"{path}: {len(self.source.shots)} frames", flush=True)
 
     def _progress(self, what: str, share: float) -> None:
-        """Print progress once a second, and when a stage ends."""
+        """One line in a terminal, nothing in a pipe."""
+        if not sys.stderr.isatty():
+            return
         name, at, begun = self._said
         now = time.perf_counter()
         if share >= 1.0 or what != name or now - at >= 1.0:
             self._said = (what, now, now if what != name else begun)
             left = f", {(now - begun) * (1.0 / share - 1.0):.0f} s left" if what == name and share < 1.0 else ""
-            print(f"  {what:10} {100 * share:3.0f} %{left}", flush=True)
+            end = "\n" if share >= 1.0 else ""
+            print(f"\r  {what:10} {100 * share:3.0f} %{left:16}", end=end, file=sys.stderr, flush=True)

@@ -37,6 +37,7 @@ Files end in .png or .jpg (the first image of a path), or in .mp4.
 Image = NDArray[np.uint8]
 _IMAGES, _VIDEOS = (".png", ".jpg", ".jpeg"), (".mp4",)
 DEFAULT_HEIGHT = 480  # pixels, at the shape of the cameras' images
+MOST_NAMED = 20  # cameras in an error
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -85,7 +86,9 @@ def _render(args: argparse.Namespace) -> None:
     steps, fps, (width, height) = _path(args, sources[0])
     if ending in _IMAGES:
         steps = steps[:1]
-    cameras = [lens(width, height, args.fov or step.fov_deg) for step in steps]
+    if ending in _VIDEOS and (width % 2 or height % 2):
+        raise ExportError(f"{args.file}: videos need even sizes, not {width} x {height}: give --size")
+    cameras = [step.lens or lens(width, height, args.fov or step.fov_deg) for step in steps]
     snapshots = [source.field.snapshot() for source in sources]
 
     def render(index: int) -> list[Rendering]:
@@ -108,15 +111,17 @@ def _path(args: argparse.Namespace, source: Source) -> tuple[list[Step], float, 
         return steps, args.fps or fps, _size(args.size) or size
     fps, fov = args.fps or 25.0, vertical_fov_deg(like)
     if args.camera is not None:
-        shots = {view.camera: view for view in source.views}
+        # A carried camera's views are called hand#0, hand#1, ...: its newest one stands for it.
+        shots = {view.camera.rpartition("#")[0]: view for view in source.views if "#" in view.camera}
+        shots |= {view.camera: view for view in source.views}
         if args.camera not in shots:
-            raise ExportError(f"--camera {args.camera}: the run has {', '.join(list(shots)[:20])}")
-        view = shots[args.camera]
-        return (
-            [Step(source.pose(view), vertical_fov_deg(view.intrinsics))],
-            fps,
-            _size(args.size) or _shape(view.intrinsics),
-        )
+            more = f", and {len(shots) - MOST_NAMED} more" if len(shots) > MOST_NAMED else ""
+            raise ExportError(f"--camera {args.camera}: the run has {', '.join(list(shots)[:MOST_NAMED])}{more}")
+        view, camera = shots[args.camera], shots[args.camera].intrinsics
+        size = _size(args.size) or (camera.width, camera.height)
+        scaled = camera.scaled(size[1] / camera.height)
+        own = scaled if args.fov is None and (scaled.width, scaled.height) == size else None
+        return [Step(source.pose(view), vertical_fov_deg(camera), own)], fps, size
     size = _size(args.size) or _shape(like)
     if args.pose is not None:
         return looking(args.pose[:3], args.pose[3:], fov), fps, size
@@ -133,8 +138,8 @@ def _size(text: str | None) -> tuple[int, int] | None:
         return None
     found = re.fullmatch(r"(\d+)x(\d+)", text)
     size = (int(found[1]), int(found[2])) if found else (0, 0)
-    if not all(2 <= side <= MAX_IMAGE_SIDE_PX and side % 2 == 0 for side in size):
-        raise ExportError(f"--size {text}: expected even numbers, such as 1280x720")
+    if not all(2 <= side <= MAX_IMAGE_SIDE_PX for side in size):
+        raise ExportError(f"--size {text}: expected pixels such as 1280x720")
     return size
 
 
@@ -160,27 +165,33 @@ def _depth_colors(render: Callable[[int], list[Rendering]], count: int) -> Calla
 
 
 class _Writer:
-    """Writes an image, or a video one image at a time. ExportError: the file cannot be written."""
+    """Writes an image, or a video one image at a time, beside the file, which is replaced when all of it is there.
+    ExportError: the file cannot be written."""
 
     def __init__(self, file: Path, fps: float, size: tuple[int, int]) -> None:
         self._file, self._video = file, None
+        self._part = file.with_name(f".{file.stem}.part{file.suffix}")
         if file.suffix.lower() in _VIDEOS:
-            self._video = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+            self._video = cv2.VideoWriter(str(self._part), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
             if not self._video.isOpened():
                 raise ExportError(f"{file}: cannot be written: is the folder there, and has OpenCV its video codecs?")
 
     def __enter__(self) -> Callable[[Image], None]:
         return self._write
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         if self._video is not None:
             self._video.release()
+        if error is None:
+            self._part.replace(self._file)
+        else:
+            self._part.unlink(missing_ok=True)
 
     def _write(self, image: Image) -> None:
         bgr = np.ascontiguousarray(image[..., ::-1])
         if self._video is not None:
             self._video.write(bgr)
-        elif not cv2.imwrite(str(self._file), bgr):
+        elif not cv2.imwrite(str(self._part), bgr):
             raise ExportError(f"{self._file}: cannot be written")
 
 

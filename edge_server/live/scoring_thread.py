@@ -230,9 +230,10 @@ class ScoringThread:
                 self._frame_scores[truth] = score
         every = {truth for _, truth in known}
         self._frame_scores = {truth: score for truth, score in self._frame_scores.items() if truth in every}
-        now = [self._frame_scores[truth] for _, truth in newest if truth in self._frame_scores]
+        now = [truth for _, truth in newest if truth in self._frame_scores]
         if now:
-            self.so_far = so_far(list(self._frame_scores.values()), now[0])
+            last = max(now, key=lambda truth: truth.taken_ns)
+            self.so_far = so_far(list(self._frame_scores.values()), self._frame_scores[last])
 
     def _forget_snapshots(self) -> None:
         """Drop those that were replaced before the next capture at which what is shown is scored."""

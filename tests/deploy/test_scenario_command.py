@@ -40,11 +40,22 @@ def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path,
     mine = tmp_path / "new" / "mine.yaml"
     printed(capsys, "scenario", "init", str(mine), "--like", name)
     text = printed(capsys, "scenario", "show", str(mine))
-    assert "\nname: mine\n" in text and text.count("\n") == printed(capsys, "scenario", "show", name).count("\n")
+    assert '\nname: "mine"\n' in text and text.count("\n") == printed(capsys, "scenario", "show", name).count("\n")
     assert "valid" in printed(capsys, "scenario", "check", str(mine))
     assert "exists" in refused(capsys, "scenario", "init", str(mine))
     assert mine.read_text() == text
     assert ".yaml" in refused(capsys, "scenario", "init", str(tmp_path / "mine.txt"))
+    for odd in ("a: b.yaml", "x\\1.yaml"):
+        assert "expected a name" in refused(capsys, "scenario", "init", str(tmp_path / odd))
+    for plain in ("123.yaml", "yes.yaml"):  # that YAML would not read as text
+        printed(capsys, "scenario", "init", str(tmp_path / "plain" / plain), "--like", "quad")
+        assert "valid" in printed(capsys, "scenario", "check", str(tmp_path / "plain" / plain))
+
+
+def test_a_folder_that_is_there_already_is_not_written_into(tmp_path, capsys):
+    (tmp_path / "card").mkdir()
+    assert "card: exists" in refused(capsys, "scenario", "init", str(tmp_path / "mine.yaml"), "--like", "card")
+    assert not (tmp_path / "mine.yaml").exists()
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from edge_server.export import ExportError
 from edge_server.export.run_source import open_source
 from edge_server.fields import Budget, checkpoint
 from edge_server.fields.registry import make_field
+from edge_server.surface import reconstruct
 
 OPTIONS = {"splat": {"gaussians": 512, "start": 256, "seed_cells": 16}}
 SMALL = {"rays": 512, "batch_samples": 4096, "samples": 48}
@@ -51,7 +52,21 @@ def test_everything_at_once(run, tmp_path, capsys):
     for name in ("m.ply", "s.ply", "p.ply", "colmap/sparse/0/images.txt", "nerf/transforms.json"):
         assert (tmp_path / name).stat().st_size > 100, name
     assert len(list((tmp_path / "colmap" / "images").glob("*.png"))) == 8
-    assert "8 cameras" in said and "triangles" in said and "sharpen" in said
+    assert "8 cameras" in said and "triangles" in said
+    assert "%" not in said.replace("% of", "")  # progress is for terminals
+
+
+def test_depth_is_sharpened_for_a_mesh_alone(run, tmp_path, monkeypatch):
+    """It takes minutes; progress is one line of a terminal."""
+    pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
+    sharpened, sharpen = [], reconstruct.refine_depth
+    monkeypatch.setattr(reconstruct, "refine_depth", lambda *args: sharpened.append(1) or sharpen(*args))
+    assert export(run, "--points", tmp_path / "p.ply", "--colmap", tmp_path / "colmap") == 0 and not sharpened
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    written = []
+    monkeypatch.setattr(sys.stderr, "write", written.append, raising=False)
+    assert export(run, "--mesh", tmp_path / "m.ply", "--voxel", 10) == 0 and sharpened
+    assert any(text.startswith("\r  sharpen") for text in written)
 
 
 def test_a_mesh_of_a_known_scene_is_measured_against_it(run, tmp_path, capsys):

@@ -138,6 +138,8 @@ def test_a_path_of_nerfstudio_keeps_its_size_and_poses(run, tmp_path, capsys):
     (path := tmp_path / "camera_path.json").write_text(json.dumps(nerfstudio()))
     assert render(run, "--path", path, tmp_path / "flight.mp4") == 0
     assert "2 images of 64 x 48" in capsys.readouterr().out
+    (path).write_text(json.dumps(nerfstudio(seconds=0)))  # the rate is given: its seconds do not count
+    assert render(run, "--path", path, tmp_path / "flight.mp4") == 0
     # The same viewpoint, said by eye and target.
     assert render(run, "--path", path, tmp_path / "a.png") == 0
     assert render(run, "--pose", 0, -0.5, 0, 0, 0, 0, tmp_path / "b.png", "--fov", 40, "--size", "64x48") == 0
@@ -168,7 +170,8 @@ def test_a_path_that_cannot_be_flown_is_refused_by_key(change, says, run, tmp_pa
     [
         (["--orbit", "view.gif"], "ends in .png"),
         (["--orbit", "view.mp4", "--seconds", "0"], "--seconds 0"),
-        (["--orbit", "view.mp4", "--size", "33x20"], "even numbers"),
+        (["--orbit", "view.mp4", "--size", "33x20"], "videos need even sizes, not 33 x 20"),
+        (["--orbit", "view.mp4", "--size", "big"], "--size big: expected pixels"),
         (["--orbit", "view.mp4", "--fov", "nan"], "--fov nan"),
         (["--camera", "cam99", "view.png"], "--camera cam99: the run has cam01"),
         (["--pose", "0", "0", "1", "0", "0", "1", "view.png"], "--pose: "),
@@ -181,3 +184,18 @@ def test_what_cannot_be_rendered_is_refused_in_one_line(words, says, run, tmp_pa
     error = capsys.readouterr().err
     assert says in error and error.count("\n") == 1
     assert render(tmp_path / "none", "--orbit", "view.mp4") == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_camera_is_rendered_with_its_own_lens(tmp_path):
+    """Its focal lengths differ, and its axis is off the middle: the picture fits the photograph."""
+    still = synthetic_still("tile", cameras=9, size=32).training
+    lens = Pinhole(32, 32, 40.0, 30.0, 12.0, 18.0)
+    field = make_field("splat", {"gaussians": 512, "start": 256, "seed_cells": 16}, seed=3)
+    field.fit([View(f"hand#{k}", v.image, v.camera_to_world, lens) for k, v in enumerate(still)], Budget(steps=5))
+    checkpoint.save(tmp_path / "field.npz", field.state(), {"field": "splat", "options": {}, "seed": 3})
+    last = field.views[-1]
+    expected = np.clip(field.render(last.camera_to_world, lens).color * 255 + 0.5, 0, 255).astype(np.uint8)
+    for camera in (last.camera, "hand"):  # a carried camera is its newest view
+        assert render(tmp_path, "--camera", camera, tmp_path / "own.png") == 0
+        np.testing.assert_array_equal(cv2.imread(str(tmp_path / "own.png"))[..., ::-1], expected)

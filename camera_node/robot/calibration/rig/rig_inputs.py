@@ -69,24 +69,28 @@ def _of_video(file: Path, target: Target, progress: Callable[[], None]) -> tuple
         fps = capture.get(cv2.CAP_PROP_FPS)
         if not capture.isOpened() or not 0 < fps < 1000:
             raise CalibrationError(f"{file}: cannot be read as a video")
-        every = max(2, round(MOMENT_S * fps))
         found: dict[str, Corners] = {}
         size, before = (0, 0), None
+        starts = itertools.count()
+        moment, start = next(starts), 0  # of the frame nearest to each MOMENT_S, whatever the video's rate
         for index in itertools.count():
             if not capture.grab():
                 break
-            if index % every > 1:
+            if index > start + 1:
+                moment = next(starts)
+                start = max(round(moment * MOMENT_S * fps), index)
+            if index < start:
                 continue
             ok, image = capture.retrieve()
             if not ok:
                 raise CalibrationError(f"{file}: frame {index} cannot be decoded")
             size = (image.shape[1], image.shape[0])
             corners = target.find(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
-            if index % every == 0:
+            if index == start:
                 before = corners
                 progress()
             elif corners is not None and before is not None and moved_px(before, corners) < STILL_PX:
-                found[f"{index / fps:.1f}s"] = corners
+                found[f"{moment * MOMENT_S:.1f}s"] = corners
     finally:
         capture.release()
     if not size[0]:

@@ -29,6 +29,7 @@ _OUTLIER = 0.15
 _FARTHEST = 1.0
 _DAMPING, _USUAL = 1e-3, np.array([0.03] * 3 + [0.02] * 3)
 _SPREAD, _REACH = 0.8, 8
+_SAME_POSE = 1e-3  # of all numbers of a matrix: another pose is another place, whose correction is not known
 
 
 @dataclass
@@ -102,6 +103,13 @@ class PoseCorrections:
         known = self._of(view)
         return _corrected(known.given, known.rotation, known.shift_m)
 
+    def learned_pose(self, view: View) -> Array | None:
+        """As ``pose``; None where nothing was learned of this view, and nothing changes."""
+        known = self.known.get(view.camera)
+        if known is None or not np.allclose(known.given, view.camera_to_world, atol=_SAME_POSE):
+            return None
+        return _corrected(known.given, known.rotation, known.shift_m)
+
     def pose_between(self, view: View, neighbors: dict[str, float]) -> Array:
         """The pose (4, 4) of a view from which nothing is learned, by the corrections of others.
 
@@ -119,7 +127,7 @@ class PoseCorrections:
     def _of(self, view: View) -> _Correction:
         given = np.asarray(view.camera_to_world, dtype=np.float64)
         known = self.known.get(view.camera)
-        if known is None or not np.allclose(known.given, given, atol=1e-3):
+        if known is None or not np.allclose(known.given, given, atol=_SAME_POSE):
             known = self.known[view.camera] = _Correction(given, at_ns=view.generated_ns)
             self._sorted = {}
         return known

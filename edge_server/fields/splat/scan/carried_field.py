@@ -30,6 +30,8 @@ from edge_server.fields.splat.scan.sweep import sweep_depth
 from edge_server.fields.splat.scan.tracking import Alignment, Rendered, align, gray
 
 SEPARATOR = "#"  # between a camera and the number of its keyframe: no camera has it in its name
+# What a field that begins anew still knows of its cameras and their frames.
+_OF_CAMERAS = ("_pixels", "_taken", "_seen", "_left_out", "_in_a_row", "_moving", "_depths")
 
 
 class CarriedField(ScanField):
@@ -41,6 +43,7 @@ class CarriedField(ScanField):
         super()._forget_parameters()
         self._clear_views()
         self._pixels, self._taken = 0, 0  # of the largest image, and keyframes, so far
+        self._due_before = 0  # keyframes that were due before the field began anew, which counts steps from 0 again
         self._left_out: dict[str, int] = {}  # frames of each camera that show something else
         self._in_a_row: dict[str, int] = {}
         self._moving: dict[str, float] = {}  # share of a camera's newest keyframe where something moves
@@ -54,7 +57,7 @@ class CarriedField(ScanField):
         news = [view for view in views if self._is_new(view)]
         if not self._views and news:
             self._begin(news)
-        due = self.step // tuned.STEPS_A_KEYFRAME + len(self._seen) - self._taken
+        due = self._due_before + self.step // tuned.STEPS_A_KEYFRAME + len(self._seen) - self._taken
         best = {}
         for view in sorted(news, key=lambda view: (view.depth is not None, view.generated_ns)):
             best[view.camera] = view  # the newest, of those with depth if there are any: only they seed
@@ -223,9 +226,12 @@ class CarriedField(ScanField):
     def _begin_anew(self) -> None:
         """Find the box and the first Gaussians from all keyframes so far: without depth, the first few say little, and
         a field that was fitted to them is not mended by later ones."""
-        views, known = self._views, (self._pixels, self._taken, self._seen)
+        views, kept = self._views, {name: getattr(self, name) for name in _OF_CAMERAS}
+        due = self._due_before + self.step // tuned.STEPS_A_KEYFRAME
         self._begin(views)
-        self._pixels, self._taken, self._seen = known
+        for name, value in kept.items():
+            setattr(self, name, value)
+        self._due_before = due
         for view in views:
             self._follow(view)
             self._append(view, self._aim(view, None))
@@ -272,7 +278,7 @@ class CarriedField(ScanField):
 
     def _most_kept(self) -> int:
         pixels = self._views[-1].image.shape[0] * self._views[-1].image.shape[1]
-        return max(tuned.KEPT_PIXELS // pixels, tuned.LEAST_KEPT)
+        return min(max(tuned.KEPT_PIXELS // pixels, tuned.LEAST_KEPT), tuned.MOST_KEPT)
 
     def _least_needed(self) -> int:
         """The older of the two keyframes that were taken nearest to each other, the newest ones apart."""
@@ -340,7 +346,8 @@ class CarriedField(ScanField):
             self.cloud.keep(kept)
 
     def _counters(self) -> dict[str, Any]:
-        return {**super()._counters(), "taken": self._taken, "pixels": self._pixels, "measured": self._measured}
+        own = {"taken": self._taken, "due_before": self._due_before, "pixels": self._pixels, "measured": self._measured}
+        return {**super()._counters(), **own, "left_out": self._left_out}
 
     def _arrays(self) -> Arrays:
         aims = [np.append(normal, pixel_m) for normal, pixel_m in self._aims]
@@ -349,7 +356,8 @@ class CarriedField(ScanField):
     def _load(self, meta: dict[str, Any], state: Arrays) -> None:
         super()._load(meta, state)
         self._taken, self._pixels = int(meta["taken"]), int(meta["pixels"])
-        self._measured = bool(meta["measured"])
+        self._due_before, self._measured = int(meta["due_before"]), bool(meta["measured"])
+        self._left_out = {str(camera): int(count) for camera, count in meta["left_out"].items()}
         self._clear_views()
         views, aims = self.view_store.views, np.asarray(state["aims"], np.float64)
         if aims.shape != (len(views), 37) or not np.isfinite(aims).all():

@@ -28,8 +28,9 @@ class RefinedCameras:
 
     def correction(self, view: View) -> Correction:
         """How to render what ``view`` saw: as it was learned, else as its neighbors in time suggest."""
-        if view.camera in self.poses.known:
-            return Correction(self.poses.pose(view), *self.exposures.of(view.camera))
+        learned = self.poses.learned_pose(view)
+        if learned is not None:
+            return Correction(learned, *self.exposures.of(view.camera))
         neighbors = self.poses.neighbors_in_time(view, self._track_of(view))
         return Correction(self.poses.pose_between(view, neighbors), *self.exposures.between(neighbors))
 

@@ -139,3 +139,17 @@ def test_no_gradient_moves_a_pose_out_of_bounds(value: float) -> None:
     assert np.linalg.norm(known.shift_m) <= 0.1 + 1e-12 and np.linalg.norm(known.rotation) <= np.deg2rad(2.0) + 1e-12
     poses.take_back(1.0)
     np.testing.assert_allclose(known.shift_m, 0.0, atol=1e-12)
+
+
+def test_to_ask_for_what_was_learned_changes_nothing() -> None:
+    """Snapshots are read by several threads, also with a known name at another pose."""
+    poses = PoseCorrections(0.3, 5.0)
+    for k in range(3):
+        poses.begin(_view(f"a#{k}", k, 0.1 * k), "a")
+        shifted = _view(x=0.1 * k).camera_to_world.copy()
+        shifted[0, 3] += 0.05
+        poses.set_pose(_view(f"a#{k}", k, 0.1 * k), shifted)
+    before = poses.meta()
+    assert poses.learned_pose(_view("a#1", 1, 0.1))[0, 3] == pytest.approx(0.15)
+    assert poses.learned_pose(_view("a#1", 1, 0.9)) is None and poses.learned_pose(_view("b", 1)) is None
+    assert poses.meta() == before and poses.tracks() == ["a"]
