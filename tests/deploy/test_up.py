@@ -145,7 +145,7 @@ def test_a_process_that_dies_ends_the_run_is_named_and_the_others_are_stopped(
         "import time; time.sleep(60)",
         "import os, time; print('so much'); time.sleep(0.8); os.kill(os.getpid(), 9)",
     )
-    made = ProcessSet(child("edge", sleeps), child("emulator", sleeps), [child("node", dies)], "127.0.0.1:1", "")
+    made = ProcessSet(child("edge", sleeps), child("emulator", sleeps), child("node", dies), "127.0.0.1:1", "")
     monkeypatch.setattr(launcher, "process_set", lambda *_: made)
     (tmp_path / "small.yaml").write_text(SMALL)
     run = launcher.Launcher(load(tmp_path / "small.yaml"), launcher.Options(tmp_path / "run", port=free_port()))
@@ -164,7 +164,7 @@ def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(tmp_path: Path, monkey
     reader, writer = os.pipe()
     sleeps = [sys.executable, "-c", "import time; time.sleep(60)"]
     children = [Child(name, name, sleeps, tmp_path / f"{name}.txt") for name in ("edge", "emulator", "node")]
-    made = ProcessSet(*children[:2], [children[2]], "127.0.0.1:1", "")
+    made = ProcessSet(*children[:3], "127.0.0.1:1", "")
     monkeypatch.setattr(launcher, "process_set", lambda *_: made)
     monkeypatch.setattr(made.edge, "start", lambda: (Child.start(made.edge), os.close(reader)))
     monkeypatch.setattr(sys, "stdout", os.fdopen(writer, "w"))
@@ -231,6 +231,6 @@ def test_a_run_does_not_delete_the_policy_that_it_loads(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text, seconds", [("60", 60.0), ("60s", 60.0), ("1.5m", 90.0), ("2h", 7200.0), ("0", 0.0)])
 def test_times_are_read_as_people_write_them(text: str, seconds: float) -> None:
-    from freshfield_up import cli as script
+    from freshfield_up import demo_command as script
 
     assert script.seconds(text) == seconds

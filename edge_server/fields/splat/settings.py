@@ -58,7 +58,7 @@ class SplatSettings(FieldSettings, frozen=True):
     start: Annotated[int, within(1, 1 << 20, "number of Gaussians at the start, at most ``gaussians``")] = 4096
     sh_degree: ShDegree = 0
     seed_cells: Annotated[int, within(8, 256, "cells a side of the grid that gives initial positions")] = 64
-    epsilon: Annotated[float, about("Adam's epsilon, on gradients summed over pixels")] = 1e-3
+    epsilon: float = 1e-3
     densify_every: Annotated[
         int, within(1, 1 << 30, "minimum number of steps between densifications, and at least one pass over all views")
     ] = 50
