@@ -48,9 +48,9 @@ class Soak:
         tmpfs = ["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "freshfield", str(self.out)]
         self.has_disk = subprocess.run(tmpfs, capture_output=True).returncode == 0
         found = process_set(scenario, self.out, free_ports(1)[0])
-        self.children: dict[str, Child] = dict(zip(ROLES, (found.nodes[0], found.emulator, found.edge)))
+        self.children: dict[str, Child] = dict(zip(ROLES, (found.node, found.emulator, found.edge)))
         self.hops = {hop: TcpFaultProxy(to) for hop, to in zip(HOPS, (found.emulator_address, found.edge_address))}
-        for child, hop in zip((found.nodes[0], found.emulator), self.hops.values()):
+        for child, hop in zip((found.node, found.emulator), self.hops.values()):
             child.command = [*child.command, "--to", hop.address]  # the last one counts
         self.edge_address = found.edge_address
         self.cameras = scenario.cameras
