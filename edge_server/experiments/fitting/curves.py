@@ -1,0 +1,70 @@
+"""Fits side by side: fidelity by seconds of the wall clock, the median of several seeds each.
+
+  python -m edge_server.experiments.fitting.curves "with depth=RUN,RUN" none=RUN,RUN --out docs/results/scans
+
+writes scans.json and scans.png of folders that ``edge-server fit --out RUN`` wrote. Where a fit refines poses, its
+figures are those at refined poses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge_server.report.style import figure, label_lines
+from freshfield.files import write_json
+
+
+def median_curve(runs: Sequence[Path]) -> dict[str, Any]:
+    """Of fits of one kind: ``t_s``, ``psnr_db``, ``ssim``, ``lpips`` by reported instant, medians over the runs.
+
+    runs: folders of ``edge-server fit``. Raises OSError and ValueError for a folder that is none, or whose instants
+    differ in number from the others'.
+    """
+    rows = [[json.loads(line) for line in (run / "series.jsonl").read_text().splitlines()] for run in runs]
+    if len({len(of_run) for of_run in rows}) != 1:
+        raise ValueError(f"{', '.join(map(str, runs))}: reported at different instants")
+    columns = {
+        "t_s": ("t_s",),
+        "psnr_db": ("psnr_refined_db", "psnr_db"),
+        "ssim": ("ssim_refined", "ssim"),
+        "lpips": ("lpips",),
+    }
+    curve: dict[str, Any] = {"runs": len(runs)}
+    for name, keys in columns.items():
+        values = [[next(row[k] for k in keys if row.get(k) is not None) for row in of_run] for of_run in rows]
+        curve[name] = np.round(np.median(values, axis=0), 3).tolist()
+    return curve
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Write curves and figure; returns the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("fits", nargs="+", metavar="NAME=RUN,RUN", help="folders of fits that differ in their seed")
+    parser.add_argument("--out", type=Path, required=True, metavar="NAME", help="writes NAME.json, NAME.png")
+    args = parser.parse_args(argv)
+    curves = {}
+    for fit in args.fits:
+        name, _, runs = fit.partition("=")
+        try:
+            curves[name] = median_curve([Path(run) for run in runs.split(",")])
+        except (OSError, ValueError) as error:
+            parser.error(f"{name}: {error}")
+    write_json(args.out.with_suffix(".json"), {"command": "edge-server fit DATA --holdout 8", "curves": curves})
+    with figure(args.out.with_suffix(".png"), 2) as (_, axes):
+        for name, curve in curves.items():
+            for line, key in zip(axes[:, 0], ("psnr_db", "ssim")):
+                line.plot(curve["t_s"], curve[key], marker=".", label=name)
+        label_lines(axes[0, 0], "PSNR, dB")
+        label_lines(axes[1, 0], "SSIM", "seconds of the wall clock")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,38 @@
+"""Fits side by side: medians of what was reported, at refined poses where there are some."""
+
+import json
+
+import pytest
+
+from edge_server.experiments.fitting.curves import main
+
+
+def write_fit(folder, rows):
+    folder.mkdir()
+    (folder / "series.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return folder
+
+
+def row(t_s, psnr_db, **more):
+    return {"t_s": t_s, "psnr_db": psnr_db, "ssim": 0.5, "lpips": 0.2} | more
+
+
+def test_medians_at_refined_poses(tmp_path):
+    refined = [
+        write_fit(tmp_path / str(db), [row(1.0, 3.0, psnr_refined_db=db, ssim_refined=0.7)])
+        for db in (20.0, 26.0, 22.0)
+    ]
+    exact = write_fit(tmp_path / "exact", [row(1.0, 30.0, psnr_refined_db=None)])
+    fits = ["carried=" + ",".join(map(str, refined)), f"exact={exact}"]
+    assert main([*fits, "--out", str(tmp_path / "both")]) == 0
+    curves = json.loads((tmp_path / "both.json").read_text())["curves"]
+    assert curves["carried"] == {"runs": 3, "t_s": [1.0], "psnr_db": [22.0], "ssim": [0.7], "lpips": [0.2]}
+    assert curves["exact"]["psnr_db"] == [30.0]
+    assert (tmp_path / "both.png").stat().st_size > 1000
+
+
+def test_fits_of_other_instants_are_refused(tmp_path, capsys):
+    fits = [write_fit(tmp_path / str(n), [row(1.0, 3.0)] * n) for n in (1, 2)]
+    with pytest.raises(SystemExit):
+        main([f"two={fits[0]},{fits[1]}", "--out", str(tmp_path / "two")])
+    assert "different instants" in capsys.readouterr().err
