@@ -45,7 +45,7 @@ PY := .venv/bin/python
 export PYTHONPYCACHEPREFIX := $(abspath .venv)/byte-code
 unexport PYTHONDONTWRITEBYTECODE
 INSTALL := $(PY) -m pip --disable-pip-version-check -q install --no-compile
-WARM_UP = PYTHONPATH=proto:. $(PY) -c 'from edge_server.fields.registry import make_field; make_field("$(1)", $(2)).warm_up($(3))'
+WARM_UP = PYTHONPATH=proto:. $(PY) -m edge_server.fields.warm_up_command --field $(1)
 KERNELS := $(wildcard edge_server/fields/*/kernels/*.py edge_server/fields/*/*/kernels/*.py)
 # The line of pyproject.toml that starts with a name.
 wanted = $(shell sed -n 's/^ *"\($(1)[^"]*\)",*$$/\1/p' pyproject.toml | head -n 1)
@@ -173,7 +173,7 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 # installation of everything else than after it, and again where they have changed. Should it fail here, the edge
 # server tries again.
 .venv/.ok-kernels: .venv/.ok-numba $(KERNELS)
-	@echo "compiling the field's kernels"; $(call WARM_UP,splat,{"layers": True},cameras=2) >.venv/kernels.log 2>&1 || \
+	@echo "compiling the field's kernels"; $(call WARM_UP,splat) >.venv/kernels.log 2>&1 || \
 	  echo "the kernels were not compiled ahead (.venv/kernels.log): the edge server will do it at its start"
 	@touch $@
 
@@ -194,7 +194,7 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 # The other fields' kernels, at once in two processes: two processes of tests would compile all of them twice.
 .venv/.ok-all-kernels: .venv/.ok-test .venv/.ok-kernels
 	@echo "compiling the other fields' kernels"
-	@{ $(call WARM_UP,nerfacto,{}) & $(call WARM_UP,ngp,{}) && $(call WARM_UP,tensorf,{}) && wait $$!; } >>.venv/kernels.log 2>&1 || \
+	@{ $(call WARM_UP,nerfacto) & $(call WARM_UP,ngp) && $(call WARM_UP,tensorf) && wait $$!; } >>.venv/kernels.log 2>&1 || \
 	  echo "they were not compiled ahead (.venv/kernels.log): tests will do it"
 	@touch $@
 

@@ -37,7 +37,7 @@ WORKDIR /app
 USER freshfield
 # The field's kernels, compiled for this machine's processor; on another kind of processor they are compiled
 # again at the first start.
-RUN python -c 'from edge_server.fields.registry import make_field; make_field("splat", {"layers": True}).warm_up(cameras=4)'
+RUN freshfield warm-up
 VOLUME /runs
 EXPOSE 7000 8080
 HEALTHCHECK --interval=5s --timeout=3s --start-period=120s --retries=3 \

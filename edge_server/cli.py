@@ -89,6 +89,7 @@ _COMMANDS = {
         "experiments.virtual.simulate",
         "run a scenario's whole deployment in virtual time, reproducible bit for bit",
     ),
+    "warm-up": ("fields.warm_up_command", "compile a field's kernels, so that the first run starts at once"),
     "costs": (
         "experiments.virtual.costs",
         "measure the time that a scenario's updates take on this machine, for virtual time",

@@ -9,9 +9,10 @@ says itself is left as it is.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from freshfield.scenario import Scenario
+if TYPE_CHECKING:
+    from freshfield.scenario import Scenario
 
 FIELD = "splat"
 ARRIVALS: dict[str, Any] = {"updates": "arrivals", "update_ms": 20.0, "steps": 10}

@@ -25,6 +25,7 @@ EXAMPLES = """examples:
   freshfield scenario check mine.yaml
   freshfield doctor mine.yaml                  what this machine lacks for it
   freshfield render runs/quad --orbit quad.mp4
+  freshfield warm-up                           compile the field's kernels before the first run
   freshfield completion bash > ~/.local/share/bash-completion/completions/freshfield
 
 One program a machine: camera-node, channel-emu, edge-server; each has --help.
@@ -32,7 +33,7 @@ One program a machine: camera-node, channel-emu, edge-server; each has --help.
 
 
 # Commands of another program -> its module.
-_ELSEWHERE = {"doctor": "camera_node.cli", "render": "edge_server.cli"}
+_ELSEWHERE = {"doctor": "camera_node.cli", "render": "edge_server.cli", "warm-up": "edge_server.cli"}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -75,6 +76,7 @@ def parser() -> argparse.ArgumentParser:
     )
     commands.add_parser("doctor", add_help=False, help="check this machine's part of a scenario (camera-node doctor)")
     commands.add_parser("render", add_help=False, help="images and videos of a run (edge-server render)")
+    commands.add_parser("warm-up", add_help=False, help="compile the field's kernels (edge-server warm-up)")
     completion = commands.add_parser("completion", help="print a shell's completion of this command (needs shtab)")
     completion.add_argument("shell", choices=("bash", "zsh", "tcsh"))
     completion.set_defaults(run=_completion)

@@ -26,8 +26,8 @@ SAMPLE_EVERY_S = 2.0
 """Of memory and processor time of every process, in ``processes.jsonl``."""
 READY_WITHIN_S = 600.0
 """A first start compiles the field's kernels: a minute, or more on a busy machine."""
-_COMPILING = "compiling"
-"""Start of the edge's status text until it can make a first update."""
+_LOADING, _COMPILING = "loading", "compiling"
+"""Starts of the edge's status text until it can make a first update."""
 REPORT_WITHIN_S = 300.0
 
 
@@ -61,7 +61,7 @@ class Launcher:
         self._stop_requested = threading.Event()
         self._began_s = time.monotonic()
         self._ready_s: float | None = None
-        self._page_announced = False
+        self._page_announced = self._compiling_announced = False
         self._failures: list[str] = []
 
     def run(self) -> int:
@@ -135,6 +135,10 @@ class Launcher:
             here, port, after_s = net.LOOPBACK, self.options.port, now_s - self._began_s
             _say(f"page: http://{here}:{port}   (after {after_s:.0f} s)")
             _say(f"      from another machine first: ssh -L {port}:{here}:{port} THIS-MACHINE")
+        if not self._compiling_announced and self._edge_doing().startswith(_COMPILING):
+            self._compiling_announced = True
+            _say("the field's kernels are compiled for this processor, once: usually 20 to 50 s")
+            _say("      before a first run instead: freshfield warm-up")
         waited_for = self._waiting_for()
         if waited_for is None:
             self._ready_s = now_s
@@ -153,8 +157,11 @@ class Launcher:
         phases = [read_json(file).get("phase") for file in self.options.out.glob("node-*.json")]
         if "streaming" not in phases:
             return self.processes.node
-        doing = str(read_json(self.options.out / "edge.json").get("doing") or _COMPILING)
-        return self.processes.edge if doing.startswith(_COMPILING) else None
+        return self.processes.edge if self._edge_doing().startswith((_LOADING, _COMPILING)) else None
+
+    def _edge_doing(self) -> str:
+        """What the edge server says that it does."""
+        return str(read_json(self.options.out / "edge.json").get("doing") or _LOADING)
 
     def _check_alive(self) -> bool:
         """Whether no process has ended."""

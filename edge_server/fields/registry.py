@@ -46,6 +46,9 @@ def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 
     Raises ValueError for an unknown representation or option (the message lists the known ones), or for a
     value that it cannot have.
     """
+    from edge_server.fields.compiling import log_compilation  # names and options are known without numba
+
+    log_compilation()
     settings = settings_of(name, options, seed)
     make: Callable[[Any], Field] = import_module(f"edge_server.fields.{settings.module}").make
     return make(settings)

@@ -10,6 +10,7 @@ from pathlib import Path
 from queue import Empty, Queue
 
 from edge_server.fields import Budget, FitReport, Snapshot, View
+from edge_server.fields.compiling import told
 from edge_server.live.field_updater import FieldUpdater, Selection
 from edge_server.live.state import Controls, Publication
 from freshfield.clock import Clock
@@ -90,11 +91,12 @@ class UpdateLoop:
 
     def _main(self) -> None:
         try:
-            self._on_status("compiling the field's kernels")
-            self._updater.field.warm_up(len(self._updater.buffer.cameras))
-            self._await_cameras()
-            while not self._stop.is_set():
-                self._update_once()
+            with told(self._on_status):
+                self._on_status("loading the field's kernels")
+                self._updater.field.warm_up(len(self._updater.buffer.cameras))
+                self._await_cameras()
+                while not self._stop.is_set():
+                    self._update_once()
         except BaseException as error:  # the server raises it and ends
             log.exception("the update loop failed")
             self.failure = error

@@ -14,7 +14,9 @@ import pytest
 import yaml
 
 from edge_server.fields.splat.layers.layered_field import LayeredField
+from edge_server.fields.splat.scan.carried_field import CarriedField
 from freshfield.scenario import load
+from freshfield_up.cli import main
 from tests.conftest import ROOT
 from tests.support import wait_until
 
@@ -100,11 +102,12 @@ def test_an_image_runs_as_nobody_in_particular(name: str) -> None:
 
 
 def test_the_edges_image_compiles_the_kernels_of_a_field_that_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    (line,) = re.findall(r"^RUN python -c '(.*)'$", (ROOT / "deploy" / "edge.Dockerfile").read_text(), re.MULTILINE)
-    compiled = list[str]()
-    monkeypatch.setattr(LayeredField, "warm_up", lambda field, cameras: compiled.append(cameras))
-    exec(line, {})
-    assert compiled == [4]
+    (line,) = re.findall(r"^RUN freshfield (.*)$", (ROOT / "deploy" / "edge.Dockerfile").read_text(), re.MULTILINE)
+    compiled = list[object]()
+    for kind in (LayeredField, CarriedField):
+        monkeypatch.setattr(kind, "warm_up", lambda field, cameras: compiled.append((type(field), cameras)) or 0.0)
+    assert main(line.split()) == 0
+    assert compiled == [(LayeredField, 1), (CarriedField, 1)]
 
 
 def engine() -> tuple[list[str], str]:

@@ -1,0 +1,66 @@
+"""Tells people while numba compiles kernels, which else is a silence of tens of seconds.
+
+numba keeps what it compiled (``cache=True``) beside the sources or in ``NUMBA_CACHE_DIR``, for one kind of processor
+and one version of the source: a first start compiles, later ones load. It announces each function that it compiles,
+but not those that it loads, so a process that says nothing loaded everything.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from numba.core import event
+
+log = logging.getLogger(__name__)
+
+USUAL = "once a machine, usually 20 to 50 s"
+"""Of ``splat`` in layers: 20 s on a fast core; 35 s on a slow one, 46 with the kernels of depth."""
+LOG_EVERY_S = 10.0
+"""Between two lines of the log: a long compilation shows that it goes on, and a short one is a single line."""
+
+
+class Teller(event.Listener):
+    """Says how many functions were compiled so far, and in what time, at most once every ``every_s`` seconds."""
+
+    def __init__(self, say: Callable[[str], None], every_s: float) -> None:
+        self._say = say
+        self._every_s = every_s
+        self._count = 0
+        self._began_s = 0.0
+        self._said_s = -every_s
+
+    def on_start(self, event: event.Event) -> None:
+        now_s = time.perf_counter()
+        if not self._count:
+            self._began_s = now_s
+        self._count += 1
+        if now_s - self._said_s >= self._every_s:
+            self._said_s = now_s
+            name = event.data["dispatcher"].py_func.__name__
+            passed_s = now_s - self._began_s
+            self._say(f"compiling the field's kernels ({USUAL}): {name}, number {self._count}, after {passed_s:.0f} s")
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+@contextmanager
+def told(say: Callable[[str], None]) -> Iterator[None]:
+    """Within it, ``say`` is called with a line for people whenever numba begins to compile a function; from the thread
+    that compiles."""
+    with event.install_listener("numba:compile", Teller(say, every_s=0.0)):
+        yield
+
+
+_log_teller: Teller | None = None
+
+
+def log_compilation() -> None:
+    """Log, in this process and from now on, that kernels are compiled. Further calls do nothing."""
+    global _log_teller
+    if _log_teller is None:
+        _log_teller = Teller(log.info, LOG_EVERY_S)
+        event.register("numba:compile", _log_teller)
