@@ -20,6 +20,7 @@ import grpc.aio
 import numpy as np
 
 from channel_emu.live.camera_stream import PUSH, CameraStream
+from channel_emu.live.channel_service import ChannelService
 from channel_emu.live.live_link import Flips
 from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.live.status import snapshot
@@ -31,12 +32,13 @@ from freshfield.ledger import Ledger
 from freshfield.limits import MAX_OTHER_CALLS, MAX_STREAMS_PER_CAMERA
 from freshfield.streams import OpenStreams, ServedCall, SessionStreams, serve_health
 from freshfield.transport import CLIENT_OPTIONS
-from freshfield.v1 import clock_pb2, frames_pb2
+from freshfield.v1 import channel_pb2, channel_pb2_grpc, clock_pb2, frames_pb2
 
 log = logging.getLogger("channel-emu")
 
 SERVICE = frames_pb2.DESCRIPTOR.services_by_name["FrameStreamService"].full_name
 CLOCK_SERVICE = clock_pb2.DESCRIPTOR.services_by_name["ClockService"].full_name
+CONTROL_SERVICE = channel_pb2.DESCRIPTOR.services_by_name["ChannelService"].full_name
 _EXCHANGE = f"/{CLOCK_SERVICE}/Exchange"
 _EXCHANGE_TIMEOUT_S = 5.0
 # After this long without the edge, warn once.
@@ -80,6 +82,7 @@ class FrameProxy(Proxy):
         self._exchange = self.service_channel.unary_unary(_EXCHANGE)
         self._warn_at_ns = self.origin_ns + _WARN_AFTER_NS
         self.flows = {camera: self._flow(camera) for camera in cameras}
+        self._control = ChannelService(self)
         self._handlers = {
             PUSH: grpc.stream_stream_rpc_method_handler(self._push),
             _EXCHANGE: grpc.unary_unary_rpc_method_handler(self._pass_exchange),
@@ -91,7 +94,8 @@ class FrameProxy(Proxy):
 
     async def prepare(self, server: grpc.aio.Server) -> None:
         """Connect to the edge. Returns when all streams are open, or after _FIRST_WAIT_S."""
-        await serve_health(server, (SERVICE, CLOCK_SERVICE))
+        channel_pb2_grpc.add_ChannelServiceServicer_to_server(self._control, server)
+        await serve_health(server, (SERVICE, CLOCK_SERVICE, CONTROL_SERVICE))
         for flow in self.flows.values():
             self.spawn(flow.run())
         # Frames that came before the streams to the edge were open would be broken, but not by the channel.
@@ -202,7 +206,8 @@ class FrameProxy(Proxy):
 
     def _snapshot(self, final: bool = False) -> dict[str, Any]:
         flows, now_ns = list(self.flows.values()), self.events.now_ns()
-        return snapshot(self.channel, flows, self.stats, self.rejected, now_ns, self._priority, final)
+        changes = self._control.changes
+        return snapshot(self.channel, flows, self.stats, self.rejected, now_ns, self._priority, final, changes)
 
 
 def damage_payload(raw: bytes, flips: Flips) -> bytes:

@@ -17,6 +17,7 @@ import grpc.aio
 from channel_emu.live.event_queue import EventQueue
 from channel_emu.live.histogram import Histogram
 from channel_emu.model.ages import RunningAge
+from channel_emu.model.channel import Channel
 from channel_emu.model.link import Event, EventKind, Link, Transit
 from channel_emu.model.trace import TraceWriter
 from freshfield.limits import MAX_QUEUED_BYTES
@@ -136,6 +137,11 @@ class LiveLink:
         self._act(events)
         self._events.schedule(self)
         return transit
+
+    def change(self, channel: Channel, at_ns: int) -> None:
+        """Follow the channel, which an operator has changed, from ``at_ns`` on."""
+        self._act(channel.change(self.model, at_ns))
+        self._events.schedule(self)
 
     def advance(self, now_ns: int) -> None:
         """Act on all decisions due up to the channel's instant ``now_ns``."""

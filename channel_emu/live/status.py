@@ -12,6 +12,9 @@ from channel_emu.live.live_link import DelayStats
 from channel_emu.model.channel import Channel
 from channel_emu.model.link import EventKind
 
+SET_BY_HAND = "set by hand"
+"""The state while an operator's delays and losses are in force."""
+
 
 def snapshot(
     channel: Channel,
@@ -21,6 +24,7 @@ def snapshot(
     now_ns: int,
     priority: str,
     final: bool,
+    changes: Sequence[dict[str, Any]] = (),
 ) -> dict[str, Any]:
     """The status as plain values, at the channel's instant ``now_ns``.
 
@@ -29,12 +33,13 @@ def snapshot(
     rejected: frames refused by the emulator, by reason.
     priority: see ``priority.raise_priority``.
     final: whether the emulator is ending.
+    changes: by operators, see ``ChannelService``.
 
-    ``state`` is that of the shared chain; with one chain a camera, ``by_camera`` has the states.
+    ``state`` is that of the shared chain, or SET_BY_HAND; with one chain a camera, ``by_camera`` has the states.
     ``counts`` are sums over all cameras; ``broken`` counts frames broken by a reset or a missing edge.
     """
     now = max(now_ns, 0)
-    names = channel.config.state_names
+    by_hand, names = channel.by_hand, channel.config.state_names
     totals: Counter[str] = Counter()
     by_camera: dict[str, Any] = {}
     edge_rejected: Counter[str] = Counter()
@@ -43,7 +48,7 @@ def snapshot(
         totals.update(counts)
         edge_rejected.update(flow.rejected)
         entry: dict[str, Any] = {**counts, "connected": flow.connected, "streams": len(flow.link.calls)}
-        if channel.chain is None and flow.link.model.chain is not None:
+        if by_hand is None and channel.chain is None and flow.link.model.chain is not None:
             entry["state"] = names[flow.link.model.chain.state(now)]
         by_camera[flow.camera] = entry
     chain = channel.chain
@@ -55,7 +60,9 @@ def snapshot(
         "priority": priority,
         "uptime_s": round(now / 1e9, 3),
         "states": names,
-        "state": None if chain is None else names[chain.state(now)],
+        "state": SET_BY_HAND if by_hand else None if chain is None else names[chain.state(now)],
+        "by_hand": None if by_hand is None else {"delay_ms": by_hand[0], "loss": by_hand[1]},
+        "changes": list(changes),
         "state_share": _shares(channel, flows, now),
         "drawn_delay_ms": _figures(stats.drawn, shape=True),
         "delay_error_ms": _figures(stats.error, shape=final),

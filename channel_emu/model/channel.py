@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from msgspec.structs import replace
+
 from channel_emu.model import faults
 from channel_emu.model.chain import Chain
 from channel_emu.model.counter_rng import CounterRng
 from channel_emu.model.faults import per_state
-from channel_emu.model.link import Link
+from channel_emu.model.link import Event, Fault, Link
 from channel_emu.model.queue_server import QueueServer
 from channel_emu.model.service_time import ServiceTime, WorkSampler, exponential, gamma, lognormal, replayed
-from channel_emu.model.settings import ChannelConfig
+from channel_emu.model.settings import ArrivalsConfig, ChannelConfig, ServiceConfig
 from channel_emu.model.traffic import PoissonArrivals
 
 
@@ -21,6 +23,9 @@ class Channel:
         self.seed = seed
         self.chain = self._chain("") if config.chain is not None and config.chain.scope == "shared" else None
         self._server = QueueServer(config.queue_limit) if config.server.shared else None
+        self.by_hand: tuple[float, float] | None = None
+        """Mean delay (ms) and loss that an operator has set; None: the channel is the scenario's."""
+        self._in_force = config
 
     def chain_of(self, camera: str) -> Chain | None:
         """A new chain if the scope is per-camera, else the shared one; None if the channel has no chain."""
@@ -40,8 +45,37 @@ class Channel:
             self.config.discipline,
             self.service(camera, chain),
             arrivals,
-            faults.make(self.config.faults, self.seed, camera) if self.config.faults else (),
+            self._faults(camera),
             self._server or QueueServer(self.config.queue_limit),
+        )
+
+    def set_by_hand(self, delay_ms: float, loss: float) -> None:
+        """Let links that ``change`` have these delays and losses in place of the scenario's channel.
+
+        delay_ms: mean; the distribution's shape stays (none: every delay is the mean). loss: probability.
+        Frames enter as they are offered, and all other faults are off. Chain, discipline and server stay.
+        """
+        service = self.config.service
+        spread = service.law not in ("none", "trace")
+        self.by_hand = delay_ms, loss
+        self._in_force = replace(
+            self.config,
+            arrivals=ArrivalsConfig(),
+            service=replace(service, mean_ms=delay_ms) if spread else ServiceConfig("deterministic", mean_ms=delay_ms),
+            faults={"loss": faults.params_class("loss")(loss)} if loss > 0.0 else {},
+        )
+
+    def set_by_scenario(self) -> None:
+        """End ``set_by_hand``."""
+        self.by_hand, self._in_force = None, self.config
+
+    def change(self, link: Link, at_ns: int) -> list[Event]:
+        """Bring a link to what is in force, from ``at_ns`` on. Returns its events up to then."""
+        return link.change(
+            at_ns,
+            self.service(link.camera, link.chain),
+            self.arrivals(link.camera, link.chain),
+            self._faults(link.camera),
         )
 
     def forget(self, before_ns: int) -> None:
@@ -51,14 +85,14 @@ class Channel:
 
     def arrivals(self, camera: str, chain: Chain | None) -> PoissonArrivals | None:
         """The camera's Poisson arrival process; None if frames arrive as they are offered."""
-        rates = self.config.arrivals.rate_per_ms
+        rates = self._in_force.arrivals.rate_per_ms
         if rates is None:
             return None
         return PoissonArrivals(per_state(rates), chain, CounterRng(self.seed, camera, "channel.arrivals"))
 
     def service(self, camera: str, chain: Chain | None) -> ServiceTime:
         """The camera's service times. chain: as ``chain_of`` returned it."""
-        config = self.config.service
+        config = self._in_force.service
         means = [1.0] if config.mean_ms is None else per_state(config.mean_ms)
         modulated = self.config.service_state == "modulated"
         return ServiceTime(
@@ -66,7 +100,7 @@ class Channel:
         )
 
     def _work_sampler(self, rng: CounterRng) -> WorkSampler:
-        config = self.config.service
+        config = self._in_force.service
         if config.law == "exponential":
             return exponential(rng)
         if config.law == "gamma" and config.shape is not None:
@@ -74,6 +108,10 @@ class Channel:
         if config.law == "lognormal" and config.sigma is not None:
             return lognormal(rng, config.sigma)
         return replayed(config.delays_ms or [0.0 if config.law == "none" else 1.0])
+
+    def _faults(self, camera: str) -> tuple[Fault, ...]:
+        listed = self._in_force.faults
+        return faults.make(listed, self.seed, camera) if listed else ()
 
     def _chain(self, camera: str) -> Chain:
         config = self.config.chain

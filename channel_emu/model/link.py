@@ -210,6 +210,24 @@ class Link:
         self.server.advance_to(self._clamp(to_ns))
         return self._take_events()
 
+    def change(
+        self, at_ns: int, service: ServiceTime, arrivals: PoissonArrivals | None, faults: Sequence[Fault]
+    ) -> list[Event]:
+        """Process the events up to ``at_ns``; from then on, draw delays, arrivals and faults from these. Returns the
+        events in order.
+
+        Frames in service keep their due instants; the new faults decide whether they arrive.
+        """
+        at_ns = self._clamp(at_ns)
+        self.server.advance_to(at_ns)
+        self._service, self._arrivals, self._faults = service, arrivals, tuple(faults)
+        self._next_reset_ns = min((f.next_reset_ns(at_ns) for f in self._faults), default=NEVER_NS)
+        waiting, self._unsampled, self._sample_ns = self._unsampled, None, NEVER_NS
+        self._update_next_event()
+        if waiting is not None:  # its sampling instant was of the arrivals before
+            self._arrive(waiting, at_ns)
+        return self._take_events()
+
     def flush(self, at_ns: int) -> list[Event]:
         """Process the events up to ``at_ns``, then break all frames still inside. Returns all events in
         order."""

@@ -34,6 +34,7 @@ CALLS = {
     "/freshfield.v1.EdgeService/ResetField": CHANGE,
     "/freshfield.v1.EdgeService/SaveSnapshot": CHANGE,
     "/freshfield.v1.EdgeService/SetPolicy": CHANGE,
+    "/freshfield.v1.ChannelService/SetChannel": CHANGE,
     "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo": LOOK,
 }
 """The action that each gRPC method needs. Others (of a service behind ``channel-emu proxy``) need CHANGE."""

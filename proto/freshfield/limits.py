@@ -193,3 +193,8 @@ MAX_CENTER_OUTSIDE_SIDES = 1.0
 
 MAX_LENS_ERROR_PX = 1.0
 """Distance of a pixel from itself after undistortion and projection; a lens with more cannot be inverted."""
+
+MAX_SET_DELAY_MS = 10_000.0
+"""Mean delay that an operator may set: with more, a run would show nothing but its own start."""
+MAX_CHANNEL_CHANGES = 256
+"""Of operators, that the emulator's status keeps; it is written twice a second. Older ones are in the log."""

@@ -13,7 +13,7 @@ from freshfield.access import ANYBODY, CALLS, LOOK, Access, Caller, HttpDoor, Ht
 from freshfield.frame import FrameRejected
 from freshfield.streams import Admission, ServedCall, SessionStreams
 from freshfield.transport import Transport
-from freshfield.v1 import clock_pb2, edge_pb2, frames_pb2
+from freshfield.v1 import channel_pb2, clock_pb2, edge_pb2, frames_pb2
 from tests.role_table import TOKENS, cells_of
 
 HEALTH = "/grpc.health.v1.Health/Check"
@@ -108,7 +108,7 @@ def test_every_cell_of_the_role_table() -> None:
 def test_every_method_has_its_row() -> None:
     ours = {
         f"/{service.full_name}/{method.name}"
-        for module in (frames_pb2, clock_pb2, edge_pb2)
+        for module in (frames_pb2, clock_pb2, channel_pb2, edge_pb2)
         for service in module.DESCRIPTOR.services_by_name.values()
         for method in service.methods
     }

@@ -7,6 +7,7 @@ import gc
 import json
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import grpc
 import grpc.aio
@@ -17,13 +18,14 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from channel_emu.live import live_link
 from channel_emu.live.camera_stream import CREDITS, PUSH
 from channel_emu.live.live_link import Message
+from channel_emu.live.status import SET_BY_HAND
 from channel_emu.model import trace
 from edge_server.report.frame_accounting import account_frames
 from freshfield.depth import DepthImage
 from freshfield.frame import to_request
 from freshfield.ledger import read_all
 from freshfield.transport import Transport
-from freshfield.v1 import clock_pb2, clock_pb2_grpc
+from freshfield.v1 import channel_pb2, channel_pb2_grpc, clock_pb2, clock_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
 from tests.channel_emu.decided_again import compare
 from tests.channel_emu.live.emulator import CAMERAS, emulate, frame_of, make, offer, run
@@ -369,5 +371,39 @@ def test_the_token_is_demanded_and_passed_on(tmp_path: Path) -> None:
                 await call.read()
             assert refused.value.code() == grpc.StatusCode.UNAUTHENTICATED
             await stranger.close()
+
+    run(live())
+
+
+def test_an_operator_changes_the_channel_and_gives_it_back(tmp_path: Path) -> None:
+    async def live() -> None:
+        section = {"arrivals": "poisson:1/1ms", "service": "exp:1ms", "discipline": "parallel"}
+        async with emulate(tmp_path, section, cameras=("cam00",)) as r:
+            link = r.proxy.links["cam00"].model
+            operator = Transport().aio_channel(f"127.0.0.1:{r.proxy.port}")
+            ask = channel_pb2_grpc.ChannelServiceStub(operator).SetChannel
+
+            async def deliveries_of(**wanted: float) -> int:
+                await ask(channel_pb2.SetChannelRequest(**wanted))
+                before = link.counts["delivered"]
+                await r.cameras["cam00"].stream(20, 0.002)
+                await r.settled()
+                return link.counts["delivered"] - before
+
+            assert await deliveries_of(delay_ms=80.0) == 20  # each frame enters: nothing samples them
+            assert 40.0 < r.proxy.stats.latency.summary()["mean"] < 160.0
+            assert await deliveries_of(loss=1.0) == 0
+            assert snapshot_of(r)["state"] == SET_BY_HAND and snapshot_of(r)["by_hand"] == {"delay_ms": 0, "loss": 1}
+            lost = link.counts["lost"]
+            assert 0 < await deliveries_of() <= 20 and link.counts["lost"] == lost == 20
+            for wrong in ({"delay_ms": float("nan")}, {"delay_ms": -1.0}, {"delay_ms": 1e9}, {"loss": 1.5}):
+                with pytest.raises(grpc.aio.AioRpcError, match="0 to 1"):
+                    await ask(channel_pb2.SetChannelRequest(**wrong))
+            assert [change["loss"] for change in snapshot_of(r)["changes"]] == [0.0, 1.0, None]
+            assert snapshot_of(r)["by_hand"] is None and snapshot_of(r)["state"] is None
+            await operator.close()
+
+    def snapshot_of(emulation: Any) -> dict[str, Any]:
+        return emulation.proxy._snapshot()
 
     run(live())
