@@ -34,8 +34,8 @@ import edge_server.fields.splat.layers.layered_field
 import edge_server.fields.splat.layers.depth.depth_supervision
 """
 EMULATOR = """
-import channel_emu.cli, channel_emu.live.frame_proxy
-import channel_emu.virtual.simulate
+import channel_emu.cli, channel_emu.live.frame_proxy, channel_emu.testing
+import channel_emu.virtual.simulate, channel_emu.estimate
 """
 
 
@@ -60,7 +60,7 @@ UNASKED = {
         *("edge_server", "channel_emu", "scipy", "matplotlib"),
     ),
     FEW_CAMERAS: ("edge_server.fields.splat.layers.depth.network_depth", "edge_server.embed", "onnx"),
-    EMULATOR: ("torch", "numba", "camera_node", "edge_server"),
+    EMULATOR: ("torch", "numba", "cv2", "scipy", "matplotlib", "camera_node", "edge_server"),
 }
 
 

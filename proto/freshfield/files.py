@@ -122,9 +122,7 @@ def picture(path: Path, rows: int, columns: int, size: tuple[float, float], **op
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
-        raise PlotError(
-            "a picture needs matplotlib (pip install 'freshfield[edge]' or 'freshfield[calibrate]')"
-        ) from None
+        raise PlotError("a picture needs matplotlib: pip install 'freshfield[emu]'") from None
     figure = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(figure)
     yield figure.subplots(rows, columns, squeeze=False, **options)

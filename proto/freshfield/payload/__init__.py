@@ -3,6 +3,8 @@
 The limits are checked on headers *before* anything is decompressed: a 109 kB PNG can claim 2.7 GB of pixels,
 OpenCV allocates as many bytes as a PNG's chunk claims (one flipped bit: 4 GB, 5 s), and the zstandard decoder
 ignores ``max_output_size`` for a frame that declares its size.
+
+OpenCV is imported by what encodes and decodes: the emulator only checks headers, and runs without it.
 """
 
 from __future__ import annotations
@@ -11,22 +13,19 @@ import os
 import struct
 from typing import Literal
 
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
 from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_JPEG_SCANS, MAX_JPEG_SEGMENTS, MAX_PAYLOAD_BYTES
 from freshfield.payload.png import pixels_only, png_size
 
 # OpenCV reads this when it is first imported: a second barrier behind the header checks below.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_IMAGE_SIDE_PX**2))
 
-import cv2
-import numpy as np
-import zstandard
-from numpy.typing import NDArray
-
 CODECS = ("jpeg", "png", "zstd")
 DEFAULT_CODEC: Literal["jpeg"] = "jpeg"
 """Of a scenario that names none: what most cameras send."""
-# Indexed by the number of halvings.
-_JPEG_FLAGS = (cv2.IMREAD_COLOR, cv2.IMREAD_REDUCED_COLOR_2, cv2.IMREAD_REDUCED_COLOR_4, cv2.IMREAD_REDUCED_COLOR_8)
 
 
 class PayloadError(ValueError):
@@ -45,6 +44,8 @@ def encode(image: NDArray[np.uint8], codec: str = "jpeg", quality: int = 92) -> 
     quality: of jpeg, 1 to 100; from 90 up without chroma subsampling.
     Raises PayloadError for an image, size or codec that cannot be sent.
     """
+    import cv2
+
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
         raise PayloadError("bad_image", f"expected uint8 (H, W, 3 or 4), got {image.dtype} {image.shape}")
     if max(image.shape[:2]) > MAX_IMAGE_SIDE_PX or min(image.shape[:2]) < 1:
@@ -103,6 +104,8 @@ def decode(payload: bytes, codec: str, width: int, height: int, halvings: int = 
         column. A JPEG is decoded directly to the smaller size, which is faster.
     Raises PayloadError with a reason of ``check``, or ``undecodable`` for damaged data.
     """
+    import cv2
+
     check(payload, codec, width, height)
     if codec == "zstd":
         raw = inflate(payload, width * height * 3)
@@ -114,7 +117,8 @@ def decode(payload: bytes, codec: str, width: int, height: int, halvings: int = 
         except ValueError as error:
             raise PayloadError("undecodable", str(error)) from None
     if codec == "jpeg":
-        flags = _JPEG_FLAGS[halvings] | cv2.IMREAD_IGNORE_ORIENTATION
+        reduced = (cv2.IMREAD_COLOR, cv2.IMREAD_REDUCED_COLOR_2, cv2.IMREAD_REDUCED_COLOR_4, cv2.IMREAD_REDUCED_COLOR_8)
+        flags = reduced[halvings] | cv2.IMREAD_IGNORE_ORIENTATION
         width, height, halvings = -(-width >> halvings), -(-height >> halvings), 0
     try:
         image = cv2.imdecode(np.frombuffer(payload, np.uint8), flags)
@@ -149,6 +153,8 @@ def inflate(payload: bytes, size: int) -> bytes:
 
 
 def _halved(image: NDArray[np.uint8], halvings: int) -> NDArray[np.uint8]:
+    import cv2
+
     for _ in range(halvings):
         bottom, right = image.shape[0] % 2, image.shape[1] % 2
         even = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
