@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node import settings as tuned
 from camera_node.settings import RecordedConfig
 from camera_node.sources.base import Source, pixels
 from camera_node.sources.registry import open_sources
@@ -21,17 +22,6 @@ from freshfield.geometry import so3_log
 from freshfield.scenario import Scenario
 
 Array = NDArray[np.float64]
-
-_CAPTURES = 100
-_LEAST_CAPTURES = 20  # fewer shifts correlate by chance
-_WIDTH = 80  # pixels of the compared images: enough for shifts of a tenth, and .3 s for all of them
-_LARGEST_LAG = 4  # captures
-_LAG_STEP = 0.25
-_MOVES_PX = 0.1  # standard deviation of shifts below which nothing can be told from them
-# Right poses of redkitchen and handheld correlate by .90 and .97; late by 100 ms they gain .05 and more at their lag.
-_AGREES, _GAIN = 0.7, 0.03
-_LATE_MS = 60.0
-_FAST_M_PER_S = 10.0  # nobody carries a camera so fast: another unit
 
 
 class PosesWrong(ValueError):
@@ -46,7 +36,7 @@ def check(scenario: Scenario, config: RecordedConfig, data: Path | None) -> str:
     said = []
     for camera, source in open_sources(scenario, config, scenario.training, data).items():
         images, poses, focal_px = _captures(source, config.codec)
-        if len(images) >= _LEAST_CAPTURES:
+        if len(images) >= tuned.POSES_LEAST_CAPTURES:
             said.append(f"{camera} {compare(images, poses, focal_px, 1e3 / float(source.fps))}")
     return "; ".join(said)
 
@@ -64,22 +54,22 @@ def compare(images: list[NDArray[np.float32]], poses: Array, focal_px: float, pe
     steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     speed, rate = 1e3 * float(np.median(steps_m)) / period_ms, np.rad2deg(np.linalg.norm(turns, axis=1).mean())
     said = f"moves at {speed:.2g} m/s, turns at {1e3 * rate / period_ms:.2g} degrees/s"
-    if speed > _FAST_M_PER_S:
+    if speed > tuned.POSES_FAST_M_PER_S:
         raise PosesWrong(f"{said}: are its poses in meters?")
-    if shifts.std(axis=0).max() < _MOVES_PX:
+    if shifts.std(axis=0).max() < tuned.POSES_MOVE_PX:
         return f"{said}; its images hardly move"
     if not turns.any():
         raise PosesWrong(f"{said}, while its images shift: do its poses lack the rotation?")
-    lags = np.arange(-_LARGEST_LAG, _LARGEST_LAG + _LAG_STEP, _LAG_STEP)
+    lags = np.arange(-tuned.POSES_LARGEST_LAG, tuned.POSES_LARGEST_LAG + tuned.POSES_LAG_STEP, tuned.POSES_LAG_STEP)
     found = np.array([_correlation(shifts, expected, lag) for lag in lags])
     now, best = float(found[len(lags) // 2]), int(found.argmax())
     late_ms = float(lags[best]) * period_ms
     for axis, direction in enumerate(("sideways", "up and down")):
-        if _correlation(shifts[:, [axis]], expected[:, [axis]], 0.0) < -_AGREES:
+        if _correlation(shifts[:, [axis]], expected[:, [axis]], 0.0) < -tuned.POSES_AGREE:
             raise PosesWrong(f"{said}, but its images move the other way {direction}: are its axes OpenCV's?")
-    if found[best] < _AGREES:
+    if found[best] < tuned.POSES_AGREE:
         return f"{said}; its images tell nothing of its turns (correlation {found[best]:.2f})"
-    if abs(late_ms) > _LATE_MS and found[best] > now + _GAIN:
+    if abs(late_ms) > tuned.POSES_LATE_MS and found[best] > now + tuned.POSES_GAIN:
         early = "late" if late_ms > 0 else "early"
         raise PosesWrong(
             f"{said}; its poses are some {abs(late_ms):.0f} ms {early}: its images move as they do, at another time "
@@ -103,24 +93,29 @@ def _captures(source: Source, codec: str) -> tuple[list[NDArray[np.float32]], Ar
     images: list[NDArray[np.float32]] = []
     poses: list[Array] = []
     focal_px = 1.0
-    for tick in range(_CAPTURES):
+    for tick in range(tuned.POSES_CAPTURES):
+        if len(images) == tuned.POSES_LEAST_CAPTURES and _equal(poses):
+            break
         if tick and source.content(tick) <= source.content(tick - 1):
             break  # the recording plays back, where late poses are early
         try:
             shot = source.read(source.content(tick))
-        except (
-            ValueError
-        ):  # before the first pose of a trajectory, after its last, or a damaged file, which others report
-            if images:
+        except ValueError:  # before the first pose of a trajectory, after its last, or a damaged file: others report it
+            if len(images) >= tuned.POSES_LEAST_CAPTURES:
                 break
+            images, poses = [], []  # shifts are found between consecutive captures
             continue
-        if len(images) == 1 and np.array_equal(shot.pose.matrix(), poses[0]):
-            return [], np.empty((0, 4, 4)), 1.0
         lens = shot.intrinsics
         gray = cv2.cvtColor(pixels(shot, codec)[..., :3], cv2.COLOR_RGB2GRAY)
-        size = (_WIDTH, max(1, round(_WIDTH * lens.height / lens.width)))
+        size = (tuned.POSES_WIDTH_PX, max(1, round(tuned.POSES_WIDTH_PX * lens.height / lens.width)))
         images.append(cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32))
         poses.append(shot.pose.matrix())
-        focal_px = lens.fx * _WIDTH / lens.width
+        focal_px = lens.fx * tuned.POSES_WIDTH_PX / lens.width
     source.release()
+    if _equal(poses):
+        return [], np.empty((0, 4, 4)), 1.0
     return images, np.array(poses), focal_px
+
+
+def _equal(poses: list[Array]) -> bool:
+    return all(np.array_equal(pose, poses[0]) for pose in poses)

@@ -33,6 +33,16 @@ shot: a link that takes exactly so many captures a frame would never get depth i
 MAX_LATENCY_MS = 6e4
 """Longest latency of a camera: one that is a minute late is not live."""
 
+# --- camera-node doctor: do a carried camera's poses move as its images do? ---
+POSES_CAPTURES, POSES_LEAST_CAPTURES = 100, 20  # captures that are compared; fewer shifts correlate by chance
+POSES_WIDTH_PX = 80  # of the compared images: enough for shifts of a tenth of a pixel, and 0.3 s for all of them
+POSES_LARGEST_LAG, POSES_LAG_STEP = 4, 0.25  # captures by which poses are tried to be late or early
+POSES_MOVE_PX = 0.1  # standard deviation of shifts below which nothing can be told from them
+# Right poses of redkitchen and handheld correlate by .90 and .97; late by 100 ms they gain .05 and more at their lag.
+POSES_AGREE, POSES_GAIN = 0.7, 0.03
+POSES_LATE_MS = 60.0  # least delay that is said: what is found is off by up to 25
+POSES_FAST_M_PER_S = 10.0  # nobody carries a camera so fast: another unit
+
 
 class SourceConfig(Settings, frozen=True, kw_only=True):
     """Keys of every kind. fps: not given, it is the recording's own, 15 for a world, 10 for photos. effects: name ->

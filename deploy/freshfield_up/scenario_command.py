@@ -83,9 +83,8 @@ def checked(scenario: Scenario) -> list[str]:
     source = source_config(scenario)
     channel = channel_from_mapping(scenario.channel, f"{scenario.path}: channel", scenario.path.parent)
     try:
-        from edge_server.edge_defaults import cameras_move
         from edge_server.fields.registry import settings_of
-        from edge_server.settings import described, read_config
+        from edge_server.settings import cameras_move, described, read_config
     except ImportError as error:
         raise ScenarioError(f"edge: not checked, {error.name} is missing: install the extra edge") from None
     edge = read_config(scenario)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from edge_server.export import ExportError
 from edge_server.export.camera_paths import Step, lens, looking, orbit, read_nerfstudio, vertical_fov_deg
 from edge_server.export.run_source import Source, open_source
-from edge_server.fields import Rendering
+from edge_server.fields import SEPARATOR, Rendering
 from freshfield.files import out_file
 from freshfield.geometry import Pinhole
 from freshfield.limits import MAX_IMAGE_SIDE_PX
@@ -112,7 +112,7 @@ def _path(args: argparse.Namespace, source: Source) -> tuple[list[Step], float, 
     fps, fov = args.fps or 25.0, vertical_fov_deg(like)
     if args.camera is not None:
         # A carried camera's views are called hand#0, hand#1, ...: its newest one stands for it.
-        shots = {view.camera.rpartition("#")[0]: view for view in source.views if "#" in view.camera}
+        shots = {view.camera.rpartition(SEPARATOR)[0]: view for view in source.views if SEPARATOR in view.camera}
         shots |= {view.camera: view for view in source.views}
         if args.camera not in shots:
             more = f", and {len(shots) - MOST_NAMED} more" if len(shots) > MOST_NAMED else ""

@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 
 from freshfield.geometry import Pinhole
 
+SEPARATOR = "#"
+"""Between a camera's name and the number of its keyframe (``hand#3``): no camera's name may hold it."""
+
 
 @dataclass(frozen=True)
 class View:

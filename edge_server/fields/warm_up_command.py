@@ -10,9 +10,9 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from edge_server.edge_defaults import FIELD
 from edge_server.fields.compiling import USUAL
 from edge_server.fields.registry import field_names, make_field
+from edge_server.settings import FIELD
 
 DESCRIPTION = f"""\
 Compile the kernels of a field for this processor ({USUAL}), so that

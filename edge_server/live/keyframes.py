@@ -21,11 +21,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edge_server.fields import View
+from edge_server.fields import SEPARATOR, View
 from edge_server.live.camera_motion import pose_distance
 from edge_server.settings import KeyframesConfig
 
-SEPARATOR = "#"
 # A camera leaving a keyframe replaces its image only within this share of the distance to the next one.
 _NEAR = 0.5
 RESTARTS_BELOW = 16

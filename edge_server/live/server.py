@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 import cv2
 import msgspec
 
-from edge_server.edge_defaults import cameras_move
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Field, View, checkpoint
@@ -36,7 +35,7 @@ from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Snapshot
 from edge_server.run_records import DepthCounts, DepthStatus, EdgeStatus, UpdateCounts
 from edge_server.scheduler import LivePolicies, short_name
-from edge_server.settings import EdgeConfig, described, embedding_for, read_config
+from edge_server.settings import EdgeConfig, cameras_move, described, embedding_for, read_config
 from freshfield.clock import Clock, WallClock
 from freshfield.files import ReplacedJson, write_json
 from freshfield.ledger import Ledger

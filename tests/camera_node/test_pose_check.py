@@ -73,12 +73,16 @@ def test_images_that_tell_nothing_are_not_held_against_the_poses():
     assert "hardly move" in pose_check.compare(flat, poses(), 60.0, 100.0)
 
 
-def test_a_recording_is_read_as_it_is_streamed(tmp_path):
+@pytest.mark.parametrize(
+    ("still", "damaged"), [(0, ()), (3, ()), (0, (1,)), (3, (0, 5))], ids=["whole", "stands", "damaged", "both"]
+)
+def test_a_recording_is_read_as_it_is_streamed(tmp_path, still, damaged):
     images, focal_px = filmed()
     frames = []
-    for k, image in enumerate(images):
-        cv2.imwrite(str(tmp_path / f"{k:03d}.png"), image.astype(np.uint8))
-        matrix = (poses(0.1)[k] @ OPENGL_TO_OPENCV).tolist()
+    for k, image in enumerate([images[0]] * still + images):
+        data = cv2.imencode(".png", image.astype(np.uint8))[1].tobytes()
+        (tmp_path / f"{k:03d}.png").write_bytes(data[: len(data) // 2] if k in damaged else data)
+        matrix = (poses(0.1)[max(k - still, 0)] @ OPENGL_TO_OPENCV).tolist()
         frames.append({"file_path": f"{k:03d}.png", "transform_matrix": matrix, "time": 2 + k * PERIOD_S})
     data = {"fl_x": focal_px, "w": 80, "h": 60, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(data))

@@ -21,7 +21,6 @@ from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic import SCENES
 from camera_node.synthetic.scene import HELD_OUT
 from camera_node.synthetic.source import WORLD_FPS
-from edge_server.edge_defaults import FIELD
 from edge_server.experiments.common.arguments import (
     OptionError,
     add_lpips,
@@ -42,6 +41,7 @@ from edge_server.fields.registry import efforts_of, field_names, option_help, se
 from edge_server.fields.splat.scan.settings import scan_options
 from edge_server.live.scoring_thread import to_bytes
 from edge_server.run_records import UpdateRow
+from edge_server.settings import FIELD
 from freshfield.files import out_folder, write_json
 from freshfield.machine_load import LoadMeter, outside_cores
 from freshfield.scenario import NOTHING_HELD_OUT

@@ -16,7 +16,6 @@ import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic.scene import SCENES
-from edge_server.edge_defaults import FIELD
 from edge_server.experiments.common.arguments import add_lpips, command_parser, parse_options, run_command
 from edge_server.experiments.engine import Engine
 from edge_server.experiments.frontier import from_scratch, update_time
@@ -27,7 +26,7 @@ from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import field_names, make_field
 from edge_server.report.machine import machine, versions
 from edge_server.scheduler import make_policy, parse_policy
-from edge_server.settings import ComputeConfig
+from edge_server.settings import FIELD, ComputeConfig
 from freshfield.files import out_folder, write_json
 from freshfield.scenario import ScenarioError
 

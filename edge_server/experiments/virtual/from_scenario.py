@@ -16,7 +16,6 @@ from camera_node.sources.with_effects import camera_effects
 from camera_node.synthetic import Scene, make_scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects
 from channel_emu.model.settings import channel_from_mapping
-from edge_server.edge_defaults import cameras_move
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.truth import CapturedTruth, ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import Truth, VirtualDeployment
@@ -25,7 +24,7 @@ from edge_server.fields import Field
 from edge_server.live.field_updater import open_updater
 from edge_server.live.state import Publication
 from edge_server.scheduler import make_policy
-from edge_server.settings import EdgeConfig, read_config
+from edge_server.settings import EdgeConfig, cameras_move, read_config
 from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:

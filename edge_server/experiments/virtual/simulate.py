@@ -18,7 +18,6 @@ import numpy as np
 from camera_node.capture import build_cameras
 from camera_node.settings import source_config
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.edge_defaults import cameras_move
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
 from edge_server.experiments.common.tables import mean_or_none, number
 from edge_server.experiments.engine import processor
@@ -31,7 +30,15 @@ from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.state import Publication
 from edge_server.report.machine import versions
 from edge_server.scheduler import parse_policy, short_name
-from edge_server.settings import ComputeConfig, EdgeConfig, PolicyConfig, described, embedding_for, read_config
+from edge_server.settings import (
+    ComputeConfig,
+    EdgeConfig,
+    PolicyConfig,
+    cameras_move,
+    described,
+    embedding_for,
+    read_config,
+)
 from freshfield.files import out_folder, write_json, write_text
 from freshfield.scenario import Scenario, ScenarioError, load
 from freshfield.settings import as_mapping, read_settings

@@ -17,13 +17,12 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.edge_defaults import SCAN
 from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
 from edge_server.fields.splat.scan.carried_field import CarriedField
 from edge_server.live.loop import STOP_S, UpdateLoop
 from edge_server.live.server import EdgeServer, ServerOptions
-from edge_server.settings import read_config
+from edge_server.settings import SCAN, read_config
 from freshfield import frame as wire
 from freshfield import payload, scenario
 from freshfield.geometry import Pose, look_at

@@ -14,15 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common.cameras import settings as tuned
 from freshfield.geometry import so3_log
 
 Array = NDArray[np.float64]
-
-_PARTS = 8
-_LEAST_POSES = 2 * _PARTS
-_SURE = 2.0  # standard errors from which on a hint is given
-# Share of the largest singular value that is added for C, so that what is not told at all is left to the world.
-_PRIOR = 0.01
 
 
 @dataclass(frozen=True)
@@ -46,7 +41,7 @@ class ConstantCorrection:
         """One line for people; a hint to calibrate where a constant part is beyond doubt."""
         turned, shifted = float(np.linalg.norm(self.rotation_deg)), float(np.linalg.norm(self.shift_mm))
         single = f"single poses scatter by {self.scatter_deg:.2f} degrees and {self.scatter_mm:.1f} mm"
-        if turned <= _SURE * self.error_deg and shifted <= _SURE * self.error_mm:
+        if turned <= tuned.SURE * self.error_deg and shifted <= tuned.SURE * self.error_mm:
             return f"corrections of poses have no sure part in common in the camera's axes; {single}"
         return (
             f"corrections of poses have in common {turned:.2f} degrees (+- {self.error_deg:.2f}) about "
@@ -61,13 +56,13 @@ def constant_correction(given: Sequence[Array], corrected: Sequence[Array]) -> C
 
     given, corrected: (4, 4) each, camera to world, of the same captures in the order of time.
     """
-    if len(given) < _LEAST_POSES or not (np.isfinite(given).all() and np.isfinite(corrected).all()):
+    if len(given) < tuned.LEAST_POSES or not (np.isfinite(given).all() and np.isfinite(corrected).all()):
         return None
     whole = _Corrections.of(np.array(given), np.array(corrected))
     (rotation, shift), (left_rad, left_m) = whole.common()
-    part = np.arange(len(given)) * _PARTS // len(given)
-    without = [whole.where(part != k).common()[0] for k in range(_PARTS)]
-    errors = [np.std([each[kind] for each in without], axis=0) * np.sqrt(_PARTS - 1) for kind in range(2)]
+    part = np.arange(len(given)) * tuned.PARTS // len(given)
+    without = [whole.where(part != k).common()[0] for k in range(tuned.PARTS)]
+    errors = [np.std([each[kind] for each in without], axis=0) * np.sqrt(tuned.PARTS - 1) for kind in range(2)]
     error_rad, error_m = (float(np.linalg.norm(error)) for error in errors)
     return ConstantCorrection(
         np.rad2deg(rotation),
@@ -109,7 +104,7 @@ class _Corrections:
     def _solved(self, found: Array) -> tuple[tuple[Array, Array], Array]:
         """The camera's and the world's part (3,) of ``found`` (N, 3), and the rest."""
         system = np.concatenate([np.broadcast_to(np.eye(3), self.local.shape), self.local], axis=2).reshape(-1, 6)
-        prior = np.diag([_PRIOR * np.linalg.norm(system, 2)] * 3 + [0.0] * 3)
+        prior = np.diag([tuned.COMMON_PRIOR * np.linalg.norm(system, 2)] * 3 + [0.0] * 3)
         solution, *_ = np.linalg.lstsq(np.vstack([system, prior]), np.append(found.ravel(), np.zeros(6)), rcond=None)
         return (solution[:3], solution[3:]), found - (system @ solution).reshape(-1, 3)
 

@@ -10,26 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common.cameras import settings as tuned
 from freshfield.geometry import so3_exp, so3_log
 
 Array = NDArray[np.float64]
-
-# Of ``correct``: pixels compared; the share of a Gauss-Newton step that is taken; its length in one parameter,
-# pixels; the squared error that a correction at its bound costs (without detail, poses stay as given); the residual
-# from which on a pixel counts less (something moved, or is hidden).
-PIXELS = 384
-_STEP_SHARE = 0.8
-_LONGEST = 1.0
-_PRIOR = 1e-2
-_OUTLIER = 0.15
-# Of ``descend``: the longest step in a parameter, pixels; the squared error that a step of _USUAL (meters, radians)
-# costs, so that what an image hardly tells apart stays as it is; the share of a step that the next view in time makes
-# too, the one after it that share of it again, and so on for _REACH views: errors of tracking vary slowly, and a fit of
-# some seconds looks at each view but a few times.
-_FARTHEST = 1.0
-_DAMPING, _USUAL = 1e-3, np.array([0.03] * 3 + [0.02] * 3)
-_SPREAD, _REACH = 0.8, 8
-_SAME_POSE = 1e-3  # of all numbers of a matrix: another pose is another place, whose correction is not known
 
 
 @dataclass
@@ -106,7 +90,7 @@ class PoseCorrections:
     def learned_pose(self, view: View) -> Array | None:
         """As ``pose``; None where nothing was learned of this view, and nothing changes."""
         known = self.known.get(view.camera)
-        if known is None or not np.allclose(known.given, view.camera_to_world, atol=_SAME_POSE):
+        if known is None or not np.allclose(known.given, view.camera_to_world, atol=tuned.SAME_POSE):
             return None
         return _corrected(known.given, known.rotation, known.shift_m)
 
@@ -127,7 +111,7 @@ class PoseCorrections:
     def _of(self, view: View) -> _Correction:
         given = np.asarray(view.camera_to_world, dtype=np.float64)
         known = self.known.get(view.camera)
-        if known is None or not np.allclose(known.given, given, atol=_SAME_POSE):
+        if known is None or not np.allclose(known.given, given, atol=tuned.SAME_POSE):
             known = self.known[view.camera] = _Correction(given, at_ns=view.generated_ns)
             self._sorted = {}
         return known
@@ -148,8 +132,8 @@ class PoseCorrections:
         rng: chooses the pixels. background: float32 (3,), behind transparent pixels.
         """
         known, camera = self._of(view), view.intrinsics
-        column = rng.integers(0, camera.width, PIXELS)
-        row = rng.integers(0, camera.height, PIXELS)
+        column = rng.integers(0, camera.width, tuned.PIXELS)
+        row = rng.integers(0, camera.height, tuned.PIXELS)
         points = np.stack([column + 0.5, row + 0.5], axis=-1)
         seen = view.image[row, column] / 255.0
         if seen.shape[1] == 4:
@@ -167,19 +151,19 @@ class PoseCorrections:
                 moved[:3, 3] += axis
             slopes[k] = (render(moved, points) - here) / 0.5  # per pixel's worth of motion
         error = here - seen
-        robust = 1.0 / (1.0 + (np.square(error).sum(axis=1, keepdims=True) / _OUTLIER**2))
+        robust = 1.0 / (1.0 + (np.square(error).sum(axis=1, keepdims=True) / tuned.OUTLIER**2))
         # Sums by einsum without BLAS: its order of summation depends on the number of threads.
         total = np.concatenate([known.rotation, known.shift_m]) / scale
-        hessian = np.einsum("inc,jnc,nk->ij", slopes, slopes, robust, optimize=False) / PIXELS
-        gradient = np.einsum("inc,nc,nk->i", slopes, error, robust, optimize=False) / PIXELS
+        hessian = np.einsum("inc,jnc,nk->ij", slopes, slopes, robust, optimize=False) / tuned.PIXELS
+        gradient = np.einsum("inc,nc,nk->i", slopes, error, robust, optimize=False) / tuned.PIXELS
         # The prior follows the bounds: without it, rotations and shifts, which look alike from afar, would be
         # confused.
         bounds = np.array([self.most_rad] * 3 + [self.most_m] * 3) / scale
-        prior = _PRIOR / np.square(np.maximum(bounds, 1e-3))
-        step = -_STEP_SHARE * np.linalg.solve(hessian + np.diag(prior), gradient + prior * total)
+        prior = tuned.PRIOR / np.square(np.maximum(bounds, 1e-3))
+        step = -tuned.STEP_SHARE * np.linalg.solve(hessian + np.diag(prior), gradient + prior * total)
         if not np.isfinite(step).all():
             return
-        step = np.clip(step, -_LONGEST, _LONGEST) * scale
+        step = np.clip(step, -tuned.LONGEST, tuned.LONGEST) * scale
         known.rotation, known.shift_m = known.rotation + step[:3], known.shift_m + step[3:]
         everyone = list(self.known.values())
         mean_rotation = np.mean([c.rotation for c in everyone], axis=0)
@@ -204,8 +188,8 @@ class PoseCorrections:
         known = self._of(view)
         axes = known.given[:3, :3]  # a correction is too small to matter here
         local = np.concatenate([axes.T @ gradient[:3], axes.T @ gradient[3:]])
-        damped = normal + np.diag(_DAMPING * view.image[..., :3].size / np.square(_USUAL))
-        farthest = _FARTHEST * np.array([pixel_m] * 3 + [1.0 / view.intrinsics.fx] * 3)
+        damped = normal + np.diag(tuned.DAMPING * view.image[..., :3].size / np.square(tuned.USUAL))
+        farthest = tuned.FARTHEST * np.array([pixel_m] * 3 + [1.0 / view.intrinsics.fx] * 3)
         step = np.clip(-0.5 * np.linalg.solve(damped, local), -farthest, farthest)
         known.steps += 1
         changed = self._around(view.camera)
@@ -224,9 +208,9 @@ class PoseCorrections:
         if self.known[ordered[0]].at_ns == self.known[ordered[-1]].at_ns:
             return {camera: 1.0}
         rank = self._ranks[camera]
-        near = range(max(rank - _REACH, 0), min(rank + _REACH + 1, len(ordered)))
+        near = range(max(rank - tuned.REACH, 0), min(rank + tuned.REACH + 1, len(ordered)))
         steps = {k: self.known[ordered[k]].steps for k in near}
-        return {ordered[k]: _SPREAD ** abs(k - rank) / (1 + steps[k]) if k != rank else 1.0 for k in near}
+        return {ordered[k]: tuned.SPREAD ** abs(k - rank) / (1 + steps[k]) if k != rank else 1.0 for k in near}
 
     def _order(self, track: str) -> list[str]:
         """The names of a track's views in the order of time."""

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import View
+from edge_server.fields import SEPARATOR, View
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.cameras.pose_corrections import normal_matrix
 from edge_server.fields.common.kernels.camera import CAMERA
@@ -29,7 +29,6 @@ from edge_server.fields.splat.scan.scan_field import ScanField, Shown
 from edge_server.fields.splat.scan.sweep import sweep_depth
 from edge_server.fields.splat.scan.tracking import Alignment, Rendered, align, gray
 
-SEPARATOR = "#"  # between a camera and the number of its keyframe: no camera has it in its name
 # What a field that begins anew still knows of its cameras and their frames.
 _OF_CAMERAS = ("_pixels", "_taken", "_seen", "_left_out", "_in_a_row", "_moving", "_depths")
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from edge_server.edge_defaults import MOST_CARRIED, SCAN, cameras_move
-from edge_server.settings import EdgeConfig, KeyframesConfig, described, read_config
+from edge_server.settings import MOST_CARRIED, SCAN, EdgeConfig, KeyframesConfig, cameras_move, described, read_config
 from freshfield.scenario import ScenarioError, parse
 
 STILL = EdgeConfig("splat", {"layers": True}, updates="arrivals", update_ms=20.0, steps=10)

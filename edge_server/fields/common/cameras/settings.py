@@ -1,0 +1,26 @@
+"""Numbers of the corrections of cameras, each tuned once on recorded footage."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# --- poses, corrected by the pixels that a field renders (``PoseCorrections.correct``) ---
+PIXELS = 384  # that are compared
+STEP_SHARE, LONGEST = 0.8, 1.0  # of a Gauss-Newton step that is taken; its length in one parameter, pixels
+PRIOR = 1e-2  # squared error that a correction at its bound costs: without detail, poses stay as given
+OUTLIER = 0.15  # residual from which on a pixel counts less: something moved, or is hidden
+
+# --- poses, corrected by a gradient (``PoseCorrections.descend``) ---
+FARTHEST = 1.0  # longest step in a parameter, pixels
+# The squared error that a step of USUAL (meters, radians) costs: what an image hardly tells apart stays as it is.
+DAMPING, USUAL = 1e-3, np.array([0.03] * 3 + [0.02] * 3)
+# The share of a step that the next view in time makes too, the one after it that share of it again, and so on for REACH
+# views: errors of tracking vary slowly, and a fit of some seconds looks at each view but a few times.
+SPREAD, REACH = 0.8, 8
+SAME_POSE = 1e-3  # of all numbers of a matrix: another pose is another place, whose correction is not known
+
+# --- what all corrections of a camera have in common ---
+PARTS = 8  # of the path, each left out in turn (jackknife)
+LEAST_POSES = 2 * PARTS
+SURE = 2.0  # standard errors from which on a hint is given
+COMMON_PRIOR = 0.01  # share of the largest singular value added for the camera: what is not told is left to the world
