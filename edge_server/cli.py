@@ -134,6 +134,11 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
         metavar="DIR",
         help="--out of channel-emu run: the page shows its channel state [this --out]",
     )
+    run.add_argument(
+        "--emulator",
+        metavar="HOST:PORT",
+        help="--listen of channel-emu run: visitors of the page may change the network [they may not]",
+    )
     run.add_argument("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
     run.add_argument(
         "--policy",
@@ -181,7 +186,8 @@ def _run(args: argparse.Namespace) -> int:
         except ValueError as error:
             raise ScenarioError(f"--policy {error}") from None
     secure = transport.from_arguments(args)
-    open_page = partial(_open_page, args.page_host, args.page_port, secure)
+    emulator = args.emulator and transport.peer("--emulator", args.emulator)
+    open_page = partial(_open_page, args.page_host, args.page_port, secure, emulator)
     options = ServerOptions(
         listen=args.listen,
         out=args.out,
@@ -214,11 +220,11 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _open_page(host: str, port: int, secure: transport.Transport, state: EdgeState) -> OpenPage:
+def _open_page(host: str, port: int, secure: transport.Transport, emulator: str | None, state: EdgeState) -> OpenPage:
     from edge_server.page import PageError, start_page  # the viewer is imported only where there is a page
 
     try:
-        return start_page(state, host, port, secure)
+        return start_page(state, host, port, secure, emulator)
     except PageError as error:
         raise TransportError(str(error)) from None
 

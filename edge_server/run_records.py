@@ -131,8 +131,9 @@ class SoFarScores(Struct):
 
 
 class EdgeStatus(Struct, kw_only=True):
-    """What a report takes from edge.json. seconds: of fitting. uptime_s: of a live edge. chosen: how the edge
-    works and why, in one line. last_frames: sequence and capture time of the last frame of each camera's sessions."""
+    """What a report takes from edge.json. seconds: of fitting. started_ns, uptime_s: of a live edge. chosen: how the
+    edge works and why, in one line. last_frames: sequence and capture time of the last frame of each camera's
+    sessions."""
 
     kind: Literal["live", "fit"] = "live"
     scenario: str | None = None
@@ -142,6 +143,7 @@ class EdgeStatus(Struct, kw_only=True):
     policy: str | None = None
     value: Number | None = None
     seconds: Number | None = None
+    started_ns: int | None = None
     uptime_s: Number | None = None
     lines_lost: Count = 0
     updates: UpdateCounts | None = None
@@ -178,9 +180,19 @@ class Delays(Struct, omit_defaults=True):
     histogram: Histogram | None = None
 
 
+class ChannelChange(Struct):
+    """An operator's change of the channel. at_ns: on the emulator's clock; delay_ms (mean), loss: None where the
+    scenario's channel came back."""
+
+    at_ns: int
+    delay_ms: Number | None = None
+    loss: Number | None = None
+
+
 class ChannelStatus(Struct):
     """What a report takes from the emulator's channel.json. state_share: share of time in each state."""
 
+    changes: list[ChannelChange] = []
     state_share: dict[str, Number] | None = None
     drawn_delay_ms: Delays | None = None
     delay_error_ms: Delays | None = None

@@ -90,6 +90,8 @@ def process_set(
         LOOPBACK,
         "--page-port",
         str(page_port),
+        "--emulator",
+        emulator_address,
         *common,
         *recorded,
         *edge_options,

@@ -56,7 +56,7 @@ def make_keys(out: Path, cameras: Sequence[str], edge: Sequence[str], emulator: 
     Raises TransportError for an invalid host, for a camera named like another process, or if openssl cannot
     make a certificate; FileExistsError if ``out`` exists.
     """
-    names = {"edge": "edge", "emulator": "camera:*", "operator": "operator", "viewer": "viewer"}
+    names = {"edge": "operator", "emulator": "camera:*", "operator": "operator", "viewer": "viewer"}
     if doubled := names.keys() & set(cameras):
         raise TransportError(f"keys: a camera cannot be called {' or '.join(sorted(doubled))}: rename it")
     names |= {camera: f"camera:{camera}" for camera in cameras}

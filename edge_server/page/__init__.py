@@ -19,6 +19,7 @@ import viser
 from edge_server.live.state import EdgeState
 from edge_server.page.access_guard import AccessGuard
 from edge_server.page.controls import notify
+from edge_server.page.network_control import EmulatorControl
 from edge_server.page.panel import Panel
 from edge_server.page.rendering import RenderLoop
 from edge_server.page.scene import Scene
@@ -47,16 +48,26 @@ class Page:
     _server: viser.ViserServer
     _refresher: _Refresher
     _renders: RenderLoop
+    _network: EmulatorControl | None
 
     def stop(self) -> None:
         """Close the port and end the page's threads. May be called twice."""
         self._refresher.stop()
         self._renders.stop()
         _quietly(self._server.stop)
+        if self._network is not None:
+            self._network.close()
 
 
-def start_page(state: EdgeState, host: str = "127.0.0.1", port: int = 8080, transport: Transport | None = None) -> Page:
-    """Serve the page of ``state``. Port 0 takes a free one. Raises PageError if the port is not available,
+def start_page(
+    state: EdgeState,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    transport: Transport | None = None,
+    emulator: str | None = None,
+) -> Page:
+    """Serve the page of ``state``. Port 0 takes a free one. emulator: HOST:PORT of the channel emulator, for visitors
+    to change the network; None: they cannot. Raises PageError if the port is not available,
     TransportError if it would be open to others (see ``Transport.guard``)."""
     _check_port(host, port)
     transport = transport or Transport()
@@ -77,7 +88,8 @@ def start_page(state: EdgeState, host: str = "127.0.0.1", port: int = 8080, tran
     )
     scene = Scene(server, state)
     renders = RenderLoop(state)
-    panel = Panel(server, state)
+    network = EmulatorControl(transport, emulator) if emulator is not None else None
+    panel = Panel(server, state, network)
     refresher = _Refresher(server, state, scene, panel)
 
     async def joined(client: viser.ClientHandle) -> None:
@@ -104,7 +116,7 @@ def start_page(state: EdgeState, host: str = "127.0.0.1", port: int = 8080, tran
     renders.start()
     refresher.start()
     port = server.get_port()
-    return Page(page_url(host, port, tls is not None), port, server, refresher, renders)
+    return Page(page_url(host, port, tls is not None), port, server, refresher, renders, network)
 
 
 class _Refresher:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from edge_server.live.state import CameraView, Comparison, EdgeState, Publication
 from edge_server.page import markup
 from edge_server.page.controls import ControlPanel
+from edge_server.page.network_control import EmulatorControl, NetworkControl
 from edge_server.page.settings import AGE_PARTS_OF, POSE_NOISE
 from edge_server.page.timelines import History, Timelines
 from freshfield import coverage
@@ -28,7 +29,7 @@ PANEL_COLOR = (36, 36, 36)
 class Panel:
     """GUI shared by all visitors. One thread calls ``refresh``, a few times a second."""
 
-    def __init__(self, server: viser.ViserServer, state: EdgeState) -> None:
+    def __init__(self, server: viser.ViserServer, state: EdgeState, network: EmulatorControl | None = None) -> None:
         self._state = state
         gui = server.gui
         gui.set_panel_label("freshfield")
@@ -44,6 +45,10 @@ class Panel:
         self._pair: Any = None
         self._compared_update: int | None = None
         self._refreshes = 0
+        self._network: NetworkControl | None = None
+        if network is not None:
+            with gui.add_folder("Change the network"):
+                self._network = NetworkControl(gui, network, None)
         with gui.add_folder("Controls"):
             self.controls = ControlPanel(server, state)
         side = gui.add_panel()
@@ -88,6 +93,8 @@ class Panel:
         if self._refreshes % 2:  # charts need only one new point a second
             self._timelines.refresh(history, publications)
         self.controls.refresh()
+        if self._network is not None:
+            self._network.refresh(channel)
         comparison = self._state.comparison
         if comparison is not None and comparison.number != self._compared_update:
             held_out = any(c.held_out for c in cameras if c.camera == comparison.camera)

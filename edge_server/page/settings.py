@@ -26,3 +26,14 @@ QUIET_S = 0.7
 """Cameras report one after the other: a viewpoint is chosen when no new one has reported for this long."""
 POSE_NOISE = 0.02
 """Meters, and radians: a camera whose pose changes by less stands still."""
+NETWORKS = {"ideal": (0.0, 0.0), "good": (30.0, 0.01), "bad": (400.0, 0.2), "blackout": (0.0, 1.0)}
+"""Mean delay (ms) and loss of the conditions that a visitor chooses from: none; a home's network; a crowded mobile
+one, with which a walking person has moved by half a meter before they are seen; nothing arrives."""
+MAX_SLIDER_DELAY_MS = 2000
+"""STALE_MS: beyond it, no color changes any more."""
+SLIDER_SETTLES_S = 0.3
+"""A slider that has stood still for so long is let go of."""
+ANSWER_S = 3.0
+"""For the emulator's answer: after a longer time a visitor presses again."""
+STATUS_LAG_S = 1.0
+"""Until the emulator's status tells of a change: it is written, and read, twice a second."""

@@ -14,7 +14,16 @@ from edge_server.fidelity.scorer import SHOWN
 from edge_server.report.frame_accounting import account_frames
 from edge_server.report.machine import machine, versions
 from edge_server.report.run_files import RunFiles, read_run_files
-from edge_server.run_records import AgesRow, Baseline, DepthStatus, EdgeStatus, ShownRow, UpdateCounts, UpdateRow
+from edge_server.run_records import (
+    AgesRow,
+    Baseline,
+    ChannelChange,
+    DepthStatus,
+    EdgeStatus,
+    ShownRow,
+    UpdateCounts,
+    UpdateRow,
+)
 from freshfield.files import write_json, write_text
 from freshfield.machine_load import outside_load
 
@@ -69,6 +78,7 @@ def assemble(files: RunFiles) -> dict[str, Any]:
         "foreground": edge.foreground,
         "fidelity": {**fidelity(series, seconds, edge), "shown": shown(files.shown, seconds)},
         "channel": msgspec.to_builtins(files.channel),
+        "events": events(files.channel.changes, edge.started_ns),
         "notes": notes + accounting.notes,
     }
     if edge.depth is not None:
@@ -77,6 +87,20 @@ def assemble(files: RunFiles) -> dict[str, Any]:
         data = msgspec.to_builtins(edge.data)
         report |= {"data": data, "frames": None, "age_ms": None, "channel": None, "notes": []}
     return report
+
+
+def events(changes: Sequence[ChannelChange], started_ns: int | None) -> list[dict[str, Any]]:
+    """What operators changed, [{t_s: since the edge started, what: in words}]; emulator and edge have one clock, or
+    nearly."""
+    if started_ns is None:
+        return []
+    found = []
+    for change in changes:
+        what = "the scenario's network again"
+        if change.delay_ms is not None and change.loss is not None:
+            what = f"network set: {change.delay_ms:.0f} ms, {100.0 * change.loss:.0f} % lost"
+        found.append({"t_s": (change.at_ns - started_ns) / 1e9, "what": what})
+    return found
 
 
 def ages(rows: Sequence[AgesRow]) -> dict[str, Any]:

@@ -40,6 +40,7 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
         return False
     with figure(path, 2, height_inch=2.5, sharex=True) as (_, axes):
         top, bottom = axes[:, 0]
+        _mark_events(top, report)
         _plot(top, series, "psnr_db", BLUE, "whole image")
         _plot(top, series, "psnr_moving_db", VERMILION, "moving pixels")
         flat = {"nearest_view_db": "nearest view", "mean_colour_db": "mean color"}
@@ -73,6 +74,7 @@ def draw_ages(report: Report, files: RunFiles, path: Path) -> bool:
     aaoi = _points(report["fidelity"]["series"], "aaoi_ms")
     with figure(path, 2, height_inch=2.6) as (_, axes):
         over_time, by_camera = axes[:, 0]
+        _mark_events(over_time, report)
         over_time.fill_between(t, low, high, color=SKY, alpha=0.35, linewidth=0, label="all cameras")
         over_time.plot(t, mid, color=BLUE, label="median camera")
         if len(aaoi[0]):
@@ -237,6 +239,15 @@ def _plot(axes: Axes, series: list[dict[str, Any]], name: str, color: str, label
     points = _points(series, name)
     if points[0]:
         axes.plot(*points, color=color, label=label)
+
+
+def _mark_events(axes: Axes, report: Report) -> None:
+    """A line where an operator changed something, with the words above it."""
+    for event in report["events"]:
+        axes.axvline(event["t_s"], color=INK, linewidth=0.8, linestyle=":")
+        axes.annotate(
+            event["what"], (event["t_s"], 1.0), xycoords=("data", "axes fraction"), rotation=90, va="top", fontsize=6
+        )
 
 
 def _robust_top(values: list[float]) -> float:

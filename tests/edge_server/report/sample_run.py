@@ -21,6 +21,7 @@ from tests.edge_server.report.ledgers import write
 CAMERAS = ("cam00", "cam01", "cam02", "cam03")
 SECONDS = 40.0
 EDGE = {
+    "started_ns": 1_000_000_000,
     "scenario": "sample",
     "seed": 7,
     "field": "ngp",
@@ -33,6 +34,10 @@ EDGE = {
     "lpips_network": "alex",
 }
 CHANNEL = {
+    "changes": [
+        {"at_ns": 11_000_000_000, "delay_ms": 400.0, "loss": 0.2},
+        {"at_ns": 15_000_000_000, "delay_ms": None, "loss": None},
+    ],
     "state_share": {"high": 0.4, "low": 0.6},
     "drawn_delay_ms": {
         "mean": 60.2,

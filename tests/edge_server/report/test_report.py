@@ -42,6 +42,8 @@ def test_report_json_holds_what_is_returned_and_every_documented_key(run):
     assert report["fidelity"]["baseline"] == {"mean_colour_db": 14.5, "nearest_view_db": 13.8}
     assert all(tuple(row) == SERIES for row in report["fidelity"]["series"])
     assert report["channel"] == CHANNEL
+    words = ("network set: 400 ms, 20 % lost", "the scenario's network again")
+    assert report["events"] == [{"t_s": t_s, "what": what} for t_s, what in zip((10.0, 14.0), words)]
     assert report["versions"]["python"] and report["machine"]["cores"] >= 1
     assert set(report["outside_load"]) == {"cores", "ours", "method"}
 

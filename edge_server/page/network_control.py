@@ -1,0 +1,131 @@
+"""The visitor's control of the network: four conditions, and sliders of delay and loss.
+
+The edge is an operator of the channel emulator, and asks it in a visitor's name. What it refuses becomes a
+notification for that visitor.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from typing import Any
+
+import grpc
+import viser
+
+from edge_server.page.controls import notify
+from edge_server.page.markup import note
+from edge_server.page.settings import ANSWER_S, MAX_SLIDER_DELAY_MS, NETWORKS, SLIDER_SETTLES_S, STATUS_LAG_S
+from freshfield.transport import Transport, peer_text
+from freshfield.v1 import channel_pb2, channel_pb2_grpc
+
+log = logging.getLogger(__name__)
+
+SCENARIO = "scenario"
+Setting = tuple[float, float] | None
+"""Mean delay (ms) and loss (0 to 1); None: the scenario's channel."""
+
+
+class EmulatorControl:
+    """Sets delay and loss of the emulator at ``address`` (HOST:PORT). Thread-safe; connects at the first call.
+
+    transport: must make this process an operator there, see docs/deploy.md.
+    """
+
+    def __init__(self, transport: Transport, address: str) -> None:
+        self._transport, self._address = transport, address
+        # A certificate says who this is; a token of this server's visitors would be a wrong one there.
+        self._metadata = () if transport.cert is not None and transport.ca is not None else transport.metadata()
+        self._channel: grpc.Channel | None = None
+        self._lock = threading.Lock()
+        self.in_force: Setting = None
+        """What was set here last."""
+
+    def set(self, wanted: Setting) -> None:
+        """Change the network. Raises RuntimeError with what the emulator said, or that it did not answer."""
+        delay_ms, loss = wanted or (None, None)
+        with self._lock:
+            if self._channel is None:
+                self._channel = self._transport.channel(self._address)
+            ask = channel_pb2_grpc.ChannelServiceStub(self._channel).SetChannel
+            try:
+                request = channel_pb2.SetChannelRequest(delay_ms=delay_ms, loss=loss)
+                ask(request, timeout=ANSWER_S, metadata=self._metadata)
+            except grpc.RpcError as error:
+                said = f"{error.code().name}: {peer_text(error.details())}"
+                raise RuntimeError(f"the emulator at {self._address} refuses ({said})") from None
+            self.in_force = wanted
+
+    def close(self) -> None:
+        """Close the connection."""
+        with self._lock:
+            if self._channel is not None:
+                self._channel.close()
+                self._channel = None
+
+
+class NetworkControl:
+    """Inputs in the current GUI container, kept equal to what is in force, which others may change too."""
+
+    def __init__(self, gui: viser.GuiApi, network: EmulatorControl, status: dict[str, Any] | None) -> None:
+        self._network = network
+        self._timer: threading.Timer | None = None
+        self._refresh_after_s = 0.0
+        self.buttons: Any = gui.add_button_group("network", (SCENARIO, *NETWORKS))
+        self.delay: Any = gui.add_slider("delay, ms", 0, MAX_SLIDER_DELAY_MS, 10, 0, hint="Mean delay of a frame.")
+        self.loss: Any = gui.add_slider("loss, %", 0, 100, 1, 0, hint="Share of the frames that never arrive.")
+        self.words: Any = gui.add_html("")
+        self.buttons.on_click(self._pressed)
+        for slider in (self.delay, self.loss):
+            slider.on_update(self._moved)
+        self.refresh(status)
+
+    def refresh(self, status: dict[str, Any] | None) -> None:
+        """Show what is in force. status: the emulator's; None where it is on another machine."""
+        if time.monotonic() < self._refresh_after_s:  # sliders stay where the visitor has them
+            return
+        in_force = self._network.in_force
+        if status is not None and "by_hand" in status:
+            told = status["by_hand"]
+            in_force = (told["delay_ms"], told["loss"]) if isinstance(told, dict) else None
+        self.words.content = note(f"The network is {describe(in_force)}.")
+        if in_force is not None:
+            values = round(min(in_force[0], MAX_SLIDER_DELAY_MS)), round(100.0 * in_force[1])
+            for slider, value in zip((self.delay, self.loss), values):
+                if slider.value != value:
+                    slider.value = value
+
+    # --- callbacks ------------------------------------------------------------------------------
+
+    async def _pressed(self, event: Any) -> None:
+        # A coroutine runs before the next click is handled, so the group still holds this click's value.
+        self._set_after(0.0, event.client, NETWORKS.get(event.target.value))
+
+    def _moved(self, event: Any) -> None:
+        if event.client is not None:  # not set by refresh
+            self._set_after(SLIDER_SETTLES_S, event.client, (float(self.delay.value), self.loss.value / 100.0))
+
+    def _set_after(self, seconds: float, client: Any, wanted: Setting) -> None:
+        """Set it unless another change comes first: a slider that is dragged is one change."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._refresh_after_s = time.monotonic() + seconds + STATUS_LAG_S
+        self._timer = threading.Timer(seconds, self._set, (client, wanted))
+        self._timer.name, self._timer.daemon = "page-network", True
+        self._timer.start()
+
+    def _set(self, client: Any, wanted: Setting) -> None:
+        try:
+            self._network.set(wanted)
+        except Exception as error:  # any failure is shown to the visitor and never ends the page
+            log.info("page: network %s refused: %s", describe(wanted), error)
+            notify(client, "The network has not changed", str(error) or type(error).__name__, bad=True)
+
+
+def describe(setting: Setting) -> str:
+    """A setting in words."""
+    if setting is None:
+        return "the scenario's"
+    name = next((name for name, each in NETWORKS.items() if each == setting), "set by hand")
+    return f"{name}: mean delay {setting[0]:.0f} ms, {100.0 * setting[1]:.0f} % of the frames lost"

@@ -1,0 +1,68 @@
+"""The visitor changes the network: through the page in a browser, and the emulator's own process."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from unittest.mock import MagicMock
+
+import pytest
+
+from edge_server.page import start_page
+from edge_server.page.network_control import EmulatorControl, NetworkControl, describe
+from freshfield.files import ReplacedJson
+from freshfield.transport import Transport
+from tests.edge_server.page.browser import Browser
+from tests.edge_server.page.preview import Preview
+from tests.support import free_port, wait_until
+
+
+@pytest.mark.browser
+def test_a_visitor_changes_the_network_and_gives_it_back(tmp_path):
+    address, status = f"127.0.0.1:{free_port()}", ReplacedJson(tmp_path / "channel.json")
+    command = [sys.executable, "-m", "channel_emu.cli", "run", "card", "--listen", address, "--out", str(tmp_path)]
+    emulator = subprocess.Popen([*command, "--to", "127.0.0.1:1"], stderr=subprocess.DEVNULL)
+    preview = Preview()
+    preview.state = replace(preview.state, channel=status.read)
+    page = start_page(preview.state, "127.0.0.1", 0, emulator=address)
+    preview.start()
+    try:
+        with Browser(page.url, timeout_s=60.0) as browser:
+            browser.wait_for_text("The network is the scenario's.")
+            wait_until(lambda: status.read() is not None, "no status")
+            browser.close_notices()
+            browser.click_text("blackout")
+            browser.wait_for_text("The network is blackout: mean delay 0 ms, 100 % of the frames lost.")
+            browser.wait_for_text("2 set by hand")  # a state of the channel's chart
+            x, y, width = browser.evaluate(
+                "(() => { const r = document.querySelector('.mantine-Slider-track').getBoundingClientRect();"
+                "return [r.x, r.y + r.height / 2, r.width]; })()"
+            )
+            browser.click(x + width / 2, y)
+            browser.wait_for_text("The network is set by hand: mean delay 1")
+            browser.click_text("scenario")
+            browser.wait_for_text("The network is the scenario's.")
+    finally:
+        page.stop()
+        preview.stop()
+        emulator.terminate()
+        emulator.wait(10)
+    changes = json.loads((tmp_path / "channel.json").read_text())["changes"]
+    assert [c["loss"] for c in changes] == [1.0, 1.0, None] and changes[0]["delay_ms"] == 0.0
+    assert 800.0 <= changes[1]["delay_ms"] <= 1200.0 and changes[2]["delay_ms"] is None
+
+
+def test_what_the_emulator_does_not_answer_is_told_to_its_visitor():
+    network, client, gui = EmulatorControl(Transport(), f"127.0.0.1:{free_port()}"), MagicMock(), MagicMock()
+    control = NetworkControl(gui, network, None)
+    control._set(client, (400.0, 0.2))
+    title, words = client.add_notification.call_args.args
+    assert title == "The network has not changed" and "UNAVAILABLE" in words and network.in_force is None
+    network.close()
+
+
+def test_a_setting_is_told_in_words():
+    assert describe((0.0, 0.5)) == "set by hand: mean delay 0 ms, 50 % of the frames lost"
+    assert describe((400.0, 0.2)).startswith("bad: mean delay 400 ms, 20 %") and describe(None) == "the scenario's"
