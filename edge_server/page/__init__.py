@@ -24,6 +24,7 @@ from edge_server.page.panel import Panel
 from edge_server.page.rendering import RenderLoop
 from edge_server.page.scene import Scene
 from edge_server.page.settings import REFRESH_S
+from edge_server.page.splats.stream import SplatStream
 from edge_server.page.timelines import History
 from freshfield.access import HttpDoor
 from freshfield.transport import Transport
@@ -49,11 +50,13 @@ class Page:
     _refresher: _Refresher
     _renders: RenderLoop
     _network: EmulatorControl | None
+    _splats: SplatStream
 
     def stop(self) -> None:
         """Close the port and end the page's threads. May be called twice."""
         self._refresher.stop()
         self._renders.stop()
+        self._splats.stop()
         _quietly(self._server.stop)
         if self._network is not None:
             self._network.close()
@@ -113,10 +116,13 @@ def start_page(
                 notify(server.get_clients().get(number), "Not done", "You logged in to look only.", bad=True)
 
     guard.controls, guard.on_refused = server.gui._gui_input_handle_from_uuid, on_refused
+    splats = SplatStream(state, lambda: scene.viewpoint)
+    guard.splats = splats.serve
     renders.start()
     refresher.start()
+    splats.start()
     port = server.get_port()
-    return Page(page_url(host, port, tls is not None), port, server, refresher, renders, network)
+    return Page(page_url(host, port, tls is not None), port, server, refresher, renders, network, splats)
 
 
 class _Refresher:

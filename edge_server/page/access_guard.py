@@ -18,7 +18,7 @@ import ssl
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -30,6 +30,7 @@ from websockets.exceptions import ConnectionClosedError, InvalidMessage
 from websockets.http11 import Request, Response
 
 from edge_server.page.settings import SAY_EVERY_S
+from edge_server.page.splats.stream import STREAM, file_response
 from freshfield.access import ANYBODY, CHANGE, Caller, HttpDoor, HttpRefused
 from freshfield.limits import (
     MAX_CLICKS_HZ,
@@ -111,7 +112,8 @@ class AccessGuard:
     tls: for the port; None: no TLS.
     controls: the controls whose values may be set, by id.
     on_refused: called with the connection of a viewer who tried to change something.
-    The last two are set once the page has been made.
+    splats: serves those who draw splats themselves; None: nobody may.
+    The last three are set once the page has been made.
     """
 
     def __init__(self, access: HttpDoor, tls: ssl.SSLContext | None) -> None:
@@ -120,6 +122,7 @@ class AccessGuard:
         self._quiet_until_s: dict[str, float] = {}
         self.controls: dict[str, Any] = {}
         self.on_refused: Callable[[ServerConnection], None] = lambda connection: None
+        self.splats: Callable[[ServerConnection], Awaitable[None]] | None = None
         self._access = access
         self._tls = tls
         self._secret = secrets.token_bytes(32)
@@ -150,7 +153,12 @@ class AccessGuard:
             }
             if self._tls is not None:
                 options["ssl_handshake_timeout"] = TLS_HANDSHAKE_TIMEOUT_S
-            return websockets.asyncio.server.serve(handler, host, port, **options)
+
+            async def routed(connection: ServerConnection) -> None:
+                draws = isinstance(connection, VisitorConnection) and connection.draws
+                await (self.splats(connection) if draws and self.splats else handler(connection))
+
+            return websockets.asyncio.server.serve(routed, host, port, **options)
 
         server = SimpleNamespace(**vars(websockets.asyncio.server) | {"serve": guarded})
         asyncio_package = SimpleNamespace(**vars(websockets.asyncio) | {"server": server})
@@ -203,6 +211,10 @@ class AccessGuard:
             return message.sound(self.controls) or self._refuse("a value that no control takes")
         return True
 
+    def acknowledges(self, data: str | bytes) -> bool:
+        """Whether what a visitor sent who draws splats is the number of a message."""
+        return (isinstance(data, bytes) and len(data) == 4) or self._refuse("a message that visitors do not send")
+
     def _refuse(self, what: str) -> bool:
         """Count what was refused, and log it, once a minute at most."""
         self.refused[what] += 1
@@ -247,10 +259,13 @@ class AccessGuard:
                 self._refuse(f"visitors beyond {MAX_VISITORS}")
                 return connection.respond(503, f"{MAX_VISITORS} visitors are here already\n")
             self.visitors.add(connection)
-        response = process(connection, request)
+            connection.draws = request.path == STREAM and self.splats is not None
+            if connection.draws:
+                return None
+        response = (file_response(request.path) if self.splats else None) or process(connection, request)
         if response is not None:
             # The pages of others may not show ours in a frame, to have it clicked on.
-            response.headers["Content-Security-Policy"] = "frame-ancestors 'self'"
+            response.headers.setdefault("Content-Security-Policy", "frame-ancestors 'self'")
             if self._access.access is not None and authorization is not None:
                 flags = "; Secure" if self._tls is not None else ""
                 value = self._cookie(connection.caller)
@@ -276,6 +291,7 @@ class VisitorConnection(ServerConnection):
     def __init__(self, guard: AccessGuard, *words: Any, **more: Any) -> None:
         super().__init__(*words, **more)
         self.caller = ANYBODY
+        self.draws = False  # splats, by itself
         self._guard = guard
         self._clicks = 0.0  # how many may come at once
         self._clicked_s = -math.inf
@@ -299,9 +315,10 @@ class VisitorConnection(ServerConnection):
         return True
 
     async def recv(self, decode: bool | None = None) -> Any:
-        while not self._guard.takes(self, data := await super().recv(decode)):
-            pass
-        return data
+        while True:
+            data = await super().recv(decode)
+            if self._guard.acknowledges(data) if self.draws else self._guard.takes(self, data):
+                return data
 
     async def send(self, message: Any, text: bool | None = None) -> None:
         """Send; a visitor who reads nothing for too long is disconnected, and what waits for them dropped."""

@@ -53,6 +53,11 @@ class Scene:
         self._next_thumbnail = 0
         self._undecodable: set[str] = set()
 
+    @property
+    def viewpoint(self) -> Viewpoint | None:
+        """Where visitors begin; None while it is not known."""
+        return self._viewpoint
+
     def refresh(self, cameras: list[CameraView], watched: bool) -> None:
         """Bring the scene up to date if there are visitors (``watched``)."""
         self._place_visitors(cameras)

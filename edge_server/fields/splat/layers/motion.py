@@ -141,6 +141,11 @@ class Motion:
         moved = np.einsum("nm,nmc->nc", share, self.at(instant_s).astype(np.float32).take(anchor, axis=0))
         return (points + moved).astype(np.float32)
 
+    def newest_knots(self, count: int) -> tuple[int, NDArray[np.float32]]:
+        """Number of the first of the newest ``count`` knots, whose instant is number / KNOTS_PER_S, and their
+        displacements (count, K, 3), scene units."""
+        return self._first + WINDOW - count, self._knots[-count:].astype(np.float32)
+
     def choose_anchors(
         self, points: NDArray[np.floating], opacity: NDArray[np.floating], count: int, instant_s: float
     ) -> None:

@@ -123,3 +123,4 @@ NETWORK_NEAR = 0.15  # difference of log depth up to which it does not contradic
 NETWORK_SPREAD = 0.06  # share of the image's width within which its errors are taken to be alike
 NETWORK_BEYOND = 1.5  # farther, or nearer, than the known depths it is not believed by more than this factor
 NETWORK_NOISE = 0.015  # as NOISE, share of the median inverse depth
+BEHIND = 0.03  # share of a measured depth by which a Gaussian may lie behind it and still be of that surface

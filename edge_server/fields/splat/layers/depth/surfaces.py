@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.camera_rows import camera_rows
+from edge_server.fields.common.kernels.camera import LENS, ORIGIN
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.layers.depth import settings as tuned
@@ -118,6 +119,22 @@ class SurfaceScene:
         """The pixels that no camera says anything about, bool (H, W), from a pose, camera-to-world (4, 4)."""
         (agreement,) = self.render([pose], replace(lens, distortion=(0.0, 0.0, 0.0, 0.0)), pool)[1]
         return np.asarray(agreement <= tuned.SURE)
+
+    def unseen_points(self, points_m: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Which points (N, 3), world meters, lie before no camera's measured surface nor on it, bool (N,). Distortion
+        is ignored."""
+        unseen = np.ones(len(points_m), np.bool_)
+        local = (np.asarray(points_m, np.float64) - self.center).astype(np.float32)
+        for row, (width, height), first in zip(self.meshes.cams, self.meshes.size, self.meshes.first):
+            x, y, z = row[:ORIGIN].reshape(3, 3) @ (local - row[ORIGIN:LENS]).T
+            fx, fy, cx, cy = row[LENS : LENS + 4]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                u, v = np.floor(fx * x / z + cx), np.floor(fy * y / z + cy)
+            inside = np.flatnonzero((z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height))
+            pixel = first + v[inside].astype(np.int64) * width + u[inside].astype(np.int64)
+            depth = self.meshes.depth[pixel]
+            unseen[inside[(depth > 0) & (z[inside] <= depth * np.float32(1.0 + tuned.BEHIND))]] = False
+        return unseen
 
     def render(
         self, poses: Sequence[Array], lens: Pinhole, pool: Pool

@@ -1,0 +1,149 @@
+"""What the field has published, as records: made once for all visitors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.splat.layers import settings as layers
+from edge_server.fields.splat.layers.motion import Motion
+from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
+from edge_server.fields.splat.snapshot import SplatSnapshot
+from edge_server.page.splats.messages import KnotsBlock, MovingBlock, SceneBlock
+from edge_server.page.splats.records import scale_range, to_records, weights
+from edge_server.page.splats.settings import KNOTS_SENT, MOST_ANCHORS, NEW_SET_EVERY_S, STATIC_EVERY_S
+
+_SAMPLED = 512  # Gaussians by whose places two static sets are told apart
+_SAME = 0.02  # scene units that half of them move at most, if the field goes on with the same ones
+_BUSY = 8.0  # static records are made again after so many times what they took: an eighth of a core at most
+
+
+@dataclass(frozen=True)
+class StaticRecords:
+    """The static Gaussians, those of largest weight first.
+
+    number: counts sets of other Gaussians; within one, row k stays the same Gaussian.
+    version: counts what was made. records: RECORD (N,). weight: float64 (N,). unseen: bool (N,), see
+    ``SurfaceScene.unseen_points``; None without depth.
+    """
+
+    number: int
+    version: int
+    scales: tuple[float, float]
+    records: NDArray[np.void]
+    weight: NDArray[np.float64]
+    unseen: NDArray[np.bool_] | None
+
+
+@dataclass(frozen=True)
+class Published:
+    """A publication. serial: counts them. origin_ns: where the stream's seconds begin, on the clock of frames.
+    moving: those of largest weight first; None, and knots None, where nothing moves."""
+
+    serial: int
+    origin_ns: int
+    scene: SceneBlock
+    static: StaticRecords
+    moving: MovingBlock | None
+    knots: KnotsBlock | None
+
+
+class Publisher:
+    """Turns snapshots into ``Published``. start_ns: begin of the run, from which seconds count where nothing moves."""
+
+    def __init__(self, start_ns: int) -> None:
+        self._start_ns = start_ns
+        self._snapshot: object = None
+        self._newest: Published | None = None
+        self._identity: tuple[SceneBox, int] | None = None
+        self._fields = self._anchor_sets = self._sets = self._versions = 0
+        self._anchors: NDArray[np.float64] | None = None
+        self._order = np.zeros(0, np.intp)
+        self._places = np.zeros((0, 3), np.float32)
+        self._set_since_s = self._static_due_s = -np.inf
+
+    def take(self, snapshot: object, now_s: float) -> Published | None:
+        """The newest publication as records. None: the field does not consist of Gaussians. now_s: any clock."""
+        if not isinstance(snapshot, SplatSnapshot):
+            return None
+        if snapshot is self._snapshot:
+            return self._newest
+        layered = snapshot if isinstance(snapshot, LayeredSnapshot) and snapshot.static is not None else None
+        moving = None if layered is None else layered.moving
+        origin_ns = self._start_ns if moving is None else moving.origin_ns
+        before = self._newest
+        if (snapshot.box, origin_ns) != self._identity:
+            self._identity = snapshot.box, origin_ns
+            self._fields += 1
+            before = None
+        params = snapshot.gaussians.params if layered is None or layered.static is None else layered.static
+        static = self._static(params, None if before is None else before.static, now_s, layered)
+        box = snapshot.box
+        red, green, blue = map(float, snapshot.background)
+        scene = SceneBlock(self._fields, box.centre_m, box.radius_m, box.near_m / box.radius_m, (red, green, blue))
+        records, knots = (None, None) if moving is None else self._moving(moving)
+        serial = 0 if self._newest is None else self._newest.serial + 1
+        self._snapshot = snapshot
+        self._newest = Published(serial, origin_ns, scene, static, records, knots)
+        return self._newest
+
+    def _static(
+        self, params: NDArray[np.float32], before: StaticRecords | None, now_s: float, layered: LayeredSnapshot | None
+    ) -> StaticRecords:
+        if before is not None and now_s < self._static_due_s:
+            return before
+        same = before is not None and self._same(params)
+        if before is not None and not same and now_s < self._set_since_s + NEW_SET_EVERY_S:
+            return before
+        began = perf_counter()
+        if before is None or not same:
+            self._sets += 1
+            self._set_since_s = now_s
+            self._order = np.argsort(-weights(params), kind="stable")
+        self._versions += 1
+        self._places = params[:: max(len(params) // _SAMPLED, 1), :3].copy()
+        params = params[self._order]
+        scales = before.scales if before is not None and same else scale_range(params)
+        surfaces = None if layered is None else layered.surfaces
+        unseen = before.unseen if before is not None and same else None
+        if surfaces is not None and unseen is None and layered is not None:
+            box = layered.box
+            unseen = surfaces.unseen_points(params[:, :3] * box.radius_m + np.asarray(box.centre_m))
+        records = to_records(params, scales)
+        made = StaticRecords(self._sets, self._versions, scales, records, weights(params), unseen)
+        self._static_due_s = now_s + max(STATIC_EVERY_S, _BUSY * (perf_counter() - began))
+        return made
+
+    def _same(self, params: NDArray[np.float32]) -> bool:
+        """Whether these are the Gaussians of the last set, trained on: others came, went or changed places else."""
+        if len(params) != len(self._order):
+            return False
+        places = params[:: max(len(params) // _SAMPLED, 1), :3]
+        return bool(np.median(np.linalg.norm(places - self._places, axis=1)) < _SAME)
+
+    def _moving(self, moving: MovingSnapshot) -> tuple[MovingBlock | None, KnotsBlock | None]:
+        motion: Motion = moving.motion
+        if motion.anchors is None or not len(moving.params) or len(motion.anchors) > MOST_ANCHORS:
+            return None, None
+        if motion.anchors is not self._anchors:
+            self._anchors = motion.anchors
+            self._anchor_sets += 1
+        order = np.argsort(-weights(moving.params), kind="stable")
+        params = moving.params[order]
+        scales = scale_range(params)
+        share = np.rint(moving.share[order] * 255.0).astype(np.int32)
+        share[:, 1] = np.minimum(share[:, 1], 255 - share[:, 0])
+        block = MovingBlock(
+            self._anchor_sets,
+            scales,
+            to_records(params, scales),
+            moving.anchor[order].astype(np.uint8),
+            share[:, :2].astype(np.uint8),
+        )
+        first, knots = motion.newest_knots(KNOTS_SENT)
+        rate, newest_s = float(layers.KNOTS_PER_S), moving.newest_s
+        return block, KnotsBlock(self._anchor_sets, first, rate, newest_s, layers.MAX_AHEAD_S, knots)

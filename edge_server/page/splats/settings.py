@@ -1,0 +1,45 @@
+"""Numbers of the splat stream."""
+
+from __future__ import annotations
+
+VERSION = 1
+"""Of the messages. A reader refuses others."""
+
+CHUNK = 128
+"""Static Gaussians sent together."""
+COLOR_LOW, COLOR_STEP = -0.5, 2.0 / 255
+"""Colors of Gaussians may leave [0, 1] by half (``fields.splat.settings``)."""
+MOST_ANCHORS = 255
+"""A byte names an anchor."""
+KNOTS_SENT = 6
+"""Newest knots of the motion: the display needs four, those before serve a visitor whose messages come late."""
+
+TICK_S = 0.03
+"""Between two looks at what the field has published, while somebody watches."""
+STATUS_EVERY_S = 0.5
+"""Cameras, ages and the line of text."""
+MOVING_EVERY_S = 0.1
+"""Between two moving sets. One .18 s old with new knots is 27 dB like the newest where it moves."""
+STATIC_EVERY_S = 0.5
+"""Between two looks at which static chunks have changed."""
+CHANGED_SHARE = 0.02
+"""Share of a chunk's weight that has changed noticeably, from which it is sent again."""
+NEW_SET_EVERY_S = 1.0
+"""Between two static sets with other Gaussians, as while a field grows: each is sent whole."""
+NEW_SET_S = 2.0
+"""A new static set is cut so that the visitor's link takes it in this time, the largest Gaussians first."""
+
+FIRST_WINDOW, LEAST_WINDOW, MOST_WINDOW = 8_192, 4_096, 2_000_000
+"""Bytes under way to a visitor: at first, at least, at most."""
+QUEUE_S = 0.1
+"""Delay beyond the shortest round trip at which a link counts as full."""
+BACK_OFF = 0.7
+"""Factor on the window then, once a round trip."""
+FORGET_RTT_S = 30.0
+"""The shortest round trip is that of this time."""
+DRAIN_EVERY_S = 4.0
+"""A link that has not been empty for so long is let run empty, to find its round trip without a queue of ours."""
+MOVING_SHARE = 0.6
+"""Of the link, for moving sets: what does not fit is cut, the smallest Gaussians first."""
+LEAST_MOVING = 64
+"""Gaussians of a moving set, however slow the link: sets become fewer from there on."""

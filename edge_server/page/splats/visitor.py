@@ -1,0 +1,259 @@
+"""What one visitor is sent, and when: never more than their link takes.
+
+The window of bytes under way follows delay, as in LEDBAT (RFC 6817): a link whose round trip grows beyond its
+shortest is full. What does not fit is left out in this order: small Gaussians, static sets that changed little,
+moving sets; knots, which move what is there already, come last.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.page.splats import settings as tuned
+from edge_server.page.splats.messages import (
+    Block,
+    MovingBlock,
+    StaticBlock,
+    StatusBlock,
+    UnseenBlock,
+    write_block,
+    write_message,
+)
+from edge_server.page.splats.published import Published, StaticRecords
+from edge_server.page.splats.records import RECORD, noticeable
+
+_MOVING_BYTES = RECORD.itemsize + 5
+_HEADS = 32  # bytes of a static block beside its records
+_LEAST_BYTES = tuned.CHUNK * RECORD.itemsize + _HEADS  # that a message may have
+
+
+class LinkWindow:
+    """Bytes that may be under way, from the delays of what was acknowledged.
+
+    short: whether there was more to send than the window took.
+    """
+
+    def __init__(self) -> None:
+        self.short = False
+        self.window = float(tuned.FIRST_WINDOW)
+        self.under_way = 0
+        self.rate_bytes_per_s = 0.0
+        self._sent: deque[tuple[int, int, float]] = deque()  # number, bytes, when
+        self._round_trips: deque[tuple[float, float]] = deque()  # when, seconds
+        self._backed_off_s = -np.inf
+        self._drained_s = np.inf
+        self._since_s, self._acknowledged = 0.0, 0
+
+    @property
+    def round_trip_s(self) -> float:
+        """The shortest of late; 0 before the first."""
+        return min((trip for _, trip in self._round_trips), default=0.0)
+
+    @property
+    def room(self) -> int:
+        """Bytes that may be sent now."""
+        return max(int(self.window) - self.under_way, 0)
+
+    def sent(self, number: int, size: int, now_s: float) -> None:
+        """Note a message of so many bytes."""
+        if not self._sent and not self._acknowledged:
+            self._since_s = now_s
+        self._drained_s = min(self._drained_s, now_s)
+        self._sent.append((number, size, now_s))
+        self.under_way += size
+
+    def acknowledged(self, number: int, now_s: float) -> None:
+        """Note that the visitor has read all messages up to this one. A number that was not sent changes nothing."""
+        if not any(sent == number for sent, _, _ in self._sent):
+            return
+        size, round_trip_s = 0, 0.0
+        while True:
+            sent, bytes_, sent_s = self._sent.popleft()
+            size, round_trip_s = size + bytes_, now_s - sent_s
+            if sent == number:
+                break
+        self.under_way -= size
+        self._count(size, now_s)
+        while self._round_trips and self._round_trips[0][0] < now_s - tuned.FORGET_RTT_S:
+            self._round_trips.popleft()
+        self._round_trips.append((now_s, round_trip_s))
+        if round_trip_s - self.round_trip_s > tuned.QUEUE_S:
+            if now_s - self._backed_off_s > round_trip_s:
+                self._backed_off_s = now_s
+                self.window = max(self.window * tuned.BACK_OFF, tuned.LEAST_WINDOW)
+        elif self.short:  # a window that suffices says nothing of the link
+            self.window = min(self.window + size, tuned.MOST_WINDOW)
+
+    def _count(self, size: int, now_s: float) -> None:
+        self._acknowledged += size
+        if now_s - self._since_s >= tuned.STATUS_EVERY_S:
+            self.rate_bytes_per_s = self._acknowledged / (now_s - self._since_s)
+            self._since_s, self._acknowledged = now_s, 0
+
+    @property
+    def bound_bytes_per_s(self) -> float:
+        """What the window lets through: its bytes in a round trip that is as long as a full link's."""
+        return self.window / (self.round_trip_s + tuned.QUEUE_S if self._round_trips else 1.0)
+
+    def drains(self, now_s: float) -> bool:
+        """Whether to send nothing until all has arrived, so that the next round trip is measured without a queue."""
+        if self.under_way == 0:
+            self._drained_s = now_s
+        return now_s - self._drained_s > tuned.DRAIN_EVERY_S
+
+
+class Visitor:
+    """The state of one visitor's stream. All times are seconds of one clock."""
+
+    def __init__(self) -> None:
+        self.link = LinkWindow()
+        self._number = 0
+        self._field = -1
+        self._serial = -1  # of the newest publication sent
+        self._status_s = self._moving_s = -np.inf
+        self._whole: MovingBlock | None = None  # the moving set, once all of it was sent
+        self._forget_static()
+
+    def _forget_static(self) -> None:
+        self._source: StaticRecords | None = None  # what is being sent
+        self._set = 0  # counts what this visitor was sent; another number is another set
+        self._sent = np.zeros(0, RECORD)
+        self._known = np.zeros(0, np.bool_)
+        self._due: list[int] = []  # chunks
+
+    @property
+    def shown_static(self) -> int:
+        """Static Gaussians of the set that is sent."""
+        return len(self._sent)
+
+    def acknowledged(self, number: int, now_s: float) -> None:
+        """The visitor has read all messages up to this one."""
+        self.link.acknowledged(number, now_s)
+
+    def message(
+        self, published: Published | None, present_ns: int, status: dict[str, Any], now_s: float
+    ) -> bytes | None:
+        """What to send now; None: nothing new, or the link is full.
+
+        published: None while there is nothing to draw.
+        present_ns: the present, on the clock of frames. status: what all visitors are told; the link's is added.
+        """
+        if self.link.room < tuned.LEAST_WINDOW // 4 or self.link.drains(now_s):
+            self.link.short = True
+            return None
+        room = self.link.room
+        self.link.short = False
+        blocks: list[Block] = []
+        if published is not None and published.scene.field != self._field:
+            self._field = published.scene.field
+            self._forget_static()
+            blocks.append(published.scene)
+        told = now_s >= self._status_s + tuned.STATUS_EVERY_S
+        if told:
+            blocks.append(StatusBlock(status | {"link": self._link(published)}))
+        room -= sum(len(write_block(block)) for block in blocks)
+        if published is not None:
+            blocks += self._newest(published, room, now_s)
+        if not blocks:
+            return None
+        if told:
+            self._status_s = now_s
+        instant_s = 0.0 if published is None else (present_ns - published.origin_ns) / 1e9
+        data = write_message(self._number, instant_s, blocks)
+        self.link.sent(self._number, len(data), now_s)
+        self._number = (self._number + 1) & 0xFFFFFFFF
+        return data
+
+    def _newest(self, published: Published, room: int, now_s: float) -> list[Block]:
+        """Knots, moving set and static chunks, as far as there is room."""
+        blocks: list[Block] = []
+        if published.knots is not None and published.serial != self._serial:
+            size = len(write_block(published.knots))
+            if size <= room:
+                blocks.append(published.knots)
+                room -= size
+                self._serial = published.serial
+        moving = published.moving
+        if moving is not None and moving is not self._whole and now_s >= self._moving_s + tuned.MOVING_EVERY_S:
+            cut = self._cut(moving, room)
+            if cut is not None:
+                blocks.append(cut)
+                room -= len(write_block(cut))
+                self._moving_s = now_s
+                # A set that was cut is sent again when the link takes more, even if it stays the newest.
+                self._whole = moving if len(cut.records) == len(moving.records) else None
+        # No more than the link takes until the next: what a message takes itself is not to be taken for a queue.
+        room = min(room, max(round(tuned.TICK_S * self.link.bound_bytes_per_s), _LEAST_BYTES))
+        return blocks + self._static(published.static, room)
+
+    def _link(self, published: Published | None) -> dict[str, Any]:
+        return {
+            "bytes_per_s": round(self.link.rate_bytes_per_s),
+            "round_trip_ms": round(1e3 * self.link.round_trip_s, 1),
+            "static": [len(self._sent), 0 if published is None else len(published.static.records)],
+        }
+
+    def _cut(self, moving: MovingBlock, room: int) -> MovingBlock | None:
+        """The moving set's largest Gaussians, as many as the link takes in time; None: not now."""
+        takes = tuned.MOVING_SHARE * self.link.bound_bytes_per_s * tuned.MOVING_EVERY_S
+        count = min(len(moving.records), max(int(takes) // _MOVING_BYTES, tuned.LEAST_MOVING))
+        if count * _MOVING_BYTES > room:
+            self.link.short = True
+            return None
+        parts = moving.records[:count], moving.anchor[:count], moving.share[:count]
+        return MovingBlock(moving.anchors, moving.scales, *parts)
+
+    # --- what stands still --------------------------------------------------------------------
+
+    def _static(self, newest: StaticRecords, room: int) -> list[Block]:
+        """Chunks that are due, as many as fit."""
+        complete = bool(self._known.all())
+        if newest is not self._source and (complete or self._same(newest)):
+            self._take(newest)
+        static, blocks = self._source, list[Block]()
+        if static is None:
+            return blocks
+        while self._due:
+            first = self._due[0] * tuned.CHUNK
+            records = static.records[first : min(first + tuned.CHUNK, len(self._sent))]
+            room -= RECORD.itemsize * len(records) + _HEADS
+            if room < 0:
+                self.link.short = True
+                break
+            self._due.pop(0)
+            blocks.append(StaticBlock(self._set, len(self._sent), first, static.scales, records))
+            self._sent[first : first + len(records)] = records
+            self._known[first : first + len(records)] = True
+        if not complete and self._known.all() and static.unseen is not None:
+            blocks.append(UnseenBlock(self._set, static.unseen[: len(self._sent)]))
+        return blocks
+
+    def _same(self, newest: StaticRecords) -> bool:
+        return self._source is not None and newest.number == self._source.number
+
+    def _take(self, newest: StaticRecords) -> None:
+        """Find what of the newest records is to be sent: chunks that have changed, those with most weight in what
+        changed first; or a set anew, its largest Gaussians alone if the link does not take all."""
+        takes = int(tuned.NEW_SET_S * self.link.bound_bytes_per_s) // RECORD.itemsize
+        cut = len(self._sent) < len(newest.records)
+        wider = cut and bool(self._known.all()) and takes > 2 * len(self._sent)
+        if not self._same(newest) or wider:
+            count = min(len(newest.records), max(takes, tuned.CHUNK))
+            self._set += 1
+            self._sent, self._known = np.zeros(count, RECORD), np.zeros(count, np.bool_)
+        count = len(self._sent)
+        changed = noticeable(self._sent, newest.records[:count]) | ~self._known
+        share = _by_chunk(changed * newest.weight[:count]) / np.maximum(_by_chunk(newest.weight[:count]), 1e-30)
+        share += 2.0 * (_by_chunk(~self._known) > 0)
+        order = np.argsort(-share, kind="stable")
+        self._due = [int(k) for k in order if share[k] > tuned.CHANGED_SHARE]
+        self._source = newest
+
+
+def _by_chunk(values: NDArray) -> NDArray[np.float64]:
+    """Sums over the Gaussians of each chunk."""
+    return np.add.reduceat(values.astype(np.float64), np.arange(0, len(values), tuned.CHUNK)) if len(values) else values

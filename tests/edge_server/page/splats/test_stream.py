@@ -1,0 +1,229 @@
+"""The stream on the live page's port: what arrives, who gets it, and a browser that draws it."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import websocket
+
+from edge_server.live.state import EdgeState, Publication
+from edge_server.page import Page, start_page
+from edge_server.page.splats.messages import StreamReader, read_saved
+from edge_server.page.splats.stream import STREAM
+from freshfield.limits import MAX_VISITORS
+from freshfield.transport import Transport
+from tests.edge_server.fields.scenes import psnr
+from tests.edge_server.page.browser import Browser
+from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, snapshot
+from tests.edge_server.page.test_access_guard import get, lines, login
+from tests.edge_server.page.test_page import bare_state
+from tests.role_table import TOKENS
+from tests.support import wait_until
+
+
+def publish(state: EdgeState, shown: object, number: int = 0) -> None:
+    state.publish(Publication(number, 1.0, state.now_ns(), None, (), (), 0.0, 20.0), shown)
+
+
+@contextlib.contextmanager
+def page_of(state: EdgeState, transport: Transport | None = None) -> Iterator[Page]:
+    page = start_page(state, "127.0.0.1", 0, transport)
+    try:
+        yield page
+    finally:
+        page.stop()
+
+
+class Drawer:
+    """A visitor who reads the stream and says so."""
+
+    def __init__(self, page: Page, **headers: str) -> None:
+        address = f"ws://127.0.0.1:{page.port}{STREAM}"
+        self.socket = websocket.create_connection(address, timeout=20, header=lines(headers))
+        self.reader = StreamReader()
+
+    def read(self, answer: bytes | None = None) -> None:
+        """One message, and the answer to it, after another one if given."""
+        data = self.socket.recv()
+        self.reader.read(data)
+        for each in (answer, data[:4]):
+            if each is not None:
+                self.socket.send(each, websocket.ABNF.OPCODE_BINARY)
+
+    def read_until(self, wanted) -> None:
+        end = time.monotonic() + 20.0
+        while not wanted():
+            assert time.monotonic() < end, self.reader.status
+            self.read()
+
+
+def test_a_visitor_gets_everything_then_what_changes():
+    state = bare_state()
+    with page_of(state) as page:
+        drawer = Drawer(page)
+        drawer.read()
+        assert drawer.reader.scene is None and drawer.reader.status["scenario"] == state.scenario
+        publish(state, snapshot())
+        drawer.read_until(lambda: len(drawer.reader.at(NEWEST_S)) == 820)
+        assert drawer.reader.scene.radius_m == BOX.radius_m
+        publish(state, snapshot(gaussians(500, 7), movers=0), 1)
+        drawer.read_until(lambda: len(drawer.reader.at(NEWEST_S)) == 500)
+        drawer.socket.close()
+        wait_until(lambda: not page._splats._connected, "the end of the visit")
+        assert page._splats._thread.is_alive()
+
+
+def test_a_field_of_another_kind_is_said():
+    state = bare_state()
+    with page_of(state) as page:
+        publish(state, object())
+        drawer = Drawer(page)
+        drawer.read_until(lambda: "does not consist of Gaussians" in drawer.reader.status.get("line", ""))
+
+
+@pytest.mark.stability
+def test_answers_that_are_none_are_counted_and_cost_nothing():
+    state = bare_state()
+    with page_of(state) as page:
+        publish(state, snapshot())
+        drawer = Drawer(page)
+        for answer in (b"", b"abc", b"abcde", bytes(60_000), b"\xff\xff\xff\xff"):
+            drawer.read(answer)
+        drawer.read_until(lambda: len(drawer.reader.at(NEWEST_S)) > 0)
+
+
+def test_the_rules_of_the_page_hold_for_the_stream():
+    state = bare_state()
+    with page_of(state, Transport(tokens=TOKENS, insecure=True)) as page:
+        publish(state, snapshot())
+        for path in ("/splats/", "/splats/splats.js"):
+            assert get(page.port, path)[0] == 401
+            status, headers = get(page.port, path, **login("viewer"))
+            assert status == 200 and "script-src 'self'" in headers["Content-Security-Policy"]
+        assert get(page.port, "/splats/", Origin="http://other.org", **login("viewer"))[0] == 403
+        assert get(page.port, "/splats", **login("viewer"))[0] == 301
+        assert get(page.port, "/splats/../records.py", **login("viewer"))[0] in (404, 400)
+        with pytest.raises(websocket.WebSocketBadStatusException, match="401"):
+            Drawer(page)
+        drawer = Drawer(page, **login("viewer"))
+        drawer.read_until(lambda: drawer.reader.scene is not None)
+        visitors = [drawer] + [Drawer(page, **login("viewer")) for _ in range(MAX_VISITORS - 1)]
+        with pytest.raises(websocket.WebSocketBadStatusException, match="503"):
+            Drawer(page, **login("viewer"))
+        for each in visitors:
+            each.socket.close()
+
+
+# --- a browser -------------------------------------------------------------------------------------
+
+# Draws at a fixed instant and returns the canvas.
+DRAW = """
+(() => {
+  const { reader, renderer } = window.splats;
+  const canvas = renderer.canvas;
+  [canvas.width, canvas.height] = [%d, %d];
+  renderer.draw(reader, %s, %f);
+  return canvas.toDataURL("image/png");
+})()
+"""
+
+
+def drawn(browser: Browser, instant_s: float) -> np.ndarray:
+    """What the browser draws from POSE, RGB float (H, W, 3)."""
+    turn, eye = POSE[:3, :3].T, BOX.normalise(POSE[:3, 3])
+    fov = 2 * np.arctan(0.5 * LENS.height / LENS.fy)
+    camera = json.dumps({"turn": turn.ravel().tolist(), "eye": eye.tolist(), "fov": fov})
+    data = browser.evaluate(DRAW % (LENS.width, LENS.height, camera, instant_s))
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(data.partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.float32) / 255.0
+
+
+def rendered(shown, instant_s: float) -> np.ndarray:
+    return np.clip(shown.at(ORIGIN_NS + round(instant_s * 1e9)).render(POSE, LENS).color, 0, 1)
+
+
+@pytest.mark.browser
+def test_the_browser_draws_what_the_edge_renders():
+    state, shown = bare_state(), snapshot()
+    with page_of(state) as page, Browser(page.url + "/splats/?full", 640, 480) as browser:
+        publish(state, shown)
+        arrived = "window.splats && splats.reader.moves && splats.reader.shown.total + splats.reader.moving.count"
+        browser.wait_for(lambda: browser.evaluate(arrived) == 820, "all Gaussians")
+        for ahead_s in (0.0, 0.12, 0.9):
+            assert psnr(drawn(browser, NEWEST_S + ahead_s), rendered(shown, NEWEST_S + ahead_s)) > 50.0
+        assert psnr(drawn(browser, NEWEST_S), rendered(shown, NEWEST_S + 0.2)) < 40.0  # the test can fail
+        still = snapshot(gaussians(1300, 9), movers=0)
+        publish(state, still, 1)
+        browser.wait_for(lambda: browser.evaluate("splats.reader.shown.total") == 1300, "the new set")
+        assert psnr(drawn(browser, NEWEST_S), rendered(still, NEWEST_S)) > 50.0
+        # A context that is lost, as when a graphics driver starts anew.
+        browser.evaluate("window.lose = splats.renderer.gl.getExtension('WEBGL_lose_context'); lose.loseContext()")
+        browser.wait_for(lambda: browser.evaluate("splats.renderer.gl.isContextLost()"), "the loss")
+        browser.evaluate("lose.restoreContext()")
+        browser.wait_for(lambda: not browser.evaluate("splats.renderer.gl.isContextLost()"), "its return")
+        assert psnr(drawn(browser, NEWEST_S), rendered(still, NEWEST_S)) > 50.0
+        assert browser.errors == [] and all(f":{page.port}" in address for address in browser.requests)
+
+
+SAVED = """
+new Promise(resolve => {
+  const reader = new FileReader();
+  reader.onload = () => resolve(reader.result.split(",")[1]);
+  reader.readAsDataURL(splats.savedFile());
+})
+"""
+
+
+@pytest.mark.browser
+def test_a_saved_stream_is_played_back_without_the_edge():
+    state, shown = bare_state(), snapshot()
+    with Browser("about:blank", 640, 480) as browser:
+        with page_of(state) as page:
+            publish(state, shown)
+            browser.call("Page.navigate", url=page.url + "/splats/?full")
+            arrived = "window.splats && splats.reader.moves && splats.reader.shown.total + splats.reader.moving.count"
+            browser.wait_for(lambda: browser.evaluate(arrived) == 820, "all Gaussians")
+            data = base64.b64decode(browser.evaluate(SAVED))
+        reader, times = StreamReader(), []
+        for came_s, message in read_saved(data):
+            reader.read(message)
+            times.append(came_s)
+        assert times == sorted(times) and times[0] == 0.0
+        assert len(reader.at(NEWEST_S)) == 820
+        assert len(list(read_saved(data[:-1]))) == len(times) - 1
+        bytes_ = f"Uint8Array.from(atob('{base64.b64encode(data).decode()}'), c => c.charCodeAt(0))"
+        browser.evaluate(f"splats.open(new File([{bytes_}], 'room.ffsplats'))")
+        browser.wait_for(lambda: browser.evaluate("splats.reader.shown.total") == 700, "the file's Gaussians")
+        browser.wait_for(lambda: browser.evaluate("splats.reader.moving?.count") == 120, "what moves")
+        assert psnr(drawn(browser, NEWEST_S), rendered(shown, NEWEST_S)) > 50.0
+        browser.evaluate("splats.open(new File(['nothing'], 'x.ffsplats'))")
+        browser.wait_for_text("x.ffsplats holds no messages")
+
+
+@pytest.mark.browser
+def test_the_page_says_what_is_wrong_and_comes_back():
+    state = bare_state()
+    page = start_page(state, "127.0.0.1", 0)
+    with Browser(page.url + "/splats/", 390, 700) as browser:
+        try:
+            publish(state, snapshot())
+            browser.wait_for_text("Gaussians,")
+        finally:
+            page.stop()
+        browser.wait_for_text("The connection broke")
+        again = start_page(state, "127.0.0.1", page.port)
+        try:
+            total = len(gaussians(900, 3))
+            publish(state, replace(snapshot(gaussians(total, 3), movers=0)), 1)
+            browser.wait_for(lambda: browser.evaluate("splats.reader.shown.total") == total, "the stream again")
+            assert "broke" not in browser.text()
+        finally:
+            again.stop()

@@ -1,0 +1,144 @@
+"""What a visitor is sent over links of other speeds, in virtual time."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+import pytest
+
+from edge_server.page.splats import settings as tuned
+from edge_server.page.splats.messages import KnotsBlock, MovingBlock, StaticBlock, StreamReader, read_message
+from edge_server.page.splats.published import Publisher
+from edge_server.page.splats.records import from_records
+from edge_server.page.splats.visitor import LinkWindow, Visitor
+from tests.edge_server.page.splats.gaussians import NEWEST_S, ORIGIN_NS, gaussians, snapshot
+
+COUNT = 6000
+
+
+class Link:
+    """A visitor at the end of a link: bytes a second, one-way delay, first come first served."""
+
+    def __init__(self, bytes_per_s: float, delay_s: float = 0.02) -> None:
+        self.rate, self.delay_s = bytes_per_s, delay_s
+        self.visitor, self.reader, self.publisher = Visitor(), StreamReader(), Publisher(0)
+        self.free_s = 0.0
+        self.under_way: deque[tuple[float, bytes]] = deque()
+        self.acknowledged: deque[tuple[float, int]] = deque()
+        self.lags_s: list[float] = []
+        self.blocks: list[tuple[float, object]] = []
+
+    def run(self, seconds: range, shown=None) -> None:
+        """Ticks of 30 ms; the field trains a little at each. shown: of an instant, what is published."""
+        for tick in seconds:
+            now_s = tick * tuned.TICK_S
+            while self.under_way and self.under_way[0][0] <= now_s:
+                came_s, data = self.under_way.popleft()
+                self.reader.read(data)
+                number, _, blocks = read_message(data)
+                self.blocks += [(now_s, block) for block in blocks]
+                self.acknowledged.append((came_s + self.delay_s, number))
+            while self.acknowledged and self.acknowledged[0][0] <= now_s:
+                self.visitor.acknowledged(self.acknowledged.popleft()[1], now_s)
+            published = self.publisher.take((shown or trained)(now_s), now_s)
+            data = self.visitor.message(published, ORIGIN_NS, {"line": ""}, now_s)
+            if data is not None:
+                self.free_s = max(self.free_s, now_s) + len(data) / self.rate
+                self.under_way.append((self.free_s + self.delay_s, data))
+                self.lags_s.append(self.free_s - now_s)
+
+    def of(self, kind: type, since_s: float = 0.0) -> list:
+        return [block for at_s, block in self.blocks if isinstance(block, kind) and at_s >= since_s]
+
+
+def trained(now_s: float):
+    """The same Gaussians, a little other each half second; frames come on."""
+    params = gaussians(COUNT, 0) + np.float32(0.02 * int(now_s / 0.5) / 100)
+    return snapshot(params, movers=1000, newest_s=NEWEST_S + now_s)
+
+
+def ticks(seconds: float, since_s: float = 0.0) -> range:
+    return range(round(since_s / tuned.TICK_S), round(seconds / tuned.TICK_S))
+
+
+def test_a_fast_link_has_everything_and_goes_on():
+    link = Link(2e6)
+    link.run(ticks(3.0))
+    assert len(link.reader.at(NEWEST_S)) == COUNT + 1000
+    sets = link.of(MovingBlock, since_s=1.0)
+    assert 15 <= len(sets) <= 20  # ten a second
+    assert len(link.of(KnotsBlock, since_s=1.0)) > 50  # with each publication
+    assert max(link.lags_s) < 0.12
+    assert link.reader.status["link"]["static"] == [COUNT, COUNT]
+
+
+@pytest.mark.parametrize("kilobytes, all_of_it, lag_s", [(15, False, 0.65), (60, True, 0.3)])
+def test_a_slow_link_is_kept_short_and_shows_what_is_large(kilobytes, all_of_it, lag_s):
+    link = Link(1e3 * kilobytes)
+    link.run(ticks(12.0))
+    assert np.quantile(link.lags_s[len(link.lags_s) // 3 :], 0.9) < lag_s  # of a queue that would hold seconds
+    static, drawn = link.publisher._newest.static, link.reader._shown.params
+    here = len(drawn)
+    assert (here == COUNT) == all_of_it and here > 0.15 * COUNT
+    places = from_records(static.records[:here], static.scales)[:, :3]
+    np.testing.assert_allclose(drawn[:, :3], places, atol=0.006)  # the largest ones, some of them not the newest
+    sizes = {len(block.records) for block in link.of(MovingBlock, since_s=4.0)}
+    assert sizes and max(sizes) < 1000
+    assert len(link.of(KnotsBlock, since_s=4.0)) > 3 * len(link.of(MovingBlock, since_s=4.0)) > 3
+    used = sum(len(b.records) * 16 for b in link.of(StaticBlock)) + sum(
+        len(b.records) * 21 for b in link.of(MovingBlock)
+    )
+    assert used > 0.5 * 12.0 * link.rate  # and it is used
+
+
+def test_a_link_that_becomes_faster_gets_the_rest():
+    link = Link(15e3)
+    link.run(ticks(6.0))
+    assert link.visitor.shown_static < COUNT
+    link.rate = 2e6
+    link.run(ticks(12.0, 6.0))
+    assert link.visitor.shown_static == COUNT and len(link.reader.at(NEWEST_S)) == COUNT + 1000
+
+
+def test_who_reads_nothing_costs_a_window():
+    visitor, publisher, sent = Visitor(), Publisher(0), 0
+    for tick in ticks(30.0):
+        data = visitor.message(publisher.take(trained(0.0), 0.0), ORIGIN_NS, {}, tick * tuned.TICK_S)
+        sent += 0 if data is None else len(data)
+    assert tuned.FIRST_WINDOW / 2 < sent <= 1.1 * tuned.FIRST_WINDOW
+
+
+def test_a_growing_field_replaces_sets_that_are_whole():
+    link = Link(300e3)
+    counts = [len(link.reader.at(-1e9))]
+
+    def growing(now_s):
+        return snapshot(gaussians(COUNT, 0)[: 2000 + 80 * int(now_s / 0.09)], movers=0)
+
+    for second in range(8):
+        link.run(ticks(second + 1.0, float(second)), growing)
+        counts.append(len(link.reader.at(-1e9)))
+    assert counts == sorted(counts) and counts[-1] > 4500 and len(set(counts)) >= 5
+    assert {block.total for block in link.of(StaticBlock)} >= set(counts[1:])
+
+
+@pytest.mark.stability
+def test_numbers_that_were_not_sent_change_nothing():
+    link = LinkWindow()
+    link.sent(3, 1000, 0.0)
+    for number in (0, 2, 4, 2**32 - 1):
+        link.acknowledged(number, 1.0)
+    assert link.under_way == 1000
+    link.acknowledged(3, 0.05)
+    link.acknowledged(3, 0.06)
+    assert link.under_way == 0 and link.round_trip_s == pytest.approx(0.05)
+
+
+@pytest.mark.stability
+def test_before_there_is_a_field_the_status_says_so():
+    visitor = Visitor()
+    data = visitor.message(None, 5, {"line": "compiling"}, 0.0)
+    assert read_message(data)[2][0].content["line"] == "compiling"
+    assert visitor.message(None, 5, {"line": "compiling"}, 0.1) is None
+    assert visitor.message(None, 5, {"line": "compiling"}, tuned.STATUS_EVERY_S) is not None
