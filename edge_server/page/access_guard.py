@@ -29,6 +29,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosedError, InvalidMessage
 from websockets.http11 import Request, Response
 
+from edge_server.page.branding import branded
 from edge_server.page.settings import SAY_EVERY_S
 from edge_server.page.splats.stream import STREAM, file_response
 from freshfield.access import ANYBODY, CHANGE, Caller, HttpDoor, HttpRefused
@@ -264,6 +265,8 @@ class AccessGuard:
                 return None
         response = (file_response(request.path) if self.splats else None) or process(connection, request)
         if response is not None:
+            if response.headers.get("Content-Type", "").startswith("text/html"):
+                _brand(response)
             # The pages of others may not show ours in a frame, to have it clicked on.
             response.headers.setdefault("Content-Security-Policy", "frame-ancestors 'self'")
             if self._access.access is not None and authorization is not None:
@@ -328,6 +331,13 @@ class VisitorConnection(ServerConnection):
         except TimeoutError:
             self.transport.abort()
             raise ConnectionClosedError(None, None) from None
+
+
+def _brand(response: Response) -> None:
+    """Put the page's title, icon and styles into an HTML document."""
+    response.body = branded(bytes(response.body), response.headers["Content-Encoding"] == "gzip")
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
 
 
 def _one(request: Request, name: str) -> str | None:

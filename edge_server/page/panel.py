@@ -41,14 +41,14 @@ class Panel:
         self._troubles = gui.add_html("", visible=False)
         self._status = gui.add_html("")
         self._decision = gui.add_html("", visible=False)
-        self._caption = gui.add_html(markup.note("Waiting for a held-out frame to compare with."))
-        self._pair: Any = None
-        self._compared_update: int | None = None
-        self._refreshes = 0
         self._network: NetworkControl | None = None
         if network is not None:
             with gui.add_folder("Change the network"):
                 self._network = NetworkControl(gui, network, None)
+        self._caption = gui.add_html(markup.note("Waiting for a held-out frame to compare with."))
+        self._pair: Any = None
+        self._compared_update: int | None = None
+        self._refreshes = 0
         with gui.add_folder("Controls"):
             self.controls = ControlPanel(server, state)
         side = gui.add_panel()

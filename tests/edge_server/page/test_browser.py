@@ -69,6 +69,22 @@ def test_nothing_fails_and_nothing_outside_is_asked_for(shown):
     assert all(f":{page.port}" in address for address in browser.requests), browser.requests
 
 
+def test_on_a_phone_the_scene_is_above_the_panels_and_nothing_is_clipped(shown):
+    _, page, _ = shown
+    with Browser(page.url, 390, 844, timeout_s=90.0) as phone:
+        phone.wait_for_text("PSNR on cam04")
+        size_of = "(({width, height}) => [width, height])(document.querySelector('%s').getBoundingClientRect())"
+        assert phone.evaluate(size_of % "canvas") == [390, 422]
+        assert phone.evaluate(size_of % ".mantine-Paper-root") == [390, 422]
+        assert phone.evaluate("document.title") == "freshfield"
+        outside = "[...document.querySelectorAll('.mantine-Paper-root *')].filter((e) => e.innerText && %s).length"
+        assert phone.evaluate(outside % "e.getBoundingClientRect().right > 391") == 0
+        phone.close_notices()
+        phone.wait_for(lambda: phone.screenshot()[120:300].std() > 15, "a picture of the scene")
+        phone.click(100, 440)  # folds the panels up
+        phone.wait_for(lambda: phone.evaluate(size_of % "canvas")[1] > 780, "a scene of the whole window")
+
+
 def _center(image: np.ndarray) -> np.ndarray:
     return image[250:650, 450:1150]
 
