@@ -18,7 +18,7 @@ import viser
 
 from edge_server.live.state import EdgeState
 from edge_server.page.access_guard import AccessGuard
-from edge_server.page.controls import notify
+from edge_server.page.controls import add_view_choice, notify
 from edge_server.page.network_control import EmulatorControl
 from edge_server.page.panel import Panel
 from edge_server.page.rendering import RenderLoop
@@ -97,6 +97,8 @@ def start_page(
 
     async def joined(client: viser.ClientHandle) -> None:
         renders.add_client(client)
+        add_view_choice(client, panel.view_order, renders)
+        guard.looks[client.client_id] = client.gui._gui_input_handle_from_uuid
 
         async def moved(camera: Any) -> None:
             renders.camera_moved(client)
@@ -105,6 +107,7 @@ def start_page(
 
     async def left(client: viser.ClientHandle) -> None:
         renders.remove_client(client)
+        guard.looks.pop(client.client_id, None)
         scene.remove_client(client)
 
     server.on_client_connect(joined)

@@ -112,9 +112,10 @@ class AccessGuard:
     access: checks the login and the origin of requests.
     tls: for the port; None: no TLS.
     controls: the controls whose values may be set, by id.
+    looks: of each visitor, the controls that change only what that visitor sees, as ``controls``. Viewers have them.
     on_refused: called with the connection of a viewer who tried to change something.
     splats: serves those who draw splats themselves; None: nobody may.
-    The last three are set once the page has been made.
+    The last four are set once the page has been made.
     """
 
     def __init__(self, access: HttpDoor, tls: ssl.SSLContext | None) -> None:
@@ -122,6 +123,7 @@ class AccessGuard:
         self.refused: Counter[str] = Counter()
         self._quiet_until_s: dict[str, float] = {}
         self.controls: dict[str, Any] = {}
+        self.looks: dict[int, dict[str, Any]] = {}
         self.on_refused: Callable[[ServerConnection], None] = lambda connection: None
         self.splats: Callable[[ServerConnection], Awaitable[None]] | None = None
         self._access = access
@@ -206,10 +208,11 @@ class AccessGuard:
         if not connection.in_time():
             return self._refuse("more than a person can click")
         if isinstance(message, Update):
-            if not connection.caller.may(CHANGE):
+            own = next((each for each in self.looks.values() if message.uuid in each), None)
+            if own is None and not connection.caller.may(CHANGE):
                 self.on_refused(connection)
                 return self._refuse("a change by a viewer")
-            return message.sound(self.controls) or self._refuse("a value that no control takes")
+            return message.sound(self.controls if own is None else own) or self._refuse("a value that no control takes")
         return True
 
     def acknowledges(self, data: str | bytes) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge_server.page.settings import FRESH_MS, STALE_MS
 
@@ -48,6 +49,13 @@ def scale_color(fraction: float) -> RGB:
     """Color at ``fraction`` of the scale: green, yellow at the middle, vermillion."""
     r, g, b = (np.interp(fraction, (0.0, 0.5, 1.0), stops) for stops in zip(FRESH, MIDDLE, STALE))
     return round(float(r)), round(float(g)), round(float(b))
+
+
+def age_colors(ages_ms: NDArray[np.float64]) -> NDArray[np.float32]:
+    """``age_color`` of many ages (N,), in [0, 1], (N, 3)."""
+    scale = np.array([scale_color(step / STEPS) for step in range(STEPS + 1)], np.float32) / 255
+    fractions = np.log(np.maximum(ages_ms, FRESH_MS) / FRESH_MS) / np.log(STALE_MS / FRESH_MS)
+    return scale[np.round(np.minimum(fractions, 1.0) * STEPS).astype(int)]
 
 
 def css(color: RGB) -> str:

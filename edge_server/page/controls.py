@@ -17,7 +17,9 @@ import viser
 
 from edge_server.live.state import EdgeState
 from edge_server.page.markup import frontier, note
+from edge_server.page.rendering import RenderLoop
 from edge_server.page.settings import NOTICE_S
+from edge_server.page.views import ERROR, HINT, PICTURE, TRUTH, VIEWS
 from edge_server.scheduler import make_policy, policy_help, short_name
 
 log = logging.getLogger(__name__)
@@ -120,6 +122,19 @@ class ControlPanel:
             except ValueError:
                 self._parameter[policy] = "value"
         return self._parameter[policy]
+
+
+def add_view_choice(client: Any, order: float, renders: RenderLoop) -> None:
+    """Let a visitor, and this one alone, choose what of the scene they see. order: of the input in the panel."""
+    choice = client.gui.add_dropdown("show", VIEWS, initial_value=PICTURE, hint=HINT, order=order)
+    # The visitor's own node of this name takes the place of what all share: cameras in front of a comparison disturb.
+    cameras = client.scene.add_frame("/cameras", show_axes=False)
+
+    def chosen(event: Any) -> None:
+        cameras.visible = choice.value not in (TRUTH, ERROR)
+        renders.choose(client, choice.value)
+
+    choice.on_update(chosen)
 
 
 def _finite_or_zero(value: float | None) -> float:

@@ -41,6 +41,8 @@ class Panel:
         self._troubles = gui.add_html("", visible=False)
         self._status = gui.add_html("")
         self._decision = gui.add_html("", visible=False)
+        self.view_order = self._decision.order + 0.5
+        """Of what each visitor has alone, below the status."""
         self._network: NetworkControl | None = None
         if network is not None:
             with gui.add_folder("Change the network"):

@@ -17,8 +17,9 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Snapshot
-from edge_server.live.state import EdgeState
+from edge_server.fields import Rendering, Snapshot
+from edge_server.live.state import Comparison, EdgeState
+from edge_server.page import views
 from edge_server.page.viewpoint import row_band, visitor_camera
 from freshfield.geometry import Pinhole
 
@@ -57,7 +58,6 @@ MIN_GAP_S = 0.05
 SETTLE_S = 0.25
 STRIPE_PX, SHADE = 6, 0.7  # width and brightness of the stripes over what no camera has seen
 COARSE = 4  # that is asked at so many times fewer pixels a side: it takes a few milliseconds then
-BACKDROP = np.array([18, 20, 24], np.float32) / 255
 
 
 @dataclass
@@ -68,15 +68,17 @@ class ClientState:
     serial: number of viewpoints so far.
     level: the finest of LEVELS sent for this viewpoint and ``renderer``, -1 for none.
     sent: number of images since the last blank background.
+    view: what of the scene is shown, one of ``views.VIEWS``.
     """
 
     client: Any
     viewpoint: tuple[NDArray[np.float64], NDArray[np.float64], float, int, int] | None = None
     moved_at: float = 0.0
     serial: int = 0
-    renderer: Snapshot | None = None
+    renderer: Snapshot | Comparison | None = None
     level: int = -1
     sent: int = 0
+    view: str = views.PICTURE
 
 
 class RenderLoop:
@@ -112,6 +114,15 @@ class RenderLoop:
     def remove_client(self, client: Any) -> None:
         with self._wake:
             self._visitors.pop(client.client_id, None)
+
+    def choose(self, client: Any, view: str) -> None:
+        """Show the client another of ``views.VIEWS`` from now on."""
+        with self._wake:
+            visitor = self._visitors.get(client.client_id)
+            if visitor is not None:
+                visitor.view, visitor.level = view, -1
+                visitor.serial += 1
+                self._wake.notify_all()
 
     def camera_moved(self, client: Any) -> None:
         """Replace the viewpoint to render for the client."""
@@ -159,15 +170,44 @@ class RenderLoop:
             visitors = [v for v in self._visitors.values() if v.viewpoint is not None]
         if not visitors or renderer is None:
             return False
-        levels = [(self._next_level(visitor, renderer, now), visitor.sent, visitor) for visitor in visitors]
+        levels = [
+            (self._next_level(visitor, self._compared(visitor) or renderer, now), visitor.sent, visitor)
+            for visitor in visitors
+        ]
         due = [(level, sent, visitor) for level, sent, visitor in levels if level is not None]
         if not due:
             return False
         level, _, visitor = min(due, key=lambda item: item[:2])
-        self._render_and_send(visitor, renderer, level)
+        comparison = self._compared(visitor)
+        if comparison is None:
+            self._render_and_send(visitor, renderer, level)
+        else:
+            self._send_comparison(visitor, comparison)
         return True
 
-    def _next_level(self, visitor: ClientState, renderer: Snapshot, now: float) -> int | None:
+    def _compared(self, visitor: ClientState) -> Comparison | None:
+        """What a visitor who looks at truth or error sees; None for another view, and before there is a truth."""
+        return self._state.comparison if visitor.view in (views.TRUTH, views.ERROR) else None
+
+    def _send_comparison(self, visitor: ClientState, comparison: Comparison) -> None:
+        with self._wake:
+            viewpoint, serial = visitor.viewpoint, visitor.serial
+        assert viewpoint is not None
+        began = perf_counter()
+        _, camera = visitor_camera(*viewpoint, rows=LEVELS[-1].max_rows)
+        image = views.compared(comparison, camera.width, camera.height, visitor.view == views.ERROR)
+        self._send(visitor, image)
+        self._not_before[NEWER] = began + max((perf_counter() - began) / LEVELS[NEWER].max_share, MIN_GAP_S)
+        with self._wake:
+            if visitor.serial == serial:  # nothing finer will follow
+                visitor.level, visitor.renderer = len(LEVELS) - 1, comparison
+
+    def _send(self, visitor: ClientState, image: NDArray[np.float32]) -> None:
+        if visitor.client.client_id in self._visitors:  # has not left meanwhile
+            visitor.client.scene.set_background_image(browser_image(image), format="jpeg", jpeg_quality=85)
+            visitor.sent += 1
+
+    def _next_level(self, visitor: ClientState, renderer: Snapshot | Comparison, now: float) -> int | None:
         """The level to render next for a visitor; None if it has the finest or must wait."""
         if visitor.level < 0:
             level = MOVING
@@ -189,20 +229,22 @@ class RenderLoop:
         began = perf_counter()
         try:
             shown = renderer.at(self._state.now_ns())
-            image = self._render(shown, pose, camera, visitor, serial, level)
+            rendering = self._render(shown, pose, camera, visitor, serial, level)
         finally:
             spent = perf_counter() - began
             # The second bound matters if rendering is cheap: it spares the network and the browser.
             self._not_before[level] = began + max(spent / LEVELS[level].max_share, MIN_GAP_S)
-        if image is None:
+        if rendering is None:
             return
         self._adapt(level, spent)
-        if level and isinstance(shown, TellsUnseen):
+        image = rendering.color
+        if visitor.view == views.DEPTH:
+            image = views.depth_view(rendering)
+        elif visitor.view == views.AGE:
+            image = views.age_view(rendering, pose, camera, self._state.cameras())
+        elif level and isinstance(shown, TellsUnseen):
             image = hatched(image, shown.unseen(pose, camera.scaled(1.0 / COARSE)))
-        if visitor.client.client_id not in self._visitors:  # has left meanwhile
-            return
-        visitor.client.scene.set_background_image(browser_image(image), format="jpeg", jpeg_quality=85)
-        visitor.sent += 1
+        self._send(visitor, image)
         with self._wake:
             if visitor.serial == serial:
                 visitor.level, visitor.renderer = level, renderer
@@ -223,8 +265,8 @@ class RenderLoop:
 
     def _render(
         self, renderer: Snapshot, pose: NDArray, camera: Pinhole, visitor: ClientState, serial: int, level: int
-    ) -> NDArray[np.float32] | None:
-        """The color, rendered in bands; None if the visitor has moved meanwhile. Every band projects the whole
+    ) -> Rendering | None:
+        """The image, rendered in bands; None if the visitor has moved meanwhile. Every band projects the whole
         field again, so that there are no more of them than the time of the last such image calls for."""
         bands = max(1, round(self._took_s[level] / BAND_S)) if level else 1
         edges = np.linspace(0, camera.height, min(bands, camera.height) + 1).astype(int)
@@ -232,8 +274,8 @@ class RenderLoop:
         for top, bottom in pairwise(edges):
             if level and (visitor.serial != serial or self._stopped):
                 return None
-            parts.append(renderer.render(pose, row_band(camera, int(top), int(bottom - top))).color)
-        return np.concatenate(parts)
+            parts.append(renderer.render(pose, row_band(camera, int(top), int(bottom - top))))
+        return Rendering(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("color", "depth", "opacity")))
 
     def _log_error(self, error: Exception) -> None:
         """Log an error once, not at every frame, and pause for a second."""
@@ -262,7 +304,7 @@ def hatched(image: NDArray[np.float32], unseen: NDArray[np.bool_] | None) -> NDA
 def browser_image(color: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Color (H, W, 3) as uint8; pixels that are not finite show the backdrop."""
     good = np.isfinite(color).all(axis=-1, keepdims=True)
-    return (np.clip(np.where(good, color, BACKDROP), 0, 1) * 255 + 0.5).astype(np.uint8)
+    return (np.clip(np.where(good, color, views.BACKDROP), 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def _same(a: tuple | None, b: tuple) -> bool:

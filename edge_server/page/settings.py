@@ -37,3 +37,13 @@ ANSWER_S = 3.0
 """For the emulator's answer: after a longer time a visitor presses again."""
 STATUS_LAG_S = 1.0
 """Until the emulator's status tells of a change: it is written, and read, twice a second."""
+SOLID = 0.5
+"""From this opacity on a pixel has a depth."""
+ERROR_GAIN = 4.0
+"""Of differences, as in the report's figures: one of 10 % of the range is plain to see."""
+AGE_VIEW_STEP = 4
+"""Pixels from one point whose age is reckoned to the next: 9 cameras then take 10 ms at 480 rows."""
+AGE_VIEW_LIGHT = 0.35
+"""Least share of an age's color: the picture's shades fill the rest, so that shapes can be told."""
+LABEL_PX = 10
+"""Margin of the words on a large image."""

@@ -26,7 +26,8 @@ from edge_server.page.access_guard import AccessGuard
 from freshfield.access import HttpDoor
 from freshfield.limits import MAX_SCRAPES, MAX_VISITOR_MESSAGE_BYTES
 from freshfield.transport import Transport, TransportError
-from tests.edge_server.page.test_page import bare_state
+from tests.edge_server.page.preview import BallScene
+from tests.edge_server.page.test_page import bare_state, publication
 from tests.edge_server.page.visitor import Visitor
 from tests.role_table import TOKENS, cells_of
 from tests.support import free_port, wait_until
@@ -113,6 +114,24 @@ def test_who_may_change(what: str, who: str, may: bool) -> None:
             else:
                 visitor.wait_for(lambda: visitor.counts["NotificationShowMessage"], "a word about it")
     assert state.controls.paused == may
+
+
+def test_who_may_only_look_chooses_what_they_see_for_themselves_alone() -> None:
+    state = bare_state()
+    state.publish(publication(0), BallScene(0.0))
+    with page_of(state, LOGIN, "0.0.0.0") as page, contextlib.ExitStack() as opened:
+        visitor, other = (opened.enter_context(Visitor(page.port, headers=lines(login("viewer")))) for _ in range(2))
+        visitor.wait_for(lambda: len(guard_of(page).looks) == 2 and other.images and visitor.images, "the picture")
+        mine, theirs = (guard_of(page).looks[number] for number in sorted(guard_of(page).looks))
+        (choice,), at = mine, visitor.images
+        visitor.send("GuiUpdateMessage", uuid=choice, updates={"value": "no such view"})
+        visitor.send("GuiUpdateMessage", uuid=choice, updates={"value": "depth"})
+        visitor.wait_for(lambda: visitor.images > at, "an image of depth")
+        assert guard_of(page).refused == {"a value that no control takes": 1}
+        assert [each.view for each in page._renders._visitors.values()] == ["depth", "picture"]
+        assert [handle.value for handle in (*mine.values(), *theirs.values())] == ["depth", "picture"]
+        visitor.close()
+        other.wait_for(lambda: len(guard_of(page).looks) == 1, "the end of what the other had")
 
 
 @pytest.mark.parametrize(("what", "who", "may"), cells_of("metrics"))

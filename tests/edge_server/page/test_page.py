@@ -109,7 +109,7 @@ def test_an_image_at_rest_has_a_band_for_every_tenth_of_a_second_that_the_last_o
     loop._adapt(finest, took_s)
     broken, visitor = Broken(), ClientState(None)
     camera = Pinhole.from_fov(40, 300, 60)
-    assert loop._render(broken, np.eye(4), camera, visitor, visitor.serial, finest).shape == (300, 40, 3)
+    assert loop._render(broken, np.eye(4), camera, visitor, visitor.serial, finest).color.shape == (300, 40, 3)
     assert broken.renders == bands
     broken.renders = 0
     loop._render(broken, np.eye(4), camera, visitor, visitor.serial, MOVING)
@@ -158,7 +158,7 @@ def test_the_tiles_say_the_latest_score_and_the_ages_of_training_cameras():
 
 def test_what_cameras_see_is_reckoned_when_they_stand_still():
     server = MagicMock()
-    server.gui.add_html.side_effect = lambda content, **_: SimpleNamespace(content=content, visible=True)
+    server.gui.add_html.side_effect = lambda content, **_: SimpleNamespace(content=content, visible=True, order=0.0)
     shown = panel.Panel(server, bare_state())
 
     def coverage_of(*places_m, depth=()):
