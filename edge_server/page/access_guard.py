@@ -266,10 +266,12 @@ class AccessGuard:
             connection.draws = request.path == STREAM and self.splats is not None
             if connection.draws:
                 return None
-        response = (file_response(request.path) if self.splats else None) or process(connection, request)
-        if response is not None:
-            if response.headers.get("Content-Type", "").startswith("text/html"):
+        response = file_response(request.path) if self.splats else None
+        if response is None:
+            response = process(connection, request)
+            if response is not None and response.headers.get("Content-Type", "").startswith("text/html"):
                 _brand(response)
+        if response is not None:
             # The pages of others may not show ours in a frame, to have it clicked on.
             response.headers.setdefault("Content-Security-Policy", "frame-ancestors 'self'")
             if self._access.access is not None and authorization is not None:
@@ -337,7 +339,7 @@ class VisitorConnection(ServerConnection):
 
 
 def _brand(response: Response) -> None:
-    """Put the page's title, icon and styles into an HTML document."""
+    """Put the page's title, icon and styles into viser's HTML document."""
     response.body = branded(bytes(response.body), response.headers["Content-Encoding"] == "gzip")
     del response.headers["Content-Length"]
     response.headers["Content-Length"] = str(len(response.body))
