@@ -292,7 +292,7 @@ def _presets(_: argparse.Namespace) -> int:
 def _add_proxy(commands: Any) -> None:
     sub = commands.add_parser(
         "proxy",
-        help="put any gRPC service behind an emulated link; messages are not parsed",
+        help="put any gRPC service, or any TCP port, behind an emulated link; messages are not parsed",
         description="Clients connect to LISTEN instead of the service at TO. A dropped unary call answers "
         "UNAVAILABLE, a dropped stream message is left out. Prints what happened on Ctrl-C. In tests, use "
         "the pytest fixture of channel_emu.testing.",
@@ -307,6 +307,11 @@ def _add_proxy(commands: Any) -> None:
         help="messages that pass the link: to the service (up), its answers (down) or both [%(default)s]",
     )
     sub.add_argument("--shared", action="store_true", help="one link for all methods [one for each]")
+    sub.add_argument(
+        "--tcp",
+        action="store_true",
+        help="any protocol over TCP, in pieces of 16 kB, in order: a piece that is lost is sent again after 200 ms",
+    )
     _add_live_options(sub, "message")
     sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     sub.set_defaults(go=_proxy)
@@ -320,7 +325,10 @@ def _proxy(args: argparse.Namespace) -> int:
     config = _config_of(args)
     if not args.no_priority:
         raise_priority()
-    status, report = _serve(args, Proxy, config, args.seed, direction=args.direction, shared=args.shared)
+    proxy: Callable[..., Proxy] = Proxy
+    if args.tcp:
+        from channel_emu.live.tcp_proxy import TcpProxy as proxy
+    status, report = _serve(args, proxy, config, args.seed, direction=args.direction, shared=args.shared)
     if report is not None:
         print(json.dumps(report.plain()) if args.json else show(report))
     return status

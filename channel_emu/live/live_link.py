@@ -21,7 +21,6 @@ from channel_emu.model.channel import Channel
 from channel_emu.model.link import Event, EventKind, Link, Transit
 from channel_emu.model.trace import TraceWriter
 from freshfield.limits import MAX_QUEUED_BYTES
-from freshfield.streams import ServedCall
 
 STREAM_ENDED = (grpc.RpcError, grpc.aio.BaseError, asyncio.InvalidStateError)
 """Exceptions by which gRPC reports that a stream is over."""
@@ -34,6 +33,12 @@ class Receiver(Protocol):
 
     def settle(self, message: Message, kind: EventKind) -> None:
         """DELIVERED: pass the message on. DUPLICATED: pass it on again. Any other kind: it was dropped."""
+
+
+class Ends(Protocol):
+    """A call, or a connection, that a reset of the link ends."""
+
+    def end(self, code: grpc.StatusCode, details: str) -> None: ...
 
 
 @dataclass(slots=True)
@@ -102,7 +107,7 @@ class LiveLink:
     ) -> None:
         self.name = name
         self.model = model
-        self.calls: set[ServedCall] = set()
+        self.calls: set[Ends] = set()
         """The open calls whose messages pass this link; a reset ends them."""
         self.stats = stats
         self.age = RunningAge()

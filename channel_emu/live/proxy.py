@@ -154,7 +154,8 @@ class Proxy(grpc.GenericRpcHandler):
             await asyncio.gather(*self._tasks, return_exceptions=True)
             if self.streams_last:  # the grace period would wait in vain
                 for call in {call for link in self.links.values() for call in link.calls}:
-                    call.task.cancel()
+                    if isinstance(call, ServedCall):
+                        call.task.cancel()
             await self._server.stop(_STOP_GRACE_S)
             await self.service_channel.close()
 

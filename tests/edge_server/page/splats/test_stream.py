@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import contextlib
 import json
+import queue
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import websocket
 
+from channel_emu.live.proxy import ProxyOptions
+from channel_emu.live.tcp_proxy import TcpProxy
+from channel_emu.model.settings import channel_from_mapping
 from edge_server.live.state import EdgeState, Publication
 from edge_server.page import Page, start_page
 from edge_server.page.splats.messages import StreamReader, read_saved
@@ -120,6 +127,42 @@ def test_the_rules_of_the_page_hold_for_the_stream():
             Drawer(page, **login("viewer"))
         for each in visitors:
             each.socket.close()
+
+
+def test_a_bad_last_mile_makes_it_less_and_later_but_breaks_nothing():
+    """Through the emulator's TCP proxy."""
+    state, shown = bare_state(), snapshot(gaussians(6000, 0))
+    section = {"service": {"law": "exponential", "mean_ms": 30.0}, "faults": {"loss": {"probability": 0.05}}}
+    with page_of(state) as page, proxied(page.port, section) as port:
+        publish(state, shown)
+        drawer = Drawer(SimpleNamespace(port=port))
+        drawer.read_until(lambda: len(drawer.reader.at(NEWEST_S)) == 6120)
+        link = drawer.reader.status["link"]
+        assert link["static"] == [6000, 6000] and link["round_trip_ms"] > 20.0
+        drawer.socket.close()
+
+
+@contextlib.contextmanager
+def proxied(to: int, section: dict) -> Iterator[int]:
+    """The port of a TCP proxy before port ``to``, on a thread of its own."""
+    started: queue.Queue[tuple[int, asyncio.AbstractEventLoop, asyncio.Event]] = queue.Queue()
+
+    async def serve() -> None:
+        options = ProxyOptions("127.0.0.1:0", f"127.0.0.1:{to}", direction="both")
+        proxy, stop = TcpProxy(channel_from_mapping(section), 1, options), asyncio.Event()
+        await proxy.start()
+        started.put((proxy.port, asyncio.get_running_loop(), stop))
+        await stop.wait()
+        await proxy.stop()
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()), daemon=True)
+    thread.start()
+    port, loop, stop = started.get(timeout=20)
+    try:
+        yield port
+    finally:
+        loop.call_soon_threadsafe(stop.set)
+        thread.join(timeout=20)
 
 
 # --- a browser -------------------------------------------------------------------------------------

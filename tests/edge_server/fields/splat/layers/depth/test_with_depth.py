@@ -83,6 +83,13 @@ def test_depth_lets_layers_begin_sooner_and_shows_what_is_between_the_cameras() 
     unseen = field.snapshot().unseen(HELD.camera_to_world, HELD.intrinsics)
     _, distance = seen(HELD.intrinsics, HELD.camera_to_world)
     assert unseen is not None and unseen[~np.isfinite(distance)].mean() > 0.9 > 0.5 > unseen[distance < 9].mean()
+    surfaces, camera = field.snapshot().surfaces, CAMERAS[0]
+    assert surfaces is not None
+    depth = surfaces.meshes.depth[: camera.image[..., 0].size].reshape(camera.image.shape[:2])
+    on_axis = camera.intrinsics.rays() / camera.intrinsics.rays()[..., 2:]
+    offsets = (depth[..., None] * on_axis)[depth > 0] @ camera.camera_to_world[:3, :3].T
+    shares = [surfaces.unseen_points(camera.camera_to_world[:3, 3] + far * offsets).mean() for far in (0.8, 1.0, 1.5)]
+    assert shares[:2] == [0.0, 0.0] and shares[2] > 0.9
 
 
 def test_one_camera_with_depth_has_layers() -> None:
