@@ -151,6 +151,8 @@ class TcpProxy(Proxy):
         task.add_done_callback(self._open.discard)
         try:
             await self._carry_both(reader, writer)
+        except asyncio.CancelledError:
+            pass  # by ``stop``; asyncio's server would log it as an error
         except Exception as error:
             self.fail(error)
         finally:

@@ -33,6 +33,8 @@ FIRST_WINDOW, LEAST_WINDOW, MOST_WINDOW = 8_192, 4_096, 2_000_000
 """Bytes under way to a visitor: at first, at least, at most."""
 QUEUE_S = 0.1
 """Delay beyond the shortest round trip at which a link counts as full."""
+JITTER_OF = 2
+"""Round trips whose least is compared with that."""
 BACK_OFF = 0.7
 """Factor on the window then, once a round trip."""
 FORGET_RTT_S = 30.0

@@ -44,6 +44,7 @@ class LinkWindow:
         self.rate_bytes_per_s = 0.0
         self._sent: deque[tuple[int, int, float]] = deque()  # number, bytes, when
         self._round_trips: deque[tuple[float, float]] = deque()  # when, seconds
+        self._last_trips_s: deque[float] = deque(maxlen=tuned.JITTER_OF - 1)
         self._backed_off_s = -np.inf
         self._drained_s = np.inf
         self._since_s, self._acknowledged = 0.0, 0
@@ -81,7 +82,10 @@ class LinkWindow:
         while self._round_trips and self._round_trips[0][0] < now_s - tuned.FORGET_RTT_S:
             self._round_trips.popleft()
         self._round_trips.append((now_s, round_trip_s))
-        if round_trip_s - self.round_trip_s > tuned.QUEUE_S:
+        # The least of the last few: a single late message says that the link jitters, not that it is full.
+        late_s = min(list(self._last_trips_s) + [round_trip_s]) - self.round_trip_s
+        self._last_trips_s.append(round_trip_s)
+        if late_s > tuned.QUEUE_S:
             if now_s - self._backed_off_s > round_trip_s:
                 self._backed_off_s = now_s
                 self.window = max(self.window * tuned.BACK_OFF, tuned.LEAST_WINDOW)
@@ -212,8 +216,9 @@ class Visitor:
     def _static(self, newest: StaticRecords, room: int) -> list[Block]:
         """Chunks that are due, as many as fit."""
         complete = bool(self._known.all())
-        if newest is not self._source and (complete or self._same(newest)):
-            self._take(newest)
+        wider = complete and self._takes() > 2 * len(self._sent) < 2 * len(newest.records)
+        if wider or (newest is not self._source and (complete or self._same(newest))):
+            self._take(newest, wider)
         static, blocks = self._source, list[Block]()
         if static is None:
             return blocks
@@ -235,14 +240,16 @@ class Visitor:
     def _same(self, newest: StaticRecords) -> bool:
         return self._source is not None and newest.number == self._source.number
 
-    def _take(self, newest: StaticRecords) -> None:
+    def _takes(self) -> int:
+        """Static Gaussians that the link takes in the time of a new set."""
+        return int(tuned.NEW_SET_S * self.link.bound_bytes_per_s) // RECORD.itemsize
+
+    def _take(self, newest: StaticRecords, wider: bool) -> None:
         """Find what of the newest records is to be sent: chunks that have changed, those with most weight in what
-        changed first; or a set anew, its largest Gaussians alone if the link does not take all."""
-        takes = int(tuned.NEW_SET_S * self.link.bound_bytes_per_s) // RECORD.itemsize
-        cut = len(self._sent) < len(newest.records)
-        wider = cut and bool(self._known.all()) and takes > 2 * len(self._sent)
+        changed first; or a set anew, its largest Gaussians alone if the link does not take all. wider: anew, because
+        the link takes more than it did."""
         if not self._same(newest) or wider:
-            count = min(len(newest.records), max(takes, tuned.CHUNK))
+            count = min(len(newest.records), max(self._takes(), tuned.CHUNK))
             self._set += 1
             self._sent, self._known = np.zeros(count, RECORD), np.zeros(count, np.bool_)
         count = len(self._sent)
