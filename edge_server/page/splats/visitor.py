@@ -83,7 +83,7 @@ class LinkWindow:
             self._round_trips.popleft()
         self._round_trips.append((now_s, round_trip_s))
         # The least of the last few: a single late message says that the link jitters, not that it is full.
-        late_s = min(list(self._last_trips_s) + [round_trip_s]) - self.round_trip_s
+        late_s = min([*self._last_trips_s, round_trip_s]) - self.round_trip_s
         self._last_trips_s.append(round_trip_s)
         if late_s > tuned.QUEUE_S:
             if now_s - self._backed_off_s > round_trip_s:
