@@ -125,7 +125,8 @@ class UpdateLoop:
         selection = self._select(budget)
         if selection is None:
             return
-        self._on_status(f"fitting {len(selection.items)} views")
+        learning = getattr(self._updater.field, "learning", "")
+        self._on_status(learning or f"fitting {len(selection.items)} views")
         fitted = self._updater.fit(selection, budget)
         if fitted is None:
             self._stop.wait(0.01)  # every selected frame is damaged: newer ones will come

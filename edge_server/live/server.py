@@ -185,6 +185,7 @@ class EdgeServer:
             field_name=config.field,
             chosen=described(scenario, config, self._moving),
             troubles=lambda: getattr(self.updater.field, "troubles", ()),
+            flat_db=lambda: self.scoring.baselines.mean.mean_colour_db,
             so_far=lambda: self.scoring.so_far,
         )
         log.info("%s", self.state.chosen)

@@ -134,6 +134,7 @@ class EdgeState:
     frontier: what accuracy costs in time, as measured.
     chosen: how the edge works and why, in one line (``config.described``).
     troubles: what the field finds wrong with poses and measured depth, for people.
+    flat_db: PSNR of the mean color of the training images, against the held-out views; None: not known.
     so_far: scores of held-out cameras that move.
     warnings: what other machines can do here that they should not, in words (--insecure).
     status_line: what the loop is doing, in one line for people, e.g. waiting for a first frame.
@@ -149,6 +150,7 @@ class EdgeState:
     save_snapshot: Callable[[], Path]
     channel: Callable[[], dict | None] = lambda: None
     troubles: Callable[[], Sequence[str]] = tuple
+    flat_db: Callable[[], float | None] = lambda: None
     so_far: Callable[[], SoFarScores | None] = lambda: None
     frontier: Frontier | None = None
     field_name: str = ""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from edge_server.live.state import CameraView, Comparison, EdgeState, Publication
 from edge_server.page import markup
 from edge_server.page.controls import ControlPanel
+from edge_server.page.diagnosis import poor_picture
 from edge_server.page.network_control import EmulatorControl, NetworkControl
 from edge_server.page.settings import AGE_PARTS_OF, POSE_NOISE
 from edge_server.page.timelines import History, Timelines
@@ -79,7 +80,8 @@ class Panel:
         """Show the current state."""
         last = publications[-1] if publications else None
         self._status.content = markup.status(summary(self._state, cameras, publications))
-        troubles = self._state.troubles()
+        poor = poor_picture(self._state.flat_db(), publications, cameras)
+        troubles = [*self._state.troubles(), *([poor] if poor else [])]
         self._troubles.visible = bool(troubles)
         self._troubles.content = markup.warning("; ".join(troubles)) if troubles else ""
         if last is not None:

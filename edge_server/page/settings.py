@@ -47,3 +47,8 @@ AGE_VIEW_LIGHT = 0.35
 """Least share of an age's color: the picture's shades fill the rest, so that shapes can be told."""
 LABEL_PX = 10
 """Margin of the words on a large image."""
+FLAT_SCORES, FLAT_MARGIN_DB = 20, 0.5
+"""Latest scores that tell whether a picture is better than one mean color, and by how much it must be: whatever
+shows the scene exceeds it by several dB."""
+REFUSED_SHARE = 0.2
+"""Of a camera's frames, from which on refusals explain a bad picture."""

@@ -118,6 +118,15 @@ class LayeredField:
         return () if depth is None else depth.troubles
 
     @property
+    def learning(self) -> str:
+        """What it learns before layers begin, for people; empty afterwards, and where they will not."""
+        if not self.layered or self.tracker is not None or len(self.cameras) < tuned.LEAST_CAMERAS:
+            return ""
+        frames = min(camera.plate.count for camera in self.cameras.values())
+        known = f"{frames} of {tuned.PLATE_FRAMES} frames of each camera"
+        return f"learning the background: {known if frames < tuned.PLATE_FRAMES else 'what stands still'}"
+
+    @property
     def views(self) -> tuple[View, ...]:
         """What the still field learns from: a view of each camera, or its background plate."""
         return tuple(view for view in self.still.views if not self.cameras or view.camera in self.cameras)

@@ -104,10 +104,11 @@ def test_it_is_the_still_field_at_first_and_where_a_camera_moves() -> None:
     for field in (layered, plain):
         _run(field, range(4))
     same_state(layered.still, plain)
+    assert layered.learning == "learning the background: 4 of 8 frames of each camera"
     for field in (layered, plain):
         for frame, turned in enumerate(_turning(), start=4):
             field.fit([turned, _frame(2, frame, True)], Budget(steps=10))
-    assert not layered.layered
+    assert not layered.layered and not layered.learning
     _run(layered, range(20, 40), steps=2)
     _run(plain, range(20, 40), steps=2)
     same_state(layered.still, plain)
@@ -181,10 +182,10 @@ def test_one_camera_alone_begins_no_layers() -> None:
     field = LayeredField(SMALL)
     for frame in range(20):
         field.fit([_frame(0, frame, True)], Budget(steps=1))
-    assert field.layered and field.moving is None and field.part_s["static field"] > 0.0
+    assert field.layered and field.moving is None and not field.learning and field.part_s["static field"] > 0.0
     for frame in range(20, 30):
         field.fit([_frame(k, frame, True) for k in range(2)], Budget(steps=1))
-    assert field.moving is not None
+    assert field.moving is not None and not field.learning
 
 
 def test_nothing_moves_where_nothing_moves() -> None:

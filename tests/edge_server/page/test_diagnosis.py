@@ -1,0 +1,47 @@
+"""A picture that is good for nothing is told, with its likely cause."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from edge_server.live.state import CameraView
+from edge_server.page.diagnosis import poor_picture
+from edge_server.page.settings import FLAT_SCORES
+from tests.edge_server.page.test_page import publication
+
+GOOD = CameraView("cam01", False, None, 80.0, 100, 3)
+CASES = {
+    "poses or lenses": [GOOD, replace(GOOD, camera="cam02"), replace(GOOD, camera="cam00", held_out=True)],
+    "frames are 9 s old; see the network": [replace(GOOD, age_ms=9000.0), replace(GOOD, age_ms=9100.0)],
+    "refuses frames of cam01;": [replace(GOOD, rejected=100), GOOD],
+    "1 of 2 cameras have sent": [GOOD, replace(GOOD, age_ms=None)],
+    "0 of 2 cameras have sent": [replace(GOOD, age_ms=None)] * 2,
+}
+
+
+def scored(*psnr_db):
+    return [replace(publication(number), psnr_db=db) for number, db in enumerate(psnr_db)]
+
+
+@pytest.mark.parametrize("cause", CASES)
+def test_the_likely_cause_is_named(cause):
+    said = poor_picture(12.0, scored(*[30.0] * 9, *[12.3, None] * FLAT_SCORES), CASES[cause])
+    assert "no better than one mean color (12.3 dB; that color 12.0 dB)" in said and cause in said
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    ("flat_db", "scores"),
+    [
+        (12.0, [13.0] * FLAT_SCORES),
+        (12.0, [5.0] * (FLAT_SCORES - 1)),
+        (12.0, [float("nan")] * FLAT_SCORES),
+        (12.0, [float("inf")] * FLAT_SCORES),
+        (None, [5.0] * FLAT_SCORES),
+        (12.0, []),
+    ],
+)
+def test_nothing_is_said_of_a_better_picture_and_of_what_is_not_known(flat_db, scores):
+    assert poor_picture(flat_db, scored(*scores), [GOOD]) == ""
