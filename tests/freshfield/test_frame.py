@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
@@ -161,6 +162,18 @@ def test_each_refusal_has_its_reason(change, reason):
     with pytest.raises(FrameRejected) as error:
         from_request(changed(change))
     assert error.value.reason == reason and str(error.value)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("axis", ["cx", "cy"])
+def test_a_principal_point_lies_at_most_one_image_outside(axis):
+    """A crop may put it outside, by no more than the image itself."""
+    lens = frame().intrinsics
+    side = lens.width if axis == "cx" else lens.height
+    for center, taken in ((-side, True), (-side - 1e-6, False), (2 * side, True), (2 * side + 1e-6, False)):
+        request = changed(set_header(**{f"intrinsics__{axis}": center}))
+        with contextlib.nullcontext() if taken else pytest.raises(FrameRejected, match="principal point"):
+            assert getattr(from_request(request).intrinsics, axis) == center
 
 
 @pytest.mark.stability

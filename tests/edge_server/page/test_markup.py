@@ -103,8 +103,13 @@ def test_a_decision_is_told_in_words():
     old = words(("cam01", "cam03"), 120.0, "threshold")
     assert "uses 2 of 6 views, up to 120 ms old; leaves out cam02 (903 ms old), cam06 (800 ms old)" in old
     assert "cam04 (700 ms old) and 1 more." in old and "cam00" not in old
+    assert "cam05 (650 ms old)." in words(("cam01", "cam03", "cam04"))  # three are named, and no more is there
     assert "uses all 6 views; the policy chose 30 ms." in words(tuple(ages), 30.0, "bandit:policy.npz")
     assert "refuses cam03, which contradict the others" in words(tuple(ages), refused=("cam03",))
+
+
+def test_what_cameras_see_is_a_sentence_below_its_plan():
+    assert "<svg/><div>Nine see mM." in markup.coverage("<svg/>", "nine see mM")
 
 
 def test_the_channel_line_shows_only_what_the_emulator_reports():

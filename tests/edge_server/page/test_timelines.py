@@ -8,7 +8,7 @@ import numpy as np
 
 from edge_server.live.state import CameraView, Publication
 from edge_server.page import timelines
-from edge_server.page.timelines import MAX_POINTS, History, _decimate, _forward_fill, _stairs
+from edge_server.page.timelines import MAX_POINTS, RECENT, History, _decimate, _forward_fill, _stairs
 
 
 def views(*ages: float | None) -> list[CameraView]:
@@ -95,3 +95,42 @@ def test_the_charts_show_ages_scored_updates_of_the_window_and_states_by_name(mo
     )
     assert (when, psnr) == ([90.0, 195.0], [20.0, 22.0]) and title.endswith(", dB")
     assert state == [1.0, 1.0] and names == "0 low, 1 high"
+
+
+def test_a_chart_draws_lines_with_recent_values_and_is_made_anew_where_they_change():
+    gui, made = MagicMock(), []
+    gui.add_uplot.side_effect = lambda **props: made.append(MagicMock(**props)) or made[-1]
+    gui.add_html.side_effect = lambda content, visible: MagicMock(content=content, visible=visible)
+    lines = (("mean", (0, 1, 2)), ("omega", (3, 4, 5)))
+    chart = timelines._Chart(gui, "Age", lines, zero=True)
+    t = np.arange(RECENT + 2.0)
+    nan = np.full(len(t), np.nan)
+    chart.draw(t[:1], t[:1], nan[:1])
+    assert not made and not chart._caption.visible  # one point is no line
+    chart.draw(t[:2], t[:2], nan[:2])
+    assert len(made) == 1 and chart._caption.visible and "omega" not in chart._caption.content
+    x, y = made[0].data
+    assert x.tolist() == y.tolist() == [0.0, 1.0]
+    props = gui.add_uplot.call_args.kwargs
+    assert [each["label"] for each in props["series"]] == ["s", "mean"]
+    assert props["series"][1]["stroke"] == "#000102" and "fill" not in props["series"][1]
+    assert props["series"][1]["points"] == {"show": False}
+    assert props["scales"] == {"x": {"time": False}, "y": {"range": (0.0, None)}} and props["legend"] == {"show": False}
+    omega = nan.copy()
+    omega[2] = 7.0  # the first of the last RECENT rows
+    chart.draw(t, t, omega)
+    assert len(made) == 2 and made[0].remove.called and made[1].data[2].tolist() == [7.0] * len(t)
+    omega[2:] = np.nan
+    omega[1] = 7.0
+    chart.draw(t, t, omega)
+    assert len(made) == 3 and len(made[2].data) == 2
+    chart.draw(t, 2 * t, omega, remark="as before")
+    assert len(made) == 3 and made[2].data[1].tolist() == (2 * t).tolist() and "as before" in chart._caption.content
+
+
+def test_a_stepped_chart_is_a_filled_staircase_from_any_value():
+    gui = MagicMock()
+    timelines._Chart(gui, "Channel", (("state", (0, 1, 2)),), stepped=True).draw(np.arange(2.0), np.arange(2.0))
+    props = gui.add_uplot.call_args.kwargs
+    assert [column.tolist() for column in props["data"]] == [[0, 1, 1], [0, 0, 1]]
+    assert props["series"][1]["fill"] == "#00010230" and "y" not in props["scales"]

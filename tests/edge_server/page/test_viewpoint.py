@@ -7,7 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_server.page.viewpoint import VERTICAL_FOV_RAD, initial_viewpoint, row_band, visitor_camera, world_up
+from edge_server.page.viewpoint import (
+    DISTANCES,
+    MARGIN,
+    SEEN_SHARE,
+    VERTICAL_FOV_RAD,
+    initial_viewpoint,
+    row_band,
+    visitor_camera,
+    world_up,
+)
 from freshfield.geometry import look_at, matrix_to_quaternion, quaternion_to_matrix, se3_inverse
 from tests.edge_server.page.preview import BallScene
 
@@ -58,6 +67,23 @@ def test_the_visitor_sees_the_rig_from_behind_and_above(spread_deg, share):
     local = (eyes - camera[:3, 3]) @ camera[:3, :3]
     seen = (np.abs(local[:, :2] / local[:, 2:]) < np.tan(VERTICAL_FOV_RAD / 2)).all(axis=1) & (local[:, 2] > 0)
     assert seen.mean() >= share
+
+
+@pytest.mark.parametrize("spread_deg", [90, 140, 160])
+def test_the_visitor_stands_as_near_as_lets_them_see_the_share(spread_deg):
+    poses = rig(9, spread_deg)
+    eyes, view = poses[:, :3, 3], initial_viewpoint(poses)
+    away_m = np.linalg.norm(view.position - TARGET)
+    step_m = np.diff(DISTANCES)[0] * view.radius_m
+
+    def share_at(distance_m: float) -> float:
+        camera = look_at(TARGET + (view.position - TARGET) * distance_m / away_m, TARGET, view.up)
+        x, y, z = ((eyes - camera[:3, 3]) @ camera[:3, :3]).T
+        limit = MARGIN * np.tan(np.deg2rad(30.0)) * z  # VERTICAL_FOV_RAD, a square window
+        return float(np.mean((z > 0) & (np.abs(x) < limit) & (np.abs(y) < limit)))
+
+    assert DISTANCES[0] * view.radius_m + 1e-6 < away_m < DISTANCES[-1] * view.radius_m - 1e-6
+    assert share_at(away_m) >= SEEN_SHARE > share_at(away_m - step_m)
 
 
 def test_a_ring_has_no_behind_so_the_visitor_stands_behind_its_first_camera():
