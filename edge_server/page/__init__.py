@@ -49,7 +49,6 @@ class Page:
     _server: viser.ViserServer
     _refresher: _Refresher
     _renders: RenderLoop
-    _network: EmulatorControl | None
     _splats: SplatStream
 
     def stop(self) -> None:
@@ -58,8 +57,6 @@ class Page:
         self._renders.stop()
         self._splats.stop()
         _quietly(self._server.stop)
-        if self._network is not None:
-            self._network.close()
 
 
 def start_page(
@@ -91,8 +88,7 @@ def start_page(
     )
     scene = Scene(server, state)
     renders = RenderLoop(state)
-    network = EmulatorControl(transport, emulator) if emulator is not None else None
-    panel = Panel(server, state, network)
+    panel = Panel(server, state, EmulatorControl(transport, emulator) if emulator is not None else None)
     refresher = _Refresher(server, state, scene, panel)
 
     async def joined(client: viser.ClientHandle) -> None:
@@ -125,7 +121,7 @@ def start_page(
     refresher.start()
     splats.start()
     port = server.get_port()
-    return Page(page_url(host, port, tls is not None), port, server, refresher, renders, network, splats)
+    return Page(page_url(host, port, tls is not None), port, server, refresher, renders, splats)
 
 
 class _Refresher:

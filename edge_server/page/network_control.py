@@ -28,7 +28,7 @@ Setting = tuple[float, float] | None
 
 
 class EmulatorControl:
-    """Sets delay and loss of the emulator at ``address`` (HOST:PORT). Thread-safe; connects at the first call.
+    """Sets delay and loss of the emulator at ``address`` (HOST:PORT).
 
     transport: must make this process an operator there, see docs/deploy.md.
     """
@@ -37,38 +37,27 @@ class EmulatorControl:
         self._transport, self._address = transport, address
         # A certificate says who this is; a token of this server's visitors would be a wrong one there.
         self._metadata = () if transport.cert is not None and transport.ca is not None else transport.metadata()
-        self._channel: grpc.Channel | None = None
-        self._lock = threading.Lock()
         self.in_force: Setting = None
         """What was set here last."""
 
     def set(self, wanted: Setting) -> None:
         """Change the network. Raises RuntimeError with what the emulator said, or that it did not answer."""
         delay_ms, loss = wanted or (None, None)
-        with self._lock:
-            if self._channel is None:
-                self._channel = self._transport.channel(self._address)
-            ask = channel_pb2_grpc.ChannelServiceStub(self._channel).SetChannel
+        request = channel_pb2.SetChannelRequest(delay_ms=delay_ms, loss=loss)
+        with self._transport.channel(self._address) as channel:
+            ask = channel_pb2_grpc.ChannelServiceStub(channel).SetChannel
             try:
-                request = channel_pb2.SetChannelRequest(delay_ms=delay_ms, loss=loss)
                 ask(request, timeout=ANSWER_S, metadata=self._metadata)
             except grpc.RpcError as error:
                 said = f"{error.code().name}: {peer_text(error.details())}"
                 raise RuntimeError(f"the emulator at {self._address} refuses ({said})") from None
-            self.in_force = wanted
-
-    def close(self) -> None:
-        """Close the connection."""
-        with self._lock:
-            if self._channel is not None:
-                self._channel.close()
-                self._channel = None
+        self.in_force = wanted
 
 
 class NetworkControl:
     """Inputs in the current GUI container, kept equal to what is in force, which others may change too."""
 
-    def __init__(self, gui: viser.GuiApi, network: EmulatorControl, status: dict[str, Any] | None) -> None:
+    def __init__(self, gui: viser.GuiApi, network: EmulatorControl) -> None:
         self._network = network
         self._timer: threading.Timer | None = None
         self._refresh_after_s = 0.0
@@ -79,7 +68,7 @@ class NetworkControl:
         self.buttons.on_click(self._pressed)
         for slider in (self.delay, self.loss):
             slider.on_update(self._moved)
-        self.refresh(status)
+        self.refresh(None)
 
     def refresh(self, status: dict[str, Any] | None) -> None:
         """Show what is in force. status: the emulator's; None where it is on another machine."""

@@ -47,7 +47,7 @@ class Panel:
         self._network: NetworkControl | None = None
         if network is not None:
             with gui.add_folder("Change the network"):
-                self._network = NetworkControl(gui, network, None)
+                self._network = NetworkControl(gui, network)
         self._caption = gui.add_html(markup.note("Waiting for a held-out frame to compare with."))
         self._pair: Any = None
         self._compared_update: int | None = None

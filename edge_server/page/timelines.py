@@ -22,6 +22,8 @@ RECENT = 10
 # More points than the chart has pixels would be sent but not seen.
 MAX_POINTS = 300
 HEIGHT = 104
+STATE_WORDS = {"low": "good", "high": "bad"}
+"""The thesis's names of a network's states, low and high traffic, for people."""
 
 
 class History:
@@ -95,7 +97,7 @@ class Timelines:
             _column(p.psnr_db for p in scored),
             _column(p.psnr_moving_db for p in scored),
         )
-        names = ", ".join(f"{i} {name}" for i, name in enumerate(history.state_names))
+        names = ", ".join(f"{i} {STATE_WORDS.get(name, name)}" for i, name in enumerate(history.state_names))
         self._channel.draw(t, state, remark=names)
 
 

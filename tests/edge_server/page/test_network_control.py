@@ -56,11 +56,10 @@ def test_a_visitor_changes_the_network_and_gives_it_back(tmp_path):
 
 def test_what_the_emulator_does_not_answer_is_told_to_its_visitor():
     network, client, gui = EmulatorControl(Transport(), f"127.0.0.1:{free_port()}"), MagicMock(), MagicMock()
-    control = NetworkControl(gui, network, None)
+    control = NetworkControl(gui, network)
     control._set(client, (400.0, 0.2))
     title, words = client.add_notification.call_args.args
     assert title == "The network has not changed" and "UNAVAILABLE" in words and network.in_force is None
-    network.close()
 
 
 def test_a_setting_is_told_in_words():

@@ -94,7 +94,7 @@ def test_the_charts_show_ages_scored_updates_of_the_window_and_states_by_name(mo
         and omega[1] == 50.0
     )
     assert (when, psnr) == ([90.0, 195.0], [20.0, 22.0]) and title.endswith(", dB")
-    assert state == [1.0, 1.0] and names == "0 low, 1 high"
+    assert state == [1.0, 1.0] and names == "0 good, 1 bad"
 
 
 def test_a_chart_draws_lines_with_recent_values_and_is_made_anew_where_they_change():
