@@ -62,6 +62,13 @@ def test_what_the_emulator_does_not_answer_is_told_to_its_visitor():
     assert title == "The network has not changed" and "UNAVAILABLE" in words and network.in_force is None
 
 
+def test_a_certificate_speaks_for_the_edge_and_not_a_token_of_its_visitors(tmp_path):
+    tokens = {"operator": "secret"}
+    assert EmulatorControl(Transport(tokens=tokens), "x:1")._metadata == (("authorization", "Bearer secret"),)
+    certificate = Transport(cert=tmp_path / "c", key=tmp_path / "k", ca=tmp_path / "a", tokens=tokens)
+    assert EmulatorControl(certificate, "x:1")._metadata == ()
+
+
 def test_a_setting_is_told_in_words():
     assert describe((0.0, 0.5)) == "set by hand: mean delay 0 ms, 50 % of the frames lost"
     assert describe((400.0, 0.2)).startswith("bad: mean delay 400 ms, 20 %") and describe(None) == "the scenario's"
