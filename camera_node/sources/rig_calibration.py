@@ -18,7 +18,7 @@ import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError, camera_to_world, errors_at, read_array, read_json
 from camera_node.sources.datasets.transforms_keys import says_something
-from freshfield.geometry import Pinhole, Pose
+from freshfield.geometry import Array, Pinhole, Pose, se3_inverse
 
 _READ = ("width", "height", "K", "dist_k1k2p1p2", "R_world_to_cam", "t_world_to_cam")
 _HARMLESS = """
@@ -48,6 +48,17 @@ def load_calibration(file: Path) -> dict[str, CalibratedCamera]:
     return {str(name): _camera(entry, f"{file}: {name}") for name, entry in data.items()}
 
 
+def calibration_entry(lens: Pinhole, camera_to_world: Array | None = None) -> dict[str, Any]:
+    """A camera's entry, as ``load_calibration`` reads it. camera_to_world: (4, 4); None: the pose is not known."""
+    matrix, distortion = lens.opencv()
+    size = {"width": lens.width, "height": lens.height}
+    entry: dict[str, Any] = {**size, "K": matrix.tolist(), "dist_k1k2p1p2": distortion.tolist()}
+    if camera_to_world is not None:
+        to_camera = se3_inverse(camera_to_world)
+        entry |= {"R_world_to_cam": to_camera[:3, :3].tolist(), "t_world_to_cam": to_camera[:3, 3].tolist()}
+    return entry
+
+
 def _sizes(width: Any, height: Any) -> dict[str, tuple[Any, ...]]:
     """Keys that may repeat the size -> what they may say."""
     both = ([width, height],)
@@ -71,15 +82,7 @@ def _camera(entry: dict[str, Any], where: str) -> CalibratedCamera:
         raise DatasetError(f"{where}: width and height are {size}, expected positive whole numbers")
     if k[0, 0] <= 0 or k[1, 1] <= 0 or abs(k[0, 1]) > 1e-6 * k[0, 0]:
         raise DatasetError(f"{where}.K: expected positive focal lengths and no skew")
-    intrinsics = Pinhole(
-        int(entry["width"]),
-        int(entry["height"]),
-        float(k[0, 0]),
-        float(k[1, 1]),
-        float(k[0, 2]) + 0.5,
-        float(k[1, 2]) + 0.5,
-        tuple(map(float, distortion)),  # type: ignore[arg-type]
-    )
+    intrinsics = Pinhole.from_opencv(entry["width"], entry["height"], k, distortion)
     if "R_world_to_cam" not in entry:
         return CalibratedCamera(intrinsics, None)
     rotation = read_array(entry, "R_world_to_cam", (3, 3), where)

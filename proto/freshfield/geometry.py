@@ -252,6 +252,21 @@ class Pinhole:
         f = 0.5 * width / np.tan(0.5 * np.deg2rad(horizontal_fov_deg))
         return Pinhole(width, height, float(f), float(f), width / 2.0, height / 2.0)
 
+    @staticmethod
+    def from_opencv(
+        width: int, height: int, matrix: ArrayLike, distortion: ArrayLike = (0.0, 0.0, 0.0, 0.0)
+    ) -> Pinhole:
+        """Camera of OpenCV's matrix (3, 3), whose pixel centers are whole numbers, and (k1, k2, p1, p2)."""
+        m, (k1, k2, p1, p2) = np.asarray(matrix, dtype=np.float64), np.ravel(distortion).tolist()
+        fx, fy, cx, cy = m[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+        return Pinhole(width, height, fx, fy, cx + 0.5, cy + 0.5, (k1, k2, p1, p2))
+
+    def opencv(self) -> tuple[Array, Array]:
+        """OpenCV's matrix (3, 3), whose pixel centers are whole numbers, and (k1, k2, p1, p2)."""
+        return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1]]), np.array(
+            self.distortion
+        )
+
     @property
     def distorted(self) -> bool:
         """Whether any distortion coefficient is not zero."""

@@ -167,9 +167,10 @@ lenses = st.builds(
 def test_projection_agrees_with_opencv(camera, seed):
     """OpenCV counts pixel centres as whole numbers, we the image's corner as zero: half a pixel apart."""
     points = np.random.default_rng(seed).uniform([-1, -1, 2], [1, 1, 5], (20, 3))
-    k = np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
-    theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), k, np.array(camera.distortion))
+    theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), *camera.opencv())
     np.testing.assert_allclose(camera.project(points), theirs[:, 0] + 0.5, atol=1e-6)
+    read = Pinhole.from_opencv(camera.width, camera.height, *camera.opencv())
+    np.testing.assert_allclose(read.project(points), camera.project(points), atol=1e-6)
 
 
 @given(lenses, st.integers(0, 2**32))

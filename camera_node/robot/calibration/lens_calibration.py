@@ -20,7 +20,8 @@ from camera_node.robot.calibration.settings import (
     OUTLIER_ERROR,
     SHORTEST_FOCAL,
 )
-from camera_node.robot.calibration.targets import Corners, opencv_lens
+from camera_node.robot.calibration.targets import Corners
+from camera_node.sources.rig_calibration import calibration_entry
 from freshfield.geometry import Pinhole
 
 _UNDETERMINED = "the pictures do not determine a lens: show the target larger, tilted, everywhere"
@@ -48,17 +49,8 @@ class LensCalibration:
 
     def to_json(self, camera: str) -> dict[str, Any]:
         """The calibration JSON that the video source and --lens read."""
-        matrix, distortion = opencv_lens(self.pinhole)
-        return {
-            camera: {
-                "width": self.pinhole.width,
-                "height": self.pinhole.height,
-                "K": matrix.tolist(),
-                "dist_k1k2p1p2": distortion.tolist(),
-                "error_px": self.error_px,
-                "std_fx_fy_cx_cy_k1_k2_p1_p2": list(self.std),
-            }
-        }
+        known = {"error_px": self.error_px, "std_fx_fy_cx_cy_k1_k2_p1_p2": list(self.std)}
+        return {camera: calibration_entry(self.pinhole) | known}
 
     def show(self) -> str:
         p, s = self.pinhole, self.std
@@ -136,14 +128,6 @@ def _solve(views: Mapping[str, Corners], size: tuple[int, int]) -> tuple[Pinhole
         )
     except cv2.error as error:
         raise CalibrationError(f"{_UNDETERMINED} ({error.err})") from None
-    k1, k2, p1, p2 = map(float, distortion.ravel()[:4])
-    lens = Pinhole(
-        *size,
-        float(matrix[0, 0]),
-        float(matrix[1, 1]),
-        float(matrix[0, 2]) + 0.5,
-        float(matrix[1, 2]) + 0.5,
-        (k1, k2, p1, p2),
-    )
+    lens = Pinhole.from_opencv(*size, matrix, distortion.ravel()[:4])
     normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
     return lens, tuple(map(float, std.ravel()[:8])), normals, np.asarray(errors, dtype=np.float64).ravel()

@@ -82,7 +82,7 @@ def parse_target(spec: str) -> Target:
 def estimate_pose(corners: Corners, lens: Pinhole) -> Array:
     """Pose (4, 4) of a flat target in the camera from its corners. Raises CalibrationError if none is found or two
     are equally likely (a small target seen straight on)."""
-    matrix, distortion = opencv_lens(lens)
+    matrix, distortion = lens.opencv()
     # OpenCV's origin is the center of the first pixel.
     pixels = np.ascontiguousarray(corners.pixels - 0.5)
     count, turns, shifts, errors = cv2.solvePnPGeneric(
@@ -95,12 +95,6 @@ def estimate_pose(corners: Corners, lens: Pinhole) -> Array:
         raise CalibrationError("the target is seen so straight on that it may be tilted either way")
     turn, shift = cv2.solvePnPRefineLM(corners.points, pixels, matrix, distortion, turns[0], shifts[0])
     return se3(cv2.Rodrigues(turn)[0], shift.ravel())
-
-
-def opencv_lens(lens: Pinhole) -> tuple[Array, Array]:
-    """Matrix (3, 3) and (k1, k2, p1, p2) for OpenCV, whose pixel centers are whole numbers."""
-    matrix = np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
-    return matrix, np.array(lens.distortion)
 
 
 def to_gray(image: NDArray[np.uint8]) -> GrayImage:

@@ -191,9 +191,7 @@ def lens(camera: str, calibration: Any, socket: Any, size: tuple[int, int]) -> P
             f"{camera}: the device holds no calibration of this camera ({_first_line(error)}): "
             "calibrate it and name the file in source.calibration"
         ) from None
-    # Pixel centers are at whole numbers there.
-    fx, fy, cx, cy = map(float, (matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5))
-    return Pinhole(*size, fx, fy, cx, cy)
+    return Pinhole.from_opencv(*size, matrix)
 
 
 def _first_line(error: Exception) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 
 from camera_node.robot.calibration.settings import FIRST_DAMPING, LAST_DAMPING, MOST_STEPS, ROBUST_PX, SMALLEST_GAIN
-from camera_node.robot.calibration.targets import Array, Corners, opencv_lens
+from camera_node.robot.calibration.targets import Array, Corners
 from freshfield.geometry import Pinhole, se3, so3_log
 
 _LENS = 8  # fx, fy, cx, cy, k1, k2, p1, p2, in the order of projectPoints' derivatives
@@ -79,7 +79,10 @@ def adjust(
     return Bundle(
         {name: _matrix(numbers[0][k]) for k, name in enumerate(layout.cameras)},
         {name: _matrix(numbers[1][k]) for k, name in enumerate(layout.moments)},
-        {name: _pinhole(lenses[name], numbers[2][k]) for k, name in enumerate(layout.cameras)},
+        {
+            name: Pinhole.from_opencv(lenses[name].width, lenses[name].height, *_opencv(numbers[2][k]))
+            for k, name in enumerate(layout.cameras)
+        },
         np.sqrt(squares),
         dict(zip(layout.cameras, np.concatenate([np.zeros((1, 6)), std]))),
     )
@@ -195,15 +198,10 @@ def _matrix(six: Array) -> Array:
 
 
 def _lens_numbers(lens: Pinhole) -> Array:
-    matrix, distortion = opencv_lens(lens)
+    matrix, distortion = lens.opencv()
     return np.concatenate([[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], distortion])
 
 
 def _opencv(numbers: Array) -> tuple[Array, Array]:
     fx, fy, cx, cy = numbers[:4]
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), numbers[4:]
-
-
-def _pinhole(lens: Pinhole, numbers: Array) -> Pinhole:
-    fx, fy, cx, cy, k1, k2, p1, p2 = map(float, numbers)
-    return Pinhole(lens.width, lens.height, fx, fy, cx + 0.5, cy + 0.5, (k1, k2, p1, p2))

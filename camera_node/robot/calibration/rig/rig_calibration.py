@@ -12,9 +12,9 @@ import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.rig.bundle_adjustment import Bundle, Sighting, adjust
-from camera_node.robot.calibration.rig.scaled_model import calibration_entry
 from camera_node.robot.calibration.settings import FEW_SHARED, MIN_SHARED, OUTLIER_ERROR, OUTLIER_PX
 from camera_node.robot.calibration.targets import Array, Corners, estimate_pose
+from camera_node.sources.rig_calibration import calibration_entry
 from freshfield.geometry import Pinhole, se3_inverse, so3_log
 
 # From a target's axes (y down, z away from the viewer) to the world's (z up where the target lies on the floor).

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.targets import Array, opencv_lens
+from camera_node.robot.calibration.targets import Array
 from camera_node.sources.datasets.colmap import load_dataset
-from freshfield.geometry import Pinhole, se3_inverse
+from camera_node.sources.rig_calibration import calibration_entry
+from freshfield.geometry import Pinhole
 
 
 @dataclass(frozen=True)
@@ -37,20 +38,6 @@ class ScaledModel:
             f"{name}: at {x:.3f} {y:.3f} {z:.3f}" for name, (x, y, z) in ((n, p[:3, 3]) for n, p in self.poses.items())
         ]
         return "\n".join(lines)
-
-
-def calibration_entry(lens: Pinhole, camera_to_world: Array) -> dict[str, Any]:
-    """A camera's entry in a calibration file (``sources.rig_calibration``)."""
-    matrix, distortion = opencv_lens(lens)
-    to_camera = se3_inverse(camera_to_world)
-    return {
-        "width": lens.width,
-        "height": lens.height,
-        "K": matrix.tolist(),
-        "dist_k1k2p1p2": distortion.tolist(),
-        "R_world_to_cam": to_camera[:3, :3].tolist(),
-        "t_world_to_cam": to_camera[:3, 3].tolist(),
-    }
 
 
 def read_scaled_model(folder: Path, first: str, second: str, meters: str) -> ScaledModel:

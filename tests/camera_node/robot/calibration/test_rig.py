@@ -13,7 +13,7 @@ from camera_node.cli import main
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.rig import rig_inputs
 from camera_node.robot.calibration.rig.rig_calibration import RigCalibration, calibrate_rig
-from camera_node.robot.calibration.targets import Corners, opencv_lens, parse_target
+from camera_node.robot.calibration.targets import Corners, parse_target
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import Pinhole, look_at, se3, se3_inverse, so3_exp, so3_log
 
@@ -141,7 +141,7 @@ def photo(name: str, board: np.ndarray, noise: float, seed: int) -> np.ndarray:
         return np.full((480, 640), 110, np.uint8)
     lens = plain_lens(name)
     finer = np.array([[4, 0, 1.5], [0, 4, 1.5], [0, 0, 1]])
-    homography = finer @ opencv_lens(lens)[0] @ pose[:3, [0, 1, 3]] @ to_target
+    homography = finer @ lens.opencv()[0] @ pose[:3, [0, 1, 3]] @ to_target
     image = cv2.warpPerspective(drawn, homography, (2560, 1920), flags=cv2.INTER_LINEAR, borderValue=110)
     image = cv2.resize(image, (640, 480), interpolation=cv2.INTER_AREA).astype(np.float64)
     return np.clip(image + np.random.default_rng(seed).normal(0, noise, image.shape), 0, 255).astype(np.uint8)
