@@ -5,21 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from freshfield.geometry import Array, Pinhole, look_at
+from freshfield.geometry import Array, Pinhole, on_sphere
 
 PosedCameras = dict[str, tuple[Pinhole, Array]]
-
-
-def on_sphere(
-    target: ArrayLike, radius_m: float, azimuth_deg: float, elevation_deg: float, outward: bool = False
-) -> Array:
-    """Camera-to-world (4, 4) at ``radius_m`` from ``target`` (3,), looking at it or, if ``outward``, away
-    from it. Azimuth 0 is on the target's -y side, 90 on its +x side; elevation 90 is above it."""
-    a, e = np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg)
-    away = np.array([np.cos(e) * np.sin(a), -np.cos(e) * np.cos(a), np.sin(e)])
-    target = np.asarray(target, dtype=np.float64)
-    eye = target + radius_m * away
-    return look_at(eye, eye + away) if outward else look_at(eye, target)
 
 
 def spread_order(directions: Array) -> list[int]:

@@ -14,7 +14,7 @@ from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND, HandE
 from camera_node.robot.arm.kinematics import MODELS, ArmModel, apply_calibration
 from camera_node.settings import ArmConfig, errors_of, source_config
 from freshfield.clock import WallClock
-from freshfield.geometry import Pose
+from freshfield.geometry import Pose, se3, so3_exp
 from freshfield.scenario import Scenario, ScenarioError
 
 log = logging.getLogger("camera-node")
@@ -39,11 +39,7 @@ def arm_model(scenario: Scenario, config: ArmConfig) -> ArmModel:
 
 def base_matrix(config: ArmConfig) -> NDArray[np.float64]:
     """World-from-base (4, 4)."""
-    yaw = np.deg2rad(config.base_yaw_deg)
-    out = np.eye(4)
-    out[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    out[:3, 3] = config.base_m
-    return out
+    return se3(so3_exp([0, 0, np.deg2rad(config.base_yaw_deg)]), config.base_m)
 
 
 def load_hand_eyes(scenario: Scenario, config: ArmConfig, cameras: Iterable[str]) -> dict[str, HandEye]:

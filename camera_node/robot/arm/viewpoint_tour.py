@@ -9,7 +9,6 @@ hand on the stop.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.settings import PathConfig
-from freshfield.geometry import look_at, se3_inverse
+from freshfield.geometry import on_sphere, se3, se3_inverse, so3_exp
 
 Array = NDArray[np.float64]
 
@@ -39,21 +38,12 @@ def viewpoints(path: PathConfig) -> list[Array]:
     and so on."""
     first, last = path.azimuths_deg
     count = max(2, round(abs(last - first) / path.step_deg) + 1)
-    target, down = np.array(path.target_m), np.deg2rad(sorted(path.elevations_deg, reverse=True))
-    poses = []
-    for k, a in enumerate(np.deg2rad(np.linspace(first, last, count))):
-        for e in down if k % 2 == 0 else down[::-1]:
-            away = np.array([math.cos(e) * math.sin(a), -math.cos(e) * math.cos(a), math.sin(e)])
-            poses.append(look_at(target + path.radius_m * away, target))
-    return poses
-
-
-def _roll(angle_deg: float) -> Array:
-    """Rotation (4, 4) about the camera's optical axis."""
-    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
-    turn = np.eye(4)
-    turn[:2, :2] = [[c, -s], [s, c]]
-    return turn
+    down = sorted(path.elevations_deg, reverse=True)
+    return [
+        on_sphere(path.target_m, path.radius_m, azimuth, elevation)
+        for k, azimuth in enumerate(np.linspace(first, last, count))
+        for elevation in (down if k % 2 == 0 else down[::-1])
+    ]
 
 
 @dataclass(frozen=True)
@@ -139,8 +129,8 @@ def _free_postures(
     found = [
         (joints, k)
         for k, pose in enumerate(poses)
-        for turn in path.rolls_deg
-        for joints in arm.inverse(base_inverse @ pose @ _roll(turn) @ camera_to_flange, near)
+        for roll in np.deg2rad(path.rolls_deg)
+        for joints in arm.inverse(base_inverse @ pose @ se3(so3_exp([0, 0, roll]), [0, 0, 0]) @ camera_to_flange, near)
         if not arm.singularities(joints)
     ]
     postures = np.reshape([joints for joints, _ in found], (-1, 6))

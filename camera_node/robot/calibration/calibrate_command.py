@@ -167,7 +167,7 @@ def _samples(args: argparse.Namespace, board: Any) -> Any:
         if args.camera is None:
             raise CalibrationError("--camera ID: say which of the scenario's cameras")
         return live_samples(args, board, lens, setup)
-    samples, unused = inputs.read_visp_folder(args.folder, board, lens, setup, _print_progress)
+    samples, unused = inputs.read_visp_folder(args.folder, board, lens, setup, rig_command.print_progress)
     for name, why in unused.items():
         print(f"{name}: {why}", file=sys.stderr)
     return samples
@@ -177,18 +177,11 @@ def _intrinsics(args: argparse.Namespace) -> int:
     from camera_node.robot.calibration import inputs
     from camera_node.robot.calibration.lens_calibration import calibrate_lens
     from camera_node.robot.calibration.targets import parse_target
-    from freshfield import files
 
     board = parse_target(args.board)
-    found, unused, size = inputs.find_corners(inputs.list_images(args.folder), board, None, _print_progress)
+    found, unused, size = inputs.find_corners(inputs.list_images(args.folder), board, None, rig_command.print_progress)
     lens = calibrate_lens(found, size, unused)
-    data = lens.to_json(args.camera)
-    if args.out is not None:
-        try:
-            files.write_json(args.out, data, indent=1)
-        except OSError as error:
-            raise CalibrationError(f"--out: {args.out}: {error.strerror}") from None
-    print(json.dumps(data) if args.json else lens.show())
+    rig_command.show(args, lens.show(), lens.to_json(args.camera))
     return 0
 
 
@@ -215,8 +208,3 @@ def _target(args: argparse.Namespace) -> int:
         f"{board.pattern_m[0] * 1e3:.1f} x {board.pattern_m[1] * 1e3:.1f} mm"
     )
     return 0
-
-
-def _print_progress(done: int) -> None:
-    if sys.stderr.isatty():
-        print(f"\r{done} pictures ", end="", file=sys.stderr, flush=True)

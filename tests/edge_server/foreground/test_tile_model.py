@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.synthetic.camera_rig import on_sphere
 from camera_node.synthetic.scene import make_scene
 from edge_server.foreground import ForegroundConfig
 from edge_server.foreground.foreground import Foreground, make_foreground
 from edge_server.settings import read_config
-from freshfield.geometry import Pinhole
+from freshfield.geometry import Pinhole, on_sphere
 from freshfield.scenario import load
 from tests.edge_server.foreground.pictures import iou
 

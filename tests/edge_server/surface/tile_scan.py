@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
-from camera_node.synthetic.camera_rig import on_sphere
 from camera_node.synthetic.scene import Scene
 from edge_server.fields import View
-from freshfield.geometry import Pinhole
+from freshfield.geometry import Pinhole, on_sphere
 
 DISTANCE_M, FOV_DEG = 0.3, 50.0
 # (azimuth, elevation) of the cameras around a point.

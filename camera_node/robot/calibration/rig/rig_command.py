@@ -55,17 +55,31 @@ def run(args: argparse.Namespace) -> int:
         if args.board is None:
             raise CalibrationError("--board SPEC: say what the target is")
         found = _from_target(args)
-    data = found.to_json()
-    print(json.dumps(data) if args.json else found.show(), flush=True)
-    if args.out is not None:
-        from freshfield import files
-
-        files.write_json(args.out, data, indent=1)
+    show(args, found.show(), found.to_json())
     if args.plot is not None:
         from camera_node.robot.calibration.rig.rig_picture import draw_rig
 
         draw_rig(args.plot, found.poses, getattr(found, "boards", {}))
     return 0
+
+
+def show(args: argparse.Namespace, text: str, data: dict[str, Any]) -> None:
+    """Print what was found as ``args`` say, and write ``data`` to --out. Raises CalibrationError."""
+    # Print first: the result is not lost if the file cannot be written.
+    print(json.dumps(data) if args.json else text, flush=True)
+    if args.out is not None:
+        from freshfield import files
+
+        try:
+            files.write_json(args.out, data, indent=1)
+        except OSError as error:
+            raise CalibrationError(f"--out: {args.out}: {error.strerror}") from None
+
+
+def print_progress(done: int) -> None:
+    """Say on a terminal how many pictures are done."""
+    if sys.stderr.isatty():
+        print(f"\r{done} pictures ", end="", file=sys.stderr, flush=True)
 
 
 def _from_target(args: argparse.Namespace) -> Any:
@@ -83,7 +97,7 @@ def _from_target(args: argparse.Namespace) -> Any:
         finally:
             close()
     else:
-        views = rig_inputs.read_folder(args.folder, board, _print_progress)
+        views = rig_inputs.read_folder(args.folder, board, print_progress)
     if args.lens is None:
         lenses = {}
         for camera, seen in views.corners.items():
@@ -102,8 +116,3 @@ def _from_target(args: argparse.Namespace) -> Any:
                     f"{camera}: pictures of {size[0]} x {size[1]}, but --lens is of {lens.width} x {lens.height}"
                 )
     return calibrate_rig(views.corners, lenses, args.lens is None, args.origin)
-
-
-def _print_progress(done: int) -> None:
-    if sys.stderr.isatty():
-        print(f"\r{done} pictures ", end="", file=sys.stderr, flush=True)
