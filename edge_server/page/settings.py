@@ -42,7 +42,7 @@ SOLID = 0.5
 ERROR_GAIN = 4.0
 """Of differences, as in the report's figures: one of 10 % of the range is plain to see."""
 AGE_VIEW_STEP = 4
-"""Pixels from one point whose age is reckoned to the next: 9 cameras then take 10 ms at 480 rows."""
+"""Pixels from one point whose age is reckoned to the next: 9 cameras then take 12 ms of a processor at 480 rows."""
 AGE_VIEW_LIGHT = 0.35
 """Least share of an age's color: the picture's shades fill the rest, so that shapes can be told."""
 LABEL_PX = 10

@@ -90,6 +90,40 @@ def test_a_flush_breaks_off_what_is_inside_and_frees_the_line(discipline: str) -
     assert subject.flush(100 * MS) == []
 
 
+def test_a_change_keeps_due_instants_and_lets_in_what_waits_to_be_sampled() -> None:
+    section = {
+        "arrivals": {"process": "poisson", "rate_per_ms": [1.0, 0.0]},
+        "discipline": "parallel",
+        "service": "det:50ms",
+    }
+    section |= {
+        "chain": {"mu1_per_ms": 1e-9, "mu2_per_ms": 1e-9, "initial": "s1"},
+        "faults": {"reset": {"at_ms": [500]}},
+    }
+    channel = Channel(channel_from_mapping(section), 0)
+    subject = channel.link("cam00")
+    sampled = subject.offer(0)[0]
+    subject.advance(30 * MS)
+    waiting = subject.offer(40 * MS)[0]
+    assert sampled.started_ns is not None and waiting.started_ns is None
+    channel.set_by_hand(20.0, 0.0)
+    channel.change(subject, 40 * MS)
+    assert (waiting.started_ns, waiting.due_ns) == (40 * MS, 60 * MS)
+    subject.advance(100 * MS)
+    assert sampled.ended_ns == sampled.started_ns + 50 * MS and waiting.outcome is EventKind.DELIVERED
+    assert subject.offer(600 * MS)[0].due_ns == 620 * MS and subject.resets == 0  # no other fault is in force
+    channel.set_by_hand(0.0, 1.0)
+    lost = subject.pending()[0]
+    channel.change(subject, 610 * MS)
+    assert subject.advance(700 * MS)[-1].transit is lost and lost.outcome is EventKind.LOST
+    assert lost.ended_ns == 620 * MS
+    channel.set_by_scenario()
+    channel.change(subject, 700 * MS)
+    again = subject.offer(800 * MS)[0]
+    subject.advance(900 * MS)
+    assert again.drawn_ns == 50 * MS and again.started_ns > again.offered_ns and channel.by_hand is None
+
+
 def test_what_is_due_at_the_flush_arrives() -> None:
     subject = link("drop-new", [10])
     subject.offer(0)
