@@ -197,7 +197,9 @@ class RenderLoop:
         _, camera = visitor_camera(*viewpoint, rows=LEVELS[-1].max_rows)
         image = views.compared(comparison, camera.width, camera.height, visitor.view == views.ERROR)
         self._send(visitor, image)
-        self._not_before[NEWER] = began + max((perf_counter() - began) / LEVELS[NEWER].max_share, MIN_GAP_S)
+        spent = perf_counter() - began
+        for level in (MOVING, NEWER):  # a visitor who drags sees it anew, as one who moves
+            self._not_before[level] = began + max(spent / LEVELS[level].max_share, MIN_GAP_S)
         with self._wake:
             if visitor.serial == serial:  # nothing finer will follow
                 visitor.level, visitor.renderer = len(LEVELS) - 1, comparison

@@ -20,7 +20,7 @@ from edge_server.fidelity.scorer import Score
 from edge_server.fields import Rendering
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication
-from edge_server.page import Page, PageError, page_url, panel, start_page
+from edge_server.page import Page, PageError, page_url, panel, start_page, views
 from edge_server.page.controls import ControlPanel
 from edge_server.page.panel import PAIR_WIDTH, side_by_side
 from edge_server.page.rendering import LEVELS, MOVING, NEWER, ClientState, RenderLoop, browser_image, hatched
@@ -295,6 +295,26 @@ def test_a_visitor_is_sent_the_scene_from_where_they_stand():
     assert here.std() > 20 and above.std() > 20
     size = (64, 48)
     assert np.abs(cv2.resize(here, size).astype(float) - cv2.resize(above, size)).mean() > 10
+
+
+def test_who_looks_at_truth_gets_each_comparison_once_and_the_picture_before_there_is_one():
+    state, client = bare_state(), MagicMock(client_id=1)
+    client.camera = SimpleNamespace(
+        position=(4.0, 0.0, 3.0), wxyz=(1.0, 0, 0, 0), fov=0.9, image_width=80, image_height=60
+    )
+    loop = RenderLoop(state)
+    loop.add_client(client)
+    loop.choose(client, views.TRUTH)
+    sent = client.scene.set_background_image
+    state.publish(publication(0), BallScene(0.0))
+    assert loop._step(1e9) and sent.call_count == 1
+    truth = np.full((6, 8, 3), 200, np.uint8)
+    for number in (1, 2):
+        state.scored(publication(0), Comparison("cam00", truth, truth, number))
+        assert loop._step(1e9 * number + 1e9) and not loop._step(1e9 * number + 2e9)
+        assert sent.call_count == 1 + number and (sent.call_args.args[0] == 200).mean() > 0.2
+    loop.choose(client, views.PICTURE)
+    assert loop._step(9e9) and (sent.call_args.args[0] == 200).mean() < 0.2
 
 
 @pytest.mark.parametrize(("update_ms", "newer_s"), [(25.0, 0.03), (800.0, 0.16), (5000.0, 0.2)])
