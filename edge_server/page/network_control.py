@@ -76,8 +76,10 @@ class NetworkControl:
             return
         in_force = self._network.in_force
         if status is not None and "by_hand" in status:
-            told = status["by_hand"]
-            in_force = (told["delay_ms"], told["loss"]) if isinstance(told, dict) else None
+            try:
+                in_force = float(status["by_hand"]["delay_ms"]), float(status["by_hand"]["loss"])
+            except (KeyError, TypeError, ValueError):  # null: the scenario's; or another version's file
+                in_force = None
         self.words.content = note(f"The network is {describe(in_force)}.")
         if in_force is not None:
             values = round(min(in_force[0], MAX_SLIDER_DELAY_MS)), round(100.0 * in_force[1])

@@ -12,6 +12,7 @@ import pytest
 
 from edge_server.page import start_page
 from edge_server.page.network_control import EmulatorControl, NetworkControl, describe
+from edge_server.page.settings import MAX_SLIDER_DELAY_MS
 from freshfield.files import ReplacedJson
 from freshfield.transport import Transport
 from tests.edge_server.page.browser import Browser
@@ -60,6 +61,18 @@ def test_what_the_emulator_does_not_answer_is_told_to_its_visitor():
     control._set(client, (400.0, 0.2))
     title, words = client.add_notification.call_args.args
     assert title == "The network has not changed" and "UNAVAILABLE" in words and network.in_force is None
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("by_hand", [None, 3, "x", {}, {"delay_ms": None, "loss": 0.1}, {"delay_ms": "a", "loss": 1}])
+def test_an_odd_status_file_is_survived(by_hand):
+    gui = MagicMock()
+    gui.add_slider.side_effect = lambda *words, **more: MagicMock(value=0)
+    control = NetworkControl(gui, EmulatorControl(Transport(), "x:1"))
+    control.refresh({"by_hand": {"delay_ms": 9000.0, "loss": 0.5}})
+    assert control.delay.value == MAX_SLIDER_DELAY_MS and control.loss.value == 50
+    control.refresh({"by_hand": by_hand})
+    assert "the scenario" in control.words.content and control.loss.value == 50
 
 
 def test_a_certificate_speaks_for_the_edge_and_not_a_token_of_its_visitors(tmp_path):
