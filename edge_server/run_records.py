@@ -13,6 +13,7 @@ from msgspec import Meta, Struct, field
 
 Number = Annotated[float, Meta(ge=-1e15, le=1e15)]
 Count = Annotated[int, Meta(ge=0, le=10**15)]
+Instant = Annotated[int, Meta(ge=0, le=2**62)]  # nanoseconds of some clock
 
 
 class UpdateRow(Struct, kw_only=True):
@@ -130,12 +131,33 @@ class SoFarScores(Struct):
         return f"now {self.now_psnr_db:.2f} dB, all {self.frames} frames so far {self.all_psnr_db:.2f} dB{poses}"
 
 
+class Event(Struct):
+    """Something that happened at ``t_s``, in words."""
+
+    t_s: Number
+    what: str
+
+
+class RunFacts(Struct):
+    """Where and how a process ran, as it said itself (``report.machine.run_facts``). started: date and time, ISO 8601.
+    machine, versions: see ``report.machine``."""
+
+    started: str | None = None
+    command: str | None = None
+    commit: str | None = None
+    host: str | None = None
+    machine: dict[str, Any] = {}
+    versions: dict[str, str | None] = {}
+
+
 class EdgeStatus(Struct, kw_only=True):
     """What a report takes from edge.json. seconds: of fitting. started_ns, uptime_s: of a live edge. chosen: how the
     edge works and why, in one line. last_frames: sequence and capture time of the last frame of each camera's
     sessions."""
 
-    kind: Literal["live", "fit"] = "live"
+    kind: Literal["live", "fit", "simulated"] = "live"
+    run: RunFacts = field(default_factory=RunFacts)
+    events: list[Event] = []
     scenario: str | None = None
     seed: int | None = None
     field: str | None = None
@@ -143,7 +165,7 @@ class EdgeStatus(Struct, kw_only=True):
     policy: str | None = None
     value: Number | None = None
     seconds: Number | None = None
-    started_ns: int | None = None
+    started_ns: Instant | None = None
     uptime_s: Number | None = None
     lines_lost: Count = 0
     updates: UpdateCounts | None = None
@@ -181,17 +203,19 @@ class Delays(Struct, omit_defaults=True):
 
 
 class ChannelChange(Struct):
-    """An operator's change of the channel. at_ns: on the emulator's clock; delay_ms (mean), loss: None where the
+    """A change of the channel by an operator, at an instant of the emulator's clock; without delay (ms) and loss the
     scenario's channel came back."""
 
-    at_ns: int
+    at_ns: Instant
     delay_ms: Number | None = None
     loss: Number | None = None
 
 
-class ChannelStatus(Struct):
+class ChannelStatus(Struct, omit_defaults=True):
     """What a report takes from the emulator's channel.json. state_share: share of time in each state."""
 
+    preset: str | None = None
+    discipline: str | None = None
     changes: list[ChannelChange] = []
     state_share: dict[str, Number] | None = None
     drawn_delay_ms: Delays | None = None

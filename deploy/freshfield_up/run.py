@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import shlex
 import signal
 import subprocess
+import sys
 import threading
 import time
 from contextlib import suppress
@@ -70,6 +72,7 @@ class Launcher:
         options = self.options
         self.processes = process_set(self.scenario, options.out, options.port, options.data, options.seed, options.edge)
         about = {"scenario": str(self.scenario.path), "seed": self.scenario.seed, "port": options.port}
+        about["command"] = shlex.join(["freshfield", *sys.argv[1:]])
         lock = folder.prepare(options.out, about)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup

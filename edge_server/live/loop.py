@@ -34,6 +34,7 @@ class UpdateLoop:
     on_published(publication, renderer, views): called after each update, on the loop's thread.
     on_status(line): says what the loop is doing.
     on_checkpoint(path): writes the field, between two updates.
+    on_event(what): says that an operator's change took effect.
     controls: what operators change; it takes effect with the next decision.
     update_ms: fitting time of an update, however long the rest of it takes.
     """
@@ -48,6 +49,7 @@ class UpdateLoop:
         on_published: Callable[[Publication, Snapshot, list[View]], None],
         on_status: Callable[[str], None],
         on_checkpoint: Callable[[Path], None],
+        on_event: Callable[[str], None],
     ) -> None:
         self._updater = updater
         self._clock = clock
@@ -57,8 +59,10 @@ class UpdateLoop:
         self._on_published = on_published
         self._on_status = on_status
         self._on_checkpoint = on_checkpoint
+        self._on_event = on_event
         self._checkpoints: Queue[tuple[Path, Future[Path]]] = Queue()
         self._stop = threading.Event()
+        self._paused = False
         self._without_steps = 0  # updates in a row
         self._warned_of = (0, 0, clock.now_ns() / 1e9)  # frames shed and arrived, and when
         self.failure: BaseException | None = None
@@ -117,7 +121,10 @@ class UpdateLoop:
 
     def _update_once(self) -> None:
         self._apply_controls()
-        if self._controls.paused:
+        if self._controls.paused != self._paused:
+            self._paused = self._controls.paused
+            self._on_event(f"an operator {'paused updates' if self._paused else 'resumed'}")
+        if self._paused:
             self._on_status("paused")
             self._stop.wait(_MAX_SLEEP_S)
             return
@@ -141,10 +148,13 @@ class UpdateLoop:
     def _apply_controls(self) -> None:
         if self._policy_changed:
             self._updater.policy = self._controls.chosen  # type: ignore[assignment]
+            value = "" if self._controls.value is None else f" {self._controls.value:g}"
+            self._on_event(f"an operator chose the policy {self._controls.policy}{value}")
         if self._controls.reset_requested:
             self._controls.reset_requested = False
             self._updater.reset()
             log.info("the field was reset")
+            self._on_event("an operator reset the field")
         self._write_checkpoints()
 
     def _warn_without_steps(self, report: FitReport) -> None:

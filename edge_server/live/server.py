@@ -33,6 +33,7 @@ from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.output.journal import Journal
 from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Snapshot
+from edge_server.report.machine import run_facts
 from edge_server.run_records import DepthCounts, DepthStatus, EdgeStatus, UpdateCounts
 from edge_server.scheduler import LivePolicies, short_name
 from edge_server.settings import EdgeConfig, cameras_move, described, embedding_for, read_config
@@ -105,6 +106,7 @@ class EdgeServer:
         self.options = options
         self.clock = clock or WallClock()
         self.start_ns = self.clock.now_ns()
+        self._run_facts = run_facts()
         self._stopping = threading.Event()
         self._update_ms = RollingPercentiles(_UPDATE_TIMES)
         self._counts = UpdateCounts()
@@ -170,6 +172,7 @@ class EdgeServer:
             self._published,
             self._set_status_line,
             self._write_checkpoint,
+            lambda what: self.state.note(what),
         )
         self.state = EdgeState(
             scenario=scenario.name,
@@ -302,6 +305,7 @@ class EdgeServer:
         self.loop.update_ms = config.update_ms
         self.state.chosen = described(self.scenario, config, camera)
         log.info("%s", self.state.chosen)
+        self.state.note(f"the field began anew: {camera} moves")
         with contextlib.suppress(ValueError):  # the file that a scenario names may know the first choice only
             self.frontier = self.state.frontier = open_frontier(self.scenario, config)
             write_json(self.options.out / "frontier.json", msgspec.to_builtins(self.frontier))
@@ -355,6 +359,8 @@ class EdgeServer:
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
             "started_ns": self.start_ns,
+            "run": self._run_facts,
+            "events": [{"t_s": t_s, "what": what} for t_s, what in self.state.events.copy()],
             "uptime_s": self.state.now_s(),
             "field": self.config.field,
             "chosen": self.state.chosen,

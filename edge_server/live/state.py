@@ -22,6 +22,7 @@ from edge_server.run_records import Frontier, SoFarScores
 from edge_server.scheduler import Policy
 from freshfield.frame import Frame
 
+MOST_EVENTS = 200  # kept: each is in every edge.json
 SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages
 
 
@@ -137,6 +138,7 @@ class EdgeState:
     flat_db: PSNR of the mean color of the training images, against the held-out views; None: not known.
     so_far: scores of held-out cameras that move.
     warnings: what other machines can do here that they should not, in words (--insecure).
+    events: (seconds since the run began, what happened), for the report; ``note`` adds one.
     status_line: what the loop is doing, in one line for people, e.g. waiting for a first frame.
     """
 
@@ -158,6 +160,7 @@ class EdgeState:
     started: bool = False
     status_line: str = ""
     warnings: list[str] = field(default_factory=list)
+    events: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
     _publications: deque[Publication] = field(default_factory=lambda: deque(maxlen=4096))
     _shown: deque[Score] = field(default_factory=lambda: deque(maxlen=SHOWN_OF))
     _renderer: Snapshot | None = None
@@ -167,6 +170,10 @@ class EdgeState:
     def now_s(self) -> float:
         """Seconds since the run began."""
         return (self.now_ns() - self.start_ns) / 1e9
+
+    def note(self, what: str) -> None:
+        """Remember an event, in words: it is marked on the report's curves."""
+        self.events.append((round(self.now_s(), 3), what))
 
     def publish(self, publication: Publication, renderer: Snapshot) -> None:
         """Add a publication."""

@@ -11,19 +11,11 @@ import msgspec
 import numpy as np
 
 from edge_server.fidelity.scorer import SHOWN
+from edge_server.report.conclusion import conclusion
+from edge_server.report.events import events
 from edge_server.report.frame_accounting import account_frames
-from edge_server.report.machine import machine, versions
 from edge_server.report.run_files import RunFiles, read_run_files
-from edge_server.run_records import (
-    AgesRow,
-    Baseline,
-    ChannelChange,
-    DepthStatus,
-    EdgeStatus,
-    ShownRow,
-    UpdateCounts,
-    UpdateRow,
-)
+from edge_server.run_records import AgesRow, Baseline, DepthStatus, EdgeStatus, ShownRow, UpdateCounts, UpdateRow
 from freshfield.files import write_json, write_text
 from freshfield.machine_load import outside_load
 
@@ -54,7 +46,7 @@ def build_report(out_dir: str | Path) -> dict[str, Any]:
 
 def assemble(files: RunFiles) -> dict[str, Any]:
     """The contents of report.json. ``kind``: live, or fit for a recorded data set without a network, whose
-    frames, ages and channel are None."""
+    frames, ages and channel are None; or simulated, in virtual time. ``run``: facts that the run wrote down itself."""
     edge, series = files.edge, files.series
     notes = list(files.notes)
     if edge.lines_lost:
@@ -69,8 +61,8 @@ def assemble(files: RunFiles) -> dict[str, Any]:
         "field": edge.field,
         "chosen": edge.chosen,
         "policy": {"name": edge.policy, "value": edge.value},
-        "versions": versions(),
-        "machine": machine(),
+        "run": {**msgspec.to_builtins(edge.run), **({"command": files.command} if files.command else {})},
+        "events": events(files),
         "outside_load": outside_load(files.processes),
         "frames": {**accounting.as_dict(), "ledgers": accounting.ledgers},
         "age_ms": ages(files.ages),
@@ -78,29 +70,17 @@ def assemble(files: RunFiles) -> dict[str, Any]:
         "foreground": edge.foreground,
         "fidelity": {**fidelity(series, seconds, edge), "shown": shown(files.shown, seconds)},
         "channel": msgspec.to_builtins(files.channel),
-        "events": events(files.channel.changes, edge.started_ns),
         "notes": notes + accounting.notes,
     }
     if edge.depth is not None:
         report["depth"] = depth(edge.depth, files.ages)
+    if edge.kind == "simulated":
+        report |= {"frames": None, "age_ms": None}  # simulation.json counts them
     if edge.kind == "fit":
         data = msgspec.to_builtins(edge.data)
         report |= {"data": data, "frames": None, "age_ms": None, "channel": None, "notes": []}
+    report["conclusion"] = conclusion(report)
     return report
-
-
-def events(changes: Sequence[ChannelChange], started_ns: int | None) -> list[dict[str, Any]]:
-    """What operators changed, [{t_s: since the edge started, what: in words}]; emulator and edge have one clock, or
-    nearly."""
-    if started_ns is None:
-        return []
-    found = []
-    for change in changes:
-        what = "the scenario's network again"
-        if change.delay_ms is not None and change.loss is not None:
-            what = f"network set: {change.delay_ms:.0f} ms, {100.0 * change.loss:.0f} % lost"
-        found.append({"t_s": (change.at_ns - started_ns) / 1e9, "what": what})
-    return found
 
 
 def ages(rows: Sequence[AgesRow]) -> dict[str, Any]:

@@ -38,9 +38,9 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
     series, found = report["fidelity"]["series"], report["fidelity"]
     if not _points(series, "psnr_db")[0]:
         return False
-    with figure(path, 2, height_inch=2.5, sharex=True) as (_, axes):
-        top, bottom = axes[:, 0]
-        _mark_events(top, report)
+    scored = any(_points(series, name)[0] for name in ("ssim", "lpips"))
+    with figure(path, 2 if scored else 1, height_inch=2.5, sharex=True) as (_, axes):
+        top = axes[0, 0]
         _plot(top, series, "psnr_db", BLUE, "whole image")
         _plot(top, series, "psnr_moving_db", VERMILION, "moving pixels")
         flat = {"nearest_view_db": "nearest view", "mean_colour_db": "mean color"}
@@ -52,11 +52,17 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
         if fit and SELECTED not in found["scored_on"]:
             title = "Fidelity on held-out views"
         label_lines(top, "PSNR (dB)", title=title)
+        seconds = "seconds of fitting" if fit else "seconds since the edge started"
+        _mark(axes, report)
+        if len(axes) == 1:
+            top.set_xlabel(seconds)
+            return True
+        bottom = axes[1, 0]
         _plot(bottom, series, "ssim", GREEN, "SSIM (higher is better)")
         network = found.get("lpips_network") or "network unknown"
         _plot(bottom, series, "lpips", ORANGE, f"LPIPS-{network} (lower is better)")
         bottom.set_ylim(0.0, 1.02)
-        label_lines(bottom, "score", "seconds of fitting" if fit else "seconds since the edge started")
+        label_lines(bottom, "score", seconds)
     return True
 
 
@@ -74,13 +80,13 @@ def draw_ages(report: Report, files: RunFiles, path: Path) -> bool:
     aaoi = _points(report["fidelity"]["series"], "aaoi_ms")
     with figure(path, 2, height_inch=2.6) as (_, axes):
         over_time, by_camera = axes[:, 0]
-        _mark_events(over_time, report)
         over_time.fill_between(t, low, high, color=SKY, alpha=0.35, linewidth=0, label="all cameras")
         over_time.plot(t, mid, color=BLUE, label="median camera")
         if len(aaoi[0]):
             over_time.plot(*aaoi, color=VERMILION, linewidth=1.2, label="selected views,\nat publication")
         over_time.set_ylim(0, _robust_top([*high, *aaoi[1]]))
         label_lines(over_time, "age (ms)", "seconds since the edge started", "Age of information")
+        _mark(axes[:1], report)
         x = np.arange(len(spreads))
         mean, p50, p95 = (np.array([s[k] for s in spreads.values()]) for k in ("mean", "p50", "p95"))
         by_camera.vlines(x, p50, p95, color=SKY, linewidth=5, label="median to 95 %")
@@ -109,6 +115,7 @@ def draw_updates(report: Report, files: RunFiles, path: Path) -> bool:
         bottom.step(*zip(*counts), where="post", color=GREEN)
         bottom.set_ylim(bottom=0)
         label_lines(bottom, "views used", "seconds since the edge started")
+        _mark(axes, report)
     return True
 
 
@@ -120,13 +127,15 @@ def draw_channel(report: Report, files: RunFiles, path: Path) -> bool:
     histogram = drawn.histogram if drawn and drawn.histogram and sum(drawn.histogram.counts) > 0 else None
     if not shares and histogram is None:
         return False
-    with figure(path, 1, 2, height_inch=2.7, width_ratios=[1, 2]) as (_, axes):
-        left, right = axes[0]
-        left.bar(range(len(shares)), [100 * s for s in shares.values()], color=SKY, width=0.6)
-        left.set_xticks(range(len(shares)), list(shares))
-        left.set_ylim(0, 100)
-        left.grid(axis="x", visible=False)
-        label_lines(left, "% of the time", "state of the channel", "Channel states")
+    ratios = [1] * bool(shares) + [2] * (histogram is not None)
+    with figure(path, 1, len(ratios), height_inch=2.7, width_ratios=ratios) as (_, axes):
+        left, right = axes[0, 0], axes[0, -1]
+        if shares:
+            left.bar(range(len(shares)), [100 * s for s in shares.values()], color=SKY, width=0.6)
+            left.set_xticks(range(len(shares)), list(shares))
+            left.set_ylim(0, 100)
+            left.grid(axis="x", visible=False)
+            label_lines(left, "% of the time", "state of the channel", "Channel states")
         if drawn and histogram:
             edges, counts = np.array(histogram.edges_ms), np.array(histogram.counts)
             width = np.diff(edges)
@@ -137,9 +146,6 @@ def draw_channel(report: Report, files: RunFiles, path: Path) -> bool:
             right.set_xlim(0, edges[-1])
             right.set_yticks([])
             label_lines(right, "density", "drawn delay (ms)", "Drawn delays")
-        else:
-            right.set_axis_off()
-            right.text(0.5, 0.5, "no delays were drawn", ha="center", color=GRAY)
     return True
 
 
@@ -183,6 +189,7 @@ def draw_processes(report: Report, files: RunFiles, path: Path) -> bool:
         bottom.set_ylim(bottom=0)
         label_lines(top, "resident (MB)", title="Memory and processor time of the processes")
         label_lines(bottom, "cores", "seconds since the start")
+        _mark(axes, report)
     return True
 
 
@@ -241,12 +248,14 @@ def _plot(axes: Axes, series: list[dict[str, Any]], name: str, color: str, label
         axes.plot(*points, color=color, label=label)
 
 
-def _mark_events(axes: Axes, report: Report) -> None:
-    """A line where an operator changed something, with the words above it."""
-    for event in report["events"]:
-        axes.axvline(event["t_s"], color=INK, linewidth=0.8, linestyle=":")
-        axes.annotate(
-            event["what"], (event["t_s"], 1.0), xycoords=("data", "axes fraction"), rotation=90, va="top", fontsize=6
+def _mark(axes: np.ndarray, report: Report) -> None:
+    """Mark the report's events, by their numbers in its list, on curves over time. axes: (rows, columns)."""
+    for number, event in enumerate(report["events"], 1):
+        for ax in axes.flat:
+            ax.axvline(event["t_s"], color=PURPLE, linestyle=":", linewidth=1.0)
+        top = axes.flat[0]
+        top.annotate(
+            str(number), (event["t_s"], 1.0), xycoords=("data", "axes fraction"), color=PURPLE, fontsize=8, ha="center"
         )
 
 

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+import shlex
 import subprocess
+import sys
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,18 @@ from freshfield.machine_load import usable_cores
 
 _PACKAGES = ("freshfield", "numpy", "numba", "torch", "grpcio", "opencv-contrib-python-headless")
 _PROC = Path("/proc")
+
+
+def run_facts() -> dict[str, Any]:
+    """Date, command line, commit, host, machine and versions of this process: see ``run_records.RunFacts``."""
+    return {
+        "started": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "commit": commit(),
+        "host": platform.node(),
+        "machine": machine(),
+        "versions": versions(),
+    }
 
 
 def versions() -> dict[str, str | None]:

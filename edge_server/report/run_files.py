@@ -19,10 +19,18 @@ ProcessRow = dict[str, Number | dict[str, Number | None] | None]
 LATE_S = 1.0
 
 
+class _Started(msgspec.Struct):
+    """What a report takes from run.json, which the launcher writes."""
+
+    command: str | None = None
+
+
 @dataclass
 class RunFiles:
     """Contents of a run's folder.
 
+    command: the line that started all processes, where one did.
+    restarts_s: when the edge server started again.
     processes: rows {t_s, name: {rss_mb, cpu, pid}}.
     frontier: the one that the edge used.
     images: those that exist, by name.
@@ -30,6 +38,8 @@ class RunFiles:
     """
 
     out: Path
+    command: str | None = None
+    restarts_s: list[float] = field(default_factory=list)
     edge: EdgeStatus = field(default_factory=EdgeStatus)
     channel: ChannelStatus = field(default_factory=ChannelStatus)
     series: list[UpdateRow] = field(default_factory=list)
@@ -55,11 +65,12 @@ def read_run_files(out: Path) -> RunFiles:
         # Not of a fit.
         shown=_read_rows(out / "shown.jsonl", ShownRow, notes, optional=True),
         frontier=_read(out / "frontier.json", Frontier, notes, optional=True),
-        # Only where the scenario asks for one.
         # Only where one command started all of them.
         processes=_read_rows(out / "processes.jsonl", ProcessRow, notes, optional=True),
+        command=(_read(out / "run.json", _Started, notes, optional=True) or _Started()).command,
         notes=notes,
     )
+    files.restarts_s = restarts([row.t_s for row in files.ages])
     for name in ("truth", "rendered"):
         path = out / f"{name}.png"
         if path.is_file():
@@ -85,6 +96,12 @@ def continuous(times_s: Sequence[float]) -> list[float]:
         found.append(t_s + shift)
         last = max(last, t_s + shift)
     return found
+
+
+def restarts(times_s: Sequence[float]) -> list[float]:
+    """When the process that wrote such rows started again, on the scale of ``continuous``."""
+    placed = continuous(times_s)
+    return [placed[k] for k in range(1, len(placed)) if times_s[k] < times_s[k - 1] - LATE_S]
 
 
 def _read(path: Path, kind: type[T], notes: list[str], optional: bool = False) -> T | None:

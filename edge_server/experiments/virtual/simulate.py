@@ -9,6 +9,7 @@ import itertools
 import json
 import sys
 import time
+from bisect import bisect_right
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,9 @@ from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SHOWN, Score, Scorer
 from edge_server.live.output.decision_log import DecisionLog
+from edge_server.live.output.journal import shown_line
 from edge_server.live.state import Publication
-from edge_server.report.machine import versions
+from edge_server.report.machine import run_facts, versions
 from edge_server.scheduler import parse_policy, short_name
 from edge_server.settings import (
     ComputeConfig,
@@ -108,13 +110,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ScenarioError, DatasetError, ValueError) as error:
         print(f"edge-server simulate: {error}", file=sys.stderr)
         return 2
-    found = {**summary(scenario, deployment, args.seconds), "chosen": chosen}
+    found = {**summary(scenario, deployment, args.seconds), "field": config.field, "chosen": chosen}
     if missing:
         found["lpips_missing"] = missing
     if watched is not None:
         found["now_and_all"] = watched.means()
     if args.out is not None:
-        write_output(args.out, found, deployment.publications)
+        write_output(args.out, found, deployment, scenario.channel.get("preset"))
         if watched is not None:
             watched.write(args.out)
     print(json.dumps(found) if args.json else show(found))
@@ -182,13 +184,32 @@ def digest(deployment: VirtualDeployment) -> str:
     return found.hexdigest()
 
 
-def write_output(out: Path, found: dict[str, Any], publications: Sequence[Publication]) -> None:
-    """Write OUT/simulation.json, and OUT/series.jsonl with a line for each publication, as a live run does.
-    Raises OSError."""
+def write_output(out: Path, found: dict[str, Any], deployment: VirtualDeployment, channel: str | None = None) -> None:
+    """Write OUT/simulation.json, and what a live run writes for its report: edge.json, channel.json, and lines for each
+    publication and each scored instant (series.jsonl, shown.jsonl). channel: its preset. Raises OSError."""
+    publications = deployment.publications
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / "simulation.json", found)
+    names = ("scenario", "seed", "seconds", "policy", "value", "chosen", "lpips_missing")
+    write_json(
+        out / "edge.json",
+        {
+            "kind": "simulated",
+            "run": run_facts(),
+            "field": found["field"],
+            **{name: found[name] for name in names if name in found},
+        },
+    )
+    write_json(out / "channel.json", {"preset": channel})
     lines = [json.dumps(dataclasses.asdict(p)) for p in publications]
     write_text(out / "series.jsonl", "".join(line + "\n" for line in lines))
+    instants = [p.published_ns for p in publications]
+    lines = []
+    for score in deployment.shown:
+        behind = publications[bisect_right(instants, score.published_ns) - 1]
+        t_s = behind.t_s + (score.published_ns - behind.published_ns) / 1e9
+        lines.append(shown_line(t_s, score, behind))
+    write_text(out / "shown.jsonl", "".join(line + "\n" for line in lines))
 
 
 def show(found: dict[str, Any]) -> str:
@@ -308,7 +329,7 @@ def _parser() -> argparse.ArgumentParser:
         "--out",
         type=out_folder,
         metavar="DIR",
-        help="folder to write simulation.json, series.jsonl and a learned policy's decisions to",
+        help="folder to write simulation.json, what edge-server report reads and a learned policy's decisions to",
     )
     add("--json", action="store_true", help="print the result as one JSON object")
     return parser

@@ -75,21 +75,8 @@ class Journal:
                 self._write_oldest()
 
     def shown(self, t_s: float, score: Score, publication: Publication) -> None:
-        """Write a line with ``score``, the score of what was shown at ``t_s``: ``publication``, extrapolated
-        to ``t_s``. The age of its views is the sum of network, waiting, computing and display."""
-        waiting_ms = publication.aaoi_ms - publication.update_ms - (publication.network_ms or 0.0)
-        line = ShownRow(
-            t_s=round(t_s, 4),
-            number=publication.number,
-            **{name: getattr(score, name) for name in SHOWN},
-            age_ms=AgeParts(
-                network=publication.network_ms,
-                waiting=waiting_ms,
-                computing=publication.update_ms,
-                display=1e3 * (t_s - publication.t_s),
-            ),
-        )
-        self._files["shown"].write(json.dumps(line, default=asdict, allow_nan=False))
+        """Write ``shown_line``."""
+        self._files["shown"].write(shown_line(t_s, score, publication))
 
     def ages(
         self, t_s: float, ages_ms: Mapping[str, float | None], depth_ages_ms: Mapping[str, float] | None = None
@@ -134,3 +121,21 @@ class Journal:
             return
         self._without_line = 0
         self._files["series"].write(json.dumps(dataclasses.asdict(publication), allow_nan=False))
+
+
+def shown_line(t_s: float, score: Score, publication: Publication) -> str:
+    """A line of shown.jsonl with ``score``, the score of what was shown at ``t_s``: ``publication``, extrapolated to
+    ``t_s``. The age of its views is the sum of network, waiting, computing and display."""
+    waiting_ms = publication.aaoi_ms - publication.update_ms - (publication.network_ms or 0.0)
+    line = ShownRow(
+        t_s=round(t_s, 4),
+        number=publication.number,
+        **{name: getattr(score, name) for name in SHOWN},
+        age_ms=AgeParts(
+            network=publication.network_ms,
+            waiting=waiting_ms,
+            computing=publication.update_ms,
+            display=1e3 * (t_s - publication.t_s),
+        ),
+    )
+    return json.dumps(line, default=asdict, allow_nan=False)

@@ -129,7 +129,7 @@ class Running:
     """A loop on the wall clock, with what it published and its status lines."""
 
     def __init__(self, u: FieldUpdater, grace_ms: float = 0.0) -> None:
-        self.published, self.lines, self.saved = [], [], []
+        self.published, self.lines, self.saved, self.events = [], [], [], []
         self.clock = WallClock()
         self.controls = Controls(u.policy.name, u.policy.value)
         self.loop = UpdateLoop(
@@ -141,6 +141,7 @@ class Running:
             lambda p, r, v: self.published.append((p, r)),
             self.lines.append,
             self.saved.append,
+            self.events.append,
         )
 
     def until(self, condition, seconds: float = 60.0) -> None:

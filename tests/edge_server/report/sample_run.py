@@ -13,6 +13,7 @@ from edge_server.fidelity.scorer import Score
 from edge_server.live.output.journal import Journal
 from edge_server.live.state import Publication
 from edge_server.report.build_report import assemble
+from edge_server.report.machine import machine, versions
 from edge_server.report.report_page import render_page
 from edge_server.report.run_files import read_run_files
 from freshfield.files import write_json
@@ -32,6 +33,13 @@ EDGE = {
     "baseline": {"mean_colour_db": 14.5, "nearest_view_db": 13.8},
     "lpips_missing": None,
     "lpips_network": "alex",
+    "run": {
+        "started": "2026-02-03T04:05:06+01:00",
+        "host": "bench",
+        "commit": "abc1234567",
+        "command": "edge-server run",
+    }
+    | {"machine": machine(), "versions": versions()},
 }
 CHANNEL = {
     "changes": [
@@ -99,6 +107,7 @@ def write_run(out: Path, publications: int = 49, ages: int = 200) -> None:
         journal.scored(publication(number), final=True)
         journal.shown(publication(number).t_s + 0.1, SHOWN, replace(publication(number), network_ms=50.0))
     journal.close()
+    (out / "run.json").write_text(json.dumps({"command": "freshfield demo"}))
     (out / "channel.json").write_text(json.dumps(CHANNEL))
     image = np.zeros((48, 64, 3), np.uint8)
     image[10:30, 20:40] = (40, 160, 220)

@@ -1,0 +1,122 @@
+"""The conclusion of a report: what was shown, at what age, and what limited it, in three sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from edge_server.fidelity.scorer import SELECTED
+from freshfield.scenario import NOTHING_HELD_OUT
+
+Report = Mapping[str, Any]
+LITTLE_DB = 3.0
+"""Above an image of one mean color: below that, a field shows a blur, whatever the age."""
+SHARE = 0.05
+"""Of frames or updates: below that, what was lost or left out is not worth a clause."""
+
+
+def conclusion(report: Report) -> list[str]:
+    """At most three sentences, from the contents of report.json. A sentence says only what was measured."""
+    if report["kind"] == "fit":
+        return [sentence for sentence in (_shown(report), _fitted(report)) if sentence]
+    if not report["updates"]["count"]:
+        return ["Nothing was shown: the field was never updated.", *_delivery(report)]
+    return [sentence for sentence in (_shown(report), _age(report), _limit(report)) if sentence]
+
+
+def _shown(report: Report) -> str:
+    fidelity = report["fidelity"]
+    shown, final, so_far = fidelity["shown"], fidelity["final"], fidelity["so_far"]
+    found = shown if shown["psnr_db"] is not None else final
+    db = found["psnr_db"]
+    if so_far is not None:
+        db = so_far["now_psnr_db"]
+        text = (
+            f"The newest held-out frame read {db:.1f} dB, all {so_far['frames']} so far {so_far['all_psnr_db']:.1f} dB"
+        )
+    elif db is None:
+        return "How good the picture was is not known: nothing was scored in the last fifth of the run."
+    elif report["kind"] == "fit":
+        text = f"After {report['seconds']:.0f} s of fitting, {_views(report)} read {db:.1f} dB"
+        if final["psnr_refined_db"] is not None:
+            text += f", {final['psnr_refined_db']:.1f} dB at refined poses and exposures"
+    else:
+        text = (
+            f"In the last fifth of the run, {'what was shown' if found is shown else 'publications'} read {db:.1f} dB"
+        )
+        text += f" on {NOTHING_HELD_OUT}" if SELECTED in fidelity["scored_on"] else ""
+        if found["psnr_moving_db"] is not None:
+            text += f", {found['psnr_moving_db']:.1f} dB where the scene moves"
+    flat = fidelity["baseline"]["mean_colour_db"]
+    if flat is None:
+        return f"{text}."
+    if db < flat:
+        return f"{text}: worse than an image of one mean color, which reads {flat:.1f} dB."
+    return f"{text}; an image of one mean color reads {flat:.1f} dB."
+
+
+def _views(report: Report) -> str:
+    count = len((report["data"] or {}).get("held_out", ()))
+    if not count or SELECTED in report["fidelity"]["scored_on"]:
+        return NOTHING_HELD_OUT
+    return "the held-out view" if count == 1 else f"{count} held-out views"
+
+
+def _fitted(report: Report) -> str:
+    data, rows = report["data"], report["fidelity"]["series"]
+    if not data or not rows:
+        return ""
+    least = next((r for r in rows if r["psnr_db"] is not None and r["psnr_db"] >= rows[-1]["psnr_db"] - 1.0), None)
+    text = f"It learned from {data['training']} views"
+    return f"{text}, and was within 1 dB of its end after {least['t_s']:.0f} s." if least else f"{text}."
+
+
+def _age(report: Report) -> str:
+    parts = {name: ms for name, ms in report["fidelity"]["shown"]["age_ms"].items() if ms is not None}
+    still, moving = (report["fidelity"]["shown"][f"psnr_{what}_db"] for what in ("still", "moving"))
+    if parts:
+        each = ", ".join(f"{ms:.0f} ms {name}" for name, ms in parts.items())
+        text = f"The views behind it were {sum(parts.values()):.0f} ms old on average ({each})"
+    elif report["age_ms"] and report["age_ms"]["mean"] is not None:
+        text = f"The newest frame of a camera was {report['age_ms']['mean']:.0f} ms old on average"
+    else:
+        return ""
+    if still is not None and moving is not None:
+        text += (
+            f"; what stands still, which age does not hurt, reads {still:.1f} dB, {still - moving:.1f} above what moves"
+        )
+    return f"{text}."
+
+
+def _limit(report: Report) -> str:
+    """What limited the picture: the cameras where even what stands still is a blur, else the larger part of the age."""
+    shown, flat = report["fidelity"]["shown"], report["fidelity"]["baseline"]["mean_colour_db"]
+    still = shown["psnr_still_db"]
+    lost = "; ".join(_delivery(report)).rstrip(".")
+    if still is not None and flat is not None and still < flat + LITTLE_DB:
+        few = "too few cameras, poses that do not fit, or too short a run"
+        return f"What stands still is little better than one mean color: {few}{f'; {lost}' if lost else ''}."
+    age = {name: ms or 0.0 for name, ms in shown["age_ms"].items()}
+    if not any(age.values()):
+        return f"{lost[:1].upper()}{lost[1:]}." if lost else ""
+    computing = age["waiting"] + age["computing"]
+    if age["network"] > computing:
+        text = "The network was the limit: it takes the larger part of that age"
+    else:
+        text = "Time to compute was the limit: waiting and computing take more of that age than the network"
+    return f"{text}{f'; {lost}' if lost else ''}."
+
+
+def _delivery(report: Report) -> list[str]:
+    """What share of the frames the network and the edge left out, and of updates that learned nothing, in one
+    sentence; empty where none is worth a word."""
+    frames, updates = report["frames"] or {}, report["updates"]
+    sent, delivered = frames.get("sent") or 0, frames.get("delivered") or 0
+    undelivered = sum(frames.get(name) or 0 for name in ("dropped_busy", "superseded", "lost", "skipped", "broken"))
+    shares = (
+        (undelivered, sent, "of the frames sent did not pass the network"),
+        (updates["shed"] or 0, delivered, "of those delivered were left out for lack of time"),
+        (updates["without_step"], updates["count"], "of the updates had no time for a step of training"),
+    )
+    said = [f"{part / whole:.0%} {what}" for part, whole, what in shares if whole and part >= SHARE * whole]
+    return [", ".join(said) + "."] if said else []

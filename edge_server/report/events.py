@@ -1,0 +1,71 @@
+"""What happened during a run besides updates: marked on every curve over time, and listed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+from typing import Any
+
+from edge_server.report.run_files import RunFiles
+from edge_server.run_records import AgesRow, ChannelChange, Event
+
+SILENT_MS = 3000.0
+"""Age from which on a camera counts as gone: longer than any frame of the shipped channels takes."""
+TOGETHER_S = 1.0
+"""Cameras that fall silent within that time are one event: a blackout, or a node that ended."""
+MOST = 40
+"""Events that are listed: a link that comes and goes would make the curves unreadable."""
+_NAMED = 3  # cameras in a line
+
+
+def events(files: RunFiles) -> list[dict[str, Any]]:
+    """[{t_s: seconds since the edge started, what: in words}], in order; the ``MOST`` first."""
+    restarted_s = files.restarts_s[-1] if files.restarts_s else 0.0  # the edge's events and start are the last one's
+    found = [Event(event.t_s + restarted_s, event.what) for event in files.edge.events]
+    if (began_ns := files.edge.started_ns) is not None:
+        changes = files.channel.changes
+        found += [Event((each.at_ns - began_ns) / 1e9 + restarted_s, _words(each)) for each in changes]
+    found += [Event(t_s, "the edge server started again") for t_s in files.restarts_s]
+    found += silences(files.ages)
+    found = sorted((event for event in found if event.t_s >= 0.0), key=lambda event: event.t_s)
+    return [{"t_s": round(event.t_s, 2), "what": event.what} for event in found[:MOST]]
+
+
+def silences(rows: Sequence[AgesRow]) -> list[Event]:
+    """When cameras stopped to deliver frames for more than ``SILENT_MS``, and for how long."""
+    cameras = sorted({camera for row in rows for camera in row.age_ms})
+    gaps = sorted((gap for camera in cameras for gap in _gaps(rows, camera)), key=lambda gap: gap[0])
+    found = []
+    while gaps:
+        first_s = gaps[0][0]
+        together = [gap for gap in gaps if gap[0] - first_s <= TOGETHER_S]
+        gaps = gaps[len(together) :]
+        names = sorted({gap[2] for gap in together})
+        who = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+        ends_s = [end_s for _, end_s, _ in together if end_s is not None]
+        if len(ends_s) < len(together):
+            found.append(Event(first_s, f"{who}: no further frame"))
+        else:
+            found.append(Event(first_s, f"{who}: no frame for {max(ends_s) - first_s:.1f} s"))
+    return found
+
+
+def _gaps(rows: Sequence[AgesRow], camera: str) -> list[tuple[float, float | None, str]]:
+    """(capture time of the last frame before the gap, seconds; that of the first one after it, None: there is none;
+    camera)."""
+    ages = [(row.t_s, age_ms) for row in rows if (age_ms := row.age_ms.get(camera)) is not None]
+    found: list[tuple[float, float | None, str]] = []
+    for silent, run in groupby(ages, key=lambda at: at[1] >= SILENT_MS):
+        times = list(run)
+        captured_s = times[0][0] - times[0][1] / 1e3
+        if silent:
+            found.append((captured_s, None, camera))
+        elif found:
+            found[-1] = (found[-1][0], captured_s, camera)
+    return found
+
+
+def _words(change: ChannelChange) -> str:
+    if change.delay_ms is None and change.loss is None:
+        return "the scenario's network again"
+    return f"network set: {change.delay_ms or 0.0:.0f} ms, {100.0 * (change.loss or 0.0):.0f} % lost"
