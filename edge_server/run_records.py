@@ -139,8 +139,8 @@ class Event(Struct):
 
 
 class RunFacts(Struct):
-    """Where and how a process ran, as it said itself (``report.machine.run_facts``). started: date and time, ISO 8601.
-    machine, versions: see ``report.machine``."""
+    """Where and how a process ran, as it said itself (``machine.run_facts``). started: date and time, ISO 8601.
+    machine, versions: see ``machine``."""
 
     started: str | None = None
     command: str | None = None

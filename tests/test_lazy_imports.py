@@ -33,6 +33,10 @@ FEW_CAMERAS = """
 import edge_server.fields.splat.layers.layered_field
 import edge_server.fields.splat.layers.depth.depth_supervision
 """
+WARM_UP = """
+import edge_server.fields.splat.layers.layered_field, edge_server.fields.splat.scan.carried_field
+import edge_server.fields.warm_up_command
+"""
 EMULATOR = """
 import channel_emu.cli, channel_emu.live.frame_proxy, channel_emu.testing
 import channel_emu.virtual.simulate, channel_emu.estimate
@@ -60,6 +64,7 @@ UNASKED = {
         *("edge_server", "channel_emu", "scipy", "matplotlib"),
     ),
     FEW_CAMERAS: ("edge_server.fields.splat.layers.depth.network_depth", "edge_server.embed", "onnx"),
+    WARM_UP: ("grpc", "zstandard", "google", "torch"),  # ``make`` compiles while it installs them
     EMULATOR: ("torch", "numba", "cv2", "scipy", "matplotlib", "camera_node", "edge_server"),
 }
 
@@ -67,7 +72,7 @@ UNASKED = {
 @pytest.mark.parametrize(
     ("program", "unasked"),
     UNASKED.items(),
-    ids=("edge", "node", "node without an arm", "tile", "few cameras", "emulator"),
+    ids=("edge", "node", "node without an arm", "tile", "few cameras", "warm-up", "emulator"),
 )
 def test_what_nobody_asks_for_is_not_imported(program: str, unasked: tuple[str, ...]) -> None:
     code = f"{program}\nimport sys\nprint([name for name in sys.modules if name.startswith({unasked})])"

@@ -20,7 +20,7 @@ from edge_server.experiments.common.statistics import discoveries, interval, pai
 from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.rollouts.rollout import run_rollouts
 from edge_server.experiments.rollouts.setting import Setting, seeds
-from edge_server.report.machine import commit, machine
+from edge_server.machine import commit, machine
 from edge_server.scheduler import STATE_PARTS, short_name
 from edge_server.settings import ComputeConfig, read_config
 from freshfield.files import out_file, write_json

@@ -12,7 +12,6 @@ from typing import Any
 
 from edge_server.fields.compiling import USUAL
 from edge_server.fields.registry import field_names, make_field
-from edge_server.settings import FIELD
 
 DESCRIPTION = f"""\
 Compile the kernels of a field for this processor ({USUAL}), so that
@@ -34,14 +33,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("freshfield warm-up", description=DESCRIPTION, formatter_class=raw)
     parser.add_argument("scenario", nargs="?", help="scenario file, or the name of a shipped one: its field alone")
-    parser.add_argument("--field", choices=field_names(), default=FIELD, help="without a scenario [%(default)s]")
+    parser.add_argument("--field", choices=field_names(), help="without a scenario [the default field]")
     args = parser.parse_args(argv)
-    if args.scenario is None:
-        field, seconds = args.field, warm_up(args.field)
-    else:
+    if args.scenario is not None:
         field, seconds = _of_scenario(args.scenario)
+    else:
+        field = args.field or _default_field()
+        seconds = warm_up(field)
     print(f"kernels of {field} ready after {seconds:.1f} s")
     return 0
+
+
+def _default_field() -> str:
+    from edge_server.settings import FIELD  # with scenario files, and what reads them
+
+    return FIELD
 
 
 def _of_scenario(name: str) -> tuple[str, float]:

@@ -33,7 +33,7 @@ from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.output.journal import Journal
 from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Snapshot
-from edge_server.report.machine import run_facts
+from edge_server.machine import run_facts
 from edge_server.run_records import DepthCounts, DepthStatus, EdgeStatus, UpdateCounts
 from edge_server.scheduler import LivePolicies, short_name
 from edge_server.settings import EdgeConfig, cameras_move, described, embedding_for, read_config

@@ -19,7 +19,7 @@ import camera_node
 import channel_emu
 import edge_server
 import freshfield
-from edge_server.report.machine import versions
+from edge_server.machine import versions
 
 _PACKAGES = {str(package.__name__): package for package in (freshfield, camera_node, channel_emu, edge_server)}
 _KEY_LENGTH = 40

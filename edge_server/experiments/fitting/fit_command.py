@@ -40,7 +40,7 @@ from edge_server.fields import Field, RefinesCameras, checkpoint
 from edge_server.fields.registry import efforts_of, field_names, option_help, settings_of
 from edge_server.fields.splat.scan.settings import scan_options
 from edge_server.live.scoring_thread import to_bytes
-from edge_server.report.machine import run_facts
+from edge_server.machine import run_facts
 from edge_server.run_records import UpdateRow
 from edge_server.settings import FIELD
 from freshfield.files import out_folder, write_json

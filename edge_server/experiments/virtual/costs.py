@@ -22,7 +22,7 @@ from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of, run_command
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
-from edge_server.report.machine import machine, versions
+from edge_server.machine import machine, versions
 from edge_server.settings import ComputeConfig, EdgeConfig, read_config
 from freshfield.files import out_file, write_json
 from freshfield.scenario import Scenario, ScenarioError, load

@@ -30,7 +30,7 @@ from edge_server.fidelity.scorer import SHOWN, Score, Scorer
 from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.output.journal import shown_line
 from edge_server.live.state import Publication
-from edge_server.report.machine import run_facts, versions
+from edge_server.machine import run_facts, versions
 from edge_server.scheduler import parse_policy, short_name
 from edge_server.settings import (
     ComputeConfig,

@@ -47,7 +47,7 @@ def versions() -> dict[str, str | None]:
 def commit() -> str | None:
     """The commit that the program runs from, with ``-dirty`` where files differ from it; None outside a
     clone."""
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[1]
     if not (root / ".git").exists():
         return None
     command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=10", "--exclude=*"]

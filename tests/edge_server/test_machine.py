@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import os
 
-from edge_server.report.machine import machine, versions
+from edge_server.machine import machine, versions
 
 
 def test_versions_name_what_figures_depend_on():
