@@ -27,12 +27,12 @@ def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Eff
     from camera_node.synthetic.effects import load_effects
 
     with errors_of(f"{scenario.path}: source.effects"):
-        effects = load_effects(
-            config.effects, lambda name: scenario.rng(f"effect {name}", camera), held_out=camera in scenario.held_out
-        )
-    if config.kind != "world" and (effects.lens or effects.exposure or effects.delay):
+        held_out = camera in scenario.held_out
+        effects = load_effects(config.effects, lambda name: scenario.rng(f"effect {name}", camera), held_out, camera)
+    if config.kind != "world" and (effects.lens or effects.exposure or effects.delay or effects.mount):
         raise ScenarioError(
-            f"{scenario.path}: source.effects: effects of the kinds lens, exposure and delay need source kind world"
+            f"{scenario.path}: source.effects: effects of the kinds lens, exposure, delay and mount need source kind "
+            "world"
         )
     return effects
 

@@ -22,7 +22,7 @@ from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.render import Image
 from freshfield import payload
 from freshfield.depth import DepthImage
-from freshfield.geometry import Pose
+from freshfield.geometry import Array, Pose
 from freshfield.scenario import Scenario, ScenarioError
 from freshfield.settings import as_mapping
 
@@ -73,12 +73,16 @@ class WorldSource(Source):
         self.intrinsics = effects.reported_lens(lens)
         self._walk = walk
         self.repeats_after = _repeats_after(self.scene, self.fps, None if walk is None else walk.lap_s)
+        self._turns = bool(effects.mount) and walk is None
+        if self._turns:
+            self.repeats_after = None
         # Frames with equal images but different reported poses are different shots.
         self.contents = None if effects.image or effects.pose_varies else self.repeats_after
         self._pose, self._effects = Pose.from_matrix(matrix), effects
         # Frames to which image effects are applied later are stored losslessly.
         self._codec, self._quality = "zstd" if effects.image else codec, quality
         self._depth: DepthRenderer | None = None
+        self._placed: tuple[Array, Renderer] | None = None
         self.cache: FrameCache | None = None
         if folder is not None and self.repeats_after is not None:
             self.cache = FrameCache(self.key(), self._codec, (lens.width, lens.height), folder)
@@ -103,12 +107,12 @@ class WorldSource(Source):
         """As the listed depth sensor measures it. Of a scene that repeats, measurements repeat too."""
         if not self._effects.depth:
             return None
-        lens, matrix = self.scene.cameras[self.camera_id]
+        lens = self.scene.cameras[self.camera_id][0]
         frame = content % self.repeats_after if self.repeats_after else content
-        if self._depth is None or self._walk is not None:
+        if self._depth is None or self._walk is not None or self._turns:
             from camera_node.synthetic.depth import DepthRenderer
 
-            at = matrix if self._walk is None else self._walk.pose(self._time_s(frame))
+            at = self._placed_at(frame) if self._walk is None else self._walk.pose(self._time_s(frame))
             self._depth = DepthRenderer(self.scene.world, lens, at)
         exact = self._depth.depth(self._time_s(frame))
         return self._effects.depth[0].measure(exact, pixels(shot, self._codec), lens, content)
@@ -127,7 +131,7 @@ class WorldSource(Source):
 
     def release(self) -> None:
         # Replace the scene by the same one without its renderers.
-        self._depth = None
+        self._depth = self._placed = None
         self.scene = self.scene.with_world(self.scene.world)
 
     def key(self) -> str:
@@ -160,11 +164,23 @@ class WorldSource(Source):
         return data
 
     def _render(self, frame: int) -> Image:
-        if self._walk is None:
-            view: Renderer = self.scene.renderer(self.camera_id)
+        if self._turns:
+            view: Renderer = self._mounted(frame)
+        elif self._walk is None:
+            view = self.scene.renderer(self.camera_id)
         else:
             view = self._walk.view(self.scene, self.scene.cameras[self.camera_id][0])
         return self._effects.with_exposure(view).image(self._time_s(frame))
+
+    def _mounted(self, frame: int) -> Renderer:
+        """A renderer of where the camera really stands, kept until it stands elsewhere."""
+        at = self._placed_at(frame)
+        if self._placed is None or not np.array_equal(self._placed[0], at):
+            self._placed = at, self.scene.view(self.scene.cameras[self.camera_id][0], at)
+        return self._placed[1]
+
+    def _placed_at(self, frame: int) -> Array:
+        return self._effects.placed(self.scene.cameras[self.camera_id][1], self._time_s(frame))
 
     def _time_s(self, frame: int) -> float:
         return float(frame / self.fps) + self.phase_ns / 1e9

@@ -8,6 +8,7 @@ The kinds, by where they act:
 * ``clock``    changes the node's clock and so its time stamps;
 * ``pose``     changes the pose that frames report, not the image;
 * ``delay``    changes the instant of that pose, of a camera that moves;
+* ``mount``    changes where a camera really stands, not the pose that frames report (rendered as frames are due);
 * ``depth``    measures depth with frames that carry it (costs time for each of those).
 
 To add one, write a file here with a dataclass of the same name (the effect's parameters and ``kind``) and add
@@ -31,10 +32,11 @@ from camera_node.clocks import ClockError
 from camera_node.synthetic.render import Image
 from camera_node.synthetic.scene import Scene
 from freshfield.depth import DepthImage
-from freshfield.geometry import Pinhole, Pose
+from freshfield.geometry import Array, Pinhole, Pose
 from freshfield.settings import ScenarioError, Settings, about, read_settings
 
 NAMES = (
+    "bump",
     "clock_drift",
     "depth_sensor",
     "exposure_drift",
@@ -54,6 +56,7 @@ class EffectParameters(Settings, frozen=True, kw_only=True):
     """Base of the effects' parameters."""
 
     in_truth: Annotated[bool, about("whether the effect applies to held-out cameras as well")] = False
+    cameras: Annotated[tuple[str, ...], about("the cameras it applies to; not given: all")] = ()
 
     kind: ClassVar[str]
 
@@ -124,6 +127,12 @@ class DelayEffect(Protocol):
         ...
 
 
+class MountEffect(Protocol):
+    def placed(self, camera_to_world: Array, t_s: float) -> Array:
+        """Where a camera that was mounted at a pose, (4, 4), really stands at ``t_s`` after the epoch."""
+        ...
+
+
 class DepthEffect(Protocol):
     def measure(self, depth_m: NDArray[np.float32], image: Image, camera: Pinhole, index: int) -> DepthImage:
         """What a sensor measures with frame number ``index``.
@@ -144,6 +153,7 @@ class Effects:
     clock: tuple[ClockError, ...] = ()
     pose: tuple[PoseEffect, ...] = ()
     delay: tuple[DelayEffect, ...] = ()
+    mount: tuple[MountEffect, ...] = ()
     depth: tuple[DepthEffect, ...] = ()
     rendered: tuple[tuple[str, Any], ...] = ()  # name and parameters of the effects within cached frames
 
@@ -199,6 +209,12 @@ class Effects:
             t_s = effect.instant_s(t_s)
         return t_s
 
+    def placed(self, camera_to_world: Array, t_s: float) -> Array:
+        """Where the camera really stands, see ``MountEffect``."""
+        for effect in self.mount:
+            camera_to_world = effect.placed(camera_to_world, t_s)
+        return camera_to_world
+
 
 NO_EFFECTS = Effects()
 
@@ -220,9 +236,11 @@ def load_effects(
     listed: Mapping[str, Mapping[str, Any] | None],
     rng_for: Callable[[str], np.random.Generator],
     held_out: bool = False,
+    camera: str = "",
 ) -> Effects:
     """The listed effects (name -> parameters) of one camera; NO_EFFECTS if none applies.
 
+    camera: its name, for effects that list ``cameras``.
     rng_for: gives the random stream of an effect for this camera; called once for each effect that applies.
     held_out: only effects with ``in_truth: true`` apply.
     Raises EffectError for an unknown effect or parameter.
@@ -234,7 +252,7 @@ def load_effects(
             effect = read_settings(effect_class(name), dict(given or {}), f"effect {name}")
         except ScenarioError as error:
             raise EffectError(str(error)) from None
-        if held_out and not effect.in_truth:
+        if (held_out and not effect.in_truth) or (effect.cameras and camera not in effect.cameras):
             continue
         found.setdefault(effect.kind, []).append(effect.start(rng_for(name)))
         if effect.kind == "exposure":

@@ -17,6 +17,7 @@ class Params(Settings, frozen=True):
     windows_ms: Annotated[list[list[float]], about("[start, end] of each window")] = field(default_factory=list)
     every_ms: float | None = None
     for_ms: float | None = None
+    cameras: Annotated[tuple[str, ...], about("whose links it concerns; not given: all")] = ()
 
     def __post_init__(self) -> None:
         for window in self.windows_ms:
@@ -32,8 +33,9 @@ class Params(Settings, frozen=True):
 
 class Blackout(Fault):
     def __init__(self, params: Params, seed: int, camera: str) -> None:
-        self.windows_ns = [(to_ns(a), to_ns(b)) for a, b in params.windows_ms]
-        self.every_ns = to_ns(params.every_ms) if params.every_ms is not None else 0
+        concerned = not params.cameras or camera in params.cameras
+        self.windows_ns = [(to_ns(a), to_ns(b)) for a, b in params.windows_ms if concerned]
+        self.every_ns = to_ns(params.every_ms) if params.every_ms is not None and concerned else 0
         self.for_ns = to_ns(params.for_ms) if params.for_ms is not None else 0
 
     def loses(self, transit: Transit) -> bool:

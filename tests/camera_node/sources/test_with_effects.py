@@ -81,6 +81,25 @@ def test_a_depth_sensor_measures_with_every_camera_but_the_held_out_one_and_chan
     assert found["cam01"].source.key() == plain["cam01"].source.key(), "rendered frames are found again"
 
 
+def test_a_bumped_camera_shows_another_view_from_then_on_and_reports_its_old_pose():
+    bump = {"at_s": 1.0, "pitch_deg": 1.0, "cameras": ["cam01"]}
+    found, plain = cameras({"bump": bump, "depth_sensor": {}}), cameras({"depth_sensor": {}})
+
+    def made(camera: Camera, tick: int) -> tuple[Any, ...]:
+        shot = camera.source.read(tick)
+        depth = camera.source.depth(tick, shot)
+        assert depth is not None
+        return pixels(camera, tick).tobytes(), depth.counts.tobytes(), shot.pose
+
+    assert made(found["cam01"], 9) == made(plain["cam01"], 9)
+    assert made(found["cam02"], 10) == made(plain["cam02"], 10)
+    turned, stood = made(found["cam01"], 10), made(plain["cam01"], 10)
+    assert turned[0] != stood[0] and turned[1] != stood[1] and turned[2] == stood[2]
+    again = plain["cam01"].source.contents
+    assert again is not None and made(found["cam01"], again + 9)[0] != made(plain["cam01"], 9)[0], "it stays turned"
+    assert made(found["cam01"], 9) == made(plain["cam01"], 9), "in any order"
+
+
 def test_a_wrong_pose_is_claimed_of_the_right_image():
     found = cameras({"pose_noise": {"translation_mm": 20.0, "rotation_deg": 1.0}})["cam01"]
     plain = cameras({})["cam01"]
@@ -120,10 +139,10 @@ def test_a_lens_that_does_not_go_with_the_scene_is_one_line_with_the_file_s_name
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["lens_distortion", "motion_blur", "pose_delay"])
+@pytest.mark.parametrize("name", ["bump", "lens_distortion", "motion_blur", "pose_delay"])
 def test_recordings_have_lenses_of_their_own(tmp_path, name):
     scenario = photo_scenario(write_photos(tmp_path, 24), 3, effects={name: None})
-    with pytest.raises(ScenarioError, match="kinds lens, exposure and delay need source kind world"):
+    with pytest.raises(ScenarioError, match="kinds lens, exposure, delay and mount need source kind world"):
         build_cameras(scenario, source_config(scenario), scenario.cameras)
 
 

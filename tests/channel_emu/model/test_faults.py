@@ -69,6 +69,10 @@ def test_blackout_loses_what_is_on_the_way_during_a_window() -> None:
     fates = {at: subject.offer(at * MS)[0] for at in (0, 69, 95, 160, 185, 350)}
     subject.advance(1000 * MS)
     assert [at for at, t in fates.items() if t.outcome is EventKind.LOST] == [95, 185]
+    subject = link({"blackout": {"windows_ms": [[0, 1000]], "cameras": ["another"]}}, delay_ms=20)
+    fate = subject.offer(0)[0]
+    subject.advance(1000 * MS)
+    assert fate.outcome is EventKind.DELIVERED
 
 
 def test_resets_break_what_is_inside_at_their_instants() -> None:

@@ -36,6 +36,7 @@ from edge_server.fields.splat.layers.observations import (
     FixedCamera,
     Observation,
     Observations,
+    bumped_by,
     cameras_of,
     newest_of_each,
 )
@@ -115,7 +116,8 @@ class LayeredField:
     def troubles(self) -> tuple[str, ...]:
         """What is wrong with poses and measured depth, for people."""
         depth = self.supervision.depth
-        return () if depth is None else depth.troubles
+        bumped = [f"{name} {bumped_by(camera)}" for name, camera in self.cameras.items() if camera.bumped is not None]
+        return (*bumped, *(() if depth is None else depth.troubles))
 
     @property
     def learning(self) -> str:
@@ -316,6 +318,11 @@ class LayeredField:
         refused = self.refused | {view.camera}
         may_refuse = self.tracker is not None and 4 * len(refused) <= len(self.cameras)
         foreground = camera.plate.take(view.image, may_refuse)
+        if camera.shows_turned(view, foreground, self.observations.usual_share):
+            foreground = None
+            if camera.was_turned:
+                self._turn_camera(view)
+                return
         if foreground is None:
             self.refused = refused
             return
@@ -338,6 +345,17 @@ class LayeredField:
         self.cameras[view.camera] = camera
         self.observations.forget_camera(view.camera)
         return camera
+
+    def _turn_camera(self, view: View) -> None:
+        """Begin a camera anew that was bumped, turned as its frames show."""
+        before = self.cameras[view.camera]
+        stands = before.view.camera_to_world.copy()
+        stands[:3, :3] @= before.turns[-1]
+        camera = self._move_camera(view)
+        camera.bumped = stands
+        camera.correct(stands, before.depth_scale)
+        log.warning("%s: %s", view.camera, bumped_by(camera))
+        self.refused -= {view.camera}
 
     # --- the still field ---------------------------------------------------------------------
 

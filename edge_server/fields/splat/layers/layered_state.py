@@ -26,13 +26,13 @@ from freshfield.geometry import Pinhole
 Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
-VERSION = 7
+VERSION = 8
 COUNTERS = ("layered", "origin_ns")  # of the field
 # Of its supervision.
 SUPERVISED = ("plates_s", "fine_s", "fine", "exposure_rounds", "anew", "with_depth", "early")
 TRACKED = ("anchors_s", "seeded_s", "fits")  # of its tracker
-OF_CAMERA = ("newest_s", "rendered_step", "moves", "anew", "depth_scale")
-ARRAYS_OF_CAMERA = ("away", "depth_m", "reported")  # or None
+OF_CAMERA = ("newest_s", "rendered_step", "moves", "anew", "depth_scale", "looked_ns")
+ARRAYS_OF_CAMERA = ("away", "depth_m", "reported", "bumped")  # or None
 
 
 def pack(field: Any) -> Arrays:
@@ -49,6 +49,7 @@ def pack(field: Any) -> Arrays:
             arrays |= _prefixed("fine.", camera.fine.state())
         if camera.depth is not None:
             arrays |= _prefixed("depth.", camera.depth.state())
+        arrays["turns"] = np.reshape(camera.turns, (-1, 3, 3))
         arrays |= {name: array for name in ARRAYS_OF_CAMERA if (array := getattr(camera, name)) is not None}
         state |= _prefixed(f"camera_{k}.", arrays)
     for k, o in enumerate(field.observations):
@@ -103,6 +104,7 @@ def unpack(field: Any, state: Arrays) -> None:
         plate.load_state(_under("plate.", arrays))
         fine = FinePlate.from_state(view, _under("fine.", arrays)) if "fine.color" in arrays else None
         camera = FixedCamera(view, plate, fine=fine, taken=deque(facts["taken"], maxlen=FRAMES_KNOWN))
+        camera.turns = list(np.array(arrays["turns"]))
         for name in ARRAYS_OF_CAMERA:
             setattr(camera, name, np.array(arrays[name]) if name in arrays else None)
         _set(camera, OF_CAMERA, facts)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from edge_server.fields import Rendering, View
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.layers import settings as tuned
+from edge_server.fields.splat.layers.bump import degrees_of, find_turn
 from edge_server.fields.splat.layers.motion import ViewRow
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
 from edge_server.fields.splat.layers.static_layer import PlateImage
@@ -39,6 +40,9 @@ class FixedCamera:
     away: float64 (4, 4), pose of the newest frame, where that was taken elsewhere.
     moves: number of places other than its own from which frames came, since it last stood still.
     anew: whether it began anew where it stands, and its plate says little yet.
+    bumped: float64 (4, 4), where it stands by its own pictures since it was bumped; None: where its frames say.
+    turns: of the latest frames in a row that are its plate, turned: ``bump.find_turn``, oldest first.
+    looked_ns: ``generated_ns`` of the frame in which a turn was last looked for.
     """
 
     view: View
@@ -55,6 +59,9 @@ class FixedCamera:
     away: NDArray[np.float64] | None = None
     moves: int = 0
     anew: bool = False
+    bumped: NDArray[np.float64] | None = None
+    turns: list[NDArray[np.float64]] = field(default_factory=list)
+    looked_ns: int = 0
 
     @classmethod
     def begin(cls, view: View, pool: Pool) -> FixedCamera:
@@ -84,6 +91,31 @@ class FixedCamera:
     def reported_pose(self) -> NDArray[np.float64]:
         """The pose that its frames say."""
         return self.view.camera_to_world if self.reported is None else self.reported
+
+    @property
+    def assumed_pose(self) -> NDArray[np.float64]:
+        """Where it stands, before registration corrects it."""
+        return self.reported_pose if self.bumped is None else self.bumped
+
+    def shows_turned(self, view: View, foreground: NDArray[np.bool_] | None, usual: Callable[[str], float]) -> bool:
+        """Whether a frame, or one that was refused (foreground: None), is the plate as a camera sees it that was
+        turned: then it adds to ``turns``. usual: see ``Observations.usual_share``."""
+        share = 1.0 if foreground is None else float(foreground.mean())
+        unusual = share > tuned.BUMP_SHARE and share > tuned.BUMP_UNUSUAL * usual(self.view.camera)
+        waits = not self.turns and 0 <= view.generated_ns - self.looked_ns < 1e9 * tuned.BUMP_EVERY_S
+        if self.anew or not unusual or waits:
+            return False
+        self.looked_ns = view.generated_ns
+        turn = find_turn(self.plate.picture, self.plate.known, view.image, view.intrinsics)
+        if self.turns and turn is not None and degrees_of(self.turns[-1].T @ turn) > tuned.BUMP_AGREE_DEG:
+            self.turns = []  # it still swings
+        self.turns = [] if turn is None else [*self.turns, turn]
+        return turn is not None
+
+    @property
+    def was_turned(self) -> bool:
+        """Whether enough frames in a row say that it stands turned now."""
+        return len(self.turns) >= tuned.BUMP_FRAMES
 
     def correct(self, pose: NDArray[np.float64], depth_scale: float) -> None:
         """Take a pose (4, 4) and a factor on depth instead of those that its frames say."""
@@ -193,9 +225,24 @@ class Observations:
         """Drop the frames of a camera."""
         self._sorted = [o for o in self._sorted if o.camera != camera]
 
+    def usual_share(self, camera: str) -> float:
+        """Median share of the foreground in a camera's frames; 1 where there is none."""
+        shares = [o.share for o in self._sorted if o.camera == camera]
+        return float(np.median(shares)) if shares else 1.0
+
     def of_knots(self, first: int, last: int) -> list[Observation]:
         """The frames from knot ``first`` to knot ``last``, both included."""
         return [o for o in self._sorted if first <= o.knot <= last]
+
+
+def bumped_by(camera: FixedCamera) -> str:
+    """What happened to a camera that was bumped, for people."""
+    assert camera.bumped is not None
+    turn = camera.reported_pose[:3, :3].T @ camera.bumped[:3, :3]
+    return (
+        f"was bumped: all of its picture is turned by {degrees_of(turn):.1f} degrees from where its frames say that it "
+        "stands; this is corrected, but a new calibration is better"
+    )
 
 
 def _same_pose(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:

@@ -59,6 +59,17 @@ CLOSE, SPECK, HOLE = 5, 10, 0.02  # pixels, pixels, share of the image: see ``pl
 REFUSED_SHARE = 0.6  # of the pixels: with more foreground, a frame does not show what the plate shows
 HELD_OPACITY, HELD_ERROR = 0.5, 0.12  # where the moving set explains a frame
 
+# --- a camera that was bumped (bump) ---
+BUMP_SIDES_PX = (32, 64, 128)  # of the images that are aligned, one after the other: a turn of some pixels of the first
+BUMP_SHARE, BUMP_UNUSUAL = 0.1, 2.0  # of the pixels, and of the usual foreground: with less no turn is looked for
+BUMP_FRAMES, BUMP_AGREE_DEG = 3, 0.3  # frames in a row that tell the same turn: it no longer swings
+BUMP_EVERY_S = 0.2  # how often is looked for one, until a frame tells a turn
+BUMP_ROUNDS = 10  # of Gauss-Newton in each
+BUMP_NEAR = 8.0  # of 255: pixels that differ by more do not show what the plate shows
+# A turn is believed that has so many more pixels show what the plate shows, and leaves so few of those that did not.
+BUMP_GAINS, BUMP_LEAVES = 0.05, 0.6
+BUMP_LEAST_DEG, BUMP_MOST_DEG = 0.3, 12.0  # less is below what calibration errs; more shows another view
+
 # --- how much a pixel counts ---
 NEAR_FOREGROUND_PX = 5  # width of the square by which the foreground grows, where pixels count in full
 BACKGROUND_WEIGHT = 0.5  # weight of the other pixels

@@ -241,7 +241,7 @@ class StaticSupervision:
         corrections = self.depth.corrections
         for name, camera in cameras.items():
             found = corrections.get(name)
-            pose, scale = (camera.reported_pose, 1.0) if found is None else (found.pose, found.scale)
+            pose, scale = (camera.assumed_pose, 1.0) if found is None else (found.pose, found.scale)
             if camera.depth_scale != scale or not np.array_equal(camera.view.camera_to_world, pose):
                 camera.correct(pose, scale)
                 for o in observations:
@@ -310,7 +310,7 @@ class StaticSupervision:
             plate = camera.plate_image(fine=False)
             learned = camera.plate_image(fine=True) if self.fine else plate
             depth = None if camera.depth is None else camera.depth.copied()
-            copies.append(CameraPlates(plate, learned, depth, camera.reported_pose))
+            copies.append(CameraPlates(plate, learned, depth, camera.assumed_pose))
         return copies
 
     # --- plates at full resolution ------------------------------------------------------------

@@ -81,7 +81,7 @@ def test_every_file_is_registered_and_follows_the_protocol():
     on_disk = sorted(m.name for m in pkgutil.iter_modules(fx.__path__))
     assert sorted(fx.NAMES) == on_disk
     methods = {"lens": "rendered", "exposure": "expose", "image": "apply", "clock": "node_ns", "pose": "reported"}
-    methods |= {"depth": "measure", "delay": "instant_s"}
+    methods |= {"depth": "measure", "delay": "instant_s", "mount": "placed"}
     for name in fx.NAMES:
         cls = fx.effect_class(name)
         assert callable(getattr(cls().start(np.random.default_rng(0)), methods[cls.kind]))
@@ -100,6 +100,7 @@ def test_the_held_out_camera_shows_the_truth_unless_in_truth():
     assert asked == ["lens_distortion"]
     assert len(held_out.lens) == 1 and not held_out.image and not held_out.clock
     assert fx.load_effects({"sensor_noise": {}}, rng_for, held_out=True) is fx.NO_EFFECTS
+    assert fx.load_effects({"clock_drift": {"cameras": ["cam02"]}}, rng_for, camera="cam01") is fx.NO_EFFECTS
     training = fx.load_effects(listed, rng_for)
     assert len(training.lens) == len(training.image) == len(training.clock) == 1
 
@@ -107,7 +108,7 @@ def test_the_held_out_camera_shows_the_truth_unless_in_truth():
 @pytest.mark.parametrize(
     ("listed", "message"),
     [
-        ({"smoke": {}}, "unknown effect 'smoke'; valid effects: clock_drift, depth_sensor, exposure_drift, "),
+        ({"smoke": {}}, "unknown effect 'smoke'; valid effects: bump, clock_drift, depth_sensor, exposure_drift, "),
         ({"sensor_noise": {"sigma": 1}}, "effect sensor_noise.sigma: unknown key; expected one of read_noise"),
         ({"motion_blur": {"exposure_ms": 0}}, "exposure_ms: expected .*1e-06 to 1000"),
         ({"pose_noise": {"correlation_s": 1e-9}}, "correlation_s must be 0 or at least 0.001"),
@@ -122,6 +123,7 @@ def test_an_invalid_effect_is_refused_in_one_line(listed, message):
 
 # Parameters with which an effect changes nothing.
 NEUTRAL: dict[str, dict] = {
+    "bump": {"yaw_deg": 0.0},
     "clock_drift": {},
     "depth_sensor": {},
     "exposure_drift": {"amplitude_stops": 0.0, "offset_spread_stops": 0.0},
