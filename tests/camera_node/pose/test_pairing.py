@@ -31,7 +31,11 @@ def test_nearest_or_between_with_the_gap_and_a_bound_that_counts():
     assert nearest.at(10 * MS)[0][0] == 8 and nearest.at(13 * MS)[0][0] == 16
     with pytest.raises(PoseGapError, match=r"22\.0 ms away, more than 10 ms"):
         joints.at(38 * MS)
-    assert joints.at(78 * MS)[0][0] == 68  # after the last: the last, not beyond it
+    # Outside: the first or the last, not beyond it, as far as the bound itself.
+    assert joints.at(78 * MS)[0][0] == 68 and joints.at(-10 * MS)[0][0] == 0
+    for t_ms in (-11, 79):
+        with pytest.raises(PoseGapError, match="nearest pose"):
+            joints.at(t_ms * MS)
     assert not joints.ready(69 * MS) and joints.ready(68 * MS)
     for wrong in ({"max_gap_ns": -1}, {"keep_ns": 0}, {"restart_after": 0}):
         with pytest.raises(ValueError, match="must be positive"):

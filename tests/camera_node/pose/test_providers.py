@@ -1,51 +1,19 @@
-"""Pairing instants with poses: nearest, interpolated, bounded."""
+"""Poses that stay, and those of a trajectory file."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from camera_node.pose.pairing import PoseGapError, SampleBuffer
 from camera_node.pose.providers import FixedPose, TrajectoryError, read_tum
 from freshfield.geometry import Pose, so3_exp
 
 MS = 1_000_000
 
 
-def turn(angle: float, x: float = 0.0) -> Pose:
-    m = np.eye(4)
-    m[:3, :3] = so3_exp([0, 0, angle])
-    m[0, 3] = x
-    return Pose.from_matrix(m)
-
-
-def track_of(times: list[int], poses: list[Pose], interpolate: bool = True) -> SampleBuffer[Pose]:
-    track = SampleBuffer(Pose.interpolate if interpolate else None, 50 * MS)
-    for t_ns, pose in zip(times, poses, strict=True):
-        track.add(t_ns, pose)
-    return track
-
-
-def test_nearest_and_interpolated():
-    times, poses = [0, 100 * MS, 130 * MS], [turn(0.0, 0), turn(1.0, 10), turn(1.0, 10)]
-    nearest = track_of(times, poses, interpolate=False)
-    assert nearest.at(40 * MS) == (poses[0], 40 * MS)
-    assert nearest.at(70 * MS) == (poses[1], 30 * MS)
-    between, gap_ns = track_of(times, poses).at(40 * MS)
-    assert gap_ns == 40 * MS  # still the distance to the nearest sample
-    np.testing.assert_allclose(between.matrix(), turn(0.4, 4).matrix(), atol=1e-12)
-
-
-def test_beyond_the_bound_there_is_no_pose():
-    track = track_of([0, 200 * MS], [turn(0), turn(1)])
-    assert track.at(-50 * MS)[0] == turn(0) and track.at(250 * MS)[0] == turn(1)
-    for t_ms in (-51, 100, 251):
-        with pytest.raises(PoseGapError, match="nearest pose"):
-            track.at(t_ms * MS)
-
-
 def test_a_fixed_pose_has_no_gap():
-    assert FixedPose(turn(0.3)).at(123) == (turn(0.3), 0)
+    pose = Pose.from_matrix(np.eye(4))
+    assert FixedPose(pose).at(123) == (pose, 0)
 
 
 def test_tum_files_keep_nanoseconds_and_put_w_first(tmp_path):
@@ -54,7 +22,9 @@ def test_tum_files_keep_nanoseconds_and_put_w_first(tmp_path):
     track = read_tum(file)
     exact, gap_ns = track.at(1305031102_175304000)
     assert gap_ns == 0 and read_tum(file, start_ns=1305031102_175304000).at(0) == (exact, 0)
-    np.testing.assert_allclose(exact.matrix()[:3, :3], so3_exp([0, 0, np.pi / 3]), atol=1e-6)
+    between, _ = track.at(1305031102_187652000)
+    for pose, angle in ((exact, np.pi / 3), (between, np.pi / 6)):
+        np.testing.assert_allclose(pose.matrix()[:3, :3], so3_exp([0, 0, angle]), atol=1e-6)
 
 
 def test_a_trajectory_may_have_one_sample(tmp_path):

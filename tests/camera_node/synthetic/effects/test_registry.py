@@ -177,14 +177,6 @@ def test_each_effect_has_its_own_random_stream():
     assert np.array_equal(alone.apply(image, 0, 0.0), among.apply(image, 0, 0.0))
 
 
-def test_an_effect_leaves_the_original_scene_as_it_is():
-    scene = make_scene("room", {"width": 32, "height": 32, "supersample": 1})
-    cameras, before = scene.cameras, scene.render("cam01", 0.4)
-    changed = fx.load_effects({"lens_distortion": {}}, lambda _: np.random.default_rng(0)).extend(scene)
-    assert not np.array_equal(changed.render("cam01", 0.4), before)
-    assert scene.cameras is cameras and np.array_equal(scene.render("cam01", 0.4), before)
-
-
 SCENE = {"width": 16, "height": 12, "supersample": 1, "speed_m_per_s": 8.0}
 # The ends of the ranges that the docstrings and messages promise.
 EXTREMES: dict[str, list[dict]] = {
