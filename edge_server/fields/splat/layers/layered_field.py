@@ -121,12 +121,15 @@ class LayeredField:
 
     @property
     def learning(self) -> str:
-        """What it learns before layers begin, for people; empty afterwards, and where they will not."""
-        if not self.layered or self.tracker is not None or len(self.cameras) < tuned.LEAST_CAMERAS:
+        """What it learns before plates are certain, for people; empty afterwards, and where there will be no layers."""
+        if not self.layered or len(self.cameras) < tuned.LEAST_CAMERAS:
             return ""
-        frames = min(camera.plate.count for camera in self.cameras.values())
-        known = f"{frames} of {tuned.PLATE_FRAMES} frames of each camera"
-        return f"learning the background: {known if frames < tuned.PLATE_FRAMES else 'what stands still'}"
+        if self.tracker is None:
+            frames = min(min(camera.plate.count for camera in self.cameras.values()), tuned.PLATE_FRAMES)
+            return f"learning the background: {frames} of {tuned.PLATE_FRAMES} frames of each camera"
+        if self.supervision.early and len(self.observations):
+            return f"learning the background: {self.observations.newest_s:.1f} of {tuned.PLATE_S:g} s"
+        return ""
 
     @property
     def views(self) -> tuple[View, ...]:

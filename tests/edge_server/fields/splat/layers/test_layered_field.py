@@ -147,6 +147,7 @@ def test_layers_begin_before_plates_are_certain_and_the_still_field_anew_when_th
     field = LayeredField(SMALL)
     _run(field, range(14), steps=10)
     assert field.tracker is not None and field.supervision.early and len(known) <= 6
+    assert field.learning == "learning the background: 0.9 of 2 s"
     _run(field, range(14, 30), steps=10)
     assert len(known) > 2 and known[-1] >= known[0] and field.static.ready
     resumed, score = LayeredField(SMALL), _score(field.snapshot(), 29 * FRAME_S)
@@ -154,7 +155,7 @@ def test_layers_begin_before_plates_are_certain_and_the_still_field_anew_when_th
     for each in (field, resumed):
         _run(each, range(30, 34), steps=10)
     same_state(field, resumed)
-    assert not field.supervision.early and field.still.step < 60 and not field.static.ready
+    assert not field.supervision.early and not field.learning and field.still.step < 60 and not field.static.ready
     assert _score(field.snapshot(), 33 * FRAME_S) > score - 1.0
     _run(field, range(34, 45), steps=30)
     assert field.supervision.earlier is None and _score(field.snapshot(), 44 * FRAME_S) > score - 0.5
