@@ -21,6 +21,7 @@ from channel_emu.model.faults import per_state
 from channel_emu.model.link import DISCIPLINES
 from channel_emu.model.notation import section
 from channel_emu.model.presets import preset
+from freshfield.plugins import PluginError
 from freshfield.settings import ScenarioError, Settings, about, as_mapping, read_settings, within
 
 NotNegative = Annotated[float, Meta(ge=0)]
@@ -236,10 +237,10 @@ def _read_faults(faults: Any, where: str) -> dict[str, Any]:
         raise ScenarioError(f"{where}: expected a mapping of faults, got {faults!r}")
     read: dict[str, Any] = {}
     for name, params in faults.items():
-        if name not in fault_modules.NAMES:
-            known = ", ".join(fault_modules.NAMES)
-            raise ScenarioError(f"{where}.{name}: unknown fault; expected one of {known}")
-        kind = fault_modules.params_class(name)
+        try:
+            kind = fault_modules.params_class(name)
+        except PluginError as error:
+            raise ScenarioError(f"{where}: {error}") from None
         if not isinstance(params, dict):  # the first parameter alone: loss: 0.1
             params = {kind.__struct_fields__[0]: params}
         read[name] = read_settings(kind, params, f"{where}.{name}")

@@ -68,6 +68,9 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--count", type=int, default=20000, metavar="N", help="points in --points, --colmap, --transforms [%(default)s]"
     )
+    add(
+        "--allow-plugins", action="store_true", help="run code from outside that the run's field names, if you trust it"
+    )
     mesh = parser.add_argument_group("for --mesh").add_argument
     mesh("--voxel", type=float, metavar="MM", help="voxel size in millimeters [the width of a pixel at the surface]")
     mesh(
@@ -105,7 +108,7 @@ class Export:
         """The field and its cameras."""
         from edge_server.export.run_source import open_source
 
-        source = open_source(self.args.run)
+        source = open_source(self.args.run, self.args.allow_plugins)
         print(f"{source.file}: {source.name}, {len(source.views)} cameras", flush=True)
         return source
 

@@ -63,6 +63,9 @@ def _parser() -> argparse.ArgumentParser:
     which("--path", type=Path, metavar="FILE", help="nerfstudio's camera_path.json, in the run's world")
     add("file", type=out_file, metavar="FILE", help="image or video to write")
     add("--beside", type=Path, metavar="RUN", help="another run, rendered to the right")
+    add(
+        "--allow-plugins", action="store_true", help="run code from outside that the run's field names, if you trust it"
+    )
     add("--depth", action="store_true", help="depth instead of color: near red, far blue, one scale for the whole path")
     add("--size", metavar="WxH", help="pixels [the cameras' shape, 480 high; a path's own]")
     add("--fov", type=float, metavar="DEG", help="vertical field of view [the cameras'; a path's own]")
@@ -82,7 +85,7 @@ def _render(args: argparse.Namespace) -> None:
     ):
         if value is not None and not lowest <= value <= highest:
             raise ExportError(f"--{option} {value:g}: expected {lowest:g} to {highest:g}")
-    sources = [open_source(run) for run in (args.run, args.beside) if run is not None]
+    sources = [open_source(run, args.allow_plugins) for run in (args.run, args.beside) if run is not None]
     steps, fps, (width, height) = _path(args, sources[0])
     if ending in _IMAGES:
         steps = steps[:1]

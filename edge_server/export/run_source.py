@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from edge_server.export import ExportError, PosedImage, file_names
 from edge_server.fields import Field, RefinesCameras, View, checkpoint
 from edge_server.fields.registry import make_field, option_help
+from freshfield.plugins import refuse_foreign
 from freshfield.untrusted import stored_bytes
 
 # In order: a run's last checkpoint, a fit's checkpoint.
@@ -43,13 +44,17 @@ class Source:
         return np.asarray(view.camera_to_world if known is None else known.camera_to_world, np.float64)
 
 
-def open_source(path: Path) -> Source:
-    """Load the field saved in ``path``: a checkpoint, or the folder of a run or fit. ExportError: there is
-    none, or it cannot be read."""
+def open_source(path: Path, allow_plugins: bool = False) -> Source:
+    """Load the field saved in ``path``: a checkpoint, or the folder of a run or fit.
+
+    allow_plugins: also one whose class is from outside (``freshfield.plugins``), which runs its code.
+    ExportError: there is none, or it cannot be read.
+    """
     file = find_checkpoint(path)
     try:
         state, about = checkpoint.load(file, most_bytes=stored_bytes(file))
         name = str(about["field"])
+        refuse_foreign("field", name, str(file), allow_plugins)
         options: dict[str, Any] = dict(about.get("options") or {})
         field = make_field(name, _saved_options(name, options, state), seed=int(about.get("seed", 0)))
         field.load_state(state)

@@ -12,6 +12,7 @@ from typing import Any
 
 from edge_server.fields import Field
 from edge_server.fields.common import trainer_settings
+from freshfield import plugins
 
 _PACKAGES: dict[str, str] = {
     "ngp": "edge_server.fields.ngp",
@@ -28,11 +29,13 @@ def field_names() -> tuple[str, ...]:
 
 def option_help(name: str) -> dict[str, str]:
     """Option -> what it means. ValueError: unknown representation."""
-    return trainer_settings.option_help(_module(name, "settings").SETTINGS)
+    return trainer_settings.option_help(_settings_class(name))
 
 
 def efforts_of(name: str) -> Mapping[str, Mapping[str, Any]]:
     """Preset -> its options. ValueError: unknown representation."""
+    if name not in _PACKAGES:
+        return {"medium": {}}
     found: Mapping[str, Mapping[str, Any]] = _module(name, "settings").EFFORTS
     return found
 
@@ -40,7 +43,8 @@ def efforts_of(name: str) -> Mapping[str, Mapping[str, Any]]:
 def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 0) -> Field:
     """A fresh field.
 
-    name: one of ``field_names``.
+    name: one of ``field_names``, or a class from outside (``freshfield.plugins``), which is constructed with its
+        settings: of the class in its attribute ``Settings``, a subclass of ``FieldSettings``.
     options: see ``option_help``, and ``effort``, one of ``efforts_of``; None: the defaults.
     seed: of the field, unless ``options`` has one.
     Raises ValueError for an unknown representation or option (the message lists the known ones), or for a
@@ -50,6 +54,9 @@ def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 
 
     log_compilation()
     settings = settings_of(name, options, seed)
+    if name not in _PACKAGES:
+        outside: Field = plugins.find("field", name, _PACKAGES)(settings)
+        return outside
     make: Callable[[Any], Field] = import_module(f"edge_server.fields.{settings.module}").make
     return make(settings)
 
@@ -57,11 +64,17 @@ def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 
 def settings_of(name: str, options: Mapping[str, Any] | None = None, seed: int = 0) -> Any:
     """The settings that these options result in, with defaults and effort. ValueError as
     ``make_field``."""
-    module = _module(name, "settings")
-    return trainer_settings.settings_from(module.SETTINGS, module.EFFORTS, options or {}, seed)
+    return trainer_settings.settings_from(_settings_class(name), efforts_of(name), options or {}, seed)
+
+
+def _settings_class(name: str) -> Any:
+    if name in _PACKAGES:
+        return _module(name, "settings").SETTINGS
+    found = getattr(plugins.find("field", name, _PACKAGES), "Settings", None)
+    if not (isinstance(found, type) and issubclass(found, trainer_settings.FieldSettings)):
+        raise plugins.PluginError(f"field {name}: expected an attribute Settings, a subclass of FieldSettings")
+    return found
 
 
 def _module(name: str, module: str) -> Any:
-    if name not in _PACKAGES:
-        raise ValueError(f"no field is called {name!r}; there are: {', '.join(_PACKAGES)}")
     return import_module(f"{_PACKAGES[name]}.{module}")

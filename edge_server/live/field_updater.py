@@ -22,6 +22,7 @@ from edge_server.live.view_decoder import ViewDecoder
 from edge_server.scheduler import STATE_PARTS, Epoch, Policy, SelectionWindow
 from edge_server.settings import EdgeConfig, embedding_for, open_embedder
 from freshfield.frame import Frame
+from freshfield.plugins import short_name
 from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned, or a scenario asks for it
@@ -66,6 +67,8 @@ class FieldUpdater:
     foreground: cuts the background out of views.
     on_arrivals: select only after a frame has arrived since the last selection.
     number: number of the next update.
+    forgiving: whether a policy that raises costs a decision only, all views used instead (live). policy_failures: how
+    often that was so.
     materialize: gives buffered frames their images and poses where these are made late (virtual time).
     """
 
@@ -81,6 +84,7 @@ class FieldUpdater:
         on_arrivals: bool = False,
     ) -> None:
         self.buffer = buffer
+        self.forgiving, self.policy_failures, self._unplanned = False, 0, False
         self.on_arrivals = on_arrivals
         self._selected_of = 0  # arrivals at the last selection
         self._selected: dict[str, Frame] = {}  # the newest selected frame of each camera
@@ -151,7 +155,33 @@ class FieldUpdater:
 
     def plan(self, now_ns: int) -> SelectionWindow:
         """The first half of a decision: how long to wait for frames."""
-        return self.policy.plan(self.epoch(now_ns))
+        try:
+            return self.policy.plan(self.epoch(now_ns))
+        except Exception as error:
+            self._policy_failed(error)
+            self._unplanned = True
+            return SelectionWindow()
+
+    def _policy_failed(self, error: Exception) -> None:
+        """Go on without the policy's decision, or raise."""
+        if not self.forgiving:
+            raise error
+        if not self.policy_failures:
+            name = short_name(self.policy.name)
+            log.warning(
+                "policy %s failed, all views are used: %s: %s", name, type(error).__name__, error, exc_info=error
+            )
+        self.policy_failures += 1
+
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """What goes wrong, for people: the field's, and the policy's."""
+        found = tuple(getattr(self.field, "troubles", ()))
+        if self.policy_failures:
+            found += (
+                f"policy {short_name(self.policy.name)} failed {self.policy_failures} times: all views were used",
+            )
+        return found
 
     def select(
         self, plan: SelectionWindow, now_ns: int, budget: Budget | None = None, most_new: int | None = None
@@ -169,11 +199,17 @@ class FieldUpdater:
         if now_ns < plan.wait_until_ns or (self.on_arrivals and nothing_new):
             return None
         self._follow_field()
-        cameras = self.policy.select(self._epoch(newest, now_ns), plan)
-        if not cameras:
+        unplanned, self._unplanned = self._unplanned, False
+        try:
+            cameras = newest if unplanned else self.policy.select(self._epoch(newest, now_ns), plan)
+            chosen = [newest[c] for c in cameras]
+        except Exception as error:
+            self._policy_failed(error)
+            chosen = list(newest.values())
+        if not chosen:
             return None
         self._selected_of = total
-        items, others = self.buffer.take([newest[c] for c in cameras], self._most_new(budget, most_new))
+        items, others = self.buffer.take(chosen, self._most_new(budget, most_new))
         if self.field.frame_s is not None:
             own = {item.camera: item for item in items}
             arrivals = len(others) + sum(self._selected.get(c) is not item for c, item in own.items())

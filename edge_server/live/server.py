@@ -139,6 +139,7 @@ class EdgeServer:
             raise ScenarioError(f"{scenario.path}: edge.policy: {error}") from None
         policy = self.policies.first
         self.updater = open_updater(scenario, config, policy, field, self.start_ns, resumed=options.resume is not None)
+        self.updater.forgiving = True
         # Numbers continue, so that a snapshot does not take the name of an earlier one.
         self.updater.number = max(0, int(about.get("updates", 0)))
         if not self._moving:
@@ -187,7 +188,7 @@ class EdgeServer:
             frontier=self.frontier,
             field_name=config.field,
             chosen=described(scenario, config, self._moving),
-            troubles=lambda: getattr(self.updater.field, "troubles", ()),
+            troubles=lambda: self.updater.troubles,
             flat_db=lambda: self.scoring.baselines.mean.mean_colour_db,
             so_far=lambda: self.scoring.so_far,
         )

@@ -14,6 +14,7 @@ import numpy as np
 from edge_server.scheduler import fixed
 from edge_server.scheduler.policy import Policy
 from edge_server.scheduler.wait import Wait, WaitArrived, WaitFlush
+from freshfield import plugins
 from freshfield.limits import MAX_POLICY_CHARS
 from freshfield.scenario import SCENARIO_FOLDER
 
@@ -43,7 +44,7 @@ OFFERED: tuple[str, ...] = tuple(policy for policy in POLICIES if policy not in 
 def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
     """The named policy; modules of learned policies are imported only now.
 
-    name: as in ``POLICIES``, or bandit:FILE.
+    name: as in ``POLICIES``, bandit:FILE, or a class from outside (``freshfield.plugins``).
     value: value of its parameter; None takes the default.
     rng: for policies that draw.
     Raises ValueError for an unknown name (the message lists the known ones), a value out of range, or a file
@@ -55,11 +56,13 @@ def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Pol
         from edge_server.scheduler.learned.bandit import BanditPolicy
 
         return BanditPolicy.from_file(name.removeprefix(BANDIT), rng)
+    made: type[Policy] = POLICIES[name][0] if name in POLICIES else plugins.find("policy", name, [*POLICIES, BANDIT])
+    if not issubclass(made, Policy):
+        raise plugins.PluginError(f"policy {name}: {made.__name__} does not derive from edge_server.scheduler.Policy")
+    policy = made(value, rng)
     if name not in POLICIES:
-        raise ValueError(
-            f"policy {name!r} is not known; choose one of {', '.join(POLICIES)}; a learned one is bandit:FILE"
-        )
-    return POLICIES[name][0](value, rng)
+        policy.name = name  # by which every other process finds it too
+    return policy
 
 
 def make_live_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
@@ -78,6 +81,8 @@ def parse_policy(text: str) -> tuple[str, float | None]:
     if text.startswith(BANDIT):
         return resolve_checkpoint(text, Path()), None
     name, _, value = text.partition(":")
+    if name not in POLICIES:
+        name, value = plugins.split_value(plugins.absolute(text, Path()))
     try:
         return name, float(value) if value else None
     except ValueError:
@@ -85,8 +90,10 @@ def parse_policy(text: str) -> tuple[str, float | None]:
 
 
 def short_name(name: str) -> str:
-    """A policy's name for people to read: of ``bandit:FILE`` without the file's folder."""
-    return BANDIT + Path(name.removeprefix(BANDIT)).name if name.startswith(BANDIT) else name
+    """A policy's name for people to read: of ``bandit:FILE`` and FILE.py:CLASS without the file's folder."""
+    if name.startswith(BANDIT):
+        return BANDIT + Path(name.removeprefix(BANDIT)).name
+    return plugins.short_name(name)
 
 
 def resolve_checkpoint(name: str, folder: Path) -> str:
@@ -106,7 +113,7 @@ def policy_help(name: str) -> str:
     """One line on a policy; empty for an unknown one."""
     if name.startswith(BANDIT):
         return "a learned policy (edge-server train-scheduler)"
-    return POLICIES[name][1] if name in POLICIES else ""
+    return POLICIES[name][1] if name in POLICIES else ("of your own" if plugins.is_reference(name) else "")
 
 
 class LivePolicies:
@@ -128,6 +135,6 @@ class LivePolicies:
         """The policy that an operator asks for. Raises ValueError if it is not offered."""
         if name not in self.offered and len(name) > MAX_POLICY_CHARS:
             raise ValueError(f"policy: a name of {len(name)} characters; none has more than {MAX_POLICY_CHARS}")
-        if name.startswith(BANDIT) and name not in self.offered:
-            raise ValueError(f"policy {name!r}: what was learned is chosen at the start (--policy {name})")
+        if (name.startswith(BANDIT) or name not in POLICIES) and name not in self.offered:
+            raise ValueError(f"policy {name!r}: what was learned, or is your own, is chosen at the start (--policy)")
         return make_live_policy(name, value, self._rng(name))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Field, View
 from edge_server.viewpoints.candidates import Candidates, ViewpointError
+from freshfield import plugins
 
 # name -> (module, class, one line of help)
 SELECTORS: dict[str, tuple[str, str, str]] = {
@@ -66,13 +67,19 @@ class Selector(Protocol):
 
 
 def make_selector(name: str) -> Selector:
-    """The named selector, whose module is imported only now. ``NAME:FILE`` hands FILE on to it. Raises
-    ViewpointError for an unknown name."""
+    """The named selector, whose module is imported only now. ``NAME:FILE`` hands FILE on to it. name:
+    as in SELECTORS, or a class from outside (``freshfield.plugins``). Raises ViewpointError for an unknown name."""
     base, _, file = name.partition(":")
     if base not in SELECTORS:
-        raise ViewpointError(f"no selector is called {base!r}; there are: {', '.join(SELECTORS)}")
-    module, cls, _ = SELECTORS[base]
-    made: Any = getattr(importlib.import_module(f"edge_server.viewpoints.{module}"), cls)
+        base, file = plugins.split_value(name)
+    if base in SELECTORS:
+        module, cls, _ = SELECTORS[base]
+        made: Any = getattr(importlib.import_module(f"edge_server.viewpoints.{module}"), cls)
+    else:
+        try:
+            made = plugins.find("selector", base, SELECTORS)
+        except plugins.PluginError as error:
+            raise ViewpointError(str(error)) from None
     if bool(file) != hasattr(made, "from_file"):
         raise ViewpointError(f"selector {name}: {'it takes no file' if file else f'expected {base}:FILE'}")
     selector: Selector = made.from_file(file) if file else made()

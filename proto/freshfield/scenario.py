@@ -25,6 +25,7 @@ import numpy as np
 from freshfield.frame import valid_id
 from freshfield.limits import MAX_CAMERAS, MAX_IMAGE_SIDE_PX
 from freshfield.payload import DEFAULT_CODEC
+from freshfield.plugins import absolute
 from freshfield.settings import ScenarioError, Settings, about, read_settings, within
 from freshfield.untrusted import UntrustedError, read_text, read_yaml
 
@@ -150,7 +151,7 @@ def load(path: str | Path, seed: int | None = None) -> Scenario:
         raise ScenarioError(f"{file}: not YAML: {error}") from None
     except UntrustedError as error:
         raise ScenarioError(f"{file}: {error}") from None
-    return parse(data, file, seed)
+    return parse(absolute(data, file.parent), file, seed)
 
 
 def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from camera_node.clocks import ClockError
 from camera_node.synthetic.render import Image
 from camera_node.synthetic.scene import Scene
+from freshfield import plugins
 from freshfield.depth import DepthImage
 from freshfield.geometry import Array, Pinhole, Pose
 from freshfield.settings import ScenarioError, Settings, about, read_settings
@@ -67,9 +68,17 @@ class EffectParameters(Settings, frozen=True, kw_only=True):
 
 
 def effect_class(name: str) -> type[EffectParameters]:
-    """Import and return the class of an effect. Raises EffectError for an unknown name."""
+    """Import and return the class of an effect, one of NAMES or from outside (``freshfield.plugins``). Raises
+    EffectError for an unknown name."""
     if name not in NAMES:
-        raise EffectError(f"unknown effect {name!r}; valid effects: {', '.join(NAMES)}")
+        try:
+            found: type[EffectParameters] = plugins.find("effect", name, NAMES)
+        except plugins.PluginError as error:
+            raise EffectError(str(error)) from None
+        if not (issubclass(found, EffectParameters) and getattr(found, "kind", None) in Effects.__dataclass_fields__):
+            kinds = ", ".join(kind for kind in Effects.__dataclass_fields__ if kind != "rendered")
+            raise EffectError(f"effect {name}: expected a subclass of EffectParameters whose kind is one of {kinds}")
+        return found
     return getattr(importlib.import_module(f"{__name__}.{name}"), name.title().replace("_", ""))
 
 

@@ -10,6 +10,8 @@ import importlib
 from typing import Any
 
 from channel_emu.model.link import Fault
+from freshfield import plugins
+from freshfield.settings import Settings
 
 NAMES = ("loss", "duplication", "corruption", "blackout", "reset", "bandwidth")
 
@@ -19,14 +21,31 @@ _MODULES = {"loss": "chance", "duplication": "chance"}
 
 
 def params_class(name: str) -> type[Any]:
-    """The parameters of the fault ``name``, one of NAMES. Imports the fault's module."""
-    return _module(name).Params
+    """The parameters of the fault ``name``, one of NAMES or from outside (``freshfield.plugins``). Imports the fault's
+    module. Raises PluginError for an unknown name."""
+    if name in NAMES:
+        return _module(name).Params  # type: ignore[no-any-return]
+    found: Any = getattr(_outside(name), "Params", None)
+    if not (isinstance(found, type) and issubclass(found, Settings)):
+        raise plugins.PluginError(
+            f"fault {name}: expected an attribute Params, a subclass of freshfield.settings.Settings"
+        )
+    return found
 
 
 def make(params: dict[str, Any], seed: int, camera: str) -> tuple[Fault, ...]:
-    """The faults of one camera, in the order of NAMES. params: ``Params`` by fault name."""
+    """The faults of one camera, in the order of NAMES, then those from outside. params: ``Params`` by fault name."""
     listed = [name for name in NAMES if name in params]
-    return tuple(getattr(_module(name), name.capitalize())(params[name], seed, camera) for name in listed)
+    built_in = [getattr(_module(name), name.capitalize())(params[name], seed, camera) for name in listed]
+    others = [_outside(name)(params[name], seed, camera) for name in params if name not in NAMES]
+    return (*built_in, *others)
+
+
+def _outside(name: str) -> type[Any]:
+    found: type[Any] = plugins.find("fault", name, NAMES)
+    if not issubclass(found, Fault):
+        raise plugins.PluginError(f"fault {name}: {found.__name__} does not derive from channel_emu.model.link.Fault")
+    return found
 
 
 def _module(name: str) -> Any:

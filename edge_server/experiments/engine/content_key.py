@@ -20,6 +20,7 @@ import channel_emu
 import edge_server
 import freshfield
 from edge_server.machine import versions
+from freshfield.plugins import files_named
 
 _PACKAGES = {str(package.__name__): package for package in (freshfield, camera_node, channel_emu, edge_server)}
 _KEY_LENGTH = 40
@@ -43,6 +44,9 @@ def result_key(work: Callable[..., Any], inputs: Any, files: Iterable[Path | Non
         "files": [content_digest(path) for path in files if path is not None],
     }
     text = json.dumps(parts, sort_keys=True, default=plain)
+    named = files_named(json.loads(text))
+    if named:  # classes from outside: the code above does not cover them
+        text += json.dumps([content_digest(file) for file in named])
     return hashlib.sha256(text.encode()).hexdigest()[:_KEY_LENGTH]
 
 

@@ -149,8 +149,6 @@ def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
             raise ValueError(f"--seeds {args.seeds}: expected 1 or more")
         sweep = replace(sweep, seeds=args.seeds)
     fields = field_names() if args.field == "all" else tuple(args.field.split(","))
-    if unknown := set(fields) - set(field_names()):
-        raise ValueError(f"no field is called {', '.join(unknown)}; there are: {', '.join(field_names())}")
     options = parse_options(args.option)
     for field in fields:
         make_field(field, options)  # rejects wrong options now, not between two measurements

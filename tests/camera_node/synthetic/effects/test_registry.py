@@ -108,7 +108,7 @@ def test_the_held_out_camera_shows_the_truth_unless_in_truth():
 @pytest.mark.parametrize(
     ("listed", "message"),
     [
-        ({"smoke": {}}, "unknown effect 'smoke'; valid effects: bump, clock_drift, depth_sensor, exposure_drift, "),
+        ({"smoke": {}}, "effect 'smoke' is not known; there are: bump, clock_drift, depth_sensor, exposure_drift, "),
         ({"sensor_noise": {"sigma": 1}}, "effect sensor_noise.sigma: unknown key; expected one of read_noise"),
         ({"motion_blur": {"exposure_ms": 0}}, "exposure_ms: expected .*1e-06 to 1000"),
         ({"pose_noise": {"correlation_s": 1e-9}}, "correlation_s must be 0 or at least 0.001"),

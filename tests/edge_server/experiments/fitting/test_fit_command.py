@@ -150,7 +150,7 @@ def test_an_instant_of_a_recording_and_scores_on_training_views(tmp_path):
     [
         (["--option", "levels"], "expected KEY=VALUE"),
         (["--option", "color=1"], "no option color"),
-        (["--field", "nothing"], "no field is called 'nothing'"),
+        (["--field", "nothing"], "field 'nothing' is not known; there are: ngp"),
         (["--seconds", "0"], "--seconds 0"),
         (["--holdout", "x"], "no image or camera 'x'"),
         (["--scale", "0.5"], "scale is 0.5"),

@@ -162,7 +162,7 @@ def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_sweep):
         (["--policy", "best"], "policy 'best' is not known"),
         (["--scene", "nowhere"], "no such file or folder"),
         (["--seeds", "0"], "--seeds 0"),
-        (["--field", "splot"], "no field is called splot; there are: ngp"),
+        (["--field", "splot"], "field 'splot' is not known (did you mean splat?); there are: ngp"),
         (["--option", "x"], "expected KEY=VALUE"),
         (["--field", "ngp", "--option", "levels=99"], "levels: expected a whole number"),
         (["--field", "ngp", "--option", "contracted=maybe"], "contracted: expected"),

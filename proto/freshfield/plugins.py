@@ -1,0 +1,147 @@
+"""Classes from outside freshfield, by name: a policy, effect, fault, field or selector that somebody else wrote.
+
+A name that is not built in is, in this order,
+
+- ``FILE.py:CLASS``, a class of a file; FILE is looked for beside the scenario, then in the working directory;
+- ``MODULE:CLASS``, a class of an installed module;
+- the name of an entry point of an installed package, in the group ``freshfield.KIND`` (``freshfield.policy``, ...).
+
+Nothing is imported that nobody names. A name comes from a scenario file or from the command line of whoever starts a
+program: both are trusted as programs are. What others wrote (a run's folder, a recording, a message) names nothing
+that is loaded: see ``refuse_foreign``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import importlib
+import importlib.util
+import re
+import sys
+from collections.abc import Iterable, Mapping
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from freshfield.settings import ScenarioError
+
+KINDS = ("policy", "effect", "fault", "field", "selector")
+_FILE = re.compile(r"(?P<where>[^:]+\.py):(?P<name>[A-Za-z_]\w*)(?P<rest>(:.*)?)")
+_MODULE = re.compile(r"(?P<where>[A-Za-z_]\w*(\.\w+)*):(?P<name>[A-Za-z_]\w*)(?P<rest>(:.*)?)")
+
+
+class PluginError(ScenarioError):
+    """A class from outside cannot be used; the message says why."""
+
+
+def is_reference(name: str) -> bool:
+    """Whether a name is FILE.py:CLASS or MODULE:CLASS."""
+    return any(pattern.fullmatch(name) for pattern in (_FILE, _MODULE))
+
+
+def split_value(text: str) -> tuple[str, str]:
+    """A name and what follows its last colon, as in ``threshold:120`` or ``mine.py:Mine:120``; empty: nothing does."""
+    match = _FILE.fullmatch(text) or _MODULE.fullmatch(text)
+    if match is None:
+        name, _, value = text.partition(":")
+        return name, value
+    return f"{match['where']}:{match['name']}", match["rest"][1:]
+
+
+def find(kind: str, name: str, built_in: Iterable[str]) -> Any:
+    """The class of this name, which is not built in. kind: one of KINDS. Raises PluginError; its message lists what
+    there is, ``built_in`` first."""
+    match = _FILE.fullmatch(name) or _MODULE.fullmatch(name)
+    if match is not None:
+        module = _file_module(kind, Path(match["where"])) if match.re is _FILE else _module(kind, match["where"])
+        found = getattr(module, match["name"], None)
+        if not isinstance(found, type):
+            there = [each for each, value in vars(module).items() if isinstance(value, type)]
+            raise PluginError(f"{kind} {name}: no class {match['name']} in it; there are: {', '.join(there) or 'none'}")
+        return found
+    installed = {entry.name: entry for entry in entry_points(group=f"freshfield.{kind}")}
+    if name in installed:
+        return _imported(kind, name, installed[name].load)
+    known = [*built_in, *sorted(installed)]
+    near = difflib.get_close_matches(name, known, 1)
+    raise PluginError(
+        f"{kind} {name!r} is not known{f' (did you mean {near[0]}?)' if near else ''}; there are: {', '.join(known)}; "
+        "one of your own is FILE.py:CLASS or MODULE:CLASS"
+    )
+
+
+def absolute(data: Any, folder: Path) -> Any:
+    """A scenario's content with the FILE of each FILE.py:CLASS, in keys and values, made absolute where ``folder`` has
+    it, so that every process finds it."""
+    if isinstance(data, Mapping):
+        return {absolute(key, folder): absolute(value, folder) for key, value in data.items()}
+    if isinstance(data, list):
+        return [absolute(value, folder) for value in data]
+    match = _FILE.fullmatch(data) if isinstance(data, str) else None
+    if match is None or not (folder / Path(match["where"]).expanduser()).is_file():
+        return data
+    return f"{(folder / Path(match['where']).expanduser()).absolute()}:{match['name']}{match['rest']}"
+
+
+def files_named(data: Any) -> list[Path]:
+    """The files, sorted, of every FILE.py:CLASS in a JSON value, as far as they exist."""
+    found, open_ = set[Path](), [data]
+    while open_:
+        value = open_.pop()
+        if isinstance(value, Mapping):
+            open_ += [*value.keys(), *value.values()]
+        elif isinstance(value, list):
+            open_ += value
+        elif isinstance(value, str) and (match := _FILE.fullmatch(value)) and Path(match["where"]).is_file():
+            found.add(Path(match["where"]))
+    return sorted(found)
+
+
+def short_name(name: str) -> str:
+    """A name for people: without the folder of FILE.py:CLASS."""
+    match = _FILE.fullmatch(name)
+    return name if match is None else f"{Path(match['where']).name}:{match['name']}{match['rest']}"
+
+
+def refuse_foreign(kind: str, name: str, source: str, allowed: bool) -> None:
+    """Raise PluginError if a file that somebody else may have written names a class outside, unless that is allowed.
+    source: what the file is."""
+    if is_reference(name) and not allowed:
+        raise PluginError(
+            f"{source} names the {kind} {name}, code from outside freshfield: to run it, if you trust it, "
+            "say --allow-plugins"
+        )
+
+
+def _module(kind: str, name: str) -> ModuleType:
+    found: ModuleType = _imported(kind, name, lambda: importlib.import_module(name))
+    return found
+
+
+def _file_module(kind: str, file: Path) -> ModuleType:
+    """The module of a file, executed once a process."""
+    file = file.expanduser().absolute()
+    if not file.is_file():
+        raise PluginError(f"{kind} {file}: there is no such file")
+    name = f"freshfield_plugin_{file.stem}_{hashlib.sha256(str(file).encode()).hexdigest()[:12]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, file)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        _imported(kind, str(file), lambda: spec.loader.exec_module(module))  # type: ignore[union-attr]
+    except PluginError:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _imported(kind: str, name: str, load: Any) -> Any:
+    try:
+        return load()
+    except Exception as error:  # whatever the code of others raises
+        raise PluginError(f"{kind} {name}: cannot be imported: {type(error).__name__}: {error}") from error

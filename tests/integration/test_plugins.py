@@ -1,0 +1,142 @@
+"""Classes of one's own in a deployment: a policy, an effect, a fault and a field from a file beside the scenario."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from camera_node.synthetic.effects import EffectError, load_effects
+from channel_emu.model.settings import channel_from_mapping
+from edge_server.experiments import compare
+from edge_server.experiments.virtual.simulate import main as simulate
+from edge_server.export import ExportError
+from edge_server.export.run_source import open_source
+from edge_server.fields import checkpoint
+from edge_server.fields.registry import make_field, option_help
+from edge_server.live.buffer import FrameBuffer
+from edge_server.live.field_updater import FieldUpdater
+from edge_server.scheduler import make_policy
+from edge_server.viewpoints.candidates import ViewpointError
+from edge_server.viewpoints.registry import make_selector
+from freshfield.settings import ScenarioError
+from tests.edge_server.experiments.rollouts.small import RAW
+from tests.edge_server.fields_for_tests import tiny_field
+from tests.edge_server.frames import frame
+
+FILE = Path(__file__).with_name("own_classes.py")
+MS = 1_000_000
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with the classes, and a scenario that names them."""
+    shutil.copy(FILE, tmp_path / "own.py")
+    edge = {**RAW["edge"], "steps": 2, "updates": "arrivals", "update_ms": 50, "compute": {"ms_per_step": 2.0}}
+    edge["policy"] = {"name": "own.py:Youngest", "value": 2}
+    source = {**RAW["source"], "effects": {"own.py:Darker": {"counts": 60}}}
+    channel = {"service": {"law": "deterministic", "mean_ms": 5.0}, "faults": {"own.py:Late": {"ms": 40.0}}}
+    whole = {**RAW, "edge": edge, "source": source, "channel": channel}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(whole))
+    monkeypatch.chdir("/")
+    return tmp_path
+
+
+def run(path: Path, capsys, *words: str) -> dict:
+    assert simulate([str(path), "--seconds", "1.0", "--json", *words]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_deployment_in_virtual_time_uses_them_all_and_repeats(folder, capsys):
+    out = folder / "out"
+    found = run(folder / "mine.yaml", capsys, "--out", str(out))
+    assert found == run(folder / "mine.yaml", capsys)
+    lines = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
+    assert lines and all(len(line["selected"]) <= 2 for line in lines)
+    assert all(line["aaoi_ms"] > 45.0 for line in lines)  # 5 ms of the channel, 40 of the fault
+    assert found["policy"] == f"{folder / 'own.py'}:Youngest"
+    plain = run(folder / "mine.yaml", capsys, "--policy", "all")
+    assert plain["policy"] == "all" and plain["digest"] != found["digest"]
+
+
+def test_comparing_uses_them_in_worker_processes_and_sees_that_the_file_changed(folder, capsys, monkeypatch):
+    monkeypatch.setattr(compare, "LEAD_S", 0.4)
+    monkeypatch.chdir(folder)
+    words = ["mine.yaml", "all", "own.py:Youngest:1", "--seeds", "2", "--seconds", "0.4", "--jobs", "2"]
+    words += ["--results", "known.jsonl", "--json", "scores.json"]
+    assert compare.main(words) == 0
+    assert "own.py:Youngest:1" in capsys.readouterr().out
+    policies = json.loads(Path("scores.json").read_text())["policies"]
+    assert [found["views"][0] for name, found in policies.items() if "Youngest" in name] == [1.0]
+    known = len(Path("known.jsonl").read_text().splitlines())
+    assert compare.main(words) == 0 and len(Path("known.jsonl").read_text().splitlines()) == known
+    with Path("own.py").open("a") as file:
+        file.write("\n# another version\n")
+    assert compare.main(words) == 0
+    assert len(Path("known.jsonl").read_text().splitlines()) > known  # was computed anew
+
+
+def updates(folder, name: str) -> FieldUpdater:
+    policy = make_policy(f"{folder / 'own.py'}:{name}", None, np.random.default_rng(0))
+    made = FieldUpdater(FrameBuffer(("cam01", "cam02")), policy, tiny_field(), start_ns=0)
+    for camera in ("cam01", "cam02"):
+        made.buffer.put(frame(camera, generated_ns=100 * MS), 120 * MS)
+    return made
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("name, failures", [("RaisesInPlan", 2), ("RaisesInSelect", 2), ("NamesNobody", 2)])
+def test_a_policy_that_raises_costs_its_decision_live_and_stops_what_is_measured(folder, caplog, name, failures):
+    live, measured = updates(folder, name), updates(folder, name)
+    live.forgiving = True
+    for _ in range(failures):
+        assert {item.camera for item in live.select(live.plan(200 * MS), 200 * MS).items} == {"cam01", "cam02"}
+    assert live.policy_failures == failures
+    assert f"own.py:{name} failed {failures} times" in live.troubles[0]
+    assert len([line for line in caplog.messages if "all views are used" in line]) == 1
+    with pytest.raises((RuntimeError, KeyError)):
+        measured.select(measured.plan(200 * MS), 200 * MS)
+
+
+def test_what_is_of_the_wrong_kind_is_refused_by_name(folder):
+    own = f"{folder / 'own.py'}:"
+    with pytest.raises(ScenarioError, match=r"does not derive from edge_server\.scheduler\.Policy"):
+        make_policy(f"{own}Darker", None, np.random.default_rng(0))
+    with pytest.raises(EffectError, match="expected a subclass of EffectParameters"):
+        load_effects({f"{own}Late": {}}, lambda name: np.random.default_rng(0))
+    with pytest.raises(EffectError, match="counts"):
+        load_effects({f"{own}Darker": {"counts": "many"}}, lambda name: np.random.default_rng(0))
+    with pytest.raises(ScenarioError, match=r"does not derive from channel_emu\.model\.link\.Fault"):
+        channel_from_mapping({"faults": {f"{own}Youngest": {}}})
+    with pytest.raises(ScenarioError, match="ms"):
+        channel_from_mapping({"faults": {f"{own}Late": {"ms": "soon"}}})
+    with pytest.raises(ScenarioError, match="expected an attribute Settings"):
+        make_field(f"{own}Youngest")
+    with pytest.raises(ViewpointError, match=r"selector 'cover' is not known \(did you mean coverage"):
+        make_selector("cover")
+
+
+def test_a_field_of_ones_own_runs_is_saved_and_is_not_loaded_from_a_folder_of_others(folder, capsys):
+    own = f"{folder / 'own.py'}:Flat"
+    assert "level" in option_help(own)
+    with pytest.raises(ScenarioError, match="has no option hight"):
+        make_field(own, {"hight": 1})
+    whole = yaml.safe_load((folder / "mine.yaml").read_text())
+    whole["edge"] |= {"field": "own.py:Flat", "field_options": {"level": 0.25}}
+    (folder / "flat.yaml").write_text(yaml.safe_dump(whole))
+    assert run(folder / "flat.yaml", capsys)["updates"] > 0
+    field = make_field(own, {"level": 0.25})
+    checkpoint.save(folder / "flat.npz", field.state(), {"field": own, "options": {}})
+    with pytest.raises(ExportError, match="--allow-plugins"):
+        open_source(folder / "flat.npz")
+    with pytest.raises(ExportError, match="has seen no camera yet"):  # its code ran
+        open_source(folder / "flat.npz", allow_plugins=True)
+
+
+def test_a_selector_of_ones_own(folder):
+    selector = make_selector(f"{folder / 'own.py'}:LastFirst")
+    assert selector.name == "last first"
