@@ -29,6 +29,9 @@ STUDY ?=
 SEED ?= 1
 COUNT ?= 200
 
+# Option of `make pythons`: versions, or files of interpreters.
+PYTHONS ?= 3.12 3.13
+
 # Options of `make images`: docker or podman, and more for its build, such as --build-arg TORCH=cpu.
 ENGINE ?= docker
 BUILD ?=
@@ -59,7 +62,7 @@ endef
 BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrome 2>/dev/null))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format types bench figures mutants proto proto-check lock images clean
+.PHONY: help demo test lint format types bench figures mutants pythons proto proto-check lock images clean
 
 help:  ## what there is to make
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 22
@@ -105,6 +108,10 @@ figures: .venv/.ok-test  ## the thesis's figures, hours to days: docs/results/th
 
 mutants: .venv/.ok-test  ## careless edits drawn from a seed, and whether quick tests notice, hours: SEED=1 COUNT=200
 	$(PY) -m tests.mutation_sample --seed $(SEED) --count $(COUNT)
+
+pythons: .venv/.ok-test  ## quick tests with other Pythons, kept in docs/results/pythons.json: PYTHONS="3.12 3.13"
+	$(PY) -m tests.tools.pythons $(PYTHONS) --json docs/results/pythons.json \
+	  $(if $(TORCH_INDEX),--pip="--extra-index-url $(TORCH_INDEX)")
 
 proto: .venv/.ok-test  ## regenerate proto/freshfield/v1 from its .proto files
 	$(call PROTOC,.)
