@@ -1,4 +1,4 @@
-"""Free ports, waits for other threads and processes, and the work that a refusal takes."""
+"""Free ports, small worlds, waits for other threads and processes, and the work that a refusal takes."""
 
 from __future__ import annotations
 
@@ -18,6 +18,12 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
+
+
+def small_world(**changed: Any) -> dict[str, Any]:
+    """The source of a scenario: a room in small pictures."""
+    size = {"kind": "world", "scene": "room", "width": 32, "height": 32, "fps": 15}
+    return {**size, "params": {"supersample": 1}, **changed}
 
 
 def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], timeout_s: float = 20.0) -> Any:

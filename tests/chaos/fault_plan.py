@@ -10,6 +10,7 @@ import numpy as np
 
 from edge_server.scheduler import parse_policy
 from freshfield.scenario import Scenario, parse, seed_sequence
+from tests.support import small_world
 
 ROLES = ("node", "emulator", "edge")
 POLICIES = ("all", "threshold:120", "wait:80", "freshest-k:2", "round-robin:2", "random", "age-driven", "periodic:300")
@@ -74,15 +75,7 @@ def scenario_of(seed: int) -> Scenario:
             "seed": seed,
             "cameras": {"count": 5, "held_out": ["cam00"], "phase": str(rng.choice(["locked", "spread"]))},
             # With its own motion, its frames, which no other seed needs, are not kept on disk.
-            "source": {
-                "kind": "world",
-                "scene": "room",
-                "width": 32,
-                "height": 32,
-                "fps": 15,
-                "motion_seed": seed,
-                "params": {"supersample": 1},
-            },
+            "source": small_world(motion_seed=seed),
             "channel": channel,
             "edge": {
                 "field": field,

@@ -18,6 +18,7 @@ from freshfield.frame import Frame, from_request, to_request
 from freshfield.geometry import Pose
 from freshfield.scenario import ScenarioError, parse
 from tests.camera_node.sources.datasets.photos import opencv_pose, photo_scenario, picture, write_photos
+from tests.support import small_world
 
 
 @pytest.fixture(autouse=True)
@@ -26,16 +27,7 @@ def own_cache(tmp_path, monkeypatch):
 
 
 def cameras(effects: dict[str, Any], count: int = 3, scene: str = "tower", seed: int = 5) -> dict[str, Camera]:
-    source = {
-        "kind": "world",
-        "scene": scene,
-        "width": 24,
-        "height": 16,
-        "fps": 10,
-        "codec": "zstd",
-        "effects": effects,
-        "params": {"supersample": 1},
-    }
+    source = small_world(scene=scene, width=24, height=16, fps=10, codec="zstd", effects=effects)
     top = {"seed": seed, "cameras": {"count": count, "held_out": ["cam00"]}, "source": source}
     scenario = parse(top, Path("world.yaml"))
     return {c.name: c for c in build_cameras(scenario, source_config(scenario), scenario.cameras)}

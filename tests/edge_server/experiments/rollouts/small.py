@@ -9,6 +9,7 @@ from typing import Any
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.rollouts.setting import Setting
 from freshfield.scenario import Scenario, parse
+from tests.support import small_world
 
 NOTHING = Folders()
 FIELD = {"gaussians": 128, "start": 96, "seed_cells": 8}
@@ -18,15 +19,7 @@ RAW: dict[str, Any] = {
     "name": "small",
     "seed": 3,
     "cameras": {"count": 5, "held_out": ["cam00"]},
-    "source": {
-        "kind": "world",
-        "scene": "room",
-        "width": 24,
-        "height": 24,
-        "fps": 15,
-        "speed_m_per_s": 2.0,
-        "params": {"supersample": 1},
-    },
+    "source": small_world(width=24, height=24, speed_m_per_s=2.0),
     "channel": {"preset": "ch5"},
     "edge": {"field": "splat", "field_options": FIELD, "updates": "cycle", "lpips": "none"},
 }

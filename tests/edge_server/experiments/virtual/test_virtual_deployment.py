@@ -25,6 +25,7 @@ from freshfield import payload
 from freshfield.frame import to_request
 from freshfield.scenario import Scenario, parse
 from tests.edge_server.experiments.sets import SMALL, write_recording
+from tests.support import small_world
 
 SETTINGS = RunSettings(steps=2, compute=ComputeConfig(ms_per_step=40.0, ms_per_update=20.0))
 
@@ -34,14 +35,7 @@ def scenario(channel: dict[str, Any] | None = None, seed: int = 3, **other: Any)
         "name": "virtual",
         "seed": seed,
         "cameras": {"count": 5, "held_out": ["cam00"]},
-        "source": {
-            "kind": "world",
-            "scene": "room",
-            "width": 32,
-            "height": 32,
-            "fps": 15,
-            "params": {"supersample": 1},
-        },
+        "source": small_world(),
         "channel": {"preset": "ch5"} if channel is None else channel,
         "edge": {"field": "ngp", "field_options": SMALL},
     }
@@ -107,8 +101,7 @@ def test_a_fault_of_the_rate_takes_longer_for_what_the_frames_hold():
 
 
 def with_sensors(channel: dict[str, Any], every: int) -> Scenario:
-    source = {"kind": "world", "scene": "room", "width": 32, "height": 32, "fps": 15, "params": {"supersample": 1}}
-    return scenario(channel, source={**source, "depth_every": every, "effects": {"depth_sensor": {}}})
+    return scenario(channel, source=small_world(depth_every=every, effects={"depth_sensor": {}}))
 
 
 @pytest.mark.parametrize("every", [0, 1, 5])
@@ -183,8 +176,7 @@ def test_at_twice_the_load_frames_are_left_out_and_what_is_shown_does_not_age() 
     )
     ages = []
     for fps in (15.0, 30.0):
-        source = {"kind": "world", "scene": "room", "width": 32, "height": 32, "fps": fps, "params": {"supersample": 1}}
-        deployment = run(scenario({}, edge=edge, source=source), settings, seconds=6.0)
+        deployment = run(scenario({}, edge=edge, source=small_world(fps=fps)), settings, seconds=6.0)
         late = [p for p in deployment.publications if p.t_s > 2.0]
         assert max(p.update_ms for p in late) <= 80.0
         halves = [np.mean([p.aaoi_ms for p in late if (p.t_s > 4.0) is second]) for second in (False, True)]
@@ -203,14 +195,7 @@ def test_a_camera_that_reports_late_is_waited_for_only_as_long_as_the_grace():
 
 
 def test_node_clocks_may_be_wrong_and_ages_are_still_true():
-    source = {
-        "kind": "world",
-        "scene": "room",
-        "width": 32,
-        "height": 32,
-        "fps": 15,
-        "effects": {"clock_drift": {"offset_ms": 80.0, "drift_ppm": 200.0}},
-    }
+    source = small_world(effects={"clock_drift": {"offset_ms": 80.0, "drift_ppm": 200.0}})
     wrong, right = run(scenario(source=source)), run(scenario())
     assert [p.ages_ms for p in wrong.publications] == [p.ages_ms for p in right.publications]
 
@@ -225,8 +210,7 @@ def test_a_recording_is_scored_against_its_nearest_capture(tmp_path):
 
 
 def world_with(effects: dict[str, Any], scene: str = "tower", **source: Any) -> dict[str, Any]:
-    size = {"kind": "world", "scene": scene, "width": 32, "height": 32, "fps": 15}
-    return {**size, "params": {"supersample": 1}, "effects": effects, **source}
+    return small_world(scene=scene, effects=effects, **source)
 
 
 def test_every_effect_at_once_repeats_bit_for_bit():
