@@ -31,6 +31,24 @@ def test_medians_at_refined_poses(tmp_path):
     assert (tmp_path / "both.png").stat().st_size > 1000
 
 
+def test_simulations_by_what_was_shown(tmp_path):
+    runs = []
+    for seed, curve in enumerate(([[0.0, 20.0, None], [0.5, 22.0, 18.0], [1.0, 23.0, 19.0]], [[0.5, 24.0, 19.0]])):
+        runs.append(tmp_path / str(seed))
+        runs[-1].mkdir()
+        found = {"shown_curve_db": curve, "seconds_to_1_db": 0.5 + seed}
+        (runs[-1] / "simulation.json").write_text(json.dumps(found))
+    assert main([f"quad={runs[0]},{runs[1]}", "--out", str(tmp_path / "shown")]) == 0
+    (curve,) = json.loads((tmp_path / "shown.json").read_text())["curves"].values()
+    assert curve == {
+        "runs": 2,
+        "seconds_to_1_db": [0.5, 1.5],
+        "t_s": [0.5],
+        "psnr_db": [23.0],
+        "psnr_moving_db": [18.5],
+    }
+
+
 def test_fits_of_other_instants_are_refused(tmp_path, capsys):
     fits = [write_fit(tmp_path / str(n), [row(1.0, 3.0)] * n) for n in (1, 2)]
     with pytest.raises(SystemExit):
