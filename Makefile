@@ -62,7 +62,7 @@ endef
 BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrome 2>/dev/null))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format types bench figures mutants pythons proto proto-check lock images clean
+.PHONY: help demo test docs lint format types bench figures mutants pythons proto proto-check lock images clean
 
 help:  ## what there is to make
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 22
@@ -81,6 +81,10 @@ test: .venv/.ok-all-kernels  ## all tests but the slow ones (the browser's too, 
 	echo "tests that need the machine to themselves"; $(PY) -m pytest \
 	  -m "$(CHOSEN) and not side_by_side" $(PYTEST); second=$$?; \
 	for code in $$first $$second; do [ $$code = 0 ] || [ $$code = 5 ] || exit $$code; done
+
+docs: .venv/.ok-docs  ## the documentation as a site: site/index.html
+	@NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --quiet
+	@echo "site/index.html; with search: $(PYTHON) -m http.server -d site"
 
 lint: .venv/.ok-test  ## ruff: rules and format
 	$(PY) -m ruff check .
@@ -149,7 +153,7 @@ images:  ## build both images on the base image's newest digest: ENGINE=docker, 
 	done
 
 clean:  ## remove the virtual environment and every cache (runs/ stays)
-	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist site
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # --- set-up ---
@@ -196,6 +200,10 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 .venv/.ok-test: .venv/.ok-run pyproject.toml
 	@echo "test tools"
 	@$(INSTALL) -e '.[edge,embed,test,dev]'
+	@touch $@
+
+.venv/.ok-docs: .venv/.ok-run pyproject.toml
+	@$(INSTALL) -e '.[edge,embed,docs]'
 	@touch $@
 
 # The other fields' kernels, at once in two processes: two processes of tests would compile all of them twice.

@@ -21,10 +21,10 @@ NOTATIONS = ("arrivals", "chain", "service")
 
 def text(section: str | None) -> str:
     """Keys of a section, or of all, with what is allowed, defaults and help. Raises ScenarioError."""
-    if section is not None and section not in _SECTIONS:
-        raise ScenarioError(f"no section is called {section!r}; there are: {', '.join(_SECTIONS)}")
-    chosen = [section] if section else list(_SECTIONS)
-    return "\n".join(line for name in chosen for line in _SECTIONS[name]()).strip("\n")
+    if section is not None and section not in SECTIONS:
+        raise ScenarioError(f"no section is called {section!r}; there are: {', '.join(SECTIONS)}")
+    chosen = [section] if section else list(SECTIONS)
+    return "\n".join(line for name in chosen for line in SECTIONS[name]()).strip("\n")
 
 
 def schema() -> dict[str, Any]:
@@ -121,11 +121,13 @@ def _edge() -> Iterator[str]:
     for title, model in models.items():
         if model not in shown:
             yield from _described(title, model, shown=shown)
-    from edge_server.fields.registry import field_names, option_help
+    from edge_server.fields.registry import field_names, option_help, settings_of
 
     for name in field_names():
+        default = settings_of(name)
         yield from ("", f"edge.field_options of field {name}", "")
-        yield from (f"    {option:22} {about}" for option, about in option_help(name).items())
+        for option, about in option_help(name).items():
+            yield f"    {option:22} default {getattr(default, option)!r}; {about}"
 
 
 def _edge_models() -> dict[str, type[Settings]]:
@@ -144,7 +146,7 @@ def _edge_models() -> dict[str, type[Settings]]:
     }
 
 
-_SECTIONS: dict[str, Callable[[], Iterator[str]]] = {
+SECTIONS: dict[str, Callable[[], Iterator[str]]] = {
     "cameras": _cameras,
     "source": _source,
     "effects": _effects,
