@@ -103,7 +103,7 @@ def _limit(report: Report) -> str:
     if age["network"] > computing:
         text = "The network was the limit: it takes the larger part of that age"
     else:
-        text = "Time to compute was the limit: waiting and computing take more of that age than the network"
+        text = "Waiting for an update and computing it were the limit: they take more of that age than the network"
     return f"{text}{f'; {lost}' if lost else ''}."
 
 

@@ -53,7 +53,7 @@ def test_three_sentences_say_what_was_shown_its_age_and_its_limit(tmp_path: Path
         ({"fidelity.baseline.mean_colour_db": None}, 0, "17.0 dB where the scene moves."),
         ({"fidelity.shown.psnr_db": None, "fidelity.final.psnr_db": None}, 0, "is not known"),
         ({"fidelity.so_far": {"now_psnr_db": 20.0, "all_psnr_db": 23.0, "frames": 9}}, 0, "all 9 so far 23.0 dB"),
-        ({"fidelity.shown.age_ms.waiting": 0.0}, 2, "Time to compute was the limit"),
+        ({"fidelity.shown.age_ms.waiting": 0.0}, 2, "Waiting for an update and computing it were the limit"),
         ({"fidelity.shown.psnr_still_db": 15.0}, 2, "too few cameras"),
         ({"updates.shed": 70}, 2, "92% of those delivered were left out for lack of time"),
     ],
