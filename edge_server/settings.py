@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import msgspec
 from msgspec.structs import replace
 
+from edge_server.fields.registry import FIELD
 from edge_server.scheduler import Policy, resolve_checkpoint
 from freshfield.limits import LONGEST_MS
 from freshfield.scenario import Scenario
@@ -30,7 +31,6 @@ LEAST_UPDATE_MS = 10.0
 """Shortest fitting time of an update: a shorter one is not worth the decoding of its views."""
 MOST_MS = 1e9
 """Largest cost that virtual time charges."""
-FIELD = "splat"
 ARRIVALS: dict[str, Any] = {"updates": "arrivals", "update_ms": 20.0, "steps": 10}
 """Of a field in layers that follows arrivals."""
 CYCLE: dict[str, Any] = {"updates": "cycle", "update_ms": 800.0, "steps": 100}

@@ -20,6 +20,8 @@ _PACKAGES: dict[str, str] = {
     "tensorf": "edge_server.fields.tensorf",
     "splat": "edge_server.fields.splat",
 }
+FIELD = "splat"
+"""The usual representation."""
 
 
 def field_names() -> tuple[str, ...]:

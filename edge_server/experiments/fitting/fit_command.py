@@ -37,12 +37,11 @@ from edge_server.fidelity.images import Color, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Score, Scorer
 from edge_server.fields import Field, RefinesCameras, checkpoint
-from edge_server.fields.registry import efforts_of, field_names, option_help, settings_of
+from edge_server.fields.registry import FIELD, efforts_of, field_names, option_help, settings_of
 from edge_server.fields.splat.scan.settings import scan_options
 from edge_server.live.scoring_thread import to_bytes
 from edge_server.machine import run_facts
 from edge_server.run_records import UpdateRow
-from edge_server.settings import FIELD
 from freshfield.files import out_folder, write_json
 from freshfield.machine_load import LoadMeter, outside_cores
 from freshfield.scenario import NOTHING_HELD_OUT

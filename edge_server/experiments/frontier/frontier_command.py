@@ -23,10 +23,10 @@ from edge_server.experiments.frontier.from_scratch import Fit, Still
 from edge_server.experiments.frontier.output import recommendation, write_output
 from edge_server.experiments.frontier.update_time import Charged, MovingRun, MovingScene, variants
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
-from edge_server.fields.registry import field_names, make_field
+from edge_server.fields.registry import FIELD, field_names, make_field
 from edge_server.machine import machine, versions
 from edge_server.scheduler import make_policy, parse_policy
-from edge_server.settings import FIELD, ComputeConfig
+from edge_server.settings import ComputeConfig
 from freshfield.files import out_folder, write_json
 from freshfield.scenario import ScenarioError
 
