@@ -152,7 +152,8 @@ class RunFacts(Struct):
 
 class EdgeStatus(Struct, kw_only=True):
     """What a report takes from edge.json. seconds: of fitting. started_ns, uptime_s: of a live edge. chosen: how the
-    edge works and why, in one line. last_frames: sequence and capture time of the last frame of each camera's
+    edge works and why, in one line. troubles: what the field finds wrong with frames, poses and depth, a line each.
+    last_frames: sequence and capture time of the last frame of each camera's
     sessions."""
 
     kind: Literal["live", "fit", "simulated"] = "live"
@@ -168,6 +169,7 @@ class EdgeStatus(Struct, kw_only=True):
     started_ns: Instant | None = None
     uptime_s: Number | None = None
     lines_lost: Count = 0
+    troubles: list[str] = []
     updates: UpdateCounts | None = None
     foreground: dict[str, Number | None] | None = None
     baseline: Baseline | None = None

@@ -35,8 +35,8 @@ ARRIVALS: dict[str, Any] = {"updates": "arrivals", "update_ms": 20.0, "steps": 1
 """Of a field in layers that follows arrivals."""
 CYCLE: dict[str, Any] = {"updates": "cycle", "update_ms": 800.0, "steps": 100}
 """Of everything else."""
-CARRIED: dict[str, Any] = {"updates": "cycle", "update_ms": 150.0, "steps": 24}
-"""Of a scan by cameras that move: a keyframe an update."""
+CARRIED: dict[str, Any] = {"updates": "cycle", "update_ms": 80.0, "steps": 8}
+"""Of a scan by cameras that move: a third of what a keyframe gets, so that a new one shows as soon as it is seeded."""
 MOST_CARRIED = 4
 """Cameras: photos that are dealt to twelve (``fox``) are no tracks, and read 8 dB less as a scan (19 against 27)."""
 SCAN: dict[str, Any] = {"scan": True, "refine": True, "carried": True, "gaussians": 60_000}

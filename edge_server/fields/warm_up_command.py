@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from edge_server.fields.compiling import USUAL
-from edge_server.fields.registry import field_names, make_field
+from edge_server.fields.registry import FIELD, field_names, make_field
 
 DESCRIPTION = f"""\
 Compile the kernels of a field for this processor ({USUAL}), so that
@@ -38,16 +38,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.scenario is not None:
         field, seconds = _of_scenario(args.scenario)
     else:
-        field = args.field or _default_field()
+        field = args.field or FIELD
         seconds = warm_up(field)
     print(f"kernels of {field} ready after {seconds:.1f} s")
     return 0
-
-
-def _default_field() -> str:
-    from edge_server.settings import FIELD  # with scenario files, and what reads them
-
-    return FIELD
 
 
 def _of_scenario(name: str) -> tuple[str, float]:

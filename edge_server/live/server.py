@@ -365,6 +365,7 @@ class EdgeServer:
             "uptime_s": self.state.now_s(),
             "field": self.config.field,
             "chosen": self.state.chosen,
+            "troubles": list(self.state.troubles()),
             "policy": short_name(self.state.controls.policy),
             "value": self.state.controls.value,
             "paused": self.state.controls.paused,

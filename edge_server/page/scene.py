@@ -12,6 +12,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from edge_server.fields import RefinesCameras, View
 from edge_server.live.state import CameraView, EdgeState
 from edge_server.page.colors import HELD_OUT, RGB, age_color
 from edge_server.page.settings import QUIET_S, SETTLE_S, THUMBNAIL_BUDGET_S, THUMBNAIL_EVERY_S
@@ -121,12 +122,21 @@ class Scene:
         if found is None or found.newest is None or self._viewpoint is None:
             return
         frame = found.newest
-        pose = frame.pose.matrix()
+        pose = self._believed(frame)
         with client.atomic():
             client.camera.position = pose[:3, 3]
             client.camera.look_at = pose[:3, 3] + pose[:3, 2] * self._viewpoint.radius_m
             client.camera.up_direction = -pose[:3, 1]
             client.camera.fov = float(2 * np.arctan(0.5 * frame.intrinsics.height / frame.intrinsics.fy))
+
+    def _believed(self, frame: Frame) -> NDArray[np.float64]:
+        """Where the field believes that a frame was taken: what it shows fits the poses that it has refined."""
+        pose, shown = frame.pose.matrix(), self._state.renderer
+        if not isinstance(shown, RefinesCameras):
+            return pose
+        nothing = np.zeros((0, 0, 3), np.uint8)
+        known = shown.correction(View(frame.camera, nothing, pose, frame.intrinsics, frame.generated_edge_ns))
+        return pose if known is None else known.camera_to_world
 
     def _thumbnails(self, cameras: list[CameraView]) -> None:
         """Update thumbnails in turn, within the time budget."""

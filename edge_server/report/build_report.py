@@ -51,6 +51,7 @@ def assemble(files: RunFiles) -> dict[str, Any]:
     notes = list(files.notes)
     if edge.lines_lost:
         notes.append(f"the edge could not write {edge.lines_lost} lines of its results (a full disk?)")
+    notes += edge.troubles
     accounting = account_frames(files.out)
     seconds = max(edge.seconds or edge.uptime_s or 0.0, series[-1].t_s if series else 0.0)
     report = {

@@ -26,7 +26,8 @@ from camera_node.capture import Camera
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.refined import render_refined
 from edge_server.fidelity.scorer import Scorer
-from edge_server.fields import Snapshot, View
+from edge_server.fields import RefinesCameras, Snapshot, View
+from edge_server.live.camera_motion import pose_distance
 from freshfield import payload
 from freshfield.files import write_json
 
@@ -55,12 +56,30 @@ class NowAndAll:
         for number in range(1, int(seconds / MARKS_S) + 1):
             deployment.at(round(1e9 * number * MARKS_S), partial(self._mark, number * MARKS_S))
 
-    def means(self) -> dict[str, float | None]:
-        """Means of the rows from SINCE_S on; empty before."""
+    def means(self) -> dict[str, Any]:
+        """Means of the rows from SINCE_S on; empty before. revisited: of captures that a recording showed again, how
+        far apart the first and the last refined pose are in the end (medians): nothing if no pose drifts."""
         late = [row for row in self.rows if row["t_s"] >= SINCE_S]
-        return {
+        means: dict[str, Any] = {
             name: float(np.mean([row[name] for row in late])) for name in (late[0] if late else ()) if name != "t_s"
         }
+        if revisited := self._revisited():
+            means["revisited"] = revisited
+        return means
+
+    def _revisited(self) -> dict[str, float] | None:
+        shown = self._deployment.shown_now()
+        if not isinstance(shown, RefinesCameras):
+            return None
+        found: dict[bytes, list[NDArray[np.float64]]] = {}
+        for frame in self._frames:
+            if (known := shown.correction(frame)) is not None:
+                found.setdefault(frame.camera_to_world.tobytes(), []).append(known.camera_to_world)
+        apart = [pose_distance(poses[0], poses[-1]) for poses in found.values() if len(poses) > 1]
+        if not apart:
+            return None
+        apart_m, apart_deg = np.median(apart, axis=0)
+        return {"captures": len(apart), "apart_mm": 1e3 * float(apart_m), "apart_deg": float(apart_deg)}
 
     def write(self, out: Path) -> None:
         """Write rows and images to the folder ``out``. Raises OSError."""

@@ -25,6 +25,7 @@ from edge_server.page.controls import ControlPanel
 from edge_server.page.panel import PAIR_WIDTH, side_by_side
 from edge_server.page.rendering import LEVELS, MOVING, NEWER, ClientState, RenderLoop, browser_image, hatched
 from edge_server.page.scene import Scene, thumbnail
+from edge_server.page.viewpoint import initial_viewpoint
 from freshfield import coverage, payload
 from freshfield.geometry import Pinhole, Pose, look_at
 from tests.edge_server.frames import frame
@@ -140,6 +141,19 @@ def test_one_camera_is_first_seen_from_before_it_and_then_from_where_the_fields_
     state.publish(publication(0), SimpleNamespace(box=replace(UNIT_BOX, centre_m=(0.5, 0.0, 0.25))))
     scene.refresh(state.cameras(), watched=True)
     assert server.initial_camera.look_at.tolist() == [0.5, 0.0, 0.25]
+
+
+def test_a_visitor_looks_through_a_camera_from_its_refined_pose():
+    seen = frame()
+    state = bare_state([CameraView("cam01", False, seen, 1.0, 1, 0)])
+    scene, client, refined = Scene(MagicMock(), state), MagicMock(), seen.pose.matrix()
+    scene._viewpoint = initial_viewpoint(refined[None])
+    scene._look_through(client, "cam01")
+    np.testing.assert_array_equal(client.camera.position, seen.pose.translation_m)
+    refined[:3, 3] += 0.02
+    state.publish(publication(0), SimpleNamespace(correction=lambda view: SimpleNamespace(camera_to_world=refined)))
+    scene._look_through(client, "cam01")
+    np.testing.assert_array_equal(client.camera.position, refined[:3, 3])
 
 
 def test_the_tiles_say_the_latest_score_and_the_ages_of_training_cameras():

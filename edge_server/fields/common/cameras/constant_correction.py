@@ -37,11 +37,19 @@ class ConstantCorrection:
     scatter_mm: float
 
     @property
+    def sure(self) -> bool:
+        """Whether a constant part is beyond doubt."""
+        turned, shifted = float(np.linalg.norm(self.rotation_deg)), float(np.linalg.norm(self.shift_mm))
+        return turned > max(tuned.SURE * self.error_deg, tuned.STANDS_OUT * self.scatter_deg) or shifted > max(
+            tuned.SURE * self.error_mm, tuned.STANDS_OUT * self.scatter_mm
+        )
+
+    @property
     def words(self) -> str:
-        """One line for people; a hint to calibrate where a constant part is beyond doubt."""
+        """One line for people; a hint to calibrate where it is sure."""
         turned, shifted = float(np.linalg.norm(self.rotation_deg)), float(np.linalg.norm(self.shift_mm))
         single = f"single poses scatter by {self.scatter_deg:.2f} degrees and {self.scatter_mm:.1f} mm"
-        if turned <= tuned.SURE * self.error_deg and shifted <= tuned.SURE * self.error_mm:
+        if not self.sure:
             return f"corrections of poses have no sure part in common in the camera's axes; {single}"
         return (
             f"corrections of poses have in common {turned:.2f} degrees (+- {self.error_deg:.2f}) about "

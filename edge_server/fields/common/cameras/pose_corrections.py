@@ -29,6 +29,11 @@ class _Correction:
     steps: int = 0
     track: str = ""
 
+    @property
+    def pose(self) -> Array:
+        """The corrected pose (4, 4)."""
+        return _corrected(self.given, self.rotation, self.shift_m)
+
 
 class PoseCorrections:
     """Bounded corrections of camera poses.
@@ -84,15 +89,14 @@ class PoseCorrections:
 
     def pose(self, view: View) -> Array:
         """The corrected camera_to_world (4, 4) of a view."""
-        known = self._of(view)
-        return _corrected(known.given, known.rotation, known.shift_m)
+        return self._of(view).pose
 
     def learned_pose(self, view: View) -> Array | None:
         """As ``pose``; None where nothing was learned of this view, and nothing changes."""
         known = self.known.get(view.camera)
         if known is None or not np.allclose(known.given, view.camera_to_world, atol=tuned.SAME_POSE):
             return None
-        return _corrected(known.given, known.rotation, known.shift_m)
+        return known.pose
 
     def pose_between(self, view: View, neighbors: dict[str, float]) -> Array:
         """The pose (4, 4) of a view from which nothing is learned, by the corrections of others.

@@ -42,6 +42,7 @@ class CarriedField(ScanField):
         super()._forget_parameters()
         self._clear_views()
         self._pixels, self._taken = 0, 0  # of the largest image, and keyframes, so far
+        self._took_at = 0  # step of the newest keyframe
         self._due_before = 0  # keyframes that were due before the field began anew, which counts steps from 0 again
         self._left_out: dict[str, int] = {}  # frames of each camera that show something else
         self._in_a_row: dict[str, int] = {}
@@ -118,7 +119,8 @@ class CarriedField(ScanField):
         self._follow(view)
         shown = self._look(view)
         if self._rigid is not None and len(self.cloud) and self._agreeing(view, shown) < tuned.SURE:
-            if not self._plausible(view, self._track(view)):
+            if self._flat(view, shown) or not self._plausible(view, self._track(view)):
+                self._leave_out(view)
                 return
             shown = self._look(view)
         self._taken += 1
@@ -136,6 +138,7 @@ class CarriedField(ScanField):
         self._append(view, self._aim(view, shown))
         if not self._measured and len(self._views) in tuned.BEGINS:
             self._begin_anew()
+        self._took_at = self.step
         while len(self._views) > self._most_kept():
             self._drop(self._least_needed())
 
@@ -177,18 +180,28 @@ class CarriedField(ScanField):
         error = np.abs(gray(expected[::2, ::2]) - gray(view.image[::2, ::2]))[surface]
         return float((error < tuned.SOFT).mean()) if error.size else 1.0
 
+    def _flat(self, view: View, shown: Shown) -> bool:
+        """Whether a view shows hardly anything where the field shows something: its lens is covered, or it is dark. An
+        exposure could be found by which it agrees."""
+        surface = shown.opacity >= tuned.ALIGNED_OPACITY
+        if surface.mean() < tuned.LEAST_OVERLAP:
+            return False
+        contrast, expected = (float(gray(each)[surface].std()) for each in (view.image, shown.color))
+        return contrast < tuned.FLAT * expected
+
     def _plausible(self, view: View, found: Alignment) -> bool:
-        """Whether a view shows what the field does. If not, it is forgotten and counted, unless too many were."""
+        """Whether a view shows what the field does, or so many in a row did not that this one is taken."""
         camera = view.camera.rpartition(SEPARATOR)[0]
         row = self._in_a_row.get(camera, 0)
-        if found.overlap < tuned.LEAST_OVERLAP or found.agreeing >= tuned.LEAST_AGREEING or row >= tuned.PATIENCE:
-            self._in_a_row[camera] = 0
-            return True
-        self._in_a_row[camera] = row + 1
+        taken = found.overlap < tuned.LEAST_OVERLAP or found.agreeing >= tuned.LEAST_AGREEING or row >= tuned.PATIENCE
+        self._in_a_row[camera] = 0 if taken else row + 1
+        return taken
+
+    def _leave_out(self, view: View) -> None:
+        camera = view.camera.rpartition(SEPARATOR)[0]
         self._left_out[camera] = self._left_out.get(camera, 0) + 1
         self._poses.forget(view.camera)
         self._exposures.known.pop(view.camera, None)
-        return False
 
     def _without_what_moves(self, view: View) -> View:
         """The view, with a weight of 0 where something has come since the last keyframe with depth."""
@@ -308,8 +321,10 @@ class CarriedField(ScanField):
     # --- what the field asks for --------------------------------------------------------------
 
     def _next_view(self) -> int:
-        """One of the newest keyframes, or any of them, all in turn in an order that is drawn anew for each pass."""
+        """The newest keyframe while it is fresh, else one of the newest, or any of them."""
         rng, count = self._rng(7), len(self._views)
+        if self.step - self._took_at < tuned.FRESH_STEPS:
+            return count - 1
         newest = min(tuned.NEWEST * len(self._seen), count)
         if rng.random() < tuned.NEWEST_SHARE:
             return count - 1 - int(rng.integers(newest))
@@ -345,8 +360,8 @@ class CarriedField(ScanField):
             self.cloud.keep(kept)
 
     def _counters(self) -> dict[str, Any]:
-        own = {"taken": self._taken, "due_before": self._due_before, "pixels": self._pixels, "measured": self._measured}
-        return {**super()._counters(), **own, "left_out": self._left_out}
+        names = ("taken", "took_at", "due_before", "pixels", "measured", "left_out")
+        return {**super()._counters(), **{name: getattr(self, f"_{name}") for name in names}}
 
     def _arrays(self) -> Arrays:
         aims = [np.append(normal, pixel_m) for normal, pixel_m in self._aims]
@@ -354,7 +369,7 @@ class CarriedField(ScanField):
 
     def _load(self, meta: dict[str, Any], state: Arrays) -> None:
         super()._load(meta, state)
-        self._taken, self._pixels = int(meta["taken"]), int(meta["pixels"])
+        self._taken, self._took_at, self._pixels = (int(meta[name]) for name in ("taken", "took_at", "pixels"))
         self._due_before, self._measured = int(meta["due_before"]), bool(meta["measured"])
         self._left_out = {str(camera): int(count) for camera, count in meta["left_out"].items()}
         self._clear_views()

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common.cameras.constant_correction import constant_correction
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
 from edge_server.fields.splat.scan import settings as tuned
 from freshfield.geometry import se3_inverse, so3_log
@@ -58,6 +59,10 @@ def troubles(poses: PoseCorrections) -> list[str]:
         if shift_m > tuned.DRIFT_SHARE * poses.most_m or turn_rad > tuned.DRIFT_SHARE * poses.most_rad:
             off = f"{100 * shift_m:.1f} cm and {np.rad2deg(turn_rad):.1f} degrees"
             found.append(f"{track}: its poses drift: the picture asks for {off} (median)")
+        path = poses.newest(track, tuned.MOUNT_POSES)
+        mount = constant_correction([c.given for c in path], [c.pose for c in path])
+        if mount is not None and mount.sure and late_s is None:
+            found.append(f"{track}: {mount.words}")
     return found
 
 

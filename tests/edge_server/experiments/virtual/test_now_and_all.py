@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -12,7 +14,11 @@ import yaml
 from edge_server.experiments.virtual import now_and_all
 from edge_server.experiments.virtual.simulate import main
 from edge_server.fidelity.psnr import psnr
+from edge_server.fields import View
+from freshfield.geometry import Pinhole
 from tests.edge_server.experiments.sets import SMALL
+
+TINY, LENS = np.zeros((2, 2, 3), np.uint8), Pinhole.from_fov(2, 2, 60.0)
 
 
 def test_newest_and_all_held_out_frames_are_scored_each_two_seconds_and_drawn(tmp_path: Path, monkeypatch, capsys):
@@ -39,3 +45,13 @@ def test_newest_and_all_held_out_frames_are_scored_each_two_seconds_and_drawn(tm
     )
     assert now_and_all.main([str(tmp_path / "run"), str(tmp_path / "run"), "--out", str(tmp_path / "both")]) == 0
     assert (tmp_path / "both-time.png").stat().st_size > 1000 < (tmp_path / "both-pictures.png").stat().st_size
+
+
+def test_captures_that_are_shown_again_tell_how_far_poses_drift():
+    def refined(view: View) -> SimpleNamespace:
+        return SimpleNamespace(camera_to_world=view.camera_to_world + 1e-3 * view.generated_ns * np.eye(4, k=3))
+
+    watched = now_and_all.NowAndAll(MagicMock(**{"shown_now.return_value": SimpleNamespace(correction=refined)}), (), 0)
+    there = np.eye(4) + np.eye(4, k=3)
+    watched._frames = [View("kept", TINY, pose, LENS, k) for k, pose in enumerate((np.eye(4), there, np.eye(4)))]
+    assert watched.means()["revisited"] == pytest.approx({"captures": 1, "apart_mm": 2.0, "apart_deg": 0.0})

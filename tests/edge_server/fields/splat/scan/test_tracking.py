@@ -14,6 +14,7 @@ from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.plausibility import moved_in, troubles
 from edge_server.fields.splat.scan.tracking import Rendered, align, gray
 from freshfield.geometry import Pinhole, se3_inverse, so3_exp
+from tests.edge_server.fields.common.cameras.test_constant_correction import arm_poses
 from tests.edge_server.fields.splat.scan.walk import LENS
 
 WALL = Pinhole.from_fov(160, 120, 60.0)
@@ -101,6 +102,18 @@ def test_late_and_drifting_poses_are_said() -> None:
             poses.set_pose(view, right)
         found = troubles(poses)
         assert (words is None and not found) or (words is not None and words in found[0]), found
+
+
+def test_a_mount_that_is_off_is_said_live() -> None:
+    mount, poses, still = np.eye(4), PoseCorrections(0.5, 5.0), PoseCorrections(0.5, 5.0)
+    mount[:3, :3], mount[:3, 3] = so3_exp(np.deg2rad([0.0, 1.0, 0.0])), [0.0, 0.02, 0.0]
+    for k, given in enumerate(arm_poses()):
+        view = View(f"hand#{k}", np.zeros((4, 4, 3), np.uint8), given, LENS, k * 10**8)
+        for each, error in ((poses, mount), (still, np.eye(4))):
+            each.begin(view, "hand")
+            each.set_pose(view, given @ error)
+    (said,) = troubles(poses)
+    assert "in common 1.0" in said and said.endswith("hand-eye calibration is off") and not troubles(still)
 
 
 def test_gray_is_that_of_opencv() -> None:
