@@ -1,11 +1,8 @@
 """A bad network for your own tests: the pytest fixture ``channel``.
 
-It needs only pytest besides freshfield (``pip install freshfield[test]``). In the ``conftest.py`` at the root
-of your tests::
-
-    pytest_plugins = ["channel_emu.testing"]
-
-(or, in the test's module, ``from channel_emu.testing import channel``). A test then puts any gRPC service
+It needs only pytest besides freshfield (``pip install freshfield[test]``), which finds the fixture by itself. Where
+freshfield is only on the path, write ``pytest_plugins = ["channel_emu.testing"]`` in the ``conftest.py`` at the root of
+your tests, or ``from channel_emu.testing import channel`` in the test's module. A test then puts any gRPC service
 behind a seeded link, talks to ``link.address`` instead of the service, and asserts on the report::
 
     def test_positions_stay_fresh(channel):
@@ -34,22 +31,20 @@ instants. When a test fails, pytest shows each link's seed and statistics in a s
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
-import sys
 import threading
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any, TypeVar
 
-import pytest
-
-from channel_emu.live.priority import SWITCH_INTERVAL_S
 from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.live.report import Report, show
 from channel_emu.model import trace as traces
 from channel_emu.model.settings import ChannelConfig, channel_from_mapping
+from channel_emu.pytest_plugin import channel
 from freshfield.transport import Transport
+
+__all__ = ["EmulatedLink", "channel"]
 
 T = TypeVar("T")
 _PATIENCE_S = 30.0
@@ -157,33 +152,3 @@ class EmulatedLink:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(_PATIENCE_S)
         self._loop.close()
-
-
-ChannelFactory = Callable[..., EmulatedLink]
-
-
-@pytest.fixture
-def channel(request: pytest.FixtureRequest) -> Iterator[ChannelFactory]:
-    """Fixture that makes links in front of gRPC services: ``link = channel("ch5", to="localhost:50051")``.
-
-    Arguments as of ``EmulatedLink``. All links are closed at the end of the test.
-    """
-    links: list[EmulatedLink] = []
-
-    def make(channel: str | dict[str, Any] | ChannelConfig, **options: Any) -> EmulatedLink:
-        links.append(EmulatedLink(channel, **options))
-        return links[-1]
-
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(min(before, SWITCH_INTERVAL_S))
-    try:
-        yield make
-    finally:
-        sys.setswitchinterval(before)
-        with contextlib.ExitStack() as ending:
-            for link in links:
-                ending.callback(link.close)
-        if links:
-            # Shown by pytest if the test failed.
-            text = "\n".join(link.describe() for link in links)
-            request.node.add_report_section("teardown", "emulated channel", text)

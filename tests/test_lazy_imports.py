@@ -43,7 +43,11 @@ import channel_emu.virtual.simulate, channel_emu.estimate
 """
 
 
+PYTEST = "import channel_emu.pytest_plugin"
+
+
 UNASKED = {
+    PYTEST: ("numpy", "grpc", "yaml", "msgspec", "channel_emu.testing", "channel_emu.live", "channel_emu.model"),
     EDGE: (
         *(
             f"edge_server.{room}"
@@ -72,7 +76,7 @@ UNASKED = {
 @pytest.mark.parametrize(
     ("program", "unasked"),
     UNASKED.items(),
-    ids=("edge", "node", "node without an arm", "tile", "few cameras", "warm-up", "emulator"),
+    ids=("pytest", "edge", "node", "node without an arm", "tile", "few cameras", "warm-up", "emulator"),
 )
 def test_what_nobody_asks_for_is_not_imported(program: str, unasked: tuple[str, ...]) -> None:
     code = f"{program}\nimport sys\nprint([name for name in sys.modules if name.startswith({unasked})])"

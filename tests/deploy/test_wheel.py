@@ -22,8 +22,6 @@ import grpc
 import pytest
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
-pytest_plugins = ["channel_emu.testing"]
-
 
 @pytest.fixture
 def service():
