@@ -7,30 +7,27 @@ the fixture. ``channel_emu.testing`` says how to use it.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import sys
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
-if TYPE_CHECKING:
-    from channel_emu.model.settings import ChannelConfig
-    from channel_emu.testing import EmulatedLink
-
 
 @pytest.fixture
-def channel(request: pytest.FixtureRequest) -> Iterator[Callable[..., EmulatedLink]]:
+def channel(request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
     """Fixture that makes links in front of gRPC services: ``link = channel("ch5", to="localhost:50051")``.
 
     Arguments as of ``channel_emu.testing.EmulatedLink``. All links are closed at the end of the test.
     """
     from channel_emu.live.priority import SWITCH_INTERVAL_S
-    from channel_emu.testing import EmulatedLink
 
-    links: list[EmulatedLink] = []
+    emulated_link = importlib.import_module("channel_emu.testing").EmulatedLink  # which offers this fixture
+    links: list[Any] = []
 
-    def make(channel: str | dict[str, Any] | ChannelConfig, **options: Any) -> EmulatedLink:
-        links.append(EmulatedLink(channel, **options))
+    def make(channel: Any, **options: Any) -> Any:
+        links.append(emulated_link(channel, **options))
         return links[-1]
 
     before = sys.getswitchinterval()
