@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from channel_emu.model.ages import RunningAge, mean_of_known
 from channel_emu.model.channel import Channel
@@ -40,10 +41,15 @@ class LinkRun:
     def camera(self) -> str:
         return self.link.camera
 
+    def deliveries_ns(self) -> NDArray[np.int64]:
+        """(n, 2): capture, which in virtual time is the offer, and arrival of each delivered frame, in the order of
+        arrival."""
+        came = [(t.offered_ns, t.ended_ns or 0) for t in self.transits if t.outcome is EventKind.DELIVERED]
+        return np.array(sorted(came, key=lambda pair: pair[::-1]), np.int64).reshape(-1, 2)
+
     def age(self) -> RunningAge:
-        """The age over time, counted from the capture, which in virtual time is the offer."""
-        came = [t for t in self.transits if t.outcome is EventKind.DELIVERED]
-        return RunningAge(sorted((t.ended_ns or 0, t.offered_ns) for t in came))
+        """The age over time."""
+        return RunningAge((arrived, captured) for captured, arrived in self.deliveries_ns().tolist())
 
     def delays_ms(self) -> list[float]:
         """The drawn delay of every frame that started and was due within the run."""
@@ -59,6 +65,20 @@ class Simulation:
     seed: int
     seconds: float
     runs: list[LinkRun] = field(repr=False)
+
+    def ages_ms(self, every_ms: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Instants (T,) in seconds, every ``every_ms`` from 0 on, and the age (cameras, T) of each camera's newest
+        arrived frame then, in milliseconds; NaN before the first. Raises SimulationError for a period out of range."""
+        if not every_ms > 0.0 or len(self.runs) * self.seconds * 1e3 / every_ms > _MOST_FRAMES:
+            raise SimulationError(f"every_ms: expected more than 0 and at most {_MOST_FRAMES:.0e} ages, got {every_ms}")
+        at_ns = np.arange(0, round(self.seconds * 1e9) + 1, round(every_ms * 1e6))
+        ages = np.full((len(self.runs), len(at_ns)), np.nan)
+        for row, run in zip(ages, self.runs):
+            captured, arrived = run.deliveries_ns().T
+            newest = np.maximum.accumulate(captured)
+            known = np.searchsorted(arrived, at_ns, side="right") - 1
+            row[known >= 0] = (at_ns[known >= 0] - newest[known[known >= 0]]) / 1e6
+        return at_ns / 1e9, ages
 
     def summary(self) -> dict[str, Any]:
         """Results as plain values, as the command prints them with --json."""

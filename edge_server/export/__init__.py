@@ -6,11 +6,13 @@ from ours (camera-to-world, OpenCV axes, meters, w-first quaternions).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields import View
 from freshfield.geometry import Pinhole
 
 
@@ -20,7 +22,7 @@ class ExportError(ValueError):
 
 @dataclass(frozen=True)
 class PosedImage:
-    """An image with its pose. name: file name without folder and extension. image: uint8 (H, W, 3 or 4).
+    """An image with its pose. name: file name without folder. image: uint8 (H, W, 3 or 4).
     camera_to_world: (4, 4), OpenCV axes, meters."""
 
     name: str
@@ -29,8 +31,18 @@ class PosedImage:
     intrinsics: Pinhole
 
 
-def file_names(cameras: list[str]) -> list[str]:
-    """A file name per camera, without extension: the last part of its name, numbered if two are equal."""
-    plain = [camera.replace("\\", "/").rsplit("/", 1)[-1].rsplit(".", 1)[0] or "camera" for camera in cameras]
-    safe = ["".join(c if c.isalnum() or c in "-_." else "_" for c in name) for name in plain]
-    return safe if len(set(safe)) == len(safe) else [f"{k:05d}_{name}" for k, name in enumerate(safe)]
+_PICTURES = {"png": (3, 4), "jpg": (3,), "jpeg": (3,)}  # ending -> channels of what is written
+
+
+def file_names(views: Sequence[View]) -> list[str]:
+    """A file name per view: the last part of its camera's name, with .png unless it is a picture's own name; numbered
+    if two are equal. A transparent picture is always a .png."""
+    names = []
+    for view in views:
+        plain = view.camera.replace("\\", "/").rsplit("/", 1)[-1]
+        plain = "".join(c if c.isalnum() or c in "-_." else "_" for c in plain)
+        stem, _, ending = plain.rpartition(".")
+        if not stem or view.image.shape[2] not in _PICTURES.get(ending.lower(), ()):
+            plain = f"{(stem if ending.lower() in _PICTURES else plain) or 'camera'}.png"
+        names.append(plain)
+    return names if len(set(names)) == len(names) else [f"{k:05d}_{name}" for k, name in enumerate(names)]

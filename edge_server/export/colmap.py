@@ -43,8 +43,7 @@ class Cloud:
 
 
 def write_model(folder: Path, shots: Sequence[PosedImage], cloud: Cloud) -> None:
-    """Write cameras.txt, images.txt and points3D.txt to ``folder``, which is created. Images are named
-    NAME.png. ExportError: no shots."""
+    """Write cameras.txt, images.txt and points3D.txt to ``folder``, which is created. ExportError: no shots."""
     if not shots:
         raise ExportError("no camera has reported: there is nothing to write")
     folder.mkdir(parents=True, exist_ok=True)
@@ -58,7 +57,7 @@ def write_model(folder: Path, shots: Sequence[PosedImage], cloud: Cloud) -> None
         for place, point in enumerate(which):
             tracks[point].append(f"{number} {place}")
         pose = f"{_numbers(matrix_to_quaternion(inverse[:3, :3]))} {_numbers(inverse[:3, 3])}"
-        images.append(f"{number} {pose} {lenses.index(shot.intrinsics) + 1} {shot.name}.png")
+        images.append(f"{number} {pose} {lenses.index(shot.intrinsics) + 1} {shot.name}")
         images.append(" ".join(f"{_numbers(pixel)} {point + 1}" for pixel, point in zip(pixels, which)))
     cameras = [
         f"{k} {_model(lens)[0]} {lens.width} {lens.height} {_numbers(_model(lens)[1])}"

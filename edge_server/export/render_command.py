@@ -6,20 +6,19 @@ import argparse
 import re
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from edge_server.export import ExportError
 from edge_server.export.camera_paths import Step, lens, looking, orbit, read_nerfstudio, vertical_fov_deg
+from edge_server.export.images import IMAGE_ENDINGS, Image, checked_file, colors, write_video
 from edge_server.export.run_source import Source, open_source
-from edge_server.fields import SEPARATOR, Rendering
+from edge_server.export.viewed_field import checked_size
+from edge_server.fields import Rendering
 from freshfield.files import out_file
-from freshfield.geometry import Pinhole
-from freshfield.limits import MAX_IMAGE_SIDE_PX
 
 DESCRIPTION = """\
 Renders the field of a run or fit from new viewpoints. RUN is its folder, or a checkpoint in it.
@@ -33,11 +32,6 @@ Renders the field of a run or fit from new viewpoints. RUN is its folder, or a c
 
 Files end in .png or .jpg (the first image of a path), or in .mp4.
 """
-
-Image = NDArray[np.uint8]
-_IMAGES, _VIDEOS = (".png", ".jpg", ".jpeg"), (".mp4",)
-DEFAULT_HEIGHT = 480  # pixels, at the shape of the cameras' images
-MOST_NAMED = 20  # cameras in an error
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -75,9 +69,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _render(args: argparse.Namespace) -> None:
-    ending = args.file.suffix.lower()
-    if ending not in (*_IMAGES, *_VIDEOS):
-        raise ExportError(f"{args.file}: expected a file that ends in {', '.join((*_IMAGES, *_VIDEOS))}")
+    checked_file(args.file)
     for option, value, lowest, highest in (
         ("seconds", args.seconds, 0.1, 600.0),
         ("fps", args.fps, 0.1, 240.0),
@@ -87,67 +79,49 @@ def _render(args: argparse.Namespace) -> None:
             raise ExportError(f"--{option} {value:g}: expected {lowest:g} to {highest:g}")
     sources = [open_source(run, args.allow_plugins) for run in (args.run, args.beside) if run is not None]
     steps, fps, (width, height) = _path(args, sources[0])
-    if ending in _IMAGES:
+    if args.file.suffix.lower() in IMAGE_ENDINGS:
         steps = steps[:1]
-    if ending in _VIDEOS and (width % 2 or height % 2):
-        raise ExportError(f"{args.file}: videos need even sizes, not {width} x {height}: give --size")
     cameras = [step.lens or lens(width, height, args.fov or step.fov_deg) for step in steps]
     snapshots = [source.field.snapshot() for source in sources]
 
     def render(index: int) -> list[Rendering]:
         return [s.render(steps[index].camera_to_world, cameras[index]) for s in snapshots]
 
-    colors = _depth_colors(render, len(steps)) if args.depth else _colors
+    shown = _depth_colors(render, len(steps)) if args.depth else lambda rendering: colors(rendering.color)
     began = time.monotonic()
-    with _Writer(args.file, fps, (width * len(snapshots), height)) as write:
+
+    def images() -> Iterator[Image]:
         for index in range(len(steps)):
-            write(np.concatenate([colors(each) for each in render(index)], axis=1))
+            yield np.concatenate([shown(each) for each in render(index)], axis=1)
             _progress(index + 1, len(steps), began)
-    print(f"{args.file}: {len(steps)} image{'s' * (len(steps) > 1)} of {width * len(snapshots)} x {height}")
+
+    count, width, height = write_video(args.file, images(), fps)
+    print(f"{args.file}: {count} image{'s' * (count > 1)} of {width} x {height}")
 
 
 def _path(args: argparse.Namespace, source: Source) -> tuple[list[Step], float, tuple[int, int]]:
     """Steps, images a second, and an image's width and height."""
-    like = source.views[0].intrinsics
+    asked = _size(args.size)
     if args.path is not None:
         steps, fps, size = read_nerfstudio(args.path)
-        return steps, args.fps or fps, _size(args.size) or size
-    fps, fov = args.fps or 25.0, vertical_fov_deg(like)
+        return steps, args.fps or fps, asked or size
+    fps, fov = args.fps or 25.0, vertical_fov_deg(source.views[0].intrinsics)
     if args.camera is not None:
-        # A carried camera's views are called hand#0, hand#1, ...: its newest one stands for it.
-        shots = {view.camera.rpartition(SEPARATOR)[0]: view for view in source.views if SEPARATOR in view.camera}
-        shots |= {view.camera: view for view in source.views}
-        if args.camera not in shots:
-            more = f", and {len(shots) - MOST_NAMED} more" if len(shots) > MOST_NAMED else ""
-            raise ExportError(f"--camera {args.camera}: the run has {', '.join(list(shots)[:MOST_NAMED])}{more}")
-        view, camera = shots[args.camera], shots[args.camera].intrinsics
-        size = _size(args.size) or (camera.width, camera.height)
-        scaled = camera.scaled(size[1] / camera.height)
-        own = scaled if args.fov is None and (scaled.width, scaled.height) == size else None
-        return [Step(source.pose(view), vertical_fov_deg(camera), own)], fps, size
-    size = _size(args.size) or _shape(like)
+        step, size = source.camera_step(args.camera, asked, args.fov)
+        return [step], fps, size
+    size = asked or source.usual_size()
     if args.pose is not None:
         return looking(args.pose[:3], args.pose[3:], fov), fps, size
     return orbit(source.views, max(1, round(args.seconds * fps)), fov), fps, size
 
 
-def _shape(camera: Pinhole) -> tuple[int, int]:
-    """Even numbers near DEFAULT_HEIGHT: video codecs ask for them."""
-    return 2 * round(DEFAULT_HEIGHT * camera.width / camera.height / 2), DEFAULT_HEIGHT
-
-
 def _size(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
-    found = re.fullmatch(r"(\d+)x(\d+)", text)
-    size = (int(found[1]), int(found[2])) if found else (0, 0)
-    if not all(2 <= side <= MAX_IMAGE_SIDE_PX for side in size):
+    found = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text)
+    if found is None:
         raise ExportError(f"--size {text}: expected pixels such as 1280x720")
-    return size
-
-
-def _colors(rendering: Rendering) -> Image:
-    return np.asarray(np.clip(rendering.color * 255 + 0.5, 0, 255), np.uint8)
+    return checked_size((int(found[1]), int(found[2])))
 
 
 def _depth_colors(render: Callable[[int], list[Rendering]], count: int) -> Callable[[Rendering], Image]:
@@ -165,37 +139,6 @@ def _depth_colors(render: Callable[[int], list[Rendering]], count: int) -> Calla
         return np.asarray(np.where(there[..., None], map_bgr[..., ::-1], 0), np.uint8)
 
     return colors
-
-
-class _Writer:
-    """Writes an image, or a video one image at a time, beside the file, which is replaced when all of it is there.
-    ExportError: the file cannot be written."""
-
-    def __init__(self, file: Path, fps: float, size: tuple[int, int]) -> None:
-        self._file, self._video = file, None
-        self._part = file.with_name(f".{file.stem}.part{file.suffix}")
-        if file.suffix.lower() in _VIDEOS:
-            self._video = cv2.VideoWriter(str(self._part), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
-            if not self._video.isOpened():
-                raise ExportError(f"{file}: cannot be written: is the folder there, and has OpenCV its video codecs?")
-
-    def __enter__(self) -> Callable[[Image], None]:
-        return self._write
-
-    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
-        if self._video is not None:
-            self._video.release()
-        if error is None:
-            self._part.replace(self._file)
-        else:
-            self._part.unlink(missing_ok=True)
-
-    def _write(self, image: Image) -> None:
-        bgr = np.ascontiguousarray(image[..., ::-1])
-        if self._video is not None:
-            self._video.write(bgr)
-        elif not cv2.imwrite(str(self._part), bgr):
-            raise ExportError(f"{self._file}: cannot be written")
 
 
 def _progress(done: int, count: int, began: float) -> None:

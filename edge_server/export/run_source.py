@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
-from edge_server.export import ExportError, PosedImage, file_names
-from edge_server.fields import Field, RefinesCameras, View, checkpoint
+from edge_server.export import ExportError
+from edge_server.export.viewed_field import ViewedField
+from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.registry import make_field, option_help
 from freshfield.plugins import refuse_foreign
 from freshfield.untrusted import stored_bytes
@@ -21,27 +17,12 @@ from freshfield.untrusted import stored_bytes
 NAMES = ("field.npz", "field")
 
 
-@dataclass(frozen=True)
-class Source:
-    """A saved field. file: its checkpoint. name: name of the representation. views: the last view of each
-    camera."""
+class Source(ViewedField):
+    """A saved field. file: its checkpoint. The others as of ``ViewedField``."""
 
-    file: Path
-    name: str
-    field: Field
-    views: tuple[View, ...]
-
-    @property
-    def shots(self) -> list[PosedImage]:
-        """The views as images to write, at the poses that belong to the field's Gaussians: corrected ones, if it
-        corrects them."""
-        names = file_names([v.camera for v in self.views])
-        return [PosedImage(name, v.image, self.pose(v), v.intrinsics) for name, v in zip(names, self.views)]
-
-    def pose(self, view: View) -> NDArray[np.float64]:
-        """Camera to world (4, 4) of a view, corrected where the field corrects it."""
-        known = self.field.correction(view) if isinstance(self.field, RefinesCameras) else None
-        return np.asarray(view.camera_to_world if known is None else known.camera_to_world, np.float64)
+    def __init__(self, file: Path, name: str, field: Field, views: tuple[View, ...]) -> None:
+        super().__init__(name, field, views)
+        self.file = file
 
 
 def open_source(path: Path, allow_plugins: bool = False) -> Source:
@@ -77,6 +58,13 @@ def _saved_options(name: str, options: dict[str, Any], state: dict[str, Any]) ->
     return {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items() if k in known}
 
 
+def holds_checkpoint(path: Path) -> bool:
+    """Whether a file is a checkpoint by its name, or a folder holds one."""
+    if path.is_dir():
+        return any((path / name).is_file() for name in NAMES) or any(path.glob("snapshot-*.npz"))
+    return path.is_file() and (path.suffix == ".npz" or path.name in NAMES)
+
+
 def find_checkpoint(path: Path) -> Path:
     """The checkpoint at ``path`` or in it: a run's last one, else its newest snapshot. ExportError: none."""
     if path.is_file():
@@ -91,12 +79,3 @@ def find_checkpoint(path: Path) -> Path:
         f"{path}: holds no checkpoint ({' or '.join(NAMES)}); a run writes it when it ends, "
         "with --checkpoint-every S also meanwhile"
     )
-
-
-def write_images(folder: Path, shots: list[PosedImage]) -> None:
-    """Write NAME.png for every shot, with transparency. ExportError: a file cannot be written."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for shot in shots:
-        code = cv2.COLOR_RGBA2BGRA if shot.image.shape[2] == 4 else cv2.COLOR_RGB2BGR
-        if not cv2.imwrite(str(folder / f"{shot.name}.png"), cv2.cvtColor(shot.image, code)):
-            raise ExportError(f"{folder / shot.name}.png: cannot be written")

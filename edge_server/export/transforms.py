@@ -22,7 +22,7 @@ def write_transforms(folder: Path, shots: Sequence[PosedImage], points: str | No
         k1, k2, p1, p2 = lens.distortion
         frames.append(
             {
-                "file_path": f"images/{shot.name}.png",
+                "file_path": f"images/{shot.name}",
                 "w": lens.width,
                 "h": lens.height,
                 "fl_x": lens.fx,

@@ -10,7 +10,7 @@ from camera_node.sources.datasets.formats import open_dataset
 from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.export import PosedImage
 from edge_server.export.colmap import Cloud, write_model
-from edge_server.export.run_source import write_images
+from edge_server.export.images import write_images
 from edge_server.export.transforms import write_transforms
 from freshfield.geometry import Pinhole, Pose, se3_inverse
 from tests.camera_node.sources.datasets import sets
@@ -23,7 +23,7 @@ def shots() -> list[PosedImage]:
     """One picture a camera, half of the lenses bent."""
     straight, bent = sets.rig(3), sets.rig(3, BENT)
     cameras = [straight[0], bent[1], straight[2], bent[0]]
-    return [PosedImage(f"view{k}", c.shows(0), c.camera_to_world, c.lens) for k, c in enumerate(cameras)]
+    return [PosedImage(f"view{k}.png", c.shows(0), c.camera_to_world, c.lens) for k, c in enumerate(cameras)]
 
 
 def pixels(camera_to_world: np.ndarray, lens: Pinhole, points: np.ndarray = sets.POINTS) -> np.ndarray:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from edge_server.experiments.common.folders import Folders
-from edge_server.fidelity.lpips_weights import weights_folder
+from edge_server.experiments.common.folders import Folders, folders_from
 from freshfield.untrusted import UntrustedError, read_yaml
 
 
@@ -43,8 +41,7 @@ def add_lpips(parser: argparse.ArgumentParser) -> None:
 
 def folders_of(args: argparse.Namespace) -> Folders:
     """The folders of ``--data`` and ``--lpips``, or those that the environment names."""
-    data = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
-    return Folders(data, weights_folder(args.lpips, data))
+    return folders_from(args.data, args.lpips)
 
 
 def at_least(least: int) -> Callable[[str], int]:

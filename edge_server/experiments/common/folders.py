@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from edge_server.fidelity.lpips_weights import weights_folder
 from freshfield.scenario import Scenario
 
 
@@ -27,6 +29,12 @@ class Folders:
         named = [] if data is None else [(self.data or Path()) / str(data)]
         named += [scenario.path.parent / text for text in _texts(scenario.channel)]
         return [path for path in (*named, self.lpips) if path is not None and path.exists()]
+
+
+def folders_from(data: Path | None = None, lpips: Path | None = None) -> Folders:
+    """The folders given, or those that the environment names (FRESHFIELD_DATA, FRESHFIELD_LPIPS)."""
+    data = data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
+    return Folders(data, weights_folder(lpips, data))
 
 
 def _texts(section: Any) -> list[str]:

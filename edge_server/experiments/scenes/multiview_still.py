@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic import make_scene
+from camera_node.synthetic import SCENES, make_scene
 from camera_node.synthetic.scene import HELD_OUT, Scene
-from edge_server.experiments.scenes.recorded import LEAST_WEIGHT, MultiviewStill
+from camera_node.synthetic.source import WORLD_FPS
+from edge_server.experiments.common.arguments import OptionError
+from edge_server.experiments.scenes.recorded import LEAST_WEIGHT, MultiviewStill, load_recorded
 from edge_server.fidelity.baselines import baseline
 from edge_server.fidelity.images import BLACK, Color
 from edge_server.fidelity.refined import render_refined, with_refined
@@ -20,6 +23,7 @@ from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import Field, View
 
 WHITE: Color = (1.0, 1.0, 1.0)
+_SCENE_SIZE = 128  # image width and height of a synthetic scene, before its scale
 
 
 def synthetic_still(name: str, cameras: int = 19, size: int = 128, t_s: float = 0.0) -> MultiviewStill:
@@ -29,6 +33,33 @@ def synthetic_still(name: str, cameras: int = 19, size: int = 128, t_s: float = 
     views = [View(c, scene.render(c, t_s), pose, lens) for c, (lens, pose) in scene.cameras.items()]
     held_out = tuple(v for v in views if v.camera == HELD_OUT)
     return MultiviewStill(name, tuple(v for v in views if v.camera != HELD_OUT), held_out, Path(name))
+
+
+def open_still(
+    data: Path, holdout: str | None = None, scale: float = 1.0, frame: int = 0, format: str | None = None
+) -> MultiviewStill:
+    """The views of a data set, or of a synthetic scene by its name, unless a file or folder has that name.
+
+    The arguments are those of ``load_recorded``. Raises DatasetError; OptionError for an argument that a synthetic
+    scene, whose held-out camera is given, cannot have.
+    """
+    if not _is_scene(data):
+        return replace(load_recorded(data, holdout, scale, frame, format), name=data_name(data))
+    for name, value in (("format", format), ("holdout", holdout)):
+        if value is not None:
+            raise OptionError(f"--{name} is for data sets; the scene {data} holds out {HELD_OUT}")
+    t_s = frame / WORLD_FPS
+    still = synthetic_still(str(data), size=max(8, round(_SCENE_SIZE / scale)), t_s=t_s)
+    return replace(still, instant=f"at {t_s:g} s")
+
+
+def data_name(data: Path) -> str:
+    """The name of a scene or data set in folders and reports."""
+    return str(data) if _is_scene(data) else (data if data.is_dir() else data.parent).resolve().name
+
+
+def _is_scene(data: Path) -> bool:
+    return str(data) in SCENES and not data.exists()
 
 
 def mean_baselines(training: Sequence[View], held_out: Sequence[View], color: Color = BLACK) -> dict[str, float | None]:

@@ -10,7 +10,7 @@ import json
 import sys
 import time
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from camera_node.capture import build_cameras
 from camera_node.settings import source_config
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
+from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none, number
 from edge_server.experiments.engine import processor
 from edge_server.experiments.virtual.from_scenario import build_deployment
@@ -68,36 +69,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
     folders = folders_of(args)
+    decisions: DecisionLog | None = None
+    chosen: list[str] = []
+
+    def published(publication: Publication) -> None:
+        if decisions is not None:
+            decisions.record(deployment.updates.policy, publication.number)
+
+    def say(line: str) -> None:
+        chosen.append(line)
+        if not args.json:
+            print(line, flush=True)
+
     try:
         scenario = _scenario(args)
         config = read_config(scenario)
-        chosen = described(scenario, config, "a camera" if cameras_move(scenario) else "")
-        metric, missing = None, None
-        if config.lpips != "none":
-            metric, missing = open_lpips(folders.lpips)
-        scorer = Scorer(metric)
-        decisions: DecisionLog | None = None
-
-        def published(publication: Publication) -> None:
-            if decisions is not None:
-                decisions.record(deployment.updates.policy, publication.number)
-
-        def camera_moves(new: EdgeConfig, camera: str) -> None:
-            nonlocal chosen
-            deployment.settings, chosen = _settings(new, args), described(scenario, new, camera)
-            if not args.json:
-                print(chosen, flush=True)
-
-        if not args.json:
-            print(chosen, flush=True)
-        deployment = build_deployment(
-            scenario,
-            _settings(config, args),
-            scorer=scorer,
-            data=folders.data,
-            on_published=published,
-            on_motion=camera_moves,
-        )
+        deployment, missing = open_simulation(scenario, folders, lambda new: _settings(new, args), say, published)
         if args.out is not None:
             decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
         watched = None
@@ -110,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ScenarioError, DatasetError, ValueError) as error:
         print(f"edge-server simulate: {error}", file=sys.stderr)
         return 2
-    found = {**summary(scenario, deployment, args.seconds), "field": config.field, "chosen": chosen}
+    found = {**summary(scenario, deployment, args.seconds), "field": config.field, "chosen": chosen[-1]}
     if missing:
         found["lpips_missing"] = missing
     if watched is not None:
@@ -121,6 +108,51 @@ def main(argv: Sequence[str] | None = None) -> int:
             watched.write(args.out)
     print(json.dumps(found) if args.json else show(found))
     return 0
+
+
+def open_simulation(
+    scenario: Scenario,
+    folders: Folders,
+    settings_of: Callable[[EdgeConfig], RunSettings],
+    say: Callable[[str], None] = lambda line: None,
+    on_published: Callable[[Publication], None] | None = None,
+) -> tuple[VirtualDeployment, str | None]:
+    """A scenario's deployment in virtual time, ready to run, and why LPIPS is not measured, if so.
+
+    settings_of: how it runs, by the edge's configuration, which is another one once a camera is seen to move.
+    say: gets one line on what the configuration chose.
+    on_published: see ``build_deployment``.
+    Raises ScenarioError or DatasetError.
+    """
+    config = read_config(scenario)
+    say(described(scenario, config, "a camera" if cameras_move(scenario) else ""))
+    metric, missing = None, None
+    if config.lpips != "none":
+        metric, missing = open_lpips(folders.lpips)
+
+    def camera_moves(new: EdgeConfig, camera: str) -> None:
+        deployment.settings = settings_of(new)
+        say(described(scenario, new, camera))
+
+    deployment = build_deployment(
+        scenario,
+        settings_of(config),
+        scorer=Scorer(metric),
+        data=folders.data,
+        on_published=on_published,
+        on_motion=camera_moves,
+    )
+    return deployment, missing
+
+
+def with_policy(scenario: Scenario, text: str) -> Scenario:
+    """A scenario with a policy as people write it, such as ``threshold:120``, in place of its own. Raises
+    ScenarioError where its value is not a number."""
+    try:
+        policy = as_mapping(PolicyConfig(*parse_policy(text)))
+    except ValueError as error:
+        raise ScenarioError(f"--policy {error}") from None
+    return dataclasses.replace(scenario, edge={**scenario.edge, "policy": policy})
 
 
 def summary(scenario: Scenario, deployment: VirtualDeployment, seconds: float) -> dict[str, Any]:
@@ -253,19 +285,21 @@ def _run(deployment: VirtualDeployment, seconds: float, quiet: bool) -> None:
 
 def _scenario(args: argparse.Namespace) -> Scenario:
     scenario = load(args.scenario, args.seed)
-    edge = dict(scenario.edge)
     if args.policy:
-        try:
-            edge["policy"] = as_mapping(PolicyConfig(*parse_policy(args.policy)))
-        except ValueError as error:
-            raise ScenarioError(f"--policy {error}") from None
+        scenario = with_policy(scenario, args.policy)
+    edge = dict(scenario.edge)
     if args.compute:
         edge["compute"] = as_mapping(_compute(args.compute))
     if args.out is not None:
         args.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
-    if not 0.0 < args.seconds <= 1e6:
-        raise ScenarioError(f"--seconds: expected more than 0 and at most 1e6, got {args.seconds:g}")
+    check_seconds(args.seconds)
     return dataclasses.replace(scenario, edge=edge)
+
+
+def check_seconds(seconds: float) -> None:
+    """ScenarioError for a time that no run can take."""
+    if not 0.0 < seconds <= 1e6:
+        raise ScenarioError(f"--seconds: expected more than 0 and at most 1e6, got {seconds:g}")
 
 
 def usual_settings(config: EdgeConfig) -> RunSettings:

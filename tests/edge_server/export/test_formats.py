@@ -12,10 +12,11 @@ import pytest
 from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.export import PosedImage, file_names, glb, ply
 from edge_server.export.colmap import Cloud, write_model
+from edge_server.export.images import write_images
 from edge_server.export.point_cloud import sparse_points
-from edge_server.export.run_source import write_images
 from edge_server.export.splats import Y0, write_splats
 from edge_server.export.transforms import write_transforms
+from edge_server.fields import View
 from edge_server.fields.common.kernels.volume_rendering import harmonic
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.kernels.project import Gaussians
@@ -29,7 +30,7 @@ def shots(count: int = 4) -> list[PosedImage]:
     maps = ball_maps(count)
     lenses = [LENS, DISTORTED_LENS]
     pictures = RNG.integers(0, 255, (count, 64, 64, 3), dtype=np.uint8)
-    return [PosedImage(f"view{k}", pictures[k], m.camera_to_world, lenses[k % 2]) for k, m in enumerate(maps)]
+    return [PosedImage(f"view{k}.png", pictures[k], m.camera_to_world, lenses[k % 2]) for k, m in enumerate(maps)]
 
 
 def cloud(of: list[PosedImage]) -> Cloud:
@@ -56,7 +57,7 @@ def test_colmap_opens_in_colmap(tmp_path):
     assert model.num_images() == 4 and model.num_points3D() == 50 and model.num_cameras() == 2
     images = {image.name: image for image in model.images.values()}
     for k, shot in enumerate(of):
-        image = images[f"{shot.name}.png"]
+        image = images[shot.name]
         matrix = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
         np.testing.assert_allclose(matrix, se3_inverse(shot.camera_to_world), atol=1e-12)
         which = np.flatnonzero(points.seen[:, k])
@@ -101,7 +102,7 @@ def test_transforms_read_back_as_they_were(tmp_path):
 
 def test_transparent_pictures_stay_transparent(tmp_path):
     picture = RNG.integers(0, 255, (64, 64, 4), dtype=np.uint8)
-    write_images(tmp_path, [PosedImage("a", picture, np.eye(4), LENS)])
+    write_images(tmp_path, [PosedImage("a.png", picture, np.eye(4), LENS)])
     back = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(cv2.cvtColor(back, cv2.COLOR_BGRA2RGBA), picture)
 
@@ -190,7 +191,16 @@ def test_points_know_who_sees_them():
     assert (found.seen.sum(axis=1) >= 2).mean() > 0.8
 
 
-def test_names_of_files_are_safe_and_different():
-    assert file_names(["images/0001.png", "a b"]) == ["0001", "a_b"]
-    assert file_names(["x/1.png", "y/1.png"]) == ["00000_1", "00001_1"]
-    assert file_names(["../../etc"]) == ["etc"]
+def test_pictures_keep_their_own_names_and_these_are_safe_and_different():
+    def names(*cameras: str, channels: int = 3) -> list[str]:
+        return file_names([View(c, np.zeros((2, 2, channels), np.uint8), np.eye(4), LENS) for c in cameras])
+
+    assert names("images/0001.png", "b/IMG 2.JPG", "cam00", "cam.left") == [
+        "0001.png",
+        "IMG_2.JPG",
+        "cam00.png",
+        "cam.left.png",
+    ]
+    assert names("a.jpg", "b.png", channels=4) == ["a.png", "b.png"], "JPEG has no transparency"
+    assert names("x/1.png", "y/1.png") == ["00000_1.png", "00001_1.png"]
+    assert [names(strange) for strange in ("../../etc", ".png", "x/")] == [["etc.png"], ["camera.png"], ["camera.png"]]

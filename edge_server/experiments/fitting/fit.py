@@ -1,0 +1,312 @@
+"""Fits a field to the views of one instant and measures it on views that it never saw: from the command and as a
+library."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+from msgspec.structs import asdict
+from numpy.typing import NDArray
+
+from camera_node.sources.datasets.records import DatasetError
+from edge_server.experiments.common.arguments import OptionError
+from edge_server.experiments.fitting.evaluate import Scored, fit_in_slices, marks_s
+from edge_server.experiments.fitting.misfits import misfits
+from edge_server.experiments.scenes.multiview_still import mean_baselines, open_still, score_views
+from edge_server.experiments.scenes.recorded import MultiviewStill
+from edge_server.export.run_source import Source, holds_checkpoint, open_source
+from edge_server.export.viewed_field import ViewedField
+from edge_server.fidelity.images import Color, to_unit
+from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fidelity.scorer import SELECTED, Score, Scorer
+from edge_server.fields import RefinesCameras, checkpoint
+from edge_server.fields.registry import FIELD, make_field, option_help
+from edge_server.fields.splat.scan.settings import scan_options
+from edge_server.live.scoring_thread import to_bytes
+from edge_server.machine import run_facts
+from edge_server.run_records import UpdateRow
+from freshfield.files import write_json
+from freshfield.machine_load import LoadMeter, outside_cores
+
+BACKGROUNDS: dict[str, Color] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+# Number of training views that are scored if no view is held out.
+_SCORED_OF_TRAINING = 8
+
+
+class Fit(ViewedField):
+    """A field that is fitted to a data set. ``ViewedField`` has ``render``, ``depth``, ``orbit`` and ``export``.
+
+    data: the views. field: the model, which ``Field`` describes.
+    rows: one for each evaluation so far. outside: cores that other processes used before each.
+    spent_s, spent_steps: seconds and optimizer steps so far, evaluation not counted.
+    notes: what people should know of how the data were learned.
+    lpips_missing: why LPIPS is not measured, if so.
+    """
+
+    def __init__(
+        self,
+        data: MultiviewStill,
+        field: str = FIELD,
+        options: Mapping[str, Any] | None = None,
+        *,
+        seed: int = 0,
+        background: str = "white",
+        lpips: Path | None = None,
+    ) -> None:
+        """data: from ``load``. field: name of the representation. options: of the field, e.g. ``{"gaussians": 4096}``.
+        background: white or black, behind transparent images. lpips: folder of LPIPS weights.
+
+        Raises OptionError for a field or option that there is not, DatasetError for a camera that no field can use.
+        """
+        from edge_server.fields.common.supervision import check_view  # compiles
+
+        self.data, self.seed = data, seed
+        self.notes: list[str] = []
+        self.background, given = BACKGROUNDS[background], dict(options or {})
+        if any(v.image.shape[2] == 4 for v in data.training):
+            given = {"background": background, **given}
+        try:
+            self.options = {**self._scan_options(field, given), **given}
+            model = make_field(field, self.options, seed=seed)
+        except (ValueError, TypeError) as error:
+            raise OptionError(f"--field {field}: {error}") from None
+        try:
+            for view in (*data.training, *data.held_out):
+                check_view(view)
+        except ValueError as error:
+            raise DatasetError(f"{data.file}: {error}") from None
+        super().__init__(field, model, data.training, data.held_out)
+        metric, self.lpips_missing = open_lpips(lpips)
+        self.rows: list[UpdateRow] = []
+        self.outside: float | None = None
+        self.spent_s, self.spent_steps = 0.0, 0
+        self._scorer = Scorer(metric, background=self.background)
+        self._scored_views = data.held_out or data.training[:_SCORED_OF_TRAINING]
+        self._shown: NDArray[np.float32] | None = None
+        self._processes: list[dict[str, Any]] = []
+        self._load_meter = LoadMeter("fit")
+
+    def _scan_options(self, field: str, options: Mapping[str, Any]) -> dict[str, Any]:
+        """What the data set says of how to learn it: see ``MultiviewStill.carried`` and ``timed``."""
+        data = self.data
+        if not data.carried or "scan" not in option_help(field):
+            return {}
+        note = "a scan: one camera, carried about a scene that stands still"
+        if data.timed:
+            note += "; its frames have times, so a tracker gave their poses: poses and exposures are refined"
+        self.notes.append(note)
+        found = scan_options(data.training[0].image[..., 0].size, data.timed)
+        if "effort" in options:  # says how many Gaussians
+            del found["gaussians"]
+        return found
+
+    @property
+    def psnr(self) -> NDArray[np.float64]:
+        """The curve of fidelity, (evaluations, 2): seconds of fitting, and dB on the held-out views, or on training
+        views if none is held out; at refined poses where the field refines them."""
+        rows = [(row.t_s, row.psnr_db if row.psnr_refined_db is None else row.psnr_refined_db) for row in self.rows]
+        return np.array(rows, np.float64).reshape(-1, 2)
+
+    def run(self, until_s: float, on_scored: Callable[[Scored], None] | None = None) -> bool:
+        """Fit until ``until_s`` seconds in total and score on the way. Returns False if Ctrl-C ended it early.
+
+        on_scored: called after each evaluation. Raises OptionError for a time out of range.
+        """
+        check_seconds(until_s)
+
+        def scored(at: Scored) -> None:
+            self._keep(at)
+            if on_scored is not None:
+                on_scored(at)
+
+        marks = marks_s(until_s)
+        try:
+            return fit_in_slices(
+                self.field, self.data.training, self._score, marks, scored, self.spent_s, self.spent_steps
+            )
+        except KeyboardInterrupt:  # during an evaluation: the last complete one is kept
+            return False
+
+    def _score(self) -> Score:
+        self._processes.append(self._load_meter.row(0.0))
+        score, self._shown = score_views(self.field, self._scored_views, self._scorer)
+        return score
+
+    def _keep(self, at: Scored) -> None:
+        score = at.score
+        self.spent_s = at.seconds
+        self.spent_steps = at.steps if at.steps is not None else self.spent_steps
+        self._processes[-1]["t_s"] = round(at.seconds, 3)
+        self.outside = outside_cores(self._processes[-1])
+        self._load_meter.row(0.0)  # the evaluation is not measured
+        self.rows.append(
+            UpdateRow(
+                number=len(self.rows),
+                t_s=at.seconds,
+                psnr_db=score.psnr_db,
+                ssim=score.ssim,
+                lpips=score.lpips,
+                psnr_refined_db=score.psnr_refined_db,
+                ssim_refined=score.ssim_refined,
+                selected=len(self.data.training),
+                update_ms=at.slice_s * 1e3,
+                steps=at.steps,
+                loss=at.loss,
+                scored_on=f"{len(self.data.held_out)} views" if self.data.held_out else SELECTED,
+            )
+        )
+
+    def resume(self, folder: Path, until_s: float) -> None:
+        """Go on from what ``save`` wrote. Raises OptionError if there is nothing, or it has been fitted for
+        ``until_s`` seconds already."""
+        try:
+            state, about = checkpoint.load(folder / "field")
+            self.field.load_state(state)
+            self.spent_s, self.spent_steps = float(about["seconds"]), int(about["steps"])
+            self.rows = msgspec.convert(_read_lines(folder / "series.jsonl"), list[UpdateRow])
+            self._processes = _read_lines(folder / "processes.jsonl")
+        except (OSError, ValueError, KeyError) as error:
+            raise OptionError(f"--resume: {folder} holds no fit to go on from: {error}") from None
+        if self.spent_s >= until_s - 0.05:
+            raise OptionError(
+                f"--resume: {folder} has been fitted for {self.spent_s:.1f} s already: give more --seconds"
+            )
+
+    def findings(self) -> list[str]:
+        """What a fit found out about a carried camera, a line each: what the corrections of its poses have in common,
+        and which training views do not fit the others. They become notes."""
+        if not self.data.carried:
+            return []
+        found = []
+        if isinstance(self.field, RefinesCameras):
+            from edge_server.fields.common.cameras.constant_correction import constant_correction
+
+            refined = [(v, c) for v in self.data.training if (c := self.field.correction(v)) is not None]
+            common = constant_correction(
+                [v.camera_to_world for v, _ in refined], [c.camera_to_world for _, c in refined]
+            )
+            found += [] if common is None else [common.words]
+        found += misfits(self.field, self.data.training, Scorer(None, background=self.background))
+        self.notes += found
+        return found
+
+    def save(self, folder: Path | str) -> dict[str, Any]:
+        """Write checkpoint, images and report to a folder, which ``load``, ``edge-server render`` and ``edge-server
+        export`` open. Returns report.json. Raises OSError."""
+        from edge_server.report.build_report import build_report  # draws with matplotlib
+
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        checkpoint.save(folder / "field", self.field.state(), {**self._about(), "steps": self.spent_steps})
+        _write_lines(folder / "series.jsonl", self.rows)
+        _write_lines(folder / "processes.jsonl", self._processes)
+        write_json(folder / "edge.json", self._status())
+        if self._shown is not None:
+            truth = to_unit(self._scored_views[0].image, "held-out view", self.background)
+            _write_png(folder / "truth.png", np.rint(truth * 255.0).astype(np.uint8))
+            _write_png(folder / "rendered.png", to_bytes(self._shown))
+        return build_report(folder)
+
+    def _about(self) -> dict[str, Any]:
+        return {
+            "field": self.name,
+            "options": self.options,
+            "seed": self.seed,
+            "scenario": f"fit {self.data.name}",
+            "seconds": self.spent_s,
+        }
+
+    def _status(self) -> dict[str, Any]:
+        d = self.data
+        return {
+            **self._about(),
+            "kind": "fit",
+            "run": run_facts(),
+            "chosen": "; ".join(self.notes) or None,
+            "data": {
+                "file": d.file.name,
+                "instant": d.instant,
+                "training": len(d.training),
+                "held_out": [v.camera for v in d.held_out],
+                "missing": d.missing,
+            },
+            "baseline": mean_baselines(d.training, d.held_out, self.background),
+            "lpips_missing": self.lpips_missing,
+            "lpips_network": None if self.lpips_missing else "alex",
+        }
+
+
+def load(
+    path: Path | str, *, holdout: int | str | None = None, scale: float = 1.0, frame: int = 0, format: str | None = None
+) -> MultiviewStill | Source:
+    """A data set to fit, or the field that a run or fit saved.
+
+    path: folder of a data set or the file that describes it, the name of a synthetic scene (room, tile, tower), or the
+        folder of a run or fit, or a checkpoint in it, for which the other arguments mean nothing.
+    holdout: every how many views one is held out, or names of images or cameras, separated by commas; ``split``: the
+        data set's own test set; 0: none. None: its own test set, else every 8th.
+    scale: divides the image sizes.
+    frame: number of the instant of a moving data set, from 0.
+    format: of the data set; None finds it from its files.
+    Returns a ``MultiviewStill``, whose ``training`` and ``held_out`` are views (``camera``, ``image`` uint8 (H, W, 3 or
+    4), ``camera_to_world`` (4, 4), ``intrinsics``, ``depth`` float32 (H, W) meters or None), or a ``Source``
+    (``ViewedField``).
+    Raises DatasetError, OptionError or, of a checkpoint, ExportError.
+    """
+    if holds_checkpoint(Path(path)):
+        return open_source(Path(path))
+    return open_still(Path(path), None if holdout is None else str(holdout), scale, frame, format)
+
+
+def fit(
+    data: MultiviewStill | Path | str,
+    *,
+    seconds: float = 60.0,
+    field: str = FIELD,
+    holdout: int | str | None = None,
+    options: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    progress: Callable[[UpdateRow], None] | None = None,
+) -> Fit:
+    """Fit a field to a data set.
+
+    data: from ``load``, or a path as ``load`` takes it.
+    seconds: of fitting; evaluation is not counted. holdout: as of ``load``, where data is a path.
+    field: name of the representation (``edge-server fit --list-options``). options: of it, by name.
+    progress: called with each evaluation: ``t_s``, ``psnr_db``, ``ssim``, ...
+    Raises DatasetError or OptionError.
+    """
+    if not isinstance(data, MultiviewStill):
+        data = open_still(Path(data), None if holdout is None else str(holdout))
+    elif holdout is not None:
+        raise OptionError("holdout: these views are loaded and split already: give it to load")
+    check_seconds(seconds)
+    made = Fit(data, field, options, seed=seed)
+    made.field.warm_up()
+    made.run(seconds, None if progress is None else lambda at: progress(made.rows[-1]))
+    made.findings()
+    return made
+
+
+def check_seconds(seconds: float) -> None:
+    """OptionError for a time that no fit can take."""
+    if not 0.0 < seconds <= 1e6:
+        raise OptionError(f"--seconds {seconds:g}: expected more than 0")
+
+
+def _read_lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def _write_lines(path: Path, rows: Sequence[Any]) -> None:
+    path.write_text("".join(json.dumps(row, default=asdict, allow_nan=False) + "\n" for row in rows))
+
+
+def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))

@@ -1,0 +1,152 @@
+"""Writes a field and its cameras as files for other programs: what several files need is computed once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from edge_server.export import ExportError, PosedImage
+from edge_server.fields import Field, View
+from edge_server.surface.settings import MeshSettings
+
+ENDINGS = {"mesh": (".ply", ".glb"), "splats": (".ply",), "points": (".ply",)}
+KINDS = ("splats", "transforms", "colmap", "points", "mesh")  # in the order of writing
+POINTS = 20_000  # a sparse model of usual size: more only slows its readers
+
+
+def check(files: Mapping[str, Path], count: int = POINTS) -> None:
+    """Check what can be checked before a run is opened. Raises ExportError and SurfaceError.
+
+    files, count: see ``Exporter``.
+    """
+    for kind, endings in ENDINGS.items():
+        if kind in files and files[kind].suffix.lower() not in endings:
+            raise ExportError(f"--{kind} {files[kind]}: expected a file that ends in {' or '.join(endings)}")
+    if count < 1:
+        raise ExportError(f"--count {count}: expected 1 or more")
+    if "mesh" in files:
+        from edge_server.surface.mesh import import_marching_cubes
+
+        import_marching_cubes()
+
+
+class Exporter:
+    """Writes one field.
+
+    name: of the representation. field, views: what is exported. shots: the views with their file names and poses.
+    count: number of points in points, colmap and transforms.
+    mesh: settings of a mesh.
+    say: gets a line for each file. progress: gets the stage and the share that is done.
+    measure: gets the mesh and the views, returns a line on its distance to the true surface.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        field: Field,
+        views: Sequence[View],
+        shots: list[PosedImage],
+        *,
+        count: int = POINTS,
+        mesh: MeshSettings | None = None,
+        say: Callable[[str], None] = lambda line: None,
+        progress: Callable[[str, float], None] = lambda stage, share: None,
+        measure: Callable[[Any, Any], str] | None = None,
+    ) -> None:
+        self._name, self._field, self._views, self._shots = name, field, views, shots
+        self._count, self._settings = count, mesh or MeshSettings()
+        self._say, self._progress, self._measure = say, progress, measure
+
+    def write(self, files: Mapping[str, Path]) -> None:
+        """Write every file. files: kind, one of KINDS -> its file or folder. Raises ExportError and SurfaceError."""
+        check(files, self._count)
+        if "mesh" not in files:
+            # Sharpening takes minutes, and points are drawn from the depth as well as it is.
+            self._settings = replace(self._settings, sharpen=False)
+        for kind in KINDS:
+            if kind in files:
+                files[kind].parent.mkdir(parents=True, exist_ok=True)
+                getattr(self, f"_{kind}")(files[kind])
+
+    @cached_property
+    def maps(self):
+        """Depth maps, rendered at the cameras."""
+        from edge_server.surface.reconstruct import make_depth_maps
+
+        return make_depth_maps(self._field.snapshot(), self._views, self._settings, self._progress)
+
+    @cached_property
+    def cloud(self):
+        """Surface points, and the cameras that see them."""
+        from edge_server.export.point_cloud import sparse_points
+
+        return sparse_points(self.maps, self._count)
+
+    def _mesh(self, path: Path) -> None:
+        from edge_server.surface.reconstruct import mesh_from_depth_maps
+
+        mesh = mesh_from_depth_maps(self.maps, self._settings, self._progress)
+        if path.suffix.lower() == ".glb":
+            from edge_server.export.glb import write_mesh
+        else:
+            from edge_server.export.ply import write_mesh
+        write_mesh(path, mesh.vertices, mesh.faces, mesh.color)
+        closed = ", watertight" if mesh.watertight else ""
+        self._say(f"{path}: {len(mesh.faces)} triangles, {len(mesh.vertices)} vertices{closed}")
+        if self._measure is not None:
+            self._say(f"  {self._measure(mesh, self._views)}")
+
+    def _points(self, path: Path) -> None:
+        from edge_server.export.ply import write_points
+
+        write_points(path, self.cloud.points.astype("float32"), self.cloud.color)
+        self._say(f"{path}: {len(self.cloud.points)} points")
+
+    def _splats(self, path: Path) -> None:
+        from edge_server.export.splats import write_splats
+
+        snapshot: Any = self._field.snapshot()
+        if not hasattr(snapshot, "gaussians"):
+            raise ExportError(f"--splats: {self._name} has no Gaussians: use a run or fit of field splat")
+        self._say(f"{path}: {write_splats(path, snapshot.gaussians, snapshot.box)} Gaussians")
+
+    def _colmap(self, folder: Path) -> None:
+        from edge_server.export.colmap import write_model
+        from edge_server.export.images import write_images
+
+        write_model(folder / "sparse" / "0", self._shots, self.cloud)
+        write_images(folder / "images", self._shots)
+        self._say(f"{folder}: {len(self._shots)} images, {len(self.cloud.points)} points")
+
+    def _transforms(self, folder: Path) -> None:
+        from edge_server.export.images import write_images
+        from edge_server.export.transforms import write_transforms
+
+        write_images(folder / "images", self._shots)
+        self._points(folder / "points.ply")
+        path = write_transforms(folder, self._shots, "points.ply")
+        self._say(f"{path}: {len(self._shots)} frames")
+
+
+class ProgressLine:
+    """One line of a terminal with the stage, its share and the seconds that are left; nothing in a pipe."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+        self._stage, self._printed_s, self._began_s = "", 0.0, 0.0
+
+    def __call__(self, stage: str, share: float) -> None:
+        if not self._stream.isatty():
+            return
+        now = time.perf_counter()
+        known = stage == self._stage
+        if share < 1.0 and known and now - self._printed_s < 1.0:
+            return
+        self._stage, self._printed_s, self._began_s = stage, now, self._began_s if known else now
+        left = f", {(now - self._began_s) * (1.0 / share - 1.0):.0f} s left" if known and 0.0 < share < 1.0 else ""
+        end = "\n" if share >= 1.0 else ""
+        print(f"\r  {stage:10} {100 * share:3.0f} %{left:16}", end=end, file=self._stream, flush=True)
