@@ -44,10 +44,10 @@ class UsageError(Exception):
     """A mistake in how the command was called; shown as one line."""
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run a command and return its exit status."""
+def main(arguments: list[str] | None = None, prog: str = "camera-node") -> int:
+    """Run a command and return its exit status. prog: name of the program in usage and errors."""
     parser = argparse.ArgumentParser(
-        prog="camera-node",
+        prog=prog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=EXAMPLES,
         description="Streams timestamped, posed frames of one or several cameras to the next hop.",
@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         return int(args.run(args))
     except (UsageError, CalibrationError, ScenarioError, transport.TransportError) as error:
-        print(f"camera-node: {error}", file=sys.stderr)
+        print(f"{prog}: {error}", file=sys.stderr)
         return 2
 
 

@@ -122,7 +122,11 @@ def _source(scenario: Scenario, config: SourceConfig, data: Path | None, plan: P
     for extra in [*extras, *(["ur"] if arm is not None else [])]:
         yield _check(f"package {extra}", lambda extra=extra: _package(extra))  # type: ignore[misc]
     if isinstance(config, RecordedConfig):
-        yield _check("data", lambda: _data(scenario, config, data))
+        opened = _check("data", lambda: _data(scenario, config, data))
+        yield opened
+        if not opened.ok:
+            yield CheckResult("poses and coverage", None, "not examined: they need the data")
+            return
         yield _check("poses", lambda: _poses(scenario, config, data))
     if isinstance(config, LiveConfig):
         if config.calibration is not None:

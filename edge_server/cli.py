@@ -38,17 +38,18 @@ In the help of a command, [x] after an option is its default.
   edge-server viewpoints tile --budget 8
   edge-server study mat --quick --out runs/study
   edge-server report runs/room
+  edge-server report runs/a --beside runs/b
   edge-server explain runs/room --decision 12
   edge-server export runs/room --mesh room.ply
   edge-server render runs/room --orbit room.mp4
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, prog: str = "edge-server") -> int:
     """Run the command line; returns the exit status: 0, 1 (it failed while running) or 2 (bad input). KeyboardInterrupt
-    and BrokenPipeError are for ``freshfield_up.console``."""
+    and BrokenPipeError are for ``freshfield_up.console``. prog: name of the command in usage and errors."""
     parser = argparse.ArgumentParser(
-        prog="edge-server", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog=prog, description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_run(commands)
@@ -60,13 +61,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if words and words[0] in _COMMANDS:
             command = importlib.import_module(f"edge_server.{_COMMANDS[words[0]][0]}").main
-            return command(words[1:], _compare_with_scene) if words[0] == "export" else command(words[1:])
+            more = {"export": (_compare_with_scene,), "render": (f"{prog} render",)}.get(words[0], ())
+            return int(command(words[1:], *more))
         args = parser.parse_args(words)
         return args.run(args)
     except BrokenPipeError:  # nobody reads the output
         raise
     except (ScenarioError, TransportError, OSError) as error:  # OSError: of a file or folder
-        print(f"edge-server: {error}", file=sys.stderr)
+        print(f"{prog}: {error}", file=sys.stderr)
         return 2
 
 
@@ -236,20 +238,25 @@ def _add_report(commands: argparse._SubParsersAction) -> None:
         description="Write DIR/report.json, DIR/report.html and figures from what a run left in DIR.",
     )
     report.add_argument("directory", type=Path, metavar="DIR", help="folder of a run or fit (its --out)")
+    report.add_argument("--beside", type=Path, metavar="DIR", help="print its figures beside those of this other run")
     report.set_defaults(run=_report)
 
 
 def _report(args: argparse.Namespace) -> int:
     from edge_server.report.build_report import build_report
 
-    if not args.directory.is_dir():
-        raise ScenarioError(f"{args.directory}: no such folder")
+    runs = [args.directory] if args.beside is None else [args.directory, args.beside]
     left = ("ledger-*.tsv", "series.jsonl", "edge.json", "run.json")
-    if not any(path for pattern in left for path in args.directory.glob(pattern)):
-        raise ScenarioError(
-            f"{args.directory}: holds none of {', '.join(left)}: name the folder of a run or fit (its --out)"
-        )
-    build_report(args.directory)
+    for run in runs:
+        if not run.is_dir():
+            raise ScenarioError(f"{run}: no such folder")
+        if not any(path for pattern in left for path in run.glob(pattern)):
+            raise ScenarioError(f"{run}: holds none of {', '.join(left)}: name the folder of a run or fit (its --out)")
+    reports = [build_report(run) for run in runs]
+    if args.beside is not None:
+        from edge_server.report.side_by_side import side_by_side
+
+        print(side_by_side({str(run): report for run, report in zip(runs, reports)}))
     print(args.directory / "report.html")
     return 0
 

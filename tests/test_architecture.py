@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import freshfield
 from tests.conftest import ROOT
 
 SOURCES = {"freshfield": ROOT / "proto", "camera_node": ROOT, "channel_emu": ROOT, "edge_server": ROOT}
@@ -39,6 +40,8 @@ FORBIDDEN = {
     "edge_server.report": ("edge_server.live", "edge_server.page"),
     "edge_server.viewpoints": ("edge_server.live", "edge_server.page", "edge_server.report", "edge_server.fidelity"),
 }
+# The library: names of the programs that ``import freshfield`` offers, each imported only once it is used.
+LIBRARY = "freshfield"
 FILES_A_LEVEL = 16  # fifteen and an __init__
 
 
@@ -73,11 +76,26 @@ def test_arrows_point_one_way(room: str) -> None:
     wrong = [
         f"{module} -> {target}"
         for module, targets in imports().items()
-        if within(module, room)
+        if within(module, room) and module != LIBRARY
         for target in targets
         if any(within(target, other) for other in FORBIDDEN[room])
     ]
     assert not wrong
+
+
+def test_the_library_names_what_there_is_and_imports_nothing() -> None:
+    at_import = {
+        target
+        for node in ast.parse((ROOT / "proto/freshfield/__init__.py").read_text()).body
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for target in ([alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module])
+    }
+    assert at_import == {"__future__", "importlib", "typing"}
+    assert set(freshfield.__all__) == set(freshfield._LIBRARY)
+    for name in freshfield.__all__:
+        assert getattr(freshfield, name).__doc__, name
+    with pytest.raises(AttributeError, match="the library has Channel, Fit"):
+        freshfield.rander  # noqa: B018
 
 
 def test_only_experiments_compose_the_packages_and_nothing_imports_experiments() -> None:

@@ -41,6 +41,11 @@ EMULATOR = """
 import channel_emu.cli, channel_emu.live.frame_proxy, channel_emu.testing
 import channel_emu.virtual.simulate, channel_emu.estimate
 """
+LIBRARY = "import freshfield as ff"
+CHANNEL = """
+import freshfield as ff
+ff.Channel("ch5", cameras=2).ages(1.0)
+"""
 
 
 PYTEST = "import channel_emu.pytest_plugin"
@@ -69,6 +74,8 @@ UNASKED = {
     ),
     FEW_CAMERAS: ("edge_server.fields.splat.layers.depth.network_depth", "edge_server.embed", "onnx"),
     WARM_UP: ("grpc", "zstandard", "google", "torch"),  # ``make`` compiles while it installs them
+    LIBRARY: ("numpy", "grpc", "edge_server", "camera_node", "channel_emu", "freshfield_up"),
+    CHANNEL: ("torch", "numba", "camera_node", "edge_server", "channel_emu.live", "freshfield_up"),
     EMULATOR: ("torch", "numba", "cv2", "scipy", "matplotlib", "camera_node", "edge_server"),
 }
 
@@ -76,7 +83,18 @@ UNASKED = {
 @pytest.mark.parametrize(
     ("program", "unasked"),
     UNASKED.items(),
-    ids=("pytest", "edge", "node", "node without an arm", "tile", "few cameras", "warm-up", "emulator"),
+    ids=(
+        "pytest",
+        "edge",
+        "node",
+        "node without an arm",
+        "tile",
+        "few cameras",
+        "warm-up",
+        "library",
+        "channel",
+        "emulator",
+    ),
 )
 def test_what_nobody_asks_for_is_not_imported(program: str, unasked: tuple[str, ...]) -> None:
     code = f"{program}\nimport sys\nprint([name for name in sys.modules if name.startswith({unasked})])"

@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words and words[0] in _ELSEWHERE:
         try:
-            return int(importlib.import_module(_ELSEWHERE[words[0]]).main(words))
+            return int(importlib.import_module(_ELSEWHERE[words[0]]).main(words, prog="freshfield"))
         except ImportError as error:
             print(f"freshfield: {error.name} is missing: pip install 'freshfield[edge]'", file=sys.stderr)
             return 2

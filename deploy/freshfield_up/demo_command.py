@@ -11,31 +11,13 @@ import argparse
 import re
 from pathlib import Path
 
-from freshfield import scenario as scenarios
-from freshfield.scenario import ScenarioError
-from freshfield_up.net import is_free
-from freshfield_up.run import Launcher, Options
+from freshfield_up.deployment import open_launcher
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the scenario and return the exit status. Raises ScenarioError, FolderError or MissingCommand where the run
     cannot start."""
-    scenario = scenarios.load(args.scenario, args.seed)
-    if not is_free(args.port):
-        raise ScenarioError(f"port {args.port} is taken by another program; choose one with --port (PORT=)")
-    if args.data is not None and not args.data.is_dir():
-        raise ScenarioError(f"{args.data}: no such folder of recorded data (--data)")
-    if _is_inside(args.policy, args.out):
-        raise ScenarioError(f"--policy {args.policy}: {args.out} is emptied first; choose another --out")
-    options = Options(
-        out=args.out,
-        duration_s=args.duration_s,
-        port=args.port,
-        data=args.data,
-        seed=args.seed,
-        edge=() if args.policy is None else (f"--policy={args.policy}",),
-    )
-    return Launcher(scenario, options).run()
+    return open_launcher(args.scenario, args.out, args.duration_s, args.port, args.data, args.seed, args.policy).run()
 
 
 def seconds(text: str) -> float:
@@ -50,12 +32,6 @@ def _port(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text) <= 65535:
         raise argparse.ArgumentTypeError(f"expected a port from 1 to 65535, got {text!r}")
     return int(text)
-
-
-def _is_inside(policy: str | None, out: Path) -> bool:
-    """Whether the learned policy is a file of the earlier run that this one replaces."""
-    kind, _, file = (policy or "").partition(":")
-    return kind == "bandit" and Path(file).expanduser().resolve().is_relative_to(out.resolve())
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

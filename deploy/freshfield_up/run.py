@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,37 +53,53 @@ class Options:
     edge: tuple[str, ...] = ()
 
 
-class Launcher:
-    """Runs a scenario's processes. ``run`` may be called once."""
+def print_line(text: str) -> None:
+    """Print a line. Raises BrokenPipeError once if nobody reads them: the lines of stopping are then dropped."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        console.discard_output()
+        raise
 
-    def __init__(self, scenario: Scenario, options: Options) -> None:
+
+class Launcher:
+    """Runs a scenario's processes. ``run`` may be called once.
+
+    say: gets a line for people now and then.
+    ready: set once everything is up. failures: what went wrong, a line each.
+    """
+
+    def __init__(self, scenario: Scenario, options: Options, say: Callable[[str], None] = print_line) -> None:
         self.scenario = scenario
         self.options = options
         self.processes: ProcessSet
+        self.ready = threading.Event()
+        self.failures: list[str] = []
+        self._say = say
         self._signals: list[str] = []
         self._stop_requested = threading.Event()
         self._began_s = time.monotonic()
         self._ready_s: float | None = None
         self._page_announced = self._compiling_announced = False
-        self._failures: list[str] = []
 
     def run(self) -> int:
-        """Run to the end. Returns the exit code. Raises FolderError or MissingCommand before any process
-        starts."""
+        """Run to the end: until ``stop``, the run's duration or, in the main thread, a signal. Returns the exit code.
+        Raises FolderError or MissingCommand before any process starts."""
         options = self.options
         self.processes = process_set(self.scenario, options.out, options.port, options.data, options.seed, options.edge)
         about = {"scenario": str(self.scenario.path), "seed": self.scenario.seed, "port": options.port}
         about["command"] = shlex.join(["freshfield", *sys.argv[1:]])
         lock = folder.prepare(options.out, about)
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        for number in numbers if threading.current_thread() is threading.main_thread() else ():
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
                 signal.signal(number, self._on_signal)
         try:
             cameras = f"{len(self.scenario.training)} cameras"
             if self.scenario.held_out:
                 cameras += f" + {len(self.scenario.held_out)} held out"
-            _say(f"{self.scenario.name}: {cameras}, seed {self.scenario.seed}")
-            _say(f"logs and results: {options.out}")
+            self._say(f"{self.scenario.name}: {cameras}, seed {self.scenario.seed}")
+            self._say(f"logs and results: {options.out}")
             try:
                 with suppress(BrokenPipeError):  # nobody reads the lines any more: ends as at Ctrl-C
                     self._supervise()
@@ -90,10 +107,14 @@ class Launcher:
                 self._stop()
             self._report()
             if (earlier := options.out / folder.EARLIER).exists():
-                _say(f"the run was never up; an earlier run's files are in {earlier}")
+                self._say(f"the run was never up; an earlier run's files are in {earlier}")
         finally:
             lock.close()
-        return 1 if self._failures else 0
+        return 1 if self.failures else 0
+
+    def stop(self) -> None:
+        """End the run, from any thread; ``run`` returns once the report is written."""
+        self._stop_requested.set()
 
     def _supervise(self) -> None:
         """Start the processes, then check them every tick until there is a reason to stop."""
@@ -111,7 +132,7 @@ class Launcher:
                 return
             if self._ready_s is None:
                 self._continue_start(now_s)
-                if self._failures:
+                if self.failures:
                     return
             if now_s >= next_sample_s:
                 next_sample_s = now_s + SAMPLE_EVERY_S
@@ -121,7 +142,7 @@ class Launcher:
             if now_s >= next_line_s:
                 next_line_s = now_s + LINE_EVERY_S
                 line = status_line(self.options.out, len(self.scenario.cameras))
-                _say(f"[{self._headline(now_s)}] {line}")
+                self._say(f"[{self._headline(now_s)}] {line}")
             if self._ready_s and self.options.duration_s and now_s - self._ready_s >= self.options.duration_s:
                 return
 
@@ -136,15 +157,16 @@ class Launcher:
         if not self._page_announced and net.page_answers(self.options.port):
             self._page_announced = True
             here, port, after_s = net.LOOPBACK, self.options.port, now_s - self._began_s
-            _say(f"page: http://{here}:{port}   (after {after_s:.0f} s)")
-            _say(f"      from another machine first: ssh -L {port}:{here}:{port} THIS-MACHINE")
+            self._say(f"page: http://{here}:{port}   (after {after_s:.0f} s)")
+            self._say(f"      from another machine first: ssh -L {port}:{here}:{port} THIS-MACHINE")
         if not self._compiling_announced and self._edge_doing().startswith(_COMPILING):
             self._compiling_announced = True
-            _say("the field's kernels are compiled for this processor, once: usually 20 to 50 s")
-            _say("      before a first run instead: freshfield warm-up")
+            self._say("the field's kernels are compiled for this processor, once: usually 20 to 50 s")
+            self._say("      before a first run instead: freshfield warm-up")
         waited_for = self._waiting_for()
         if waited_for is None:
             self._ready_s = now_s
+            self.ready.set()
             folder.forget_earlier(self.options.out)
             for driver in self.processes.drivers:
                 driver.start()  # last: the arm must not begin its tour before the field can learn
@@ -171,11 +193,11 @@ class Launcher:
         for child in self.processes.children:
             if child.process is not None and not child.running:
                 self._fail(child.exit_summary())
-        return not self._failures
+        return not self.failures
 
     def _fail(self, text: str) -> None:
-        self._failures.append(text)
-        _say(text)
+        self.failures.append(text)
+        self._say(text)
 
     def _headline(self, now_s: float) -> str:
         if self._ready_s is None:
@@ -193,21 +215,21 @@ class Launcher:
         """Stop the node first and the edge last, so that frames on the way arrive. A second Ctrl-C kills."""
         why = {"SIGINT": "Ctrl-C", "SIGTERM": "SIGTERM", "SIGHUP": "the terminal was closed"}
         reason = f" ({why[self._signals[0]]})" if self._signals else ""
-        _say(f"stopping{reason}: cameras, channel, edge")
+        self._say(f"stopping{reason}: cameras, channel, edge")
         for group in self.processes.groups:
             stop(group, 0.0 if len(self._signals) > 1 else GRACE_S)
             for child in group:
                 if child.killed:
-                    _say(f"{child.role} did not end in time and was killed; see {child.log}")
+                    self._say(f"{child.role} did not end in time and was killed; see {child.log}")
 
     def _report(self) -> None:
         """Write the report, also after a failure, if the run was up."""
         out = self.options.out
-        if self._failures and self._ready_s is None:
-            _say("no report: the run did not start")
+        if self.failures and self._ready_s is None:
+            self._say("no report: the run did not start")
             return
         if not any(out.glob("ledger-*.tsv")):
-            _say("no report: no process has written about a frame")
+            self._say("no report: no process has written about a frame")
             return
         report = Child("report", "the report", [program("edge-server"), "report", str(out)], out / "log-report.txt")
         report.start()
@@ -221,13 +243,4 @@ class Launcher:
         if code != 0:
             self._fail(report.exit_summary())
             return
-        _say(summarize(out))
-
-
-def _say(text: str) -> None:
-    """Print a line. Raises BrokenPipeError once if nobody reads them: the lines of stopping are then dropped."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        console.discard_output()
-        raise
+        self._say(summarize(out))

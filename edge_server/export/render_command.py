@@ -34,20 +34,21 @@ Files end in .png or .jpg (the first image of a path), or in .mp4.
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit status."""
-    args = _parser().parse_args(argv)
+def main(argv: Sequence[str] | None = None, prog: str = "edge-server render") -> int:
+    """Run the command; returns its exit status. prog: its name in usage and errors."""
+    args = _parser(prog).parse_args(argv)
     try:
         _render(args)
     except ExportError as error:
-        print(f"edge-server render: {error}", file=sys.stderr)
+        print(f"{prog}: {error}", file=sys.stderr)
         return 2
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(prog: str) -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("edge-server render", description=DESCRIPTION, formatter_class=raw)
+    description = DESCRIPTION.replace("edge-server render", prog)
+    parser = argparse.ArgumentParser(prog, description=description, formatter_class=raw)
     add = parser.add_argument
     add("run", type=Path, metavar="RUN", help="folder of a run or fit (its --out), or a checkpoint")
     which = parser.add_mutually_exclusive_group(required=True).add_argument

@@ -189,6 +189,12 @@ def test_a_data_set_is_opened_and_its_images_are_read(capsys, tmp_path):
     assert said()[1].startswith(f"{folder}: 23 images of 1 cameras; 1 of 24 images are missing, first images/003.png")
 
 
+def test_data_that_are_missing_are_said_once(capsys, tmp_path):
+    _, parts = examined(capsys, "fox", "--data", str(tmp_path))
+    wrong = [part for part, (ok, text) in parts.items() if "does not exist" in text]
+    assert wrong == ["data"] and parts["poses and coverage"] == (None, "not examined: they need the data")
+
+
 def test_what_fixed_cameras_see_is_reckoned_and_drawn(capsys, tmp_path):
     drawn = tmp_path / "plan.svg"
     _, parts = examined(capsys, "quad", "--plan", str(drawn))

@@ -25,7 +25,7 @@ CURRENT = [page for page in PAGES if "results" not in page.parts and page.name !
 # What a paragraph, list item or row of a table says of the tag need not be there any more.
 TAG = "v0.1-all"
 # Folders of the repository that a page may name a path in.
-TOP = ("camera_node", "channel_emu", "edge_server", "proto", "deploy", "docs", "tests")
+TOP = ("camera_node", "channel_emu", "edge_server", "proto", "deploy", "docs", "examples", "tests")
 
 
 def name(page: Path) -> str:

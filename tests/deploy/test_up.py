@@ -16,9 +16,11 @@ from typing import Any
 
 import pytest
 
-from freshfield.scenario import load
+import freshfield as ff
+from freshfield.scenario import ScenarioError, load
 from freshfield_up import run as launcher
 from freshfield_up.commands import ProcessSet
+from freshfield_up.deployment import DeploymentError
 from freshfield_up.folder import EARLIER, prepare
 from freshfield_up.processes import Child
 from freshfield_up.status import read_json
@@ -234,3 +236,14 @@ def test_times_are_read_as_people_write_them(text: str, seconds: float) -> None:
     from freshfield_up import demo_command as script
 
     assert script.seconds(text) == seconds
+
+
+def test_a_deployment_in_a_script_says_why_it_cannot_start(tmp_path: Path) -> None:
+    (tmp_path / "small.yaml").write_text(SMALL.replace("lpips: none", "policy: {name: nothing}"))
+    with (
+        pytest.raises(DeploymentError, match="the edge server"),
+        ff.deployment(tmp_path / "small.yaml", out=tmp_path / "run"),
+    ):
+        pass
+    with pytest.raises(ScenarioError, match="shipped scenarios"):
+        ff.deployment("nothing")

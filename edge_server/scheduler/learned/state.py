@@ -24,7 +24,7 @@ POSE_WIDTH = 6
 # The widest configurable embedding (edge_server.embed).
 MAX_DIM = 4096
 # Features are clipped to this many standard deviations: what lies beyond is a broken value, not information.
-_FEATURE_LIMIT = 8.0
+FEATURE_LIMIT = 8.0
 # A feature that hardly varied where it was standardized says nothing; scaling must not turn it into noise.
 _MIN_SPREAD = 1e-3
 
@@ -150,8 +150,8 @@ class StateLayout:
         return np.log1p(ages / self.age_scale_ms)[:, None]
 
     def _pose(self, state: State) -> NDArray[np.float64]:
-        poses = np.nan_to_num(state.poses, nan=0.0, posinf=_FEATURE_LIMIT, neginf=-_FEATURE_LIMIT)
-        return np.clip(poses, -_FEATURE_LIMIT, _FEATURE_LIMIT)
+        poses = np.nan_to_num(state.poses, nan=0.0, posinf=FEATURE_LIMIT, neginf=-FEATURE_LIMIT)
+        return np.clip(poses, -FEATURE_LIMIT, FEATURE_LIMIT)
 
     def _semantics(self, state: State) -> NDArray[np.float64]:
         if state.embeddings is None:
@@ -166,7 +166,7 @@ class StateLayout:
             z[unknown] = 0.0
         # A whole embedding initially weighs as much as one other feature; otherwise its d features drown the
         # age.
-        return np.clip(z, -_FEATURE_LIMIT, _FEATURE_LIMIT) / np.sqrt(self.dim)
+        return np.clip(z, -FEATURE_LIMIT, FEATURE_LIMIT) / np.sqrt(self.dim)
 
 
 def require_int(name: str, value: object, least: int, most: int) -> None:

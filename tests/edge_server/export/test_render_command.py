@@ -15,6 +15,7 @@ from edge_server.export.camera_paths import lens, orbit, vertical_fov_deg
 from edge_server.fields import Budget, View, checkpoint
 from edge_server.fields.registry import make_field
 from freshfield.geometry import Pinhole, look_at
+from freshfield_up.cli import main as freshfield
 
 LENS = Pinhole.from_fov(64, 48, 60.0)
 
@@ -199,3 +200,11 @@ def test_a_camera_is_rendered_with_its_own_lens(tmp_path):
     for camera in (last.camera, "hand"):  # a carried camera is its newest view
         assert render(tmp_path, "--camera", camera, tmp_path / "own.png") == 0
         np.testing.assert_array_equal(cv2.imread(str(tmp_path / "own.png"))[..., ::-1], expected)
+
+
+def test_it_names_itself_as_it_was_called(capsys):
+    assert freshfield(["render", "nowhere", "--orbit", "x.mp4"]) == 2
+    assert capsys.readouterr().err.startswith("freshfield render: nowhere")
+    with pytest.raises(SystemExit):
+        freshfield(["render", "--help"])
+    assert "edge-server" not in capsys.readouterr().out

@@ -294,3 +294,15 @@ def test_what_was_chosen_and_why_is_said(tmp_path):
     edit_edge(tmp_path, chosen="splat in layers: no <camera> moves")
     report, page = page_of(tmp_path)
     assert report["chosen"] == "splat in layers: no <camera> moves" and "no &lt;camera&gt; moves" in page
+
+
+def test_two_runs_are_printed_side_by_side(run, tmp_path, capsys):
+    out, report = run
+    write_run(tmp_path / "b")
+    edit_edge(tmp_path / "b", updates={"count": 4242})
+    assert edge_server(["report", str(out), "--beside", str(tmp_path / "b")]) == 0
+    rows = {line.split("  ")[0]: line.split()[-2:] for line in capsys.readouterr().out.splitlines()}
+    shown = f"{report['fidelity']['final']['psnr_db']:.2f}"
+    assert rows["published (dB)"] == [shown, shown] and rows["frames delivered"] == ["76", "76"]
+    assert edge_server(["report", str(out), "--beside", str(tmp_path / "c")]) == 2
+    assert "c: no such folder" in capsys.readouterr().err

@@ -1,0 +1,140 @@
+"""A scenario's processes on this machine: opened for the command, or run from a script.
+
+with freshfield.deployment("room", seconds=60, out="runs/room") as run:
+    print(run.page, run.status()["updates"])
+print(run.report["fidelity"]["shown"])
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from freshfield import scenario as scenarios
+from freshfield.scenario import ScenarioError
+from freshfield_up.net import LOOPBACK, free_ports, is_free
+from freshfield_up.run import Launcher, Options, print_line
+from freshfield_up.status import read_json
+
+
+class DeploymentError(RuntimeError):
+    """The processes did not start, or one of them died; the message says which and names its log."""
+
+
+def open_launcher(
+    scenario: str | Path,
+    out: Path,
+    seconds: float,
+    port: int,
+    data: Path | None = None,
+    seed: int | None = None,
+    policy: str | None = None,
+    say: Callable[[str], None] = print_line,
+) -> Launcher:
+    """A launcher, checked and not started. The arguments are those of ``freshfield demo``; say: see ``Launcher``.
+    Raises ScenarioError."""
+    opened = scenarios.load(scenario, seed)
+    if not is_free(port):
+        raise ScenarioError(f"port {port} is taken by another program; choose one with --port (PORT=)")
+    if data is not None and not data.is_dir():
+        raise ScenarioError(f"{data}: no such folder of recorded data (--data)")
+    if _is_inside(policy, out):
+        raise ScenarioError(f"--policy {policy}: {out} is emptied first; choose another --out")
+    edge = () if policy is None else (f"--policy={policy}",)
+    return Launcher(opened, Options(out, seconds, port, data, seed, edge), say)
+
+
+class Deployment:
+    """A running deployment, for ``with``: entering waits until everything is up, leaving ends it and writes the report.
+
+    out: folder of the run. page: address of the live page.
+    """
+
+    def __init__(
+        self,
+        scenario: str | Path,
+        *,
+        seconds: float = 0.0,
+        out: str | Path = "runs/deployment",
+        port: int | None = None,
+        data: Path | None = None,
+        seed: int | None = None,
+        policy: str | None = None,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        """scenario: a file, or the name of a shipped one. seconds: after which it ends by itself; 0: it does not.
+        out: replaces an earlier run in it. port: of the page; None: any free one. data: folder of recorded data sets.
+        seed, policy: in place of the scenario's. say: gets the lines that ``freshfield demo`` prints.
+        Raises ScenarioError."""
+        self.out = Path(out)
+        port = free_ports(1)[0] if port is None else port
+        self.page = f"http://{LOOPBACK}:{port}"
+        self._launcher = open_launcher(scenario, self.out, seconds, port, data, seed, policy, say)
+        self._thread = threading.Thread(target=self._run, name="deployment")
+        self._ended = threading.Event()
+        self._error: Exception | None = None
+
+    def __enter__(self) -> Deployment:
+        """Raises FolderError or MissingCommand where it cannot start, DeploymentError where a process fails."""
+        self._thread.start()
+        try:
+            while not self._launcher.ready.wait(0.1) and not self._ended.is_set():
+                pass
+        except BaseException:  # Ctrl-C while it starts
+            self._end()
+            raise
+        self._check()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end()
+        if error is None:
+            self._check()
+
+    @property
+    def running(self) -> bool:
+        """Whether it goes on: its ``seconds`` are not over, and no process has died."""
+        return not self._ended.is_set()
+
+    def status(self) -> dict[str, Any]:
+        """What the edge server says of itself now: ``cameras``, ``updates``, ``scores``, ``policy`` and others, as in
+        edge.json."""
+        return read_json(self.out / "edge.json")
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The contents of report.json, which is written at the end; report.html lies beside it. Raises OSError while
+        the run goes on."""
+        found: dict[str, Any] = json.loads((self.out / "report.json").read_text())
+        return found
+
+    def _run(self) -> None:
+        try:
+            self._launcher.run()
+        except Exception as error:  # belongs to the thread that waits
+            self._error = error
+        finally:
+            self._ended.set()
+
+    def _end(self) -> None:
+        self._launcher.stop()
+        self._thread.join()
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise self._error
+        if self._launcher.failures:
+            self._end()
+            raise DeploymentError("; ".join(self._launcher.failures))
+
+
+def _is_inside(policy: str | None, out: Path) -> bool:
+    """Whether the learned policy is a file of the earlier run that this one replaces."""
+    kind, _, file = (policy or "").partition(":")
+    return kind == "bandit" and Path(file).expanduser().resolve().is_relative_to(out.resolve())
