@@ -243,7 +243,13 @@ class Fit(ViewedField):
 
 
 def load(
-    path: Path | str, *, holdout: int | str | None = None, scale: float = 1.0, frame: int = 0, format: str | None = None
+    path: Path | str,
+    *,
+    holdout: int | str | None = None,
+    scale: float = 1.0,
+    frame: int = 0,
+    format: str | None = None,
+    allow_plugins: bool = False,
 ) -> MultiviewStill | Source:
     """A data set to fit, or the field that a run or fit saved.
 
@@ -254,13 +260,14 @@ def load(
     scale: divides the image sizes.
     frame: number of the instant of a moving data set, from 0.
     format: of the data set; None finds it from its files.
+    allow_plugins: run code from outside that a checkpoint's field names, if you trust it.
     Returns a ``MultiviewStill``, whose ``training`` and ``held_out`` are views (``camera``, ``image`` uint8 (H, W, 3 or
     4), ``camera_to_world`` (4, 4), ``intrinsics``, ``depth`` float32 (H, W) meters or None), or a ``Source``
     (``ViewedField``).
     Raises DatasetError, OptionError or, of a checkpoint, ExportError.
     """
     if holds_checkpoint(Path(path)):
-        return open_source(Path(path))
+        return open_source(Path(path), allow_plugins)
     return open_still(Path(path), None if holdout is None else str(holdout), scale, frame, format)
 
 
