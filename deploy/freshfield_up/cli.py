@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from freshfield.scenario import ScenarioError
-from freshfield_up import demo_command, scenario_command
+from freshfield_up import check_plugin, demo_command, scenario_command
 from freshfield_up.commands import MissingCommand
 from freshfield_up.folder import FolderError
 
@@ -25,6 +25,7 @@ EXAMPLES = """examples:
   freshfield scenario check mine.yaml
   freshfield doctor mine.yaml                  what this machine lacks for it
   freshfield render runs/quad --orbit quad.mp4
+  freshfield check-plugin policy mine.py:Mine  whether a class of your own keeps its contract
   freshfield warm-up                           compile the field's kernels before the first run
   freshfield completion bash > ~/.local/share/bash-completion/completions/freshfield
 
@@ -40,15 +41,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status: 0, 1 (a process died, or something is missing) or 2 (bad
     input)."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if words and words[0] in _ELSEWHERE:
-        try:
-            return int(importlib.import_module(_ELSEWHERE[words[0]]).main(words, prog="freshfield"))
-        except ImportError as error:
-            print(f"freshfield: {error.name} is missing: pip install 'freshfield[edge]'", file=sys.stderr)
-            return 2
-    args = parser().parse_args(words)
     try:
+        if words and words[0] in _ELSEWHERE:
+            return int(importlib.import_module(_ELSEWHERE[words[0]]).main(words, prog="freshfield"))
+        args = parser().parse_args(words)
         return int(args.run(args))
+    except ImportError as error:
+        print(f"freshfield: {error.name} is missing: pip install 'freshfield[edge]'", file=sys.stderr)
+        return 2
     except (ScenarioError, FolderError, MissingCommand) as error:
         print(f"freshfield: {error}", file=sys.stderr)
         return 2
@@ -74,6 +74,14 @@ def parser() -> argparse.ArgumentParser:
     scenario_command.add_arguments(
         commands.add_parser("scenario", help="list, show, start, check scenario files; their keys")
     )
+    check = commands.add_parser(
+        "check-plugin",
+        help="check a policy, effect, fault, field or selector of your own",
+        description="Checks that a class keeps the contract of its kind, one line a check: in usual and hard cases its "
+        "answers have the right type, shape and finite values, are the same again for the same seed and leave the "
+        "inputs as they were; parameters out of range are refused. Exit status: 0 it does, 1 not, 2 no such class.",
+    )
+    check_plugin.add_arguments(check)
     commands.add_parser("doctor", add_help=False, help="check this machine's part of a scenario (camera-node doctor)")
     commands.add_parser("render", add_help=False, help="images and videos of a run (edge-server render)")
     commands.add_parser("warm-up", add_help=False, help="compile the field's kernels (edge-server warm-up)")

@@ -75,7 +75,8 @@ class FisherRF:
         known = np.zeros(snapshot.gaussians.params.shape)
         for row in information(snapshot, [v.camera_to_world for v in state.views], [v.intrinsics for v in state.views]):
             known += row
-        known += PRIOR * np.maximum(known.mean(axis=0), 1e-12)
+        if len(known):  # without a view there is no Gaussian
+            known += PRIOR * np.maximum(known.mean(axis=0), 1e-12)
         scale = (1.0 / known).astype(np.float32)
         values, asked = np.zeros(len(poses)), np.flatnonzero(state.open)
         rows = information(snapshot, list(poses[asked]), [lens] * len(asked))

@@ -105,7 +105,8 @@ class Flat:
         return {"level": np.array(self.settings.level)}
 
     def load_state(self, state):
-        pass
+        if set(state) != {"level"}:
+            raise ValueError("not the state of a flat field")
 
     def reset(self):
         self.views = ()

@@ -1,0 +1,121 @@
+"""``freshfield check-plugin``: what keeps its contract passes, and each check can fail."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_server.scheduler import POLICIES, SelectionWindow
+from freshfield.settings import Settings
+from freshfield_up.cli import main
+from tests.integration.own_classes import Darker, Flat, LastFirst, Late, Youngest
+
+OWN = Path(__file__).parent.parent / "integration/own_classes.py"
+# Effects: tests/camera_node/synthetic/effects/test_registry.py.
+BUILT_IN = [("policy", name) for name in POLICIES] + [("selector", name) for name in ("random", "coverage")]
+OTHERS = [("policy", f"{__file__}:ByState"), ("selector", "fisher")]
+COUNT = itertools.count()
+
+
+class ByState(Youngest):
+    """Looks at more than ages."""
+
+    def select(self, epoch, window):
+        state = epoch.state(("age", "pose"))
+        return state.cameras[: 1 + int(state.poses[:, 0].sum())]
+
+
+def painted(level):
+    """A render of this level: a function of the field."""
+
+    def render(self, camera_to_world, intrinsics):
+        out = Flat.render(self, camera_to_world, intrinsics)
+        out.color[:] = level(self)
+        return out
+
+    return render
+
+
+def seen(self):
+    return self.views[0].image.mean() / 255 if self.views else 0.0
+
+
+def in_turn(self, transit):
+    self.asked = getattr(self, "asked", 0) + 1
+    return self.asked < 10
+
+
+def take_views(self, state):
+    self.views = state["level"].views
+
+
+def first_of(share):
+    return lambda self, epoch, window: tuple(epoch.generated_ns)[: share(epoch.generated_ns)]
+
+
+HOURS = 24 * 3600 * 10**9
+LATE = SelectionWindow(wait_until_ns=HOURS)
+UNBOUNDED = {"__annotations__": {"gain": float}, "gain": 1.0}
+NO_DEFAULT = type(Settings)("Params", (Settings,), {"__annotations__": {"ms": float}})
+NO_COPY = {"render": painted(seen), "state": lambda s: {"level": s}, "load_state": take_views}
+BASES = {"policy": Youngest, "effect": Darker, "fault": Late, "field": Flat, "selector": LastFirst}
+# Kind -> name of a class -> how it differs from the good one, and what the command says.
+BROKEN = {
+    "policy": {
+        "MoreArguments": ({"__init__": lambda s, a: None}, "is constructed with its defaults: TypeError"),
+        "NoWindow": ({"plan": lambda *_: None}, "six cameras: plan: expected SelectionWindow, got NoneType"),
+        "Patient": ({"plan": lambda *_: LATE}, "six cameras: plan: it waits for more than an hour"),
+        "Nobody": ({"select": lambda *_: ("cam99",)}, "one camera: select: expected a tuple of cameras"),
+        "Nothing": ({"select": lambda *_: ()}, "one camera: select: expected a tuple of cameras, one at least"),
+        "Divides": ({"select": first_of(lambda names: 6 // len(names))}, "no frame yet: ZeroDivisionError"),
+        "Changes": ({"select": first_of(lambda names: next(COUNT) % 7 or 1)}, "six cameras: two runs differ"),
+        "Empties": ({"select": lambda s, e, w: e.received_ns.clear() or (*e.generated_ns,)}, "one camera: an input"),
+        "AnyValue": ({"__init__": lambda s, value, rng: None}, "value out of range is refused: -1 is accepted"),
+    },
+    "effect": {
+        "Unbounded": (UNBOUNDED, "gain out of range is refused: -1e+300 is accepted"),
+        "Floats": ({"apply": lambda s, image, *_: image / 2}, "a black image: image: expected array uint8 (12, 16, 3)"),
+        "InPlace": ({"apply": lambda s, image, *_: np.subtract(image, 1, out=image)}, "a noisy image: an input was"),
+        "Second": ({"apply": lambda s, image, *_: image + image[1, 1]}, "a 1 x 1 image: IndexError"),
+    },
+    "fault": {
+        "Early": ({"extra_ns": lambda *_: -1}, "usual messages: extra_ns: expected nanoseconds from 0"),
+        "Fraction": ({"extra_ns": lambda *_: 0.5}, "usual messages: extra_ns: expected int, got float"),
+        "InTurn": ({"loses": in_turn}, "does not depend on the order of questions: draw by the number"),
+        "Demanding": ({"Params": NO_DEFAULT}, "is constructed with its defaults: ScenarioError"),
+    },
+    "field": {
+        "NoNumber": ({"render": painted(lambda s: np.nan)}, "one camera: color: a value is not finite"),
+        "Bytes": ({"render": painted(lambda s: 255)}, "one camera: color: below 0, or above 1"),
+        "Forgets": ({"render": painted(seen)}, "snapshots stay and states go on: load_state: it renders"),
+        "Itself": (NO_COPY, "snapshots stay and states go on: snapshot: it changes"),
+        "AnyState": ({"load_state": lambda *_: None}, "snapshots stay and states go on: load_state: the state of"),
+    },
+    "selector": {
+        "OneValue": ({"values": lambda *_: np.zeros(1)}, "half captured: values: expected one a candidate"),
+        "Infinite": ({"values": lambda s, state: np.full(len(state.open), np.inf)}, "half captured: values of open"),
+    },
+}
+ROWS = [(kind, name, *row) for kind, rows in BROKEN.items() for name, row in rows.items()]
+globals().update({name: type(BASES[kind])(name, (BASES[kind],), dict(has)) for kind, name, has, _ in ROWS})
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [(kind, f"{OWN}:{good.__name__}") for kind, good in BASES.items()] + BUILT_IN + OTHERS
+)
+def test_what_keeps_its_contract_passes(kind, name, capsys):
+    assert main(["check-plugin", kind, name]) == 0, capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("kind", "name", "says"), [(kind, name, says) for kind, name, _, says in ROWS])
+def test_each_check_can_fail(kind, name, says, capsys):
+    assert main(["check-plugin", kind, f"{__file__}:{name}"]) == 1
+    assert f"FAILED  {says}" in capsys.readouterr().out
+
+
+def test_what_is_not_there_is_one_line(capsys):
+    assert main(["check-plugin", "policy", "al"]) == 2
+    assert "did you mean all?" in capsys.readouterr().err
