@@ -240,7 +240,7 @@ def _read_faults(faults: Any, where: str) -> dict[str, Any]:
         try:
             kind = fault_modules.params_class(name)
         except PluginError as error:
-            raise ScenarioError(f"{where}: {error}") from None
+            raise ScenarioError(f"{where}.{name}: {error}") from None
         if not isinstance(params, dict):  # the first parameter alone: loss: 0.1
             params = {kind.__struct_fields__[0]: params}
         read[name] = read_settings(kind, params, f"{where}.{name}")

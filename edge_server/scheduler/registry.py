@@ -135,6 +135,8 @@ class LivePolicies:
         """The policy that an operator asks for. Raises ValueError if it is not offered."""
         if name not in self.offered and len(name) > MAX_POLICY_CHARS:
             raise ValueError(f"policy: a name of {len(name)} characters; none has more than {MAX_POLICY_CHARS}")
-        if (name.startswith(BANDIT) or name not in POLICIES) and name not in self.offered:
-            raise ValueError(f"policy {name!r}: what was learned, or is your own, is chosen at the start (--policy)")
+        if name not in POLICIES and name not in self.offered:
+            outside = name.startswith(BANDIT) or plugins.is_reference(name)
+            known = "what was learned, or is your own, is chosen at the start (--policy)"
+            raise ValueError(f"policy {name!r}: {known if outside else 'choose one of ' + ', '.join(self.offered)}")
         return make_live_policy(name, value, self._rng(name))

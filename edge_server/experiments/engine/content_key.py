@@ -142,7 +142,9 @@ def _facts(module: str) -> _Facts:
     _drop_docstrings(tree)
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     digest = hashlib.sha256(ast.dump(tree).encode()).hexdigest()
-    return _Facts(digest, tuple(dict.fromkeys(_imports(tree, module, package))))
+    # The library's names lead from there to all programs, and no program uses them.
+    imports = () if module == freshfield.__name__ else tuple(dict.fromkeys(_imports(tree, module, package)))
+    return _Facts(digest, imports)
 
 
 def _imports(tree: ast.Module, module: str, package: str) -> Iterator[str]:

@@ -74,7 +74,7 @@ def test_keys_beside_a_preset_override_it() -> None:
         ("{chain: {generator_per_ms: [[-1, 2], [1, -1]]}}", "rows sum to zero"),
         ("{chain: {mu1_per_ms: 1, mu2_per_ms: 1, initial: up}}", "initial: expected one of s1, s2"),
         ("{discipline: D/G/1/0}", "discipline: expected one of drop-new"),
-        ("{faults: {rain: {}}}", "channel.faults: fault 'rain' is not known; there are: loss"),
+        ("{faults: {rain: {}}}", "channel.faults.rain: fault 'rain' is not known; there are: loss"),
         ("{faults: {loss: [0.1, 0.2]}}", "channel: faults.loss.probability: expected one number or one a state"),
         ("{preset: ch6, faults: {loss: [0.1, 2]}}", "loss.probability[1]: expected a number, 0 to 1"),
         ("{service: 'exp'}", "channel.service: 'exp': expected exp:60ms"),

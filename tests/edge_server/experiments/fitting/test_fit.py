@@ -68,5 +68,5 @@ def test_arguments_that_say_nothing_are_refused(made):
         ff.fit(made[0].data, holdout=2)
     with pytest.raises(OptionError, match="expected more than 0"):
         ff.fit(made[0].data, seconds=0.0)
-    with pytest.raises(OptionError, match="no field is called"):
+    with pytest.raises(OptionError, match="field 'nothing' is not known"):
         ff.fit(made[0].data, field="nothing")

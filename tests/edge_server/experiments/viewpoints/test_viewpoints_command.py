@@ -36,7 +36,7 @@ def test_a_capture_is_planned_and_written(tmp_path, capsys):
     [
         (["tile", "--budget", "many"], "expected views"),
         (["tile", "--budget", "0"], "at least 1 view"),
-        (["tile", "--budget", "4", "--selector", "best"], "no selector is called"),
+        (["tile", "--budget", "4", "--selector", "best"], "selector 'best' is not known; there are: random"),
         (["tile", "--budget", "4", "--travel", "-1"], "--travel"),
         (["tile", "--budget", "4", "--selector", "ppo:none.npz"], "not a viewpoint policy"),
         (["nowhere", "--budget", "4"], "nowhere"),

@@ -181,7 +181,7 @@ def test_cameras_that_are_seen_to_move_become_a_scan_and_the_reason_is_said(tmp_
     assert main([str(path), "--seconds", "3", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert re.fullmatch(r"splat as a scan, updated in a cycle for 80 ms: cam0[123] moves", found["chosen"])
-    assert found["steps"] == 24
+    assert found["steps"] == 8
     path.write_text(json.dumps({**data, "edge": {**data["edge"], "field_options": {"layers": True}}}))
     assert main([str(path), "--seconds", "3", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
