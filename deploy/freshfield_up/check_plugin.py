@@ -15,10 +15,11 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import yaml
 
 from freshfield import plugins
 from freshfield.geometry import Pinhole, Pose, look_at
-from freshfield.settings import Settings, bare_type, read_settings
+from freshfield.settings import ScenarioError, Settings, bare_type, read_settings
 
 FAR = 1e300  # beyond what any parameter can mean; a product of two such numbers is infinite
 HOUR_NS = 3600 * 10**9  # no policy waits longer
@@ -37,14 +38,15 @@ class Contract:
     cases: Mapping[str, Callable[[], Any]]  # makes the inputs of a case anew
     use: Callable[[Any, Any], Any]  # what an instance makes of a case's inputs; raises where it is wrong
     refused: Mapping[str, tuple[float, ...]]  # parameter -> values that ``make`` has to refuse by ValueError
-    extra: Mapping[str, Callable[[], Any]] = dataclasses.field(default_factory=dict)  # raise where they fail
+    extra: Mapping[str, Callable[[Any], Any]] = dataclasses.field(default_factory=dict)  # given ``make``; raise
 
     def outcomes(self) -> Iterator[tuple[str, str]]:
         """Each check and what failed of it: empty if nothing did. Without an instance it ends."""
-        checks: dict[str, Callable[[], Any]] = {"is constructed with its defaults": partial(self.make, 1)}
+        checks: dict[str, Callable[[], Any]] = {"is constructed": partial(self.make, 1)}
         checks |= {case: partial(self.check_case, case) for case in self.cases}
         checks |= {f"{key} out of range is refused": partial(self.check_refused, key) for key in self.refused}
-        for number, (check, run) in enumerate({**checks, **self.extra}.items()):
+        checks |= {check: partial(run, self.make) for check, run in self.extra.items()}
+        for number, (check, run) in enumerate(checks.items()):
             failed = ""
             try:
                 run()
@@ -205,13 +207,14 @@ def fault(name: str) -> Contract:
             expect(answer[0] >= 0, f"extra_ns: expected nanoseconds from 0, got {answer[0]}")
         return answers
 
-    def any_order() -> None:
+    def any_order(make: Callable[..., Any]) -> None:
         same = use(make(1), messages(5000)) == use(make(1), messages(5000)[::-1])[::-1]
         expect(same, "draw by the number of the offer (channel_emu.model.counter_rng)")
 
     sizes = {"usual messages": 5000, "empty messages": 0, "the largest messages": MAX_SIZE_BYTES}
+    refused = {key: (-FAR,) for key in numbers(found)}  # no delay or rate is too large: a link ends at NEVER_NS
     extra = {"does not depend on the order of questions": any_order}
-    return Contract(make, {case: partial(messages, size) for case, size in sizes.items()}, use, numbers(found), extra)
+    return Contract(make, {case: partial(messages, size) for case, size in sizes.items()}, use, refused, extra)
 
 
 def field(name: str) -> Contract:
@@ -231,8 +234,8 @@ def field(name: str) -> Contract:
             expect(values.min() >= 0 and (what == "depth" or values.max() <= 1), f"{what}: below 0, or above 1")
         return content(out)
 
-    def goes_on() -> None:
-        first, second = make_field(name, {}, 1), make_field(name, {}, 1)
+    def goes_on(make: Callable[..., Any]) -> None:
+        first, second = make(1), make(1)
         use(first, views(NOISE))
         second.load_state(first.state())
         snapshot, before = first.snapshot(), shown(first)
@@ -286,12 +289,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``freshfield check-plugin``."""
     parser.add_argument("kind", choices=CONTRACTS, metavar="KIND", help=f"one of {', '.join(CONTRACTS)}")
     parser.add_argument("name", metavar="NAME", help="FILE.py:CLASS, MODULE:CLASS, or the name of an entry point")
+    parser.add_argument("parameters", nargs="*", metavar="KEY=VALUE", help="of it; not given: its defaults")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print one line a check. Returns 1 if one failed."""
-    outcomes = list(CONTRACTS[args.kind](args.name).outcomes())
+    found = CONTRACTS[args.kind](args.name)
+    try:
+        given = {key: yaml.safe_load(value) for key, _, value in (each.partition("=") for each in args.parameters)}
+    except yaml.YAMLError as error:
+        raise ScenarioError(f"parameters: expected KEY=VALUE: {' '.join(str(error).split())}") from None
+    outcomes = list(dataclasses.replace(found, make=partial(found.make, **given)).outcomes())
     for check, failed in outcomes:
         print(f"FAILED  {check}: {failed}" if failed else f"ok      {check}")
     return int(any(failed for _, failed in outcomes))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from channel_emu.model import faults
 from edge_server.scheduler import POLICIES, SelectionWindow
 from freshfield.settings import Settings
 from freshfield_up.cli import main
@@ -17,6 +18,8 @@ OWN = Path(__file__).parent.parent / "integration/own_classes.py"
 # Effects: tests/camera_node/synthetic/effects/test_registry.py.
 BUILT_IN = [("policy", name) for name in POLICIES] + [("selector", name) for name in ("random", "coverage")]
 OTHERS = [("policy", f"{__file__}:ByState"), ("selector", "fisher")]
+FAULTS = {"loss": "probability=0.5", "duplication": "probability=0.5", "corruption": "probability=0.5 count=3"}
+FAULTS |= {"blackout": "windows_ms=[[0,50]]", "reset": "mean_interval_ms=100", "bandwidth": "megabits_per_s=1"}
 COUNT = itertools.count()
 
 
@@ -65,7 +68,7 @@ BASES = {"policy": Youngest, "effect": Darker, "fault": Late, "field": Flat, "se
 # Kind -> name of a class -> how it differs from the good one, and what the command says.
 BROKEN = {
     "policy": {
-        "MoreArguments": ({"__init__": lambda s, a: None}, "is constructed with its defaults: TypeError"),
+        "MoreArguments": ({"__init__": lambda s, a: None}, "is constructed: TypeError"),
         "NoWindow": ({"plan": lambda *_: None}, "six cameras: plan: expected SelectionWindow, got NoneType"),
         "Patient": ({"plan": lambda *_: LATE}, "six cameras: plan: it waits for more than an hour"),
         "Nobody": ({"select": lambda *_: ("cam99",)}, "one camera: select: expected a tuple of cameras"),
@@ -85,7 +88,7 @@ BROKEN = {
         "Early": ({"extra_ns": lambda *_: -1}, "usual messages: extra_ns: expected nanoseconds from 0"),
         "Fraction": ({"extra_ns": lambda *_: 0.5}, "usual messages: extra_ns: expected int, got float"),
         "InTurn": ({"loses": in_turn}, "does not depend on the order of questions: draw by the number"),
-        "Demanding": ({"Params": NO_DEFAULT}, "is constructed with its defaults: ScenarioError"),
+        "Demanding": ({"Params": NO_DEFAULT}, "is constructed: ScenarioError"),
     },
     "field": {
         "NoNumber": ({"render": painted(lambda s: np.nan)}, "one camera: color: a value is not finite"),
@@ -110,6 +113,11 @@ def test_what_keeps_its_contract_passes(kind, name, capsys):
     assert main(["check-plugin", kind, name]) == 0, capsys.readouterr().out
 
 
+@pytest.mark.parametrize("name", faults.NAMES)
+def test_the_link_s_faults_keep_theirs(name, capsys):
+    assert main(["check-plugin", "fault", name, *FAULTS[name].split()]) == 0, capsys.readouterr().out
+
+
 @pytest.mark.parametrize(("kind", "name", "says"), [(kind, name, says) for kind, name, _, says in ROWS])
 def test_each_check_can_fail(kind, name, says, capsys):
     assert main(["check-plugin", kind, f"{__file__}:{name}"]) == 1
@@ -119,3 +127,5 @@ def test_each_check_can_fail(kind, name, says, capsys):
 def test_what_is_not_there_is_one_line(capsys):
     assert main(["check-plugin", "policy", "al"]) == 2
     assert "did you mean all?" in capsys.readouterr().err
+    assert main(["check-plugin", "fault", "loss", "probability=["]) == 2
+    assert "freshfield: parameters: expected KEY=VALUE" in capsys.readouterr().err
