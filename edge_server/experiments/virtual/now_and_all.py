@@ -6,7 +6,8 @@ that the field's corrections of neighboring frames give, where it has any.
 
   python -m edge_server.experiments.virtual.now_and_all runs/before runs/after --out docs/results/carried
 
-draws runs of ``edge-server simulate SCENARIO --out RUN``: decibels by seconds, and truth beside what each shows.
+draws runs of ``edge-server simulate SCENARIO --out RUN``: decibels by seconds, and truth beside what each shows; and
+writes carried.json, their means and rows.
 """
 
 from __future__ import annotations
@@ -124,6 +125,21 @@ def _bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
+def _facts(run: Path) -> dict[str, Any]:
+    """What a run was, and what it showed: means from SINCE_S on, and rows."""
+    about, rows = (json.loads((run / name).read_text()) for name in ("simulation.json", _FILE))
+    late = [row for row in rows if row["t_s"] >= SINCE_S]
+    names = [name for name in rows[0] if name != "t_s"]
+    means = {name: round(float(np.mean([row[name] for row in late])), 3) for name in names}
+    kept = {name: about[name] for name in ("scenario", "seed", "steps", "updates", "update_ms", "digest")}
+    return {
+        "run": run.name,
+        **kept,
+        **means,
+        "by_seconds": [[row["t_s"], *(round(row[n], 2) for n in names)] for row in rows],
+    }
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Draw runs side by side; returns the exit status."""
     from edge_server.experiments.common.drawn_images import draw_images
@@ -132,10 +148,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("runs", nargs="+", type=Path, help="folders of runs of one scenario")
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="NAME", help="writes NAME-time.png, NAME-pictures.png"
+        "--out", type=Path, required=True, metavar="NAME", help="writes NAME.json, NAME-time.png, NAME-pictures.png"
     )
     args = parser.parse_args(argv)
     images = [dict(np.load(run / _IMAGES)) for run in args.runs]
+    write_json(args.out.with_suffix(".json"), {"runs": [_facts(run) for run in args.runs]})
     with figure(args.out.with_name(f"{args.out.name}-time.png"), 2) as (_, axes):
         for run in args.runs:
             rows = json.loads((run / _FILE).read_text())

@@ -44,6 +44,12 @@ def test_newest_and_all_held_out_frames_are_scored_each_two_seconds_and_drawn(tm
         np.mean(each), abs=0.05
     )
     assert now_and_all.main([str(tmp_path / "run"), str(tmp_path / "run"), "--out", str(tmp_path / "both")]) == 0
+    one, two = json.loads((tmp_path / "both.json").read_text())["runs"]
+    assert one == two and (one["run"], one["scenario"], one["steps"]) == ("run", "walk", 2)
+    assert one["now_db"] == pytest.approx(rows[1]["now_db"], abs=1e-3) and [r[0] for r in one["by_seconds"]] == [
+        2.0,
+        4.0,
+    ]
     assert (tmp_path / "both-time.png").stat().st_size > 1000 < (tmp_path / "both-pictures.png").stat().st_size
 
 
