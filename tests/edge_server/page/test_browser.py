@@ -44,6 +44,7 @@ def test_the_page_says_what_is_going_on_and_stays_live(shown):
         "no frame yet",
         "held out",
         "Cameras send frames over a bad network",
+        "let this browser draw it",
     ):
         browser.wait_for_text(part)
     _until_updates(browser, after=len(preview.state.publications()))
