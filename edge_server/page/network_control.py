@@ -7,6 +7,7 @@ notification for that visitor.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from typing import Any
@@ -81,11 +82,12 @@ class NetworkControl:
             except (KeyError, TypeError, ValueError):  # null: the scenario's; or another version's file
                 in_force = None
         self.words.content = note(f"The network is {describe(in_force)}.")
-        if in_force is not None:
-            values = round(min(in_force[0], MAX_SLIDER_DELAY_MS)), round(100.0 * in_force[1])
-            for slider, value in zip((self.delay, self.loss), values):
-                if slider.value != value:
-                    slider.value = value
+        # Of the scenario's own network what is known: a slider that is moved changes the other one's value too.
+        delay_ms, loss = in_force or (_drawn_ms(status), 0.0)
+        values = round(min(delay_ms, MAX_SLIDER_DELAY_MS)), round(100.0 * loss)
+        for slider, value in zip((self.delay, self.loss), values):
+            if slider.value != value:
+                slider.value = value
 
     # --- callbacks ------------------------------------------------------------------------------
 
@@ -112,6 +114,15 @@ class NetworkControl:
         except Exception as error:  # any failure is shown to the visitor and never ends the page
             log.info("page: network %s refused: %s", describe(wanted), error)
             notify(client, "The network has not changed", str(error) or type(error).__name__, bad=True)
+
+
+def _drawn_ms(status: dict[str, Any] | None) -> float:
+    """The mean delay of the frames so far; 0 where it is not known."""
+    try:
+        found = float((status or {})["drawn_delay_ms"]["mean"])
+    except (KeyError, TypeError, ValueError):
+        return 0.0
+    return found if math.isfinite(found) else 0.0
 
 
 def describe(setting: Setting) -> str:

@@ -80,7 +80,8 @@ class Panel:
         """Show the current state."""
         last = publications[-1] if publications else None
         self._status.content = markup.status(summary(self._state, cameras, publications))
-        poor = poor_picture(self._state.flat_db(), publications, cameras)
+        learning = self._state.status_line.startswith("learning")  # what is shown is nothing yet, and that is said
+        poor = "" if learning else poor_picture(self._state.flat_db(), publications, cameras)
         troubles = [*self._state.troubles(), *([poor] if poor else [])]
         self._troubles.visible = bool(troubles)
         self._troubles.content = markup.warning("; ".join(troubles)) if troubles else ""

@@ -156,6 +156,8 @@ class SplatStream:
         published = None if snapshot is None else self._publisher.take(snapshot, monotonic())
         status = self._status(snapshot is not None and published is None)
         for each in connected:
+            if not each.queue.empty():  # what an acknowledgement says, the connection has not taken yet
+                continue
             with each.lock:
                 data = each.visitor.message(published, self._state.now_ns(), status, monotonic())
             if data is not None:

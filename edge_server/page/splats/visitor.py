@@ -119,6 +119,7 @@ class Visitor:
         self._field = -1
         self._serial = -1  # of the newest publication sent
         self._status_s = self._moving_s = -np.inf
+        self._anchors = -1  # number of the set of anchors whose knots were sent
         self._whole: MovingBlock | None = None  # the moving set, once all of it was sent
         self._forget_static()
 
@@ -128,6 +129,7 @@ class Visitor:
         self._sent = np.zeros(0, RECORD)
         self._known = np.zeros(0, np.bool_)
         self._due: list[int] = []  # chunks
+        self._unseen: NDArray[np.bool_] | None = None  # as sent
 
     @property
     def shown_static(self) -> int:
@@ -174,25 +176,35 @@ class Visitor:
 
     def _newest(self, published: Published, room: int, now_s: float) -> list[Block]:
         """Knots, moving set and static chunks, as far as there is room."""
-        blocks: list[Block] = []
-        if published.knots is not None and published.serial != self._serial:
-            size = len(write_block(published.knots))
-            if size <= room:
-                blocks.append(published.knots)
-                room -= size
-                self._serial = published.serial
-        moving = published.moving
-        if moving is not None and moving is not self._whole and now_s >= self._moving_s + tuned.MOVING_EVERY_S:
-            cut = self._cut(moving, room)
-            if cut is not None:
-                blocks.append(cut)
-                room -= len(write_block(cut))
-                self._moving_s = now_s
-                # A set that was cut is sent again when the link takes more, even if it stays the newest.
-                self._whole = moving if len(cut.records) == len(moving.records) else None
+        blocks = self._moving(published, room, now_s)
+        room -= sum(len(write_block(block)) for block in blocks)
         # No more than the link takes until the next: what a message takes itself is not to be taken for a queue.
         room = min(room, max(round(tuned.TICK_S * self.link.bound_bytes_per_s), _LEAST_BYTES))
         return blocks + self._static(published.static, room)
+
+    def _moving(self, published: Published, room: int, now_s: float) -> list[Block]:
+        """Knots of a new publication, and the moving set when it is due."""
+        knots, moving = published.knots, published.moving
+        if knots is None or moving is None:
+            return []
+        blocks: list[Block] = []
+        size = len(write_block(knots))
+        if published.serial != self._serial and size <= room:
+            blocks.append(knots)
+            room -= size
+        others = knots.anchors != self._anchors
+        due = moving is not self._whole and now_s >= self._moving_s + tuned.MOVING_EVERY_S
+        cut = self._cut(moving, room) if others or due else None
+        if others and (cut is None or not blocks):
+            return []  # knots of other anchors move nothing that is there: with their moving set, or not at all
+        if blocks:
+            self._serial, self._anchors = published.serial, knots.anchors
+        if cut is not None:
+            blocks.append(cut)
+            self._moving_s = now_s
+            # A set that was cut is sent again when the link takes more, even if it stays the newest.
+            self._whole = moving if len(cut.records) == len(moving.records) else None
+        return blocks
 
     def _link(self, published: Published | None) -> dict[str, Any]:
         return {
@@ -233,7 +245,8 @@ class Visitor:
             blocks.append(StaticBlock(self._set, len(self._sent), first, static.scales, records))
             self._sent[first : first + len(records)] = records
             self._known[first : first + len(records)] = True
-        if not complete and self._known.all() and static.unseen is not None:
+        if self._known.all() and static.unseen is not None and static.unseen is not self._unseen:
+            self._unseen = static.unseen
             blocks.append(UnseenBlock(self._set, static.unseen[: len(self._sent)]))
         return blocks
 
@@ -251,6 +264,7 @@ class Visitor:
         if not self._same(newest) or wider:
             count = min(len(newest.records), max(self._takes(), tuned.CHUNK))
             self._set += 1
+            self._unseen = None
             self._sent, self._known = np.zeros(count, RECORD), np.zeros(count, np.bool_)
         count = len(self._sent)
         changed = noticeable(self._sent, newest.records[:count]) | ~self._known

@@ -71,8 +71,11 @@ def test_an_odd_status_file_is_survived(by_hand):
     control = NetworkControl(gui, EmulatorControl(Transport(), "x:1"))
     control.refresh({"by_hand": {"delay_ms": 9000.0, "loss": 0.5}})
     assert control.delay.value == MAX_SLIDER_DELAY_MS and control.loss.value == 50
-    control.refresh({"by_hand": by_hand})
-    assert "the scenario" in control.words.content and control.loss.value == 50
+    control.refresh({"by_hand": by_hand, "drawn_delay_ms": {"mean": 61.2}})
+    assert "the scenario" in control.words.content and (control.delay.value, control.loss.value) == (61, 0)
+    for odd in (None, {"mean": None}, {"mean": float("nan")}, "x"):
+        control.refresh({"by_hand": None, "drawn_delay_ms": odd})
+        assert control.delay.value == 0
 
 
 def test_a_certificate_speaks_for_the_edge_and_not_a_token_of_its_visitors(tmp_path):

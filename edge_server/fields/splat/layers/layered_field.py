@@ -129,6 +129,10 @@ class LayeredField:
             return f"learning the background: {frames} of {tuned.PLATE_FRAMES} frames of each camera"
         if self.supervision.early and len(self.observations):
             return f"learning the background: {self.observations.newest_s:.1f} of {tuned.PLATE_S:g} s"
+        static, earlier = self.supervision.static, self.supervision.earlier
+        if not static.ready and (earlier is None or earlier.step < tuned.EARLY_SHOWN_AFTER):
+            step = 0 if static.shown is None else static.shown.step
+            return f"learning the background: {step} of {static.shown_after} steps"
         return ""
 
     @property

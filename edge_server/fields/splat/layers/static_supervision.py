@@ -266,10 +266,13 @@ class StaticSupervision:
                 static.begin(plates, shown_after)
         else:
             images = self._plates(cameras)
+            # On a busy machine nothing worth seeing may have been learned until now: it is soon better than that.
+            seen = self.earlier is not None and self.earlier.step >= tuned.EARLY_SHOWN_AFTER
+            shown_after = tuned.SHOWN_AFTER if seen else tuned.EARLY_SHOWN_AFTER
 
             def begin() -> None:
                 static.field.begin_anew(None)
-                static.begin(images)
+                static.begin(images, shown_after)
 
         if beside:
             static.train_beside(begin, [camera.view for camera in cameras.values()])

@@ -155,6 +155,7 @@ export class SplatRenderer {
     this.lineBuffer = gl.createBuffer();
     this.capacity = 0;
     this.target = null;
+    this.frame = null;
     this.drawn = null; // the static set that the textures hold
     this.movingRows = 0;
     this.anchorValues = new Float32Array(4 * MOST_ANCHORS);
@@ -306,7 +307,7 @@ export class SplatRenderer {
       this._remove(this.target);
       this.target = createTexture(gl, gl.RGBA16F, width, height);
       this.targetSize = `${width}x${height}`;
-      this.frame = gl.createFramebuffer();
+      this.frame ??= gl.createFramebuffer();
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.target, 0);
     }

@@ -70,13 +70,13 @@ function connect() {
     if (savedBytes < SAVED_BYTES) {
       saved.push([performance.now() / 1000, data]);
       savedBytes += data.byteLength;
-    }
+    } else element("save").textContent = "save (first 256 MB)";
     if (told !== reader.status) tell();
   };
   socket.onclose = () => {
     if (playing !== null) return;
     say("The connection broke; trying again. The picture stays as it was.");
-    setTimeout(connect, retryMs);
+    setTimeout(() => playing === null && connect(), retryMs);
     retryMs = Math.min(2 * retryMs, 8000);
   };
 }
@@ -188,15 +188,15 @@ function frame(now) {
     since = now;
     const recent = stats.frames.slice(-20);
     const mean = recent.reduce((sum, each) => sum + each, 0) / Math.max(recent.length, 1);
-    element("drawn").textContent = `${stats.drawn} Gaussians, ${(1000 / Math.max(mean, 1)).toFixed(0)} a second`;
+    element("drawn").textContent = `${stats.drawn} Gaussians, ${(1000 / Math.max(mean, 1)).toFixed(0)} frames/s`;
   }
 }
 
 /** Fewer pixels where drawing is slow, more again where it is quick. A single slow frame, or a page that was hidden, does
  *  not count. */
 function adapt(took) {
-  if (fixedSize || took > 1000) return;
-  slowness = 0.9 * slowness + 0.1 * took;
+  if (fixedSize || document.hidden) return;
+  slowness = 0.9 * slowness + 0.1 * Math.min(took, 1000);
   if (slowness > FRAME_GOAL_MS && quality > LEAST_PIXELS) quality = Math.max(quality * 0.9, LEAST_PIXELS);
   else if (slowness < FRAME_GOAL_MS / 3 && quality < 1) quality = Math.min(quality * 1.05, 1);
   else return;

@@ -107,6 +107,22 @@ def test_answers_that_are_none_are_counted_and_cost_nothing():
         drawer.read_until(lambda: len(drawer.reader.at(NEWEST_S)) > 0)
 
 
+@pytest.mark.stability
+def test_who_acknowledges_without_reading_does_not_fill_the_memory():
+    state = bare_state()
+    with page_of(state) as page:
+        drawer = Drawer(page)
+        for number in range(400):  # all that may come
+            drawer.socket.send(number.to_bytes(4, "little"), websocket.ABNF.OPCODE_BINARY)
+        for number in range(60):
+            publish(state, snapshot(gaussians(6000, number % 5)), number)
+            drawer.socket.send((number + 1).to_bytes(4, "little"), websocket.ABNF.OPCODE_BINARY)
+            time.sleep(0.03)
+        (connected,) = page._splats._connected
+        assert connected.queue.qsize() <= 1
+        drawer.socket.close()
+
+
 def test_the_rules_of_the_page_hold_for_the_stream():
     state = bare_state()
     with page_of(state, Transport(tokens=TOKENS, insecure=True)) as page:

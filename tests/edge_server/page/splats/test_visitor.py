@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from edge_server.page.splats import settings as tuned
-from edge_server.page.splats.messages import KnotsBlock, MovingBlock, StaticBlock, StreamReader, read_message
+from edge_server.page.splats.messages import (
+    KnotsBlock,
+    MovingBlock,
+    StaticBlock,
+    StreamReader,
+    UnseenBlock,
+    read_message,
+)
 from edge_server.page.splats.published import Publisher
 from edge_server.page.splats.records import from_records
 from edge_server.page.splats.visitor import LinkWindow, Visitor
-from tests.edge_server.page.splats.gaussians import NEWEST_S, ORIGIN_NS, gaussians, snapshot
+from tests.edge_server.page.splats.gaussians import NEWEST_S, ORIGIN_NS, gaussians, motion, snapshot
 
 COUNT = 6000
 
@@ -142,3 +150,43 @@ def test_before_there_is_a_field_the_status_says_so():
     assert read_message(data)[2][0].content["line"] == "compiling"
     assert visitor.message(None, 5, {"line": "compiling"}, 0.1) is None
     assert visitor.message(None, 5, {"line": "compiling"}, tuned.STATUS_EVERY_S) is not None
+
+
+@pytest.mark.parametrize("kilobytes", [20, 60, 2000])
+def test_what_moves_stays_when_anchors_are_chosen_anew(kilobytes):
+    link = Link(1e3 * kilobytes)
+
+    def anew(now_s):
+        """Other anchors each half second."""
+        shown = trained(now_s)
+        again = shown.moving.motion.copy()
+        again.anchors = ANCHORS[int(now_s / 0.5) % 2]
+        return replace(shown, moving=replace(shown.moving, motion=again))
+
+    link.run(ticks(2.0), anew)
+    for tick in ticks(8.0, 2.0):
+        link.run(range(tick, tick + 1), anew)
+        assert len(link.reader.at(NEWEST_S)) > len(link.reader._shown.params)
+    assert len({block.anchors for block in link.of(MovingBlock)}) > 8
+
+
+ANCHORS = [motion().anchors.copy() for _ in range(2)]
+
+
+def test_what_no_camera_has_seen_is_said_also_when_it_is_known_later():
+    visitor, published, reader_bits = Visitor(), Publisher(0).take(trained(0.0), 0.0), []
+    for tick in ticks(2.0):
+        now_s = tick * tuned.TICK_S
+        if now_s > 1.0 and published.static.unseen is None:
+            published = replace(published, static=replace(published.static, unseen=BITS))
+        data = visitor.message(published, ORIGIN_NS, {}, now_s)
+        if data is not None:
+            number, _, blocks = read_message(data)
+            visitor.acknowledged(number, now_s + 0.01)
+            reader_bits += [(now_s, block.bits) for block in blocks if isinstance(block, UnseenBlock)]
+    ((when_s, bits),) = reader_bits
+    assert 1.0 < when_s < 1.1
+    np.testing.assert_array_equal(bits, BITS)
+
+
+BITS = np.arange(COUNT) % 3 == 0
