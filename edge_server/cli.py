@@ -145,7 +145,7 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run.add_argument(
         "--policy",
         metavar="NAME[:VALUE]",
-        help="in place of the scenario's: all, threshold:120, bandit:FILE (docs/scheduling.md)",
+        help="in place of the scenario's: all, threshold:120, bandit:FILE, FILE.py:CLASS (docs/scheduling.md)",
     )
     run.add_argument(
         "--lpips",

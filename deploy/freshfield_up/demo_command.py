@@ -64,6 +64,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--policy",
         metavar="NAME[:VALUE]",
-        help="in place of the scenario's: all, threshold:120, bandit:FILE (docs/scheduling.md)",
+        help="in place of the scenario's: all, threshold:120, bandit:FILE, FILE.py:CLASS (docs/scheduling.md)",
     )
     parser.set_defaults(run=run)

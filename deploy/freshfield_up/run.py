@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,6 +62,14 @@ def print_line(text: str) -> None:
         raise
 
 
+def command_line(argv: Sequence[str]) -> str:
+    """The command that a run was started with, from ``sys.argv``: of ``freshfield``, or of a script that uses the
+    library."""
+    script = Path(argv[0])
+    ours = script.name == "freshfield" or script.parent.name == "freshfield_up"  # python -m freshfield_up
+    return shlex.join(["freshfield", *argv[1:]] if ours else ["python", *argv])
+
+
 class Launcher:
     """Runs a scenario's processes. ``run`` may be called once.
 
@@ -88,7 +96,7 @@ class Launcher:
         options = self.options
         self.processes = process_set(self.scenario, options.out, options.port, options.data, options.seed, options.edge)
         about = {"scenario": str(self.scenario.path), "seed": self.scenario.seed, "port": options.port}
-        about["command"] = shlex.join(["freshfield", *sys.argv[1:]])
+        about["command"] = command_line(sys.argv)
         lock = folder.prepare(options.out, about)
         numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
         for number in numbers if threading.current_thread() is threading.main_thread() else ():

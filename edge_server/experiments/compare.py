@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.arguments import add_folders, at_least, command_parser, folders_of, run_command
 from edge_server.experiments.common.channels import read_channel
@@ -21,7 +23,7 @@ from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.rollouts.rollout import run_rollouts
 from edge_server.experiments.rollouts.setting import Setting, seeds
 from edge_server.machine import commit, machine
-from edge_server.scheduler import STATE_PARTS, short_name
+from edge_server.scheduler import STATE_PARTS, make_policy, parse_policy, short_name
 from edge_server.settings import ComputeConfig, read_config
 from freshfield.files import out_file, write_json
 from freshfield.machine_load import usable_cores
@@ -64,6 +66,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(args: argparse.Namespace) -> None:
     setting = setting_of(load(args.scenario), args.seconds, args.channel, args.costs, args.slower)
     labels = _labels(args.policies)
+    for policy in labels.values():
+        make_policy(*parse_policy(policy), np.random.default_rng(0))  # rejected before anything is computed
     with Engine(args.results, args.jobs, threads=1) as engine:
         table = compare(setting, folders_of(args), engine, labels, seeds(setting.scenario.seed, "test", args.seeds))
     print(as_text(table, list(labels)))
@@ -170,7 +174,7 @@ def _parser() -> argparse.ArgumentParser:
         "policies",
         nargs="+",
         metavar="POLICY",
-        help="as edge.policy, with its value: all, threshold:120, bandit:FILE (docs/scheduling.md)",
+        help="as edge.policy, with its value: all, threshold:120, bandit:FILE, FILE.py:CLASS (docs/scheduling.md)",
     )
     add("--seeds", type=at_least(1), default=8, metavar="N", help="number of seeds [%(default)s]")
     add("--channel", metavar="FILE|PRESET", help="a channel in place of the scenario's: a file, or a preset")

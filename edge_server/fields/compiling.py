@@ -1,4 +1,4 @@
-"""Tells people while numba compiles kernels, which else is a silence of tens of seconds.
+"""Tells people while numba compiles kernels, which takes tens of seconds and would otherwise print nothing.
 
 numba keeps what it compiled (``cache=True``) beside the sources or in ``NUMBA_CACHE_DIR``, for one kind of processor
 and one version of the source: a first start compiles, later ones load. It announces each function that it compiles,

@@ -68,7 +68,7 @@ class FieldUpdater:
     on_arrivals: select only after a frame has arrived since the last selection.
     number: number of the next update.
     forgiving: whether a policy that raises costs a decision only, all views used instead (live). policy_failures: how
-    often that was so.
+    often that was so with this policy.
     materialize: gives buffered frames their images and poses where these are made late (virtual time).
     """
 
@@ -84,7 +84,7 @@ class FieldUpdater:
         on_arrivals: bool = False,
     ) -> None:
         self.buffer = buffer
-        self.forgiving, self.policy_failures, self._unplanned = False, 0, False
+        self.forgiving, self._unplanned = False, False
         self.on_arrivals = on_arrivals
         self._selected_of = 0  # arrivals at the last selection
         self._selected: dict[str, Frame] = {}  # the newest selected frame of each camera
@@ -120,7 +120,7 @@ class FieldUpdater:
     def policy(self, policy: Policy) -> None:
         """Takes effect with the next decision. ValueError as ``check``."""
         self.check(policy)
-        self._policy = policy
+        self._policy, self.policy_failures = policy, 0
 
     def check(self, policy: Policy) -> None:
         """ValueError where ``policy`` needs embeddings that are not computed here: there is no embedder, or

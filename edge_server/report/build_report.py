@@ -76,7 +76,7 @@ def assemble(files: RunFiles) -> dict[str, Any]:
     if edge.depth is not None:
         report["depth"] = depth(edge.depth, files.ages)
     if edge.kind == "simulated":
-        report |= {"frames": None, "age_ms": None, "notes": []}  # simulation.json counts them
+        report |= {"frames": None, "age_ms": None, "notes": edge.troubles}  # simulation.json counts frames
     if edge.kind == "fit":
         data = msgspec.to_builtins(edge.data)
         report |= {"data": data, "frames": None, "age_ms": None, "channel": None, "notes": []}

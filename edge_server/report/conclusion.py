@@ -89,7 +89,7 @@ def _age(report: Report) -> str:
 
 
 def _limit(report: Report) -> str:
-    """What limited the picture: the cameras where even what stands still is a blur, else the larger part of the age."""
+    """What limited the picture: the cameras where even what stands still is a blur, else the largest part of age."""
     shown, flat = report["fidelity"]["shown"], report["fidelity"]["baseline"]["mean_colour_db"]
     still = shown["psnr_still_db"]
     lost = "; ".join(_delivery(report)).rstrip(".")
@@ -99,11 +99,12 @@ def _limit(report: Report) -> str:
     age = {name: ms or 0.0 for name, ms in shown["age_ms"].items()}
     if not any(age.values()):
         return f"{lost[:1].upper()}{lost[1:]}." if lost else ""
-    computing = age["waiting"] + age["computing"]
-    if age["network"] > computing:
-        text = "The network was the limit: it takes the larger part of that age"
-    else:
-        text = "Waiting for an update and computing it were the limit: they take more of that age than the network"
+    parts = {
+        "The network was the limit: it takes": age["network"],
+        "Waiting for an update and computing it were the limit: they take": age["waiting"] + age["computing"],
+        "Showing each image until the next was the limit: it takes": age["display"],
+    }
+    text = f"{max(parts, key=lambda name: parts[name])} the largest part of that age"
     return f"{text}{f'; {lost}' if lost else ''}."
 
 

@@ -247,3 +247,17 @@ def test_a_deployment_in_a_script_says_why_it_cannot_start(tmp_path: Path) -> No
         pass
     with pytest.raises(ScenarioError, match="shipped scenarios"):
         ff.deployment("nothing")
+
+
+@pytest.mark.parametrize(
+    ("argv", "command"),
+    [
+        (["/usr/bin/freshfield", "demo", "my file"], "freshfield demo 'my file'"),
+        (["/lib/freshfield_up/__main__.py", "demo"], "freshfield demo"),
+        (["examples/deployment.py", "card", "6"], "python examples/deployment.py card 6"),
+    ],
+)
+def test_the_record_names_the_command_that_can_be_given_again(argv: list[str], command: str) -> None:
+    from freshfield_up.run import command_line
+
+    assert command_line(argv) == command

@@ -98,6 +98,8 @@ def test_a_policy_that_raises_costs_its_decision_live_and_stops_what_is_measured
     assert live.policy_failures == failures
     assert f"own.py:{name} failed {failures} times" in live.troubles[0]
     assert len([line for line in caplog.messages if "all views are used" in line]) == 1
+    live.policy = make_policy("all", None, np.random.default_rng(0))
+    assert not live.troubles
     with pytest.raises((RuntimeError, KeyError)):
         measured.select(measured.plan(200 * MS), 200 * MS)
 

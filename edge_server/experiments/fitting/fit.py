@@ -287,7 +287,7 @@ def fit(
     seconds: of fitting; evaluation is not counted. holdout: as of ``load``, where data is a path.
     field: name of the representation (``edge-server fit --list-options``). options: of it, by name.
     progress: called with each evaluation: ``t_s``, ``psnr_db``, ``ssim``, ...
-    Raises DatasetError or OptionError.
+    Raises DatasetError or OptionError, and KeyboardInterrupt at Ctrl-C; ``Fit.run`` keeps what was fitted until then.
     """
     if not isinstance(data, MultiviewStill):
         data = open_still(Path(data), None if holdout is None else str(holdout))
@@ -296,7 +296,8 @@ def fit(
     check_seconds(seconds)
     made = Fit(data, field, options, seed=seed)
     made.field.warm_up()
-    made.run(seconds, None if progress is None else lambda at: progress(made.rows[-1]))
+    if not made.run(seconds, None if progress is None else lambda at: progress(made.rows[-1])):
+        raise KeyboardInterrupt
     made.findings()
     return made
 

@@ -229,6 +229,7 @@ def write_output(out: Path, found: dict[str, Any], deployment: VirtualDeployment
             "kind": "simulated",
             "run": run_facts(),
             "field": found["field"],
+            "troubles": deployment.updates.troubles,
             **{name: found[name] for name in names if name in found},
         },
     )
@@ -348,7 +349,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--policy",
         metavar="NAME[:VALUE]",
-        help="in place of the scenario's: all, threshold:120, bandit:FILE (docs/scheduling.md)",
+        help="in place of the scenario's: all, threshold:120, bandit:FILE, FILE.py:CLASS (docs/scheduling.md)",
     )
     add("--steps", type=int, metavar="N", help="optimizer steps of an update [edge.steps, else 100]")
     add("--compute", metavar="zero|MS:MS", help="ms per step and ms per update [edge.compute, else zero]")

@@ -70,3 +70,11 @@ def test_arguments_that_say_nothing_are_refused(made):
         ff.fit(made[0].data, seconds=0.0)
     with pytest.raises(OptionError, match="field 'nothing' is not known"):
         ff.fit(made[0].data, field="nothing")
+
+
+def test_ctrl_c_returns_no_half_fit(made):
+    def press(row):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ff.fit(made[0].data, seconds=0.2, field="splat", options=SMALL, progress=press)

@@ -18,6 +18,7 @@ from edge_server.experiments.virtual.costs import main as costs_main
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
 from edge_server.experiments.virtual.simulate import main, seconds_to
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
+from edge_server.report.build_report import build_report
 from edge_server.report.explain_command import main as explain
 from edge_server.scheduler.fixed import FreshestK
 from edge_server.scheduler.learned.decision_record import read_decision
@@ -87,6 +88,9 @@ def test_files_are_written_as_a_live_run_has_them(tmp_path: Path, capsys):
     lines = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
     found = json.loads((out / "simulation.json").read_text())
     assert len(lines) == found["updates"] and lines[0]["number"] == 0 and lines[-1]["psnr_db"] > 0
+    edge = json.loads((out / "edge.json").read_text())
+    (out / "edge.json").write_text(json.dumps({**edge, "troubles": [*edge["troubles"], "cam01 was bumped"]}))
+    assert build_report(out)["notes"][-1] == "cam01 was bumped"
 
 
 @pytest.mark.parametrize(
