@@ -13,6 +13,7 @@ that is loaded: see ``refuse_foreign``.
 
 from __future__ import annotations
 
+import ast
 import difflib
 import hashlib
 import importlib
@@ -20,6 +21,7 @@ import importlib.util
 import re
 import sys
 from collections.abc import Iterable, Mapping
+from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
@@ -86,7 +88,8 @@ def absolute(data: Any, folder: Path) -> Any:
 
 
 def files_named(data: Any) -> list[Path]:
-    """The files, sorted, of every FILE.py:CLASS in a JSON value, as far as they exist."""
+    """The source files, sorted, of every class from outside that a JSON value names, as far as they exist, with what
+    they import from their own folder; of a package, all of its files."""
     found, open_ = set[Path](), [data]
     while open_:
         value = open_.pop()
@@ -94,9 +97,54 @@ def files_named(data: Any) -> list[Path]:
             open_ += [*value.keys(), *value.values()]
         elif isinstance(value, list):
             open_ += value
-        elif isinstance(value, str) and (match := _FILE.fullmatch(value)) and Path(match["where"]).is_file():
-            found.add(Path(match["where"]))
+        elif isinstance(value, str):
+            _add_sources(_source(value), found)
     return sorted(found)
+
+
+def _source(name: str) -> Path | None:
+    """The file of FILE.py:CLASS, MODULE:CLASS or of an entry point; of a module in a package, the package's folder."""
+    if (match := _FILE.fullmatch(name)) is not None:
+        return Path(match["where"])
+    match = _MODULE.fullmatch(name)
+    module = match["where"] if match is not None else _installed_modules().get(split_value(name)[0])
+    if not module:
+        return None
+    try:
+        spec = importlib.util.find_spec(module.partition(".")[0])
+    except (ImportError, ValueError):
+        return None
+    if spec is None or (spec.origin is None and not spec.submodule_search_locations):
+        return None
+    return Path(next(iter(spec.submodule_search_locations or ()), spec.origin or ""))
+
+
+@cache
+def _installed_modules() -> dict[str, str]:
+    return {entry.name: entry.module for kind in KINDS for entry in entry_points(group=f"freshfield.{kind}")}
+
+
+def _add_sources(path: Path | None, found: set[Path]) -> None:
+    """Add a file and what it imports from its folder, or the files of a package's folder."""
+    if path is not None and path.is_dir():
+        found.update(path.rglob("*.py"))
+    if path is None or path in found or not path.is_file():
+        return
+    found.add(path)
+    if path.parent.name in ("site-packages", "dist-packages"):  # beside it is everything that is installed
+        return
+    try:
+        tree = ast.parse(path.read_bytes())
+    except (SyntaxError, ValueError):  # said where it is imported
+        return
+    for node in ast.walk(tree):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module]
+        for root in {name.partition(".")[0] for name in names}:
+            _add_sources(path.parent / f"{root}.py", found)
+            if (path.parent / root / "__init__.py").is_file():
+                _add_sources(path.parent / root, found)
 
 
 def short_name(name: str) -> str:
