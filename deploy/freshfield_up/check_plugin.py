@@ -287,7 +287,7 @@ CONTRACTS = {"policy": policy, "effect": effect, "fault": fault, "field": field,
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``freshfield check-plugin``."""
-    parser.add_argument("kind", choices=CONTRACTS, metavar="KIND", help=f"one of {', '.join(CONTRACTS)}")
+    parser.add_argument("kind", choices=tuple(CONTRACTS), metavar="KIND", help=f"one of {', '.join(CONTRACTS)}")
     parser.add_argument("name", metavar="NAME", help="FILE.py:CLASS, MODULE:CLASS, or the name of an entry point")
     parser.add_argument("parameters", nargs="*", metavar="KEY=VALUE", help="of it; not given: its defaults")
     parser.set_defaults(run=run)
