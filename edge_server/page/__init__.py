@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import socket
-import threading
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
@@ -20,6 +19,7 @@ from edge_server.live.state import EdgeState
 from edge_server.page.access_guard import AccessGuard
 from edge_server.page.controls import add_view_choice, notify
 from edge_server.page.network_control import EmulatorControl
+from edge_server.page.page_thread import PageThread
 from edge_server.page.panel import Panel
 from edge_server.page.rendering import RenderLoop
 from edge_server.page.scene import Scene
@@ -124,37 +124,24 @@ def start_page(
     return Page(page_url(host, port, tls is not None), port, server, refresher, renders, splats)
 
 
-class _Refresher:
+class _Refresher(PageThread):
     """The thread that keeps scene, panel and history up to date, at a fixed low rate."""
 
     def __init__(self, server: viser.ViserServer, state: EdgeState, scene: Scene, panel: Panel) -> None:
+        super().__init__("page", "refresh")
         self._server, self._state, self._scene, self._panel = server, state, scene, panel
         self._history = History()
-        self._stopped = threading.Event()
-        self._last_error = ""
-        self._thread = threading.Thread(target=self._run, name="page", daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def stop(self) -> None:
-        self._stopped.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=5.0)
 
     def _run(self) -> None:
-        while not self._stopped.is_set():
+        while not self._stopped:
             began = perf_counter()
             try:
                 self._refresh()
             except Exception as error:  # the page must never stop the server
-                text = f"{type(error).__name__}: {error}"
-                if text != self._last_error:
-                    self._last_error = text
-                    log.warning("page: refresh failed: %s", text, exc_info=error)
+                self._say(error)
             # A slow refresh (a busy machine) is followed by an equally long pause.
             spent = perf_counter() - began
-            self._stopped.wait(max(REFRESH_S - spent, spent))
+            self._pause(max(REFRESH_S - spent, spent))
 
     def _refresh(self) -> None:
         state = self._state

@@ -8,7 +8,6 @@ in bands of rows, and an image whose visitor moves is abandoned between two band
 from __future__ import annotations
 
 import logging
-import threading
 from dataclasses import dataclass
 from itertools import pairwise
 from time import perf_counter
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from edge_server.fields import Rendering, Snapshot
 from edge_server.live.state import Comparison, EdgeState
 from edge_server.page import views
+from edge_server.page.page_thread import PageThread
 from edge_server.page.viewpoint import row_band, visitor_camera
 from freshfield.geometry import Pinhole
 
@@ -81,28 +81,16 @@ class ClientState:
     view: str = views.PICTURE
 
 
-class RenderLoop:
+class RenderLoop(PageThread):
     """The render thread."""
 
     def __init__(self, state: EdgeState) -> None:
+        super().__init__("page-render", "rendering for a visitor")
         self._state = state
         self._visitors: dict[int, ClientState] = {}
-        self._wake = threading.Condition()
-        self._stopped = False
         self._rows = [1.5 * level.min_rows for level in LEVELS]
         self._not_before = [0.0] * len(LEVELS)
         self._took_s = [level.budget_s for level in LEVELS]  # the last whole image of each level
-        self._last_error = ""
-        self._thread = threading.Thread(target=self._run, name="page-render", daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def stop(self) -> None:
-        with self._wake:
-            self._stopped = True
-            self._wake.notify_all()
-        self._thread.join(timeout=5.0)
 
     # --- called from viser's threads --------------------------------------------------------------
 
@@ -281,10 +269,7 @@ class RenderLoop:
 
     def _log_error(self, error: Exception) -> None:
         """Log an error once, not at every frame, and pause for a second."""
-        text = f"{type(error).__name__}: {error}"
-        if text != self._last_error:
-            log.warning("page: rendering for a visitor failed: %s", text, exc_info=error)
-            self._last_error = text
+        self._say(error)
         until = perf_counter() + 1.0
         self._not_before = [max(t, until) for t in self._not_before]
 

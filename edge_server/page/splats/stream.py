@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -24,14 +23,13 @@ from websockets.http11 import Response
 
 from edge_server.live.state import CameraView, EdgeState
 from edge_server.page.colors import HELD_OUT, age_color
+from edge_server.page.page_thread import PageThread
 from edge_server.page.splats.settings import TICK_S
 from edge_server.page.viewpoint import VERTICAL_FOV_RAD, Viewpoint
 
 if TYPE_CHECKING:  # with the kernels of Gaussians, which another field does not need
     from edge_server.page.splats.published import Publisher
     from edge_server.page.splats.visitor import Visitor
-
-log = logging.getLogger(__name__)
 
 PATH = "/splats/"
 STREAM = PATH + "stream"
@@ -79,30 +77,17 @@ class _Connected:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
 
-class SplatStream:
+class SplatStream(PageThread):
     """The stream of one run.
 
     viewpoint: where visitors begin; None while it is not known.
     """
 
     def __init__(self, state: EdgeState, viewpoint: Callable[[], Viewpoint | None]) -> None:
+        super().__init__("page-splats", "composing splats")
         self._state, self._viewpoint = state, viewpoint
         self._publisher: Publisher | None = None
         self._connected: list[_Connected] = []
-        self._wake = threading.Condition()
-        self._stopped = False
-        self._last_error = ""
-        self._thread = threading.Thread(target=self._run, name="page-splats", daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def stop(self) -> None:
-        with self._wake:
-            self._stopped = True
-            self._wake.notify_all()
-        if self._thread.is_alive():
-            self._thread.join(timeout=5.0)
 
     async def serve(self, connection: ServerConnection) -> None:
         """Send a visitor the stream until they leave. What they send: the number of the newest message that they have
@@ -140,13 +125,9 @@ class SplatStream:
             try:
                 self._tick(connected)
             except Exception as error:  # the page must never stop the server
-                text = f"{type(error).__name__}: {error}"
-                if text != self._last_error:
-                    self._last_error = text
-                    log.warning("page: splats: %s", text, exc_info=error)
+                self._say(error)
             spent = perf_counter() - began
-            with self._wake:
-                self._wake.wait_for(lambda: self._stopped, max(TICK_S - spent, spent))
+            self._pause(max(TICK_S - spent, spent))
 
     def _tick(self, connected: list[_Connected]) -> None:
         from edge_server.page.splats.published import Publisher
