@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,7 +27,7 @@ SCENE, STATIC, MOVING, KNOTS, STATUS, UNSEEN = range(1, 7)
 _SCENE = struct.Struct("<II3fff3f")
 _STATIC = struct.Struct("<IIII2f")
 _MOVING = struct.Struct("<II2f")
-_KNOTS = struct.Struct("<Iidfffhh")
+_KNOTS = struct.Struct("<Iddfffhh")
 _UNSEEN = struct.Struct("<II")
 MOST_GAUSSIANS, MOST_KNOTS = 1 << 20, 64
 
@@ -84,13 +84,13 @@ class KnotsBlock:
     """Displacements of the anchors at the newest knots.
 
     anchors: number of the set of anchors: moving sets with another number are not moved by these.
-    first: number of the first knot; knot k is at k / knots_per_s. newest_s: instant of the newest frame; nothing is
-    shown more than ahead_s after it. Instants are seconds since the field began.
+    first_s: instant of the first knot; those that follow are 1 / knots_per_s apart. newest_s: instant of the newest
+    frame; nothing is shown more than ahead_s after it. Instants are seconds since the run began.
     displacements: float32 (K, A, 3), scene units.
     """
 
     anchors: int
-    first: int
+    first_s: float
     knots_per_s: float
     newest_s: float
     ahead_s: float
@@ -116,8 +116,13 @@ Block = SceneBlock | StaticBlock | MovingBlock | KnotsBlock | UnseenBlock | Stat
 
 
 def write_message(number: int, instant_s: float, blocks: list[Block]) -> bytes:
-    """A message. number: counts from 0, modulo 2^32. instant_s: the edge's present, seconds since the field began."""
-    return HEAD.pack(number & 0xFFFFFFFF, instant_s) + b"".join(map(write_block, blocks))
+    """A message. number: counts from 0, modulo 2^32. instant_s: the edge's present, seconds since the run began."""
+    return join_blocks(number, instant_s, map(write_block, blocks))
+
+
+def join_blocks(number: int, instant_s: float, blocks: Iterable[bytes]) -> bytes:
+    """``write_message`` of blocks that are written already."""
+    return HEAD.pack(number & 0xFFFFFFFF, instant_s) + b"".join(blocks)
 
 
 def write_block(block: Block) -> bytes:
@@ -148,7 +153,7 @@ def _knots(block: KnotsBlock) -> bytes:
     """Displacements as 16 bits of the largest one."""
     count, anchors = block.displacements.shape[:2]
     unit = max(float(np.abs(block.displacements).max(initial=0.0)), 1e-6) / 32767
-    head = block.anchors, block.first, block.newest_s, block.knots_per_s, block.ahead_s, unit, count, anchors
+    head = block.anchors, block.first_s, block.newest_s, block.knots_per_s, block.ahead_s, unit, count, anchors
     return _KNOTS.pack(*head) + np.rint(block.displacements / unit).astype("<i2").tobytes()
 
 
@@ -223,15 +228,15 @@ def _moving(content: bytes) -> MovingBlock:
 
 
 def _read_knots(content: bytes) -> KnotsBlock:
-    set_number, first, newest_s, rate, ahead_s, unit, count, anchors = _KNOTS.unpack_from(content)
+    set_number, first_s, newest_s, rate, ahead_s, unit, count, anchors = _KNOTS.unpack_from(content)
     if not (4 <= count <= MOST_KNOTS and 0 <= anchors <= MOST_ANCHORS):
         raise MessageError(f"{count} knots of {anchors} anchors")
-    _finite(rate, newest_s, ahead_s, unit)
+    _finite(first_s, rate, newest_s, ahead_s, unit)
     if rate <= 0.0:
         raise MessageError(f"{rate} knots a second")
     _length(content, _KNOTS.size + 6 * count * anchors)
     values = np.frombuffer(content, "<i2", 3 * count * anchors, _KNOTS.size).reshape(count, anchors, 3)
-    return KnotsBlock(set_number, first, rate, newest_s, ahead_s, values.astype(np.float32) * np.float32(unit))
+    return KnotsBlock(set_number, first_s, rate, newest_s, ahead_s, values.astype(np.float32) * np.float32(unit))
 
 
 def _unseen(content: bytes) -> UnseenBlock:
@@ -350,7 +355,7 @@ def displacements_at(block: KnotsBlock, instant_s: float) -> NDArray[np.float32]
     """Displacements (A, 3) at an instant: a Catmull-Rom spline, and a straight line past the last knot and before the
     first (``fields.splat.layers.motion``)."""
     knots, last = block.displacements, len(block.displacements) - 1
-    x = max(instant_s * block.knots_per_s - block.first, 0.0)
+    x = max((instant_s - block.first_s) * block.knots_per_s, 0.0)
     i = min(int(x), last)
     f = np.float32(x - i)
     if i == last:

@@ -41,11 +41,10 @@ class StaticRecords:
 
 @dataclass(frozen=True)
 class Published:
-    """A publication. serial: counts them. origin_ns: where the stream's seconds begin, on the clock of frames.
-    moving: those of largest weight first; None, and knots None, where nothing moves."""
+    """A publication. serial: counts them. moving: those of largest weight first; None, and knots None, where nothing
+    moves."""
 
     serial: int
-    origin_ns: int
     scene: SceneBlock
     static: StaticRecords
     moving: MovingBlock | None
@@ -53,13 +52,15 @@ class Published:
 
 
 class Publisher:
-    """Turns snapshots into ``Published``. start_ns: begin of the run, from which seconds count where nothing moves."""
+    """Turns snapshots into ``Published``. start_ns: begin of the run, from which the stream's seconds count; on the
+    clock of frames."""
 
     def __init__(self, start_ns: int) -> None:
         self._start_ns = start_ns
         self._snapshot: object = None
+        self._behind = False  # whether static records are of an earlier snapshot, because it was too soon for new ones
         self._newest: Published | None = None
-        self._identity: tuple[SceneBox, int] | None = None
+        self._box: SceneBox | None = None
         self._fields = self._anchor_sets = self._sets = self._versions = 0
         self._anchors: NDArray[np.float64] | None = None
         self._order = np.zeros(0, np.intp)
@@ -70,34 +71,37 @@ class Publisher:
         """The newest publication as records. None: the field does not consist of Gaussians. now_s: any clock."""
         if not isinstance(snapshot, SplatSnapshot):
             return None
-        if snapshot is self._snapshot:
+        if snapshot is self._snapshot and not self._behind:
             return self._newest
         layered = snapshot if isinstance(snapshot, LayeredSnapshot) and snapshot.static is not None else None
         moving = None if layered is None else layered.moving
-        origin_ns = self._start_ns if moving is None else moving.origin_ns
         before = self._newest
-        if (snapshot.box, origin_ns) != self._identity:
-            self._identity = snapshot.box, origin_ns
+        if snapshot.box != self._box:
+            self._box = snapshot.box
             self._fields += 1
             before = None
         params = snapshot.gaussians.params if layered is None or layered.static is None else layered.static
         static = self._static(params, None if before is None else before.static, now_s, layered)
         box = snapshot.box
+        if snapshot is self._snapshot and before is not None and static is before.static:
+            return self._newest
         red, green, blue = map(float, snapshot.background)
         scene = SceneBlock(self._fields, box.centre_m, box.radius_m, box.near_m / box.radius_m, (red, green, blue))
         records, knots = (None, None) if moving is None else self._moving(moving)
         serial = 0 if self._newest is None else self._newest.serial + 1
         self._snapshot = snapshot
-        self._newest = Published(serial, origin_ns, scene, static, records, knots)
+        self._newest = Published(serial, scene, static, records, knots)
         return self._newest
 
     def _static(
         self, params: NDArray[np.float32], before: StaticRecords | None, now_s: float, layered: LayeredSnapshot | None
     ) -> StaticRecords:
-        if before is not None and now_s < self._static_due_s:
+        self._behind = before is not None and now_s < self._static_due_s
+        if self._behind and before is not None:
             return before
         same = before is not None and self._same(params)
-        if before is not None and not same and now_s < self._set_since_s + NEW_SET_EVERY_S:
+        self._behind = before is not None and not same and now_s < self._set_since_s + NEW_SET_EVERY_S
+        if self._behind and before is not None:
             return before
         began = perf_counter()
         if before is None or not same:
@@ -145,5 +149,6 @@ class Publisher:
             share[:, :2].astype(np.uint8),
         )
         first, knots = motion.newest_knots(KNOTS_SENT)
-        rate, newest_s = float(layers.KNOTS_PER_S), moving.newest_s
-        return block, KnotsBlock(self._anchor_sets, first, rate, newest_s, layers.MAX_AHEAD_S, knots)
+        rate, begin_s = float(layers.KNOTS_PER_S), (moving.origin_ns - self._start_ns) / 1e9
+        instants = begin_s + first / rate, rate, begin_s + moving.newest_s
+        return block, KnotsBlock(self._anchor_sets, *instants, layers.MAX_AHEAD_S, knots)

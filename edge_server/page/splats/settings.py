@@ -31,7 +31,7 @@ NEW_SET_S = 2.0
 
 FIRST_WINDOW, LEAST_WINDOW, MOST_WINDOW = 8_192, 4_096, 2_000_000
 """Bytes under way to a visitor: at first, at least, at most."""
-QUEUE_S = 0.1
+QUEUE_S = 0.08
 """Delay beyond the shortest round trip at which a link counts as full."""
 JITTER_OF = 2
 """Round trips whose least is compared with that."""

@@ -140,7 +140,7 @@ class SplatStream(PageThread):
             if not each.queue.empty():  # what an acknowledgement says, the connection has not taken yet
                 continue
             with each.lock:
-                data = each.visitor.message(published, self._state.now_ns(), status, monotonic())
+                data = each.visitor.message(published, self._state.now_s(), status, monotonic())
             if data is not None:
                 with contextlib.suppress(RuntimeError):  # the loop has ended
                     each.loop.call_soon_threadsafe(each.queue.put_nowait, data)

@@ -15,19 +15,19 @@ from numpy.typing import NDArray
 
 from edge_server.page.splats import settings as tuned
 from edge_server.page.splats.messages import (
-    Block,
     MovingBlock,
     StaticBlock,
     StatusBlock,
     UnseenBlock,
+    join_blocks,
     write_block,
-    write_message,
 )
 from edge_server.page.splats.published import Published, StaticRecords
 from edge_server.page.splats.records import RECORD, noticeable
 
 _MOVING_BYTES = RECORD.itemsize + 5
 _HEADS = 32  # bytes of a static block beside its records
+EMPTY = MovingBlock(0, (-1.0, 0.0), np.zeros(0, RECORD), np.zeros((0, 3), np.uint8), np.zeros((0, 2), np.uint8))
 _LEAST_BYTES = tuned.CHUNK * RECORD.itemsize + _HEADS  # that a message may have
 
 
@@ -118,7 +118,8 @@ class Visitor:
         self._number = 0
         self._field = -1
         self._serial = -1  # of the newest publication sent
-        self._status_s = self._moving_s = -np.inf
+        self._status_s = -np.inf  # when it was told last
+        self._moving_s = -np.inf  # when the next moving set is due
         self._anchors = -1  # number of the set of anchors whose knots were sent
         self._whole: MovingBlock | None = None  # the moving set, once all of it was sent
         self._forget_static()
@@ -141,70 +142,75 @@ class Visitor:
         self.link.acknowledged(number, now_s)
 
     def message(
-        self, published: Published | None, present_ns: int, status: dict[str, Any], now_s: float
+        self, published: Published | None, present_s: float, status: dict[str, Any], now_s: float
     ) -> bytes | None:
         """What to send now; None: nothing new, or the link is full.
 
         published: None while there is nothing to draw.
-        present_ns: the present, on the clock of frames. status: what all visitors are told; the link's is added.
+        present_s: the present, seconds since the run began. status: what all visitors are told; the link's is added.
         """
         if self.link.room < tuned.LEAST_WINDOW // 4 or self.link.drains(now_s):
             self.link.short = True
             return None
         room = self.link.room
         self.link.short = False
-        blocks: list[Block] = []
+        blocks: list[bytes] = []
         if published is not None and published.scene.field != self._field:
             self._field = published.scene.field
             self._forget_static()
-            blocks.append(published.scene)
+            blocks.append(write_block(published.scene))
         told = now_s >= self._status_s + tuned.STATUS_EVERY_S
         if told:
-            blocks.append(StatusBlock(status | {"link": self._link(published)}))
-        room -= sum(len(write_block(block)) for block in blocks)
+            blocks.append(write_block(StatusBlock(status | {"link": self._link(published)})))
+        room -= sum(map(len, blocks))
         if published is not None:
             blocks += self._newest(published, room, now_s)
         if not blocks:
             return None
         if told:
             self._status_s = now_s
-        instant_s = 0.0 if published is None else (present_ns - published.origin_ns) / 1e9
-        data = write_message(self._number, instant_s, blocks)
+        data = join_blocks(self._number, present_s, blocks)
         self.link.sent(self._number, len(data), now_s)
         self._number = (self._number + 1) & 0xFFFFFFFF
         return data
 
-    def _newest(self, published: Published, room: int, now_s: float) -> list[Block]:
+    def _newest(self, published: Published, room: int, now_s: float) -> list[bytes]:
         """Knots, moving set and static chunks, as far as there is room."""
         blocks = self._moving(published, room, now_s)
-        room -= sum(len(write_block(block)) for block in blocks)
+        room -= sum(map(len, blocks))
         # No more than the link takes until the next: what a message takes itself is not to be taken for a queue.
         room = min(room, max(round(tuned.TICK_S * self.link.bound_bytes_per_s), _LEAST_BYTES))
         return blocks + self._static(published.static, room)
 
-    def _moving(self, published: Published, room: int, now_s: float) -> list[Block]:
+    def _moving(self, published: Published, room: int, now_s: float) -> list[bytes]:
         """Knots of a new publication, and the moving set when it is due."""
         knots, moving = published.knots, published.moving
         if knots is None or moving is None:
-            return []
-        blocks: list[Block] = []
-        size = len(write_block(knots))
-        if published.serial != self._serial and size <= room:
-            blocks.append(knots)
-            room -= size
+            return self._nothing_moves()
+        blocks = [] if published.serial == self._serial else [write_block(knots)]
+        if blocks and len(blocks[0]) > room:
+            blocks.clear()
         others = knots.anchors != self._anchors
-        due = moving is not self._whole and now_s >= self._moving_s + tuned.MOVING_EVERY_S
-        cut = self._cut(moving, room) if others or due else None
+        due = moving is not self._whole and now_s >= self._moving_s
+        cut = self._cut(moving, room - sum(map(len, blocks))) if others or due else None
         if others and (cut is None or not blocks):
             return []  # knots of other anchors move nothing that is there: with their moving set, or not at all
         if blocks:
             self._serial, self._anchors = published.serial, knots.anchors
         if cut is not None:
-            blocks.append(cut)
-            self._moving_s = now_s
+            blocks.append(write_block(cut))
+            takes_s = len(blocks[-1]) / (tuned.MOVING_SHARE * self.link.bound_bytes_per_s)
+            self._moving_s = now_s + max(tuned.MOVING_EVERY_S, takes_s)
             # A set that was cut is sent again when the link takes more, even if it stays the newest.
             self._whole = moving if len(cut.records) == len(moving.records) else None
         return blocks
+
+    def _nothing_moves(self) -> list[bytes]:
+        """An empty set, once, in place of what moved."""
+        if self._anchors < 0:
+            return []
+        self._anchors, self._whole = -1, None
+        return [write_block(EMPTY)]
 
     def _link(self, published: Published | None) -> dict[str, Any]:
         return {
@@ -225,13 +231,13 @@ class Visitor:
 
     # --- what stands still --------------------------------------------------------------------
 
-    def _static(self, newest: StaticRecords, room: int) -> list[Block]:
+    def _static(self, newest: StaticRecords, room: int) -> list[bytes]:
         """Chunks that are due, as many as fit."""
         complete = bool(self._known.all())
         wider = complete and self._takes() > 2 * len(self._sent) < 2 * len(newest.records)
         if wider or (newest is not self._source and (complete or self._same(newest))):
             self._take(newest, wider)
-        static, blocks = self._source, list[Block]()
+        static, blocks = self._source, list[bytes]()
         if static is None:
             return blocks
         while self._due:
@@ -242,12 +248,12 @@ class Visitor:
                 self.link.short = True
                 break
             self._due.pop(0)
-            blocks.append(StaticBlock(self._set, len(self._sent), first, static.scales, records))
+            blocks.append(write_block(StaticBlock(self._set, len(self._sent), first, static.scales, records)))
             self._sent[first : first + len(records)] = records
             self._known[first : first + len(records)] = True
         if self._known.all() and static.unseen is not None and static.unseen is not self._unseen:
             self._unseen = static.unseen
-            blocks.append(UnseenBlock(self._set, static.unseen[: len(self._sent)]))
+            blocks.append(write_block(UnseenBlock(self._set, static.unseen[: len(self._sent)])))
         return blocks
 
     def _same(self, newest: StaticRecords) -> bool:

@@ -120,17 +120,17 @@ export class StreamReader {
   }
 
   _knots(view) {
-    const [count, anchors] = [view.getInt16(28, true), view.getInt16(30, true)];
+    const [count, anchors] = [view.getInt16(32, true), view.getInt16(34, true)];
     if (count < 4 || count > MOST_KNOTS || anchors < 0 || anchors > 255) throw new Error(`${count} knots of ${anchors} anchors`);
-    const unit = view.getFloat32(24, true);
+    const unit = view.getFloat32(28, true);
     const values = new Float32Array(3 * count * anchors);
-    for (let k = 0; k < values.length; k++) values[k] = view.getInt16(32 + 2 * k, true) * unit;
+    for (let k = 0; k < values.length; k++) values[k] = view.getInt16(36 + 2 * k, true) * unit;
     this.knots = {
       set: view.getUint32(0, true),
-      first: view.getInt32(4, true),
-      newest: view.getFloat64(8, true),
-      rate: view.getFloat32(16, true),
-      ahead: view.getFloat32(20, true),
+      first: view.getFloat64(4, true),
+      newest: view.getFloat64(12, true),
+      rate: view.getFloat32(20, true),
+      ahead: view.getFloat32(24, true),
       count,
       anchors,
       values,
@@ -156,7 +156,7 @@ export class StreamReader {
   displacements(instant, out) {
     const k = this.knots;
     const last = k.count - 1;
-    const x = Math.max(Math.min(instant, k.newest + k.ahead) * k.rate - k.first, 0);
+    const x = Math.max((Math.min(instant, k.newest + k.ahead) - k.first) * k.rate, 0);
     const i = Math.min(Math.floor(x), last);
     const f = x - i;
     const stride = 3 * k.anchors;

@@ -31,7 +31,7 @@ RECORDS = to_records(gaussians(40, 0), SCALES)
 SCENE = SceneBlock(3, (1.0, 2.0, 3.0), 2.0, 0.125, (0.0, 0.5, 1.0))
 ANCHOR = np.arange(120, dtype=np.uint8).reshape(40, 3) % 5
 SHARE = np.full((40, 2), 100, np.uint8)
-KNOTS = KnotsBlock(8, 150, 15.0, 10.5, 0.25, np.linspace(-0.5, 0.7, 4 * 5 * 3, dtype=np.float32).reshape(4, 5, 3))
+KNOTS = KnotsBlock(8, 10.0, 15.0, 10.5, 0.25, np.linspace(-0.5, 0.7, 4 * 5 * 3, dtype=np.float32).reshape(4, 5, 3))
 BLOCKS = [
     SCENE,
     StaticBlock(1, 60, 20, SCALES, RECORDS),
@@ -49,7 +49,7 @@ def test_every_block_comes_back():
     for wanted, got, names in (
         (BLOCKS[1], found[1], ("set_number", "total", "first", "scales", "records")),
         (BLOCKS[2], found[2], ("anchors", "scales", "records", "anchor", "share")),
-        (BLOCKS[3], found[3], ("anchors", "first", "knots_per_s", "newest_s", "ahead_s")),
+        (BLOCKS[3], found[3], ("anchors", "first_s", "knots_per_s", "newest_s", "ahead_s")),
         (BLOCKS[4], found[4], ("set_number", "bits")),
     ):
         for name in names:
@@ -95,9 +95,9 @@ def lying(block, *numbers):
         lying(BLOCKS[1], (3, 39)),
         lying(BLOCKS[2], (1, 2**30)),
         lying(BLOCKS[2], (1, 41)),
-        lying(BLOCKS[3], (7, 0x7FFF7FFF)),
-        lying(BLOCKS[3], (7, 3)),
-        lying(BLOCKS[3], (4, 0)),  # no knots a second
+        lying(BLOCKS[3], (8, 0x7FFF7FFF)),
+        lying(BLOCKS[3], (8, 3)),
+        lying(BLOCKS[3], (5, 0)),  # no knots a second
         lying(BLOCKS[4], (1, 2**31)),
         write_message(0, 0.0, []) + struct.pack("<II", messages.STATUS, 2**31),
         write_message(0, 0.0, []) + struct.pack("<II", messages.STATUS, 4) + b"[1] ",
@@ -117,7 +117,7 @@ def test_a_message_that_lies_is_refused_and_loses_nothing(data):
 
 def test_displacements_are_those_of_the_motion():
     first, knots = motion().newest_knots(6)
-    block = KnotsBlock(0, first, 15.0, 10.0, 0.3, knots)
+    block = KnotsBlock(0, first / 15.0, 15.0, 10.0, 0.3, knots)
     for instant_s in np.arange(first + 1.0, first + 8.0, 0.37) / 15.0:  # also past the last knot
         np.testing.assert_allclose(displacements_at(block, instant_s), motion().at(instant_s), atol=1e-6)
 

@@ -13,6 +13,8 @@ from edge_server.page.splats.published import Published, Publisher
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, snapshot
 
+START_NS, BEGIN_S = ORIGIN_NS - 3_500_000_000, 3.5  # the run began before the field's motion
+
 
 def read(published: Published, instant_s: float):
     """What a visitor draws who has all of a publication."""
@@ -26,11 +28,11 @@ def read(published: Published, instant_s: float):
 
 def test_the_visitor_sees_what_the_edge_renders():
     shown = snapshot()
-    published = Publisher(0).take(shown, 0.0)
-    assert published is not None and published.origin_ns == ORIGIN_NS
+    published = Publisher(START_NS).take(shown, 0.0)
+    assert published is not None
     for ahead_s in (-0.2, 0.0, 0.13, 0.5):
         wanted = shown.at(ORIGIN_NS + round((NEWEST_S + ahead_s) * 1e9))
-        got = replace(shown, gaussians=Gaussians(read(published, NEWEST_S + ahead_s), 0))
+        got = replace(shown, gaussians=Gaussians(read(published, BEGIN_S + NEWEST_S + ahead_s), 0))
         one, two = (each.render(POSE, LENS).color for each in (wanted, got))
         assert psnr(one, two) > 50.0 and one.std() > 0.1
 
@@ -47,23 +49,26 @@ def test_a_set_is_the_same_one_while_the_field_trains_on():
     shuffled = publisher.take(snapshot(params[::-1].copy()), 2.0)
     fewer = publisher.take(snapshot(params[:600]), 4.0)
     assert [each.static.number for each in (trained, shuffled, fewer)] == [1, 2, 3]
-    growing = publisher.take(snapshot(params[:650]), 4.7)
+    grown = snapshot(params[:650])
+    growing = publisher.take(grown, 4.7)
     assert growing.static is fewer.static  # a new set a second at most
+    assert publisher.take(grown, 4.9) is growing
+    assert len(publisher.take(grown, 5.1).static.records) == 650  # also if nothing more is published
 
 
-def test_another_box_or_origin_is_another_field():
+def test_another_box_is_another_field():
     publisher = Publisher(0)
     fields = [
         publisher.take(shown, 0.0).scene.field
         for shown in (snapshot(), snapshot(movers=100), snapshot(box=replace(BOX, radius_m=3.0)), snapshot(movers=0))
     ]
-    assert fields == [1, 1, 2, 3]
+    assert fields == [1, 1, 2, 3]  # the last: the first box again
 
 
 def test_a_still_field_and_one_without_gaussians():
     still = SplatSnapshot(BOX, Gaussians(gaussians(50, 0), 0), np.zeros(3, np.float32), snapshot().pool, 0)
     published = Publisher(5).take(still, 0.0)
-    assert (published.moving, published.knots, published.origin_ns) == (None, None, 5)
+    assert (published.moving, published.knots) == (None, None)
     assert len(published.static.records) == 50
     assert Publisher(0).take(object(), 0.0) is None
     again = Publisher(0)

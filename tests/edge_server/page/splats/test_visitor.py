@@ -20,7 +20,7 @@ from edge_server.page.splats.messages import (
 from edge_server.page.splats.published import Publisher
 from edge_server.page.splats.records import from_records
 from edge_server.page.splats.visitor import LinkWindow, Visitor
-from tests.edge_server.page.splats.gaussians import NEWEST_S, ORIGIN_NS, gaussians, motion, snapshot
+from tests.edge_server.page.splats.gaussians import NEWEST_S, gaussians, motion, snapshot
 
 COUNT = 6000
 
@@ -50,7 +50,7 @@ class Link:
             while self.acknowledged and self.acknowledged[0][0] <= now_s:
                 self.visitor.acknowledged(self.acknowledged.popleft()[1], now_s)
             published = self.publisher.take((shown or trained)(now_s), now_s)
-            data = self.visitor.message(published, ORIGIN_NS, {"line": ""}, now_s)
+            data = self.visitor.message(published, NEWEST_S, {"line": ""}, now_s)
             if data is not None:
                 self.free_s = max(self.free_s, now_s) + len(data) / self.rate
                 self.under_way.append((self.free_s + self.delay_s, data))
@@ -112,7 +112,7 @@ def test_a_link_that_becomes_faster_gets_the_rest():
 def test_who_reads_nothing_costs_a_window():
     visitor, publisher, sent = Visitor(), Publisher(0), 0
     for tick in ticks(30.0):
-        data = visitor.message(publisher.take(trained(0.0), 0.0), ORIGIN_NS, {}, tick * tuned.TICK_S)
+        data = visitor.message(publisher.take(trained(0.0), 0.0), NEWEST_S, {}, tick * tuned.TICK_S)
         sent += 0 if data is None else len(data)
     assert tuned.FIRST_WINDOW / 2 < sent <= 1.1 * tuned.FIRST_WINDOW
 
@@ -146,10 +146,10 @@ def test_numbers_that_were_not_sent_change_nothing():
 @pytest.mark.stability
 def test_before_there_is_a_field_the_status_says_so():
     visitor = Visitor()
-    data = visitor.message(None, 5, {"line": "compiling"}, 0.0)
+    data = visitor.message(None, 0.3, {"line": "compiling"}, 0.0)
     assert read_message(data)[2][0].content["line"] == "compiling"
-    assert visitor.message(None, 5, {"line": "compiling"}, 0.1) is None
-    assert visitor.message(None, 5, {"line": "compiling"}, tuned.STATUS_EVERY_S) is not None
+    assert visitor.message(None, 0.3, {"line": "compiling"}, 0.1) is None
+    assert visitor.message(None, 0.3, {"line": "compiling"}, tuned.STATUS_EVERY_S) is not None
 
 
 @pytest.mark.parametrize("kilobytes", [20, 60, 2000])
@@ -173,13 +173,25 @@ def test_what_moves_stays_when_anchors_are_chosen_anew(kilobytes):
 ANCHORS = [motion().anchors.copy() for _ in range(2)]
 
 
+def test_what_has_left_is_shown_no_longer_and_nothing_else_is_sent_again():
+    link = Link(2e6)
+    link.run(ticks(2.0))
+    still = link.reader._shown.number
+    assert len(link.reader.at(NEWEST_S)) == COUNT + 1000
+    link.run(ticks(3.0, 2.0), lambda now_s: replace(trained(1.0), moving=None))
+    assert len(link.reader.at(NEWEST_S)) == COUNT
+    assert len([block for block in link.of(MovingBlock, since_s=2.0) if not len(block.records)]) == 1
+    link.run(ticks(4.0, 3.0))
+    assert len(link.reader.at(NEWEST_S)) == COUNT + 1000 and link.reader._shown.number == still
+
+
 def test_what_no_camera_has_seen_is_said_also_when_it_is_known_later():
     visitor, published, reader_bits = Visitor(), Publisher(0).take(trained(0.0), 0.0), []
     for tick in ticks(2.0):
         now_s = tick * tuned.TICK_S
         if now_s > 1.0 and published.static.unseen is None:
             published = replace(published, static=replace(published.static, unseen=BITS))
-        data = visitor.message(published, ORIGIN_NS, {}, now_s)
+        data = visitor.message(published, NEWEST_S, {}, now_s)
         if data is not None:
             number, _, blocks = read_message(data)
             visitor.acknowledged(number, now_s + 0.01)
