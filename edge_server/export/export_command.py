@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_server.export import ExportError
-from edge_server.export.exporter import KINDS, POINTS, Exporter, ProgressLine, check
+from edge_server.export.exporter import KINDS, POINTS, Exporter, ProgressLine, check, check_installed
 from edge_server.export.run_source import open_source
 from edge_server.surface import SurfaceError
 from edge_server.surface.settings import MeshSettings
@@ -112,6 +112,7 @@ def _export(args: argparse.Namespace, files: dict[str, Path], compare: Compariso
             raise ExportError("--measure: run it as edge-server export")
         measure = compare(args.measure)
     settings = _mesh_settings(args)
+    check_installed(files)  # after the options: what is written wrong is told also where it is missing
     source = open_source(args.run, args.allow_plugins)
     print(f"{source.file}: {source.name}, {len(source.views)} cameras", flush=True)
     exporter = Exporter(

@@ -28,6 +28,10 @@ def check(files: Mapping[str, Path], count: int = POINTS) -> None:
             raise ExportError(f"--{kind} {files[kind]}: expected a file that ends in {' or '.join(endings)}")
     if count < 1:
         raise ExportError(f"--count {count}: expected 1 or more")
+
+
+def check_installed(files: Mapping[str, Path]) -> None:
+    """Check that what the files need is installed. Raises SurfaceError. files: see ``Exporter.write``."""
     if "mesh" in files:
         from edge_server.surface.mesh import import_marching_cubes
 
@@ -64,6 +68,7 @@ class Exporter:
     def write(self, files: Mapping[str, Path]) -> None:
         """Write every file. files: kind, one of KINDS -> its file or folder. Raises ExportError and SurfaceError."""
         check(files, self._count)
+        check_installed(files)
         if "mesh" not in files:
             # Sharpening takes minutes, and points are drawn from the depth as well as it is.
             self._settings = replace(self._settings, sharpen=False)
