@@ -12,7 +12,7 @@ from pathlib import Path
 
 from camera_node.capture_schedule import CaptureSchedule, RateSchedule, ScheduledSource
 from camera_node.clocks import ClockError, NodeClock
-from camera_node.settings import DEPTH_STEP, LiveConfig, SourceConfig
+from camera_node.settings import DEPTH_STEP, SourceConfig
 from camera_node.sources.base import Shot, Source
 from camera_node.sources.registry import open_sources
 from camera_node.sources.with_effects import camera_effects
@@ -76,7 +76,7 @@ class Camera:
         self.codec = source.codec if isinstance(source, ScheduledSource) else config.codec
         # A camera that waits for a device or an arm must not keep others waiting.
         arm = getattr(config, "arm", None)
-        self.waits = isinstance(config, LiveConfig) or (arm is not None and source.camera in arm.cameras)
+        self.waits = config.waits or (arm is not None and source.camera in arm.cameras)
         self._quality = config.quality
         self._cache = cache
         self._clock_error = clock_error
@@ -137,7 +137,12 @@ class Camera:
         return self._cache.bytes + more <= self._cache.max_bytes
 
     def _encode(self, content: int) -> Shot:
-        shot = self.source.read(content)
+        try:
+            shot = self.source.read(content)
+        except (ValueError, OSError):
+            raise
+        except Exception as error:  # a source from outside raises anything: that costs this shot
+            raise ValueError(repr(error)) from error
         data = shot.image
         if not isinstance(data, bytes):
             data = payload.encode(data, self.codec, self._quality)

@@ -1,8 +1,8 @@
 """The scenario's ``source:`` section: what the cameras see, their frame rate, and how frames are compressed.
 
-``kind`` chooses the struct in ``MODELS``, whose docstring and keys ``freshfield scenario keys source`` prints. All keys
-are checked here, with file and key in the message. Checks that need the data itself (does the folder hold this camera?)
-are made when the source opens.
+``kind`` chooses the struct in ``MODELS``, or a class from outside (``own_class``), whose docstring and keys
+``freshfield scenario keys source`` prints. All keys are checked here, with file and key in the message. Checks that
+need the data itself (does the folder hold this camera?) are made when the source opens.
 """
 
 from __future__ import annotations
@@ -12,14 +12,18 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta, field
 
+from freshfield import plugins
 from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_STAMP_S
 from freshfield.payload import DEFAULT_CODEC
 from freshfield.scenario import Scenario
 from freshfield.settings import ScenarioError, Settings, about, read_settings, within
+
+if TYPE_CHECKING:
+    from camera_node.sources.base import Source
 
 Background = Literal["white", "black", "keep"]
 FPS_RANGE = (0.01, 1000.0)
@@ -56,6 +60,8 @@ class SourceConfig(Settings, frozen=True, kw_only=True):
     # Depth takes about as many bytes as its image: so it adds a sixth to them, and of 15 frames a second three measure.
     depth_every: Annotated[int, within(0, 10**6, "of so many frames of a depth camera one brings depth; 0: none")] = 5
     effects: dict[str, dict[str, Any] | None] = field(default_factory=dict)
+
+    waits: ClassVar[bool] = False  # whether captures wait for hardware: in threads of their own, never in virtual time
 
 
 Elevation = Annotated[float, within(-89.0, 89.0, "elevations of the rings")]
@@ -198,6 +204,8 @@ class LiveConfig(SourceConfig, frozen=True, kw_only=True):
     arm: Annotated[ArmConfig | None, about("an arm that carries the cameras it lists")] = None
     first_frame_s: Annotated[float, within(0.1, 60, "time that a camera may take until its first frame")] = 3.0
 
+    waits: ClassVar[bool] = True
+
 
 class CameraConfig(LiveConfig, frozen=True, kw_only=True):
     """Any camera or stream that OpenCV opens: a USB camera by number or path (/dev/v4l/by-id/...), a network
@@ -310,9 +318,24 @@ def source_config(scenario: Scenario) -> SourceConfig:
     """The checked ``source:`` section. Raises ScenarioError."""
     where = f"{scenario.path}: source"
     kind = scenario.source.get("kind")
-    if not isinstance(kind, str) or kind not in MODELS:
+    if not isinstance(kind, str):
         raise ScenarioError(f"{where}.kind: expected one of {', '.join(MODELS)}, got {kind!r}")
-    return read_settings(MODELS[kind], scenario.source, where)
+    with errors_of(f"{where}.kind"):
+        model = MODELS.get(kind) or own_class(kind)[1]
+    return read_settings(model, scenario.source, where)
+
+
+def own_class(kind: str) -> tuple[type[Source], type[SourceConfig]]:
+    """The class of a source from outside (``freshfield.plugins``), and its keys. Raises PluginError."""
+    from camera_node.sources.base import Source
+
+    found: type[Source] = plugins.find("source", kind, MODELS)
+    if not issubclass(found, Source):
+        raise plugins.PluginError(f"{kind}: {found.__name__} does not derive from camera_node.sources.base.Source")
+    keys, built_in = found.Config or SourceConfig, (WorldConfig, RecordedConfig, LiveConfig, McapConfig)
+    if not (isinstance(keys, type) and issubclass(keys, SourceConfig)) or issubclass(keys, built_in):
+        raise plugins.PluginError(f"{kind}: Config: expected a subclass of SourceConfig, and of no built-in kind's")
+    return found, keys
 
 
 def find_data(name: str, scenario: Scenario, base: Path | None, key: str = "data") -> Path:

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,10 @@ class Source(ABC):
     contents: number of different shots before they repeat; None if they never repeat.
     repeats_after: number of ticks after which the scene and the camera's path repeat, errors of sensors apart; None if
         they do not, or it is not known.
+
+    A source from outside (``camera_node.settings.own_class``) is constructed with (scenario, config,
+    camera). Config: its keys in the scenario, a subclass of ``camera_node.settings.SourceConfig``, whose ``waits`` says
+    that it is hardware; None: the keys of every kind.
     """
 
     camera: str
@@ -74,6 +79,7 @@ class Source(ABC):
     contents: int | None = None
     repeats_after: int | None = None
     phase_ns: int = 0
+    Config: ClassVar[Any] = None
 
     def content(self, tick: int) -> int:
         """Number of the shot that a tick shows: 0 to contents - 1, or the tick itself if shots never

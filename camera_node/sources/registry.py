@@ -5,9 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from camera_node.settings import LiveConfig, McapConfig, RecordedConfig, SourceConfig, WorldConfig
+from camera_node.settings import (
+    MODELS,
+    LiveConfig,
+    McapConfig,
+    RecordedConfig,
+    SourceConfig,
+    WorldConfig,
+    errors_of,
+    own_class,
+)
 from camera_node.sources.base import Source
 from freshfield.scenario import Scenario, ScenarioError
 
@@ -26,7 +35,7 @@ def open_sources(
 
     data: folder of the data sets; None: $FRESHFIELD_DATA.
     effects: by camera; a source applies those of its camera.
-    Raises ScenarioError, DatasetError, CameraError or ArmError.
+    Raises ScenarioError, DatasetError, CameraError or ArmError; of a class from outside whatever it raises.
     """
     effects = effects or {}
     if scenario.held_out_every and scenario.held_out:
@@ -46,7 +55,11 @@ def open_sources(
             "capture when they can"
         )
     sources: dict[str, Source]
-    if isinstance(config, RecordedConfig):
+    if config.kind not in MODELS:
+        with errors_of(f"{scenario.path}: source"):
+            own: Any = own_class(config.kind)[0]
+            sources = {camera: own(scenario, config, camera) for camera in cameras}
+    elif isinstance(config, RecordedConfig):
         from camera_node.sources.datasets.streamer import open_recorded
 
         sources = open_recorded(scenario, config, cameras, data)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 from camera_node.capture_schedule import PartialSchedule, RateSchedule
-from camera_node.settings import RecordedConfig, SourceConfig, WorldConfig
+from camera_node.settings import McapConfig, SourceConfig
 from camera_node.sources.base import Shot, Source
 from freshfield.depth import DepthImage
 from freshfield.scenario import Scenario, ScenarioError
@@ -50,7 +50,7 @@ class PathShare(Source):
 
 def check_divisible(scenario: Scenario, config: SourceConfig) -> None:
     """Raises ScenarioError if the captures of this source cannot be divided."""
-    if not isinstance(config, RecordedConfig | WorldConfig) or getattr(config, "arm", None) is not None:
+    if config.waits or isinstance(config, McapConfig) or getattr(config, "arm", None) is not None:
         raise ScenarioError(
             f"{scenario.path}: cameras.held_out_every: needs a recorded data set or a synthetic world: two processes "
             "cannot read one device"

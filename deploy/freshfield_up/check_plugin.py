@@ -1,12 +1,14 @@
-"""``freshfield check-plugin``: whether a policy, effect, fault, field or selector keeps the contract of its kind."""
+"""``freshfield check-plugin``: whether a class from outside, such as a policy, keeps the contract of its kind."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 import dataclasses
+import itertools
 import traceback
 from collections.abc import Callable, Iterator, Mapping
+from fractions import Fraction
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -282,7 +284,51 @@ def selector(name: str) -> Contract:
     return Contract(lambda seed: make_selector(name), cases, use, {})
 
 
-CONTRACTS = {"policy": policy, "effect": effect, "fault": fault, "field": field, "selector": selector}
+def source(name: str) -> Contract:
+    from camera_node.capture import Camera, ShotCache
+    from camera_node.settings import FPS_RANGE, MODELS, SourceConfig, own_class, source_config
+    from camera_node.sources.base import Shot
+    from camera_node.sources.registry import open_sources
+    from freshfield.scenario import parse
+
+    if name in MODELS:
+        raise plugins.PluginError(f"source {name} is built in: its tests are the project's; one of your own is checked")
+    keys = own_class(name)[1]
+
+    def make(seed: int, **given: Any) -> Any:
+        told = {"cameras": {"count": 2}, "seed": seed, "source": {"kind": name, **given}}
+        scenario = parse(plugins.absolute(told, Path()), Path("check-plugin"))
+        config = source_config(scenario)
+        opened = open_sources(scenario, config, scenario.cameras)
+        return [Camera(made, config, ShotCache(0), depth_every=1) for made in opened.values()]
+
+    def use(made: Any, ticks: Any) -> Any:
+        answers = {}
+        for tick, camera in itertools.product(ticks, made):
+            own = camera.source
+            expect(own.camera == camera.name and own.camera in ("cam00", "cam01"), "camera: not the one of the call")
+            right = isinstance(own.fps, Fraction) and FPS_RANGE[0] <= own.fps <= FPS_RANGE[1]
+            expect(right, f"fps: expected a Fraction, {FPS_RANGE[0]} to {FPS_RANGE[1]:g}, got {own.fps!r}")
+            expect(isinstance(own.intrinsics, Pinhole), "intrinsics: expected a freshfield.geometry.Pinhole")
+            number = own.content(tick)
+            expect(number in range(own.contents or 2**63), f"content: expected 0 to contents - 1, got {number!r}")
+            shot = own.read(number)
+            right = isinstance(shot, Shot) and isinstance(shot.pose, Pose)
+            expect(right, f"read: expected a Shot with a Pose, got {type(shot).__name__}")
+            sent = camera.shot(number)  # raises ValueError for what cannot be sent
+            expect(not camera.depth_failed, "depth: it cannot be sent; the log says why")
+            answers[own.camera, tick] = content((sent.payload, sent.pose.matrix(), sent.encoded_depth))
+        return None if keys.waits else sorted(answers.items())
+
+    def any_order(make: Callable[..., Any]) -> None:
+        same = use(make(1), range(4)) == use(make(1), range(3, -1, -1))
+        expect(same, "a shot depends on those read before: captures are skipped where time is short")
+
+    cases: dict[str, Any] = {"the first frames": lambda: range(4), "a frame after a year": lambda: [2**30]}
+    return Contract(make, cases, use, numbers(keys, SourceConfig), {"does not depend on the order of reads": any_order})
+
+
+CONTRACTS = {"source": source, "policy": policy, "effect": effect, "fault": fault, "field": field, "selector": selector}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

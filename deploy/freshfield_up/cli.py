@@ -76,7 +76,7 @@ def parser() -> argparse.ArgumentParser:
     )
     check = commands.add_parser(
         "check-plugin",
-        help="check a policy, effect, fault, field or selector of your own",
+        help="check a source, policy, effect, fault, field or selector of your own",
         description="Checks that a class keeps the contract of its kind, one line a check: in usual and hard cases its "
         "answers have the right type, shape and finite values, are the same again for the same seed and leave the "
         "inputs as they were; parameters out of range are refused. Exit status: 0 it does, 1 not, 2 no such class.",

@@ -8,6 +8,7 @@ import re
 import shutil
 from pathlib import Path
 
+from freshfield import plugins
 from freshfield.frame import valid_id
 from freshfield.scenario import SCENARIO_FOLDER, Scenario, ScenarioError, load
 
@@ -101,7 +102,7 @@ def checked(scenario: Scenario) -> list[str]:
     return [
         f"{scenario.path}: valid",
         f"  cameras  {len(scenario.cameras)}{held}",
-        f"  source   {source.kind}{effects}",
+        f"  source   {plugins.short_name(source.kind)}{effects}",
         f"  channel  {channel.preset}: mean delay {channel.mean_delay_ms:.3g} ms{states}",
         f"  edge     {described(scenario, edge, moving)}",
     ]

@@ -1,12 +1,38 @@
-"""A policy and an effect for freshfield, to copy and change."""
+"""A source, a policy and an effect for freshfield, to copy and change."""
 
 from typing import Annotated, ClassVar
 
 import numpy as np
 
+from camera_node.settings import SourceConfig
+from camera_node.sources.base import Shot, Source, rate
 from camera_node.synthetic.effects import EffectParameters
 from edge_server.scheduler import Policy
+from freshfield.geometry import Pinhole, Pose, look_at
 from freshfield.settings import within
+
+
+class Bar(Source):
+    """A bright bar that moves across a dark image, before cameras side by side. Replace ``read`` by your camera."""
+
+    class Config(SourceConfig, frozen=True):
+        bar_px: Annotated[int, within(1, 32, "width of the bar")] = 8
+
+    intrinsics = Pinhole.from_fov(64, 48, 60.0)
+    contents = 64  # frames until they repeat; leave it out if they never do
+
+    def __init__(self, scenario, config, camera):
+        self.camera, self.fps, self.width = camera, rate(config.fps or 10), config.bar_px
+        place = (2.0, 0.2 * scenario.cameras.index(camera), 1.0)
+        self.pose = Pose.from_matrix(look_at(place, (0.0, 0.0, 0.5)))  # camera-to-world, meters
+
+    def content(self, tick):
+        return tick % self.contents
+
+    def read(self, content):
+        image = np.full((48, 64, 3), 40, np.uint8)  # (H, W, 3) RGB
+        image[:, content : content + self.width] = 220
+        return Shot(image, self.pose, self.intrinsics)
 
 
 class LeastUsed(Policy):

@@ -9,7 +9,7 @@ import pytest
 
 from freshfield_up.cli import main
 
-KINDS = ("policy", "effect", "fault", "field", "selector")
+KINDS = ("policy", "effect", "fault", "field", "selector", "source")
 OWN = [
     (kind, entry.name)
     for kind in KINDS
@@ -18,8 +18,8 @@ OWN = [
 ]
 
 
-def test_both_are_installed():
-    assert OWN == [("policy", "least-used"), ("effect", "vignette")]
+def test_all_are_installed():
+    assert OWN == [("policy", "least-used"), ("effect", "vignette"), ("source", "bar")]
 
 
 @pytest.mark.parametrize(("kind", "name"), OWN)

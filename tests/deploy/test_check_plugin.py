@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,10 @@ import pytest
 
 from channel_emu.model import faults
 from edge_server.scheduler import POLICIES, SelectionWindow
+from freshfield.geometry import Pinhole
 from freshfield.settings import Settings
 from freshfield_up.cli import main
-from tests.integration.own_classes import Darker, Flat, LastFirst, Late, Youngest
+from tests.integration.own_classes import Darker, Flat, LastFirst, Late, Turning, Youngest
 
 OWN = Path(__file__).parent.parent / "integration/own_classes.py"
 # Effects: tests/camera_node/synthetic/effects/test_registry.py.
@@ -59,14 +61,33 @@ def first_of(share):
     return lambda self, epoch, window: tuple(epoch.generated_ns)[: share(epoch.generated_ns)]
 
 
+def after(self):
+    self.last = (getattr(self, "last", -1) + 1) % 50
+    return self.last
+
+
+def shot(**changed):
+    return lambda self, content: replace(Turning.read(self, content), **changed)
+
+
 HOURS = 24 * 3600 * 10**9
 LATE = SelectionWindow(wait_until_ns=HOURS)
 UNBOUNDED = {"__annotations__": {"gain": float}, "gain": 1.0}
 NO_DEFAULT = type(Settings)("Params", (Settings,), {"__annotations__": {"ms": float}})
 NO_COPY = {"render": painted(seen), "state": lambda s: {"level": s}, "load_state": take_views}
-BASES = {"policy": Youngest, "effect": Darker, "fault": Late, "field": Flat, "selector": LastFirst}
+BASES = {"policy": Youngest, "effect": Darker, "fault": Late, "field": Flat, "selector": LastFirst, "source": Turning}
 # Kind -> name of a class -> how it differs from the good one, and what the command says.
 BROKEN = {
+    "source": {
+        "Fast": ({"fps": 10}, "the first frames: fps: expected a Fraction"),
+        "Another": ({"camera": property(lambda _: "cam07", lambda *_: None)}, "the first frames: camera: not the one"),
+        "Ends": ({"contents": 3, "content": lambda s, tick: tick}, "the first frames: content: expected 0 to contents"),
+        "Picture": ({"read": lambda s, n: Turning.read(s, n).image}, "the first frames: read: expected a Shot"),
+        "Halves": ({"read": shot(image=np.ones((24, 32, 3)) / 2)}, "the first frames: PayloadError: expected uint8"),
+        "OtherLens": ({"read": shot(intrinsics=Pinhole.from_fov(64, 24, 60.0))}, "the first frames: "),
+        "Counts": ({"read": lambda s, n: Turning.read(s, next(COUNT) % 50)}, "the first frames: two runs differ"),
+        "InOrder": ({"read": lambda s, n: Turning.read(s, after(s))}, "does not depend on the order of reads: a shot"),
+    },
     "policy": {
         "MoreArguments": ({"__init__": lambda s, a: None}, "is constructed: TypeError"),
         "NoWindow": ({"plan": lambda *_: None}, "six cameras: plan: expected SelectionWindow, got NoneType"),

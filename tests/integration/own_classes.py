@@ -1,17 +1,54 @@
-"""A policy, an effect, a fault, a selector and a field as a user writes them; and policies that fail."""
+"""A source, a policy, an effect, a fault, a selector and a field as a user writes them; and policies that fail."""
 
 from __future__ import annotations
 
+from fractions import Fraction
 from typing import Annotated, ClassVar
 
 import numpy as np
 
+from camera_node.settings import SourceConfig
+from camera_node.sources.base import Shot, Source
 from camera_node.synthetic.effects import EffectParameters
 from channel_emu.model.link import Fault
 from edge_server.fields import FitReport, Rendering
 from edge_server.fields.common.trainer_settings import FieldSettings
 from edge_server.scheduler import Policy
+from freshfield.geometry import Pinhole, Pose, look_at
 from freshfield.settings import Settings, within
+
+
+class Turning(Source):
+    """A gray that grows with each frame, before a camera that somebody turned."""
+
+    class Config(SourceConfig, frozen=True):
+        level: Annotated[int, within(0, 255, "of the first frame")] = 40
+
+    fps, contents = Fraction(10), 50
+    intrinsics = Pinhole.from_fov(32, 24, 60.0)
+
+    def __init__(self, scenario, config, camera):
+        self.camera, self.level = camera, config.level
+        self.pose = Pose.from_matrix(look_at((2.0, scenario.cameras.index(camera), 1.0), (0.0, 0.0, 0.5)))
+
+    def content(self, tick):
+        return tick % self.contents
+
+    def read(self, content):
+        return Shot(np.full((24, 32, 3), (self.level + content) % 256, np.uint8), self.pose, self.intrinsics)
+
+
+class NoKeys(Turning):
+    Config = Settings
+
+
+class RaisesOften(Turning):
+    """Every other capture fails in a way that nobody foresaw."""
+
+    def read(self, content):
+        if content % 2:
+            raise KeyError("no such frame")
+        return super().read(content)
 
 
 class Youngest(Policy):

@@ -35,9 +35,12 @@ def test_the_template_is_built_installed_checked_and_used(tmp_path: Path) -> Non
     run(["pip", "install", "-q", "--no-deps", "--no-index", "--target", str(site), str(wheel)], tmp_path)
     (source / "freshfield_example.py").unlink()  # the installed one is meant
 
-    assert "3 passed" in run(["pytest", "-q", "test_contract.py"], source, site)
+    assert "4 passed" in run(["pytest", "-q", "test_contract.py"], source, site)
     edge = {**RAW["edge"], "policy": {"name": "least-used", "value": 1}}
     whole = {**RAW, "edge": edge, "source": {**RAW["source"], "effects": {"vignette": {"loss": 0.3}}}}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(whole))
     said = run(["edge_server.cli", "simulate", "mine.yaml", "--seconds", "1", "--json"], tmp_path, site)
     assert json.loads(said)["policy"] == "least-used"
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({**whole, "source": {"kind": "bar", "bar_px": 4}}))
+    said = run(["edge_server.cli", "simulate", "mine.yaml", "--seconds", "1", "--json"], tmp_path, site)
+    assert json.loads(said)["updates"] > 0

@@ -1,7 +1,8 @@
-"""Classes of one's own in a deployment: a policy, an effect, a fault and a field from a file beside the scenario."""
+"""Classes of one's own in a deployment: source, policy, effect, fault and field from a file beside the scenario."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import shutil
 from pathlib import Path
@@ -10,6 +11,10 @@ import numpy as np
 import pytest
 import yaml
 
+from camera_node.capture import build_cameras
+from camera_node.node import Node, NodeOptions
+from camera_node.settings import source_config
+from camera_node.sources.base import pixels
 from camera_node.synthetic.effects import EffectError, load_effects
 from channel_emu.model.settings import channel_from_mapping
 from edge_server.experiments import compare
@@ -23,7 +28,9 @@ from edge_server.live.field_updater import FieldUpdater
 from edge_server.scheduler import make_policy
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.registry import make_selector
+from freshfield.scenario import load, parse
 from freshfield.settings import ScenarioError
+from freshfield.transport import Transport
 from tests.edge_server.experiments.rollouts.small import RAW
 from tests.edge_server.fields_for_tests import tiny_field
 from tests.edge_server.frames import frame
@@ -61,6 +68,28 @@ def test_a_deployment_in_virtual_time_uses_them_all_and_repeats(folder, capsys):
     assert found["policy"] == f"{folder / 'own.py'}:Youngest"
     plain = run(folder / "mine.yaml", capsys, "--policy", "all")
     assert plain["policy"] == "all" and plain["digest"] != found["digest"]
+
+
+def test_a_source_of_ones_own_is_streamed_and_runs_in_virtual_time(folder, capsys):
+    whole = yaml.safe_load((folder / "mine.yaml").read_text())
+    whole["source"] = {"kind": "own.py:Turning", "level": 60, "effects": {"own.py:Darker": None}}
+    (folder / "own_source.yaml").write_text(yaml.safe_dump(whole))
+    assert run(folder / "own_source.yaml", capsys)["updates"] > 0
+    scenario = load(folder / "own_source.yaml")
+    (camera,) = build_cameras(scenario, source_config(scenario), scenario.training[:1])
+    assert abs(int(pixels(camera.shot(7), camera.codec).mean()) - (60 + 7 - 20)) <= 1
+
+
+@pytest.mark.stability
+def test_a_source_that_raises_loses_those_frames_alone(folder, caplog):
+    whole = {"cameras": {"count": 2}, "source": {"kind": f"{folder / 'own.py'}:RaisesOften", "fps": 10}}
+    scenario = parse(whole, folder / "raises.yaml")
+    cameras = build_cameras(scenario, source_config(scenario), scenario.cameras)
+    node = Node(scenario, cameras, NodeOptions(to="127.0.0.1:1", transport=Transport(), seconds=1.0))
+    asyncio.run(node.run())
+    for status in node.status()["cameras"].values():
+        assert status["captured"] > 2 and status["failed"] > 2
+    assert len([line for line in caplog.messages if "KeyError('no such frame')" in line]) == 2
 
 
 def test_comparing_uses_them_in_worker_processes_and_sees_that_the_file_changed(folder, capsys, monkeypatch):
@@ -118,6 +147,12 @@ def test_what_is_of_the_wrong_kind_is_refused_by_name(folder):
         channel_from_mapping({"faults": {f"{own}Late": {"ms": "soon"}}})
     with pytest.raises(ScenarioError, match="expected an attribute Settings"):
         make_field(f"{own}Youngest")
+    for wrong in ("Youngest", "NoKeys"):
+        with pytest.raises(ScenarioError, match=r"raw.yaml: source.kind: .*(base\.Source|Config: expected a subclass)"):
+            source_config(parse({"cameras": {"count": 2}, "source": {"kind": own + wrong}}, Path("raw.yaml")))
+    with pytest.raises(ScenarioError, match=r"raw.yaml: source.level: expected .*0 to 255"):
+        turning = {"kind": f"{own}Turning", "level": 256}
+        source_config(parse({"cameras": {"count": 2}, "source": turning}, Path("raw.yaml")))
     with pytest.raises(ViewpointError, match=r"selector 'cover' is not known \(did you mean coverage"):
         make_selector("cover")
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.capture import Camera, build_cameras
-from camera_node.settings import LiveConfig, SourceConfig, WorldConfig, source_config
+from camera_node.settings import SourceConfig, WorldConfig, source_config
 from camera_node.sources.with_effects import camera_effects
 from camera_node.synthetic import Scene, make_scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects
@@ -87,7 +87,7 @@ def training_cameras(scenario: Scenario, data: Path | None = None) -> list[Camer
     """The training cameras as a node would host them. Raises ScenarioError for real cameras and for cameras
     on an arm, which run only in real time."""
     source = source_config(scenario)
-    if isinstance(source, LiveConfig) or getattr(source, "arm", None) is not None:
+    if source.waits or getattr(source, "arm", None) is not None:
         raise ScenarioError(
             f"{scenario.path}: source: its cameras or its arm keep real time and cannot be run in virtual "
             "time: use freshfield demo, or camera-node and edge-server run"

@@ -1,4 +1,4 @@
-"""Classes from outside freshfield, by name: a policy, effect, fault, field or selector that somebody else wrote.
+"""Classes from outside freshfield, by name: a source, policy, effect, fault, field or selector of somebody else.
 
 A name that is not built in is, in this order,
 
@@ -29,7 +29,7 @@ from typing import Any
 
 from freshfield.settings import ScenarioError
 
-KINDS = ("policy", "effect", "fault", "field", "selector")
+KINDS = ("policy", "effect", "fault", "field", "selector", "source")
 _FILE = re.compile(r"(?P<where>[^:]+\.py):(?P<name>[A-Za-z_]\w*)(?P<rest>(:.*)?)")
 _MODULE = re.compile(r"(?P<where>[A-Za-z_]\w*(\.\w+)*):(?P<name>[A-Za-z_]\w*)(?P<rest>(:.*)?)")
 
