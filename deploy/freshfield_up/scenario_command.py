@@ -32,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     check.set_defaults(run=_check)
     keys = commands.add_parser("keys", help="what a section may say: keys, bounds, defaults")
     keys.add_argument("section", nargs="?", help="cameras, source, effects, channel, faults or edge [all]")
+    keys.add_argument("name", nargs="?", help="one source, effect, fault, field or policy, also one of your own [all]")
     keys.set_defaults(run=_keys)
     schema = commands.add_parser("schema", help="print the JSON Schema of scenario files, for editors")
     schema.set_defaults(run=_schema)
@@ -78,23 +79,29 @@ def _check(args: argparse.Namespace) -> int:
 
 def checked(scenario: Scenario) -> list[str]:
     """What each package makes of its section, a line each. Raises ScenarioError."""
-    from camera_node.settings import source_config
+    from camera_node.settings import WorldConfig, errors_of, source_config
+    from camera_node.sources.with_effects import camera_effects
+    from camera_node.synthetic import make_scene
     from channel_emu.model.settings import channel_from_mapping
 
     source = source_config(scenario)
+    for camera in scenario.cameras:
+        camera_effects(scenario, source, camera)
+    if isinstance(source, WorldConfig):
+        with errors_of(f"{scenario.path}: source"):
+            make_scene(source.scene, {"count": len(scenario.cameras), **source.scene_parameters()})
     channel = channel_from_mapping(scenario.channel, f"{scenario.path}: channel", scenario.path.parent)
     try:
         from edge_server.fields.registry import settings_of
+        from edge_server.scheduler import make_policy
         from edge_server.settings import cameras_move, described, read_config
     except ImportError as error:
         raise ScenarioError(f"edge: not checked, {error.name} is missing: install the extra edge") from None
     edge = read_config(scenario)
-    try:
+    with errors_of(f"{scenario.path}: edge.field"):
         settings_of(edge.field, edge.field_options)
-    except ScenarioError:
-        raise
-    except ValueError as error:
-        raise ScenarioError(f"{scenario.path}: edge.field: {error}") from None
+    with errors_of(f"{scenario.path}: edge.policy"):
+        make_policy(edge.policy.name, edge.policy.value, scenario.rng("policy"))
     held = f", {', '.join(scenario.held_out)} held out" if scenario.held_out else ", none held out"
     states = f", states {', '.join(channel.state_names)}" if channel.chain else ""
     effects = f" with {', '.join(source.effects)}" if source.effects else ""
@@ -111,7 +118,7 @@ def checked(scenario: Scenario) -> list[str]:
 def _keys(args: argparse.Namespace) -> int:
     from freshfield_up import keys
 
-    print(keys.text(args.section))
+    print(keys.text(args.section, args.name))
     return 0
 
 

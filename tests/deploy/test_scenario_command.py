@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import copy
 import json
+import re
+from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jsonschema
 import pytest
 
+from freshfield import plugins
 from freshfield.scenario import SCENARIO_FOLDER
 from freshfield.untrusted import read_yaml
 from freshfield_up.cli import main
 
+OWN = Path(__file__).parent.parent / "integration/own_classes.py"
 SHIPPED = sorted(SCENARIO_FOLDER.glob("*.yaml"))
 
 
@@ -62,6 +67,14 @@ def test_a_folder_that_is_there_already_is_not_written_into(tmp_path, capsys):
     ("section", "wrong"),
     [
         ("source: {kind: world, scene: room, fps: fast}", "source.fps"),
+        ("source: {kind: world, scene: castle}", "source: .*castle"),
+        ("source: {kind: world, effects: {rain: null}}", "source.effects: effect 'rain' is not known"),
+        ("source: {kind: world, effects: {sensor_noise: {x: 3}}}", "sensor_noise.x: unknown key"),
+        ("source: {kind: world, effects: {OWN:Darker: {counts: 256}}}", "Darker.counts: expected .*0 to 255, got 256"),
+        ("source: {kind: OWN:Turning, level: 256}", "source.level: expected .*0 to 255, got 256"),
+        ("edge: {policy: {name: freshest}}", "edge.policy: policy 'freshest' is not known"),
+        ("edge: {policy: {name: freshest-k, value: 0.5}}", "edge.policy: k: expected a whole number"),
+        ("edge: {field: OWN:Flat, field_options: {level: 2}}", "edge.field: flat.level: expected .*0 to 1, got 2"),
         ("channel: {preset: ch7}", "channel.preset"),
         ("channel: {faults: {rain: 1}}", "channel.faults.rain"),
         ("edge: {update_ms: 1}", "edge.update_ms"),
@@ -72,8 +85,8 @@ def test_a_folder_that_is_there_already_is_not_written_into(tmp_path, capsys):
 def test_check_reads_every_section(section, wrong, tmp_path, capsys):
     file = tmp_path / "mine.yaml"
     source = "" if section.startswith("source") else "source: {kind: world, scene: room}\n"
-    file.write_text(f"cameras: {{count: 4}}\n{source}{section}\n")
-    assert wrong in refused(capsys, "scenario", "check", str(file))
+    file.write_text(f"cameras: {{count: 4}}\n{source}{section.replace('OWN', str(OWN))}\n")
+    assert re.search(wrong, refused(capsys, "scenario", "check", str(file)))
 
 
 def test_keys_of_a_section_and_of_all(capsys):
@@ -89,6 +102,42 @@ def test_keys_of_a_section_and_of_all(capsys):
         part = printed(capsys, "scenario", "keys", section)
         assert key in part and part.strip() in everything
     assert "there are: cameras" in refused(capsys, "scenario", "keys", "camera")
+
+
+@pytest.mark.parametrize(
+    ("section", "name", "line"),
+    [
+        ("source", "Turning", "level                  default 40; 0 to 255; of the first frame"),
+        ("effects", "Darker", "counts                 default 20; 0 to 255; of 255"),
+        ("faults", "Late", "ms                     default 10.0; 0 to 10000; added to each delay"),
+        ("edge", "Flat", "level                  default 0.5; gray"),
+        ("edge", "Youngest", "value                  default 1; k"),
+    ],
+)
+def test_options_of_plug_ins_are_keys_named_or_installed(section, name, line, capsys, monkeypatch):
+    assert line in printed(capsys, "scenario", "keys", section, f"{OWN}:{name}")
+    own = {"Turning": "source", "Darker": "effect", "Late": "fault", "Flat": "field", "Youngest": "policy"}[name]
+    found = plugins.find(own, f"{OWN}:{name}", ())
+    entries = [SimpleNamespace(name="mine", load=lambda: found), EntryPoint("broken", "no_such_module:Mine", "")]
+    monkeypatch.setattr(plugins, "entry_points", lambda group: entries if group == f"freshfield.{own}" else [])
+    everything = printed(capsys, "scenario", "keys", section)
+    assert line in everything and "mine" in everything and "broken" not in everything
+    assert line in printed(capsys, "scenario", "keys", section, "mine")
+    assert "no_such_module" in refused(capsys, "scenario", "keys", section, "broken")
+    if name == "Youngest":
+        return
+    from freshfield_up.keys import schema
+
+    ours, key = jsonschema.Draft202012Validator(schema()), line.split()[0]
+    for value, valid in ((0.5 if name == "Flat" else 1, True), (-1, False)):
+        options = {key: value}
+        data = {
+            "source": {"source": {"kind": "mine", **options}},
+            "effects": {"source": {"kind": "world", "effects": {"mine": options}}},
+            "faults": {"channel": {"faults": {"mine": options}}},
+            "edge": {"edge": {"field": "mine", "field_options": options}},
+        }[section]
+        assert ours.is_valid({"cameras": {"count": 2}, "source": {"kind": "world"}, **data}) == valid
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +167,9 @@ def test_the_schema_knows_kinds_bounds_and_short_notation(validator: Any) -> Non
     def valid(**sections: Any) -> bool:
         return validator.is_valid({"cameras": {"count": 4}, "source": {"kind": "world"}, **sections})
 
+    assert valid(source={"kind": "mine.py:Mine", "anything": 1}) and valid(channel={"faults": {"mine.py:Late": {}}})
+    assert valid(edge={"field_options": {"layers": True}}) and not valid(edge={"field_options": {"lairs": True}})
+    assert not valid(edge={"field": "ngp", "field_options": {"layers": True}})
     assert valid(channel={"service": "exp:60ms", "faults": {"loss": 0.1}}) and valid(edge=None)
     assert valid(source={"kind": "realsense", "width": 640}) and not valid(source={"kind": "world", "iso": 400})
     assert (

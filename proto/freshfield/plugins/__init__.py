@@ -63,15 +63,20 @@ def find(kind: str, name: str, built_in: Iterable[str]) -> Any:
             there = [each for each, value in vars(module).items() if isinstance(value, type)]
             raise PluginError(f"{kind} {name}: no class {match['name']} in it; there are: {', '.join(there) or 'none'}")
         return found
-    installed = {entry.name: entry for entry in entry_points(group=f"freshfield.{kind}")}
-    if name in installed:
-        return _imported(kind, name, installed[name].load)
-    known = [*built_in, *sorted(installed)]
+    entries = {entry.name: entry for entry in entry_points(group=f"freshfield.{kind}")}
+    if name in entries:
+        return _imported(kind, name, entries[name].load)
+    known = [*built_in, *installed(kind)]
     near = difflib.get_close_matches(name, known, 1)
     raise PluginError(
         f"{kind} {name!r} is not known{f' (did you mean {near[0]}?)' if near else ''}; there are: {', '.join(known)}; "
         "one of your own is FILE.py:CLASS or MODULE:CLASS"
     )
+
+
+def installed(kind: str) -> list[str]:
+    """The names of the entry points of installed packages, sorted."""
+    return sorted({entry.name for entry in entry_points(group=f"freshfield.{kind}")})
 
 
 def absolute(data: Any, folder: Path) -> Any:
