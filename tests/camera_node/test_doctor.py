@@ -128,6 +128,13 @@ def test_a_camera_is_opened_and_watched(capsys, tmp_path):
     assert parts["camera eye"][0] is False and "no camera at http" in parts["camera eye"][1]
 
 
+def test_a_camera_whose_lens_nobody_knows_is_wrong(capsys, tmp_path):
+    camera = NetworkCamera(WallClock())
+    _, parts = examined(capsys, bench_with(tmp_path, camera, calibration=None))
+    camera.close()
+    assert parts["camera eye"][0] is False and "intrinsics" in parts["camera eye"][1]
+
+
 @pytest.mark.parametrize("asked, ok", [(40, False), (10, True), (4, True)])
 def test_a_camera_at_a_fraction_of_the_rate_that_was_asked_for_is_wrong(capsys, tmp_path, asked, ok):
     camera = NetworkCamera(WallClock(), fps=12.0)

@@ -66,3 +66,12 @@ def test_it_says_whether_all_frames_are_accounted_for(tmp_path, found, expected)
     frames = {"captured": 3, "sent": 3, "delivered": 3, "rejected": {}, **found}
     (tmp_path / "report.json").write_text(json.dumps({"frames": frames}))
     assert expected in summarize(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "shed, said", [(7, "3 delivered, 7 of them left out for lack of time, 0"), (0, "3 delivered, 0")]
+)
+def test_it_says_how_many_frames_were_left_out(tmp_path, shed, said):
+    report = {"frames": {"delivered": 3, "rejected": {}}, "updates": {"shed": shed}}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    assert f"{said} rejected" in summarize(tmp_path)

@@ -103,6 +103,20 @@ def test_without_real_time_the_priority_is_raised(monkeypatch: pytest.MonkeyPatc
     assert priority.raise_priority() == ("short-slice" if short_slice else "normal")
 
 
+@pytest.mark.parametrize(
+    ("machine", "system", "number"),
+    [("x86_64", "Linux", 314), ("aarch64", "Linux", 274), ("riscv64", "Linux", None), ("x86_64", "Darwin", None)],
+)
+def test_short_slices_are_asked_for_where_the_call_is_known(monkeypatch, machine, system, number) -> None:
+    library = mock.Mock()
+    library.syscall.return_value = 0
+    monkeypatch.setattr(priority.platform, "machine", lambda: machine)
+    monkeypatch.setattr(priority.platform, "system", lambda: system)
+    monkeypatch.setattr(priority.ctypes, "CDLL", lambda _: library)
+    assert priority._shorten_slice() is (number is not None)
+    assert [call.args[:2] for call in library.syscall.call_args_list] == ([] if number is None else [(number, 0)])
+
+
 def test_dropped_messages_hold_no_bytes() -> None:
     async def live() -> None:
         flow = CallFlow(0, ServedCall(mock.Mock()), None, lambda: 0)

@@ -69,6 +69,13 @@ def test_the_visitor_sees_the_rig_from_behind_and_above(spread_deg, share):
     assert seen.mean() >= share
 
 
+@pytest.mark.parametrize(("cameras_deg", "visitor_deg"), [(20, 30), (35, 45), (0, 18), (60, 55), (-20, 18)])
+def test_the_visitor_looks_from_ten_degrees_above_the_cameras_within_bounds(cameras_deg, visitor_deg):
+    view = initial_viewpoint(rig(9, 60, cameras_deg))
+    out = (view.position - view.look_at) / np.linalg.norm(view.position - view.look_at)
+    assert np.rad2deg(np.arcsin(out @ view.up)) == pytest.approx(visitor_deg, abs=0.1)
+
+
 @pytest.mark.parametrize("spread_deg", [90, 140, 160])
 def test_the_visitor_stands_as_near_as_lets_them_see_the_share(spread_deg):
     poses = rig(9, spread_deg)
