@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 
-import pytest
-
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.studies import drawing
 from tests.edge_server.experiments.studies.invented import request
