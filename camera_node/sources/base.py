@@ -67,6 +67,8 @@ class Source(ABC):
     contents: number of different shots before they repeat; None if they never repeat.
     repeats_after: number of ticks after which the scene and the camera's path repeat, errors of sensors apart; None if
         they do not, or it is not known.
+    timed: its shots were taken at known times, so that a tracker gave their poses; False for photos, whose poses were
+        computed from them.
 
     A source from outside (``camera_node.settings.own_class``) is constructed with (scenario, config,
     camera). Config: its keys in the scenario, a subclass of ``camera_node.settings.SourceConfig``, whose ``waits`` says
@@ -78,6 +80,7 @@ class Source(ABC):
     intrinsics: Pinhole
     contents: int | None = None
     repeats_after: int | None = None
+    timed: bool = True
     phase_ns: int = 0
     Config: ClassVar[Any] = None
 

@@ -21,6 +21,8 @@ FORMATS = tuple(kind for kind, model in MODELS.items() if issubclass(model, Reco
 
 # What scanners and other tools leave, and the command of nerfstudio that makes a transforms.json of it.
 _CONVERTED = {"cameras.xml": "metashape"}
+_VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
+_OF_VIDEO = "a video and its trajectory are named in a scenario: freshfield scenario init mine.yaml --like video"
 
 
 class Reader(Protocol):
@@ -61,6 +63,8 @@ def recognize(file: Path) -> str:
         return "foxglove"
     if file.suffix in (".bin", ".txt"):
         return {"rgb.txt": "tum", "frame-000000.pose.txt": "sevenscenes"}.get(file.name, "colmap")
+    if file.suffix.lower() in _VIDEOS:
+        raise DatasetError(f"{file}: its lens and poses are not known: {_OF_VIDEO}")
     data = read_json(file) if file.suffix == ".json" else None
     if isinstance(data, dict):
         return "transforms" if "frames" in data else "eyeful" if "KRT" in data else "video"
@@ -99,5 +103,5 @@ def open_dataset(path: Path, scale: float = 1.0, name: str | None = None) -> tup
     raise DatasetError(
         f"{path}: holds no data set: expected transforms.json, transforms_*.json, the calibration JSON of "
         "videos, poses_bounds.npy, annots.npy, Eyeful's cameras.json, a COLMAP model, or an export of a depth camera "
-        "(rgb.txt, frame-000000.pose.txt, metadata.json, keyframes)"
+        f"(rgb.txt, frame-000000.pose.txt, metadata.json, keyframes); {_OF_VIDEO}"
     )

@@ -51,9 +51,13 @@ class Playback:
         position = (2 * tick * self.recorded_fps + self.fps) // (2 * self.fps)  # rounds half up, exactly
         if not self.back_and_forth:
             return int(position % self.count)
-        period = max(1, 2 * (self.count - 1))
-        place = int(position % period)
-        return place if place < self.count else period - place
+        place = int(position % self.period)
+        return place if place < self.count else self.period - place
+
+    @property
+    def period(self) -> int:
+        """Number of frames after which they repeat."""
+        return max(1, 2 * (self.count - 1)) if self.back_and_forth else self.count
 
     def whole_groups(self, size: int) -> list[int]:
         """The frames of the ticks of one pass, the last few left out so that ticks whose number is a multiple of
@@ -207,8 +211,9 @@ class ImageSource(Source):
         poses: PoseProvider | None = None,
     ) -> None:
         self.camera, self.fps = camera, playback.fps
-        self.contents = len(images)
+        self.contents, self.timed = len(images), images[0].time_s is not None
         self.intrinsics = images[0].intrinsics
+        self.repeats_after = playback.period if playback.fps == playback.recorded_fps else None
         self._images, self._order, self._playback = images, order, playback
         self._codec, self._poses = codec, poses
         self._whole: set[int] = set()

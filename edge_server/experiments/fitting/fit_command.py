@@ -35,8 +35,10 @@ Fit a recorded data set as fast as this machine can, and measure fidelity on vie
   edge-server fit --field splat --list-options
   edge-server fit ~/data/people/calibration.json --holdout cam01 --scale 4 --field ngp --option samples=256
   edge-server fit ~/data/apartment --format eyeful --holdout split
+  edge-server fit mine.yaml --seconds 30
 
-DATA is the folder of a data set, or a synthetic scene: room, tile, tower. The format is found from the files:
+DATA is the folder of a data set, a synthetic scene (room, tile, tower), or the file of a scenario with one carried
+camera of recorded data, such as a video with its trajectory. The format is found from the files:
 transforms JSON (nerfstudio, instant-ngp, NeRF-synthetic), videos with a calibration JSON, DyNeRF (videos
 with poses_bounds.npy), ZJU-MoCap (annots.npy), Eyeful Tower (cameras.json or .xml), a COLMAP model (text or
 binary). If the folder holds several, name the describing file or give --format. A moving scene is fitted at
@@ -49,7 +51,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     parser = command_parser("fit", DESCRIPTION)
     add = parser.add_argument
-    add("data", type=Path, nargs="?", metavar="DATA", help="data set (folder or file), or a synthetic scene")
+    add(
+        "data",
+        type=Path,
+        nargs="?",
+        metavar="DATA",
+        help="data set (folder or file), scenario file, or synthetic scene",
+    )
     add("--format", choices=list(FORMATS), help="format of the data set [found from its files]")
     add("--field", metavar="NAME", help=f"representation: {', '.join(field_names())} [{FIELD}]")
     add("--list-options", action="store_true", help="list the options of --field, with defaults, and exit")

@@ -15,6 +15,7 @@ from camera_node.synthetic import SCENES, make_scene
 from camera_node.synthetic.scene import HELD_OUT, Scene
 from camera_node.synthetic.source import WORLD_FPS
 from edge_server.experiments.common.arguments import OptionError
+from edge_server.experiments.scenes.captures import SUFFIXES, load_captures
 from edge_server.experiments.scenes.recorded import LEAST_WEIGHT, MultiviewStill, load_recorded
 from edge_server.fidelity.baselines import baseline
 from edge_server.fidelity.images import BLACK, Color
@@ -38,11 +39,16 @@ def synthetic_still(name: str, cameras: int = 19, size: int = 128, t_s: float = 
 def open_still(
     data: Path, holdout: str | None = None, scale: float = 1.0, frame: int = 0, format: str | None = None
 ) -> MultiviewStill:
-    """The views of a data set, or of a synthetic scene by its name, unless a file or folder has that name.
+    """The views of a data set, of the carried camera of a scenario file, or of a synthetic scene by its name, unless a
+    file or folder has that name.
 
-    The arguments are those of ``load_recorded``. Raises DatasetError; OptionError for an argument that a synthetic
-    scene, whose held-out camera is given, cannot have.
+    The arguments are those of ``load_recorded``. Raises DatasetError; OptionError for an argument that a scenario, or
+    a synthetic scene, whose held-out camera is given, cannot have.
     """
+    if data.suffix in SUFFIXES:
+        if scale != 1.0 or frame or format is not None:
+            raise OptionError(f"--scale, --frame and --format are for data sets: {data} says its scale and its kind")
+        return load_captures(data, holdout)
     if not _is_scene(data):
         return replace(load_recorded(data, holdout, scale, frame, format), name=data_name(data))
     for name, value in (("format", format), ("holdout", holdout)):
@@ -55,6 +61,8 @@ def open_still(
 
 def data_name(data: Path) -> str:
     """The name of a scene or data set in folders and reports."""
+    if data.suffix in SUFFIXES:
+        return data.stem
     return str(data) if _is_scene(data) else (data if data.is_dir() else data.parent).resolve().name
 
 

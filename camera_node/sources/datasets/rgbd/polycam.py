@@ -3,8 +3,9 @@
     keyframes/cameras/ID.json  width height fx fy cx cy, t_00 .. t_23 (camera-to-world, rows, OpenGL axes, y up)
     keyframes/images/ID.jpg    keyframes/depth/ID.png  millimeters, smaller than the image and registered to it
 
-Where Polycam has optimized the poses, ``corrected_cameras`` and ``corrected_images`` are read instead. The keys are
-read as nerfstudio's ``ns-process-data polycam`` reads them; the world is turned so that z points up.
+ID is the time in microseconds. Where Polycam has optimized the poses, ``corrected_cameras`` and ``corrected_images``
+are read instead, as photos: without times, which say that a tracker (ARKit) gave the poses, so that they are refined.
+The keys are read as nerfstudio's ``ns-process-data polycam`` reads them; the world is turned so that z points up.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
     folder, which = cameras.parent, cameras.name.removesuffix("cameras")
     images: list[PosedImage] = []
     missing: list[str] = []
-    for file in sorted(cameras.glob("*.json")):
+    files = sorted(cameras.glob("*.json"), key=lambda file: (len(file.stem), file.stem))  # of numbers: by time
+    tracked = not which and all(file.stem.isdecimal() for file in files)
+    for file in files:
         where, entry = str(file), read_json(file)
         if not isinstance(entry, dict):
             raise DatasetError(f"{file}: expected Polycam's mapping of a camera")
@@ -55,5 +58,6 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
             reader = DepthFile(depth).read if depth else None
             photo = Photo(image, Lens(int(width), int(height), fx, fy, cx, cy), options, depth=reader)
         turned = _Y_UP_TO_Z_UP @ pose @ OPENGL_TO_OPENCV
-        images.append(posed_photo(photo, file.stem, turned, where))
+        time_s = (int(file.stem) - int(files[0].stem)) / 1e6 if tracked else None
+        images.append(posed_photo(photo, file.stem, turned, where, time_s=time_s))
     return dataset_of_files(images, missing, folder, str(cameras))

@@ -99,10 +99,10 @@ def write_record3d(folder: Path) -> None:
     (folder / "metadata.json").write_text(json.dumps(data))
 
 
-def write_polycam(folder: Path) -> None:
+def write_polycam(folder: Path, from_us: int = 7_000_000) -> None:
     lens, small = Pinhole(64, 48, 60.0, 61.0, 31.0, 25.0), Pinhole(32, 24, 30.0, 30.5, 15.5, 12.5)
     for n in range(COUNT):
-        name = f"{7000 + n}"
+        name = f"{from_us + 100_000 * n}"
         save(folder / f"keyframes/images/{name}.png", image(n, lens))
         save(folder / f"keyframes/depth/{name}.png", np.rint(1000 * depth(n, small)).astype(np.uint16))
         matrix = TO_ARKIT @ pose(n) @ FLIP
@@ -185,8 +185,8 @@ def test_a_missing_image_is_counted_and_missing_depth_costs_only_depth(tmp_path,
         ("record3d", "metadata.json", "{", "cannot be read as JSON"),
         ("record3d", "metadata.json", '{"poses": [[1]]}', "poses: expected finite numbers of shape"),
         ("record3d", "metadata.json", "{}", "a list 'poses'"),
-        ("polycam", "keyframes/cameras/7000.json", '{"width": 64}', "height is missing"),
-        ("polycam", "keyframes/cameras/7000.json", "[]", "expected Polycam's mapping"),
+        ("polycam", "keyframes/cameras/7000000.json", '{"width": 64}', "height is missing"),
+        ("polycam", "keyframes/cameras/7000000.json", "[]", "expected Polycam's mapping"),
     ],
 )
 def test_damage_is_named(tmp_path, name, file, content, message):
@@ -198,12 +198,14 @@ def test_damage_is_named(tmp_path, name, file, content, message):
 
 
 def test_corrected_poses_of_polycam_are_preferred(tmp_path):
-    write_polycam(tmp_path)
+    """They were computed from the photos, the others are a tracker's, at the times that files are named by."""
+    write_polycam(tmp_path, 950_000)  # names that are sorted by time are not as texts
+    assert [image.time_s for image in open_dataset(tmp_path)[1]] == pytest.approx(0.1 * np.arange(COUNT))
     frames = tmp_path / "keyframes"
     shutil.copytree(frames / "images", frames / "corrected_images")
     (frames / "corrected_cameras").mkdir()
-    entry = json.loads((frames / "cameras/7001.json").read_text())
-    (frames / "corrected_cameras/7001.json").write_text(json.dumps(entry | {"t_03": entry["t_03"] + 0.5}))
+    entry = json.loads((frames / "cameras/1050000.json").read_text())
+    (frames / "corrected_cameras/1050000.json").write_text(json.dumps(entry | {"t_03": entry["t_03"] + 0.5}))
     (found,) = open_dataset(tmp_path)[1]
-    assert found.name == "7001" and found.depth is not None
+    assert found.name == "1050000" and found.depth is not None and found.time_s is None
     assert np.abs(found.camera_to_world[:3, 3] - pose(1)[:3, 3]).max() == pytest.approx(0.5)
