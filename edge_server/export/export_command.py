@@ -25,7 +25,8 @@ Write the results of a run or fit as files for other programs. RUN is its folder
   edge-server export runs/demo --colmap out/colmap --transforms out/nerf
 
 --mesh         triangles with colors: .ply or .glb (scikit-image: pip install 'freshfield[surface]')
---splats       the Gaussians of a splat field, in the layout that splat viewers open (.ply)
+--splats       the Gaussians of a splat field, in the layout that splat viewers open (.ply), or a quarter as
+               large (.spz: pip install 'freshfield[spz]')
 --points       surface points with colors (.ply)
 --colmap       DIR/images, under the pictures' own names, and a model in DIR/sparse/0, as text
 --transforms   DIR/transforms.json, DIR/images and DIR/points.ply, for nerfstudio and others
@@ -62,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("run", type=Path, metavar="RUN", help="folder of a run or fit (its --out), or a checkpoint")
     add("--mesh", type=out_file, metavar="FILE", help="mesh: .ply or .glb")
-    add("--splats", type=out_file, metavar="FILE", help="Gaussians: .ply")
+    add("--splats", type=out_file, metavar="FILE", help="Gaussians: .ply or .spz")
     add("--points", type=out_file, metavar="FILE", help="surface points: .ply")
     add("--colmap", type=out_folder, metavar="DIR", help="COLMAP model with images")
     add("--transforms", type=out_folder, metavar="DIR", help="transforms.json with images and points")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -13,9 +14,11 @@ from edge_server.export import ExportError, PosedImage
 from edge_server.fields import Field, View
 from edge_server.surface.settings import MeshSettings
 
-ENDINGS = {"mesh": (".ply", ".glb"), "splats": (".ply",), "points": (".ply",)}
+ENDINGS = {"mesh": (".ply", ".glb"), "splats": (".ply", ".spz"), "points": (".ply",)}
 KINDS = ("splats", "transforms", "colmap", "points", "mesh")  # in the order of writing
 POINTS = 20_000  # a sparse model of usual size: more only slows its readers
+PIXELS_A_POINT = 1000  # at most, of the depth that points are drawn from: 20 million pixels take 8 s of processor time
+LONG_S = 10.0  # of a stage that is announced in a pipe, too
 
 
 def check(files: Mapping[str, Path], count: int = POINTS) -> None:
@@ -31,7 +34,11 @@ def check(files: Mapping[str, Path], count: int = POINTS) -> None:
 
 
 def check_installed(files: Mapping[str, Path]) -> None:
-    """Check that what the files need is installed. Raises SurfaceError. files: see ``Exporter.write``."""
+    """Check that what the files need is installed. Raises SurfaceError, ExportError. files: see ``Exporter.write``."""
+    if "splats" in files and files["splats"].suffix.lower() == ".spz":
+        from edge_server.export.splats import import_gsply
+
+        import_gsply()
     if "mesh" in files:
         from edge_server.surface.mesh import import_marching_cubes
 
@@ -70,8 +77,11 @@ class Exporter:
         check(files, self._count)
         check_installed(files)
         if "mesh" not in files:
-            # Sharpening takes minutes, and points are drawn from the depth as well as it is.
+            # Sharpening takes minutes, and points are drawn from the depth as well as it is, and from a part of it.
             self._settings = replace(self._settings, sharpen=False)
+            pixels = sum(view.intrinsics.width * view.intrinsics.height for view in self._views)
+            share = min(1.0, math.sqrt(PIXELS_A_POINT * self._count / max(pixels, 1)))
+            self._views = [replace(view, intrinsics=view.intrinsics.scaled(share)) for view in self._views]
         for kind in KINDS:
             if kind in files:
                 files[kind].parent.mkdir(parents=True, exist_ok=True)
@@ -138,20 +148,29 @@ class Exporter:
 
 
 class ProgressLine:
-    """One line of a terminal with the stage, its share and the seconds that are left; nothing in a pipe."""
+    """One line of a terminal with the stage, its share and the seconds that are left. In a pipe, nothing but the
+    estimate of a stage that takes longer than LONG_S, once a second of it has passed."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
-        self._stage, self._printed_s, self._began_s = "", 0.0, 0.0
+        self._stage, self._printed_s, self._began = "", 0.0, (0.0, 0.0)
+        self._announced = False
 
     def __call__(self, stage: str, share: float) -> None:
-        if not self._stream.isatty():
-            return
         now = time.perf_counter()
         known = stage == self._stage
         if share < 1.0 and known and now - self._printed_s < 1.0:
             return
-        self._stage, self._printed_s, self._began_s = stage, now, self._began_s if known else now
-        left = f", {(now - self._began_s) * (1.0 / share - 1.0):.0f} s left" if known and 0.0 < share < 1.0 else ""
+        if not known:
+            self._stage, self._began, self._announced = stage, (now, share), False
+        self._printed_s = now
+        began_s, first = self._began
+        left_s = (now - began_s) * (1.0 - share) / (share - first) if share > first else 0.0
+        if not self._stream.isatty():
+            if left_s > LONG_S and not self._announced:
+                self._announced = True
+                print(f"  {stage}: some {left_s:.0f} s", file=self._stream, flush=True)
+            return
+        left = f", {left_s:.0f} s left" if left_s else ""
         end = "\n" if share >= 1.0 else ""
         print(f"\r  {stage:10} {100 * share:3.0f} %{left:16}", end=end, file=self._stream, flush=True)

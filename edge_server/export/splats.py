@@ -1,4 +1,4 @@
-"""Gaussians as PLY in the layout of Kerbl et al.'s code, which the common splat viewers open.
+"""Gaussians as PLY in the layout of Kerbl et al.'s code, which the common splat viewers open, or as Niantic's SPZ.
 
 There, color is 0.5 + Y0 f_dc + sum of Y_k f_rest, with spherical harmonics whose odd orders have the opposite
 sign. Scales are logarithms, opacities are before the sigmoid, quaternions are w-first: as here.
@@ -6,7 +6,9 @@ sign. Scales are logarithms, opacities are before the sigmoid, quaternions are w
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +19,12 @@ from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSITION, QUATERNION, SCALE, Gaussians
 from edge_server.fields.splat.planar import unit_quaternions
 from edge_server.fields.splat.settings import LOG_SCALE_HIGH, LOG_SCALE_LOW
+from freshfield.files import write_bytes
 
 Y0 = 0.28209479177387814
 # Signs of the harmonics of degree 1: Kerbl et al. negate those of odd order.
 SIGNS = np.array([-1, 1, -1], np.float32)
+SPZ_BITS, SPZ_WHOLE_BITS = 12, 23  # of a position behind the binary point, as others write it; and in all, without sign
 
 
 def write_splats(path: Path, gaussians: Gaussians, box: SceneBox) -> int:
@@ -28,8 +32,45 @@ def write_splats(path: Path, gaussians: Gaussians, box: SceneBox) -> int:
     table = splat_table(gaussians, box)
     if not len(table):
         raise ExportError("the field has no Gaussians yet: fit it first")
-    write_table(path, table)
+    if path.suffix.lower() == ".spz":
+        write_bytes(path, spz_bytes(table))
+    else:
+        write_table(path, table)
     return len(table)
+
+
+def spz_bytes(table: NDArray[np.void]) -> bytes:
+    """The rows of ``splat_table`` as SPZ, version 3: positions as multiples of 2^-12 m (coarser beyond 2 km), the rest
+    in a byte a number. Raises ExportError without gsply."""
+    gsply = import_gsply()
+
+    def columns(*names: str) -> NDArray[np.float32]:
+        return np.stack([table[name] for name in names], axis=-1) if names else np.zeros((len(table), 0), np.float32)
+
+    assert table.dtype.names is not None
+    rest = columns(*(name for name in table.dtype.names if name.startswith("f_rest_")))
+    means = columns("x", "y", "z")
+    gaussians = gsply.GSData(
+        means=means,
+        scales=columns("scale_0", "scale_1", "scale_2"),
+        quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        opacities=table["opacity"],
+        sh0=columns("f_dc_0", "f_dc_1", "f_dc_2"),
+        shN=rest.reshape(len(table), 3, -1).transpose(0, 2, 1),
+    )
+    bits = min(SPZ_BITS, SPZ_WHOLE_BITS - int(np.frexp(np.abs(means).max())[1]))
+    with tempfile.TemporaryDirectory() as folder:
+        gsply.write_spz(file := Path(folder) / "splats.spz", gaussians, fractional_bits=max(bits, 1))
+        return file.read_bytes()
+
+
+def import_gsply() -> Any:
+    """The library that writes SPZ. Raises ExportError where it is missing."""
+    try:
+        import gsply
+    except ImportError:
+        raise ExportError("SPZ needs gsply: pip install 'freshfield[spz]', or write .ply") from None
+    return gsply
 
 
 def splat_table(gaussians: Gaussians, box: SceneBox) -> NDArray[np.void]:

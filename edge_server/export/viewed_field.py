@@ -98,7 +98,7 @@ class ViewedField:
     def export(self, file: Path | str, kind: Kind | None = None) -> None:
         """Write the field for other programs.
 
-        file: ends in .ply, or, of a mesh, in .ply or .glb.
+        file: ends in .ply; of a mesh also in .glb, of splats also in .spz.
         kind: splats (the Gaussians of a splat field), points of the surface, or a mesh; None: a mesh if the file ends
             in .glb, else splats.
         Raises ExportError where the field has no Gaussians, the ending is another, or a package is missing.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 import sys
 import tracemalloc
@@ -13,6 +14,7 @@ import pytest
 from edge_server.cli import main as edge_server
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.export import ExportError
+from edge_server.export.exporter import ProgressLine
 from edge_server.export.run_source import open_source
 from edge_server.fields import Budget, checkpoint
 from edge_server.fields.registry import make_field
@@ -69,6 +71,31 @@ def test_depth_is_sharpened_for_a_mesh_alone(run, tmp_path, monkeypatch):
     assert any(text.startswith("\r  sharpen") for text in written)
 
 
+def test_a_pipe_is_told_of_long_work_alone(monkeypatch):
+    now, out = [0.0], io.StringIO()
+    monkeypatch.setattr("edge_server.export.exporter.time.perf_counter", lambda: now[0])
+    line = ProgressLine(out)
+    for stage, each_s in (("depth", 0.05), ("sharpen", 2.0), ("fuse", 0.05)):
+        for step in range(11):
+            line(stage, step / 10)
+            now[0] += each_s
+    assert out.getvalue() == "  sharpen: some 18 s\n"
+
+
+def test_points_of_large_pictures_are_drawn_from_a_part_of_them(run, tmp_path, capsys, monkeypatch):
+    """Of 8 x 32 x 32 pixels."""
+    sizes, rendered = [], reconstruct.render_depth_maps
+    monkeypatch.setattr(
+        reconstruct,
+        "render_depth_maps",
+        lambda f, cameras, *more: sizes.append([lens.width for _, lens in cameras]) or rendered(f, cameras, *more),
+    )
+    for count, width in ((2, 32 * (2000 / (8 * 32 * 32)) ** 0.5), (80, 32)):
+        assert export(run, "--points", tmp_path / "p.ply", "--count", count) == 0
+        assert sizes.pop() == [pytest.approx(width, abs=1)] * 8
+        assert " points" in capsys.readouterr().out
+
+
 def test_a_mesh_of_a_known_scene_is_measured_against_it(run, tmp_path, capsys):
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
     wanted = (run, "--mesh", tmp_path / "m.ply", "--voxel", 10, "--no-sharpen")
@@ -103,6 +130,7 @@ def test_a_field_comes_back_as_it_was(tmp_path, name):
         (("--mesh", "m.ply", "--voxel", "0"), "--voxel 0: expected more than 0 mm"),
         (("--mesh", "m.ply", "--method", "poisson"), "method must be one of tsdf, sdf"),
         (("--points", "p.ply", "--count", "0"), "--count 0"),
+        (("--splats", "s.splat"), "--splats s.splat: expected a file that ends in .ply or .spz"),
         (("--mesh", "m.ply", "--voxel", "10", "--bounds", *["1", "1", "1", "0", "0", "0"]), "lower corner"),
     ],
 )

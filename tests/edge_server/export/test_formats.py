@@ -14,7 +14,7 @@ from edge_server.export import PosedImage, file_names, glb, ply
 from edge_server.export.colmap import Cloud, write_model
 from edge_server.export.images import write_images
 from edge_server.export.point_cloud import sparse_points
-from edge_server.export.splats import Y0, write_splats
+from edge_server.export.splats import Y0, splat_table, write_splats
 from edge_server.export.transforms import write_transforms
 from edge_server.fields import View
 from edge_server.fields.common.kernels.volume_rendering import harmonic
@@ -132,6 +132,31 @@ def test_splats_stand_as_viewers_expect_them(tmp_path, sh_degree):
         shown = 0.5 + Y0 * data[f"f_dc_{c}"]
         shown = shown + sum(theirs[k] * data[f"f_rest_{c * extra + k}"] for k in range(extra))
         np.testing.assert_allclose(shown, ours, atol=1e-5)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1])
+@pytest.mark.parametrize(("radius_m", "off_m"), [(2.5, 2**-13), (4e6, 4e6 * 2**-20)])
+def test_splats_come_back_from_spz(tmp_path, sh_degree, radius_m, off_m):
+    gsply = pytest.importorskip("gsply", reason="gsply is not installed (extra spz)")
+    params = RNG.uniform(-1.0, 1.0, (30, 14 + 9 * sh_degree)).astype(np.float32)
+    gaussians, box = Gaussians(params, sh_degree), SceneBox((1.0, -2.0, 0.5), radius_m, 0.1, False, 3.0, 0.01)
+    assert write_splats(tmp_path / "s.SPZ", gaussians, box) == 30
+    found, data = gsply.read_spz(tmp_path / "s.SPZ"), splat_table(gaussians, box)
+
+    def wanted(*names):
+        return np.stack([data[name] for name in names], axis=-1)
+
+    assert np.abs(found.means - wanted(*"xyz")).max() <= off_m
+    sixteenth = np.abs(found.scales - np.clip(wanted("scale_0", "scale_1", "scale_2"), -10, 255 / 16 - 10)).max()
+    assert sixteenth <= 1 / 32 + 1e-6
+    turn = np.abs((found.quats * wanted("rot_0", "rot_1", "rot_2", "rot_3")).sum(axis=1))
+    assert turn.min() > 1 - 1e-5
+    assert np.abs(1 / (1 + np.exp(-found.opacities)) - 1 / (1 + np.exp(-data["opacity"]))).max() <= 0.51 / 255
+    shown = np.clip(wanted("f_dc_0", "f_dc_1", "f_dc_2"), -0.5 / 0.15, 0.5 / 0.15)
+    assert np.abs(found.sh0 - shown).max() <= 0.51 / (0.15 * 255)
+    for c in range(3 * bool(sh_degree)):
+        rest = np.clip(wanted(*(f"f_rest_{c * 3 + k}" for k in range(3))), -1, 127 / 128)
+        assert np.abs(found.shN[:, :, c] - rest).max() <= 0.51 / 128
 
 
 def kerbl(x: float, y: float, z: float) -> list[float]:
