@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge_server.page.colors import FRESH, HELD_OUT, MIDDLE, STALE, UNKNOWN, age_color, scale_color
+from edge_server.page.colors import FRESH, HELD_OUT, MIDDLE, STALE, UNKNOWN, age_color, age_colors, scale_color
 from edge_server.page.settings import FRESH_MS, STALE_MS
 
 # Machado, Oliveira and Fernandes (2009), severity 1, acting on linear RGB.
@@ -30,6 +30,11 @@ def test_what_is_no_age_has_a_color_too():
     assert age_color(float("nan")) == STALE
     assert age_color(float("inf")) == STALE
     assert age_color(-30.0) == FRESH  # a clock a little ahead
+
+
+def test_many_ages_have_the_colors_of_each():
+    ages = np.array([0.0, FRESH_MS, 90.0, 400.0, STALE_MS, 1e9])
+    np.testing.assert_allclose(age_colors(ages), [np.array(age_color(age)) / 255 for age in ages], atol=1e-6)
 
 
 @pytest.mark.parametrize("deficiency", DEFICIENCIES)

@@ -104,6 +104,13 @@ def test_it_asks_where_it_is_unsure():
     assert i != j and model.information(features, np.array([i]), np.array([j]))[0] > np.median(told)
 
 
+def test_any_two_trajectories_can_be_asked_about_and_never_one_twice():
+    features = np.array([[0.0], [1.0], [3.0]])
+    model, rng = fit_reward(features, []), np.random.default_rng(0)  # after no answer: a random pair
+    asked = {next_pair(model, features, rng) for _ in range(200)}
+    assert asked == {(i, j) for i in range(3) for j in range(3) if i != j}
+
+
 def test_wrong_input_is_named():
     with pytest.raises(ViewpointError, match="finite features"):
         fit_reward(np.full((5, 2), np.nan), [])

@@ -33,6 +33,8 @@ def test_too_few_values_have_no_interval():
     assert Interval(1.0, 0.5, 1.5, 9).above(0.4) is True
     assert Interval(1.0, 0.5, 1.5, 9).above(1.6) is False
     assert Interval(1.0, 0.5, 1.5, 9).above(1.0) is None
+    assert Interval(1.0, 0.5, 1.5, 9).above(1.5) is None  # its end is part of it
+    assert Interval(1.0, 1.0, 1.0, 9).above(1.0) is False  # all values alike
 
 
 def test_pairing_takes_out_what_seeds_have_in_common():
