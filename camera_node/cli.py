@@ -95,6 +95,9 @@ def _add_cameras(command: argparse.ArgumentParser) -> None:
     command.add_argument("scenario", help="scenario file, or the name of a shipped one")
     who = command.add_mutually_exclusive_group(required=True)
     who.add_argument("--camera", metavar="ID[,ID]", help="cameras of the scenario to stream or render")
+    who.add_argument(
+        "--camera-index", type=int, metavar="N", help="the camera of this number in the scenario, from 0 (of a pod)"
+    )
     who.add_argument("--all", action="store_true", help="all cameras of the scenario")
     command.add_argument("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
     command.add_argument("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
@@ -222,6 +225,10 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _chosen(scenario: Scenario, args: argparse.Namespace) -> tuple[str, ...]:
+    if args.camera_index is not None:
+        if not 0 <= args.camera_index < len(scenario.cameras):
+            raise UsageError(f"--camera-index {args.camera_index}: expected 0 to {len(scenario.cameras) - 1}")
+        return (scenario.cameras[args.camera_index],)
     if args.all:
         return scenario.cameras
     chosen = tuple(dict.fromkeys(c.strip() for c in args.camera.split(",") if c.strip()))

@@ -25,7 +25,7 @@ RUN /build/bin/hatchling build -t wheel -d /dist \
 
 FROM ${BASE}
 RUN useradd --system --create-home --uid 10001 freshfield \
- && install -d -o freshfield -g freshfield /runs
+ && install -d -o freshfield -g freshfield /runs && mkdir /app
 COPY --from=build /venv /venv
 # All that is written lies in /runs, so that the rest may be read-only.
 ENV PATH=/venv/bin:$PATH PYTHONUNBUFFERED=1 XDG_CACHE_HOME=/runs/cache \

@@ -156,7 +156,12 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run.add_argument(
         "--data", type=Path, metavar="DIR", help="folder of data sets; only its lpips/ is read [$FRESHFIELD_DATA]"
     )
-    run.add_argument("--resume", type=Path, metavar="FILE", help="start from a checkpoint of an earlier run")
+    run.add_argument(
+        "--resume",
+        type=Path,
+        metavar="FILE",
+        help="start from a checkpoint of an earlier run; OUT/field.npz, which this run writes itself, may not be there yet",
+    )
     run.add_argument(
         "--checkpoint-every", type=float, metavar="S", help="write OUT/field.npz every S seconds [only at the end]"
     )
@@ -199,7 +204,7 @@ def _run(args: argparse.Namespace) -> int:
         open_page=None if args.page_port is None else open_page,
         metrics_port=args.metrics_port,
         lpips_folder=weights_folder(args.lpips, args.data),
-        resume=args.resume,
+        resume=None if args.resume == args.out / "field.npz" and not args.resume.exists() else args.resume,
         checkpoint_s=args.checkpoint_every,
         record=args.record,
     )

@@ -30,7 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "edge-server keys",
         description="Make a development certificate authority (CA), and a folder with "
         "certificate, key and CA for each process of a scenario: edge, emulator, every camera, operator and "
-        "viewer. The edge's folder also holds tokens.txt, with which people log in to the page.",
+        "viewer. The edge's folder also holds tokens.txt, with which people log in to the page; kustomization.yaml "
+        "makes Kubernetes secrets of all that (docs/deploy.md).",
     )
     parser.add_argument("scenario", help="scenario file, or the name of a shipped one")
     parser.add_argument("--out", type=out_folder, required=True, metavar="DIR", help="folder to write; must not exist")
@@ -79,9 +80,25 @@ def make_keys(out: Path, cameras: Sequence[str], edge: Sequence[str], emulator: 
                 (folder / "ca.pem").write_bytes((whole / "cert.pem").read_bytes())
             lines = [f"{name} {secrets.token_urlsafe(24)}\n" for name in ("operator", "viewer")]
             (whole / "edge" / "tokens.txt").write_text("".join(lines))
+            (whole / "kustomization.yaml").write_text(_kubernetes_secrets(cameras))
             whole.rename(out)
     finally:
         os.umask(before)
+
+
+def _kubernetes_secrets(cameras: Sequence[str]) -> str:
+    """A Kustomize component (deploy/kubernetes): a secret for each kind of pod. Camera pods share one; each mounts
+    the files of its own number alone."""
+    files = {"camera-keys": [f"ca.pem={cameras[0]}/ca.pem"] if cameras else []}
+    for process in ("edge", "emulator"):
+        files[f"{process}-keys"] = [f"{process}/{name}.pem" for name in ("cert", "key", "ca")]
+    files["edge-keys"].append("edge/tokens.txt")
+    for number, camera in enumerate(cameras):
+        files["camera-keys"] += [f"{number}-{name}.pem={camera}/{name}.pem" for name in ("cert", "key")]
+    lines = ["apiVersion: kustomize.config.k8s.io/v1alpha1", "kind: Component", "secretGenerator:"]
+    for secret, listed in files.items():
+        lines += [f"  - name: {secret}", "    files:", *(f"      - {file}" for file in listed)]
+    return "\n".join(lines) + "\n"
 
 
 def _certify(folder: Path, name: str, extensions: Sequence[str], authority: Path | None = None) -> None:

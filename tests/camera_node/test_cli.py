@@ -18,6 +18,7 @@ def test_mistakes_are_one_line_and_exit_code_2(capsys, tmp_path, monkeypatch):
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
     to = ("--to", "127.0.0.1:1")
     assert "shipped scenarios: " in fails(capsys, "run", "nope", "--all", *to)
+    assert "--camera-index 13: expected 0 to 12" in fails(capsys, "run", "room", "--camera-index", "13", *to)
     assert "has no camera cam77; it has cam00, " in fails(capsys, "run", "room", "--camera", "cam01,cam77", *to)
     assert "FRESHFIELD_DATA" in fails(capsys, "run", "fox", "--all", *to)
     assert "does not exist" in fails(capsys, "run", "fox", "--all", "--data", str(tmp_path), *to)

@@ -114,6 +114,14 @@ def test_the_end_says_if_nobody_was_reached_or_nothing_was_captured():
     assert failure(Eye("cam01", gone)).startswith("no frame could be captured (")
 
 
+def test_a_fault_of_the_program_ends_the_node_and_is_told(monkeypatch):
+    """A frame that is missing is counted; what should never happen is not passed over."""
+    node = node_of([Eye("cam01"), Eye("cam02")], seconds=5.0)
+    monkeypatch.setattr(node, "_frame", MagicMock(side_effect=ZeroDivisionError))
+    with pytest.raises(ZeroDivisionError):
+        asyncio.run(node.run())
+
+
 def test_reasons_of_refusals_are_logged_once_and_not_without_end(caplog):
     outbox = Outbox("cam01", "s", None, VirtualClock(0))
     sender = Sender(outbox, MagicMock(), (), lambda: None, np.random.default_rng(0))

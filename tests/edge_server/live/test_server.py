@@ -386,8 +386,11 @@ def test_a_terminal_that_is_closed_ends_the_run_as_ctrl_c_does(tmp_path, monkeyp
         assert server._stopping.wait(5)
 
     monkeypatch.setattr(EdgeServer, "run", closed)
+    # A first start under a supervisor: what it will resume from is not there yet.
+    words = ["run", "room", "--out", str(tmp_path / "out"), "--page-port", "0", "--resume"]
     try:
-        assert edge_server(["run", "room", "--out", str(tmp_path / "out"), "--page-port", "0"]) == 0
+        assert edge_server([*words, str(tmp_path / "out/field.npz")]) == 0
+        assert edge_server([*words, str(tmp_path / "other/field.npz")]) == 2
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

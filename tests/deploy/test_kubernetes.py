@@ -1,0 +1,260 @@
+"""deploy/kubernetes: valid by the published schemas, every name refers to what there is, and only the emulator reaches
+the edge."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import yaml
+
+import camera_node.cli
+import channel_emu.cli
+import edge_server.cli
+from edge_server.live.keys import make_keys
+from edge_server.report.build_report import build_report
+from freshfield.scenario import load
+from tests.conftest import ROOT
+from tests.deploy.kustomize import Document, by_kubectl, rendered
+from tests.support import wait_until
+
+SCENES = sorted(folder.name for folder in (ROOT / "deploy/kubernetes/overlays").iterdir())
+SCHEMAS = "1.31"
+CLI = {"edge-server": edge_server.cli, "channel-emu": channel_emu.cli, "camera-node": camera_node.cli}
+
+
+@pytest.fixture(scope="module")
+def overlays(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the overlays with their keys."""
+    copy = tmp_path_factory.mktemp("kubernetes") / "kubernetes"
+    shutil.copytree(ROOT / "deploy/kubernetes", copy, ignore=shutil.ignore_patterns("keys"))
+    for scene in SCENES:
+        make_keys(copy / "overlays" / scene / "keys", load(scene).cameras, ["edge"], ["emulator"])
+    return copy / "overlays"
+
+
+@pytest.fixture(params=SCENES)
+def scene(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def documents(overlays: Path, scene: str) -> list[Document]:
+    return rendered(overlays / scene)
+
+
+def of(documents: list[Document], *kinds: str) -> dict[str, Document]:
+    return {d["metadata"]["name"]: d for d in documents if d["kind"] in kinds}
+
+
+def pods(documents: list[Document]) -> dict[str, Document]:
+    """Name -> template of its pods."""
+    return {name: d["spec"]["template"] for name, d in of(documents, "StatefulSet", "Deployment").items()}
+
+
+def test_they_are_what_kubectl_makes_of_them(overlays: Path, scene: str, documents: list[Document]) -> None:
+    if shutil.which("kubectl") is not None:
+        theirs, key = by_kubectl(overlays / scene), lambda d: (d["kind"], d["metadata"]["name"])
+        assert sorted(documents, key=key) == sorted(theirs, key=key)
+    assert len(documents) == len({(d["kind"], d["metadata"]["name"]) for d in documents})
+
+
+def test_they_follow_the_published_schemas(documents: list[Document]) -> None:
+    validator = pytest.importorskip("kubernetes_validate", reason="kubernetes-validate is not installed (extra dev)")
+    for document in documents:
+        validator.validate(document, SCHEMAS, strict=True)
+    broken = of(documents, "StatefulSet")["edge"]
+    broken["spec"]["template"]["spec"]["containers"][0]["livenessProbe"]["periods"] = 3
+    with pytest.raises(validator.ValidationError):
+        validator.validate(broken, SCHEMAS, strict=True)
+
+
+def test_a_pod_for_each_camera_and_commands_that_their_programs_take(
+    monkeypatch: pytest.MonkeyPatch, scene: str, documents: list[Document]
+) -> None:
+    (config,) = of(documents, "ConfigMap").values()
+    assert config["data"] == {"SCENARIO": scene}
+    cameras = load(scene).cameras
+    assert of(documents, "StatefulSet")["camera"]["spec"]["replicas"] == len(cameras)
+    for name, template in pods(documents).items():
+        (container,) = template["spec"]["containers"]
+        program, *words = (
+            word.replace("$(SCENARIO)", scene).replace("$(INDEX)", str(len(cameras) - 1))
+            for word in container["command"]
+        )
+        taken = []
+        monkeypatch.setattr(CLI[program], "_run", lambda args, taken=taken: taken.append(args) or 0)
+        assert CLI[program].main(words) == 0 and taken[0].scenario == scene, name
+        if name == "camera":
+            assert camera_node.cli._chosen(load(scene), taken[0]) == (cameras[-1],)
+        probe = container["livenessProbe"]["exec"]["command"]
+        assert (
+            probe[:3] == ["python", "-m", "freshfield_up.healthy"] == container["startupProbe"]["exec"]["command"][:3]
+        )
+        if name != "camera":  # asked at the port it listens on, as the Service names it
+            port = taken[0].listen.rpartition(":")[2]
+            assert f"--serving=127.0.0.1:{port}" in probe and container["readinessProbe"]["exec"]["command"] == probe
+            listed = {each["port"] for each in of(documents, "Service")[name]["spec"]["ports"]}
+            assert listed == {each["containerPort"] for each in container["ports"]} and int(port) in listed
+    assert container["env"][0]["name"] == "INDEX"
+
+
+def test_every_volume_is_there_and_nobody_sees_anothers_key(scene: str, documents: list[Document]) -> None:
+    secrets = of(documents, "Secret")
+    for name, template in pods(documents).items():
+        spec = template["spec"]
+        (container,) = spec["containers"]
+        volumes = {each["name"] for each in spec["volumes"]}
+        volumes |= {
+            each["metadata"]["name"]
+            for each in of(documents, "StatefulSet").get(name, {"spec": {}})["spec"].get("volumeClaimTemplates", ())
+        }
+        mounts = {each["mountPath"]: each for each in container["volumeMounts"]}
+        assert {each["name"] for each in mounts.values()} == volumes
+        (secret,) = [each["secret"]["secretName"] for each in spec["volumes"] if "secret" in each]
+        assert secret == f"{name}-keys" and secret in secrets
+        given = {word.partition("=")[2] for word in container["command"] if word.startswith(("--tls", "--token"))}
+        files = secrets[secret]["data"].keys()
+        if name == "camera":
+            for number in range(len(load(scene).cameras)):
+                parts = [m.get("subPathExpr", m.get("subPath")) for at, m in mounts.items() if at.startswith("/keys")]
+                assert {part.replace("$(INDEX)", str(number)) for part in parts} <= files
+            assert given == {at for at in mounts if at.startswith("/keys/")}
+        else:
+            assert {f"/keys/{file}" for file in files} == given
+
+
+def test_the_emulator_is_the_only_way_from_a_camera_to_the_edge(documents: list[Document]) -> None:
+    policies = of(documents, "NetworkPolicy")
+    labels = {name: template["metadata"]["labels"] for name, template in pods(documents).items()}
+    denied = policies["default-deny"]["spec"]
+    assert denied == {"podSelector": {}, "policyTypes": ["Ingress", "Egress"]}
+
+    def allowed(way: str, peers: str, name: str, other: str, port: int) -> bool:
+        """Whether some policy of pod ``name`` lets it talk with ``other``."""
+        for policy in policies.values():
+            chosen = policy["spec"]["podSelector"].get("matchLabels", {}).items()
+            if chosen <= labels[name].items():
+                for rule in policy["spec"].get(way, ()):
+                    matching = [
+                        p["podSelector"]["matchLabels"].items() <= labels[other].items() for p in rule.get(peers, ())
+                    ]
+                    if port in [each["port"] for each in rule["ports"]] and (any(matching) or not rule.get(peers)):
+                        return True
+        return False
+
+    def reaches(source: str, target: str, port: int) -> bool:
+        return allowed("egress", "to", source, target, port) and allowed("ingress", "from", target, source, port)
+
+    ways = {(a, b, port) for a in labels for b in labels if a != b for port in (7000, 7001) if reaches(a, b, port)}
+    assert ways == {("camera", "emulator", 7001), ("emulator", "edge", 7000), ("edge", "emulator", 7001)}
+
+
+def test_pods_are_confined_limited_and_watched(documents: list[Document]) -> None:
+    (namespace,) = of(documents, "Namespace").values()
+    assert namespace["metadata"]["labels"] == {"pod-security.kubernetes.io/enforce": "restricted"}
+    for template in pods(documents).values():
+        spec = template["spec"]
+        assert spec["securityContext"]["runAsNonRoot"] and spec["automountServiceAccountToken"] is False
+        for container in (*spec["containers"], *spec.get("initContainers", ())):
+            confined = container["securityContext"]
+            assert confined["readOnlyRootFilesystem"] and not confined["allowPrivilegeEscalation"]
+            assert confined["capabilities"] == {"drop": ["ALL"]}
+            assert {"cpu", "memory"} <= container["resources"]["requests"].keys()
+            assert "memory" in container["resources"]["limits"]
+    edge = pods(documents)["edge"]
+    scraped = edge["metadata"]["annotations"]["prometheus.io/port"]
+    assert f"--metrics-port={scraped}" in edge["spec"]["containers"][0]["command"]
+
+
+def as_pod(documents: list[Document], name: str, keys: Path, index: int | None = None) -> Document:
+    """One pod of a workload, as ``podman play kube`` takes it, which knows no Secret, StatefulSet or limit here."""
+    spec = copy.deepcopy(pods(documents)[name]["spec"])
+    (container,) = spec["containers"]
+    (config,) = of(documents, "ConfigMap").values()
+    del container["envFrom"]
+    container["env"] = [{"name": key, "value": value} for key, value in config["data"].items()]
+    container["env"] += [] if index is None else [{"name": "INDEX", "value": str(index)}]
+    for each in (container, *spec.get("initContainers", ())):
+        del each["resources"]
+        each.pop("startupProbe", None)
+        each.pop("readinessProbe", None)
+    mounts = [mount for mount in container["volumeMounts"] if mount["name"] != "keys"]
+    container["volumeMounts"] = [*mounts, {"name": "keys", "mountPath": "/keys", "readOnly": True}]
+    own = keys / (name if index is None else load("quad").cameras[index])
+    volumes = [each for each in spec["volumes"] if each["name"] != "keys"]
+    volumes.append({"name": "keys", "hostPath": {"path": str(own), "type": "Directory"}})
+    for claim in of(documents, "StatefulSet").get(name, {"spec": {}})["spec"].get("volumeClaimTemplates", ()):
+        called = claim["metadata"]["name"]
+        volumes.append({"name": called, "persistentVolumeClaim": {"claimName": f"freshfield-{name}-{called}"}})
+    spec["volumes"] = volumes
+    pod = name if index is None else f"{name}-{index}"
+    return {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": pod, "labels": {"app": pod}}, "spec": spec}
+
+
+def podman(*words: str | Path, check: bool = True) -> str:
+    done = subprocess.run(["podman", *map(str, words)], capture_output=True, text=True, timeout=600.0)
+    assert done.returncode == 0 or not check, f"podman {words}: {done.stderr[-2000:]}"
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1500)
+def test_played_by_podman_a_dead_edge_goes_on_and_every_frame_is_accounted_for(overlays: Path, tmp_path: Path) -> None:
+    if shutil.which("podman") is None or "FRESHFIELD_IMAGES_ARE_BUILT" not in os.environ:
+        pytest.skip("no podman with the images of deploy/*.Dockerfile (FRESHFIELD_IMAGES_ARE_BUILT=1)")
+    documents, keys = rendered(overlays / "quad"), overlays / "quad" / "keys"
+    if os.geteuid() == 0:
+        subprocess.run(["chown", "-R", "10001", keys], check=True)
+    cameras = [f"camera-{index}" for index in range(len(load("quad").cameras))]
+
+    def play(name: str, networks: Sequence[str], index: int | None = None) -> None:
+        pod = as_pod(documents, name, keys, index)
+        file = tmp_path / f"{pod['metadata']['name']}.yaml"
+        file.write_text(yaml.safe_dump(pod))
+        podman("play", "kube", *(word for each in networks for word in ("--network", each)), file)
+
+    def status() -> Document:
+        text = podman("exec", "edge-edge", "cat", "/runs/edge.json", check=False)
+        return dict(json.loads(text)) if text else {"updates": {"count": 0}, "cameras": {}}
+
+    def checkpoint_written() -> bool:
+        return "field.npz" in podman("exec", "edge-edge", "ls", "/runs", check=False)
+
+    try:
+        podman("network", "create", "freshfield-edge")
+        podman("network", "create", "--internal", "freshfield-cameras")
+        play("edge", ["freshfield-edge"])
+        play("emulator", ["freshfield-edge", "freshfield-cameras"])
+        for index, _ in enumerate(cameras):
+            play("camera", ["freshfield-cameras"], index)
+        wait_until(lambda: status()["updates"]["count"] >= 5, "no five updates", 300.0)
+        wait_until(checkpoint_written, "no checkpoint", 120.0)
+        before = status()["updates"]["count"]
+        podman("pod", "rm", "-f", "-t", "0", "edge")
+        died_s = time.monotonic()
+        play("edge", ["freshfield-edge"])
+        wait_until(lambda: status()["updates"]["count"] >= 5, "the new edge makes no updates", 300.0)
+        print(f"killed after {before} updates; five more {time.monotonic() - died_s:.1f} s later")
+        for pod in (*cameras, "emulator", "edge"):
+            podman("pod", "stop", "-t", "30", pod)
+            podman("cp", f"{pod}-{pod.partition('-')[0]}:/runs/.", tmp_path / "runs")
+    finally:
+        for pod in (*cameras, "emulator", "edge"):
+            podman("pod", "rm", "-f", "-t", "0", pod, check=False)
+        podman("volume", "rm", "freshfield-edge-runs", check=False)
+        podman("network", "rm", "freshfield-edge", "freshfield-cameras", check=False)
+    series = [json.loads(line) for line in (tmp_path / "runs" / "series.jsonl").read_text().splitlines()]
+    (again,) = [k for k in range(1, len(series)) if series[k]["t_s"] < series[k - 1]["t_s"]]
+    assert series[again]["number"] > 0, "it began anew"
+    report = build_report(tmp_path / "runs")
+    assert report["frames"]["closes"], report["frames"]["doubts"]
+    assert report["frames"]["delivered"] > 100
+    print({key: report["frames"][key] for key in ("captured", "sent", "delivered", "cut_off")})
