@@ -160,7 +160,7 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
         "--resume",
         type=Path,
         metavar="FILE",
-        help="start from a checkpoint of an earlier run; OUT/field.npz, which this run writes itself, may not be there yet",
+        help="start from a checkpoint of an earlier run; OUT/field.npz, which this run writes, may not be there yet",
     )
     run.add_argument(
         "--checkpoint-every", type=float, metavar="S", help="write OUT/field.npz every S seconds [only at the end]"
