@@ -215,5 +215,5 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 
 # What slow tests need besides: Ray, some 240 MB; scikit-image and pycolmap for surfaces; and what tests of cameras and arms skip without, 200 MB.
 .venv/.ok-slow: .venv/.ok-test
-	@$(INSTALL) -e '.[cluster,surface,spz,colmap,ur,oak,realsense,mcap]'
+	@$(INSTALL) -e '.[cluster,surface,spz,colmap,ur,oak,realsense,mcap,ros,foxglove]'
 	@touch $@

@@ -14,7 +14,7 @@ from camera_node.robot import arm_cli
 from camera_node.robot.calibration import CalibrationError, calibrate_command
 from freshfield import transport
 from freshfield.files import out_folder
-from freshfield.scenario import Scenario, ScenarioError, load
+from freshfield.scenario import Scenario, ScenarioError, load, parse
 
 if TYPE_CHECKING:
     from camera_node.capture import Camera
@@ -23,6 +23,7 @@ EXAMPLES = """examples:
   camera-node run room --all --to 127.0.0.1:7001             every camera of the shipped scenario "room"
   camera-node run room.yaml --camera cam03 --to emu:7001     one camera, e.g. on its own machine
   camera-node run fox --all --to :7001 --data ~/data         recorded data, from the folder --data
+  camera-node run bag/ --as hand --to :7001                  a ROS bag or other recording, as camera "hand"
   camera-node prepare room --all                             render ahead, so that run starts quickly
   camera-node calibrate hand-eye --help                      pose of a camera on an arm
   camera-node simulate-arm cell                              a simulated arm for the scenario "cell"
@@ -91,7 +92,8 @@ def main(arguments: list[str] | None = None, prog: str = "camera-node") -> int:
         return 2
 
 
-def _add_cameras(command: argparse.ArgumentParser) -> None:
+def _add_cameras(command: argparse.ArgumentParser) -> argparse._MutuallyExclusiveGroup:
+    """Add what says which cameras of which scenario; returns the group that chooses the cameras."""
     command.add_argument("scenario", help="scenario file, or the name of a shipped one")
     who = command.add_mutually_exclusive_group(required=True)
     who.add_argument("--camera", metavar="ID[,ID]", help="cameras of the scenario to stream or render")
@@ -101,11 +103,18 @@ def _add_cameras(command: argparse.ArgumentParser) -> None:
     who.add_argument("--all", action="store_true", help="all cameras of the scenario")
     command.add_argument("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
     command.add_argument("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
+    return who
 
 
 def _add_run(run: argparse.ArgumentParser) -> None:
     run.set_defaults(run=_run)
-    _add_cameras(run)
+    _add_cameras(run).add_argument(
+        "--as",
+        dest="names",
+        metavar="ID[=NAME][,...]",
+        help="in place of a scenario, play a recording or data set: as camera ID, which in the recording is NAME "
+        "[the only one]",
+    )
     run.add_argument("--to", required=True, metavar="HOST:PORT", help="address of the channel emulator or edge server")
     run.add_argument(
         "--out", type=out_folder, metavar="DIR", help="folder to write the ledger and status file to [not written]"
@@ -156,14 +165,29 @@ def _open(args: argparse.Namespace, cache_mb: float) -> tuple[Scenario, list[Cam
     from camera_node.settings import source_config
 
     arm_cli.log_to_stderr(logging.WARNING if args.quiet else logging.INFO)
-    scenario = load(args.scenario, args.seed)
+    names = getattr(args, "names", None)  # prepare has no --as
+    scenario = load(args.scenario, args.seed) if names is None else _recording(Path(args.scenario), names, args.seed)
     try:
-        cameras = build_cameras(
-            scenario, source_config(scenario), _chosen(scenario, args), args.data, int(cache_mb * 2**20)
-        )
+        chosen = scenario.cameras if names is not None else _chosen(scenario, args)
+        cameras = build_cameras(scenario, source_config(scenario), chosen, args.data, int(cache_mb * 2**20))
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from None
     return scenario, cameras
+
+
+def _recording(path: Path, names: str, seed: int | None) -> Scenario:
+    """The scenario that plays a recording or data set. names: as for --as. Raises UsageError or ScenarioError."""
+    from camera_node.sources.datasets.formats import find_format
+    from camera_node.sources.datasets.records import DatasetError
+
+    pairs = [pair.strip().partition("=") for pair in names.split(",")]
+    try:
+        kind = find_format(path)
+    except DatasetError as error:
+        raise UsageError(str(error)) from None
+    assignment = {camera: name for camera, _, name in pairs if name}
+    source = {"kind": kind, "data": str(path.resolve()), "assignment": assignment}
+    return parse({"cameras": {"ids": [camera for camera, *_ in pairs]}, "source": source}, path, seed)
 
 
 def _devices(_: argparse.Namespace) -> int:

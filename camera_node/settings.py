@@ -34,6 +34,12 @@ DEPTH_STEP = 0x9E3779B9
 """2^32 by the golden ratio: shot k has depth where k * DEPTH_STEP mod 2^32 is below 2^32 / depth_every. That is one in
 depth_every shots, spread evenly (each fifth: 3, 5 or 8 apart), and also one in depth_every of each second, third, ...
 shot: a link that takes exactly so many captures a frame would never get depth if it came with each so many-th."""
+RECORDING_DEPTH_NEAR_NS = 20_000_000
+"""Time within which an image of a recorded bag gets a depth image: less than half a period of 15 images a second."""
+RECORDING_POSE_NEAR_NS = 50_000_000
+"""Largest gap from such an image to a sample of its frame's own transform: half a period of 10 samples a second."""
+RECORDING_PARENTS_NEAR_NS = 250_000_000
+"""The same of the transforms above: robots correct map -> odom only some times a second, and by little."""
 MAX_LATENCY_MS = 6e4
 """Longest latency of a camera: one that is a minute late is not live."""
 
@@ -269,6 +275,11 @@ class FoxgloveConfig(RecordedConfig, frozen=True, kw_only=True):
     """A recording in MCAP, by any tool, in Foxglove's protobuf messages (extra ``mcap``). data: the file."""
 
 
+class RosbagConfig(RecordedConfig, frozen=True, kw_only=True):
+    """A ROS bag, read without ROS (extra ``ros``). data: a ROS 2 bag's folder, its one .mcap or .db3 file, or a ROS 1
+    .bag. Cameras are called as their frames (``frame_id``): name them in cameras.ids, or in assignment."""
+
+
 class McapConfig(SourceConfig, frozen=True, kw_only=True):
     """A session that ``edge-server run --record`` wrote, replayed message by message: the same bytes and
     poses, stamps shifted to now, from first to last, after which the node ends. fps, codec, quality and depth are
@@ -297,6 +308,7 @@ MODELS: dict[str, type[SourceConfig]] = {
     "sevenscenes": HandheldConfig,
     "record3d": HandheldConfig,
     "polycam": HandheldConfig,
+    "rosbag": RosbagConfig,
     "foxglove": FoxgloveConfig,
     "mcap": McapConfig,
     "camera": CameraConfig,

@@ -58,10 +58,10 @@ UNASKED = {
             f"edge_server.{room}"
             for room in ("embed", "foreground", "live.depth_in_image", "live.keyframes", "surface")
         ),
-        *("edge_server.fields.splat.planar", "onnx", "skimage", "matplotlib", "mcap", "torch"),
+        *("edge_server.fields.splat.planar", "onnx", "skimage", "matplotlib", "mcap", "rosbags", "foxglove", "torch"),
     ),
     NODE: (
-        *("camera_node.robot.teleop", "camera_node.robot.calibration.hand_eye.samples", "scipy", "mcap"),
+        *("camera_node.robot.teleop", "camera_node.robot.calibration.hand_eye.samples", "scipy", "mcap", "rosbags"),
         *("torch", "numba", "matplotlib", "edge_server", "channel_emu", "depthai", "pyrealsense2", "rtde"),
     ),
     NODE_WITHOUT_ARM: (

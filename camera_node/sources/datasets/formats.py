@@ -59,8 +59,8 @@ def recognize(file: Path) -> str:
     """
     if file.name == "metadata.json":
         return "record3d"
-    if file.suffix == ".mcap":
-        return "foxglove"
+    if file.suffix in (".mcap", ".db3", ".bag"):
+        return "foxglove" if file.suffix == ".mcap" else "rosbag"
     if file.suffix in (".bin", ".txt"):
         return {"rgb.txt": "tum", "frame-000000.pose.txt": "sevenscenes"}.get(file.name, "colmap")
     if file.suffix.lower() in _VIDEOS:
@@ -69,6 +69,16 @@ def recognize(file: Path) -> str:
     if isinstance(data, dict):
         return "transforms" if "frames" in data else "eyeful" if "KRT" in data else "video"
     return next((name for name in FORMATS if file.name in reader(name).FILES), "transforms")
+
+
+def find_format(path: Path) -> str:
+    """The format of a describing file, or of a folder by its first describing file. Raises DatasetError."""
+    if path.is_file():
+        return recognize(path)
+    for name in FORMATS:
+        if find_files(path, reader(name).FILES):
+            return name
+    raise DatasetError(f"{path}: no data set or recording: no file or folder, or none of the known formats")
 
 
 def open_dataset(path: Path, scale: float = 1.0, name: str | None = None) -> tuple[Path, Dataset]:
@@ -103,5 +113,5 @@ def open_dataset(path: Path, scale: float = 1.0, name: str | None = None) -> tup
     raise DatasetError(
         f"{path}: holds no data set: expected transforms.json, transforms_*.json, the calibration JSON of "
         "videos, poses_bounds.npy, annots.npy, Eyeful's cameras.json, a COLMAP model, or an export of a depth camera "
-        f"(rgb.txt, frame-000000.pose.txt, metadata.json, keyframes); {_OF_VIDEO}"
+        f"(rgb.txt, frame-000000.pose.txt, metadata.json, keyframes), or a ROS bag (metadata.yaml); {_OF_VIDEO}"
     )

@@ -25,6 +25,7 @@ WORLD = "world"
 HEADER, DEPTH, IMAGE, POSE, CALIBRATION = "header", "depth", "image", "pose", "calibration"
 TRANSFORMS, DECISIONS, SCORES = "/tf", "/decisions", "/scores"
 INSTALL = "recordings need MCAP: pip install 'freshfield[mcap]'"
+INSTALL_ROS = "ROS bags need rosbags: pip install 'freshfield[ros]'"
 
 
 class SessionError(ValueError):

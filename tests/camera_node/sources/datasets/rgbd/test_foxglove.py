@@ -10,7 +10,7 @@ import pytest
 
 from camera_node.sources.datasets.formats import open_dataset
 from camera_node.sources.datasets.records import DatasetError
-from camera_node.sources.datasets.rgbd.foxglove import _nearest
+from camera_node.sources.datasets.rgbd.recording import _nearest
 from freshfield.geometry import Pose, look_at
 
 mcap = pytest.importorskip("mcap_protobuf.writer", reason="needs the extra mcap")

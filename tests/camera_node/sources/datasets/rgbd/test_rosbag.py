@@ -1,0 +1,256 @@
+"""ROS bags, written by rosbags' own writers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_node.cli import _recording, main
+from camera_node.settings import source_config
+from camera_node.sources.datasets.formats import open_dataset
+from camera_node.sources.datasets.records import DatasetError
+from camera_node.sources.registry import open_sources
+from freshfield.geometry import Pose, look_at
+
+rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="needs the extra ros")
+
+from rosbags.typesys import Stores, get_typestore  # noqa: E402
+
+START_NS = 1_700_000_000 * 10**9
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+K = [40.0, 0, 15.5, 0, 41.0, 11.5, 0, 0, 1]
+P = [38.0, 0, 15.0, 0, 0, 39.0, 11.0, 0, 0, 0, 1, 0]
+MM = np.random.default_rng(0).integers(400, 5000, (24, 32)).astype(np.uint16)
+PICTURE = cv2.resize(np.random.default_rng(1).integers(0, 256, (4, 5, 3), dtype=np.uint8), (32, 24))
+MOUNT = Pose.from_matrix(look_at([0.1, 0.0, 0.3], [1.0, 0.0, 0.3]))  # of the camera on the robot
+EYE = "camera_optical"
+
+
+def type_(name: str):
+    return STORE.types[name.replace("/", "/msg/")]
+
+
+def header(t_ns: int, frame: str):
+    return type_("std_msgs/Header")(type_("builtin_interfaces/Time")(t_ns // 10**9, t_ns % 10**9), frame)
+
+
+def transform(t_ns: int, parent: str, child: str, pose: Pose):
+    w, x, y, z = pose.quaternion
+    moved = type_("geometry_msgs/Transform")(
+        type_("geometry_msgs/Vector3")(*pose.translation_m), type_("geometry_msgs/Quaternion")(x, y, z, w)
+    )
+    return type_("geometry_msgs/TransformStamped")(header(t_ns, parent), child, moved)
+
+
+def transforms(*each):
+    return type_("tf2_msgs/TFMessage")(list(each))
+
+
+def image(t_ns: int, encoding: str, values: np.ndarray, frame: str = EYE, big: bool = False):
+    values = np.ascontiguousarray(values)
+    data = values.reshape(-1).view(np.uint8)
+    return type_("sensor_msgs/Image")(header(t_ns, frame), *values.shape[:2], encoding, big, values.strides[0], data)
+
+
+def compressed(t_ns: int, form: str, data: bytes, frame: str = EYE):
+    return type_("sensor_msgs/CompressedImage")(header(t_ns, frame), form, np.frombuffer(data, np.uint8))
+
+
+def info(t_ns: int, model: str = "plumb_bob", d: tuple = (0.0,) * 5, k: list = K, frame: str = EYE):
+    roi = type_("sensor_msgs/RegionOfInterest")(0, 0, 0, 0, False)
+    numbers = (np.array(values, np.float64) for values in (d, k, np.eye(3).ravel(), P))
+    return type_("sensor_msgs/CameraInfo")(header(t_ns, frame), 24, 32, model, *numbers, 0, 0, roi)
+
+
+def drive(t_s: float) -> Pose:
+    return Pose((1.0, 0.0, 0.0, 0.0), (0.5 * t_s, 0.0, 0.0))
+
+
+def robot(frames: int = 3) -> list:
+    """A robot that drives: map -> odom (rare), odom -> base (every 40 ms), base -> camera (static)."""
+    said = [("/tf_static", START_NS + n, transforms(transform(START_NS + n, "base", EYE, MOUNT))) for n in (0, 10**9)]
+    shift = Pose((1.0, 0.0, 0.0, 0.0), (10.0, 0.0, 0.0))
+    for n in range(frames):
+        said.append(("/tf", 0, transforms(transform(START_NS + n * 10**8, "map", "odom", shift))))
+    for n in range(-1, 3 * frames):
+        t_ns = START_NS + n * 40_000_000
+        said.append(("/tf", t_ns, transforms(transform(t_ns, "odom", "/base", drive(n * 0.04)))))
+    said.append(("/camera/camera_info", START_NS, info(START_NS)))
+    return said
+
+
+def write(where: Path, said: list, storage: str = "MCAP") -> Path:
+    """Write (topic, log time or 0: a little after the last, message)."""
+    with rosbag2.Writer(where, version=9, storage_plugin=rosbag2.StoragePlugin[storage]) as bag:
+        topics, last = {}, START_NS
+        for topic, t_ns, message in sorted(said, key=lambda each: each[1] or last):
+            if topic not in topics:
+                topics[topic] = bag.add_connection(topic, message.__msgtype__, typestore=STORE)
+            last = max(last + 1, t_ns + 5_000_000)
+            bag.write(topics[topic], last, STORE.serialize_cdr(message, message.__msgtype__))
+    return where
+
+
+def pictures(frames: int = 3) -> list:
+    said = []
+    for n in range(frames):
+        t_ns = START_NS + n * 100_000_000
+        said.append(("/camera/image_raw", t_ns, image(t_ns, "rgb8", PICTURE)))
+        said.append(("/camera/aligned_depth/image_raw", t_ns, image(t_ns + 8_000_000, "16UC1", MM)))
+    return said
+
+
+@pytest.mark.parametrize("storage", ["MCAP", "SQLITE3"])
+@pytest.mark.parametrize("as_file", [False, True])
+def test_images_depth_and_the_chain_of_transforms_of_a_bag(tmp_path, storage, as_file):
+    bag = write(tmp_path / "run", robot() + pictures(), storage)
+    if as_file:
+        bag = next(file for file in bag.iterdir() if file.suffix in (".mcap", ".db3"))
+    _, found = open_dataset(bag)
+    assert found.cameras == (EYE,) and found.moving and len(found) == 3 and not found.notes
+    for n, record in enumerate(found):
+        at = drive(0.1 * n).matrix() @ MOUNT.matrix()
+        at[0, 3] += 10.0
+        assert np.allclose(record.camera_to_world, at, atol=1e-9), "interpolated between two samples of odom -> base"
+        assert record.time_s == pytest.approx(0.1 * n) and np.array_equal(record.read(), PICTURE)
+        assert (record.intrinsics.cx, record.intrinsics.cy) == (16.0, 12.0)
+        depth = record.depth()
+        assert np.array_equal(depth.counts, MM) and depth.after_image_ns == 8_000_000
+
+
+def png(values: np.ndarray) -> bytes:
+    return cv2.imencode(".png", values)[1].tobytes()
+
+
+BAYER = np.random.default_rng(3).integers(0, 256, (24, 32), dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        (lambda t: image(t, "bgr8", PICTURE[..., ::-1]), PICTURE),
+        (lambda t: image(t, "bgra8", np.dstack([PICTURE[..., ::-1], PICTURE[..., :1]])), PICTURE),
+        (lambda t: image(t, "mono8", PICTURE[..., 0]), PICTURE[..., [0, 0, 0]]),
+        (lambda t: image(t, "bayer_rggb8", BAYER), cv2.cvtColor(BAYER, cv2.COLOR_BayerRGGB2RGB)),
+        (lambda t: compressed(t, "rgb8; png compressed bgr8", png(PICTURE[..., ::-1])), PICTURE),
+    ],
+)
+def test_encodings_of_images(tmp_path, message, expected):
+    bag = write(tmp_path / "run", [*robot(), ("/any/topic", START_NS, message(START_NS))])
+    assert np.array_equal(open_dataset(bag)[1][0].read(), expected)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        lambda t: image(t, "32FC1", (MM / 1000.0).astype(np.float32)),
+        lambda t: image(t, "16UC1", MM.astype(">u2"), big=True),
+        lambda t: compressed(t, "16UC1; compressedDepth png", bytes(12) + png(MM)),
+    ],
+)
+def test_encodings_of_depth(tmp_path, message):
+    bag = write(tmp_path / "run", [*robot(), *pictures(1)[:1], ("/depth", START_NS, message(START_NS))])
+    assert np.array_equal(open_dataset(bag)[1][0].depth().counts, MM)
+
+
+def test_of_several_topics_of_a_frame_one_is_taken_and_named(tmp_path):
+    t = START_NS
+    said = [
+        ("/camera/image_raw", t, image(t, "rgb8", PICTURE)),
+        ("/camera/image_mono", t, image(t, "mono8", PICTURE[..., 0])),
+        ("/camera/image_raw/compressed", t, compressed(t, "jpeg", png(PICTURE[..., ::-1]))),
+        ("/camera/infra", t, image(t, "yuv422", PICTURE[..., :2])),
+        ("/depth", t, image(t, "16UC1", MM, "depth_optical")),
+        ("/other/image_rect", t, image(t, "rgb8", PICTURE, "other")),
+        ("/other/camera_info", t, info(t, d=(0.1, 0, 0, 0, 0), frame="other")),
+        ("/tf", t, transforms(transform(t, "map", "other", MOUNT))),
+        ("/lost/image", t, image(t, "rgb8", PICTURE, "lost")),
+        ("/apart/image", t, image(t, "rgb8", PICTURE, "apart")),
+        ("/apart/camera_info", t, info(t, frame="apart")),
+        ("/tf", t, transforms(transform(t, "elsewhere", "apart", MOUNT))),
+    ]
+    found = open_dataset(write(tmp_path / "run", robot() + said))[1]
+    assert found.cameras == (EYE, "other")
+    assert np.array_equal(found.of(EYE)[0].read(), PICTURE)
+    rectified = found.of("other")[0].intrinsics
+    assert (rectified.fx, rectified.cy, rectified.distorted) == (38.0, 11.5, False), "of image_rect it is P"
+    notes = "\n".join(found.notes)
+    for said_so in (
+        "1 images of encoding yuv422 are not read",
+        "/camera/image_mono are of the same instants as those of /camera/image_raw: left out",
+        "/camera/image_raw/compressed are of the same instants",
+        "depth of depth_optical is in no image's frame",
+        "lost has no CameraInfo: left out",
+        "apart hangs on elsewhere, which no transform joins to map: left out",
+    ):
+        assert said_so in notes
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ([("/info", START_NS, info(START_NS, k=[0.0] * 9))], "the focal lengths are 0, 0"),
+        ([("/info", START_NS, info(START_NS, k=[np.nan] * 9))], "not finite"),
+        ([("/info", START_NS, info(START_NS, "rational_polynomial", (0.1,) * 8))], "undistort the images"),
+        ([("/info", START_NS, info(START_NS, "omni", ()))], "undistort the images"),
+        ([("/tf", 0, transforms(transform(START_NS, "base", "map", MOUNT)))], "form a circle"),
+        ([("/tf", 0, transforms(transform(START_NS, "map", EYE, MOUNT)))], "hangs on map and on base: keep one"),
+        ([("/tf", 0, transforms(transform(START_NS, "base", EYE, Pose((0, 0, 0, 0), (0, 0, 0)))))], "quaternion"),
+        ([("/tf", 0, transforms(transform(START_NS, "base", EYE, Pose((1, 0, 0, 0), (np.inf, 0, 0)))))], "not finite"),
+    ],
+)
+def test_what_a_bag_gets_wrong_is_one_line(tmp_path, said, message):
+    with pytest.raises(DatasetError, match=message) as error:
+        open_dataset(write(tmp_path / "run", said + robot() + pictures(1)))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.stability
+def test_a_damaged_bag_is_named_and_one_without_poses_says_so(tmp_path):
+    bag = write(tmp_path / "run", robot() + pictures())
+    file = bag / "run.mcap"
+    whole = file.read_bytes()
+    for data in (b"", whole[:20], b"RIFF" + whole):
+        file.write_bytes(data)
+        with pytest.raises(DatasetError, match="run: cannot be read as a ROS bag") as error:
+            open_dataset(bag)
+        assert "\n" not in str(error.value)
+    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: []\n")
+    with pytest.raises(DatasetError, match="cannot be read as a ROS bag"):
+        open_dataset(bag)
+    with pytest.raises(DatasetError, match=f"no image in ROS messages .*: {EYE} has no CameraInfo"):
+        open_dataset(write(tmp_path / "bare", pictures()))
+    with pytest.raises(DatasetError, match="3 images of camera_optical have no pose within 50 ms"):
+        late = [(topic, t, m) for topic, t, m in robot() if "odom" not in str(m)]
+        gone = (
+            transform(START_NS + 10**10, "map", "base", MOUNT),
+            transform(START_NS + 2 * 10**10, "map", "base", MOUNT),
+        )
+        open_dataset(write(tmp_path / "late", [*late, ("/tf", 0, transforms(*gone)), *pictures()]))
+
+
+def test_a_bag_is_played_without_a_scenario(tmp_path, capsys):
+    said = [*robot(), *pictures(), ("/left/camera_info", START_NS, info(START_NS, frame="left"))]
+    said += [
+        ("/left/image", START_NS + n * 10**8, image(START_NS + n * 10**8, "rgb8", PICTURE, "left")) for n in (0, 1)
+    ]
+    said.append(("/tf", 0, transforms(transform(START_NS, "base", "left", MOUNT))))
+    bag = write(tmp_path / "run", said)
+    scenario = _recording(bag, f"hand={EYE},left", 3)
+    sources = open_sources(scenario, source_config(scenario), scenario.cameras)
+    assert set(sources) == {"hand", "left"} and scenario.seed == 3
+    shot = sources["hand"].read(1)
+    assert np.array_equal(shot.image, PICTURE) and shot.pose.translation_m == pytest.approx((10.15, 0.0, 0.3))
+    assert np.array_equal(sources["hand"].depth(1, shot).counts, MM)
+    for path, names, expected in (
+        (bag, "hand=nowhere", "the data has no camera 'nowhere'"),
+        (bag, "a b", "'a b' is not an id"),
+        (tmp_path / "none", "hand", "no data set or recording"),
+        (tmp_path, "hand", "no data set or recording"),
+    ):
+        assert main(["run", str(path), "--as", names, "--to", "127.0.0.1:1"]) == 2
+        assert expected in capsys.readouterr().err
