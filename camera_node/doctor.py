@@ -133,6 +133,8 @@ def _source(scenario: Scenario, config: SourceConfig, data: Path | None, plan: P
             yield _check("calibration", lambda: _calibration(scenario, config))
         for camera in scenario.cameras:
             yield _check(f"camera {camera}", lambda camera=camera: _camera(scenario, camera, config))  # type: ignore[misc]
+        if config.trajectory is not None:
+            yield _check("tracker", lambda: _tracker(scenario, config.trajectory))
     if arm is not None:
         from camera_node.robot.arm import checks
 
@@ -290,6 +292,26 @@ def _calibration(scenario: Scenario, config: LiveConfig) -> str:
     if missing:
         raise CheckFailed(f"{config.calibration}: it lacks {', '.join(missing)}")
     return f"{config.calibration}: {len(known)} cameras"
+
+
+def _tracker(scenario: Scenario, config: TrajectoryConfig) -> str:
+    """Ask for the poses of now, as a camera does."""
+    from camera_node.pose.trajectories import trajectory_poses
+
+    poses = trajectory_poses(scenario, config, scenario.cameras, scenario.path.parent, live=True)
+    clock, said = WallClock(), []
+    try:
+        time.sleep(_LISTEN_S)
+        for camera, tracked in poses.items():
+            _, gap_ns = tracked.at(clock.now_ns())
+            said.append(f"{camera}: a pose {gap_ns / 1e6:.0f} ms from now")
+    except PoseGapError as error:
+        raise CheckFailed(f"{error}: is the tracker running, and does it write each pose at once?") from None
+    finally:
+        for tracked in poses.values():
+            if isinstance(tracked, Closable):
+                tracked.close()
+    return "; ".join(said) or "none of the cameras has a file"
 
 
 def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:

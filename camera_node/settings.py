@@ -54,6 +54,12 @@ POSES_LATE_MS = 60.0  # least delay that is said: what is found is off by up to 
 POSES_FAST_M_PER_S = 10.0  # nobody carries a camera so fast: another unit
 
 
+# --- poses of a tracker that runs beside a camera ---
+TRACKER_LOOKS_S = 0.002  # how often for lines: a tenth of the 20 ms between poses of a usual tracker
+TRACKER_LATE_S = 0.1  # a frame waits so long for its pose: trackers take 20 to 60 ms, and captures are 67 ms apart
+TRACKER_LINE_BYTES = 4096  # read at once, and longest line that is kept: one has some 100
+
+
 class SourceConfig(Settings, frozen=True, kw_only=True):
     """Keys of every kind. fps: not given, it is the recording's own, 15 for a world, 10 for photos. effects: name ->
     parameters, or null (see ``freshfield scenario keys effects``).
@@ -145,7 +151,8 @@ class WorldConfig(SourceConfig, frozen=True, kw_only=True):
 
 
 class TrajectoryConfig(Settings, frozen=True):
-    """Poses from TUM files (``t tx ty tz qx qy qz qw``), one a camera, instead of the calibration's.
+    """Poses from TUM files (``t tx ty tz qx qy qz qw``), one a camera, instead of the calibration's. Of real cameras
+    a tracker appends to them while the camera runs, or writes to named pipes: seconds since 1970.
 
     max_gap_ms: a frame farther than this from its pose sample is not sent.
     hand_eye: the files are of the flange that holds the camera, and this one, of ``camera-node calibrate hand-eye
@@ -199,7 +206,7 @@ class LiveConfig(SourceConfig, frozen=True, kw_only=True):
     devices: serial numbers; for kind ``camera`` a number, path or address (``camera-node devices``). Needed if there is
         more than one.
     calibration: relative to the scenario; not given: intrinsics are the device's own, if it has any, and poses come
-    from ``arm``.
+    from ``arm`` or ``trajectory``, whose files are relative to the scenario, too.
     """
 
     devices: Annotated[dict[str, str | int], about("camera -> its device")] = field(default_factory=dict)
@@ -208,6 +215,7 @@ class LiveConfig(SourceConfig, frozen=True, kw_only=True):
     exposure_us: Annotated[int, within(1, 10**6, "fixed exposure; not given: automatic")] | None = None
     calibration: Annotated[str | None, about("JSON of intrinsics and poses by camera, as for videos")] = None
     arm: Annotated[ArmConfig | None, about("an arm that carries the cameras it lists")] = None
+    trajectory: Annotated[TrajectoryConfig | None, about("poses that a tracker writes to files")] = None
     first_frame_s: Annotated[float, within(0.1, 60, "time that a camera may take until its first frame")] = 3.0
 
     waits: ClassVar[bool] = True

@@ -81,28 +81,29 @@ def read_samples(path: Path) -> tuple[list[int], list[Pose]]:
         lines = read_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise TrajectoryError(f"{path}: cannot be read: {error}") from None
-    times: list[int] = []
-    poses: list[Pose] = []
-    for number, line in enumerate(lines, 1):
-        fields = line.replace(",", " ").split()
-        if not fields or fields[0].startswith("#") or (not times and fields[0] in _COLUMN_NAMES):
-            continue
-        try:
-            t, x, y, z, qx, qy, qz, qw = map(float, fields)
-            if not np.all(np.isfinite([t, x, y, z])):
-                raise ValueError
-            q = quaternion_normalize((qw, qx, qy, qz))
-        except GeometryError as error:
-            raise TrajectoryError(f"{path}:{number}: {error}") from None
-        except ValueError:
-            raise TrajectoryError(f"{path}:{number}: expected t tx ty tz qx qy qz qw") from None
-        if abs(t) > MAX_STAMP_S:
-            raise TrajectoryError(
-                f"{path}:{number}: the time {t:g} cannot be in seconds: is it in milliseconds or nanoseconds?"
-            )
-        times.append(_nanoseconds(fields[0]))
-        poses.append(Pose(tuple(map(float, q)), (x, y, z)))  # type: ignore[arg-type]
-    return times, poses
+    found = (read_sample(line, f"{path}:{number}") for number, line in enumerate(lines, 1))
+    samples = [sample for sample in found if sample is not None]
+    return [t_ns for t_ns, _ in samples], [pose for _, pose in samples]
+
+
+def read_sample(line: str, where: str) -> tuple[int, Pose] | None:
+    """Time (ns) and pose of a line of a trajectory; None: it holds none. Raises TrajectoryError, which begins with
+    ``where``."""
+    fields = line.replace(",", " ").split()
+    if not fields or fields[0].startswith("#") or fields[0] in _COLUMN_NAMES:
+        return None
+    try:
+        t, x, y, z, qx, qy, qz, qw = map(float, fields)
+        if not np.all(np.isfinite([t, x, y, z])):
+            raise ValueError
+        q = quaternion_normalize((qw, qx, qy, qz))
+    except GeometryError as error:
+        raise TrajectoryError(f"{where}: {error}") from None
+    except ValueError:
+        raise TrajectoryError(f"{where}: expected t tx ty tz qx qy qz qw") from None
+    if abs(t) > MAX_STAMP_S:
+        raise TrajectoryError(f"{where}: the time {t:g} cannot be in seconds: is it in milliseconds or nanoseconds?")
+    return _nanoseconds(fields[0]), Pose(tuple(map(float, q)), (x, y, z))  # type: ignore[arg-type]
 
 
 def _nanoseconds(seconds: str) -> int:

@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose.providers import PoseProvider, read_tum
-from camera_node.settings import FPS_RANGE, RecordedConfig, TrajectoryConfig, VideoConfig, errors_of, find_data
+from camera_node.pose.providers import PoseProvider
+from camera_node.pose.trajectories import trajectory_poses
+from camera_node.settings import FPS_RANGE, RecordedConfig, VideoConfig, find_data
 from camera_node.sources.base import Shot, Source, assign_cameras, rate
 from camera_node.sources.datasets.formats import open_configured
 from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
@@ -98,7 +99,8 @@ def open_recorded(
         timeline, order = Timeline(0.0, 0, rate(config.fps or PHOTO_FPS)), {}
     poses: dict[str, PoseProvider] = {}
     if isinstance(config, VideoConfig) and config.trajectory is not None:
-        poses = _trajectory_poses(scenario, config.trajectory, cameras, path)
+        base = path if path.is_dir() else path.parent
+        poses = trajectory_poses(scenario, config.trajectory, cameras, base)
     sources: dict[str, Source] = {}
     for camera, fps in recorded.items():
         if camera not in poses and np.isnan(shown[camera][0].camera_to_world).any():
@@ -250,25 +252,3 @@ class ImageSource(Source):
         except payload.PayloadError:
             return None
         return data
-
-
-def _trajectory_poses(
-    scenario: Scenario, config: TrajectoryConfig, cameras: Sequence[str], path: Path
-) -> dict[str, PoseProvider]:
-    """Poses on the clip's time scale, from the TUM files that the scenario names, by camera."""
-    base, where = path if path.is_dir() else path.parent, f"{scenario.path}: source.trajectory"
-    found: dict[str, PoseProvider] = {}
-    for camera in set(cameras) & set(config.files):
-        with errors_of(f"{where}.files.{camera}"):
-            found[camera] = read_tum(
-                base / config.files[camera],
-                config.pairing == "interpolated",
-                round(config.max_gap_ms * 1e6),
-                round(config.start_s * 1e9),
-            )
-        if config.hand_eye:
-            from camera_node.robot.arm.hand_eye_mount import read_hand_eye
-
-            with errors_of(f"{where}.hand_eye"):
-                found[camera] = read_hand_eye(base / config.hand_eye).camera_poses(found[camera])
-    return found

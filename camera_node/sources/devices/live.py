@@ -212,20 +212,25 @@ def calibrations(scenario: Scenario, config: LiveConfig) -> dict[str, Calibrated
 def _poses(
     scenario: Scenario, config: LiveConfig, cameras: Sequence[str], known: Mapping[str, CalibratedCamera]
 ) -> dict[str, PoseProvider]:
-    """Poses from the arm, else from the calibration. Raises ScenarioError if a camera has neither."""
+    """Poses from the arm, else of a tracker, else from the calibration. Raises ScenarioError if a camera has none."""
     poses: dict[str, PoseProvider] = {}
     if config.arm is not None:
         from camera_node.robot.arm.camera_poses import camera_poses
 
         poses.update(camera_poses(scenario, config.arm, cameras))
+    if config.trajectory is not None:
+        from camera_node.pose.trajectories import trajectory_poses
+
+        tracked = [camera for camera in cameras if camera not in poses]
+        poses.update(trajectory_poses(scenario, config.trajectory, tracked, scenario.path.parent, live=True))
     for camera in cameras:
         pose = known[camera].pose if camera in known else None
         if camera in poses:
             continue
         if pose is None:
             raise ScenarioError(
-                f"{scenario.path}: source: camera {camera} has no pose: name it in arm.cameras, or give "
-                "R_world_to_cam and t_world_to_cam in the calibration"
+                f"{scenario.path}: source: camera {camera} has no pose: name it in arm.cameras or trajectory.files, or "
+                "give R_world_to_cam and t_world_to_cam in the calibration"
             )
         poses[camera] = FixedPose(pose)
     return poses

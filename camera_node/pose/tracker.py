@@ -1,0 +1,90 @@
+"""Poses that a tracker (SLAM, motion capture) gives while the camera runs: lines of a TUM trajectory, appended to a
+file, or written to a named pipe.
+
+Times are seconds since 1970 (UTC), as ROS stamps and ``time.time()`` are, so that they fit the frames' stamps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import stat
+import threading
+import time
+from pathlib import Path
+
+from camera_node.pose.pairing import PoseGapError, SampleBuffer
+from camera_node.pose.providers import TrajectoryError, read_sample
+from camera_node.settings import TRACKER_LATE_S, TRACKER_LINE_BYTES, TRACKER_LOOKS_S
+from freshfield.geometry import Pose
+
+log = logging.getLogger("camera-node")
+
+
+class TrackerPoses:
+    """The poses in ``path``, followed by a thread until ``close``. The file may come later, or begin anew.
+
+    interpolate, max_gap_ns: as of ``SampleBuffer``. refused: number of lines that are no pose.
+    """
+
+    def __init__(self, path: Path, interpolate: bool = True, max_gap_ns: int = 50_000_000) -> None:
+        self.path, self.refused = path, 0
+        self._samples = SampleBuffer[Pose](Pose.interpolate if interpolate else None, max_gap_ns)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._main, name=f"tracker {path.name}", daemon=True)
+        self._thread.start()
+
+    def at(self, t_ns: int) -> tuple[Pose, int]:
+        """The pose at an instant, and the time (ns) to the nearest sample. Waits for a later sample, because a tracker
+        computes: up to ``TRACKER_LATE_S``. Raises PoseGapError."""
+        until = time.monotonic() + TRACKER_LATE_S
+        while not self._samples.ready(t_ns) and time.monotonic() < until and not self._stop.wait(TRACKER_LOOKS_S):
+            pass
+        try:
+            return self._samples.at(t_ns)
+        except PoseGapError as error:
+            raise PoseGapError(f"{self.path}: {error}; its times are seconds since 1970") from None
+
+    def close(self) -> None:
+        """End the thread."""
+        self._stop.set()
+        self._thread.join(2.0)
+
+    def _main(self) -> None:
+        while not self._stop.wait(TRACKER_LOOKS_S):
+            with contextlib.suppress(OSError):  # it is not there yet, or its disk failed: looked for again
+                self._follow()
+
+    def _follow(self) -> None:
+        """Read lines until the file is another one, or shorter than before. Raises OSError."""
+        # A named pipe without a writer is empty, not waited for.
+        file = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)
+        try:
+            opened, taken, rest = os.fstat(file), 0, b""
+            while not self._stop.is_set():
+                data = b""
+                with contextlib.suppress(BlockingIOError):  # a pipe whose writer has nothing to say
+                    data = os.read(file, TRACKER_LINE_BYTES)
+                taken += len(data)
+                *lines, rest = (rest + data).split(b"\n")
+                rest = rest[-TRACKER_LINE_BYTES:]
+                for line in lines:
+                    self._add(line)
+                there = os.stat(self.path)
+                shrunk = stat.S_ISREG(there.st_mode) and there.st_size < taken
+                if shrunk or there.st_ino != opened.st_ino or (not data and self._stop.wait(TRACKER_LOOKS_S)):
+                    return
+        finally:
+            os.close(file)
+
+    def _add(self, line: bytes) -> None:
+        try:
+            sample = read_sample(line.decode(errors="replace"), str(self.path))
+        except TrajectoryError as error:
+            self.refused += 1
+            if self.refused == 1:
+                log.warning("%s; lines that are no pose are left out", error)
+            return
+        if sample is not None:
+            self._samples.add(*sample)

@@ -1,0 +1,40 @@
+"""The poses that a scenario's ``source.trajectory`` names, by camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from camera_node.pose.providers import PoseProvider, read_tum
+from camera_node.settings import TrajectoryConfig, errors_of
+from freshfield.scenario import Scenario, ScenarioError
+
+
+def trajectory_poses(
+    scenario: Scenario, config: TrajectoryConfig, cameras: Sequence[str], base: Path, live: bool = False
+) -> dict[str, PoseProvider]:
+    """Poses of those ``cameras`` for which the scenario names a TUM file, below ``base``.
+
+    live: a tracker writes the files while the cameras run; else they are whole, on the clip's time scale.
+    Raises ScenarioError.
+    """
+    where = f"{scenario.path}: source.trajectory"
+    if live and config.start_s:
+        raise ScenarioError(f"{where}.start_s: is for recordings: times of a tracker are seconds since 1970")
+    found: dict[str, PoseProvider] = {}
+    interpolated, max_gap_ns = config.pairing == "interpolated", round(config.max_gap_ms * 1e6)
+    for camera in set(cameras) & set(config.files):
+        file = base / config.files[camera]
+        if live:
+            from camera_node.pose.tracker import TrackerPoses
+
+            found[camera] = TrackerPoses(file, interpolated, max_gap_ns)
+        else:
+            with errors_of(f"{where}.files.{camera}"):
+                found[camera] = read_tum(file, interpolated, max_gap_ns, round(config.start_s * 1e9))
+        if config.hand_eye:
+            from camera_node.robot.arm.hand_eye_mount import read_hand_eye
+
+            with errors_of(f"{where}.hand_eye"):
+                found[camera] = read_hand_eye(base / config.hand_eye).camera_poses(found[camera])
+    return found
