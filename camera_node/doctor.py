@@ -20,12 +20,14 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from camera_node.pose.providers import Closable, PoseGapError
 from camera_node.settings import (
     ArmConfig,
     LiveConfig,
     McapConfig,
     RecordedConfig,
     SourceConfig,
+    TrajectoryConfig,
     find_data,
     source_config,
 )
@@ -133,8 +135,8 @@ def _source(scenario: Scenario, config: SourceConfig, data: Path | None, plan: P
             yield _check("calibration", lambda: _calibration(scenario, config))
         for camera in scenario.cameras:
             yield _check(f"camera {camera}", lambda camera=camera: _camera(scenario, camera, config))  # type: ignore[misc]
-        if config.trajectory is not None:
-            yield _check("tracker", lambda: _tracker(scenario, config.trajectory))
+        if (tracker := config.trajectory) is not None:
+            yield _check("tracker", lambda: _tracker(scenario, tracker))
     if arm is not None:
         from camera_node.robot.arm import checks
 

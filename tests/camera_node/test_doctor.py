@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import re
+import time
 from pathlib import Path
 
 import pytest
@@ -126,6 +127,17 @@ def test_a_camera_is_opened_and_watched(capsys, tmp_path):
     _, parts = examined(capsys, file)
     assert parts["calibration"] == (False, "calibration.json: it lacks eye")
     assert parts["camera eye"][0] is False and "no camera at http" in parts["camera eye"][1]
+
+
+def test_a_tracker_beside_a_camera_is_asked_for_the_pose_of_now(capsys, tmp_path):
+    camera = NetworkCamera(WallClock())
+    file = bench_with(tmp_path, camera, trajectory={"files": {"eye": "poses.txt"}, "max_gap_ms": 60_000})
+    _, parts = examined(capsys, file)
+    assert parts["tracker"][0] is False and "poses.txt: there is no pose yet" in parts["tracker"][1]
+    (tmp_path / "poses.txt").write_text(f"{time.time():.6f} 1 2 3 0 0 0 1\n")
+    _, parts = examined(capsys, file)
+    camera.close()
+    assert parts["tracker"][0] and re.fullmatch(r"eye: a pose \d+ ms from now", parts["tracker"][1])
 
 
 def test_a_camera_whose_lens_nobody_knows_is_wrong(capsys, tmp_path):
