@@ -280,12 +280,13 @@ def read_saved(data: bytes) -> Iterator[tuple[float, bytes]]:
 class StreamReader:
     """What a browser would show after the messages read so far: the reference for other readers.
 
-    scene: None before the first. params: see ``at``.
+    scene: None before the first. instant_s: of the newest message, the edge's present. params: see ``at``.
     """
 
     def __init__(self) -> None:
         self.scene: SceneBlock | None = None
         self.status: dict[str, Any] = {}
+        self.instant_s = 0.0
         self._forget()
 
     def _forget(self) -> None:
@@ -295,7 +296,8 @@ class StreamReader:
 
     def read(self, data: bytes) -> None:
         """Take a message in. Raises MessageError; what was read before stays."""
-        for block in read_message(data)[2]:
+        _, self.instant_s, blocks = read_message(data)
+        for block in blocks:
             if isinstance(block, SceneBlock):
                 if self.scene is not None and self.scene.field != block.field:
                     self._forget()

@@ -21,6 +21,7 @@ import websocket
 from channel_emu.live.proxy import ProxyOptions
 from channel_emu.live.tcp_proxy import TcpProxy
 from channel_emu.model.settings import channel_from_mapping
+from edge_server.fields.splat.layers.settings import MAX_AHEAD_S
 from edge_server.live.state import EdgeState, Publication
 from edge_server.page import Page, start_page
 from edge_server.page.splats.messages import StreamReader, read_saved
@@ -29,7 +30,7 @@ from freshfield.limits import MAX_VISITORS
 from freshfield.transport import Transport
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.page.browser import Browser
-from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, snapshot
+from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, motion, snapshot
 from tests.edge_server.page.test_access_guard import get, lines, login
 from tests.edge_server.page.test_page import bare_state
 from tests.role_table import TOKENS
@@ -210,6 +211,16 @@ def rendered(shown, instant_s: float) -> np.ndarray:
     return np.clip(shown.at(ORIGIN_NS + round(instant_s * 1e9)).render(POSE, LENS).color, 0, 1)
 
 
+# Displacements of the anchors at 60 instants a second, xyz and a fourth that is not used.
+MOVED = """
+(() => {
+  const { reader } = window.splats;
+  const out = new Float32Array(4 * reader.knots.anchors);
+  return Array.from({ length: 60 }, (_, k) => (reader.displacements(%f + k / 60, out), Array.from(out)));
+})()
+"""
+
+
 @pytest.mark.browser
 def test_the_browser_draws_what_the_edge_renders():
     state, shown = bare_state(), snapshot()
@@ -222,6 +233,17 @@ def test_the_browser_draws_what_the_edge_renders():
         assert (
             psnr(drawn(browser, NEWEST_S, state.start_ns), rendered(shown, NEWEST_S + 0.2)) < 40.0
         )  # the test can fail
+        # Motion at each frame of a display, also past the newest frame, is the edge's spline.
+        instants = NEWEST_S - 0.2 + np.arange(60) / 60
+        moved = np.array(browser.evaluate(MOVED % (instants[0] + (ORIGIN_NS - state.start_ns) / 1e9)))
+        wanted = [motion().at(min(t, NEWEST_S + MAX_AHEAD_S)) for t in instants]
+        np.testing.assert_allclose(moved.reshape(60, -1, 4)[..., :3], wanted, atol=5e-5)
+        assert np.abs(np.diff(wanted, axis=0)).max() > 1e-3
+        # What no camera has seen is striped, darker.
+        browser.evaluate("splats.reader.shown.unseen = new Uint8Array(700).fill(1)")
+        browser.evaluate("splats.reader.shown.changed = [0, 700]")
+        seen, striped = rendered(shown, NEWEST_S), drawn(browser, NEWEST_S, state.start_ns)
+        assert 15.0 < psnr(striped, seen) < 40.0 and striped.mean() < seen.mean()
         still = snapshot(gaussians(1300, 9), movers=0)
         publish(state, still, 1)
         browser.wait_for(lambda: browser.evaluate("splats.reader.shown.total") == 1300, "the new set")
