@@ -14,7 +14,14 @@ from typing import Any
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.arguments import add_folders, at_least, command_parser, folders_of, run_command
+from edge_server.experiments.common.arguments import (
+    add_folders,
+    add_workers,
+    at_least,
+    command_parser,
+    folders_of,
+    run_command,
+)
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
@@ -26,7 +33,6 @@ from edge_server.machine import commit, machine
 from edge_server.scheduler import STATE_PARTS, make_policy, parse_policy, short_name
 from edge_server.settings import ComputeConfig, read_config
 from freshfield.files import out_file, write_json
-from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario, ScenarioError, load
 from freshfield.settings import as_mapping
 
@@ -68,7 +74,7 @@ def _run(args: argparse.Namespace) -> None:
     labels = _labels(args.policies)
     for policy in labels.values():
         make_policy(*parse_policy(policy), np.random.default_rng(0))  # rejected before anything is computed
-    with Engine(args.results, args.jobs, threads=1) as engine:
+    with Engine(args.results, args.jobs, args.ray, threads=1) as engine:
         table = compare(setting, folders_of(args), engine, labels, seeds(setting.scenario.seed, "test", args.seeds))
     print(as_text(table, list(labels)))
     if args.json is not None:
@@ -181,7 +187,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--seconds", type=float, default=SPAN_S, metavar="S", help=f"seconds scored, after {LEAD_S:g} [%(default)g]")
     add("--costs", type=Path, metavar="FILE", help="file written by `edge-server costs` [edge.compute of the scenario]")
     add("--slower", type=float, default=1.0, metavar="K", help="computing takes K times as long [%(default)g]")
-    add("--jobs", type=at_least(1), default=usable_cores(), metavar="N", help="worker processes [%(default)s]")
+    add_workers(parser)
     add("--json", type=out_file, metavar="FILE", help="write the comparison to FILE")
     add("--results", type=out_file, metavar="FILE", help="keep finished runs in FILE, and use those it has [none]")
     add_folders(parser)

@@ -43,6 +43,12 @@ RECOVERY_S = 2.0
 _MOST_INSIDE = QUEUE_LIMIT + 2
 
 
+def read_seeds(text: str) -> list[int]:
+    """The seeds of ``A..B``, or of numbers separated by commas. Raises ValueError."""
+    first, dots, last = text.partition("..")
+    return list(range(int(first), int(last) + 1)) if dots else [int(word) for word in text.split(",")]
+
+
 def run_seed(seed: int, only: Sequence[int] | None = None) -> dict[str, Any]:
     """Run one seed twice. only: numbers of the faults to carry out; None: all.
 

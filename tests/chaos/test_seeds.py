@@ -20,10 +20,7 @@ CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Seeds of --seeds: ``A..B``, or numbers separated by commas."""
     if metafunc.definition.get_closest_marker("chaos") is not None:
-        text = metafunc.config.getoption("--seeds")
-        first, dots, last = text.partition("..")
-        seeds = range(int(first), int(last) + 1) if dots else [int(word) for word in text.split(",")]
-        metafunc.parametrize("seed", seeds)
+        metafunc.parametrize("seed", seeds.read_seeds(metafunc.config.getoption("--seeds")))
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_server.experiments.common.folders import Folders, folders_from
+from freshfield.machine_load import usable_cores
 from freshfield.untrusted import UntrustedError, read_yaml
 
 
@@ -42,6 +43,13 @@ def add_lpips(parser: argparse.ArgumentParser) -> None:
 def folders_of(args: argparse.Namespace) -> Folders:
     """The folders of ``--data`` and ``--lpips``, or those that the environment names."""
     return folders_from(args.data, args.lpips)
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """Add ``--jobs`` and ``--ray``, as in ``Engine``."""
+    add = parser.add_argument
+    add("--jobs", type=int, default=usable_cores(), metavar="N", help="number of worker processes [%(default)s]")
+    add("--ray", metavar="ADDRESS", help="run on a Ray cluster instead: auto, local, or host:port")
 
 
 def at_least(least: int) -> Callable[[str], int]:

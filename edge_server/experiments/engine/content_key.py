@@ -33,13 +33,9 @@ def result_key(work: Callable[..., Any], inputs: Any, files: Iterable[Path | Non
     files: files and folders whose contents the result depends on; None is skipped.
     Raises TypeError for inputs that JSON cannot hold, OSError for a file that cannot be read.
     """
-    while isinstance(work, partial):
-        work = work.func
     parts = {
-        "work": f"{work.__module__}.{work.__qualname__}",
-        "code": code_digest(work.__module__),
-        "versions": _versions(),
-        "processor": processor(),
+        **surroundings(work),
+        "work": f"{_unbound(work).__module__}.{_unbound(work).__qualname__}",
         "inputs": inputs,
         "files": [content_digest(path) for path in files if path is not None],
     }
@@ -48,6 +44,18 @@ def result_key(work: Callable[..., Any], inputs: Any, files: Iterable[Path | Non
     if named:  # classes from outside: the code above does not cover them
         text += json.dumps([content_digest(file) for file in named])
     return hashlib.sha256(text.encode()).hexdigest()[:_KEY_LENGTH]
+
+
+def surroundings(work: Callable[..., Any]) -> dict[str, Any]:
+    """What the results of ``work`` depend on besides its inputs: code, versions of packages, kind of processor."""
+    return {"code": code_digest(_unbound(work).__module__), "versions": _versions(), "processor": processor()}
+
+
+def _unbound(work: Callable[..., Any]) -> Callable[..., Any]:
+    """The function within ``functools.partial``."""
+    while isinstance(work, partial):
+        work = work.func
+    return work
 
 
 def plain(value: Any) -> Any:

@@ -1,9 +1,10 @@
-"""Runs a function over many inputs: here, in processes or on a Ray cluster, through joblib."""
+"""Runs a function over many inputs: here, in processes (joblib) or as tasks of a Ray cluster."""
 
 from __future__ import annotations
 
 import json
 import os
+import platform
 import signal
 import threading
 import time
@@ -14,7 +15,7 @@ from typing import Any, TypeVar
 
 import cv2
 
-from edge_server.experiments.engine.content_key import plain, processor, result_key
+from edge_server.experiments.engine.content_key import plain, result_key, surroundings
 from edge_server.fields.common.threads.thread_pool import MOST_USEFUL, THREADS_VARIABLE
 from freshfield.files import Lines
 from freshfield.machine_load import usable_cores
@@ -22,7 +23,7 @@ from freshfield.machine_load import usable_cores
 Input = TypeVar("Input")
 # Inputs of one group in a task: enough to share images, few enough that Ctrl-C loses little work.
 _BATCH = 6
-_ROUND = 4  # tasks a core of a cluster between two lots of results
+_RETRIES = 3  # of a task whose worker or machine died; one that ends every worker it gets is not tried for ever
 _PARENT_EVERY_S = 0.5
 
 
@@ -74,6 +75,7 @@ class Engine:
     ray: address of a Ray cluster (``auto``, ``local`` or HOST:PORT) to use instead of processes.
     threads: number of threads of each process; None: an equal share of the cores.
     say: called with each line of progress.
+    Raises EngineError for less than one process.
     """
 
     file: Path | None = None
@@ -82,6 +84,10 @@ class Engine:
     threads: int | None = None
     say: Callable[[str], None] = print
     _store: ResultStore | None = None
+
+    def __post_init__(self) -> None:
+        if self.jobs < 1:
+            raise EngineError(f"--jobs: expected at least 1, got {self.jobs}")
 
     def run(
         self,
@@ -130,7 +136,7 @@ class Engine:
     def _results(self, work: Callable[[Input], Any], tasks: list[_Task[Input]]) -> Iterator[tuple[Any, list[Any]]]:
         """Each task with its results, as they come."""
         if self.ray is not None and tasks:
-            yield from _on_ray(self.ray, work, tasks)
+            yield from _on_ray(self.ray, self.threads, work, tasks)
         elif self.jobs > 1 and len(tasks) > 1:
             yield from _in_processes(min(self.jobs, len(tasks)), self.threads, work, tasks)
         else:
@@ -153,13 +159,8 @@ def _tasks(
     return [of[i : i + batch] for of in groups.values() for i in range(0, len(of), batch)]
 
 
-def _compute(work: Callable[[Any], Any], task: Any, number: int, kind: str | None = None) -> tuple[int, list[Any]]:
-    """The number of a task and its results, as they come back from a file. Every backend runs this function.
-
-    kind: the kind of processor that results are kept for; None: this one. Raises EngineError on another kind.
-    """
-    if kind is not None and kind != processor():
-        raise EngineError(f"--ray: {processor()} computes other last bits than {kind}: give it one kind of processor")
+def _compute(work: Callable[[Any], Any], task: Any, number: int) -> tuple[int, list[Any]]:
+    """The number of a task and its results, as they come back from a file. Every backend runs this function."""
     return number, [json.loads(json.dumps(work(one), default=plain)) for _, one in task]
 
 
@@ -184,18 +185,50 @@ def _in_processes(
         computed.close()  # after an error or Ctrl-C it ends the processes at once
 
 
-def _on_ray(where: str, work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[Any, list[Any]]]:
-    """In rounds, because joblib's backend for Ray returns results all at once."""
-    import joblib
+def _on_ray(
+    where: str, threads: int | None, work: Callable[[Any], Any], tasks: Sequence[Any]
+) -> Iterator[tuple[Any, list[Any]]]:
+    """As Ray's own tasks, not through joblib's backend for Ray: its actors count no core, so that all may start on one
+    machine, and the death of one ends the run. Ray repeats a task whose worker or machine died wherever a core is free.
+    """
+    join_cluster(where)
+    import ray
 
-    size = _ROUND * join_cluster(where)
-    remote = {"runtime_env": {"env_vars": {THREADS_VARIABLE: "1"}}}
-    with joblib.parallel_config("ray", ray_remote_args=remote), joblib.Parallel(-1, batch_size=1) as parallel:
-        for first in range(0, len(tasks), size):
-            part = tasks[first : first + size]
-            sent = (joblib.delayed(_compute)(work, task, k, processor()) for k, task in enumerate(part))
-            for number, results in parallel(sent):
-                yield part[number], results
+    remote = ray.remote(_compute_on_ray).options(
+        num_cpus=threads or 1,
+        max_retries=_RETRIES,
+        runtime_env={"env_vars": {THREADS_VARIABLE: str(threads or 1)}},  # read when kernels are imported
+    )
+    shared = ray.put(work)  # may hold a policy's weights
+    waiting = [remote.remote(shared, task, k, surroundings(work), threads) for k, task in enumerate(tasks)]
+    try:
+        while waiting:
+            (ended,), waiting = ray.wait(waiting)
+            number, results = ray.get(ended)
+            yield tasks[number], results
+    except (ray.exceptions.WorkerCrashedError, ray.exceptions.NodeDiedError, ray.exceptions.OutOfMemoryError) as error:
+        raise EngineError(f"--ray: a task ended its worker {_RETRIES + 1} times: {error}") from None
+    finally:
+        for left in waiting:
+            ray.cancel(left, force=True)
+
+
+def _compute_on_ray(
+    work: Callable[[Any], Any], task: Any, number: int, expected: dict[str, Any], threads: int | None
+) -> tuple[int, list[Any]]:
+    """``_compute`` on a machine of a cluster.
+
+    expected: ``surroundings`` where the keys were made. threads: as in ``Engine``.
+    Raises EngineError if results of this machine would be kept under keys that are not theirs.
+    """
+    here = surroundings(work)
+    if other := [name for name, value in expected.items() if here[name] != value]:
+        raise EngineError(
+            f"--ray: machine {platform.node()} differs in {', '.join(other)}: results would differ in their last bits; "
+            "install the same freshfield and packages on machines of one kind of processor"
+        )
+    (_share_cores if threads is None else limit_threads)(threads or 1)
+    return _compute(work, task, number)
 
 
 def limit_threads(threads: int) -> None:
@@ -228,22 +261,20 @@ def _end_with(parent: int) -> None:
     os._exit(1)  # at once: nobody waits for half a result
 
 
-def join_cluster(where: str) -> int:
-    """Join the cluster at an address, or start one here ("local"); returns its number of cores. Raises EngineError."""
+def join_cluster(where: str) -> None:
+    """Join the cluster at an address, or start one here ("local"). Raises EngineError."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a cluster started here tells nobody about its use
     try:
         import ray
-        from ray.util.joblib import register_ray
     except ImportError:
         raise EngineError("--ray needs Ray: pip install 'freshfield[cluster]'") from None
-    register_ray()
     attempts = 2 if where == "local" else 1  # the first start on a cold disk may exceed Ray's 30 seconds
     for left in reversed(range(attempts)):
         try:
             if not ray.is_initialized():
-                ray.init(address=None if where == "local" else where, log_to_driver=False, include_dashboard=False)
+                ray.init(address=where, log_to_driver=False, include_dashboard=False)
             break
         except Exception as error:  # Ray raises this very class where a node starts too slowly
             ray.shutdown()
             if not left:
                 raise EngineError(f"--ray {where}: no cluster can be reached: {error}") from None
-    return int(ray.cluster_resources()["CPU"])

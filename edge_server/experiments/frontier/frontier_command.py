@@ -16,8 +16,8 @@ import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic.scene import SCENES
-from edge_server.experiments.common.arguments import add_lpips, command_parser, parse_options, run_command
-from edge_server.experiments.engine import Engine
+from edge_server.experiments.common.arguments import add_lpips, add_workers, command_parser, parse_options, run_command
+from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.frontier import from_scratch, update_time
 from edge_server.experiments.frontier.from_scratch import Fit, Still
 from edge_server.experiments.frontier.output import recommendation, write_output
@@ -48,6 +48,7 @@ Fidelity against time, in two figures.
 The last line says which edge.update_ms figure 2 recommends. The page and the report of a scenario that names
 the file (frontier: OUT/frontier.json) draw it, with the run's own point.
 
+Times are measured one after another in this process; --jobs and --ray share out the runs of figure 2.
 Every finished point is kept in OUT/results.jsonl. After Ctrl-C the same command continues where it stopped;
 with other settings or other code, points are measured anew.
 """
@@ -108,11 +109,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     try:
         frontier = _frontier(args, QUICK if args.quick else SHIPPED if args.shipped else FULL)
-    except (DatasetError, ScenarioError, ValueError) as error:
+    except (DatasetError, EngineError, ScenarioError, ValueError) as error:
         print(f"edge-server frontier: {error}", file=sys.stderr)
         return 2
     stopped = f"what was measured is in {args.out}: the same command goes on"
-    return run_command("frontier", frontier.run, (), stopped)
+    return run_command("frontier", frontier.run, (EngineError,), stopped)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -136,6 +137,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--policy", default="all", metavar="NAME[:VALUE]", help="update policy in figure 2 [%(default)s]")
     add("--seeds", type=int, metavar="N", help="number of seeds [1 with --quick, else 3]")
     add("--seed", type=int, default=0, metavar="N", help="first random seed [%(default)s]")
+    add_workers(parser)
     add_lpips(parser)
     add("--out", type=out_folder, default="runs/frontier", metavar="DIR", help="folder to write [%(default)s]")
     return parser
@@ -157,20 +159,24 @@ def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
     weights = weights_folder(args.lpips)
     lpips, missing = open_lpips(args.lpips)
     engine = Engine(args.out / "results.jsonl")
+    workers = Engine(args.out / "results.jsonl", args.jobs, args.ray, threads=1)
     seeds = range(args.seed, args.seed + sweep.seeds)
     found = weights if lpips is not None else None
-    return Frontier(args.out, engine, sweep, still, fields, options, seeds, found, missing)
+    return Frontier(args.out, engine, workers, sweep, still, fields, options, seeds, found, missing)
 
 
 @dataclass
 class Frontier:
     """A run of the command: measures the missing points, then writes tables, CSV and figures.
 
+    engine: measures times, one after another in this process. workers: runs in virtual time, from ``--jobs`` and
+        ``--ray``; with the same file of results.
     weights, lpips_missing: folder of LPIPS weights, or why there are none.
     """
 
     out: Path
     engine: Engine
+    workers: Engine
     sweep: Sweep
     still: Still
     fields: tuple[str, ...]
@@ -236,9 +242,14 @@ class Frontier:
             runs += [
                 MovingRun(sweep.moving, speed, variant, seed, s, max(sweep.run_s, 6.0 * s), compute) for s in times
             ]
-        points = self.engine.run(
-            partial(update_time.run_updates, weights=self.weights), runs, "updates", files=lambda run: [self.weights]
-        )
+        with self.workers:
+            points = self.workers.run(
+                partial(update_time.run_updates, weights=self.weights),
+                runs,
+                "updates",
+                files=lambda run: [self.weights],
+                group=lambda run: (run.variant.label, run.speed),  # they share their renderings
+            )
         rows = [{**point, **run.facts()} for run, point in zip(runs, points)]
         charged = {variant.label: row for variant, row in zip(measured_of, measured)}
         return charged, update_time.mean_over_seeds(rows)

@@ -9,7 +9,7 @@ import dataclasses
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 from edge_server.experiments.common.seed_table import TRAINING, Row
@@ -142,9 +142,8 @@ def _train(
     about = code_digest(rollout.__name__) + setting.key + repr(dataclasses.asdict(config))
     label = f"{name}-{case.name}-{training.policy}-{run}".replace(" ", "-").replace(",", "").replace("/", "-")
     folder = request.out / "training" / f"{label}-{hashlib.sha256(about.encode()).hexdigest()[:8]}"
-    learner = train(
-        setting, config, request.folders, request.jobs, folder, lambda line: print(f"  {label}: {line}", flush=True)
-    )
+    say = partial(print, f"  {label}:", flush=True)
+    learner = train(setting, config, request.folders, request.jobs, folder, say, request.ray)
     draw_curve(request.out / f"{label}.png", read_log(folder))
     return learner.actor
 

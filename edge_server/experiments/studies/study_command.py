@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.embed import EmbeddingError
-from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of, run_command
+from edge_server.experiments.common.arguments import add_folders, add_workers, command_parser, folders_of, run_command
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.engine import EngineError
 from edge_server.experiments.rollouts.setting import SEEDS_A_PURPOSE
@@ -19,7 +19,6 @@ from edge_server.experiments.training.trainer import TrainingError
 from edge_server.fields.registry import field_names
 from edge_server.viewpoints.candidates import ViewpointError
 from freshfield.files import out_folder
-from freshfield.machine_load import usable_cores
 from freshfield.scenario import ScenarioError
 
 DESCRIPTION = f"""\
@@ -84,8 +83,6 @@ def checked(names: list[str], request: StudyRequest) -> list[str]:
         raise StudyError(f"--seeds: expected 1 to 10000, got {request.seeds}")
     if request.episodes is not None and not 1 <= request.episodes <= SEEDS_A_PURPOSE:
         raise StudyError(f"--episodes: expected 1 to {SEEDS_A_PURPOSE}, got {request.episodes}")
-    if request.jobs < 1:
-        raise StudyError(f"--jobs: expected at least 1, got {request.jobs}")
     for scene in request.scenes or ():
         try:
             found = scenario_of(scene)
@@ -96,7 +93,7 @@ def checked(names: list[str], request: StudyRequest) -> list[str]:
         if not found.held_out and not set(names) <= set(CAPTURING):
             raise StudyError(f"--scene {scene}: no camera is held out (cameras.held_out), so that nothing is scored")
     limits = [
-        (request.scenes or request.ray, {*STUDIES} - {*LEARNING}, "--scene and --ray: it has scenes of its own"),
+        (request.scenes, {*STUDIES} - {*LEARNING}, "--scene: it has scenes of its own"),
         (request.ray, {*STUDIES} - {*CAPTURING}, "--ray: captures are made on this machine"),
         (request.channel is not None, {*ON_A_CHANNEL}, f"--channel is for {', '.join(ON_A_CHANNEL)}"),
         (request.field != "splat", {*ON_A_CHANNEL} - {"representations"}, "--field: it has its own, or none"),
@@ -120,7 +117,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--quick", action="store_true", help="small images, few points and seeds: a quarter of an hour for all")
     add("--seeds", type=int, metavar="N", help="seeds per point [the study's own]")
-    add("--jobs", type=int, default=usable_cores(), metavar="N", help="number of worker processes [%(default)s]")
+    add_workers(parser)
     add(
         "--case",
         action="append",
@@ -129,7 +126,6 @@ def _parser() -> argparse.ArgumentParser:
         help=f"only cases with these words in their name, in {', '.join(CASED)}; words that no name has list all cases",
     )
     add("--episodes", type=int, metavar="N", help="episodes of each training [the study's own]")
-    add("--ray", metavar="ADDRESS", help="run on a Ray cluster instead: auto, local, or host:port")
     add(
         "--scene",
         metavar="NAME|FILE,...",

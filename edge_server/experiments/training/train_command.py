@@ -7,9 +7,10 @@ import dataclasses
 import math
 import sys
 from collections.abc import Sequence
+from functools import partial
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of, run_command
+from edge_server.experiments.common.arguments import add_folders, add_workers, command_parser, folders_of, run_command
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.engine import EngineError
 from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
@@ -21,7 +22,6 @@ from edge_server.scheduler.learned.rewards import REWARDS
 from edge_server.scheduler.learned.settings import ACTIONS, Spec
 from edge_server.settings import read_config
 from freshfield.files import out_folder, write_csv
-from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario, ScenarioError, load
 
 DESCRIPTION = """\
@@ -52,7 +52,7 @@ Images are small (--size) and the field is fast (--field), so that there are man
 
 OUT/policy.npz is the learned policy, OUT/actor.npz the part of it that decides, OUT/training.csv and .png the
 learning curve with each term of the reward. edge-server compare says what it shows, on seeds it was not trained
-on. After Ctrl-C the same command continues, bit for bit, whatever --jobs is.
+on. After Ctrl-C the same command continues, bit for bit, whatever --jobs and --ray are.
 """
 
 
@@ -84,7 +84,8 @@ def _train(args: argparse.Namespace, setting: Setting, config: TrainingConfig, f
         )
     if not setting.draws_motions:
         print("  every episode has the same motion")
-    learner = train(setting, config, folders, args.jobs, args.out, lambda line: print(f"  {line}", flush=True))
+    say = partial(print, " ", flush=True)
+    learner = train(setting, config, folders, args.jobs, args.out, say, args.ray)
     rows = read_log(args.out)
     write_csv(args.out / "training.csv", rows)
     learner.actor.save(args.out / "actor.npz")
@@ -124,8 +125,6 @@ def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> Tra
     reward, missing = reward_of(name, args.on, folders.lpips, network, args.distance)
     if missing:
         print(f"  {missing}")
-    if args.jobs < 1:
-        raise TrainingError(f"--jobs: expected at least 1, got {args.jobs}")
     seeds(args.seed, "train", args.episodes)
     if not 0.0 <= args.price < math.inf:
         raise TrainingError(f"--price: expected 0 or more, got {args.price:g}")
@@ -216,7 +215,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--field", default="splat", metavar="NAME", help="representation; '': the scenario's [%(default)s]")
     add("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
-    add("--jobs", type=int, default=usable_cores(), metavar="N", help="number of worker processes [%(default)s]")
+    add_workers(parser)
     add_folders(parser)
     add("--out", type=out_folder, required=True, metavar="DIR", help="folder to write")
     return parser

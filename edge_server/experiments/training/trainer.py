@@ -81,14 +81,16 @@ class TrainingConfig:
         return seeds(self.seed, "train", min(self.batch, self.episodes - first), first)
 
 
-def train(setting: Setting, config: TrainingConfig, folders: Folders, jobs: int, out: Path, say: Say) -> Learner:
+def train(
+    setting: Setting, config: TrainingConfig, folders: Folders, jobs: int, out: Path, say: Say, ray: str | None = None
+) -> Learner:
     """Train for all episodes; a training with the same settings in ``out`` is continued.
 
     Writes OUT/training.jsonl (a line per batch), OUT/training.json and, at the end, OUT/policy.npz. After
     KeyboardInterrupt the checkpoint of the last batch is there.
 
     setting: the setting that decisions are drawn from.
-    jobs: number of processes.
+    jobs, ray: as in ``Engine``.
     say: called with lines of progress.
 
     Returns the trained learner. Raises TrainingError if ``out`` holds a training with other settings, or if the first
@@ -102,10 +104,10 @@ def train(setting: Setting, config: TrainingConfig, folders: Folders, jobs: int,
         say(f"going on after {first} of {config.batches} batches")
     if learner is None:
         (out / "policy.npz").unlink(missing_ok=True)  # of an earlier training
-        learner = _new_learner(setting, config, folders, jobs)
+        learner = _new_learner(setting, config, folders, jobs, ray)
     for number in range(first, config.batches):
         batch_began = time.monotonic()
-        engine = Engine(jobs=jobs, threads=1, say=_now_and_then(say))
+        engine = Engine(jobs=jobs, ray=ray, threads=1, say=_now_and_then(say))
         row = _train_batch(setting, config, folders, engine, learner, number)
         rows.append({**row, "seconds": round(time.monotonic() - batch_began, 3)})
         checkpoint.save(learner, rows)
@@ -231,13 +233,13 @@ def _missing_reward_reason(outcomes: list[Outcome], found: list[RewardTerms]) ->
     )
 
 
-def _new_learner(setting: Setting, config: TrainingConfig, folders: Folders, jobs: int) -> Learner:
+def _new_learner(setting: Setting, config: TrainingConfig, folders: Folders, jobs: int, ray: str | None) -> Learner:
     from edge_server.scheduler.learned.ppo import Learner
 
     spec = config.spec
     if "semantics" in spec.layout.parts and not spec.layout.centre:
         work = partial(embeddings_seen, setting=setting, folders=folders)
-        rows = Engine(jobs=jobs, threads=1, say=lambda line: None).run(work, list(config.seeds(0)))
+        rows = Engine(jobs=jobs, ray=ray, threads=1, say=lambda line: None).run(work, list(config.seeds(0)))
         seen = np.array([z for of in rows for z in of], np.float64).reshape(-1, spec.layout.dim)
         spec = dataclasses.replace(spec, layout=spec.layout.standardized(seen))
     return Learner(spec, config.seed)

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 from pathlib import Path
@@ -14,8 +15,9 @@ from pathlib import Path
 import pytest
 
 from edge_server.experiments.engine import Engine, EngineError
-from edge_server.experiments.engine.engine import _compute
-from tests.edge_server.experiments.engine.jobs import Point, fail, measure, note
+from edge_server.experiments.engine.content_key import surroundings
+from edge_server.experiments.engine.engine import _compute_on_ray
+from tests.edge_server.experiments.engine.jobs import Point, end_worker, fail, measure, measure_on_ray, note
 from tests.support import wait_until
 
 POINTS = [Point(seed, scene=scene) for scene in ("room", "tower") for seed in range(4)]
@@ -49,19 +51,59 @@ def test_processes_compute_the_same_bit_for_bit(serial):
     assert repr(run(Engine(jobs=2), group=lambda p: p.scene, batch=3)) == repr(serial)
 
 
+@pytest.fixture(scope="module")
+def cluster():
+    """A Ray cluster of two nodes, each of one core."""
+    ray = pytest.importorskip("ray", reason="needs Ray: pip install 'freshfield[cluster]'")
+    from ray.cluster_utils import Cluster
+
+    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    nodes.add_node(num_cpus=1)
+    yield nodes
+    ray.shutdown()
+    nodes.shutdown()
+
+
 @pytest.mark.slow
 @pytest.mark.alone
-def test_a_ray_cluster_computes_the_same_bit_for_bit(serial):
-    ray = pytest.importorskip("ray", reason="needs Ray: pip install 'freshfield[cluster]'")
-    try:
-        assert repr(run(Engine(ray="local"), group=lambda p: p.scene)) == repr(serial)
-    finally:
-        ray.shutdown()
+def test_two_ray_nodes_compute_the_same_bit_for_bit_though_workers_and_a_node_are_lost(serial, cluster, tmp_path):
+    engine, work = (
+        Engine(tmp_path / "r.jsonl", ray=cluster.address, say=quiet),
+        partial(measure_on_ray, folder=tmp_path),
+    )
+    assert repr(engine.run(work, POINTS, group=lambda p: p.scene, batch=1)) == repr(serial)
+    calls = [path.name.split("-")[1:] for path in tmp_path.glob("call-*")]
+    assert sorted(seed for seed, *_ in calls) == sorted([*"01233"] * 2), "each once, and those that ended their worker"
+    assert len({node for _, _, node, _ in calls}) == 2
+    assert len((tmp_path / "r.jsonl").read_text().splitlines()) == len(POINTS)
+
+    with pytest.raises(EngineError, match="a task ended its worker 4 times"):
+        engine.run(end_worker, POINTS[:1])
+
+    more, second = [Point(seed) for seed in range(10, 20)], cluster.list_all_nodes()[1]
+
+    def lose_a_node() -> None:
+        wait_until(lambda: [*tmp_path.glob(f"call-1?-*-{second.node_id}-*")], "the second node is not used", 60.0)
+        cluster.remove_node(second, allow_graceful=False)
+
+    loss = threading.Thread(target=lose_a_node)
+    loss.start()
+    assert repr(engine.run(work, more)) == repr(run(Engine(), points=more))
+    loss.join()
+    engine.close()
+    assert second not in cluster.list_all_nodes()
 
 
-def test_a_cluster_of_another_kind_of_processor_is_refused():
-    with pytest.raises(EngineError, match="one kind of processor"):
-        _compute(measure, [("key", POINTS[0])], 0, "x86_64 haswell")
+@pytest.mark.parametrize("what", ["code", "versions", "processor"])
+def test_a_machine_of_a_cluster_whose_results_would_differ_is_refused(what):
+    with pytest.raises(EngineError, match=f"differs in {what}: .* one kind of processor"):
+        _compute_on_ray(measure, [("key", POINTS[0])], 0, {**surroundings(measure), what: "other"}, None)
+
+
+@pytest.mark.parametrize("jobs", [0, -1])
+def test_less_than_one_process_is_refused(jobs):
+    with pytest.raises(EngineError, match=f"--jobs: expected at least 1, got {jobs}"):
+        Engine(jobs=jobs)
 
 
 def test_what_is_known_is_not_computed_again_and_one_key_is_computed_once(tmp_path):
