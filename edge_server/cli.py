@@ -129,6 +129,12 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
         "--page-host", default="127.0.0.1", metavar="HOST", help="address of the page and the metrics [%(default)s]"
     )
     run.add_argument("--metrics-port", type=int, metavar="PORT", help="serve Prometheus metrics on this port [none]")
+    run.add_argument(
+        "--foxglove-port",
+        type=int,
+        metavar="PORT",
+        help="serve Foxglove on this port of 127.0.0.1, without a login [none]",
+    )
     run.add_argument("--out", type=out_folder, default="runs/edge", metavar="DIR", help="folder to write [%(default)s]")
     run.add_argument(
         "--emulator-out",
@@ -202,6 +208,7 @@ def _run(args: argparse.Namespace) -> int:
         transport=secure,
         page_host=args.page_host,
         open_page=None if args.page_port is None else open_page,
+        open_foxglove=None if args.foxglove_port is None else partial(_open_foxglove, args.foxglove_port),
         metrics_port=args.metrics_port,
         lpips_folder=weights_folder(args.lpips, args.data),
         resume=None if args.resume == args.out / "field.npz" and not args.resume.exists() else args.resume,
@@ -234,6 +241,12 @@ def _open_page(host: str, port: int, secure: transport.Transport, emulator: str 
         return start_page(state, host, port, secure, emulator)
     except PageError as error:
         raise TransportError(str(error)) from None
+
+
+def _open_foxglove(port: int, state: EdgeState) -> OpenPage:
+    from edge_server.page.foxglove_live import FoxgloveServer
+
+    return FoxgloveServer(state, port)
 
 
 def _add_report(commands: argparse._SubParsersAction) -> None:

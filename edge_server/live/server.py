@@ -75,7 +75,7 @@ class ServerOptions:
     out: folder of the run's files.
     transport: security of connections.
     page_host: address on which page and metrics listen.
-    open_page: starts the live page of a state; None: no page.
+    open_page: starts the live page of a state; None: no page. open_foxglove: the same of the server for Foxglove.
     metrics_port: port of Prometheus metrics; None: no metrics.
     lpips_folder: folder with LPIPS weights; None: that of $FRESHFIELD_LPIPS, if any.
     resume: checkpoint to start from. checkpoint_s: period of writing one, seconds; None: only at the end.
@@ -88,6 +88,7 @@ class ServerOptions:
     transport: Transport = field(default_factory=Transport)
     page_host: str = "127.0.0.1"
     open_page: Callable[[EdgeState], OpenPage] | None = None
+    open_foxglove: Callable[[EdgeState], OpenPage] | None = None
     metrics_port: int | None = None
     lpips_folder: Path | None = None
     resume: Path | None = None
@@ -206,11 +207,12 @@ class EdgeServer:
             self.options.transport, self.options.listen, self.ingest, self.clock, self.state, self._stopping
         )
         grpc.start()
-        page = None
+        opened: list[OpenPage] = []
         try:
-            if self.options.open_page is not None:
-                page = self.options.open_page(self.state)
-                log.info("page: %s", page.url)
+            for name, start in (("page", self.options.open_page), ("Foxglove", self.options.open_foxglove)):
+                if start is not None:
+                    opened.append(start(self.state))
+                    log.info("%s: %s", name, opened[-1].url)
             if self.options.metrics_port is not None:
                 from edge_server.live.output.prometheus import serve_metrics
 
@@ -227,7 +229,7 @@ class EdgeServer:
             self.scoring.stop(_LAST_SCORES_S)
             grpc.join(1.0)
             self._write_final()
-            if page is not None:
+            for page in opened:
                 page.stop()
         if self.loop.failure is not None:
             raise self.loop.failure

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections import Counter
 from types import SimpleNamespace
 
+from prometheus_client import CollectorRegistry, generate_latest
+
 from edge_server.live.ingest import DepthArrivals
 from edge_server.live.output.prometheus import EdgeCollector
+from edge_server.live.state import CameraView, Publication
+from tests.conftest import ROOT
 from tests.edge_server.page.test_page import bare_state
 
 
@@ -44,3 +50,34 @@ def test_depth_has_metrics_where_a_camera_sends_it():
     assert {name: sample.labels for name, sample in found.items()} == {name: {"camera": "cam01"} for name in found}
     assert found["freshfield_depth_frames"].value == 3 and found["freshfield_depth_bytes"].value == 2500
     assert 1.0 <= found["freshfield_depth_age_seconds"].value < 30.0
+
+
+def test_every_query_of_the_dashboard_names_a_metric_that_the_edge_exports():
+    state = bare_state()
+    state.cameras = lambda: [CameraView("cam01", False, None, 12.0, 3, 0)]
+    scores = {"psnr_db": 20.0, "psnr_moving_db": 15.0, "ssim": 0.8, "lpips": 0.2, "scored_on": "cam00"}
+    state.publish(Publication(3, 1.5, 10**9, None, ("cam01",), (10.0,), 15.0, 5.0, **scores), None)
+    registry = CollectorRegistry()
+    registry.register(
+        EdgeCollector(
+            state,
+            SimpleNamespace(
+                rejected={"crc": 4},
+                depth={"cam01": DepthArrivals(3, 2500, state.now_ns())},
+                buffer=SimpleNamespace(shed=2),
+                check_ms=SimpleNamespace(percentile=lambda percent: 1.0),
+            ),
+        )
+    )
+    exported = set(re.findall(r"^(\w+)[{ ]", generate_latest(registry).decode(), re.MULTILINE)) - {"#"}
+    dashboard = json.loads((ROOT / "deploy/grafana.json").read_text())
+    queries = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
+    queries.append(dashboard["templating"]["list"][0]["query"]["query"])
+    asked = set()
+    for query in queries:
+        names = set(re.findall(r"\bfreshfield_\w+", query))
+        assert names and names <= exported, query
+        asked |= names
+    assert asked == exported, "each metric is drawn"
+    places = [tuple(panel["gridPos"][k] for k in "xywh") for panel in dashboard["panels"]]
+    assert len({(x, y) for x, y, *_ in places}) == len(places) and all(x + w <= 24 for x, _, w, _ in places)

@@ -1,0 +1,179 @@
+"""The server for Foxglove, asked by a client that speaks its protocol (subprotocol foxglove.sdk.v1)."""
+
+from __future__ import annotations
+
+import json
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from importlib import import_module
+from itertools import count
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import websocket
+
+pytest.importorskip("foxglove", reason="needs the extra foxglove")
+pytest.importorskip("foxglove_schemas_protobuf", reason="needs the extra mcap")
+
+from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.splat.snapshot import SplatSnapshot
+from edge_server.page.foxglove_live import FoxgloveServer, point_cloud
+from edge_server.page.foxglove_live.settings import IDLE_S, MOST_POINTS
+from freshfield.transport import TransportError
+from tests.conftest import ROOT
+from tests.edge_server.page.preview import CAMERAS, LENS, Preview
+
+MESSAGE = struct.Struct("<BIQ")  # opcode 1, subscription, log time
+
+
+@pytest.fixture
+def served() -> Iterator[tuple[Preview, FoxgloveServer]]:
+    preview = Preview()
+    server = FoxgloveServer(preview.state, 0)
+    preview.start()
+    yield preview, server
+    server.stop()
+    preview.stop()
+
+
+class Client:
+    """Connects; ``channels``: what is advertised, by topic."""
+
+    def __init__(self, server: FoxgloveServer) -> None:
+        self.socket = websocket.create_connection(server.url, subprotocols=["foxglove.sdk.v1"], timeout=20)
+        assert json.loads(self.socket.recv())["op"] == "serverInfo"
+        self.channels: dict[str, dict] = {}
+        while "/scores" not in self.channels:
+            self.channels |= {c["topic"]: c for c in json.loads(self.socket.recv())["channels"]}
+        self._numbers = count(1)
+
+    def first(self, topic: str):
+        """The first message of a topic, decoded, and its log time."""
+        channel, number = self.channels[topic], next(self._numbers)
+        asked = {"op": "subscribe", "subscriptions": [{"id": number, "channelId": channel["id"]}]}
+        self.socket.send(json.dumps(asked))
+        while True:
+            kind, data = self.socket.recv_data()
+            if kind == websocket.ABNF.OPCODE_BINARY and MESSAGE.unpack_from(data)[:2] == (1, number):
+                break
+        self.socket.send(json.dumps({"op": "unsubscribe", "subscriptionIds": [number]}))
+        body, log_ns = data[MESSAGE.size :], MESSAGE.unpack_from(data)[2]
+        if channel["encoding"] == "json":
+            return json.loads(body), log_ns
+        name = channel["schemaName"].removeprefix("foxglove.")
+        return getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name).FromString(body), log_ns
+
+
+def test_one_message_of_each_kind(served):
+    preview, server = served
+    client = Client(server)
+    held_out = preview.names[CAMERAS // 2]
+    image, log_ns = client.first("/cam03/image")
+    assert image.frame_id == "cam03" and image.format == "jpeg" and image.timestamp.ToNanoseconds() == log_ns
+    decoded = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
+    assert decoded.shape == (LENS.height, LENS.width, 3)
+    calibration, _ = client.first("/cam03/calibration")
+    assert list(calibration.K) == [LENS.fx, 0, LENS.cx - 0.5, 0, LENS.fy, LENS.cy - 0.5, 0, 0, 1]
+    transform, _ = client.first("/tf")
+    where = preview._poses[transform.child_frame_id]
+    assert transform.parent_frame_id == "world"
+    assert np.allclose([getattr(transform.translation, a) for a in "xyz"], where[:3, 3])
+    assert [getattr(transform.rotation, a) for a in "wxyz"] == [
+        *preview._newest[transform.child_frame_id].pose.quaternion
+    ]
+    truth, _ = client.first("/truth/image")
+    assert truth.frame_id == held_out
+    rendered, _ = client.first("/rendered/image")
+    seen = cv2.imdecode(np.frombuffer(rendered.data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    exact = 255 * preview.state.renderer.render(preview._poses[held_out], LENS).color
+    assert seen.shape == exact.shape and np.abs(seen - exact).mean() < 12, "a moving ball, as JPEG"
+    assert client.first("/rendered/calibration")[0].frame_id == "rendered"
+    ages, _ = client.first("/ages")
+    assert set(ages["cameras"]) == set(preview.names) and 0 <= ages["least_s"] <= ages["most_s"] < 60
+    decision, log_ns = client.first("/decisions")
+    assert decision["published_ns"] == log_ns and held_out not in decision["selected"]
+    assert set(decision) == set(json.loads(client.channels["/decisions"]["schema"])["properties"])
+    assert client.first("/scores")[0]["psnr_db"] == 30.0
+
+
+def test_points_are_the_gaussians_that_are_seen(served):
+    _, server = served
+    params = np.zeros((MOST_POINTS + 3, 14), np.float32)
+    params[:, :3] = np.linspace(0.0, 1.0, len(params))[:, None]
+    params[:, 3:6], params[:, 6], params[:, 10], params[:, 11:14] = -3.0, 1.0, 4.0, (1.2, 0.5, -0.1)
+    params[0, 0] = np.nan  # drawn by no renderer
+    params[1, 10] = -4.0  # haze
+    params[2, 3:6] = -6.0  # too small among so many
+    box = SceneBox((1.0, 2.0, 3.0), 2.0, 0.1, True, 2.0, 0.01)
+    field = SplatSnapshot(box, SimpleNamespace(params=params), np.zeros(3, np.float32), None, 1)
+    points = point_cloud(field)
+    assert len(points) == MOST_POINTS and points["x"][0] == pytest.approx(1.0 + 2.0 * params[3, 0])
+    assert (points["red"][0], points["green"][0], points["blue"][0]) == (255, 128, 0)
+    server._state = SimpleNamespace(
+        renderer=field, now_ns=lambda: 7, cameras=list, publications=lambda _: [], newest=lambda scored: None
+    )
+    cloud, log_ns = Client(server).first("/points")
+    assert (cloud.frame_id, log_ns, cloud.point_stride) == ("world", 7, points.dtype.itemsize)
+    assert [f.name for f in cloud.fields] == list(points.dtype.names) and cloud.data == points.tobytes()
+
+
+def test_nothing_is_made_for_nobody(served, monkeypatch):
+    _, server = served
+    made = threading.Event()
+    monkeypatch.setattr(server, "_send", made.set)
+    client = Client(server)
+    time.sleep(3 * IDLE_S)
+    assert not made.is_set(), "a client that has subscribed to nothing"
+    monkeypatch.undo()
+    client.first("/ages")
+    client.socket.close()
+
+
+def test_a_taken_port_and_a_view_that_fails_are_said(served, caplog):
+    preview, server = served
+    with pytest.raises(TransportError, match=f"--foxglove-port {server._server.port}: .*in use"):
+        FoxgloveServer(preview.state, server._server.port)
+    broken = SimpleNamespace(at=lambda now_ns: 1 / 0)
+    client = Client(server)
+    client.first("/rendered/image")
+    preview.stop()
+    preview.state.publish(preview.state.newest(), broken)
+    client.socket.send(
+        json.dumps(
+            {"op": "subscribe", "subscriptions": [{"id": 99, "channelId": client.channels["/rendered/image"]["id"]}]}
+        )
+    )
+    deadline = time.monotonic() + 20
+    while "serving Foxglove failed: ZeroDivisionError" not in caplog.text and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert caplog.text.count("failed: ZeroDivisionError") == 1 and server._thread.is_alive()
+
+
+def test_the_layout_shows_topics_and_values_that_are_served(served):
+    _, server = served
+    client = Client(server)
+    layout = json.loads((ROOT / "deploy/foxglove-layout.json").read_text())
+
+    def names(value) -> set[str]:
+        if isinstance(value, dict):
+            return set().union(*map(names, value.values()), *map(names, value))
+        if isinstance(value, list):
+            return set().union(*map(names, value))
+        return {value} if isinstance(value, str) and value.startswith("/") else set()
+
+    shown = names(layout["configById"])
+    assert len(shown) > 6
+    for name in shown:
+        topic, _, value = name.partition(".")
+        assert topic in client.channels, name
+        assert not value or value in json.loads(client.channels[topic]["schema"])["properties"], name
+    panels, pending = set(), [layout["layout"]]
+    while pending:
+        node = pending.pop()
+        panels |= {node} if isinstance(node, str) else set()
+        pending += [] if isinstance(node, str) else [node["first"], node["second"]]
+    assert panels == set(layout["configById"])
