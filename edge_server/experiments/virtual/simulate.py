@@ -251,6 +251,8 @@ def show(found: dict[str, Any]) -> str:
     cost = found["compute"]
     charged = f"{cost['ms_per_step']:g} ms a step, {cost['ms_per_update']:g} ms an update"
     cost_text = charged if any(cost.values()) else "free of charge"
+    now_and_all = dict(found.get("now_and_all") or {})
+    revisited = now_and_all.pop("revisited", None)
     lines = [
         f"{found['scenario']}, seed {found['seed']}, {found['seconds']:g} s of virtual time, "
         f"{short_name(found['policy'])}{value}",
@@ -258,11 +260,8 @@ def show(found: dict[str, Any]) -> str:
         f"  views       {number(found['views'], 1)} an update",
         "  last fifth  " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["last_fifth"].items()),
         "  shown       " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["shown"].items()),
-        *(
-            ["  since 4 s   " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["now_and_all"].items())]
-            if found.get("now_and_all")
-            else []
-        ),
+        *(["  since 4 s   " + ", ".join(f"{k} {number(v, 3)}" for k, v in now_and_all.items())] if now_and_all else []),
+        *(["  revisited   " + ", ".join(f"{k} {number(v, 2)}" for k, v in revisited.items())] if revisited else []),
         f"  seconds until within 1 dB of that: {number(found['seconds_to_1_db'], 1)}",
         "  frames      " + ", ".join(f"{k} {v}" for k, v in found["frames"].items() if v),
         f"  digest      {found['digest'][:32]} on {found['processor']}",

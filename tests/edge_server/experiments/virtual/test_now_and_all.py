@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from edge_server.experiments.virtual import now_and_all
-from edge_server.experiments.virtual.simulate import main
+from edge_server.experiments.virtual.simulate import main, show
 from edge_server.fidelity.psnr import psnr
 from edge_server.fields import View
 from freshfield.geometry import Pinhole
@@ -32,7 +32,11 @@ def test_newest_and_all_held_out_frames_are_scored_each_two_seconds_and_drawn(tm
     }
     (tmp_path / "walk.yaml").write_text(yaml.safe_dump(section))
     assert main([str(tmp_path / "walk.yaml"), "--seconds", "5", "--json", "--out", str(tmp_path / "run")]) == 0
-    found = json.loads(capsys.readouterr().out)["now_and_all"]
+    whole = json.loads(capsys.readouterr().out)
+    found = whole["now_and_all"]
+    revisited = {"captures": 3, "apart_mm": 4.5, "apart_deg": 0.17}
+    said = show({**whole, "now_and_all": {**found, "revisited": revisited}})
+    assert "revisited   captures 3.00, apart_mm 4.50, apart_deg 0.17" in said and "revisited" not in show(whole)
     rows = json.loads((tmp_path / "run" / "now-and-all.json").read_text())
     assert [row["t_s"] for row in rows] == [2.0, 4.0]
     assert found == pytest.approx({name: value for name, value in rows[1].items() if name != "t_s"})
