@@ -150,6 +150,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="NAME", help="writes NAME.json, NAME-time.png, NAME-pictures.png"
     )
+    parser.add_argument("--without-truth", action="store_true", help="of footage that may not be published")
     args = parser.parse_args(argv)
     images = [dict(np.load(run / _IMAGES)) for run in args.runs]
     write_json(args.out.with_suffix(".json"), {"runs": [_facts(run) for run in args.runs]})
@@ -160,10 +161,11 @@ def main(argv: Sequence[str] | None = None) -> int:
                 line.plot([row["t_s"] for row in rows], [row[name] for row in rows], label=run.name)
         label_lines(axes[0, 0], "now, dB")
         label_lines(axes[1, 0], "all so far, dB", "seconds")
-    rows = [("now", [("truth", images[0]["truth_now"]), *((r.name, i["now"]) for r, i in zip(args.runs, images))])]
     half = len(images[0]["all"]) // 2
-    kept = [(r.name, i["all"][half]) for r, i in zip(args.runs, images)]
-    rows.append(("of all, half-way", [("truth", images[0]["truth_all"][half]), *kept]))
+    rows = []
+    for label, name, frame in (("now", "now", ()), ("of all, half-way", "all", half)):
+        truth = [] if args.without_truth else [("truth", images[0][f"truth_{name}"][frame])]
+        rows.append((label, [*truth, *((run.name, of_run[name][frame]) for run, of_run in zip(args.runs, images))]))
     draw_images(args.out.with_name(f"{args.out.name}-pictures.png"), rows)
     return 0
 

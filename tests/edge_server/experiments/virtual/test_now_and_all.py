@@ -48,6 +48,11 @@ def test_newest_and_all_held_out_frames_are_scored_each_two_seconds_and_drawn(tm
         np.mean(each), abs=0.05
     )
     assert now_and_all.main([str(tmp_path / "run"), str(tmp_path / "run"), "--out", str(tmp_path / "both")]) == 0
+    drawn: list[tuple[str, list[tuple[str, np.ndarray]]]] = []
+    with monkeypatch.context() as patch:
+        patch.setattr("edge_server.experiments.common.drawn_images.draw_images", lambda path, rows: drawn.extend(rows))
+        now_and_all.main([str(tmp_path / "run"), "--out", str(tmp_path / "alone"), "--without-truth"])
+    assert [[name for name, _ in panels] for _, panels in drawn] == [["run"], ["run"]]
     one, two = json.loads((tmp_path / "both.json").read_text())["runs"]
     assert one == two and (one["run"], one["scenario"], one["steps"]) == ("run", "walk", 2)
     assert one["now_db"] == pytest.approx(rows[1]["now_db"], abs=1e-3) and [r[0] for r in one["by_seconds"]] == [
