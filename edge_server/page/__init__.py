@@ -98,6 +98,7 @@ def start_page(
 
         async def moved(camera: Any) -> None:
             renders.camera_moved(client)
+            panel.make_room(client)
 
         client.camera.on_update(moved)
 

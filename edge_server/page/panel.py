@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
+from weakref import WeakSet
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from freshfield import coverage
 
 MAIN_WIDTH = 372
 SIDE_WIDTH = 356
+LEAST_SCENE_PX = 320  # beside both panels; a phone, where they are below the scene, is as wide
 # Width of two images and the gap between them, in pixels.
 PAIR_WIDTH = 640
 GAP = 8
@@ -68,7 +70,16 @@ class Panel:
             self._reckoned_with_depth = False
         side.dock_left()
         side.set_width(SIDE_WIDTH)
-        self._gui = gui
+        self._gui, self._side = gui, side
+        self._made_room: WeakSet[viser.ClientHandle] = WeakSet()
+
+    def make_room(self, client: viser.ClientHandle) -> None:
+        """Fold up the timelines, once, of a visitor whose window is so narrow that both panels hide the scene."""
+        if client.camera.image_width < LEAST_SCENE_PX and client not in self._made_room:
+            self._made_room.add(client)
+            panel = client.gui.main_panel  # a handle that speaks to this visitor alone
+            panel._placement_uuid = self._side._placement_uuid
+            panel.minimize()
 
     def refresh(
         self,
