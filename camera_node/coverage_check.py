@@ -18,9 +18,15 @@ def check(scenario: Scenario, config: SourceConfig, data: Path | None, plan: Pat
     """What the training cameras see, in words. plan: SVG file to write; None: none. Raises ValueError or OSError."""
     cameras = _fixed_cameras(scenario, config, data)
     if cameras is None:
-        return "not reckoned: the cameras move"
+        return (
+            "not reckoned: the cameras move, so what they see depends on their way: let them see each surface from "
+            "several sides"
+        )
     if not cameras:
-        return "not reckoned: no camera has a pose before the run"
+        return (
+            "not reckoned: no camera has a pose before the run: name the file of camera-node calibrate rig as "
+            "source.calibration"
+        )
     coverage = reckon(list(cameras.values()))
     found = f"{coverage.words}. {reached(len(cameras), _measures_depth(config))}"
     if plan is None:

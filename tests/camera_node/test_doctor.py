@@ -241,7 +241,7 @@ def test_a_camera_that_is_carried_is_not_taken_for_a_fixed_one(tmp_path, count, 
         return coverage_check.check(scenario, config, None, None)
 
     for loop in ("back-and-forth", "restart"):
-        assert said(loop) == "not reckoned: the cameras move"
+        assert said(loop).startswith("not reckoned: the cameras move, ")
     data = json.loads(file.read_text())
     for frame in data["frames"]:
         frame["transform_matrix"] = data["frames"][0]["transform_matrix"]
