@@ -20,9 +20,10 @@ from edge_server.fields.splat.layers.depth.body_depth import body_depth, seen_th
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
 from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
 from edge_server.fields.splat.layers.depth.kernels.surfaces import Meshes
+from edge_server.fields.splat.layers.depth.large_planes import continued, large_planes
 from edge_server.fields.splat.layers.depth.overlaps import contradicting, exposures
 from edge_server.fields.splat.layers.depth.plate_stereo import PlateStereo
-from edge_server.fields.splat.layers.depth.registration import Correction, register
+from edge_server.fields.splat.layers.depth.registration import Correction, register, register_stereo
 from edge_server.fields.splat.layers.depth.surfaces import Surface, SurfaceScene
 from edge_server.fields.splat.layers.depth.virtual_plates import virtual_plates
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation
@@ -141,13 +142,13 @@ class DepthSupervision:
             self.wrong = wrong
         used = [camera for camera in cameras if camera.name not in wrong and inverse[camera.name].any()]
         measured = {c.name: c.surface(*smooth(inverse[c.name], c.plate.color, self.pool)) for c in used}
-        if anew or not self.corrections.keys() >= measured.keys():
-            self._register(list(measured), list(measured.values()))
+        if measured and (anew or not self.corrections.keys() >= measured.keys()):
+            self._take_corrections(list(measured), register(list(measured.values())))
         surfaces = [self._corrected(c, measured.get(c.name)) for c in cameras]
-        poses = [surface.pose for surface in surfaces]
         whole = _are_whole(cameras, surfaces)
         if not whole and len(cameras) <= of_layers.STEREO_CAMERAS:
             surfaces, whole = self._filled(cameras, surfaces, anew)
+        poses = [surface.pose for surface in surfaces]
         surfaces = [surface for surface in surfaces if surface.inverse.any()]
         plates = [
             camera.learned._replace(view=replace(camera.learned.view, camera_to_world=pose))
@@ -159,8 +160,8 @@ class DepthSupervision:
         return plates, surfaces
 
     def _sweep(self, stereo: PlateStereo, cameras: Sequence[CameraPlates], every: bool = False) -> bool:
-        distance_m = scene_box([camera.plate.view for camera in cameras]).distance_m
-        return stereo.sweep({camera.name: self._corrected(camera, None) for camera in cameras}, distance_m, every)
+        plates = {camera.name: self._corrected(camera, None) for camera in cameras}
+        return stereo.sweep(plates, _distance_m(cameras), every)
 
     def _filled(
         self, cameras: Sequence[CameraPlates], surfaces: list[Surface], every: bool
@@ -174,10 +175,25 @@ class DepthSupervision:
             filled = self.stereo.fill({camera.name: surface for camera, surface in zip(cameras, surfaces)})
             if filled is not None:
                 surfaces, whole = filled, True
+                if not any(there.any() for there in measured):
+                    surfaces = self._of_stereo_alone(cameras, filled, every)
         if self.network is not None:
             surfaces = self.network.fill([camera.name for camera in cameras], surfaces, measured, self.pool)
             whole = whole or _are_whole(cameras, surfaces)
         return surfaces, whole
+
+    def _of_stereo_alone(self, cameras: Sequence[CameraPlates], surfaces: list[Surface], anew: bool) -> list[Surface]:
+        """The surfaces that stereo has found, at corrected poses, with large planes continued where no network will say
+        what is there. anew: see ``plates``."""
+        names = [camera.name for camera in cameras]
+        if anew or not self.corrections.keys() >= set(names):
+            reported = [camera.reported for camera in cameras]
+            self._take_corrections(names, register_stereo(surfaces, reported, _distance_m(cameras)))
+            surfaces = [replace(s, pose=self.corrections[name].pose) for name, s in zip(names, surfaces)]
+        if self.network is not None:
+            return surfaces
+        planes = large_planes(surfaces, np.random.default_rng([self.settings.seed, 8]))
+        return [continued(surface, planes) for surface in surfaces]
 
     def _corrected(self, camera: CameraPlates, measured: Surface | None) -> Surface:
         """What a camera sees, where it stands. measured: None: without depth."""
@@ -186,12 +202,12 @@ class DepthSupervision:
         found = self.corrections.get(camera.name)
         return measured if found is None else found.applied(measured)
 
-    def _register(self, names: Sequence[str], surfaces: Sequence[Surface]) -> None:
+    def _take_corrections(self, names: Sequence[str], found: Sequence[Correction]) -> None:
         before = self.displaced
-        self.corrections = dict(zip(names, register(surfaces))) if len(names) > 1 else {}
-        for name, found in self.displaced.items():
+        self.corrections = dict(zip(names, found)) if len(names) > 1 else {}
+        for name, off in self.displaced.items():
             if name not in before:
-                log.warning("%s %s", name, found)
+                log.warning("%s %s", name, off)
 
     def first_gaussians(self, surfaces: Sequence[Surface], box: SceneBox) -> NDArray[np.float32] | None:
         """Parameters of the static field's first Gaussians; None: it has to find them itself."""
@@ -237,6 +253,12 @@ def _are_whole(cameras: Sequence[CameraPlates], surfaces: Sequence[Surface]) -> 
     """Whether nearly all of what the plates show has depth."""
     known = sum(int(np.count_nonzero(camera.plate.known)) for camera in cameras)
     return sum(int(np.count_nonzero(s.depth())) for s in surfaces) >= (1.0 - tuned.MOST_HOLES) * known
+
+
+def _distance_m(cameras: Sequence[CameraPlates]) -> float:
+    """Of the cameras to the scene, by the poses that their frames say: corrections must not have stereo begin anew."""
+    views = [replace(camera.plate.view, camera_to_world=camera.reported) for camera in cameras]
+    return scene_box(views).distance_m
 
 
 def warm_up() -> float:

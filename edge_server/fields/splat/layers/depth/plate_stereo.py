@@ -98,10 +98,10 @@ class PlateStereo:
             self._found.pop(name, None)
         for name, surface in plates.items():
             image = _prepare(surface, lenses[name])
-            moved = name not in self._poses or not np.allclose(self._poses[name], surface.pose, atol=SAME_POSE)
-            if moved:
+            moved = np.abs(self._poses[name] - surface.pose).max() if name in self._poses else np.inf
+            if moved > tuned.SWEEP_ELSEWHERE:
                 self._found.pop(name, None)
-            if moved or _differ(self._images[name], image):
+            if moved > SAME_POSE or _differ(self._images[name], image):
                 self._images[name], self._poses[name] = image, surface.pose.copy()
                 changed.append(name)
         if changed:

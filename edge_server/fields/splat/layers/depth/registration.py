@@ -41,10 +41,9 @@ class Correction:
         return bool(max(*off, abs(np.log(self.scale)) / tuned.LARGE_LOG_SCALE) > 1.0)
 
     def __str__(self) -> str:
-        return (
-            f"stands {self.turn_deg:.1f} degrees and {100 * self.shift_m:.1f} cm from where its frames say; its depth "
-            f"is {self.scale:.3f} times what the others measure"
-        )
+        stands = f"stands {self.turn_deg:.1f} degrees and {100 * self.shift_m:.1f} cm from where its frames say"
+        measures = f"; its depth is {self.scale:.3f} times what the others measure"
+        return stands if self.scale == 1.0 else stands + measures
 
     def applied(self, surface: Surface) -> Surface:
         """The surface of the camera at its pose and scale."""
@@ -93,21 +92,49 @@ class _Pair(NamedTuple):
     by_second: Array
 
 
-def register(surfaces: Sequence[Surface]) -> list[Correction]:
-    """Corrections of cameras from their surfaces at the reported poses and scales. Those reported are kept where others
-    do not fit better."""
+def register_stereo(surfaces: Sequence[Surface], reported: Sequence[Array], distance_m: float) -> list[Correction]:
+    """Corrections of cameras whose depth stereo has found. It found what fits the poses, so that distances between
+    surfaces say nothing of them: brightness alone tells how far plates lie beside one another, and scales stay.
+
+    surfaces: at the poses with which to begin. reported: poses that calibration says, camera-to-world (4, 4).
+    distance_m: of the cameras to the scene, in whose unit nothing was measured: the errors of a calibration are taken
+        to grow with it.
+    """
+    by = tuned.REGISTERED_M / distance_m
+    alike = [
+        replace(s, pose=_scaled(s.pose, by), inverse=s.inverse / np.float32(by), slope=s.slope / np.float32(by))
+        for s in surfaces
+    ]
+    found = register(alike, [_scaled(pose, by) for pose in reported], by_stereo=True)
+    return [replace(c, pose=_scaled(c.pose, 1.0 / by), shift_m=c.shift_m / by) for c in found]
+
+
+def _scaled(pose: Array, by: float) -> Array:
+    return np.concatenate([np.concatenate([pose[:3, :3], by * pose[:3, 3:]], axis=1), pose[3:]])
+
+
+def register(
+    surfaces: Sequence[Surface], reported: Sequence[Array] | None = None, by_stereo: bool = False
+) -> list[Correction]:
+    """Corrections of cameras from their surfaces. The surfaces' poses are kept where others do not fit better.
+
+    surfaces: at the poses with which to begin, and at the reported scales.
+    reported: poses that calibration says, camera-to-world (4, 4); None: those of the surfaces.
+    by_stereo: see ``register_stereo``.
+    """
     cameras, count = [_Camera.of(s) for s in surfaces], len(surfaces)
     poses, scales = [s.pose.copy() for s in surfaces], np.ones(count)
+    reported = [s.pose for s in surfaces] if reported is None else reported
     deviation = np.tile([np.deg2rad(tuned.TURN_DEG)] * 3 + [tuned.SHIFT_M] * 3 + [tuned.LOG_SCALE], count)
-    total = np.zeros(7 * count)
-    before = _cost(cameras, poses, scales)
+    total = np.concatenate([_numbers(told, pose) for told, pose in zip(reported, poses, strict=True)])
+    before = _cost(cameras, poses, scales, by_stereo)
     for k in range(tuned.REGISTRATION_ROUNDS):
         # Most cameras are as calibrated, but one that was bumped is far off: its prior is a Cauchy distribution's.
         prior = 1.0 / (deviation**2 * (1.0 + (total / (3.0 * deviation)) ** 2))
         h, g = np.diag(prior), -total * prior
         near_m = tuned.NEAR_M * (tuned.NEAR_AT_FIRST if 2 * k < tuned.REGISTRATION_ROUNDS else 1.0)
         for i, j in _pairs(count):
-            for found in _compare(cameras, poses, scales, i, j, near_m):
+            for found in _compare(cameras, poses, scales, i, j, near_m, by_stereo):
                 _add(h, g, i, j, found)
         step = np.linalg.solve(h, g)
         total += step
@@ -118,24 +145,30 @@ def register(surfaces: Sequence[Surface]) -> list[Correction]:
             scales[i] *= np.exp(np.clip(grow[0], -0.3, 0.3))
         if np.abs(step / deviation).max() < 0.01:
             break
-    if not _cost(cameras, poses, scales) < before:
+    if not _cost(cameras, poses, scales, by_stereo) < before - (tuned.STEREO_GAIN if by_stereo else 0.0):
         poses, scales = [s.pose for s in surfaces], np.ones(count)
-    return [_correction(s.pose, pose, float(scale)) for s, pose, scale in zip(surfaces, poses, scales)]
+    return [_correction(told, pose, float(scale)) for told, pose, scale in zip(reported, poses, scales)]
+
+
+def _numbers(reported: Array, pose: Array) -> Array:
+    """Turn, shift and log scale of a camera at a pose, (7,)."""
+    return np.concatenate([so3_log(pose[:3, :3] @ reported[:3, :3].T), pose[:3, 3] - reported[:3, 3], [0.0]])
 
 
 def _correction(reported: Array, pose: Array, scale: float) -> Correction:
-    turn = np.linalg.norm(so3_log(pose[:3, :3] @ reported[:3, :3].T))
-    return Correction(pose, scale, float(np.rad2deg(turn)), float(np.linalg.norm(pose[:3, 3] - reported[:3, 3])))
+    turn, shift, _ = np.split(_numbers(reported, pose), [3, 6])
+    return Correction(pose, scale, float(np.rad2deg(np.linalg.norm(turn))), float(np.linalg.norm(shift)))
 
 
 def _pairs(count: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(count) for j in range(count) if i != j]
 
 
-def _cost(cameras: Sequence[_Camera], poses: Sequence[Array], scales: Array) -> float:
-    """Mean robust cost (Geman and McClure) of distances along normals, at most 1."""
-    near = tuned.NEAR_M * tuned.NEAR_AT_FIRST
-    found = [list(_compare(cameras, poses, scales, i, j, near))[:1] for i, j in _pairs(len(cameras))]
+def _cost(cameras: Sequence[_Camera], poses: Sequence[Array], scales: Array, by_stereo: bool = False) -> float:
+    """Mean robust cost (Geman and McClure) of distances along normals, or of differences of brightness, at most 1."""
+    near_m = tuned.NEAR_M * tuned.NEAR_AT_FIRST
+    near = tuned.NEAR_GRAY if by_stereo else near_m
+    found = [_compare(cameras, poses, scales, i, j, near_m, by_stereo)[:1] for i, j in _pairs(len(cameras))]
     square = np.concatenate([np.zeros(1), *[(p.error / near) ** 2 for pair in found for p in pair]])
     # Points that no surface is near to count in full.
     most = sum(len(c.rows) for c in cameras) * (len(cameras) - 1)
@@ -143,10 +176,10 @@ def _cost(cameras: Sequence[_Camera], poses: Sequence[Array], scales: Array) -> 
 
 
 def _compare(
-    cameras: Sequence[_Camera], poses: Sequence[Array], scales: Array, i: int, j: int, near_m: float
+    cameras: Sequence[_Camera], poses: Sequence[Array], scales: Array, i: int, j: int, near_m: float, by_stereo: bool
 ) -> list[_Pair]:
-    """Points of camera i before camera j: distances along normals, then differences of brightness; empty where the two
-    share too few. A camera turns about its own center."""
+    """Points of camera i before camera j: distances along normals, but not by stereo, then differences of brightness;
+    empty where the two share too few. A camera turns about its own center."""
     ours, theirs = cameras[i], cameras[j]
     turn_i, turn_j, lens = poses[i][:3, :3], poses[j][:3, :3], theirs.surface.lens
     to_i = (ours.points[ours.rows, ours.columns] * scales[i]) @ turn_i.T  # from camera i
@@ -177,9 +210,10 @@ def _compare(
     a, b, z = right * lens.fx, down * lens.fy, local[:, 2]
     slope = np.stack([a / z, b / z, -(a * local[:, 0] + b * local[:, 1]) / z**2], axis=1) @ turn_j.T
     robust = 1.0 + (error / tuned.NEAR_GRAY) ** 2
-    weight = tuned.GRAY_WEIGHT / (tuned.GRAY_NOISE**2 * robust**2 * tuned.ERR_ALIKE)
+    weight = (1.0 if by_stereo else tuned.GRAY_WEIGHT) / (tuned.GRAY_NOISE**2 * robust**2 * tuned.ERR_ALIKE)
     away = points - poses[j][:3, 3]
-    return [distance, _Pair(error, weight, _by_numbers(to_i, slope, True), -_by_numbers(away, slope, False))]
+    gray_pair = _Pair(error, weight, _by_numbers(to_i, slope, not by_stereo), -_by_numbers(away, slope, False))
+    return [gray_pair] if by_stereo else [distance, gray_pair]
 
 
 def _by_numbers(arm: Array, slope: Array, scales: bool) -> Array:

@@ -91,12 +91,16 @@ CHANGED_SHARE = 0.01  # of the pixels: with more depths that are new or have cha
 REGISTERED_POINTS = 4096  # of a camera that are placed before the others
 REGISTRATION_ROUNDS = 8  # of Gauss-Newton
 TURN_DEG, SHIFT_M, LOG_SCALE = 0.25, 0.004, 0.006  # deviations of calibrated poses, and of a sensor's scale
+REGISTERED_M = 3.0  # distance of cameras to the scene, `room`'s, for which these hold where none measures depth
 NEAR_M, NEAR_AT_FIRST = 0.06, 2.0  # distance along the normal at which a point counts a quarter; times this at first
 LEAST_ALIKE, REGISTERED_FACING = 0.7, 0.15  # cosines of two normals, and of a normal and the direction to the camera
 DEPTH_NOISE, DEPTH_NOISE_M = 0.006, 0.004  # deviation of a smoothed depth: share of the distance, and added to that
 NEAR_GRAY, GRAY_NOISE = 0.08, 0.03  # as NEAR_M, and deviation, of brightness in [0, 1]
 GRAY_WEIGHT = 0.15  # of a difference of brightness
 ERR_ALIKE = 25.0  # neighboring pixels err alike: so many count as one
+# Mean robust cost by which brightness must agree better, where stereo has found the depth: four cameras of `room` gain
+# .0009 with exact poses, which then stay, and .0017 to .011 with those of a calibration.
+STEREO_GAIN = 1e-3
 LARGE_TURN_DEG, LARGE_SHIFT_M, LARGE_LOG_SCALE = 1.0, 0.03, 0.025  # corrections above any of these are reported
 
 # --- stereo of plates (plate_stereo), where cameras measure none; found on `room` and on a recorded kitchen ---
@@ -110,6 +114,14 @@ SWEEP_BLUR_PX = 0.7  # interpolation blurs the other image about as much
 SWEEP_AGREE = 0.05  # difference of log depth at which another camera confirms
 SWEEP_TRUSTED = 0.5  # least share of what stereo finds that sensors, where they measure, must confirm as far as that
 SWEEP_LEAST = 0.15  # least share of the plates whose depth stereo finds: .36 with two cameras of `room`
+SWEEP_ELSEWHERE = 8e-3  # as SAME_POSE: depth found that far away is forgotten; calibrations err less
+
+# --- large planes (large_planes), by which stereo's depth is continued; found on `room` ---
+PLANES = 6  # of the scene, at most
+PLANE_POINTS, PLANE_DRAWS = 2048, 64  # of a camera that are looked at; points whose planes are tried
+PLANE_NEAR, PLANE_ALIKE = 0.03, 0.8  # share of the median distance, and cosine of normals: so far a point is on a plane
+PLANE_LEAST = 0.02  # share of the points on it: a side wall that two of four cameras see has .04
+PLANE_BEHIND = 0.05  # share of the points behind it: nothing lies behind a wall, but much behind a table
 
 # --- a depth network of the user's (network_depth) ---
 NETWORK_LEAST = 150  # pixels of a plate that must have another depth: fewer may lie on one small thing

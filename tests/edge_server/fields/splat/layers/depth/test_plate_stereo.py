@@ -127,6 +127,9 @@ def test_a_camera_is_swept_again_where_plates_change_one_a_call(monkeypatch: pyt
     assert calls(moved, 5)[0] == ["3", "0", "1", "2"]
     fewer = moved[:3]
     assert sorted(calls(fewer, 4)[0]) == ["0", "1", "2"]
+    corrected = [replace(p, pose=p.pose + 2e-3 * np.eye(4, k=3)) for p in fewer]  # a calibration: in turn, too
+    assert calls(corrected, 4) == (["0", "1", "2"], [False, False, True, False])
+    assert calls(fewer, 3)[0] == ["0", "1", "2"]
     np.testing.assert_array_equal(stereo.inverses(_named(fewer)), _swept(fewer).inverses(_named(fewer)))
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -12,11 +14,12 @@ from edge_server.fields.common.threads.thread_pool import shared_pool
 from edge_server.fields.splat.layers.depth import registration, settings
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
 from edge_server.fields.splat.layers.depth.depth_supervision import CameraPlates, DepthSupervision
-from edge_server.fields.splat.layers.depth.registration import Correction, register
+from edge_server.fields.splat.layers.depth.plate_stereo import PlateStereo
+from edge_server.fields.splat.layers.depth.registration import Correction, register, register_stereo
 from edge_server.fields.splat.layers.depth.surfaces import Surface
 from edge_server.fields.splat.layers.static_layer import PlateImage
 from edge_server.fields.splat.settings import SplatSettings
-from freshfield.geometry import se3, so3_exp
+from freshfield.geometry import Pinhole, se3, so3_exp
 from tests.edge_server.fields.splat.layers.depth.room_plates import room_plates
 
 SIZE = 96
@@ -123,3 +126,56 @@ def test_a_camera_that_joins_is_registered_with_the_others() -> None:
     assert set(depth.displaced) == {"cam02"} and "cam02 stands" in depth.troubles[0]
     turn_deg, _ = _off(depth.corrections["cam02"], surfaces[2].pose)
     assert turn_deg < 0.4
+
+
+def _off_lines_px(poses: Sequence[np.ndarray], true: Sequence[np.ndarray], lens: Pinhole) -> float:
+    """How far points of the scene appear from their epipolar lines, median over all pairs of cameras."""
+    points, off = np.random.default_rng(9).uniform((-2.0, -1.0, 0.0), (2.0, 2.0, 2.0), (200, 3)), []
+    rays = [(points - its[:3, 3]) @ its[:3, :3] @ pose[:3, :3].T for pose, its in zip(poses, true)]
+    for i, j in combinations(range(len(poses)), 2):
+        normal = np.cross(poses[j][:3, 3] - poses[i][:3, 3], rays[i])
+        sine = (normal * rays[j]).sum(axis=1) / (np.linalg.norm(normal, axis=1) * np.linalg.norm(rays[j], axis=1))
+        off.append(lens.fx * np.abs(sine))
+    return float(np.median(off))
+
+
+def test_brightness_corrects_poses_under_which_stereo_has_found_the_depth() -> None:
+    plates, _ = room_plates(4)
+    true, px = [p.pose for p in plates], []
+    for seed in range(2):
+        turns = np.deg2rad(0.12) * np.random.default_rng(seed).standard_normal((4, 3))
+        told = [replace(p, pose=se3(p.pose[:3, :3] @ so3_exp(t), p.pose[:3, 3])) for p, t in zip(plates, turns)]
+        named = {str(k): plate for k, plate in enumerate(told)}
+        stereo = PlateStereo(shared_pool())
+        stereo.sweep(named, 3.0)
+        surfaces = stereo.fill(named)
+        assert surfaces is not None
+        reported = [of.pose for of in told]
+        found = register_stereo(surfaces, reported, 3.0)
+        assert all(c.scale == 1.0 and not c.is_large and "depth" not in str(c) for c in found)
+        px.append(
+            [_off_lines_px(poses, true, plates[0].lens) for poses in ([p.pose for p in told], [c.pose for c in found])]
+        )
+    # From there, the prior is still about the reported poses.
+    there = [replace(s, pose=c.pose) for s, c in zip(surfaces, found)]
+    for one, other in zip(found, register_stereo(there, reported, 3.0)):
+        assert other.turn_deg == pytest.approx(one.turn_deg, abs=0.05)
+    before, after = np.mean(px, axis=0)
+    assert after < 0.6 * before
+
+
+def test_exact_poses_stay_where_stereo_has_found_the_depth() -> None:
+    plates, _ = room_plates(4)
+    stereo, named = PlateStereo(shared_pool()), {str(k): plate for k, plate in enumerate(plates)}
+    stereo.sweep(named, 3.0)
+    surfaces = stereo.fill(named)
+    assert surfaces is not None
+    for unit in (1.0, 1e-2):
+        scaled = [replace(s, pose=_in_unit(s.pose, unit), inverse=s.inverse / np.float32(unit)) for s in surfaces]
+        scaled = [replace(s, slope=s.slope / np.float32(unit)) for s in scaled]
+        for found, surface in zip(register_stereo(scaled, [s.pose for s in scaled], 3.0 * unit), scaled):
+            np.testing.assert_allclose(found.pose, surface.pose, atol=1e-12)
+
+
+def _in_unit(pose: np.ndarray, unit: float) -> np.ndarray:
+    return se3(pose[:3, :3], unit * pose[:3, 3])
