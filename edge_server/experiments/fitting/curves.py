@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.report.style import figure, label_lines
+from edge_server.report.style import CYCLE, figure, label_lines
 from freshfield.files import write_json
 
 
@@ -79,9 +79,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     write_json(args.out.with_suffix(".json"), {"command": command, "curves": curves})
     second, label = ("ssim", "SSIM") if fits else ("psnr_moving_db", "where it moves, dB")
     with figure(args.out.with_suffix(".png"), 2) as (_, axes):
-        for name, curve in curves.items():
+        for k, (name, curve) in enumerate(curves.items()):
+            style = "-" if k < len(CYCLE) else "--"  # colors begin again
             for line, key in zip(axes[:, 0], ("psnr_db", second)):
-                line.plot(curve["t_s"], curve[key], marker=".", label=name)
+                line.plot(curve["t_s"], curve[key], style, marker=".", label=name)
         label_lines(axes[0, 0], "PSNR, dB")
         label_lines(axes[1, 0], label, "seconds of the wall clock" if fits else "seconds since the first frame")
     return 0
