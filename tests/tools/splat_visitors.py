@@ -46,7 +46,7 @@ SETTLE_S = 5.0  # until the static set has come
 PICTURES_EVERY_S = 0.5
 SIZE = (400, 225)  # of the pictures that are compared
 MOVES = 0.05  # difference of color with and without the moving set, from which a pixel moves
-FLOATS_BYTES = 60  # of a Gaussian in a PLY file: what a whole snapshot takes without records
+FLOATS_BYTES = 68  # of a Gaussian in a PLY file: what a whole snapshot takes without records
 
 
 class Reader(threading.Thread):
@@ -242,7 +242,8 @@ def main() -> None:
     parser.add_argument("--pid", type=int, help="of the edge server")
     args = parser.parse_args()
     host = args.url.partition("://")[2].rstrip("/")
-    found: dict[str, Any] = {"load_average": os.getloadavg()[0]}
+    words = " ".join(["python -m tests.tools.splat_visitors", *sys.argv[1:]])
+    found: dict[str, Any] = {"command": words, "load_average": os.getloadavg()[0]}
     if args.visitors:
         port = int(host.rpartition(":")[2])
         found["streams"] = [visit(f"ws://{host}{STREAM}", n, args.seconds, args.pid) for n in args.visitors]
