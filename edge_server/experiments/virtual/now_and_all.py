@@ -59,7 +59,8 @@ class NowAndAll:
 
     def means(self) -> dict[str, Any]:
         """Means of the rows from SINCE_S on; empty before. revisited: of captures that a recording showed again, how
-        far apart the first and the last refined pose are in the end (medians): nothing if no pose drifts."""
+        far apart the first and the last refined pose are in the end (medians, 0 if no pose drifts), and the mean PSNR
+        of each from the newest field."""
         late = [row for row in self.rows if row["t_s"] >= SINCE_S]
         means: dict[str, Any] = {
             name: float(np.mean([row[name] for row in late])) for name in (late[0] if late else ()) if name != "t_s"
@@ -72,15 +73,25 @@ class NowAndAll:
         shown = self._deployment.shown_now()
         if not isinstance(shown, RefinesCameras):
             return None
-        found: dict[bytes, list[NDArray[np.float64]]] = {}
+        found: dict[bytes, list[tuple[View, NDArray[np.float64]]]] = {}
         for frame in self._frames:
             if (known := shown.correction(frame)) is not None:
-                found.setdefault(frame.camera_to_world.tobytes(), []).append(known.camera_to_world)
-        apart = [pose_distance(poses[0], poses[-1]) for poses in found.values() if len(poses) > 1]
-        if not apart:
+                found.setdefault(frame.camera_to_world.tobytes(), []).append((frame, known.camera_to_world))
+        twice = [(each[0], each[-1]) for each in found.values() if len(each) > 1]
+        if not twice:
             return None
-        apart_m, apart_deg = np.median(apart, axis=0)
-        return {"captures": len(apart), "apart_mm": 1e3 * float(apart_m), "apart_deg": float(apart_deg)}
+        apart_m, apart_deg = np.median([pose_distance(first[1], last[1]) for first, last in twice], axis=0)
+        first_db, last_db = np.mean([[self._psnr_db(shown, view) for view, _ in pair] for pair in twice], axis=0)
+        return {
+            "captures": len(twice),
+            "apart_mm": 1e3 * float(apart_m),
+            "apart_deg": float(apart_deg),
+            "first_db": float(first_db),
+            "last_db": float(last_db),
+        }
+
+    def _psnr_db(self, shown: Snapshot, frame: View) -> float:
+        return self._scorer.score(frame.camera, self._shown(shown, frame), 0, frame.image, 0).psnr_db
 
     def write(self, out: Path) -> None:
         """Write rows and images to the folder ``out``. Raises OSError."""
@@ -136,6 +147,7 @@ def _facts(run: Path) -> dict[str, Any]:
         "run": run.name,
         **kept,
         **means,
+        **{name: about["now_and_all"][name] for name in ("revisited",) if name in about["now_and_all"]},
         "by_seconds": [[row["t_s"], *(round(row[n], 2) for n in names)] for row in rows],
     }
 

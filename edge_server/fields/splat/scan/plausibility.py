@@ -53,7 +53,8 @@ def troubles(poses: PoseCorrections) -> list[str]:
         late_s = _lateness_s(newest)
         if late_s is not None:
             word = "late" if late_s > 0 else "early"
-            found.append(f"{track}: its poses are {word} by some {1e3 * abs(late_s):.0f} ms")
+            least = f"by some {1e3 * abs(late_s):.0f} ms or more"  # corrections follow a part of a delay
+            found.append(f"{track}: its poses are {word} {least}: camera-node doctor measures it in a recording")
         shift_m = float(np.median([np.linalg.norm(c.shift_m) for c in newest]))
         turn_rad = float(np.median([np.linalg.norm(c.rotation) for c in newest]))
         if shift_m > tuned.DRIFT_SHARE * poses.most_m or turn_rad > tuned.DRIFT_SHARE * poses.most_rad:

@@ -14,7 +14,7 @@ import yaml
 from edge_server.experiments.virtual import now_and_all
 from edge_server.experiments.virtual.simulate import main, show
 from edge_server.fidelity.psnr import psnr
-from edge_server.fields import View
+from edge_server.fields import Correction, View
 from freshfield.geometry import Pinhole
 from tests.edge_server.experiments.sets import SMALL
 
@@ -63,10 +63,16 @@ def test_newest_and_all_held_out_frames_are_scored_each_two_seconds_and_drawn(tm
 
 
 def test_captures_that_are_shown_again_tell_how_far_poses_drift():
-    def refined(view: View) -> SimpleNamespace:
-        return SimpleNamespace(camera_to_world=view.camera_to_world + 1e-3 * view.generated_ns * np.eye(4, k=3))
+    def refined(view: View) -> Correction:
+        pose = view.camera_to_world + 1e-3 * view.generated_ns * np.eye(4, k=3)
+        return Correction(pose, np.ones(3), np.zeros(3))
 
-    watched = now_and_all.NowAndAll(MagicMock(**{"shown_now.return_value": SimpleNamespace(correction=refined)}), (), 0)
+    def render(pose, lens) -> SimpleNamespace:  # brighter by a tenth for each millimeter
+        return SimpleNamespace(color=np.full((2, 2, 3), 0.1 + 100.0 * (pose[0, 3] % 1.0), np.float32))
+
+    shown = SimpleNamespace(correction=refined, render=render)
+    watched = now_and_all.NowAndAll(MagicMock(**{"shown_now.return_value": shown}), (), 0)
     there = np.eye(4) + np.eye(4, k=3)
     watched._frames = [View("kept", TINY, pose, LENS, k) for k, pose in enumerate((np.eye(4), there, np.eye(4)))]
-    assert watched.means()["revisited"] == pytest.approx({"captures": 1, "apart_mm": 2.0, "apart_deg": 0.0})
+    expected = {"captures": 1, "apart_mm": 2.0, "apart_deg": 0.0, "first_db": 20.0, "last_db": -20 * np.log10(0.3)}
+    assert watched.means()["revisited"] == pytest.approx(expected, abs=1e-3)
