@@ -142,12 +142,13 @@ def _facts(run: Path) -> dict[str, Any]:
     late = [row for row in rows if row["t_s"] >= SINCE_S]
     names = [name for name in rows[0] if name != "t_s"]
     means = {name: round(float(np.mean([row[name] for row in late])), 3) for name in names}
+    revisited = about["now_and_all"].get("revisited")
     kept = {name: about[name] for name in ("scenario", "seed", "steps", "updates", "update_ms", "digest")}
     return {
         "run": run.name,
         **kept,
         **means,
-        **{name: about["now_and_all"][name] for name in ("revisited",) if name in about["now_and_all"]},
+        **({"revisited": {name: round(value, 2) for name, value in revisited.items()}} if revisited else {}),
         "by_seconds": [[row["t_s"], *(round(row[n], 2) for n in names)] for row in rows],
     }
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget
-from edge_server.fields.common.cameras import camera_refinement
+from edge_server.fields.common.cameras import settings as refinement
 from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT
 from edge_server.fields.common.trained_field import TrainedField
 from edge_server.fields.nerfacto.field import NerfactoField
@@ -41,7 +41,7 @@ THROUGH_ALL: dict[str, tuple[dict[str, Any], ...]] = {
 
 def go_through_all(kind: str) -> None:
     """Fits, renderings and an update with every one of the settings, also with masked pixels."""
-    camera_refinement.START = 4
+    refinement.START = 4
     for extra in THROUGH_ALL[kind]:
         field = tiny(kind, **extra)
         field.fit(VIEWS[:5], Budget(steps=12))

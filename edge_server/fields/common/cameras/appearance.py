@@ -15,14 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common.cameras import settings as tuned
 from edge_server.fields.common.trainer_settings import BETA1, BETA2
 
 Array = NDArray[np.float64]
-
-_FIRST = 0.3  # standard deviation of first values: from 0 the network would get no gradient
-_RATE = 2e-2
-_EPSILON = 1e-4
-_LIMIT = 3.0  # bound of every number
 
 
 class AppearanceEmbeddings:
@@ -38,7 +34,7 @@ class AppearanceEmbeddings:
         fresh = [name for name in cameras if name not in self.known]
         for name in fresh:
             rng = np.random.default_rng(np.random.SeedSequence([self.seed, zlib.crc32(name.encode())]))
-            value = rng.normal(0.0, _FIRST, self.size)
+            value = rng.normal(0.0, tuned.APPEARANCE_FIRST, self.size)
             self.known[name] = np.stack([value, np.zeros(self.size), np.zeros(self.size)])
         if fresh:
             self._center_mean()
@@ -54,9 +50,9 @@ class AppearanceEmbeddings:
             value, m, v = self.known[name]
             m = BETA1 * m + (1.0 - BETA1) * g
             v = BETA2 * v + (1.0 - BETA2) * g * g
-            root = np.sqrt(v / (1.0 - BETA2**self.steps)) + _EPSILON
-            value = value - _RATE * m / (1.0 - BETA1**self.steps) / root
-            self.known[name] = np.stack([np.clip(value, -_LIMIT, _LIMIT), m, v])
+            root = np.sqrt(v / (1.0 - BETA2**self.steps)) + tuned.APPEARANCE_EPSILON
+            value = value - tuned.APPEARANCE_RATE * m / (1.0 - BETA1**self.steps) / root
+            self.known[name] = np.stack([np.clip(value, -tuned.APPEARANCE_MOST, tuned.APPEARANCE_MOST), m, v])
         self._center_mean()
 
     def _center_mean(self) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common.cameras import settings as tuned
 from edge_server.fields.common.cameras.appearance import AppearanceEmbeddings
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
 from edge_server.fields.common.kernels.rays import Views
@@ -22,9 +23,6 @@ from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.trainer_settings import TrainerSettings
 
 Array = NDArray[np.float64]
-
-START = 40  # steps before anything is corrected: first the scene must take shape
-EVERY = 2  # steps between corrections of a pose, of one camera after the other
 
 
 class CameraRefinement:
@@ -77,8 +75,8 @@ class CameraRefinement:
         if self.appearances is not None:
             self.appearances.learn(cameras, batch.d_embeddings, int(batch.rays.sum()))
             changed = True
-        if self.poses is not None and step >= START and step % EVERY == 0:
-            view, renderer = views[step // EVERY % len(views)], make_renderer()
+        if self.poses is not None and step >= tuned.START and step % tuned.EVERY == 0:
+            view, renderer = views[step // tuned.EVERY % len(views)], make_renderer()
 
             def render(pose: Array, points: Array) -> NDArray[np.float32]:
                 return renderer.render_pixels(pose, view.intrinsics, points)[0]

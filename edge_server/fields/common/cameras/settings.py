@@ -26,3 +26,10 @@ LEAST_POSES = 2 * PARTS
 # exact poses have as much in common as they scatter by.
 SURE, STANDS_OUT = 2.0, 1.5
 COMMON_PRIOR = 0.01  # share of the largest singular value added for the camera: what is not told is left to the world
+
+# --- poses and appearances of fields that render rays ---
+START = 40  # steps before anything is corrected: first the scene must take shape
+EVERY = 2  # steps between corrections of a pose, of one camera after the other
+APPEARANCE_FIRST = 0.3  # standard deviation of first values: from 0 the network would get no gradient
+APPEARANCE_RATE, APPEARANCE_EPSILON = 2e-2, 1e-4  # of Adam
+APPEARANCE_MOST = 3.0  # bound of every number

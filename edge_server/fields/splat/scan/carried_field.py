@@ -155,7 +155,7 @@ class CarriedField(ScanField):
         """Begin with the correction and the exposure of the keyframe before."""
         if self._rigid is None:
             return
-        track = view.camera.rpartition(SEPARATOR)[0]
+        track = _carrier(view)
         before = self._poses.neighbors_in_time(view, track)
         self._poses.begin(view, track)
         if before:
@@ -191,21 +191,21 @@ class CarriedField(ScanField):
 
     def _plausible(self, view: View, found: Alignment) -> bool:
         """Whether a view shows what the field does, or so many in a row did not that this one is taken."""
-        camera = view.camera.rpartition(SEPARATOR)[0]
+        camera = _carrier(view)
         row = self._in_a_row.get(camera, 0)
         taken = found.overlap < tuned.LEAST_OVERLAP or found.agreeing >= tuned.LEAST_AGREEING or row >= tuned.PATIENCE
         self._in_a_row[camera] = 0 if taken else row + 1
         return taken
 
     def _leave_out(self, view: View) -> None:
-        camera = view.camera.rpartition(SEPARATOR)[0]
+        camera = _carrier(view)
         self._left_out[camera] = self._left_out.get(camera, 0) + 1
         self._poses.forget(view.camera)
         self._exposures.known.pop(view.camera, None)
 
     def _without_what_moves(self, view: View) -> View:
         """The view, with a weight of 0 where something has come since the last keyframe with depth."""
-        camera = view.camera.rpartition(SEPARATOR)[0]
+        camera = _carrier(view)
         before, self._moving[camera] = self._depths.get(camera), 0.0
         if view.depth is None:
             return view
@@ -380,7 +380,12 @@ class CarriedField(ScanField):
             moved = self.view_store.memory[view.camera].moved
             view = view if moved is None else replace(view, weight=(~moved).astype(np.float32))
             self._append(view, (aim[:36].reshape(6, 6), float(aim[36])))
-            self._seen[view.camera.rpartition(SEPARATOR)[0]] = view
+            self._seen[_carrier(view)] = view
+
+
+def _carrier(view: View) -> str:
+    """The camera that a keyframe is of."""
+    return view.camera.rpartition(SEPARATOR)[0]
 
 
 make = CarriedField

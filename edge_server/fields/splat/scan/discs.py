@@ -14,7 +14,6 @@ from edge_server.fields.splat.scan import settings as tuned
 from freshfield.geometry import Pinhole, matrix_to_quaternion, quaternion_multiply
 
 Array = NDArray[np.float64]
-LEAST_SIDE = 5  # pixels of an image: normals come from differences over so many
 
 
 class Leaves(NamedTuple):
@@ -53,7 +52,7 @@ def quadtree(color: NDArray[np.float32], wanted: NDArray[np.bool_], cells: tuple
 
 def usable_depth(depth: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
     """Depth (H, W), meters, 0 where it is unknown, cannot be, or lies between two surfaces; None if nothing is left."""
-    if depth is None or min(depth.shape) < LEAST_SIDE:
+    if depth is None or min(depth.shape) < tuned.LEAST_SIDE:
         return None
     depth = np.where((depth > tuned.DEPTH_M[0]) & (depth < tuned.DEPTH_M[1]), depth, np.float32(0.0))
     kernel = np.ones((3, 3), np.uint8)

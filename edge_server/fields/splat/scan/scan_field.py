@@ -28,7 +28,7 @@ from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_
 from edge_server.fields.splat.kernels.project import BASE, COLOR, QUATERNION, SCALE, SH_COLUMNS
 from edge_server.fields.splat.kernels.rasterize import LOSSES, MOMENTS, render_tiles
 from edge_server.fields.splat.scan import settings as tuned
-from edge_server.fields.splat.scan.discs import LEAST_SIDE, discs, filled, quadtree, usable_depth
+from edge_server.fields.splat.scan.discs import discs, filled, quadtree, usable_depth
 from edge_server.fields.splat.scan.exposures import Exposures
 from edge_server.fields.splat.scan.refined_cameras import RefinedCameras, ScanSnapshot
 from edge_server.fields.splat.scan.sweep import sweep_depth
@@ -205,7 +205,7 @@ class ScanField(StillField):
         """Insert Gaussians where the view that comes next shows what the field does not: at the depth that is rendered
         there, or beside it where nothing is."""
         view = self._views[self._next_view()]
-        if min(view.image.shape[:2]) < LEAST_SIDE:
+        if min(view.image.shape[:2]) < tuned.LEAST_SIDE:
             return
         shown = self._look(view)
         color, there = self._as_rendered(view)

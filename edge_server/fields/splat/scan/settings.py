@@ -17,6 +17,7 @@ NEAR_SHARE = 0.1  # of the cameras' distance to the scene: a near plane for came
 
 # --- seeds from measured depth ---
 SEED_VIEWS = 60  # from at most so many views: the others see hardly anything new
+LEAST_SIDE = 5  # pixels of an image: normals come from differences over so many
 CELLS = (16, 8, 4)  # pixels a side of a quadtree's leaves
 DETAIL = 0.06  # standard deviation of a leaf's color, over channels, above which it is divided
 MIXED = (0.01, 0.75)  # shares of a leaf's pixels between which it is divided; below the first it is left out
