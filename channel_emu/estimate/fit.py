@@ -198,6 +198,12 @@ def _data_warnings(recording: Recording, constant: bool, loses: bool, states: st
     notes = []
     if recording.too_long:
         notes.append(f"{recording.too_long} frames took longer than {MAX_DELAY_MS:g} ms: left out")
+    waits = recording.discipline in ("fcfs", "parallel")
+    if recording.inferred and loses and not waits:
+        notes.append(
+            "frames dropped while a lost one was in transmission count as lost too, so losses come out too high where "
+            "delays exceed the frame period: a column outcome (delivered, lost, dropped_busy) tells them apart"
+        )
     if constant:
         what = "states are told apart by losses alone" if loses else "there is nothing to tell states by"
         notes.append(f"the delays hardly vary: {what}")

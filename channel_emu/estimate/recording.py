@@ -8,6 +8,8 @@ other link, one frame a line::
     33.3,,cam00
 
 A frame that never came has no delivered_ms; the camera may be left out, and delay_ms may stand for delivered_ms.
+A column outcome (``link.EventKind``, as ``channel-emu simulate --csv`` writes) says why one never came. Without
+it, one that finds no delivered frame in service counts as lost, also where a lost one was in service.
 Columns may be in any order, with their units (``channel_emu.model.table``).
 """
 
@@ -30,6 +32,7 @@ from freshfield.untrusted import read_text
 # Longer than any stream lives. Longer delays are left out; a row with one counts as not delivered.
 MAX_DELAY_MS = 1e9
 LOST = (str(EventKind.LOST), str(EventKind.BROKEN))
+_NEVER_SENT = frozenset(map(str, (EventKind.DROPPED_BUSY, EventKind.SUPERSEDED, EventKind.SKIPPED)))
 _MAX_ROWS_MS = 1e12
 _MOST_OVERLAPPING = 0.02  # tolerated share of frames that seem to be offered to a busy drop-new link
 
@@ -74,6 +77,8 @@ class Recording:
     sampled: bool
     too_long: int = 0
     """Number of delays left out because they exceed MAX_DELAY_MS."""
+    inferred: bool = False
+    """Whether lost and dropped frames were told apart by what was in service, for lack of a column outcome."""
 
     @property
     def frames(self) -> int:
@@ -131,7 +136,7 @@ def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:
 
 
 def _from_rows(path: Path, discipline: str) -> Recording:
-    rows: dict[str, list[tuple[float, float]]] = {}
+    rows: dict[str, list[tuple[float, float, str]]] = {}
     try:
         read = read_table(read_text(path))
         offered = read.column("offered", "sent", "send_time")
@@ -145,7 +150,7 @@ def _from_rows(path: Path, discipline: str) -> Recording:
                 f"order, with their units; it has {', '.join(read.titles) or 'no header'}"
             )
         came = [*read.times_ms(delivered or delay or offered)]
-        camera = read.text("camera")
+        camera, outcome = read.text("camera"), read.text("outcome")
         begin = next((at for at in read.times_ms(offered) if math.isfinite(at)), 0.0)  # stamps may be since 1970
         for (line, row), at, then, lost in zip(read.rows, read.times_ms(offered), came, read.lost()):
             at -= begin
@@ -156,16 +161,20 @@ def _from_rows(path: Path, discipline: str) -> Recording:
                 raise TableError(
                     f"line {line}: delivered_ms is not earlier than offered_ms, or blank: {', '.join(row):.100}"
                 )
-            rows.setdefault((row[camera] if camera is not None else "") or "cam00", []).append((at, then))
+            why = row[outcome] if outcome is not None else ""
+            rows.setdefault((row[camera] if camera is not None else "") or "cam00", []).append((at, then, why))
     except TableError as error:
         raise RecordingError(f"{path}: {error}") from None
     if not rows:
         raise RecordingError(f"{path}: there is no frame in it")
     tables: dict[str, NDArray[np.float64]] = {}
     too_long = 0
-    first = min(offered for given in rows.values() for offered, _ in given)
+    first = min(offered for given in rows.values() for offered, *_ in given)
+    never_sent: dict[str, NDArray[np.str_]] = {}
     for name, given in rows.items():
-        table = np.array(sorted(given, key=lambda row: row[0])) - first
+        given.sort(key=lambda row: row[0])
+        table = np.array([row[:2] for row in given]) - first
+        never_sent[name] = np.array([row[2] if row[2] in _NEVER_SENT else "" for row in given])
         too_long += int((table[:, 1] - table[:, 0] > MAX_DELAY_MS).sum())
         table[table[:, 1] - table[:, 0] > MAX_DELAY_MS, 1] = math.nan
         tables[name] = table
@@ -173,8 +182,8 @@ def _from_rows(path: Path, discipline: str) -> Recording:
     delays = np.concatenate([table[:, 1] - table[:, 0] for table in tables.values()])
     # On a parallel link, frames offered from this instant on may still be in service.
     sure_ms = float(np.nanmax(instants)) - float(np.nanmax(delays, initial=0.0))
-    cameras = [_camera_of_rows(name, t[:, 0], t[:, 1], discipline, sure_ms) for name, t in tables.items()]
-    return Recording(path, cameras, discipline, False, too_long)
+    cameras = [_camera_of_rows(name, *t.T, never_sent[name], discipline, sure_ms) for name, t in tables.items()]
+    return Recording(path, cameras, discipline, False, too_long, inferred=outcome is None)
 
 
 def _check_drop_new(recording: Recording) -> None:
@@ -197,19 +206,27 @@ def _check_drop_new(recording: Recording) -> None:
 
 
 def _camera_of_rows(
-    name: str, offered: NDArray[np.float64], delivered: NDArray[np.float64], discipline: str, sure_ms: float
+    name: str,
+    offered: NDArray[np.float64],
+    delivered: NDArray[np.float64],
+    never_sent: NDArray[np.str_],
+    discipline: str,
+    sure_ms: float,
 ) -> Camera:
     """Infer starts and outcomes. Transmission starts at the offer, or when the link becomes free.
 
-    An undelivered frame was dropped if an earlier one was in service, and lost otherwise. After the last
-    delivery, and on a parallel link from ``sure_ms`` on, it may still be in service: outcome unknown.
+    An undelivered frame was dropped if ``never_sent`` (N,) says so or an earlier one was in service, and lost
+    otherwise. After the last delivery, and on a parallel link from ``sure_ms`` on, it may still be in service:
+    outcome unknown.
     """
     n = len(offered)
     started, outcome = np.full(n, math.nan), np.full(n, str(EventKind.LOST), dtype="U16")
     free = -math.inf
     for i in range(n):
         if math.isnan(delivered[i]):
-            if discipline != "parallel" and offered[i] < free:
+            if never_sent[i]:
+                outcome[i] = never_sent[i]
+            elif discipline != "parallel" and offered[i] < free:
                 newest = discipline == "newest-waits"
                 outcome[i] = str(EventKind.SUPERSEDED if newest else EventKind.DROPPED_BUSY)
             continue

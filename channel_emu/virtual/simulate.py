@@ -112,13 +112,14 @@ class Simulation:
         }
 
     def write_frames(self, path: Path) -> None:
-        """Write CSV rows offered_ms, delivered_ms (empty: not delivered) and camera, as ``channel-emu fit`` reads
-        them. Raises OSError."""
+        """Write CSV rows offered_ms, delivered_ms (empty: not delivered), camera and outcome (an ``EventKind``, empty
+        while inside the link), as ``channel-emu fit`` reads them. Raises OSError."""
         rows = []
         for run in self.runs:
             for t in run.transits:
                 due_ms = (t.ended_ns or 0) / 1e6 if t.outcome is EventKind.DELIVERED else ""
-                rows.append({"offered_ms": t.offered_ns / 1e6, "delivered_ms": due_ms, "camera": run.camera})
+                row = {"offered_ms": t.offered_ns / 1e6, "delivered_ms": due_ms, "camera": run.camera}
+                rows.append({**row, "outcome": str(t.outcome or "")})
         write_csv(path, rows)
 
 

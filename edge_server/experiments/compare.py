@@ -72,8 +72,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(args: argparse.Namespace) -> None:
     setting = setting_of(load(args.scenario), args.seconds, args.channel, args.costs, args.slower)
     labels = _labels(args.policies)
-    for policy in labels.values():
-        make_policy(*parse_policy(policy), np.random.default_rng(0))  # rejected before anything is computed
+    rng = np.random.default_rng(0)
+    # Those that cannot be made are rejected before anything is computed.
+    made = [make_policy(*parse_policy(policy), rng) for policy in labels.values()]
+    if any(policy.embedding[0] for policy in made):
+        setting = dataclasses.replace(setting, parts=STATE_PARTS)
     with Engine(args.results, args.jobs, args.ray, threads=1) as engine:
         table = compare(setting, folders_of(args), engine, labels, seeds(setting.scenario.seed, "test", args.seeds))
     print(as_text(table, list(labels)))
@@ -104,9 +107,7 @@ def setting_of(
     if not slower > 0.0 or (slower != 1.0 and not any(charged.values())):
         raise ValueError(f"--slower {slower:g}: expected more than 0, and a scenario or --costs that charge something")
     compute = ComputeConfig(**{name: slower * ms for name, ms in charged.items()})
-    return Setting(
-        scenario, deployed=True, lead_ms=LEAD_S * 1e3, span_ms=seconds * 1e3, compute=compute, parts=STATE_PARTS
-    )
+    return Setting(scenario, deployed=True, lead_ms=LEAD_S * 1e3, span_ms=seconds * 1e3, compute=compute)
 
 
 def compare(

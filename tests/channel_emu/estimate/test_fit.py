@@ -124,6 +124,17 @@ def test_rows_behind_a_waiting_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow  # 20 s
+def test_losses_of_a_busy_link_need_outcomes(tmp_path: Path) -> None:
+    """Frames behind a lost one are dropped unseen: rows that say so give the truth, others a note."""
+    section = {**SLOW, "faults": {"loss": [0.02, 0.4]}}
+    true = {**SLOW_TRUE, "loss_1": 0.02, "loss_2": 0.4}
+    told = fit(write_rows(tmp_path / "told.csv", section, 3, 300.0, outcomes=True))
+    assert not told.warnings
+    check(told, true)
+    inferred = fit(write_rows(tmp_path / "inferred.csv", section, 3, 300.0), samples=4)
+    assert "outcome" in inferred.warnings[0] and inferred.parameters["loss_2"].value > 0.5
+
+
 def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
     """20 recordings of four parameters: 95 % of 80 is 76, and fewer than 69 has a chance of 1 in 500."""
     inside = 0

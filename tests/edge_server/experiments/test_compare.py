@@ -62,6 +62,7 @@ def test_the_command_compares_and_goes_on(tmp_path: Path, capsys, monkeypatch):
     scenario.write_text(yaml.safe_dump({**RAW, "edge": edge}))
     words = [str(scenario), "all", "freshest-k:2", "--seeds", "2", "--seconds", "0.5", "--jobs", "1"]
     words += ["--json", str(out), "--results", str(tmp_path / "known.jsonl"), "--slower", "3", "--channel", "ch6-slow"]
+    monkeypatch.setattr("edge_server.embed.make_embedder", lambda _: pytest.fail("no policy looks at embeddings"))
     assert compare.main(words) == 0
     printed = capsys.readouterr().out
     assert "freshest-k:2" in printed and "minus all" in printed
