@@ -182,7 +182,9 @@ def _from_rows(path: Path, discipline: str) -> Recording:
     delays = np.concatenate([table[:, 1] - table[:, 0] for table in tables.values()])
     # On a parallel link, frames offered from this instant on may still be in service.
     sure_ms = float(np.nanmax(instants)) - float(np.nanmax(delays, initial=0.0))
-    cameras = [_camera_of_rows(name, *t.T, never_sent[name], discipline, sure_ms) for name, t in tables.items()]
+    cameras = [
+        _camera_of_rows(name, t[:, 0], t[:, 1], never_sent[name], discipline, sure_ms) for name, t in tables.items()
+    ]
     return Recording(path, cameras, discipline, False, too_long, inferred=outcome is None)
 
 
