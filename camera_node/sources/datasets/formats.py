@@ -65,8 +65,6 @@ def recognize(file: Path) -> str:
         return {"rgb.txt": "tum", "frame-000000.pose.txt": "sevenscenes"}.get(file.name, "colmap")
     if file.suffix.lower() in _VIDEOS:
         raise DatasetError(f"{file}: its lens and poses are not known: {_OF_VIDEO}")
-    if file.suffix in (".yaml", ".yml") and file.name != "metadata.yaml":
-        raise DatasetError(f"{file}: a scenario, not a data set: name its data, or run it: edge-server simulate {file}")
     data = read_json(file) if file.suffix == ".json" else None
     if isinstance(data, dict):
         return "transforms" if "frames" in data else "eyeful" if "KRT" in data else "video"
