@@ -173,9 +173,9 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     )
     run.add_argument(
         "--record",
-        type=out_file,
+        type=lambda text: out_file(text) if text.endswith(".mcap") else out_folder(text),
         metavar="FILE",
-        help="write the session as MCAP, to view or replay (source kind mcap)",
+        help="write the session: FILE.mcap to view or replay (source kind mcap); else a ROS 2 bag, a folder",
     )
     run.add_argument("--seconds", type=float, metavar="S", help="end after S seconds [on Ctrl-C]")
     transport.add_arguments(run)

@@ -62,6 +62,7 @@ class Dataset:
     fps: rate of the recording; None if the data set does not tell.
     held_out: names of the data set's own test images.
     per_camera: each image belongs to the camera that took it, although nothing moves.
+    carried: its one camera moved through a scene, and a tracker or robot gave the poses.
     notes: what a user should know of how the files were read, a sentence each.
     """
 
@@ -70,6 +71,7 @@ class Dataset:
     fps: float | None = None
     held_out: frozenset[str] = frozenset()
     per_camera: bool = False
+    carried: bool = False
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

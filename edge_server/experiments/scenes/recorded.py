@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from camera_node.sources.datasets.formats import open_dataset
@@ -62,6 +62,8 @@ def load_recorded(
     Raises camera_node's DatasetError.
     """
     file, dataset = open_dataset(path, scale, name)
+    if dataset.carried:  # its frames are views of one scene, like photos
+        dataset = replace(dataset, images=tuple(replace(record, camera="") for record in dataset))
     found, instant = _records(dataset, frame)
     own = [key for key, record in found.items() if record.name in dataset.held_out]
     training, held_out = split(list(found), holdout or (OWN_SPLIT if own else "8"), own)

@@ -1,4 +1,4 @@
-"""Writes what arrives and what is decided to a session file, on a thread of its own.
+"""Writes what arrives and what is decided to a session file or ROS bag, on a thread of its own.
 
 Callers never wait: what does not fit the bounded queue is dropped and counted.
 """
@@ -11,13 +11,17 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from edge_server.live.state import Publication
 from freshfield.session import DECISIONS, SCORES
 from freshfield.v1 import frames_pb2 as pb
+
+if TYPE_CHECKING:
+    from freshfield.session.bag_writer import BagWriter
+    from freshfield.session.writer import SessionWriter
 
 log = logging.getLogger(__name__)
 
@@ -32,18 +36,16 @@ _MESSAGE_BYTES = 1024
 class Recorder:
     """Records one session. Thread-safe.
 
-    file: ``path``, or a numbered name beside it if that exists.
+    file: ``path``, or a numbered name beside it if that exists: MCAP if it ends so, else the folder of a ROS 2 bag.
     written, dropped: number of messages in the file, and of those that found no room.
-    Raises OSError, and SessionError where the extra ``mcap`` is missing.
+    Raises OSError, and SessionError where the extra ``mcap`` or ``ros`` is missing.
     """
 
     def __init__(self, path: Path, scenario: str) -> None:
-        from freshfield.session.writer import SessionWriter
-
         path.parent.mkdir(parents=True, exist_ok=True)
         self.file = _free_name(path)
         self.dropped = 0
-        self._writer = SessionWriter(self.file, {"scenario": scenario})
+        self._writer = _writer_class(path)(self.file, {"scenario": scenario})
         self._queue: deque[tuple[int, Callable[[], None]]] = deque()
         self._queue_bytes = 0
         self._closing = False
@@ -123,6 +125,16 @@ class Recorder:
                 self._queue.clear()
             self._writer.abandon()
             log.error("%s: recording ended: %s", self.file, error)
+
+
+def _writer_class(path: Path) -> type[SessionWriter] | type[BagWriter]:
+    if path.suffix == ".mcap":
+        from freshfield.session.writer import SessionWriter
+
+        return SessionWriter
+    from freshfield.session.bag_writer import BagWriter
+
+    return BagWriter
 
 
 def _free_name(path: Path) -> Path:

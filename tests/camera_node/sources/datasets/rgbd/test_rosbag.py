@@ -13,6 +13,7 @@ from camera_node.settings import source_config
 from camera_node.sources.datasets.formats import open_dataset
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.registry import open_sources
+from edge_server.experiments.scenes.recorded import load_recorded
 from freshfield.geometry import Pose, look_at
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="needs the extra ros")
@@ -110,7 +111,9 @@ def test_images_depth_and_the_chain_of_transforms_of_a_bag(tmp_path, storage, as
     if as_file:
         bag = next(file for file in bag.iterdir() if file.suffix in (".mcap", ".db3"))
     _, found = open_dataset(bag)
-    assert found.cameras == (EYE,) and found.moving and len(found) == 3 and not found.notes
+    assert found.cameras == (EYE,) and found.moving and len(found) == 3 and not found.notes and found.carried
+    still = load_recorded(bag, holdout="3")
+    assert still.carried and still.timed and (len(still.training), len(still.held_out)) == (2, 1)
     for n, record in enumerate(found):
         at = drive(0.1 * n).matrix() @ MOUNT.matrix()
         at[0, 3] += 10.0
