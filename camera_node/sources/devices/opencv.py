@@ -99,6 +99,8 @@ def _open(camera: str, device: str) -> cv2.VideoCapture:
         else:
             capture = cv2.VideoCapture(device, cv2.CAP_V4L2) if Path(device).exists() else cv2.VideoCapture()
         advice = "is it plugged in, is the user in the group video, does another program hold it?"
+        if Path(device).is_file():
+            advice = "it is a file, not a device: a recorded video is a source of kind video"
     if not capture.isOpened():
         raise CameraError(f"{camera}: no camera at {device}: {advice}")
     return capture

@@ -356,3 +356,9 @@ def test_the_camera_that_is_meant_is_the_one_named_or_the_only_one():
         select_device("eye", "OAK", None, ["a", "b"])
     with pytest.raises(CameraError, match=r"^eye: no OAK camera c; there are a, b$"):
         select_device("eye", "OAK", "c", ["a", "b"])
+
+
+def test_a_video_file_is_no_device(tmp_path):
+    (tmp_path / "left.mp4").write_bytes(b"any")
+    with pytest.raises(CameraError, match=r"left\.mp4: it is a file, not a device: a recorded"):
+        opencv_camera._open("left", str(tmp_path / "left.mp4"))
