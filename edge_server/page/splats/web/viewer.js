@@ -1,6 +1,6 @@
 // The page: connects to the stream, draws at the display's rate, shows cameras and what the link takes.
 
-import { OrbitCamera, add, scale, subtract, turnBy } from "./orbit.js";
+import { OrbitCamera, add, length, scale, subtract, turnBy } from "./orbit.js";
 import { StreamReader } from "./reader.js";
 import { SplatRenderer } from "./splats.js";
 
@@ -143,6 +143,7 @@ function frusta() {
   const size = FRUSTUM * (reader.status.start?.radius ?? 1);
   const lines = [];
   for (const each of reader.status.cameras ?? []) {
+    if (length(subtract(each.position, camera.position)) < size) continue; // its lines would cross the picture
     const tint = each.color.map((value) => value / 255);
     const high = Math.tan(each.fov / 2);
     const corner = (x, y) => toScene(add(each.position, scale(turnBy(each.wxyz, [x * high * each.aspect, y * high, 1]), size)));
