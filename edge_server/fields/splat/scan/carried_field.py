@@ -30,7 +30,7 @@ from edge_server.fields.splat.scan.sweep import sweep_depth
 from edge_server.fields.splat.scan.tracking import Alignment, Rendered, align, gray
 
 # What a field that begins anew still knows of its cameras and their frames.
-_OF_CAMERAS = ("_pixels", "_taken", "_seen", "_left_out", "_in_a_row", "_moving", "_depths")
+_OF_CAMERAS = ("_pixels", "_taken", "_blind", "_bare", "_seen", "_left_out", "_in_a_row", "_moving", "_depths")
 
 
 class CarriedField(ScanField):
@@ -42,6 +42,8 @@ class CarriedField(ScanField):
         super()._forget_parameters()
         self._clear_views()
         self._pixels, self._taken = 0, 0  # of the largest image, and keyframes, so far
+        self._blind = 0  # keyframes before the first ones that told a depth
+        self._bare = True  # whether no keyframe so far shows anything
         self._took_at = 0  # step of the newest keyframe
         self._due_before = 0  # keyframes that were due before the field began anew, which counts steps from 0 again
         self._left_out: dict[str, int] = {}  # frames of each camera that show something else
@@ -55,7 +57,7 @@ class CarriedField(ScanField):
         for view in views:
             check_view(view)
         news = [view for view in views if self._is_new(view)]
-        if not self._views and news:
+        if news and (not self._views or (self._bare and not all(_is_bare(view) for view in news))):
             self._begin(news)
         due = self._due_before + self.step // tuned.STEPS_A_KEYFRAME + len(self._seen) - self._taken
         best = {}
@@ -119,11 +121,13 @@ class CarriedField(ScanField):
         self._follow(view)
         shown = self._look(view)
         if self._rigid is not None and len(self.cloud) and self._agreeing(view, shown) < tuned.SURE:
-            if self._flat(view, shown) or not self._plausible(view, self._track(view)):
+            wrong = self._flat(view, shown) or not self._plausible(view, self._track(view))
+            if wrong and self._founded:
                 self._leave_out(view)
                 return
             shown = self._look(view)
         self._taken += 1
+        self._bare &= _is_bare(view)
         self._pixels = max(self._pixels, view.image.shape[0] * view.image.shape[1])
         view = self._without_what_moves(view)
         if self._rigid is not None and len(self.cloud):
@@ -131,16 +135,24 @@ class CarriedField(ScanField):
         self._measured |= view.depth is not None
         if not self._measured and len(self.cloud):
             view = replace(view, depth=self._sweep(view))
+            if not self._founded and view.depth is not None and self._taken - self._blind > tuned.BEGINS[-1]:
+                self._blind = self._taken - tuned.BEGINS[0]
         if view.depth is not None:
             seeds = self._seeds_of(view, shown, nearer=self._measured)
             self._make_room(len(seeds))
             self._add(seeds)
         self._append(view, self._aim(view, shown))
-        if not self._measured and len(self._views) in tuned.BEGINS:
+        if not self._measured and self._taken - self._blind in tuned.BEGINS:
             self._begin_anew()
         self._took_at = self.step
         while len(self._views) > self._most_kept():
             self._drop(self._least_needed())
+
+    @property
+    def _founded(self) -> bool:
+        """Whether any depth was measured or told by frames. A camera that only turns, or sees a bare wall, tells none:
+        what the field shows then is a guess, with which no frame has to agree."""
+        return self._measured or self._seen_m > 0.0
 
     def _sweep(self, view: View) -> NDArray[np.float32] | None:
         """Depth of a view from the keyframes beside it, at the poses that are believed."""
@@ -360,7 +372,7 @@ class CarriedField(ScanField):
             self.cloud.keep(kept)
 
     def _counters(self) -> dict[str, Any]:
-        names = ("taken", "took_at", "due_before", "pixels", "measured", "left_out")
+        names = ("taken", "blind", "bare", "took_at", "due_before", "pixels", "measured", "left_out")
         return {**super()._counters(), **{name: getattr(self, f"_{name}") for name in names}}
 
     def _arrays(self) -> Arrays:
@@ -371,6 +383,7 @@ class CarriedField(ScanField):
         super()._load(meta, state)
         self._taken, self._took_at, self._pixels = (int(meta[name]) for name in ("taken", "took_at", "pixels"))
         self._due_before, self._measured = int(meta["due_before"]), bool(meta["measured"])
+        self._blind, self._bare = int(meta["blind"]), bool(meta["bare"])
         self._left_out = {str(camera): int(count) for camera, count in meta["left_out"].items()}
         self._clear_views()
         views, aims = self.view_store.views, np.asarray(state["aims"], np.float64)
@@ -386,6 +399,12 @@ class CarriedField(ScanField):
 def _carrier(view: View) -> str:
     """The camera that a keyframe is of."""
     return view.camera.rpartition(SEPARATOR)[0]
+
+
+def _is_bare(view: View) -> bool:
+    """Whether a view shows nothing: a bare wall, a hand or a cap on the lens. Learned from alone, it says neither
+    where nor how large the scene is."""
+    return bool(gray(view.image).std() < tuned.BARE)
 
 
 make = CarriedField

@@ -70,6 +70,7 @@ LEAST_KEPT, MOST_KEPT = 32, 400  # keyframes, however large or small: each new o
 KEPT_CORRECTIONS = 2048  # of keyframes that went, for held-out and late frames of their time
 EXPOSED_OPACITY, EXPOSED_ERROR = 0.7, 0.25  # pixels from which a new view's exposure is found: surfaces, as expected
 EXPOSED_SHARE = 0.2  # of its pixels, at least
+BARE = 0.05  # contrast (standard deviation) of a view that shows nothing; of redkitchen's views it is .15 and more
 BEGINS = (2, 4, 8)  # numbers of keyframes without depth at which a field begins anew
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge_server.fields import View
 from freshfield.geometry import Pinhole, look_at, so3_exp, world_rays
@@ -15,14 +16,22 @@ LENS = Pinhole.from_fov(48, 40, 55.0)
 
 def walk(count: int = 80, depth: bool = True) -> list[View]:
     """Frames of an arc around the scene, 10 a second."""
-    views, ahead = [], world_rays(LENS, np.eye(4))[1][..., 2]
+    views, blank = [], np.zeros((LENS.height, LENS.width), np.float32)
     for k in range(count):
         angle = 1.8 * np.pi * k / count
         pose = look_at(2.2 * np.array([np.cos(angle), np.sin(angle), 0.5]), (0.0, 0.0, 0.3))
-        image, away_m = seen(LENS, pose)
-        measured = np.where(np.isfinite(away_m), away_m * ahead, 0.0).astype(np.float32)
-        views.append(View(f"{k:03d}", image, pose, LENS, k * 100_000_000, depth=measured if depth else None))
+        image = np.zeros((LENS.height, LENS.width, 3), np.uint8)
+        view = View(f"{k:03d}", image, pose, LENS, k * 100_000_000, depth=blank if depth else None)
+        views.append(at(pose, view))
     return views
+
+
+def at(pose: NDArray[np.float64], view: View) -> View:
+    """The view from ``pose`` instead, with depth if it has some."""
+    image, away_m = seen(LENS, pose)
+    measured = np.where(np.isfinite(away_m), away_m * world_rays(LENS, np.eye(4))[1][..., 2], 0.0)
+    depth = None if view.depth is None else measured.astype(np.float32)
+    return replace(view, image=image, camera_to_world=pose, depth=depth)
 
 
 def spoiled(views: list[View], deg: float = 1.0, shift_m: float = 0.02, gain: float = 0.25) -> list[View]:
