@@ -182,17 +182,17 @@ def as_pod(documents: list[Document], name: str, keys: Path, index: int | None =
     del container["envFrom"]
     container["env"] = [{"name": key, "value": value} for key, value in config["data"].items()]
     container["env"] += [] if index is None else [{"name": "INDEX", "value": str(index)}]
-    for each in (container, *spec.get("initContainers", ())):
-        del each["resources"]
-        each.pop("startupProbe", None)
-        each.pop("readinessProbe", None)
+    for key in ("resources", "startupProbe", "readinessProbe"):
+        container.pop(key, None)
+    # A new volume of podman's begins with what the image has there: no container has to copy the kernels.
+    named = ["kernels"] * bool(spec.pop("initContainers", None))
     mounts = [mount for mount in container["volumeMounts"] if mount["name"] != "keys"]
     container["volumeMounts"] = [*mounts, {"name": "keys", "mountPath": "/keys", "readOnly": True}]
     own = keys / (name if index is None else load("quad").cameras[index])
-    volumes = [each for each in spec["volumes"] if each["name"] != "keys"]
+    volumes = [each for each in spec["volumes"] if each["name"] not in ("keys", *named)]
     volumes.append({"name": "keys", "hostPath": {"path": str(own), "type": "Directory"}})
-    for claim in of(documents, "StatefulSet").get(name, {"spec": {}})["spec"].get("volumeClaimTemplates", ()):
-        called = claim["metadata"]["name"]
+    claims = of(documents, "StatefulSet").get(name, {"spec": {}})["spec"].get("volumeClaimTemplates", ())
+    for called in (*named, *(claim["metadata"]["name"] for claim in claims)):
         volumes.append({"name": called, "persistentVolumeClaim": {"claimName": f"freshfield-{name}-{called}"}})
     spec["volumes"] = volumes
     pod = name if index is None else f"{name}-{index}"
@@ -249,7 +249,7 @@ def test_played_by_podman_a_dead_edge_goes_on_and_every_frame_is_accounted_for(o
     finally:
         for pod in (*cameras, "emulator", "edge"):
             podman("pod", "rm", "-f", "-t", "0", pod, check=False)
-        podman("volume", "rm", "freshfield-edge-runs", check=False)
+        podman("volume", "rm", "freshfield-edge-runs", "freshfield-edge-kernels", check=False)
         podman("network", "rm", "freshfield-edge", "freshfield-cameras", check=False)
     series = [json.loads(line) for line in (tmp_path / "runs" / "series.jsonl").read_text().splitlines()]
     (again,) = [k for k in range(1, len(series)) if series[k]["t_s"] < series[k - 1]["t_s"]]
