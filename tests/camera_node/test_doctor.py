@@ -127,6 +127,9 @@ def test_a_camera_is_opened_and_watched(capsys, tmp_path):
     _, parts = examined(capsys, file)
     assert parts["calibration"] == (False, "calibration.json: it lacks eye")
     assert parts["camera eye"][0] is False and "no camera at http" in parts["camera eye"][1]
+    (tmp_path / "calibration.json").unlink()
+    _, parts = examined(capsys, file)
+    assert parts["calibration"][0] is False and "camera-node calibrate rig" in parts["calibration"][1]
 
 
 def test_a_tracker_beside_a_camera_is_asked_for_the_pose_of_now(capsys, tmp_path):
