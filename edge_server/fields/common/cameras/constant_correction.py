@@ -37,8 +37,21 @@ class ConstantCorrection:
     scatter_mm: float
 
     @property
+    def cancels_m(self) -> float | None:
+        """How far before the camera a turn and a shift sideways undo each other, meters; None where they do not. Of
+        such a pair long refinement brings forth more and more: pictures of what is there hardly tell."""
+        turn = np.deg2rad(self.rotation_deg)
+        sideways, shift = np.array([turn[1], -turn[0]]), 1e-3 * self.shift_mm[:2]  # turn x (0, 0, 1)
+        away_m = -float(sideways @ shift) / max(float(sideways @ sideways), 1e-12)
+        left = np.linalg.norm(shift + away_m * sideways)
+        near, far = tuned.CANCELS_M
+        return away_m if near < away_m < far and left < tuned.CANCELS * np.linalg.norm(shift) else None
+
+    @property
     def sure(self) -> bool:
         """Whether a constant part is beyond doubt."""
+        if self.cancels_m is not None:
+            return False
         turned, shifted = float(np.linalg.norm(self.rotation_deg)), float(np.linalg.norm(self.shift_mm))
         return turned > max(tuned.SURE * self.error_deg, tuned.STANDS_OUT * self.scatter_deg) or shifted > max(
             tuned.SURE * self.error_mm, tuned.STANDS_OUT * self.scatter_mm
@@ -50,7 +63,8 @@ class ConstantCorrection:
         turned, shifted = float(np.linalg.norm(self.rotation_deg)), float(np.linalg.norm(self.shift_mm))
         single = f"single poses scatter by {self.scatter_deg:.2f} degrees and {self.scatter_mm:.1f} mm"
         if not self.sure:
-            return f"corrections of poses have no sure part in common in the camera's axes; {single}"
+            why = "" if self.cancels_m is None else f" (a turn and a shift that cancel {self.cancels_m:.1f} m ahead)"
+            return f"corrections of poses have no sure part in common in the camera's axes{why}; {single}"
         return (
             f"corrections of poses have in common {turned:.2f} degrees (+- {self.error_deg:.2f}) about "
             f"{_axes(self.rotation_deg, 2)} and {shifted:.1f} mm (+- {self.error_mm:.1f}), {_axes(self.shift_mm, 1)}, "

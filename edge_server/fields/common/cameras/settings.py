@@ -25,6 +25,9 @@ LEAST_POSES = 2 * PARTS
 # Standard errors, and root mean square errors of single poses, from which on a hint is given: refined in tiny images,
 # exact poses have as much in common as they scatter by.
 SURE, STANDS_OUT = 2.0, 1.5
+# Distances at which a turn and a shift may undo each other, meters, and the share of the shift that may be left: drift
+# of 60 s and 270 s of `redkitchen` cancels 2.0 to 2.2 m ahead, and leaves .18 to .31.
+CANCELS_M, CANCELS = (0.3, 20.0), 0.5
 COMMON_PRIOR = 0.01  # share of the largest singular value added for the camera: what is not told is left to the world
 
 # --- poses and appearances of fields that render rays ---

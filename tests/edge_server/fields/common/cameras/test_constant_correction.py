@@ -49,3 +49,22 @@ def test_what_cannot_be_told_is_not_said():
     assert constant_correction(turning[:5], [pose @ mount for pose in turning[:5]]) is None, "too few"
     wrong = [*turning[:-1], np.full((4, 4), np.nan)]
     assert constant_correction(turning, wrong) is None
+
+
+@pytest.mark.parametrize(
+    ("rotation_deg", "shift_mm", "away_m"),
+    [
+        ([-2.85, 0.2, 0.14], [-36.4, -106.8, 67.9], 2.2),  # what a minute of `redkitchen` drifted by
+        ([0.0, 2.0, 0.0], [-69.8, 0.0, 0.0], 2.0),
+        ([0.0, 2.0, 0.0], [69.8, 0.0, 0.0], None),  # they add up
+        ([0.0, 2.0, 0.0], [0.0, 69.8, 0.0], None),  # the one has nothing to do with the other
+        ([0.0, 2.0, 0.0], [-3.0, 0.0, 0.0], None),  # nothing is so near
+        ([0.0, 2.0, 0.0], [0.0, 0.0, 0.0], None),
+    ],
+)
+def test_a_turn_and_a_shift_that_undo_each_other_do_not_accuse_the_mount(rotation_deg, shift_mm, away_m):
+    mount, given = small(rotation_deg, shift_mm), arm_poses()
+    found = constant_correction(given, [pose @ mount for pose in given])
+    assert found is not None and found.sure is (away_m is None)
+    if away_m is not None:
+        assert found.cancels_m == pytest.approx(away_m, abs=0.1) and f"cancel {away_m} m ahead" in found.words
