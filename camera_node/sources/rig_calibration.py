@@ -43,7 +43,7 @@ class CalibratedCamera:
 def load_calibration(file: Path) -> dict[str, CalibratedCamera]:
     """Cameras by name. Raises DatasetError naming file, camera and entry."""
     if not file.exists():
-        raise DatasetError(f"{file}: no such file: camera-node calibrate rig (or intrinsics, for lenses alone) makes it")
+        raise DatasetError(f"{file}: no such file: camera-node calibrate rig (or intrinsics, lenses alone) makes it")
     data = read_json(file)
     if not isinstance(data, dict) or not data or not all(isinstance(c, dict) for c in data.values()):
         raise DatasetError(f"{file}: expected a mapping from camera name to its calibration")
