@@ -80,7 +80,8 @@ def test_the_frames_of_a_simulation_can_be_fitted(capsys, tmp_path: Path) -> Non
     assert found["lost"] > 0 and found["duplicated"] > 0
     assert simulate(capsys, "--fault loss:1 --seconds 1")["delivered"] == 0
     rows = frames.read_text().splitlines()
-    assert rows[0] == "offered_ms,delivered_ms,camera" and len(rows) == found["offered"] + 1
+    assert rows[0] == "offered_ms,delivered_ms,camera,outcome" and len(rows) == found["offered"] + 1
+    assert sum(row.endswith(",lost") for row in rows) == found["lost"]
     assert main(["fit", str(frames), "--states", "1", "--json"]) == 0
     fitted = json.loads(capsys.readouterr().out)
     assert fitted["delays"] == found["delivered"]

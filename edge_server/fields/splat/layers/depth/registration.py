@@ -145,9 +145,15 @@ def register(
             scales[i] *= np.exp(np.clip(grow[0], -0.3, 0.3))
         if np.abs(step / deviation).max() < 0.01:
             break
-    if not _cost(cameras, poses, scales, by_stereo) < before - (tuned.STEREO_GAIN if by_stereo else 0.0):
+    if not _cost(cameras, poses, scales, by_stereo) < before - (_least_gain(surfaces) if by_stereo else 0.0):
         poses, scales = [s.pose for s in surfaces], np.ones(count)
     return [_correction(told, pose, float(scale)) for told, pose, scale in zip(reported, poses, scales)]
+
+
+def _least_gain(surfaces: Sequence[Surface]) -> float:
+    """Of cost, from which on poses are not exact: what lies between pixels grows with the square of their angle."""
+    focal_px = float(np.median([s.lens.fx for s in surfaces]))
+    return tuned.STEREO_GAIN * max(1.0, (tuned.STEREO_FOCAL_PX / focal_px) ** 2)
 
 
 def _numbers(reported: Array, pose: Array) -> Array:

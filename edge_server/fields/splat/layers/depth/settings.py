@@ -100,7 +100,8 @@ GRAY_WEIGHT = 0.15  # of a difference of brightness
 ERR_ALIKE = 25.0  # neighboring pixels err alike: so many count as one
 # Mean robust cost by which brightness must agree better, where stereo has found the depth: four cameras of `room` gain
 # .0009 with exact poses, which then stay, and .0017 to .011 with those of a calibration.
-STEREO_GAIN = 1e-3
+# Focal lengths are theirs; of six exact cameras of 69 pixels, .0017 would be gained, and .5 dB lost.
+STEREO_GAIN, STEREO_FOCAL_PX = 1e-3, 102.0
 LARGE_TURN_DEG, LARGE_SHIFT_M, LARGE_LOG_SCALE = 1.0, 0.03, 0.025  # corrections above any of these are reported
 
 # --- stereo of plates (plate_stereo), where cameras measure none; found on `room` and on a recorded kitchen ---
