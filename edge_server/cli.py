@@ -173,7 +173,7 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     )
     run.add_argument(
         "--record",
-        type=lambda text: out_file(text) if text.endswith(".mcap") else out_folder(text),
+        type=lambda text: out_file(text) if text.lower().endswith(".mcap") else out_folder(text),
         metavar="FILE",
         help="write the session: FILE.mcap to view or replay (source kind mcap); else a ROS 2 bag, a folder",
     )
@@ -200,6 +200,12 @@ def _run(args: argparse.Namespace) -> int:
             raise ScenarioError(f"--policy {error}") from None
     secure = transport.from_arguments(args)
     emulator = args.emulator and transport.peer("--emulator", args.emulator)
+    if args.foxglove_port is not None and (secure.tokens or secure.ca is not None):
+        raise ScenarioError("--foxglove-port knows no login: leave it out, or run without credentials")
+    own = args.out / "field.npz"
+    if args.resume == own and not own.exists():
+        logging.getLogger("edge-server").info("%s: not there yet: the field begins anew", own)
+        args.resume = None
     open_page = partial(_open_page, args.page_host, args.page_port, secure, emulator)
     options = ServerOptions(
         listen=args.listen,
@@ -211,7 +217,7 @@ def _run(args: argparse.Namespace) -> int:
         open_foxglove=None if args.foxglove_port is None else partial(_open_foxglove, args.foxglove_port),
         metrics_port=args.metrics_port,
         lpips_folder=weights_folder(args.lpips, args.data),
-        resume=None if args.resume == args.out / "field.npz" and not args.resume.exists() else args.resume,
+        resume=args.resume,
         checkpoint_s=args.checkpoint_every,
         record=args.record,
     )

@@ -128,7 +128,7 @@ class Recorder:
 
 
 def _writer_class(path: Path) -> type[SessionWriter] | type[BagWriter]:
-    if path.suffix == ".mcap":
+    if path.suffix.lower() == ".mcap":
         from freshfield.session.writer import SessionWriter
 
         return SessionWriter

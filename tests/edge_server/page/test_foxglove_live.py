@@ -19,6 +19,7 @@ import websocket
 pytest.importorskip("foxglove", reason="needs the extra foxglove")
 pytest.importorskip("foxglove_schemas_protobuf", reason="needs the extra mcap")
 
+from edge_server.cli import main as edge_server
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.page.foxglove_live import FoxgloveServer, point_cloud
@@ -177,3 +178,10 @@ def test_the_layout_shows_topics_and_values_that_are_served(served):
         panels |= {node} if isinstance(node, str) else set()
         pending += [] if isinstance(node, str) else [node["first"], node["second"]]
     assert panels == set(layout["configById"])
+
+
+def test_it_is_refused_beside_a_login_which_it_would_go_around(tmp_path, capsys):
+    (tmp_path / "tokens.txt").write_text("operator abcdefghijklmnop\n")
+    words = ["run", "room", "--out", str(tmp_path / "out"), "--foxglove-port", "0"]
+    assert edge_server([*words, "--token-file", str(tmp_path / "tokens.txt")]) == 2
+    assert "knows no login" in capsys.readouterr().err
