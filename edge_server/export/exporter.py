@@ -11,14 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from edge_server.export import ExportError, PosedImage
+from edge_server.export.settings import LONG_S, PIXELS_A_POINT, POINTS
 from edge_server.fields import Field, View
 from edge_server.surface.settings import MeshSettings
 
 ENDINGS = {"mesh": (".ply", ".glb"), "splats": (".ply", ".spz"), "points": (".ply",)}
 KINDS = ("splats", "transforms", "colmap", "points", "mesh")  # in the order of writing
-POINTS = 20_000  # a sparse model of usual size: more only slows its readers
-PIXELS_A_POINT = 1000  # at most, of the depth that points are drawn from: 20 million pixels take 8 s of processor time
-LONG_S = 10.0  # of a stage that is announced in a pipe, too
 
 
 def check(files: Mapping[str, Path], count: int = POINTS) -> None:

@@ -5,15 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from edge_server.export import ExportError
+from edge_server.export.settings import FRAMES_PER_S, GAP_S
 from edge_server.export.splats import write_splats
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.page.splats.messages import MessageError, SceneBlock, StreamReader, read_saved
-
-FRAMES_PER_S = 30
-"""At which players show a sequence, unless told otherwise."""
-_GAP_S = 5.0
-"""Longer pauses between messages are left out."""
 
 
 def write_sequence(path: Path, stream: Path) -> int:
@@ -37,7 +33,7 @@ def write_sequence(path: Path, stream: Path) -> int:
             raise ExportError(f"{stream}: message {number}: {error}") from None
         if reader.scene is None or not len(reader.at(reader.instant_s)):
             continue
-        if abs(reader.instant_s - due_s) > _GAP_S:
+        if abs(reader.instant_s - due_s) > GAP_S:
             due_s = reader.instant_s
         while due_s <= reader.instant_s:
             gaussians = Gaussians(reader.at(due_s), 0)

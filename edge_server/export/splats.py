@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from edge_server.export import ExportError
 from edge_server.export.ply import write_table
+from edge_server.export.settings import SPZ_BITS, SPZ_WHOLE_BITS
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSITION, QUATERNION, SCALE, Gaussians
 from edge_server.fields.splat.planar import unit_quaternions
@@ -24,7 +25,6 @@ from freshfield.files import write_bytes
 Y0 = 0.28209479177387814
 # Signs of the harmonics of degree 1: Kerbl et al. negate those of odd order.
 SIGNS = np.array([-1, 1, -1], np.float32)
-SPZ_BITS, SPZ_WHOLE_BITS = 12, 23  # of a position behind the binary point, as others write it; and in all, without sign
 
 
 def write_splats(path: Path, gaussians: Gaussians, box: SceneBox) -> int:

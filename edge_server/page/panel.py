@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 from weakref import WeakSet
@@ -16,13 +17,12 @@ from edge_server.page import markup
 from edge_server.page.controls import ControlPanel
 from edge_server.page.diagnosis import poor_picture
 from edge_server.page.network_control import EmulatorControl, NetworkControl
-from edge_server.page.settings import AGE_PARTS_OF, POSE_NOISE
+from edge_server.page.settings import AGE_PARTS_OF, LEAST_SCENE_PX, POSE_NOISE
 from edge_server.page.timelines import History, Timelines
 from freshfield import coverage
 
 MAIN_WIDTH = 372
 SIDE_WIDTH = 356
-LEAST_SCENE_PX = 320  # beside both panels; a phone, where they are below the scene, is as wide
 # Width of two images and the gap between them, in pixels.
 PAIR_WIDTH = 640
 GAP = 8
@@ -78,8 +78,9 @@ class Panel:
         if client.camera.image_width < LEAST_SCENE_PX and client not in self._made_room:
             self._made_room.add(client)
             panel = client.gui.main_panel  # a handle that speaks to this visitor alone
-            panel._placement_uuid = self._side._placement_uuid
-            panel.minimize()
+            with contextlib.suppress(AttributeError):  # viser's own: a version that calls it otherwise folds nothing
+                panel._placement_uuid = self._side._placement_uuid
+                panel.minimize()
 
     def refresh(
         self,

@@ -52,3 +52,5 @@ FLAT_SCORES, FLAT_MARGIN_DB = 20, 0.5
 shows the scene exceeds it by several dB."""
 REFUSED_SHARE = 0.2
 """Of a camera's frames, from which on refusals explain a bad picture."""
+LEAST_SCENE_PX = 320
+"""Of the scene beside both panels; a phone, where they are below the scene, is as wide."""

@@ -1,0 +1,20 @@
+"""Numbers of the exports."""
+
+from __future__ import annotations
+
+POINTS = 20_000
+"""Of a sparse model of usual size: more only slows its readers."""
+PIXELS_A_POINT = 1000
+"""At most, of the depth that points are drawn from: 20 million pixels take 8 s of processor time."""
+LONG_S = 10.0
+"""Of a stage that is announced in a pipe, too."""
+
+FRAMES_PER_S = 30
+"""At which players show a sequence, unless told otherwise."""
+GAP_S = 5.0
+"""Longer pauses between messages of a saved stream are left out."""
+
+SPZ_BITS = 12
+"""Of a position behind the binary point, as others write it."""
+SPZ_WHOLE_BITS = 23
+"""Of a position in all, without its sign."""
