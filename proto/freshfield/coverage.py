@@ -26,7 +26,7 @@ PLAN = 41  # cells a side of the plan
 # What `room` reached with so many cameras, dB of the whole image and where it moves: with depth sensors
 # (docs/results/few-cameras.json), and without (docs/fields.md).
 REACHED_WITH_DEPTH = {2: (22.2, 18.4), 3: (24.5, 21.2), 4: (26.0, 22.0)}
-REACHED = {2: (15.2, 16.1), 3: (18.1, 19.4), 4: (20.2, 21.4), 6: (25.2, 23.4), 8: (27.0, 24.6), 12: (29.2, 25.3)}
+REACHED = {2: (15.2, 16.1), 3: (18.1, 19.4), 4: (22.0, 21.7), 6: (25.2, 23.4), 8: (27.0, 24.6), 12: (29.2, 25.3)}
 
 Camera = tuple[Pinhole, Array]
 """Lens, and camera-to-world pose (4, 4), meters."""
