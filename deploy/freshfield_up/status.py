@@ -80,12 +80,17 @@ def _edge_line(edge: Status) -> str:
         return str(edge.get("doing") or "no update yet")
     views = f" on {NOTHING_HELD_OUT}" if (edge.get("scores") or {}).get("on") == "selected" else ""
     so_far = edge.get("so_far")
+    if isinstance(so_far, dict):
+        scores = [f"held out {held_out(so_far)}"]
+    else:
+        scores = [
+            f"PSNR {fmt(number(edge, 'scores', 'psnr_db'), '.2f')} dB{views}",
+            f"moving {fmt(number(edge, 'scores', 'psnr_moving_db'), '.2f')} dB",
+        ]
     parts = [
         f"{updates:.0f} updates",
         f"{fmt(number(edge, 'updates', 'ms_p50'), '.0f')} ms each",
-        *([f"held out {held_out(so_far)}"] if isinstance(so_far, dict) else []),
-        f"PSNR {fmt(number(edge, 'scores', 'psnr_db'), '.2f')} dB{views}",
-        f"moving {fmt(number(edge, 'scores', 'psnr_moving_db'), '.2f')} dB",
+        *scores,
         f"aAoI {fmt(number(edge, 'last', 'aaoi_ms'), '.0f')} ms",
         f"policy {edge.get('policy', '-')}",
     ]

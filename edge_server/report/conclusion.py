@@ -90,8 +90,10 @@ def _age(report: Report) -> str:
 
 def _limit(report: Report) -> str:
     """What limited the picture: the cameras where even what stands still is a blur, else the largest part of age."""
-    shown, flat = report["fidelity"]["shown"], report["fidelity"]["baseline"]["mean_colour_db"]
-    still = shown["psnr_still_db"]
+    fidelity = report["fidelity"]
+    shown, flat, so_far = fidelity["shown"], fidelity["baseline"]["mean_colour_db"], fidelity["so_far"]
+    # Where held-out cameras move, `shown` is scored at given poses, which may be wrong where the picture is not.
+    still = shown["psnr_still_db"] if so_far is None else so_far["all_psnr_db"]
     lost = "; ".join(_delivery(report)).rstrip(".")
     if still is not None and flat is not None and still < flat + LITTLE_DB:
         few = "too few cameras, poses that do not fit, or too short a run"

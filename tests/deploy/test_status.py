@@ -75,3 +75,14 @@ def test_it_says_how_many_frames_were_left_out(tmp_path, shed, said):
     report = {"frames": {"delivered": 3, "rejected": {}}, "updates": {"shed": shed}}
     (tmp_path / "report.json").write_text(json.dumps(report))
     assert f"{said} rejected" in summarize(tmp_path)
+
+
+def test_a_moving_held_out_camera_reads_its_frames_at_refined_poses(tmp_path: Path) -> None:
+    so_far = {"now_psnr_db": 24.0, "all_psnr_db": 25.0, "frames": 9, "refined": True}
+    fidelity = {"so_far": so_far, "shown": {"psnr_db": 14.0, "age_ms": {"network": 20.0}}}
+    (tmp_path / "report.json").write_text(json.dumps({"fidelity": fidelity}))
+    said = "now 24.00 dB, all 9 frames so far 25.00 dB, at refined poses"
+    text = summarize(tmp_path)
+    assert f"held out   {said}; 14.00 dB at given ones\nshown      age of 20 ms network" in text
+    (tmp_path / "edge.json").write_text(json.dumps({"updates": {"count": 2}, "so_far": so_far, "scores": {}}))
+    assert f"held out {said}, aAoI" in status_line(tmp_path, 2)

@@ -59,6 +59,14 @@ def test_three_sentences_say_what_was_shown_its_age_and_its_limit(tmp_path: Path
         ({"fidelity.shown.age_ms.waiting": 0.0}, 2, "Waiting for an update and computing it were the limit"),
         ({"fidelity.shown.age_ms.display": 10.0}, 2, "The network was the limit: it takes the largest part"),
         ({"fidelity.shown.psnr_still_db": 15.0}, 2, "too few cameras"),
+        (
+            {
+                "fidelity.shown.psnr_still_db": 15.0,
+                "fidelity.so_far": {"now_psnr_db": 20.0, "all_psnr_db": 23.0, "frames": 9},
+            },
+            2,
+            "the limit: it takes",
+        ),
         ({"updates.shed": 70}, 2, "92% of those delivered were left out for lack of time"),
     ],
 )
