@@ -46,8 +46,27 @@ class AgeParts(Struct):
     display: Number | None = None
 
 
+class SoFarScores(Struct):
+    """Scores of a held-out camera that moves (``fidelity.so_far``): of its newest frame (now), and of its frames so far
+    from the newest field (all). frames: how many these are. refined: at poses and exposures as the field corrects
+    them."""
+
+    now_psnr_db: Number
+    all_psnr_db: Number
+    now_ssim: Number | None = None
+    all_ssim: Number | None = None
+    frames: Count = 1
+    refined: bool = False
+
+    def words(self) -> str:
+        """In one line, for people."""
+        poses = ", at refined poses" if self.refined else ""
+        return f"now {self.now_psnr_db:.2f} dB, all {self.frames} frames so far {self.all_psnr_db:.2f} dB{poses}"
+
+
 class ShownRow(Struct, kw_only=True):
-    """A line of shown.jsonl: the score of what was shown at ``t_s``. number: the update that was extrapolated."""
+    """A line of shown.jsonl: the score of what was shown at ``t_s``, at poses as given. number: the update that was
+    extrapolated. so_far: of held-out cameras that move, as known then."""
 
     t_s: Number
     number: Count | None = None
@@ -57,6 +76,7 @@ class ShownRow(Struct, kw_only=True):
     ssim: Number | None = None
     lpips: Number | None = None
     age_ms: AgeParts = field(default_factory=AgeParts)
+    so_far: SoFarScores | None = None
 
 
 class AgesRow(Struct, omit_defaults=True):
@@ -111,24 +131,6 @@ class FitData(Struct):
     training: Count
     held_out: list[str]
     missing: Count
-
-
-class SoFarScores(Struct):
-    """Scores of a held-out camera that moves (``fidelity.so_far``): of its newest frame (now), and of its frames so far
-    from the newest field (all). frames: how many these are. refined: at poses and exposures as the field corrects
-    them."""
-
-    now_psnr_db: Number
-    all_psnr_db: Number
-    now_ssim: Number | None = None
-    all_ssim: Number | None = None
-    frames: Count = 1
-    refined: bool = False
-
-    def words(self) -> str:
-        """In one line, for people."""
-        poses = ", at refined poses" if self.refined else ""
-        return f"now {self.now_psnr_db:.2f} dB, all {self.frames} frames so far {self.all_psnr_db:.2f} dB{poses}"
 
 
 class Event(Struct):

@@ -288,7 +288,8 @@ class EdgeServer:
 
     def _shown(self, score: Score, publication: Publication) -> None:
         self.state.add_shown(score)
-        self.journal.shown((score.published_ns - self.start_ns) / 1e9, score, publication)
+        t_s = (score.published_ns - self.start_ns) / 1e9
+        self.journal.shown(t_s, score, publication, self.scoring.so_far)
 
     def _set_status_line(self, line: str) -> None:
         self.state.status_line = line

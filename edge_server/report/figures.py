@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 from matplotlib.axes import Axes
 
@@ -34,8 +35,11 @@ def draw_all(report: Report, files: RunFiles) -> dict[str, Path]:
 
 
 def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
-    """PSNR (whole image, moving pixels, both baselines), SSIM and LPIPS at every publication."""
+    """PSNR (whole image, moving pixels, both baselines), SSIM and LPIPS at every publication; of held-out cameras that
+    move, PSNR and SSIM of the newest frame and of all so far."""
     series, found = report["fidelity"]["series"], report["fidelity"]
+    if found["so_far"] is not None:
+        return _draw_so_far(report, files, path)
     if not _points(series, "psnr_db")[0]:
         return False
     scored = any(_points(series, name)[0] for name in ("ssim", "lpips"))
@@ -43,10 +47,7 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
         top = axes[0, 0]
         _plot(top, series, "psnr_db", BLUE, "whole image")
         _plot(top, series, "psnr_moving_db", VERMILION, "moving pixels")
-        flat = {"nearest_view_db": "nearest view", "mean_colour_db": "mean color"}
-        for (key, label), dash in zip(flat.items(), ("--", ":")):
-            if found["baseline"].get(key) is not None:
-                top.axhline(found["baseline"][key], color=GRAY, linestyle=dash, linewidth=1.2, label=label)
+        _plot_baselines(top, report)
         fit = report["kind"] == "fit"
         title = fidelity_title(found["scored_on"])
         if fit and SELECTED not in found["scored_on"]:
@@ -64,6 +65,31 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
         bottom.set_ylim(0.0, 1.02)
         label_lines(bottom, "score", seconds)
     return True
+
+
+def _draw_so_far(report: Report, files: RunFiles, path: Path) -> bool:
+    rows = [{"t_s": row.t_s, **msgspec.to_builtins(row.so_far)} for row in files.shown if row.so_far is not None]
+    if not rows:
+        return False
+    poses = ", at refined poses" if report["fidelity"]["so_far"]["refined"] else ""
+    with figure(path, 2, height_inch=2.5, sharex=True) as (_, axes):
+        top, bottom = axes[:, 0]
+        for ax, score in ((top, "psnr_db"), (bottom, "ssim")):
+            _plot(ax, rows, f"now_{score}", SKY, "newest held-out frame")
+            _plot(ax, rows, f"all_{score}", BLUE, "all held-out frames so far")
+        _plot_baselines(top, report)
+        label_lines(top, "PSNR (dB)", title=f"Fidelity on a held-out camera that moves{poses}")
+        bottom.set_ylim(0.0, 1.02)
+        label_lines(bottom, "SSIM", "seconds since the edge started")
+        _mark(axes, report)
+    return True
+
+
+def _plot_baselines(axes: Axes, report: Report) -> None:
+    flat = {"nearest_view_db": "nearest view", "mean_colour_db": "mean color"}
+    for (key, label), dash in zip(flat.items(), ("--", ":")):
+        if (level := report["fidelity"]["baseline"].get(key)) is not None:
+            axes.axhline(level, color=GRAY, linestyle=dash, linewidth=1.2, label=label)
 
 
 def draw_ages(report: Report, files: RunFiles, path: Path) -> bool:

@@ -22,7 +22,7 @@ from msgspec.structs import asdict
 
 from edge_server.fidelity.scorer import SHOWN, Score
 from edge_server.live.state import Publication
-from edge_server.run_records import AgeParts, AgesRow, ShownRow
+from edge_server.run_records import AgeParts, AgesRow, ShownRow, SoFarScores
 from freshfield.files import Lines, write_json
 
 log = logging.getLogger(__name__)
@@ -74,9 +74,9 @@ class Journal:
             if final and next(iter(self._open)) == publication.number:
                 self._write_oldest()
 
-    def shown(self, t_s: float, score: Score, publication: Publication) -> None:
+    def shown(self, t_s: float, score: Score, publication: Publication, so_far: SoFarScores | None = None) -> None:
         """Write ``shown_line``."""
-        self._files["shown"].write(shown_line(t_s, score, publication))
+        self._files["shown"].write(shown_line(t_s, score, publication, so_far))
 
     def ages(
         self, t_s: float, ages_ms: Mapping[str, float | None], depth_ages_ms: Mapping[str, float] | None = None
@@ -123,9 +123,9 @@ class Journal:
         self._files["series"].write(json.dumps(dataclasses.asdict(publication), allow_nan=False))
 
 
-def shown_line(t_s: float, score: Score, publication: Publication) -> str:
+def shown_line(t_s: float, score: Score, publication: Publication, so_far: SoFarScores | None = None) -> str:
     """A line of shown.jsonl with ``score``, the score of what was shown at ``t_s``: ``publication``, extrapolated to
-    ``t_s``. The age of its views is the sum of network, waiting, computing and display."""
+    ``t_s``. The age of its views is the sum of network, waiting, computing and display. so_far: see ``ShownRow``."""
     waiting_ms = publication.aaoi_ms - publication.update_ms - (publication.network_ms or 0.0)
     line = ShownRow(
         t_s=round(t_s, 4),
@@ -137,5 +137,6 @@ def shown_line(t_s: float, score: Score, publication: Publication) -> str:
             computing=publication.update_ms,
             display=1e3 * (t_s - publication.t_s),
         ),
+        so_far=so_far,
     )
     return json.dumps(line, default=asdict, allow_nan=False)

@@ -13,7 +13,7 @@ import pytest
 from edge_server.cli import main as edge_server
 from edge_server.live.state import Publication
 from edge_server.report.build_report import METRICS, SERIES, assemble, build_report, fidelity, updates
-from edge_server.report.figures import draw_frontier
+from edge_server.report.figures import draw_fidelity, draw_frontier
 from edge_server.report.report_page import counts, number
 from edge_server.report.run_files import continuous, read_run_files
 from edge_server.run_records import EdgeStatus, UpdateCounts, UpdateRow
@@ -230,6 +230,25 @@ def test_rows_are_in_order_of_time_across_a_restart(tmp_path):
 
 
 DEEP = "[" * 100_000
+
+
+def test_a_held_out_camera_that_moves_is_drawn_and_tabled_at_refined_poses(tmp_path) -> None:
+    write_run(tmp_path)
+    so_far = {"now_psnr_db": 23.5, "all_psnr_db": 24.7, "now_ssim": 0.79, "all_ssim": 0.8125, "frames": 9}
+    edit_edge(tmp_path, so_far={**so_far, "refined": True})
+    lines = [json.loads(line) for line in (tmp_path / "shown.jsonl").read_text().splitlines()]
+    assert not draw_fidelity(page_of(tmp_path)[0], read_run_files(tmp_path), tmp_path / "figure.png")
+    (tmp_path / "shown.jsonl").write_text("".join(json.dumps({**line, "so_far": so_far}) + "\n" for line in lines))
+    report, page = page_of(tmp_path)
+    assert draw_fidelity(report, read_run_files(tmp_path), tmp_path / "figure.png")
+    text = re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", page))
+    for words in (
+        "0.812 SSIM of the same",
+        "newest held-out frame, at refined poses 23.50 0.7900",
+        "9 held-out frames so far, at refined poses 24.70 0.8125",
+        "shown, last fifth of the run, at given poses 24.00 17.00",
+    ):
+        assert words in text, words
 
 
 @pytest.mark.stability
