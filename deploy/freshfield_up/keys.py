@@ -108,7 +108,7 @@ def _options(parts: dict[str, Any], part: dict[str, str]) -> dict[str, Any]:
     """What field_options may hold: the fields of settings that have help, the others are no options."""
     told = parts[part["$ref"].rpartition("/")[2]]["properties"]
     options = {key: each for key, each in told.items() if "description" in each}
-    return {"properties": {"field_options": _mapping({"effort": {"type": "string"}, **options})}}
+    return {"properties": {"field_options": _mapping(options)}}
 
 
 def _of_path(_: type) -> dict[str, Any]:

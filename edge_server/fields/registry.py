@@ -1,7 +1,6 @@
 """Representations by name. A package is imported only when its representation is asked for.
 
-A package has, in ``settings``, the settings class ``SETTINGS``, which names the module with ``make(settings)``, and
-``EFFORTS``, presets of its options.
+A package has, in ``settings``, the settings class ``SETTINGS``, which names the module with ``make(settings)``.
 """
 
 from __future__ import annotations
@@ -34,20 +33,12 @@ def option_help(name: str) -> dict[str, str]:
     return trainer_settings.option_help(_settings_class(name))
 
 
-def efforts_of(name: str) -> Mapping[str, Mapping[str, Any]]:
-    """Preset -> its options. ValueError: unknown representation."""
-    if name not in _PACKAGES:
-        return {"medium": {}}
-    found: Mapping[str, Mapping[str, Any]] = _module(name, "settings").EFFORTS
-    return found
-
-
 def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 0) -> Field:
     """A fresh field.
 
     name: one of ``field_names``, or a class from outside (``freshfield.plugins``), which is constructed with its
         settings: of the class in its attribute ``Settings``, a subclass of ``FieldSettings``.
-    options: see ``option_help``, and ``effort``, one of ``efforts_of``; None: the defaults.
+    options: see ``option_help``; None: the defaults.
     seed: of the field, unless ``options`` has one.
     Raises ValueError for an unknown representation or option (the message lists the known ones), or for a
     value that it cannot have.
@@ -64,19 +55,14 @@ def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 
 
 
 def settings_of(name: str, options: Mapping[str, Any] | None = None, seed: int = 0) -> Any:
-    """The settings that these options result in, with defaults and effort. ValueError as
-    ``make_field``."""
-    return trainer_settings.settings_from(_settings_class(name), efforts_of(name), options or {}, seed)
+    """The settings that these options result in, with defaults. ValueError as ``make_field``."""
+    return trainer_settings.settings_from(_settings_class(name), options or {}, seed)
 
 
 def _settings_class(name: str) -> Any:
     if name in _PACKAGES:
-        return _module(name, "settings").SETTINGS
+        return import_module(f"{_PACKAGES[name]}.settings").SETTINGS
     found = getattr(plugins.find("field", name, _PACKAGES), "Settings", None)
     if not (isinstance(found, type) and issubclass(found, trainer_settings.FieldSettings)):
         raise plugins.PluginError(f"field {name}: expected an attribute Settings, a subclass of FieldSettings")
     return found
-
-
-def _module(name: str, module: str) -> Any:
-    return import_module(f"{_PACKAGES[name]}.{module}")

@@ -72,7 +72,7 @@ class Fit(ViewedField):
         if any(v.image.shape[2] == 4 for v in data.training):
             given = {"background": background, **given}
         try:
-            self.options = {**self._scan_options(field, given), **given}
+            self.options = {**self._scan_options(field), **given}
             model = make_field(field, self.options, seed=seed)
         except (ValueError, TypeError) as error:
             raise OptionError(f"--field {field}: {error}") from None
@@ -92,7 +92,7 @@ class Fit(ViewedField):
         self._processes: list[dict[str, Any]] = []
         self._load_meter = LoadMeter("fit")
 
-    def _scan_options(self, field: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    def _scan_options(self, field: str) -> dict[str, Any]:
         """What the data set says of how to learn it: see ``MultiviewStill.carried`` and ``timed``."""
         data = self.data
         if not data.carried or "scan" not in option_help(field):
@@ -101,10 +101,7 @@ class Fit(ViewedField):
         if data.timed:
             note += "; its frames have times, so a tracker gave their poses: poses and exposures are refined"
         self.notes.append(note)
-        found = scan_options(data.training[0].image[..., 0].size, data.timed)
-        if "effort" in options:  # says how many Gaussians
-            del found["gaussians"]
-        return found
+        return scan_options(data.training[0].image[..., 0].size, data.timed)
 
     @property
     def psnr(self) -> NDArray[np.float64]:

@@ -22,7 +22,7 @@ from edge_server.experiments.fitting.evaluate import Scored
 from edge_server.experiments.fitting.fit import BACKGROUNDS, Fit, check_seconds
 from edge_server.experiments.scenes.multiview_still import data_name, open_still
 from edge_server.experiments.scenes.recorded import MultiviewStill
-from edge_server.fields.registry import FIELD, efforts_of, field_names, option_help, settings_of
+from edge_server.fields.registry import FIELD, field_names, option_help, settings_of
 from freshfield.files import out_folder
 from freshfield.scenario import NOTHING_HELD_OUT
 
@@ -97,7 +97,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             known, defaults = option_help(args.field), settings_of(args.field)
         except ValueError as error:
             parser.error(str(error))
-        print(f"{'effort':18} preset of the options below: {', '.join(efforts_of(args.field))} [medium]")
         print("\n".join(f"{name:18} {text} [{getattr(defaults, name)}]" for name, text in known.items()))
         return 0
     if args.data is None:

@@ -24,7 +24,7 @@ from edge_server.experiments.training.trainer import TrainingConfig, read_log, t
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.settings import Action, Spec
 
-FIELD_OPTIONS = {"effort": "low"}
+FIELD_OPTIONS = {"gaussians": 4096, "start": 2048}
 SIZE = 64
 FOUR_VIEWPOINTS = ("cam00", "cam04", "cam09", "cam17")
 # Cameras that judge trained policies: they give no reward and no update uses them.

@@ -54,6 +54,11 @@ OUT/policy.npz is the learned policy, OUT/actor.npz the part of it that decides,
 learning curve with each term of the reward. edge-server compare says what it shows, on seeds it was not trained
 on. After Ctrl-C the same command continues, bit for bit, whatever --jobs and --ray are.
 """
+# Options with which a field learns the small images of a training faster than with its defaults.
+QUICK_FIELDS = {
+    "splat": {"gaussians": 4096, "start": 2048},
+    "ngp": {"levels": 6, "log2_table": 14, "batch_samples": 8192, "samples": 96},
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -106,7 +111,7 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
         if args.field not in field_names():
             raise ValueError(f"--field: expected one of {', '.join(field_names())}, got {args.field!r}")
         edge["field"], edge["updates"] = args.field, "cycle"
-        edge["field_options"] = {"effort": "low"} if args.field in ("splat", "ngp") else {}
+        edge["field_options"] = QUICK_FIELDS.get(args.field, {})
     edge["policy"] = {"name": "all"}
     given = dataclasses.replace(scenario, source=source, edge=edge)
     return Setting(

@@ -141,23 +141,14 @@ def option_help(kind: type[FieldSettings]) -> dict[str, str]:
     return {name: texts[name] for name in declared if name in texts}
 
 
-def settings_from(
-    kind: type[Chosen], efforts: Mapping[str, Mapping[str, Any]], options: Mapping[str, Any], seed: int
-) -> Chosen:
+def settings_from(kind: type[Chosen], options: Mapping[str, Any], seed: int) -> Chosen:
     """Settings from plain options (a scenario's ``field`` section).
 
-    kind: the settings class. efforts: preset -> its settings. options: override those of the preset that
-    their ``effort`` names ("medium" by default). seed: of the field, unless ``options`` has one.
-    ScenarioError: unknown option or effort (the message lists the known ones), or a value it cannot have.
+    kind: the settings class. seed: of the field, unless ``options`` has one.
+    ScenarioError: unknown option (the message lists the known ones), or a value it cannot have.
     """
-    given = dict(options)
-    effort = given.pop("effort", "medium")
-    if not isinstance(effort, str) or effort not in efforts:
-        raise ScenarioError(f"{kind.name}.effort: expected one of {', '.join(efforts)}, got {effort!r}")
     valid = option_help(kind)
-    if unknown := sorted(set(given) - set(valid)):
+    if unknown := sorted(set(options) - set(valid)):
         renamed = " (harmonics is now sh_degree: 1)" if "harmonics" in unknown and "sh_degree" in valid else ""
-        raise ScenarioError(
-            f"{kind.name} has no option {', '.join(unknown)}{renamed}; it has: effort, {', '.join(valid)}"
-        )
-    return read_settings(kind, {"seed": seed, **efforts[effort], **given}, kind.name)
+        raise ScenarioError(f"{kind.name} has no option {', '.join(unknown)}{renamed}; it has: {', '.join(valid)}")
+    return read_settings(kind, {"seed": seed, **options}, kind.name)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from edge_server.fields.common.trainer_settings import HashGridSettings
 from freshfield.settings import within
@@ -35,10 +35,3 @@ class NerfactoSettings(HashGridSettings, frozen=True):
 
 
 SETTINGS = NerfactoSettings
-_LOW = {"levels": 6, "log2_table": 14, "finest_resolution": 96, "batch_samples": 8192, "samples": 16}
-_HIGH = {"log2_table": 17, "hidden": 64, "batch_samples": 32768, "rays": 8192, "samples": 32, "bins": 128}
-EFFORTS: dict[str, dict[str, Any]] = {
-    "low": {**_LOW, "samples_start": 16},
-    "medium": {},
-    "high": {**_HIGH, "samples_start": 32},
-}

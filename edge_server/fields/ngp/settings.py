@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from edge_server.fields.common.trainer_settings import HashGridSettings
 
 STATE_SHAPE = (
@@ -27,8 +25,3 @@ class NgpSettings(HashGridSettings, frozen=True):
 
 
 SETTINGS = NgpSettings
-EFFORTS: dict[str, dict[str, Any]] = {
-    "low": {"levels": 6, "log2_table": 14, "finest_resolution": 96, "batch_samples": 8192, "samples": 96},
-    "medium": {},
-    "high": {"log2_table": 17, "hidden": 64, "batch_samples": 32768, "rays": 8192, "samples": 256},
-}

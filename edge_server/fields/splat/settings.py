@@ -5,7 +5,7 @@ The texts of the options become help. Numbers of the layers stand in ``layers.se
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from edge_server.fields.common.trainer_settings import FieldSettings, ShDegree
 from freshfield.settings import about, within
@@ -97,8 +97,3 @@ class SplatSettings(FieldSettings, frozen=True):
 
 
 SETTINGS = SplatSettings
-EFFORTS: dict[str, dict[str, Any]] = {
-    "low": {"gaussians": 4096, "start": 2048},
-    "medium": {},
-    "high": {"gaussians": 32768, "start": 8192},
-}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from msgspec import Meta
 
@@ -35,8 +35,3 @@ class TensorfSettings(TrainerSettings, frozen=True):
 
 
 SETTINGS = TensorfSettings
-EFFORTS: dict[str, dict[str, Any]] = {
-    "low": {"color_rank": 8, "resolution": 96, "hidden": 16, "batch_samples": 8192, "samples": 96},
-    "medium": {},
-    "high": {"density_rank": 16, "color_rank": 24, "hidden": 64, "batch_samples": 32768, "rays": 8192, "samples": 256},
-}

@@ -11,7 +11,7 @@ import pytest
 from msgspec.structs import replace
 
 from edge_server.fields import Budget
-from edge_server.fields.registry import efforts_of, make_field, option_help, settings_of
+from edge_server.fields.registry import make_field, option_help, settings_of
 from tests.edge_server.fields.small import CLASSES, every_field
 
 
@@ -42,8 +42,6 @@ REFUSED: list[tuple[str, Any, str]] = [
     ("background", 3, "text"),
     ("background", "pink", "#80c0ff"),
     ("centre_m", [1, 2], "a list of 3"),
-    ("effort", "heroic", "one of low, medium, high"),
-    ("effort", ["high"], "one of low, medium, high"),
     ("threads", 0, "1 to 1024"),
     ("nice", 20, "0 to 19"),
     ("rays", 0, "1 to 1048576"),
@@ -57,9 +55,9 @@ REFUSED: list[tuple[str, Any, str]] = [
     ("log2_table", 7, "8 to 24"),
     ("appearance", 17, "0 to 16"),
     ("resolution", 2, "4 to 1024"),
-    ("levles", 3, "no option levles; it has: effort, "),
-    ("rate_net", 0.1, "no option rate_net; it has: effort, "),  # a tuned number, no option
-    ("harmonics", 4, "no option harmonics (harmonics is now sh_degree: 1); it has: effort, "),
+    ("levles", 3, "no option levles; it has: "),
+    ("rate_net", 0.1, "no option rate_net; it has: "),  # a tuned number, no option
+    ("harmonics", 4, "no option harmonics (harmonics is now sh_degree: 1); it has: "),
 ]
 
 
@@ -67,12 +65,12 @@ REFUSED: list[tuple[str, Any, str]] = [
 def test_what_a_field_cannot_work_with_is_refused_by_name(name: str) -> None:
     tried = 0
     for option, value, text in REFUSED:
-        if option in ("effort", *option_help(name)) or text.startswith("no option"):
+        if option in option_help(name) or text.startswith("no option"):
             tried += 1
             with pytest.raises(ValueError, match=f"^{name}.*{re.escape(text)}") as refused:
                 make_field(name, {option: value})
             assert option in str(refused.value)
-    assert tried > 15
+    assert tried >= 15
 
 
 def test_what_nobody_knows_is_refused() -> None:
@@ -87,16 +85,11 @@ def test_a_budget_without_an_end_is_refused(wrong: dict) -> None:
 
 
 @every_field
-def test_options_are_at_most_twenty_with_help_and_efforts_are_ordered(name: str) -> None:
+def test_options_are_at_most_twenty_with_help(name: str) -> None:
     known = option_help(name)
-    assert len(known) < 20 and all(len(text) > 10 for text in known.values())
-    low, medium, high = (settings_of(name, {"effort": effort}) for effort in efforts_of(name))
-    assert medium == type(medium)() == settings_of(name)
-    for found, preset in zip((low, medium, high), efforts_of(name).values()):
-        assert found == replace(medium, **preset)
-    for option in ("gaussians",) if name == "splat" else ("samples", "batch_samples"):
-        assert getattr(low, option) < getattr(medium, option) < getattr(high, option)
-    assert settings_of(name, {"effort": "high", "threads": 33}) == replace(high, threads=33)
+    assert len(known) <= 20 and all(len(text) > 10 for text in known.values())
+    usual = settings_of(name)
+    assert usual == type(usual)() and settings_of(name, {"threads": 33}) == replace(usual, threads=33)
 
 
 def test_the_registry_imports_no_representation_and_no_field_needs_torch() -> None:
