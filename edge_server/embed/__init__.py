@@ -41,8 +41,6 @@ class EmbeddingConfig(Settings, frozen=True):
     model: Annotated[str, about("a YOLO detection ONNX, relative to the scenario, or default")] = DEFAULT
     dim: Annotated[int, within(1, 4096, "length of an embedding, at most the channels of the tapped layer")] = 32
     size: Annotated[int, within(32, 2048, "side of the model's input, pixels; not given: its own")] | None = None
-    tap: Annotated[str | None, about("tensor or module (model.9) to embed; not given: the backbone's end")] = None
-    threads: Annotated[int, within(1, 256, "CPU threads")] = 1
 
 
 def read_embedding(mapping: Mapping[str, Any], scenario: Path) -> EmbeddingConfig:
@@ -79,8 +77,8 @@ def make_embedder(section: EmbeddingConfig) -> Embedder:
     with onnx_libraries("embedding"):
         from edge_server.embed.backbone import load_backbone
         from edge_server.embed.embedder import Embedder
-    backbone = load_backbone(model_path(section.model), section.tap, section.size)
-    return Embedder(backbone, section.dim, section.threads)
+    backbone = load_backbone(model_path(section.model), section.size)
+    return Embedder(backbone, section.dim)
 
 
 def open_depth_network(file: Path) -> DepthNetwork:

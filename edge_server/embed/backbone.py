@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import ast
 import base64
-import difflib
 import hashlib
 import math
 from dataclasses import dataclass
@@ -47,7 +46,7 @@ _CONVOLVE = ("Conv", "ConvInteger", "QLinearConv")
 # Operators of backbones. Those whose output size is in their data (Expand, Tile, ConstantOfShape, Range,
 # loops) are missing: a few bytes could request any amount of memory.
 _KNOWN = frozenset(
-    {
+    [
         "Abs",
         "Add",
         "AveragePool",
@@ -95,7 +94,7 @@ _KNOWN = frozenset(
         "Tanh",
         "Transpose",
         "Unsqueeze",
-    }
+    ]
 )
 _TYPES: dict[int, type[np.floating]] = {TensorProto.FLOAT: np.float32, TensorProto.FLOAT16: np.float16}
 
@@ -132,13 +131,13 @@ class Backbone:
     projection: Projection | None = None
 
 
-def load_backbone(path: Path, tap: str | None = None, size: int | None = None) -> Backbone:
-    """Load the detector at ``path``. tap, size: as in EmbeddingConfig. Raises EmbeddingError."""
+def load_backbone(path: Path, size: int | None = None) -> Backbone:
+    """Load the detector at ``path``. size: as in EmbeddingConfig. Raises EmbeddingError."""
     data = _read(path)
     model = parse_model(data, path)
     meta = {p.key: p.value for p in model.metadata_props}
     image = _image_input(model, path)
-    at = _find_tap(model, tap, path)
+    at = _find_end(model, path)
     cut = _cut(model, image.name, at, path)
     batch, (height, width) = _shape_of(cut, size, meta, path)
     channels = _check_shapes(cut, batch or 1, height, width, path)
@@ -153,7 +152,7 @@ def load_backbone(path: Path, tap: str | None = None, size: int | None = None) -
         height=height,
         width=width,
         digest=hashlib.sha256(data).hexdigest()[:8],
-        projection=_projection(meta, channels, path) if tap is None else None,
+        projection=_projection(meta, channels, path),
     )
 
 
@@ -211,24 +210,9 @@ def _image_input(model: onnx.ModelProto, path: Path) -> onnx.ValueInfoProto:
     return inputs[0]
 
 
-def _find_tap(model: onnx.ModelProto, tap: str | None, path: Path) -> str:
-    """Name of the tensor that ``tap`` means, or of the backbone's end."""
+def _find_end(model: onnx.ModelProto, path: Path) -> str:
+    """Name of the tensor at the backbone's end."""
     nodes = model.graph.node
-    if tap is not None:
-        outputs = [o for node in nodes for o in node.output if o]
-        if tap in outputs:
-            return tap
-        module = f"/{tap.strip('/')}/"
-        of_module = [
-            node.output[0]
-            for node in nodes
-            if node.name.startswith(module) and node.op_type not in ("QuantizeLinear", _PER_IMAGE)
-        ]
-        if of_module:
-            return of_module[-1]
-        near = difflib.get_close_matches(tap, outputs, n=3)
-        hint = f"; nearest: {', '.join(near)}" if near else ""
-        raise EmbeddingError(f"{path}: tap: no tensor and no module is called {tap!r}{hint}")
     readers: dict[str, list[onnx.NodeProto]] = {}
     for node in nodes:
         for name in node.input:
@@ -241,8 +225,7 @@ def _find_tap(model: onnx.ModelProto, tap: str | None, path: Path) -> str:
         if behind:
             seen.update(node.output)
     raise EmbeddingError(
-        f"{path}: no neck that enlarges and joins feature maps was found, so this is not a YOLO detection "
-        "model; if it is one, name the last tensor of its backbone with tap"
+        f"{path}: no neck that enlarges and joins feature maps was found, so this is not a YOLO detection model"
     )
 
 
@@ -273,7 +256,7 @@ def _cut(model: onnx.ModelProto, image: str, tap: str, path: Path) -> onnx.Model
         )
     if any(node.op_type == _PER_IMAGE and tap in node.output for node in cut.graph.node):
         raise EmbeddingError(
-            f"{path}: tap: {tap} is quantised with another scale for every image; name the tensor before it"
+            f"{path}: {tap} is quantised with another scale for every image: export the model without that"
         )
     if not any(node.op_type in _CONVOLVE for node in cut.graph.node):
         raise EmbeddingError(f"{path}: no convolution lies between the images and {tap}")
@@ -340,8 +323,7 @@ def _check_shapes(cut: onnx.ModelProto, batch: int, height: int, width: int, pat
     pooled = shapes.get("pooled.float", [])
     if len(pooled) != 4 or pooled[1] < 1:
         raise EmbeddingError(
-            f"{path}: the tap is not a feature map (n, channels, height, width) but {pooled or 'unknown'}; "
-            "name another with tap"
+            f"{path}: the backbone's end is not a feature map (n, channels, height, width) but {pooled or 'unknown'}"
         )
     return int(pooled[1])
 

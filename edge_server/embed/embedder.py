@@ -33,14 +33,14 @@ class Embedder:
     failed: number of images for which the model gave NaN or infinity.
     """
 
-    def __init__(self, backbone: Backbone, dim: int, threads: int = 1) -> None:
-        """dim, threads: as in ``EmbeddingConfig``. Raises EmbeddingError if ``dim`` exceeds the backbone's channels,
+    def __init__(self, backbone: Backbone, dim: int) -> None:
+        """dim: as in ``EmbeddingConfig``. Raises EmbeddingError if ``dim`` exceeds the backbone's channels,
         or the model does not run."""
         self.backbone, self.dim = backbone, dim
         self._mean, self._axes = _projection(backbone, dim)
         self.failed = 0
         self.name = f"{backbone.name}-{backbone.digest} {backbone.tap} {backbone.width}x{backbone.height} d{dim}"
-        self._session = open_session(backbone.model, threads, backbone.name)
+        self._session = open_session(backbone.model, backbone.name)
         self.step = backbone.batch or _BATCH
         """Images per run."""
         # A model that cannot run fails here, not at the first decision.
@@ -98,14 +98,14 @@ def open_model(file: Path) -> ort.InferenceSession:
     except OSError as error:
         raise EmbeddingError(f"{file}: cannot be read: {error.strerror}; name a model in ONNX format") from None
     parse_model(data, file)
-    return open_session(data, 1, str(file))
+    return open_session(data, str(file))
 
 
-def open_session(model: bytes, threads: int, name: str) -> ort.InferenceSession:
-    """Open an ONNX model. threads: as in ``EmbeddingConfig``. name: the model's name in error messages. Raises
+def open_session(model: bytes, name: str) -> ort.InferenceSession:
+    """Open an ONNX model, computed in one thread. name: the model's name in error messages. Raises
     EmbeddingError."""
     options = ort.SessionOptions()
-    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4  # errors are raised, not printed too
     # Spinning threads would take the field's cores.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")

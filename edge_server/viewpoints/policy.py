@@ -219,7 +219,7 @@ def _episodes(
         chosen = np.argmax(logps + rng.gumbel(size=logps.shape), axis=1)
         taken = np.stack([rows.steps.actions(order)[k] for order, k in zip(orders, chosen)])
         gained = reward(taken) / scale - config.way * taken[:, way] / rows.far_m
-        values = networks.value(np, spec, critic, features)
+        values = networks.value(np, critic, features)
         kept.append((features, closed, chosen, logps[np.arange(count), chosen], gained, values))
         for order, k in zip(orders, chosen):
             order.append(int(k))
@@ -265,7 +265,7 @@ def _improve(
         logps = torch.log_softmax(logits.masked_fill(closed[some], _CLOSED), dim=-1)
         now = logps.gather(1, chosen[some, None])[:, 0]
         entropy = -(logps.exp() * logps).masked_fill(closed[some], 0.0).sum(dim=-1)
-        return now, entropy, networks.value(torch, spec, critic, features[some])
+        return now, entropy, networks.value(torch, critic, features[some])
 
     clipped_update(spec, evaluate, acted, [*actor.values(), *critic.values()], adam, rng)
 

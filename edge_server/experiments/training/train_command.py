@@ -135,13 +135,7 @@ def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> Tra
         raise TrainingError(f"--price: expected 0 or more, got {args.price:g}")
     if args.price:
         reward = dataclasses.replace(reward, views=-args.price)
-    spec = Spec(
-        args.kind,
-        layout_of(setting, setting.parts),
-        _omegas(args),
-        network=args.network,
-        cameras=len(setting.scenario.training) if args.network == "flat" else None,
-    )
+    spec = Spec(args.kind, layout_of(setting, setting.parts), _omegas(args))
     return TrainingConfig(spec, reward, args.episodes, args.batch, args.samples, args.seed)
 
 
@@ -202,12 +196,6 @@ def _parser() -> argparse.ArgumentParser:
         "--omegas",
         metavar="MS,...",
         help="ms that threshold and wait choose from: 20,60,120, or A..B: each whole number",
-    )
-    add(
-        "--network",
-        choices=("pooled", "flat"),
-        default="pooled",
-        help="pooled: any number of cameras; flat: the thesis's, a fixed number [%(default)s]",
     )
     add("--scratch", action="store_true", help="each update starts from an empty field, as in the thesis")
     add("--fit-steps", type=int, metavar="N", help="optimizer steps of an update [20; 50 with --scratch]")

@@ -1,10 +1,9 @@
 """Actor and value networks as functions of weights, written once for numpy (deciding) and torch (learning).
 
-``pooled``: one encoder for every camera, with the mean and the maximum over the cameras that have reported as
-context. It takes any number of cameras, in any order. ``flat``: the thesis's layer over all cameras in their
-order (5.5). The first argument ``xp`` is the module, numpy or torch. All arrays are float64: the networks are
-tiny, and probabilities near 0 and 1 are not lost. Activations are tanh, so that no feature can make a logit
-overflow.
+One encoder for every camera, with the mean and the maximum over the cameras that have reported as context. It
+takes any number of cameras, in any order, where the thesis has a layer over all cameras (5.5). The first argument
+``xp`` is the module, numpy or torch. All arrays are float64: the networks are tiny, and probabilities near 0 and 1
+are not lost. Activations are tanh, so that no feature can make a logit overflow.
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ _COUNT_SCALE = np.log1p(200.0)
 def init_actor(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
     """Initial weights of an actor without preferences: its last layer is small, as is common for PPO."""
     weights = _init_trunk(spec, rng)
-    outputs = len(spec.omegas_ms) or (spec.cameras if spec.network == "flat" else 1)
-    if spec.action == "select" and spec.network == "pooled":
+    outputs = len(spec.omegas_ms) or 1
+    if spec.action == "select":
         weights["own"] = _orthogonal(rng, spec.hidden, spec.hidden, 1.0)
-    weights["out"] = _orthogonal(rng, spec.hidden, outputs or 1, 0.01)
+    weights["out"] = _orthogonal(rng, spec.hidden, outputs, 0.01)
     bias = np.log(spec.start / (1.0 - spec.start)) if spec.action == "select" else 0.0
-    weights["out_b"] = np.full(outputs or 1, bias)
+    weights["out_b"] = np.full(outputs, bias)
     return weights
 
 
@@ -42,29 +41,20 @@ def init_value(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.flo
 
 def logits(xp: Any, spec: Spec, weights: Weights, features: Any) -> Any:
     """Features (B, N, width) to logits: (B, N) of Bernoullis for ``select``, else (B, K) over the omegas."""
-    if spec.action != "select" or spec.network == "flat":
-        return _hidden(xp, spec, weights, features)[0] @ weights["out"] + weights["out_b"]
-    context, own = _hidden(xp, spec, weights, features, activated=False)
+    if spec.action != "select":
+        return _hidden(xp, weights, features)[0] @ weights["out"] + weights["out_b"]
+    context, own = _hidden(xp, weights, features, activated=False)
     each = xp.tanh(own @ weights["own"] + context[:, None, :])
     return (each @ weights["out"] + weights["out_b"])[..., 0]
 
 
-def value(xp: Any, spec: Spec, weights: Weights, features: Any) -> Any:
+def value(xp: Any, weights: Weights, features: Any) -> Any:
     """Features (B, N, width) to state values (B,), in units of the rewards' standard deviation."""
-    return (_hidden(xp, spec, weights, features)[0] @ weights["out"] + weights["out_b"])[..., 0]
+    return (_hidden(xp, weights, features)[0] @ weights["out"] + weights["out_b"])[..., 0]
 
 
-def _hidden(xp: Any, spec: Spec, weights: Weights, features: Any, activated: bool = True) -> tuple[Any, Any]:
+def _hidden(xp: Any, weights: Weights, features: Any, activated: bool = True) -> tuple[Any, Any]:
     """The last hidden layer (B, hidden) and the encoding of each camera (B, N, hidden)."""
-    if spec.network == "flat":
-        batch, cameras, width = features.shape
-        if cameras != spec.cameras:
-            raise ValueError(
-                f"the policy was trained for {spec.cameras} cameras and sees {cameras}: train one with "
-                "network: pooled, which takes any number"
-            )
-        own = xp.tanh(features.reshape(batch, cameras * width) @ weights["in"] + weights["in_b"])
-        return xp.tanh(own @ weights["mid"] + weights["mid_b"]), own
     own = xp.tanh(features @ weights["in"] + weights["in_b"])
     own = xp.tanh(own @ weights["enc"] + weights["enc_b"])
     pooled = _pooled(xp, own, features[..., -1:])
@@ -87,14 +77,6 @@ def _init_trunk(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.fl
     hidden, width = spec.hidden, spec.layout.width
     gain = 5.0 / 3.0  # for tanh
     zeros = np.zeros(hidden)
-    if spec.network == "flat":
-        assert spec.cameras is not None  # checked by Spec
-        return {
-            "in": _orthogonal(rng, spec.cameras * width, hidden, gain),
-            "in_b": zeros.copy(),
-            "mid": _orthogonal(rng, hidden, hidden, gain),
-            "mid_b": zeros.copy(),
-        }
     return {
         "in": _orthogonal(rng, width, hidden, gain),
         "in_b": zeros.copy(),

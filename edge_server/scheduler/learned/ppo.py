@@ -117,7 +117,7 @@ class Learner:
     def value(self, states: Sequence[State]) -> NDArray[np.float64]:
         """V (B,), in the reward's unit."""
         weights = {name: w.detach().numpy() for name, w in self._value.items()}
-        found = networks.value(np, self.spec, weights, self.spec.layout.batch(states))
+        found = networks.value(np, weights, self.spec.layout.batch(states))
         return self._rewards.mean + self._rewards.scale * found
 
     def batch(
@@ -166,7 +166,7 @@ class Learner:
         """``clipped_update``, and the share of the rewards' variance that V explained before it."""
         spec = self.spec
         with torch.no_grad():
-            baseline = networks.value(torch, spec, self._value, features)
+            baseline = networks.value(torch, self._value, features)
         spread = rewards.std(correction=0).item()
         left = (rewards - baseline).std(correction=0).item()
         # A single reward varies against those before it, which standardized it.
@@ -178,7 +178,7 @@ class Learner:
         def evaluate(some: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
             logits = networks.logits(torch, spec, self._actor, features[some])
             now, entropy = log_probability(spec, logits, features[some], actions[some])
-            return now, entropy, networks.value(torch, spec, self._value, features[some])
+            return now, entropy, networks.value(torch, self._value, features[some])
 
         acted = Acted(logps, advantages, rewards)
         return clipped_update(spec, evaluate, acted, self._parameters, self._adam, self._rng["order"]), explained

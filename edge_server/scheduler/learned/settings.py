@@ -18,7 +18,6 @@ W_P, W_S, W_L, W_T = -0.02, 0.2, 0.3, 0.015
 # and Adam's moments half a gigabyte, far more than a decision needs.
 MAX_HIDDEN = 1024
 MAX_OMEGAS = 4096
-MAX_CAMERAS = 4096
 MAX_FIRST_WEIGHTS = 2**22
 
 
@@ -29,8 +28,6 @@ class Spec:
     action: ``select`` chooses a set of cameras, Bernoulli each (5.18-5.20); ``wait``, ``wait-arrived`` and
     ``threshold`` choose one of ``omegas_ms`` (6.34, 6.39).
     layout: the features of a state.
-    network: ``pooled`` shares one encoder among any number of cameras; ``flat`` is the thesis's, whose first
-    layer spans ``cameras`` cameras in their order.
     hidden: width of all layers.
     start: every camera's probability before learning.
     hold_ms: a decision holds until the next multiple of it; 0: every update has one of its own.
@@ -43,8 +40,6 @@ class Spec:
     action: Action
     layout: StateLayout = field(default_factory=lambda: StateLayout(("age",)))
     omegas_ms: tuple[float, ...] = ()
-    network: Literal["pooled", "flat"] = "pooled"
-    cameras: int | None = None
     hidden: int = 64
     start: float = 0.5
     hold_ms: float = 0.0
@@ -67,20 +62,13 @@ class Spec:
         rising = all(a < b for a, b in zip(self.omegas_ms, self.omegas_ms[1:]))
         if not rising or not all(0 <= o <= LONGEST_MS for o in self.omegas_ms):
             raise ValueError(f"omegas_ms: expected values from 0 to {LONGEST_MS:.0f}, rising, got {self.omegas_ms}")
-        if self.network not in ("pooled", "flat"):
-            raise ValueError(f"network {self.network!r} is not known; choose pooled or flat")
-        if (self.network == "flat") != (self.cameras is not None):
-            raise ValueError("cameras: a flat network has a fixed number of them, a pooled one takes any")
-        if self.cameras is not None:
-            require_int("cameras", self.cameras, 1, MAX_CAMERAS)
         require_int("hidden", self.hidden, 1, MAX_HIDDEN)
         require_int("passes", self.passes, 1, 10_000)
         require_int("minibatch", self.minibatch, 1, 2**31)
-        first = self.layout.width * (self.cameras or 1) * self.hidden
+        first = self.layout.width * self.hidden
         if first > MAX_FIRST_WEIGHTS:
             raise ValueError(
-                f"a first layer of {first} weights is larger than any that is trained here: fewer cameras, a "
-                "smaller dim or hidden"
+                f"a first layer of {first} weights is larger than any that is trained here: a smaller dim or hidden"
             )
         if not 0.0 <= self.hold_ms < 1e9:
             raise ValueError(f"hold_ms: expected milliseconds from 0, got {self.hold_ms:g}")
@@ -101,6 +89,9 @@ class Spec:
         """ValueError for what ``as_json`` cannot have written."""
         try:
             values = dict(data)
+            # Written by earlier versions, which had a second network.
+            if values.pop("network", "pooled") != "pooled" or values.pop("cameras", None) is not None:
+                raise ValueError("a flat network, which is read no more: train another policy")
             layout = dict(values.pop("layout"))
             for name in ("parts", "centre", "spread"):
                 layout[name] = tuple(layout[name])

@@ -20,8 +20,8 @@ def scenario(**edge) -> Scenario:
 def test_defaults_and_values():
     assert read_config(load("room")).embedding is None
     assert read_config(scenario(embedding={})).embedding == EmbeddingConfig()
-    found = read_config(scenario(embedding={"dim": 16, "size": 320, "tap": "model.9"})).embedding
-    assert (found.dim, found.size, found.tap) == (16, 320, "model.9")
+    found = read_config(scenario(embedding={"dim": 16, "size": 320})).embedding
+    assert (found.dim, found.size) == (16, 320)
     assert model_path(EmbeddingConfig().model).name == "detector_int8.onnx"
 
 
@@ -38,7 +38,6 @@ def test_a_model_is_relative_to_the_scenario():
         ({"dim": 0}, "edge.embedding.dim: expected a whole number, 1 to 4096, got 0"),
         ({"dim": "32"}, "edge.embedding.dim: expected a whole number"),
         ({"size": 8}, "edge.embedding.size: expected a whole number, 32 to 2048, got 8"),
-        ({"threads": 0}, "edge.embedding.threads"),
         ("default", "edge.embedding: expected a mapping"),
     ],
 )

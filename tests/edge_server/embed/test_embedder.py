@@ -71,16 +71,6 @@ def test_the_size_is_the_files_or_the_scenarios_or_the_exporters(tmp_path):
         embedder(fixed, size=64)
 
 
-def test_a_tap_is_a_tensor_or_a_module(tmp_path):
-    path = detector(tmp_path / "d.onnx")
-    assert embedder(path, tap="fine", dim=4).backbone.channels == 4
-    assert embedder(path, tap="model.0", dim=4).backbone.tap == "fine"
-    with pytest.raises(EmbeddingError, match=r"no tensor and no module is called 'fin'; nearest: fine"):
-        embedder(path, tap="fin")
-    with pytest.raises(EmbeddingError, match="backbone holds Resize"):
-        embedder(path, tap="large")
-
-
 def test_alpha_is_laid_over_gray(tmp_path):
     made = embedder(detector(tmp_path / "d.onnx"))
     clear = np.zeros((32, 32, 4), np.uint8)
@@ -99,12 +89,6 @@ def test_the_real_yolo11n_works_unchanged():
     rows = made.embed(images)
     assert np.isfinite(rows).all() and made.failed == 0
     assert (rows == made.embed(images)).all()
-    # What the author found by hand is the same tensor.
-    by_name = embedder(path, tap="/model.10/cv2/act/Mul_output_0")
-    assert (by_name.pooled(images) == made.pooled(images)).all()
-    assert embedder(path, tap="model.9").backbone.tap == "/model.9/cv2/act/Mul_output_0"
-    with pytest.raises(EmbeddingError, match="another scale for every image"):
-        embedder(path, tap="/model.9/cv2/act/Mul_output_0_quantized")
 
 
 @pytest.mark.parametrize("file", [MODELS / "detector_int8.onnx", "default"])

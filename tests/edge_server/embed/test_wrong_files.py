@@ -58,11 +58,16 @@ def test_every_kind_of_damage_ends_in_one_line(tmp_path):
 
 
 def test_a_classifier_and_a_plain_enlargement_are_no_detectors(tmp_path):
-    refused(detector(tmp_path / "c.onnx", neck=False), "not a YOLO detection model; if it is one, name")
+    refused(detector(tmp_path / "c.onnx", neck=False), "not a YOLO detection model")
     model = onnx.load(str(detector(tmp_path / "d.onnx")))
     model.graph.node[5].CopyFrom(node("Relu", ["large"], "joined"))  # enlarged, but joined with nothing
     onnx.save(model, str(tmp_path / "e.onnx"))
     refused(tmp_path / "e.onnx", "not a YOLO detection model")
+
+
+def test_a_backbone_quantised_image_by_image_cannot_be_averaged(tmp_path):
+    quantised = helper.make_node("DynamicQuantizeLinear", ["end"], ["q", "scale", "zero"])
+    refused(detector(tmp_path / "q.onnx", extra=(quantised,)), "q is quantised with another scale for every image")
 
 
 def test_inputs_of_another_kind(tmp_path):

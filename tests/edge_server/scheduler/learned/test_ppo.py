@@ -58,12 +58,6 @@ def test_a_batch_of_one_decision_learns_against_the_value():
         assert better * (after[0, actions[0]] - before[0]) > 0.0
 
 
-def test_a_flat_network_learns_as_the_thesis_has_it():
-    learner = Learner(select(network="flat", cameras=6), 0)
-    teach(learner, FreshOnes(), 16)
-    assert regret(learner, FreshOnes()) < 0.05
-
-
 def test_a_checkpoint_goes_on_bit_for_bit(tmp_path):
     through, stopped = Learner(select(), 3), Learner(select(), 3)
     teach(through, FreshOnes(), 4)
@@ -146,8 +140,6 @@ def test_a_file_that_is_no_whole_checkpoint_is_refused_in_one_line(tmp_path, wha
 
 LARGE = {
     "hidden": {"hidden": 30_000},
-    "cameras": {"network": "flat", "cameras": 10**9},
-    "cameras times width": {"network": "flat", "cameras": 4000, "hidden": 1024},
     "dim": {"layout": {"parts": ["age", "semantics"], "dim": 10**9}},
     "omegas": {"action": "wait", "omegas_ms": list(range(10**5))},
 }
