@@ -71,21 +71,3 @@ def test_the_command_compares_and_goes_on(tmp_path: Path, capsys, monkeypatch):
     assert found["policies"]["all"]["psnr_db"][0] > 5.0
     known = (tmp_path / "known.jsonl").read_bytes()
     assert compare.main(words) == 0 and (tmp_path / "known.jsonl").read_bytes() == known
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["small", "hope"], "hope"),
-        (["small", "all", "--slower", "0"], "--slower 0"),
-        (["small", "all", "--channel", "sms"], "sms"),
-        (["nowhere", "all"], "shipped scenarios"),
-    ],
-)
-def test_what_cannot_be_compared_is_refused_in_one_line(words, said, tmp_path: Path, capsys, monkeypatch):
-    monkeypatch.setattr(compare, "compare", lambda *_: pytest.fail("was computed"))
-    (tmp_path / "small.yaml").write_text(yaml.safe_dump(RAW))
-    name = str(tmp_path / "small.yaml") if words[0] == "small" else words[0]
-    assert compare.main([name, *words[1:], "--jobs", "1"]) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1

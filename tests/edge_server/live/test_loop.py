@@ -218,35 +218,24 @@ def test_a_camera_that_never_reports_does_not_hold_the_others_up(running):
     assert any("1 of 2" in line for line in run.lines)
 
 
-def test_a_field_that_fails_at_a_checkpoint_ends_the_loop_and_tells_who_asked(tmp_path):
+@pytest.mark.parametrize("where", ["checkpoint", "fit"])
+def test_a_field_that_fails_ends_the_loop_and_tells_who_asked_for_a_checkpoint(where, tmp_path):
     u = updates(cameras=("cam01",))
     run = Running(u)
 
-    def broken(path):
+    def broken(*_):
         raise RuntimeError("its thread has failed")
 
-    run.loop._on_checkpoint = broken
     now = run.clock.now_ns()
     u.buffer.put(frame("cam01", generated_ns=now), now)
-    future = run.loop.request_checkpoint(tmp_path / "field.npz")
-    run.loop.start()
-    with pytest.raises(RuntimeError, match="thread has failed"):
-        future.result(30)
-    run.loop._thread.join(30)
-    assert isinstance(run.loop.failure, RuntimeError)
-
-
-def test_a_failing_field_ends_the_loop_and_is_not_hidden():
-    u = updates()
-
-    def broken(views, budget):
-        raise RuntimeError("no memory")
-
-    u.field.fit = broken
-    run = Running(u)
-    now = run.clock.now_ns()
-    u.buffer.put(frame("cam01", generated_ns=now), now)
-    u.buffer.put(frame("cam02", generated_ns=now), now)
+    if where == "fit":
+        u.field.fit = broken
+    else:
+        run.loop._on_checkpoint = broken
+        future = run.loop.request_checkpoint(tmp_path / "field.npz")
     run.loop.start()
     run.loop._thread.join(60)
     assert isinstance(run.loop.failure, RuntimeError)
+    if where == "checkpoint":
+        with pytest.raises(RuntimeError, match="thread has failed"):
+            future.result(30)

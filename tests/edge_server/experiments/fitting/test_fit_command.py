@@ -146,25 +146,6 @@ def test_an_instant_of_a_recording_and_scores_on_training_views(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--option", "levels"], "expected KEY=VALUE"),
-        (["--option", "color=1"], "no option color"),
-        (["--field", "nothing"], "field 'nothing' is not known; there are: ngp"),
-        (["--seconds", "0"], "--seconds 0"),
-        (["--holdout", "x"], "no image or camera 'x'"),
-        (["--scale", "0.5"], "scale is 0.5"),
-        (["--resume"], "no fit to go on from"),
-    ],
-)
-def test_what_cannot_work_is_refused_in_one_line(tmp_path, capsys, words, message):
-    write_photos(tmp_path / "set", 3)
-    assert fit(tmp_path / "set", tmp_path / "out", *words) == 2
-    said = capsys.readouterr().err
-    assert message in said and said.count("\n") == 1
-
-
-@pytest.mark.parametrize(
     ("values", "message"),
     [
         ({"fl_x": 1e307}, "no lens for an image of 32 x 32"),
@@ -181,21 +162,6 @@ def test_cameras_that_a_field_refuses_are_refused_in_one_line(tmp_path, capsys, 
     assert fit(tmp_path / "set", tmp_path / "out", "--seconds", "0.1") == 2
     said = capsys.readouterr().err
     assert message in said and said.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--scale", "0"], "--scale 0: expected more than 0"),
-        (["--scale", "-1"], "--scale -1: expected more than 0"),
-        (["--holdout", "0"], "--holdout is for data sets; the scene tile holds out cam00"),
-        (["--format", "colmap"], "--format is for data sets"),
-    ],
-)
-def test_what_a_scene_of_ours_cannot_do_is_refused_in_one_line(tmp_path, capsys, words, message):
-    assert fit("tile", tmp_path / "out", *words) == 2
-    said = capsys.readouterr().err
-    assert message in said and said.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
 def test_marks_end_with_the_whole_and_leave_a_long_last_slice():

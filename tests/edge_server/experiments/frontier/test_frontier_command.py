@@ -154,21 +154,3 @@ def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_sweep):
     said = capsys.readouterr().out
     assert "figure 2 left out" in said and said.endswith("for this scene: update_ms: any\n")
     assert (tmp_path / "out" / "frontier.png").exists() and not (tmp_path / "out" / "updates.png").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--policy", "best"], "policy 'best' is not known"),
-        (["--scene", "nowhere"], "no such file or folder"),
-        (["--seeds", "0"], "--seeds 0"),
-        (["--field", "splot"], "field 'splot' is not known (did you mean splat?); there are: ngp"),
-        (["--option", "x"], "expected KEY=VALUE"),
-        (["--field", "ngp", "--option", "levels=99"], "levels: expected a whole number"),
-        (["--field", "ngp", "--option", "contracted=maybe"], "contracted: expected"),
-        (["--policy", "threshold:soon"], "'soon' is not a number"),
-    ],
-)
-def test_what_cannot_work_is_refused(tmp_path, capsys, words, message):
-    assert edge_server(["frontier", "--quick", "--out", str(tmp_path), *words]) == 2
-    assert message in capsys.readouterr().err

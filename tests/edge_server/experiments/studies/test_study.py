@@ -204,29 +204,6 @@ def test_a_study_writes_rows_verdicts_and_a_page(tmp_path: Path):
     assert {row["case"] for row in csv.DictReader((tmp_path / "metrics.csv").open())} >= {"Gaussian blur"}
 
 
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        (["mat", "--seeds", "0"], "--seeds"),
-        (["mat", "--scene", "moon"], "moon"),
-        (["mat", "--scene", "cell"], "its camera moves"),
-        (["mat", "--jobs", "0"], "--jobs"),
-        (["mat", "--channel", "nowhere.yaml"], "nowhere.yaml"),
-        (["mat", "--channel", "sms"], "sms"),
-        (["metrics", "--channel", "ch5"], "--channel is for mat"),
-        (["preferences", "--scene", "tower", "--jobs", "1"], "its cameras look outward"),
-        (["ppo-wait", "--scene", "tower"], "scenes of its own"),
-        (["mat", "--case", "room"], "--case is for ppo-select"),
-        (["mat", "--episodes", "3"], "--episodes is for ppo-select"),
-        (["ppo-wait", "--case", "ch7"], "none has 'ch7' in its name"),
-    ],
-)
-def test_bad_requests_get_one_line(words: list[str], why: str, tmp_path: Path, capsys):
-    assert main([*words, "--quick", "--out", str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert why in error and error.count("\n") == 1
-
-
 def test_a_study_without_rows_of_a_claim_says_nothing_of_it(tmp_path: Path):
     study = STUDIES["images"]
     empty = Study(study.name, study.title, lambda _: [], lambda cases, _: [], study.metrics, study.claims, study.panels)

@@ -167,25 +167,6 @@ def test_the_curve_is_drawn_with_gaps(tmp_path: Path):
     assert (tmp_path / "curve.png").stat().st_size > 5_000
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["nowhere"], "shipped scenarios"),
-        (["room", "--parts", "age,smell"], "no smell"),
-        (["room", "--jobs", "0"], "--jobs"),
-        (["room", "--episodes", "0"], "episodes"),
-        (["room", "--field", "nope"], "--field: expected one of ngp"),
-        (["room", "--omegas", "20,60"], "--kind select chooses cameras"),
-        (["room", "--kind", "wait", "--omegas", "20,soon"], "expected milliseconds such as"),
-        (["room", "--price", "-1"], "--price: expected 0 or more"),
-    ],
-)
-def test_what_cannot_be_trained_is_refused_in_one_line(words, said, tmp_path: Path, capsys):
-    assert main([*words, "--out", str(tmp_path / "out")]) == 2
-    text = capsys.readouterr().err
-    assert said in text and text.count("\n") == 1
-
-
 def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, capsys):
     asked = "--kind threshold --omegas 50,200 --episodes 2 --batch 1 --decisions 1 --fit-steps 2 --size 24"
     words, out = command_line(tmp_path, asked)

@@ -31,23 +31,6 @@ def test_a_capture_is_planned_and_written(tmp_path, capsys):
     assert "4 views" in said and "m away" in said and "held out: PSNR" in said
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["tile", "--budget", "many"], "expected views"),
-        (["tile", "--budget", "0"], "at least 1 view"),
-        (["tile", "--budget", "4", "--selector", "best"], "selector 'best' is not known; there are: random"),
-        (["tile", "--budget", "4", "--travel", "-1"], "--travel"),
-        (["tile", "--budget", "4", "--selector", "ppo:none.npz"], "not a viewpoint policy"),
-        (["nowhere", "--budget", "4"], "nowhere"),
-        (["tower", "--budget", "4"], "its cameras look outward"),
-    ],
-)
-def test_wrong_requests_say_what_was_expected(words, said, capsys, tmp_path):
-    assert main(["viewpoints", *words, "--out", str(tmp_path)]) == 2
-    assert said in capsys.readouterr().err and not list(tmp_path.iterdir())
-
-
 def test_budgets_as_people_type_them():
     assert read_budget("8") == Budget(8) and read_budget("2.5m") == Budget(None, 2.5)
     assert read_budget("8,2.5m") == Budget(8, 2.5)

@@ -93,23 +93,6 @@ def test_files_are_written_as_a_live_run_has_them(tmp_path: Path, capsys):
     assert build_report(out)["notes"][-1] == "cam01 was bumped"
 
 
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        (["--compute", "x"], "--compute x"),
-        (["--policy", "hope"], "hope"),
-        (["--policy", "threshold:soon"], "soon"),
-        (["--policy", "wait:1e308"], "omega_ms: expected 0 to 3600000, got 1e+308"),
-        (["--seconds", "0"], "--seconds"),
-        (["--compute=-1:0"], "--compute"),
-    ],
-)
-def test_bad_requests_get_one_line(tmp_path: Path, capsys, words: list[str], why: str):
-    assert main([str(write(tmp_path)), *words]) == 2
-    error = capsys.readouterr().err
-    assert why in error and error.count("\n") == 1
-
-
 def test_the_scenario_says_zero_or_milliseconds():
     def config(compute: Any):
         data = {"name": "x", "cameras": {"count": 2}, "edge": {"compute": compute}}

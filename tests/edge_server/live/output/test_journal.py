@@ -42,17 +42,12 @@ def test_a_score_that_never_comes_holds_nothing_up(tmp_path):
 def test_status_and_ages_are_json_with_nulls_not_nan(tmp_path):
     journal = Journal(tmp_path, lambda: {"updates": {"count": 3}})
     journal.ages(0.25, {"cam01": 12.3456, "cam02": None})
+    journal.ages(0.5, {"cam01": 12.0}, {"cam01": 212.3456})
     journal.close()
     assert json.loads((tmp_path / "edge.json").read_text()) == {"updates": {"count": 3}}
-    assert lines(tmp_path / "ages.jsonl") == [{"t_s": 0.25, "age_ms": {"cam01": 12.346, "cam02": None}}]
-
-
-def test_ages_of_depth_stand_beside_those_of_frames(tmp_path):
-    journal = Journal(tmp_path, dict)
-    journal.ages(0.25, {"cam01": 12.0, "cam02": None}, {"cam01": 212.3456})
-    journal.close()
-    (line,) = lines(tmp_path / "ages.jsonl")
-    assert line == {"t_s": 0.25, "age_ms": {"cam01": 12.0, "cam02": None}, "depth_age_ms": {"cam01": 212.346}}
+    without_depth, with_depth = lines(tmp_path / "ages.jsonl")
+    assert without_depth == {"t_s": 0.25, "age_ms": {"cam01": 12.346, "cam02": None}}
+    assert with_depth == {"t_s": 0.5, "age_ms": {"cam01": 12.0}, "depth_age_ms": {"cam01": 212.346}}
 
 
 def test_a_second_process_adds_to_what_the_first_wrote(tmp_path):

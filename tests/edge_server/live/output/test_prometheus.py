@@ -25,14 +25,13 @@ class Growing(Counter):
             yield item
 
 
+def ingest(rejected, depth=None):
+    check_ms = SimpleNamespace(percentile=lambda percent: 1.0)
+    return SimpleNamespace(rejected=rejected, depth=depth or {}, buffer=SimpleNamespace(shed=2), check_ms=check_ms)
+
+
 def test_a_reason_that_comes_while_metrics_are_read_does_not_fail_them():
-    ingest = SimpleNamespace(
-        rejected=Growing(crc=4, stale=1),
-        depth={},
-        buffer=SimpleNamespace(shed=2),
-        check_ms=SimpleNamespace(percentile=lambda percent: None),
-    )
-    found = {metric.name: metric for metric in EdgeCollector(bare_state(), ingest).collect()}
+    found = {metric.name: metric for metric in EdgeCollector(bare_state(), ingest(Growing(crc=4, stale=1))).collect()}
     rejected = {s.labels["reason"]: s.value for s in found["freshfield_frames_rejected"].samples}
     assert rejected == {"crc": 4.0, "stale": 1.0}
     assert not any("depth" in name for name in found)
@@ -40,13 +39,8 @@ def test_a_reason_that_comes_while_metrics_are_read_does_not_fail_them():
 
 def test_depth_has_metrics_where_a_camera_sends_it():
     state = bare_state()
-    ingest = SimpleNamespace(
-        rejected={},
-        depth={"cam01": DepthArrivals(3, 2500, state.now_ns() - 10**9)},
-        buffer=SimpleNamespace(shed=0),
-        check_ms=SimpleNamespace(percentile=lambda percent: None),
-    )
-    found = {m.name: m.samples[0] for m in EdgeCollector(state, ingest).collect() if "depth" in m.name}
+    depth = {"cam01": DepthArrivals(3, 2500, state.now_ns() - 10**9)}
+    found = {m.name: m.samples[0] for m in EdgeCollector(state, ingest({}, depth)).collect() if "depth" in m.name}
     assert {name: sample.labels for name, sample in found.items()} == {name: {"camera": "cam01"} for name in found}
     assert found["freshfield_depth_frames"].value == 3 and found["freshfield_depth_bytes"].value == 2500
     assert 1.0 <= found["freshfield_depth_age_seconds"].value < 30.0
@@ -58,17 +52,8 @@ def test_every_query_of_the_dashboard_names_a_metric_that_the_edge_exports():
     scores = {"psnr_db": 20.0, "psnr_moving_db": 15.0, "ssim": 0.8, "lpips": 0.2, "scored_on": "cam00"}
     state.publish(Publication(3, 1.5, 10**9, None, ("cam01",), (10.0,), 15.0, 5.0, **scores), None)
     registry = CollectorRegistry()
-    registry.register(
-        EdgeCollector(
-            state,
-            SimpleNamespace(
-                rejected={"crc": 4},
-                depth={"cam01": DepthArrivals(3, 2500, state.now_ns())},
-                buffer=SimpleNamespace(shed=2),
-                check_ms=SimpleNamespace(percentile=lambda percent: 1.0),
-            ),
-        )
-    )
+    depth = {"cam01": DepthArrivals(3, 2500, state.now_ns())}
+    registry.register(EdgeCollector(state, ingest({"crc": 4}, depth)))
     exported = set(re.findall(r"^(\w+)[{ ]", generate_latest(registry).decode(), re.MULTILINE)) - {"#"}
     dashboard = json.loads((ROOT / "deploy/grafana.json").read_text())
     queries = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]

@@ -1,0 +1,100 @@
+"""What a command cannot do is refused in one line, with exit status 2, and nothing is written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from edge_server.cli import main
+from tests.edge_server.experiments.rollouts.small import RAW
+from tests.edge_server.experiments.sets import SMALL_WORDS, write_photos
+
+# Of each command, words that it cannot work with, and what it says. SMALL: a scenario, SET: a data set.
+REFUSED = {
+    "compare": [
+        ("SMALL hope", "hope"),
+        ("SMALL all --slower 0", "--slower 0"),
+        ("SMALL all --channel sms", "sms"),
+        ("nowhere all", "shipped scenarios"),
+    ],
+    "fit": [
+        ("SET --option levels", "expected KEY=VALUE"),
+        ("SET --option color=1", "no option color"),
+        ("SET --field nothing", "field 'nothing' is not known; there are: ngp"),
+        ("SET --seconds 0", "--seconds 0"),
+        ("SET --holdout x", "no image or camera 'x'"),
+        ("SET --scale 0.5", "scale is 0.5"),
+        ("SET --resume", "no fit to go on from"),
+        ("tile --scale 0", "--scale 0: expected more than 0"),
+        ("tile --scale -1", "--scale -1: expected more than 0"),
+        ("tile --holdout 0", "--holdout is for data sets; the scene tile holds out cam00"),
+        ("tile --format colmap", "--format is for data sets"),
+    ],
+    "frontier": [
+        ("--policy best", "policy 'best' is not known"),
+        ("--scene nowhere", "no such file or folder"),
+        ("--seeds 0", "--seeds 0"),
+        ("--field splot", "field 'splot' is not known (did you mean splat?); there are: ngp"),
+        ("--option x", "expected KEY=VALUE"),
+        ("--field ngp --option levels=99", "levels: expected a whole number"),
+        ("--field ngp --option contracted=maybe", "contracted: expected"),
+    ],
+    "simulate": [
+        ("SMALL --compute x", "--compute x"),
+        ("SMALL --policy threshold:soon", "'soon' is not a number"),
+        ("SMALL --policy wait:1e308", "omega_ms: expected 0 to 3600000, got 1e+308"),
+        ("SMALL --seconds 0", "--seconds"),
+        ("SMALL --compute=-1:0", "--compute"),
+    ],
+    "study": [
+        ("mat --seeds 0", "--seeds"),
+        ("mat --scene moon", "moon"),
+        ("mat --scene cell", "its camera moves"),
+        ("mat --channel nowhere.yaml", "nowhere.yaml"),
+        ("metrics --channel ch5", "--channel is for mat"),
+        ("preferences --scene tower", "its cameras look outward"),
+        ("ppo-wait --scene tower", "scenes of its own"),
+        ("mat --case room", "--case is for ppo-select"),
+        ("mat --episodes 3", "--episodes is for ppo-select"),
+        ("ppo-wait --case ch7", "none has 'ch7' in its name"),
+    ],
+    "train-scheduler": [
+        ("nowhere", "shipped scenarios"),
+        ("room --parts age,smell", "no smell"),
+        ("room --jobs 0", "--jobs"),
+        ("room --episodes 0", "episodes"),
+        ("room --field nope", "--field: expected one of ngp"),
+        ("room --omegas 20,60", "--kind select chooses cameras"),
+        ("room --kind wait --omegas 20,soon", "expected milliseconds such as"),
+        ("room --price -1", "--price: expected 0 or more"),
+    ],
+    "viewpoints": [
+        ("tile --budget many", "expected views"),
+        ("tile --budget 0", "at least 1 view"),
+        ("tile --budget 4 --selector best", "selector 'best' is not known; there are: random"),
+        ("tile --budget 4 --travel -1", "--travel"),
+        ("tile --budget 4 --selector ppo:none.npz", "not a viewpoint policy"),
+        ("nowhere --budget 4", "nowhere"),
+    ],
+}
+QUICK = {"fit": SMALL_WORDS, "frontier": ["--quick"], "study": ["--quick"]}
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "said"), [(command, *row) for command, rows in REFUSED.items() for row in rows]
+)
+def test_what_cannot_be_done_is_refused_in_one_line(
+    command: str, words: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(RAW))
+    if "SET" in words:
+        write_photos(tmp_path / "set", 3)
+    places = {"SMALL": str(tmp_path / "small.yaml"), "SET": str(tmp_path / "set")}
+    given = [places.get(word, word) for word in words.split()]
+    out = ["--json" if command == "compare" else "--out", str(tmp_path / "out")]
+    assert main([command, *QUICK.get(command, []), *given, *out]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+    assert not any(path.is_file() and path.stat().st_size for path in (tmp_path / "out").rglob("*"))
