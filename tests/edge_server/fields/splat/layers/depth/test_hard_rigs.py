@@ -1,6 +1,7 @@
 """Four cameras with depth in scenes and rigs that deceive sensors: what depth must still be worth there.
 
-A ball moves on a plate. Each case is compared with the same images without depth, or with the easy scene.
+A ball moves on a plate. Each case is compared with the same images without depth, or with the easy scene, and says
+after how many seconds of virtual time the picture has recovered.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ SMALL = SplatSettings(gaussians=1200, start=700, seed_cells=32, densify_every=20
 RIG = ring(9)
 CAMERAS, HELD = [RIG[0], RIG[2], RIG[4], RIG[6]], RIG[1]
 FRAME_S, FRAMES = 1.0 / 15.0, 36
+HALF_SECOND, LATER_S = 8, 0.2  # frames; another kind of processor rounds otherwise, and training amplifies that
+DARK = range(18, 22)  # frames
 MIRROR_Y, PANE_Y = 0.85, -0.85  # planes behind and before the plate, as wide as it and 1 m high
 PATCHES = np.kron(np.random.default_rng(4).random((12, 12)) < 0.4, np.ones((4, 4), bool))
 
@@ -83,13 +86,17 @@ def _turned(view: View, degrees: float) -> View:
 class Case:
     """world: what is there. placed: where the cameras really stand. told: what reaches the field of camera k's frame.
     gains_db: how much better than without depth the held-out view must be; None: not compared. below_easy_db: how much
-    worse than in the easy scene it may be."""
+    worse than in the easy scene it may be. recovers_s: measured, see ``_recovered_s``; since the first frame, or since
+    frame ``over``."""
+
+    recovers_s: float
 
     world: World = _plain
     placed: Callable[[int, View], View] = lambda k, view: view
     told: Callable[[int, int, View], View] = lambda k, frame, view: view
     gains_db: float | None = None
     below_easy_db: float | None = None
+    over: int = 0
 
 
 def _scaled(unit: float) -> Callable[[int, int, View], View]:
@@ -112,18 +119,23 @@ def _near(k: int, frame: int, view: View) -> View:
 
 
 CASES = {
-    "mirror": Case(_mirror, gains_db=1.5),
-    "glass": Case(_glass, gains_db=1.0),
-    "two thirds out of range": Case(told=_near, gains_db=0.7),
-    "scale 5 % off": Case(told=_of_first(lambda v: replace(v, depth=v.depth * np.float32(1.05))), below_easy_db=1.5),
-    "pose 3 degrees off": Case(told=_of_first(lambda v: _turned(v, 3.0)), gains_db=-0.3),
-    "two at one place": Case(placed=lambda k, view: CAMERAS[1] if k == 0 else view, gains_db=2.0),
-    "nothing in common": Case(placed=lambda k, view: _turned(view, (-24.0, 24.0, -24.0, 24.0)[k]), gains_db=0.4),
-    "light off": Case(
-        told=lambda k, frame, v: replace(v, image=v.image // 40) if 18 <= frame < 22 else v, below_easy_db=1.0
+    "mirror": Case(0.0, _mirror, gains_db=1.5),
+    "glass": Case(0.7, _glass, gains_db=1.0),
+    "two thirds out of range": Case(1.1, told=_near, gains_db=0.7),
+    "scale 5 % off": Case(
+        1.1, told=_of_first(lambda v: replace(v, depth=v.depth * np.float32(1.05))), below_easy_db=1.5
     ),
-    "a third as large": Case(told=_scaled(1.0 / 3.0), below_easy_db=1.0),
-    "twice as large": Case(told=_scaled(2.0), below_easy_db=1.0),
+    "pose 3 degrees off": Case(0.7, told=_of_first(lambda v: _turned(v, 3.0)), gains_db=-0.3),
+    "two at one place": Case(0.6, placed=lambda k, view: CAMERAS[1] if k == 0 else view, gains_db=2.0),
+    "nothing in common": Case(0.3, placed=lambda k, view: _turned(view, (-24.0, 24.0, -24.0, 24.0)[k]), gains_db=0.4),
+    "light off": Case(
+        0.1,
+        told=lambda k, frame, v: replace(v, image=v.image // 40) if frame in DARK else v,
+        below_easy_db=1.0,
+        over=DARK.stop,
+    ),
+    "a third as large": Case(0.8, told=_scaled(1.0 / 3.0), below_easy_db=1.0),
+    "twice as large": Case(1.0, told=_scaled(2.0), below_easy_db=1.0),
 }
 
 
@@ -136,9 +148,9 @@ def _ball_m(instant_s: float) -> Array:
     return np.array([0.25 * np.cos(3 * instant_s), 0.25 * np.sin(3 * instant_s), 0.5])
 
 
-def _shown(case: Case, depth: bool) -> float:
-    """PSNR of the held-out view at the end. depth: whether frames bring it."""
-    field = LayeredField(SMALL)
+def _curve(case: Case, depth: bool) -> list[float]:
+    """PSNR of the held-out view after each frame. depth: whether frames bring it."""
+    field, shown_db = LayeredField(SMALL), []
     for frame in range(FRAMES):
         views = []
         for k, camera in enumerate(CAMERAS):
@@ -148,23 +160,33 @@ def _shown(case: Case, depth: bool) -> float:
             told = case.told(k, frame, named)
             views.append(told if depth else replace(told, depth=None))
         field.fit(views, Budget(steps=20))
-    truth = case.world(HELD, _ball_m((FRAMES - 1) * FRAME_S))
-    last = case.told(len(CAMERAS), FRAMES, truth)
-    color = field.snapshot().render(last.camera_to_world, last.intrinsics).color
-    assert np.isfinite(color).all() and field.layered and len(field.cameras) == len(CAMERAS)
-    return psnr(color, truth.image / 255.0)
+        truth = case.world(HELD, _ball_m(frame * FRAME_S))
+        last = case.told(len(CAMERAS), FRAMES, truth)
+        color = field.snapshot().render(last.camera_to_world, last.intrinsics).color
+        assert np.isfinite(color).all()
+        shown_db.append(psnr(color, truth.image / 255.0))
+    assert field.layered and len(field.cameras) == len(CAMERAS)
+    return shown_db
 
 
 @cache
 def _easy_db() -> float:
-    return _shown(Case(), True)
+    return _curve(Case(0.0), True)[-1]
+
+
+def _recovered_s(curve: list[float], over: int) -> float:
+    """Seconds after frame ``over`` from which on each half second's mean is within 1 dB of the last one's."""
+    means = np.convolve(curve, np.full(HALF_SECOND, 1.0 / HALF_SECOND), "valid")
+    below = np.flatnonzero(means < means[-1] - 1.0)
+    return max(int(below[-1]) + 1 - over if len(below) else 0, 0) * FRAME_S
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_depth_is_worth_something_where_sensors_are_deceived(name: str) -> None:
     case = CASES[name]
-    shown_db = _shown(case, True)
+    curve = _curve(case, True)
     if case.gains_db is not None:
-        assert shown_db > _shown(case, False) + case.gains_db
+        assert curve[-1] > _curve(case, False)[-1] + case.gains_db
     if case.below_easy_db is not None:
-        assert shown_db > _easy_db() - case.below_easy_db
+        assert curve[-1] > _easy_db() - case.below_easy_db
+    assert _recovered_s(curve, case.over) <= case.recovers_s + LATER_S
