@@ -342,7 +342,13 @@ def source_config(scenario: Scenario) -> SourceConfig:
         raise ScenarioError(f"{where}.kind: expected one of {', '.join(MODELS)}, got {kind!r}")
     with errors_of(f"{where}.kind"):
         model = MODELS.get(kind) or own_class(kind)[1]
-    return read_settings(model, scenario.source, where)
+    config = read_settings(model, scenario.source, where)
+    if scenario.phase != "locked" and not isinstance(config, WorldConfig):
+        raise ScenarioError(
+            f"{scenario.path}: cameras.phase: {scenario.phase} is for source.kind world alone, others capture when "
+            "they can: remove phase"
+        )
+    return config
 
 
 def own_class(kind: str) -> tuple[type[Source], type[SourceConfig]]:

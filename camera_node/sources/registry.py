@@ -49,11 +49,6 @@ def open_sources(
         from camera_node.synthetic.source import open_sources as open_world
 
         return open_world(scenario, config, cameras, data, effects)
-    if scenario.phase != "locked":
-        raise ScenarioError(
-            f"{scenario.path}: cameras.phase: {scenario.phase} needs source.kind world; other cameras "
-            "capture when they can"
-        )
     sources: dict[str, Source]
     if config.kind not in MODELS:
         with errors_of(f"{scenario.path}: source"):

@@ -68,7 +68,8 @@ def parser() -> argparse.ArgumentParser:
         "demo",
         help="run a scenario on this machine: all its processes, the page, then a report",
         description="Starts every process of a scenario on this machine, shows its page and writes a report at the "
-        "end. Ctrl-C or --for ends it. Exit status: 0 ended as asked, 1 a process died, 2 it could not start.",
+        "end. Ctrl-C, --for or the end of a replayed recording ends it. Exit status: 0 ended so, 1 a process died, "
+        "2 it could not start.",
     )
     demo_command.add_arguments(demo)
     scenario_command.add_arguments(

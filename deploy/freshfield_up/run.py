@@ -136,6 +136,10 @@ class Launcher:
         load, next_line_s, next_sample_s = LoadMeter(), 0.0, 0.0
         while not self._stop_requested.wait(TICK_S):
             now_s = time.monotonic()
+            node = self.processes.node.process
+            if self._ready_s is not None and node is not None and node.poll() == 0:
+                self._say("the recording is over")
+                return
             if not self._check_alive():
                 return
             if self._ready_s is None:

@@ -67,6 +67,7 @@ def test_a_folder_that_is_there_already_is_not_written_into(tmp_path, capsys):
     ("section", "wrong"),
     [
         ("source: {kind: world, scene: room, fps: fast}", "source.fps"),
+        ("source: {kind: mcap, file: a.mcap}", "cameras.phase: spread is for source.kind world alone"),
         ("source: {kind: world, scene: castle}", "source: .*castle"),
         ("source: {kind: world, effects: {rain: null}}", "source.effects: effect 'rain' is not known"),
         ("source: {kind: world, effects: {sensor_noise: {x: 3}}}", "sensor_noise.x: unknown key"),
@@ -85,7 +86,7 @@ def test_a_folder_that_is_there_already_is_not_written_into(tmp_path, capsys):
 def test_check_reads_every_section(section, wrong, tmp_path, capsys):
     file = tmp_path / "mine.yaml"
     source = "" if section.startswith("source") else "source: {kind: world, scene: room}\n"
-    file.write_text(f"cameras: {{count: 4}}\n{source}{section.replace('OWN', str(OWN))}\n")
+    file.write_text(f"cameras: {{count: 4, phase: spread}}\n{source}{section.replace('OWN', str(OWN))}\n")
     assert re.search(wrong, refused(capsys, "scenario", "check", str(file)))
 
 

@@ -160,6 +160,21 @@ def test_a_process_that_dies_ends_the_run_is_named_and_the_others_are_stopped(
     assert rows[0]["edge"]["pid"] == made.edge.pid and "machine" in rows[0]
 
 
+def test_a_recording_that_is_over_ends_the_run_well(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Processes that only sleep stand for edge, emulator and node."""
+    monkeypatch.setattr(launcher.signal, "signal", lambda *_: None)
+    sleeps = [[sys.executable, "-c", f"import time; time.sleep({seconds})"] for seconds in (60, 60, 0.5)]
+    children = [Child(f"{k}", f"{k}", words, tmp_path / f"{k}.txt") for k, words in enumerate(sleeps)]
+    monkeypatch.setattr(launcher, "process_set", lambda *_: ProcessSet(*children, "127.0.0.1:1", ""))
+    (tmp_path / "small.yaml").write_text(SMALL)
+    run = launcher.Launcher(load(tmp_path / "small.yaml"), launcher.Options(tmp_path / "run", port=free_port()))
+    monkeypatch.setattr(run, "_continue_start", lambda now_s: setattr(run, "_ready_s", now_s))
+    assert run.run() == 0
+    assert "the recording is over" in capfd.readouterr().out
+
+
 def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """``freshfield demo room | head -3``; processes that only sleep stand for edge, emulator and node."""
     monkeypatch.setattr(launcher.signal, "signal", lambda *_: None)
