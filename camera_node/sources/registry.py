@@ -18,7 +18,7 @@ from camera_node.settings import (
     own_class,
 )
 from camera_node.sources.base import Source
-from freshfield.scenario import Scenario, ScenarioError
+from freshfield.scenario import Scenario
 
 if TYPE_CHECKING:
     from camera_node.synthetic.effects import Effects

@@ -52,9 +52,13 @@ SHORTEST_FOCAL, LONGEST_FOCAL = 0.2, 8.0
 MIN_SHARED, FEW_SHARED = 2, 5
 # Reprojection errors beyond it count linearly (Huber), and below it a view is never left out.
 ROBUST_PX, OUTLIER_PX = 1.0, 1.0
+# A median error beyond it: pictures of one moment are not of one instant. A usual rig has less than half a pixel.
+LARGEST_PX = 5.0
 # Levenberg-Marquardt: share of the diagonal added at first and at most, steps, and the relative gain that ends it.
 FIRST_DAMPING, LAST_DAMPING, MOST_STEPS, SMALLEST_GAIN = 1e-3, 1e12, 100, 1e-9
 # Of a video, moments so far apart; the target stands still if its corners move by less between two frames.
 MOMENT_S, STILL_PX = 0.5, 0.5
 # A live moment is new where the target has moved by this share of the image's width.
 NEW_SHARE = 0.05
+# A live camera without a new frame for so long shows nothing at that moment.
+LIVE_WAIT_S = 1.0

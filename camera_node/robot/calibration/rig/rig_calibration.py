@@ -12,7 +12,7 @@ import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.rig.bundle_adjustment import Bundle, Sighting, adjust
-from camera_node.robot.calibration.settings import FEW_SHARED, MIN_SHARED, OUTLIER_ERROR, OUTLIER_PX
+from camera_node.robot.calibration.settings import FEW_SHARED, LARGEST_PX, MIN_SHARED, OUTLIER_ERROR, OUTLIER_PX
 from camera_node.robot.calibration.targets import Array, Corners, estimate_pose
 from camera_node.sources.rig_calibration import calibration_entry
 from freshfield.geometry import Pinhole, se3_inverse, so3_log
@@ -99,7 +99,13 @@ def calibrate_rig(
     boards = {m: _medoid([se3_inverse(cameras[c]) @ seen[c, m] for c in cameras if (c, m) in seen]) for m in moments}
     sightings = [Sighting(c, m, views[c][m]) for c in cameras for m in moments if (c, m) in seen]
     bundle = adjust(sightings, cameras, boards, lenses, refine_lenses)
-    limit = max(OUTLIER_PX, OUTLIER_ERROR * float(np.median(bundle.error_px)))
+    usual_px = float(np.median(bundle.error_px))
+    if usual_px > LARGEST_PX:
+        raise CalibrationError(
+            f"what the cameras saw does not fit together (reprojection {usual_px:.0f} px): pictures of one moment are "
+            "not of one instant, or the target moved: hold it still for longer"
+        )
+    limit = max(OUTLIER_PX, OUTLIER_ERROR * usual_px)
     if bundle.error_px.max() > limit:
         kept = [s for s, error in zip(sightings, bundle.error_px) if error <= limit]
         left_out = [s for s in sightings if s not in kept]

@@ -6,8 +6,10 @@ import itertools
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.inputs import find_corners, list_images
-from camera_node.robot.calibration.settings import MOMENT_S, NEW_SHARE, STILL_PX
+from camera_node.robot.calibration.settings import LIVE_WAIT_S, MOMENT_S, NEW_SHARE, STILL_PX
 from camera_node.robot.calibration.targets import Corners, Target, to_gray
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
@@ -123,8 +125,8 @@ def watch(cameras: Mapping[str, Grab], target: Target, seconds: float | None, te
             if seconds is not None and time.monotonic() - began > seconds:
                 break
             now: dict[str, Corners | None] = {}
-            for name, grab in cameras.items():
-                image = grab()
+            images = {name: grab() for name, grab in cameras.items()}  # first: finding the target takes long
+            for name, image in images.items():
                 now[name] = None if image is None else target.find(image)
                 if image is not None:
                     views.sizes[name] = (image.shape[1], image.shape[0])
@@ -145,30 +147,44 @@ def watch(cameras: Mapping[str, Grab], target: Target, seconds: float | None, te
 def open_cameras(scenario_file: str) -> tuple[dict[str, Grab], Callable[[], None]]:
     """The live cameras of a scenario, before they have a calibration: functions for ``watch``, and one that closes
     them. Raises ScenarioError, CameraError."""
+    from camera_node.pose.providers import FixedPose
     from camera_node.settings import LiveConfig, source_config
-    from camera_node.sources.devices.feed import Feed
-    from camera_node.sources.devices.live import DEFAULT_FPS, open_feed
+    from camera_node.sources.devices.feed import CameraError, Feed
+    from camera_node.sources.devices.live import DEFAULT_FPS, LiveSource, open_feed
     from freshfield.clock import WallClock
+    from freshfield.geometry import Pinhole, Pose
     from freshfield.scenario import load
 
     loaded = load(scenario_file)
     config = source_config(loaded)
     if not isinstance(config, LiveConfig):
         raise CalibrationError(f"{loaded.path}: source.kind {config.kind}: expected camera, oak or realsense")
-    feeds: dict[str, Feed] = {}
+    fps = Fraction(config.fps or DEFAULT_FPS)
+    sources: dict[str, LiveSource] = {}
+
+    def opened(camera: str) -> Feed:
+        feed = open_feed(camera, config, fps, WallClock())
+        first = feed.grab(config.first_frame_s)
+        if first is not None:  # a source wants a lens; any will do, it is estimated here
+            feed.intrinsics = Pinhole.from_fov(first[1].shape[1], first[1].shape[0], 60.0)
+        return feed
 
     def close() -> None:
-        for feed in feeds.values():
-            feed.close()
+        for source in sources.values():
+            source.close()
 
-    def newest(feed: Feed) -> GrayImage | None:
-        taken = feed.grab(1.0)
-        return None if taken is None else to_gray(taken[1])
+    def newest(source: LiveSource) -> GrayImage | None:
+        until_s = time.monotonic() + LIVE_WAIT_S
+        while time.monotonic() < until_s:
+            with suppress(CameraError):  # no new frame yet
+                return to_gray(np.asarray(source.read(0).image))
+        return None
 
     try:
         for camera in loaded.cameras:
-            feeds[camera] = open_feed(camera, config, Fraction(config.fps or DEFAULT_FPS), WallClock())
+            standing = FixedPose(Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+            sources[camera] = LiveSource(camera, fps, partial(opened, camera), standing, None, config.first_frame_s)
     except BaseException:
         close()
         raise
-    return {camera: lambda feed=feed: newest(feed) for camera, feed in feeds.items()}, close  # type: ignore[misc]
+    return {camera: partial(newest, source) for camera, source in sources.items()}, close

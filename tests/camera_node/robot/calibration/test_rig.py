@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import time
 from pathlib import Path
 
 import cv2
@@ -15,7 +17,9 @@ from camera_node.robot.calibration.rig import rig_inputs
 from camera_node.robot.calibration.rig.rig_calibration import RigCalibration, calibrate_rig
 from camera_node.robot.calibration.targets import Corners, parse_target
 from camera_node.sources.rig_calibration import load_calibration
+from freshfield.clock import WallClock
 from freshfield.geometry import Pinhole, look_at, se3, se3_inverse, so3_exp, so3_log
+from tests.camera_node.sources.devices.mjpeg import NetworkCamera, number_of
 
 BOARD = "charuco:8x5:60mm:45mm"
 LENSES = {
@@ -113,6 +117,35 @@ def test_a_moment_that_was_mixed_up_is_left_out_and_named():
     assert list(found.unused) == ["cam2 at 07"]
     del views["cam2"]["07"]
     assert errors(dict(found.poses)) == pytest.approx(errors(dict(calibrate_rig(views, start(), True).poses)), rel=1e-3)
+
+
+@pytest.mark.stability
+def test_moments_of_cameras_that_lag_are_refused():
+    views = sightings(0.1, 8)
+    for camera in ("cam1", "cam3"):
+        shown = list(views[camera].items())
+        views[camera] = {moment: corners for (moment, _), (_, corners) in itertools.pairwise(shown)}
+    with pytest.raises(CalibrationError, match=r"reprojection \d+ px\): pictures of one moment are not of one instant"):
+        calibrate_rig(views, start(), False)
+
+
+@pytest.mark.stability
+def test_a_live_camera_shows_its_newest_frame_however_slowly_it_is_asked(tmp_path):
+    """Of network cameras, frames wait in the stream."""
+    camera = NetworkCamera(WallClock())
+    (tmp_path / "a.yaml").write_text(
+        f"cameras: {{ids: [a]}}\nsource: {{kind: camera, devices: {{a: '{camera.address}'}}, fps: 10}}\n"
+    )
+    try:
+        cameras, close = rig_inputs.open_cameras(str(tmp_path / "a.yaml"))
+        numbers = []
+        for _ in range(3):
+            time.sleep(1.0)
+            numbers.append(number_of(np.repeat(cameras["a"]()[..., None], 3, axis=2)))
+        assert min(np.diff(numbers)) > 4
+        close()
+    finally:
+        camera.close()
 
 
 @pytest.mark.stability
