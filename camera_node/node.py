@@ -266,7 +266,8 @@ class Node:
         and clock_uncertainty_ms (peer minus camera; null before the first exchange), the numbers of frames
         waiting, captured, replaced, sent and broken, outcomes {accepted, dropped_busy, superseded,
         "rejected:<reason>"}, missed (ticks for which the machine was too slow), failed (shots that could not
-        be made), depth_failed (shots made that had to do without their depth; a shot that repeats counts once).
+        be made), depth_failed (shots made that had to do without their depth; a shot that repeats counts once),
+        poses_refused (lines of a tracker that are no pose).
         """
         return {
             "name": self.name,
@@ -297,6 +298,7 @@ class Node:
             "missed": self._trouble[camera.name]["missed"],
             "failed": self._trouble[camera.name]["failed"],
             "depth_failed": camera.depth_failed,
+            "poses_refused": camera.source.poses_refused,
         }
 
 

@@ -57,7 +57,7 @@ POSES_FAST_M_PER_S = 10.0  # nobody carries a camera so fast: another unit
 # --- poses of a tracker that runs beside a camera ---
 TRACKER_LOOKS_S = 0.005  # how often for lines: a quarter of the 20 ms between poses of a usual tracker
 TRACKER_LATE_S = 0.1  # a frame waits so long for its pose: trackers take 20 to 60 ms, and captures are 67 ms apart
-TRACKER_LINE_BYTES = 4096  # read at once, and longest line that is kept: one has some 100
+TRACKER_LINE_BYTES = 4096  # read at once, compared again later, and longest line that is kept: one has some 100
 
 
 class SourceConfig(Settings, frozen=True, kw_only=True):
@@ -152,7 +152,7 @@ class WorldConfig(SourceConfig, frozen=True, kw_only=True):
 
 class TrajectoryConfig(Settings, frozen=True):
     """Poses from TUM files (``t tx ty tz qx qy qz qw``), one a camera, instead of the calibration's. Of real cameras
-    a tracker appends to them while the camera runs, or writes to named pipes: seconds since 1970.
+    a tracker writes them while the camera runs, or writes to named pipes: seconds since 1970.
 
     max_gap_ms: a frame farther than this from its pose sample is not sent.
     hand_eye: the files are of the flange that holds the camera, and this one, of ``camera-node calibrate hand-eye

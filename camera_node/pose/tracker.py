@@ -23,7 +23,8 @@ log = logging.getLogger("camera-node")
 
 
 class TrackerPoses:
-    """The poses in ``path``, followed by a thread until ``close``. The file may come later, or begin anew.
+    """The poses in ``path``, followed by a thread until ``close``. The file may come later, be replaced, or be written
+    over in place: then it is read from its beginning.
 
     interpolate, max_gap_ns: as of ``SampleBuffer``. refused: number of lines that are no pose.
     """
@@ -57,23 +58,24 @@ class TrackerPoses:
                 self._follow()
 
     def _follow(self) -> None:
-        """Read lines until the file is another one, or shorter than before. Raises OSError."""
+        """Read lines until the file is another one, or what was read last is no longer in it. Raises OSError."""
         # A named pipe without a writer is empty, not waited for.
         file = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)
         try:
-            opened, taken, rest = os.fstat(file), 0, b""
+            opened, taken, rest, last = os.fstat(file), 0, b"", b""
+            is_file = stat.S_ISREG(opened.st_mode)
             while not self._stop.is_set():
                 data = b""
                 with contextlib.suppress(BlockingIOError):  # a pipe whose writer has nothing to say
                     data = os.read(file, TRACKER_LINE_BYTES)
-                taken += len(data)
+                if is_file and os.pread(file, len(last), taken - len(last)) != last:
+                    return
+                taken, last = taken + len(data), (last + data)[-TRACKER_LINE_BYTES:]
                 *lines, rest = (rest + data).split(b"\n")
                 rest = rest[-TRACKER_LINE_BYTES:]
                 for line in lines:
                     self._add(line)
-                there = os.stat(self.path)
-                shrunk = stat.S_ISREG(there.st_mode) and there.st_size < taken
-                if shrunk or there.st_ino != opened.st_ino or (not data and self._stop.wait(TRACKER_LOOKS_S)):
+                if os.stat(self.path).st_ino != opened.st_ino or (not data and self._stop.wait(TRACKER_LOOKS_S)):
                     return
         finally:
             os.close(file)

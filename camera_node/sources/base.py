@@ -89,6 +89,11 @@ class Source(ABC):
         repeat."""
         return tick
 
+    @property
+    def poses_refused(self) -> int:
+        """Number of lines so far that a tracker wrote and that are no pose."""
+        return 0
+
     def rate_schedule(self) -> RateSchedule:
         """The instants of its ticks."""
         return RateSchedule(self.fps, self.phase_ns)

@@ -66,6 +66,11 @@ class MountedCameraPoses:
         flange, gap_ns = self._flange.at(t_ns + self._offset_ns)
         return Pose.from_matrix(flange.matrix() @ self._transform), gap_ns
 
+    @property
+    def refused(self) -> int:
+        """See ``TrackerPoses``."""
+        return getattr(self._flange, "refused", 0)
+
     def close(self) -> None:
         """Close the provider of the flange's poses."""
         if isinstance(self._flange, Closable):

@@ -116,6 +116,11 @@ class LiveSource(Source):
         pose, gap_ns = self._poses.at(captured_ns)
         return Shot(image, pose, self.intrinsics, gap_ns, captured_ns, depth)
 
+    @property
+    def poses_refused(self) -> int:
+        """See ``Source``."""
+        return getattr(self._poses, "refused", 0)
+
     def close(self) -> None:
         """Stop the thread, which closes the camera."""
         atexit.unregister(self.close)

@@ -55,7 +55,11 @@ def test_a_file_is_followed_from_before_it_is_there_to_its_next_beginning(follow
     other = followed.path.with_suffix(".new")
     _written(other, _line(4) * 20)
     os.replace(other, followed.path)
-    assert _x(followed, 4) == 4.0 and followed.refused == 0
+    assert _x(followed, 4) == 4.0
+    for k in (5, 6):  # in place, as long as before, then longer
+        _written(followed.path, _line(k) * (15 + k), "r+")
+        assert _x(followed, k) == k
+    assert followed.refused == 0
 
 
 def test_a_frame_waits_for_the_pose_that_is_computed_after_it(followed):

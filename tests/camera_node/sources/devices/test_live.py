@@ -106,9 +106,10 @@ def test_a_tracker_gives_the_poses_of_a_camera_that_moves(tmp_path, network_came
     mount = "setup: eye-in-hand\ntransform: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.5], [0, 0, 0, 1]]\n"
     (tmp_path / "mount.yaml").write_text(mount)
     trajectory = {"files": {"eye": "poses.txt"}, "max_gap_ms": 60_000, "hand_eye": "mount.yaml"}
-    (tmp_path / "poses.txt").write_text(f"{time.time():.6f} 1 2 3 0 0 0 1\n")
+    (tmp_path / "poses.txt").write_text(f"no pose\n{time.time():.6f} 1 2 3 0 0 0 1\n")
     shot = read(camera := opened(scenario(tmp_path, network_camera.address, trajectory=trajectory)))
     assert shot.pose.translation_m == pytest.approx((1.0, 2.0, 3.5)) and shot.pose_gap_ns < WITHIN_S * 1e9
+    assert camera.source.poses_refused == 1
     camera.source.close()
     with pytest.raises(ScenarioError, match=r"trajectory\.start_s: is for recordings"):
         opened(scenario(tmp_path, network_camera.address, trajectory={**trajectory, "start_s": 1.0}))
