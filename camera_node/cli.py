@@ -113,7 +113,7 @@ def _add_run(run: argparse.ArgumentParser) -> None:
         dest="names",
         metavar="ID[=NAME][,...]",
         help="in place of a scenario, play a recording or data set: as camera ID, which in the recording is NAME "
-        "[the only one]",
+        "[the only one]; none is held out: that takes a scenario with cameras.held_out (docs/data.md)",
     )
     run.add_argument("--to", required=True, metavar="HOST:PORT", help="address of the channel emulator or edge server")
     run.add_argument(
