@@ -121,7 +121,7 @@ def test_a_moment_that_was_mixed_up_is_left_out_and_named():
 
 @pytest.mark.stability
 def test_moments_of_cameras_that_lag_are_refused():
-    views = sightings(0.1, 8)
+    views = sightings(0.1, 12)
     for camera in ("cam1", "cam3"):
         shown = list(views[camera].items())
         views[camera] = {moment: corners for (moment, _), (_, corners) in itertools.pairwise(shown)}
