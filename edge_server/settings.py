@@ -42,8 +42,6 @@ MOST_CARRIED = 4
 SCAN: dict[str, Any] = {"scan": True, "refine": True, "carried": True, "gaussians": 60_000}
 """Options of ``splat`` for that; few pixels bound the Gaussians further."""
 CHOSEN = ("field", "layers", "updates", "update_ms", "steps", "keyframes")
-# Keys that scenarios of earlier versions may have, and what does the same now.
-_GONE = {"export": "leave it out, and after the run: edge-server export RUN --mesh FILE"}
 
 
 class PolicyConfig(Settings, frozen=True):
@@ -185,9 +183,6 @@ def read_config(scenario: Scenario, moving: bool | None = None) -> EdgeConfig:
 
     moving: whether a camera moves, as its poses told; None: as the scenario says, else they stand still.
     """
-    for key, instead in _GONE.items():
-        if key in scenario.edge:
-            raise ScenarioError(f"{scenario.path}: edge.{key}: is no key any more; {instead}")
     moves = cameras_move(scenario) if moving is None else moving
     section = with_defaults(scenario.edge, moves, len(scenario.training))
     if section.get("compute") == "zero":

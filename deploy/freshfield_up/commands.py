@@ -5,17 +5,22 @@ The nodes know only the emulator's address.
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario
-from freshfield_up import thread_limits
 from freshfield_up.net import LOOPBACK, free_ports
 from freshfield_up.processes import Child
 
+# Variables that set the threads of numeric libraries, which start one for each core by default. Nodes and emulator get
+# only one: they gain nothing from more, which would compete with the edge's. The edge may use every core.
+_EDGE_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+_THREADS = (*_EDGE_THREADS, "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 _ARM_PORT = 30004  # RTDE, the fixed port for the state of every controller
 
 
@@ -73,7 +78,7 @@ def process_set(
     edge_address, emulator_address = f"{LOOPBACK}:{edge_port}", f"{LOOPBACK}:{emulator_port}"
     common = ["--out", str(out), *(["--seed", str(seed)] if seed is not None else [])]
     recorded = ["--data", str(data)] if data is not None else []
-    limits = thread_limits.one_thread()
+    limits = _unless_set(_THREADS, 1)
 
     def child(name: str, role: str, command: str, action: str, *arguments: str) -> Child:
         words = [program(command), action, str(scenario.path), *arguments]
@@ -96,7 +101,7 @@ def process_set(
         *recorded,
         *edge_options,
     )
-    edge.environment = thread_limits.all_cores()
+    edge.environment = _unless_set(_EDGE_THREADS, usable_cores())
     emulator = child(
         "emulator",
         "the channel emulator",
@@ -117,6 +122,11 @@ def process_set(
     drivers = [child("driver", "the arm's driver", "camera-node", "drive-arm")] if arm.get("path") else []
     arm_address = f"{arm.get('host')}:{_ARM_PORT}"
     return ProcessSet(edge, emulator, node, edge_address, emulator_address, arms, arm_address, drivers)
+
+
+def _unless_set(variables: Sequence[str], threads: int) -> dict[str, str]:
+    """Values for the variables that the user has not set."""
+    return {name: str(threads) for name in variables if name not in os.environ}
 
 
 def program(name: str) -> str:

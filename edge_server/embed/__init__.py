@@ -31,16 +31,11 @@ class EmbeddingError(ValueError):
     """A model, setting or image is unusable; the one-line message says what, where and what to do."""
 
 
-class SizeError(EmbeddingError):
-    """The model was not exported for this image size."""
-
-
 class EmbeddingConfig(Settings, frozen=True):
     """The section ``edge.embedding`` of a scenario."""
 
     model: Annotated[str, about("a YOLO detection ONNX, relative to the scenario, or default")] = DEFAULT
     dim: Annotated[int, within(1, 4096, "length of an embedding, at most the channels of the tapped layer")] = 32
-    size: Annotated[int, within(32, 2048, "side of the model's input, pixels; not given: its own")] | None = None
 
 
 def read_embedding(mapping: Mapping[str, Any], scenario: Path) -> EmbeddingConfig:
@@ -77,7 +72,7 @@ def make_embedder(section: EmbeddingConfig) -> Embedder:
     with onnx_libraries("embedding"):
         from edge_server.embed.backbone import load_backbone
         from edge_server.embed.embedder import Embedder
-    backbone = load_backbone(model_path(section.model), section.size)
+    backbone = load_backbone(model_path(section.model))
     return Embedder(backbone, section.dim)
 
 

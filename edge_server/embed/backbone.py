@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper
 from onnx.utils import Extractor
 
-from edge_server.embed import EmbeddingError, SizeError
+from edge_server.embed import EmbeddingError
 from freshfield.untrusted import read_bytes
 
 OUTPUT = "pooled"
@@ -131,15 +131,15 @@ class Backbone:
     projection: Projection | None = None
 
 
-def load_backbone(path: Path, size: int | None = None) -> Backbone:
-    """Load the detector at ``path``. size: as in EmbeddingConfig. Raises EmbeddingError."""
+def load_backbone(path: Path) -> Backbone:
+    """Load the detector at ``path``. Raises EmbeddingError."""
     data = _read(path)
     model = parse_model(data, path)
     meta = {p.key: p.value for p in model.metadata_props}
     image = _image_input(model, path)
     at = _find_end(model, path)
     cut = _cut(model, image.name, at, path)
-    batch, (height, width) = _shape_of(cut, size, meta, path)
+    batch, (height, width) = _shape_of(cut, meta, path)
     channels = _check_shapes(cut, batch or 1, height, width, path)
     return Backbone(
         name=path.stem,
@@ -274,20 +274,10 @@ def _cut(model: onnx.ModelProto, image: str, tap: str, path: Path) -> onnx.Model
     return cut
 
 
-def _shape_of(
-    cut: onnx.ModelProto, size: int | None, meta: dict[str, str], path: Path
-) -> tuple[int | None, tuple[int, int]]:
+def _shape_of(cut: onnx.ModelProto, meta: dict[str, str], path: Path) -> tuple[int | None, tuple[int, int]]:
     """(fixed batch or None, (height, width)) of the model's input."""
     batch, _, height, width = (d.dim_value for d in cut.graph.input[0].type.tensor_type.shape.dim)
-    if height and width:
-        if size is not None and (height, width) != (size, size):
-            raise SizeError(
-                f"{path}: size: this model was exported for {width} x {height} only; leave size out, or "
-                "export it with dynamic=True"
-            )
-    elif size is not None:
-        height = width = size
-    else:
+    if not (height and width):
         height, width = exported_size(meta)
     if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE):
         raise EmbeddingError(f"{path}: images of {width} x {height} are not within 1 to {MAX_SIDE} a side")

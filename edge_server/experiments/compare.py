@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,7 +30,7 @@ from edge_server.experiments.rollouts.rollout import run_rollouts
 from edge_server.experiments.rollouts.setting import Setting, seeds
 from edge_server.machine import commit, machine
 from edge_server.scheduler import STATE_PARTS, make_policy, parse_policy, short_name
-from edge_server.settings import ComputeConfig, read_config
+from edge_server.settings import read_config
 from freshfield.files import out_file, write_json
 from freshfield.scenario import Scenario, ScenarioError, load
 from freshfield.settings import as_mapping
@@ -70,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(args: argparse.Namespace) -> None:
-    setting = setting_of(load(args.scenario), args.seconds, args.channel, args.costs, args.slower)
+    setting = setting_of(load(args.scenario), args.seconds, args.channel)
     labels = _labels(args.policies)
     rng = np.random.default_rng(0)
     # Those that cannot be made are rejected before anything is computed.
@@ -88,25 +87,15 @@ def _run(args: argparse.Namespace) -> None:
         write_json(args.json, {**about, "policies": as_json(table, list(labels))}, indent=1)
 
 
-def setting_of(
-    scenario: Scenario, seconds: float, channel: str | None = None, costs: Path | None = None, slower: float = 1.0
-) -> Setting:
+def setting_of(scenario: Scenario, seconds: float, channel: str | None = None) -> Setting:
     """The setting of a comparison in a scenario as it stands.
 
-    seconds: scored, after the lead. channel: as in ``read_channel``. costs: a file of ``edge-server costs``.
-    slower: factor on all costs.
-    Raises ScenarioError or ValueError.
+    seconds: scored, after the lead. channel: as in ``read_channel``. Raises ScenarioError or ValueError.
     """
-    edge = {**scenario.edge, "policy": {"name": "all"}}
-    if costs is not None:
-        edge["compute"] = str(costs.resolve())
-    scenario = dataclasses.replace(scenario, edge=edge)
+    scenario = dataclasses.replace(scenario, edge={**scenario.edge, "policy": {"name": "all"}})
     if channel is not None:
         scenario = dataclasses.replace(scenario, channel=read_channel(channel)[0])
-    charged = as_mapping(read_config(scenario).compute)
-    if not slower > 0.0 or (slower != 1.0 and not any(charged.values())):
-        raise ValueError(f"--slower {slower:g}: expected more than 0, and a scenario or --costs that charge something")
-    compute = ComputeConfig(**{name: slower * ms for name, ms in charged.items()})
+    compute = read_config(scenario).compute
     return Setting(scenario, deployed=True, lead_ms=LEAD_S * 1e3, span_ms=seconds * 1e3, compute=compute)
 
 
@@ -186,8 +175,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--seeds", type=at_least(1), default=8, metavar="N", help="number of seeds [%(default)s]")
     add("--channel", metavar="FILE|PRESET", help="a channel in place of the scenario's: a file, or a preset")
     add("--seconds", type=float, default=SPAN_S, metavar="S", help=f"seconds scored, after {LEAD_S:g} [%(default)g]")
-    add("--costs", type=Path, metavar="FILE", help="file written by `edge-server costs` [edge.compute of the scenario]")
-    add("--slower", type=float, default=1.0, metavar="K", help="computing takes K times as long [%(default)g]")
     add_workers(parser)
     add("--json", type=out_file, metavar="FILE", help="write the comparison to FILE")
     add("--results", type=out_file, metavar="FILE", help="keep finished runs in FILE, and use those it has [none]")

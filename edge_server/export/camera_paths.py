@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from edge_server.export import ExportError
 from edge_server.fields import View
-from freshfield.geometry import GeometryError, Pinhole, converging_point, look_at
+from freshfield.geometry import GeometryError, Pinhole, converging_point, look_at, world_up
 from freshfield.limits import MAX_IMAGE_SIDE_PX
 from freshfield.untrusted import UntrustedError, read_json, read_text
 
@@ -54,7 +54,7 @@ def orbit(views: Sequence[View], count: int, fov_deg: float) -> list[Step]:
     """
     poses = np.array([v.camera_to_world for v in views], np.float64)
     ahead, places = poses[:, :3, 2], poses[:, :3, 3]
-    up = _upward(poses)
+    up = world_up(poses)
     first = _unit(np.cross(up, [1.0, 0.0, 0.0]), np.cross(up, [0.0, 1.0, 0.0]))
     axes = np.stack([first, np.cross(up, first)])
     center = converging_point(places, ahead)
@@ -143,19 +143,6 @@ def _sweep(azimuths: Matrix, count: int) -> Matrix:
     if gaps[widest] < np.radians(WIDEST_GAP_DEG):
         return start + phase
     return start + (2 * np.pi - gaps[widest]) * (1 - np.cos(phase)) / 2
-
-
-def _upward(poses: Matrix) -> Matrix:
-    """Direction (3,) that is up for cameras (N, 4, 4).
-
-    People hold cameras level, so their right axes are perpendicular to it. Where these do not tell (one camera, or all
-    side by side), it is the mean of the images' up.
-    """
-    mean = _unit(-poses[:, :3, 1].sum(axis=0), np.array([0.0, 0.0, 1.0]))
-    _, sizes, axes = np.linalg.svd(np.concatenate([poses[:, :3, 0], np.zeros((3, 3))]))
-    if sizes[1] < 0.1 * sizes[0] or abs(axes[2] @ mean) < 0.5:
-        return mean
-    return np.asarray(axes[2] * np.sign(axes[2] @ mean))
 
 
 def _unit(vector: Matrix, otherwise: Matrix) -> Matrix:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.export import ExportError, PosedImage
+from edge_server.fidelity.images import to_bytes
 
 Image = NDArray[np.uint8]
 IMAGE_ENDINGS, VIDEO_ENDINGS = (".png", ".jpg", ".jpeg"), (".mp4",)
@@ -45,7 +46,7 @@ def write_video(
     count, size = 0, (0, 0)
     try:
         for image in images:
-            bgr = np.ascontiguousarray(colors(image)[..., ::-1])
+            bgr = np.ascontiguousarray(to_bytes(image)[..., ::-1])
             size = size if count else (bgr.shape[1], bgr.shape[0])
             if size != (bgr.shape[1], bgr.shape[0]):
                 raise ExportError(f"{file}: image {count} has another size than the first")
@@ -73,13 +74,6 @@ def checked_file(file: Path) -> Path:
     if file.suffix.lower() not in (*IMAGE_ENDINGS, *VIDEO_ENDINGS):
         raise ExportError(f"{file}: expected a file that ends in {', '.join((*IMAGE_ENDINGS, *VIDEO_ENDINGS))}")
     return file
-
-
-def colors(image: NDArray[np.uint8] | NDArray[np.float32]) -> Image:
-    """Colors in [0, 1] as bytes; bytes as they are."""
-    if image.dtype == np.uint8:
-        return np.asarray(image, np.uint8)
-    return np.asarray(np.clip(image * 255 + 0.5, 0, 255), np.uint8)
 
 
 def _opened(file: Path, part: Path, fps: float, size: tuple[int, int]) -> cv2.VideoWriter:

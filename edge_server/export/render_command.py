@@ -14,9 +14,10 @@ import numpy as np
 
 from edge_server.export import ExportError
 from edge_server.export.camera_paths import Step, lens, looking, orbit, read_nerfstudio, vertical_fov_deg
-from edge_server.export.images import IMAGE_ENDINGS, Image, checked_file, colors, write_video
+from edge_server.export.images import IMAGE_ENDINGS, Image, checked_file, write_video
 from edge_server.export.run_source import Source, open_source
 from edge_server.export.viewed_field import checked_size
+from edge_server.fidelity.images import to_bytes
 from edge_server.fields import Rendering
 from freshfield.files import out_file
 
@@ -88,7 +89,7 @@ def _render(args: argparse.Namespace) -> None:
     def render(index: int) -> list[Rendering]:
         return [s.render(steps[index].camera_to_world, cameras[index]) for s in snapshots]
 
-    shown = _depth_colors(render, len(steps)) if args.depth else lambda rendering: colors(rendering.color)
+    shown = _depth_colors(render, len(steps)) if args.depth else lambda rendering: to_bytes(rendering.color)
     began = time.monotonic()
 
     def images() -> Iterator[Image]:

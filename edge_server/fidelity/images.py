@@ -55,3 +55,11 @@ def same_size(rendering: Image, truth: Image) -> None:
             f"rendering is {rendering.shape[1]} x {rendering.shape[0]} but the truth is "
             f"{truth.shape[1]} x {truth.shape[0]}: render with the held-out camera's own intrinsics"
         )
+
+
+def to_bytes(image: NDArray[np.uint8] | NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Colors (H, W, 3) in [0, 1] as bytes, rounded; bytes as they are."""
+    if image.dtype == np.uint8:
+        return np.asarray(image, np.uint8)
+    unit: NDArray[np.float32] = np.asarray(image, np.float32)
+    return (np.clip(unit, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

@@ -20,9 +20,9 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edge_server.fidelity.baselines import BaselineMean, baseline
+from edge_server.fidelity.images import to_bytes
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fidelity.so_far import FrameScore, so_far
 from edge_server.fields import Snapshot, View
@@ -270,8 +270,3 @@ class ScoringThread:
         camera, image, truth = renderings[0]
         comparison = Comparison(camera, truth[..., :3], to_bytes(image), publication.number)
         self._on_scored(publication.scored(score), comparison, True)
-
-
-def to_bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """float (H, W, 3) in [0, 1] to uint8, rounded."""
-    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

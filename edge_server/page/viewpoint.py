@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from freshfield.geometry import Pinhole, converging_point, look_at, quaternion_to_matrix
+from freshfield.geometry import Pinhole, converging_point, look_at, quaternion_to_matrix, world_up
 
 Array = NDArray[np.float64]
 
@@ -23,9 +23,6 @@ MARGIN = 0.95
 DISTANCES = np.linspace(1.3, 2.2, 37)
 # A shorter mean of unit vectors has no meaning: cameras surround the scene, or roll freely.
 _SCATTERED = 0.25
-# x axes of cameras that face nearly the same way (about 10 degrees to either side): smallest second eigenvalue of
-# the mean of d d^T that spans a plane.
-_FAN = 0.03
 
 
 @dataclass(frozen=True)
@@ -37,24 +34,6 @@ class Viewpoint:
     look_at: Array
     up: Array
     radius_m: float
-
-
-def world_up(poses: Array) -> Array:
-    """The up direction, unit vector (3,). poses: camera-to-world (N, 4, 4), N >= 1.
-
-    Cameras are held level, so up is perpendicular to their x axes. If these are parallel (a single camera, a
-    row of cameras), it is the mean of the -y axes, which tilts with cameras that look down.
-    """
-    ups, sides = -poses[:, :3, 1], poses[:, :3, 0]
-    mean = ups.mean(axis=0)
-    if np.linalg.norm(mean) < _SCATTERED:
-        mean = ups[0]
-    spread, directions = np.linalg.eigh(sides.T @ sides / len(sides))
-    level = directions[:, 0] * (1.0 if directions[:, 0] @ mean >= 0 else -1.0)
-    # Level cameras that face different ways: their x axes span a plane.
-    if spread[1] > _FAN and spread[0] < 0.1 * spread[1] and level @ mean > _SCATTERED:
-        return level
-    return mean / np.linalg.norm(mean)
 
 
 def initial_viewpoint(poses: ArrayLike, center: ArrayLike | None = None) -> Viewpoint:

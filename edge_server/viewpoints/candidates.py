@@ -92,14 +92,11 @@ def half_hemisphere(
     return from_poses([look_at(target + radius_m * a, target) for a in away], lens, target)
 
 
-def from_poses(
-    poses: Sequence[ArrayLike], lens: Pinhole, target: ArrayLike | None = None, bounds: ArrayLike | None = None
-) -> Candidates:
+def from_poses(poses: Sequence[ArrayLike], lens: Pinhole, target: ArrayLike | None = None) -> Candidates:
     """Candidates at any poses (4, 4), all reachable.
 
     lens: intrinsics of the camera.
     target: (3,); None takes the point nearest to all lines of sight.
-    bounds: (2, 3), lower and upper corner of the object; None: not known.
     Raises ViewpointError for no poses, or for poses that are not finite.
     """
     array = np.asarray(poses, np.float64).reshape(-1, 4, 4)
@@ -108,8 +105,7 @@ def from_poses(
     if not np.isfinite(array).all():
         raise ViewpointError("a candidate's pose is not finite")
     centre = _looked_at(array) if target is None else np.asarray(target, np.float64)
-    box = None if bounds is None else np.asarray(bounds, np.float64)
-    return Candidates(array, lens, centre, np.ones(len(array), bool), box)
+    return Candidates(array, lens, centre, np.ones(len(array), bool))
 
 
 def _looked_at(poses: Array) -> Array:

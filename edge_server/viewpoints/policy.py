@@ -31,6 +31,8 @@ Embed = Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]]
 KIND = "viewpoint policy"
 _STEP_MS = 1000.0  # an age of one step, in the unit of the schedulers' state
 _CLOSED = -1e9
+# Of an update: what a learned reward allows; a capture's return is not discounted (4.14).
+_PASSES, _ENTROPY = 4, 0.01
 _ANY_KL = 1e9  # passes never end early
 
 
@@ -42,20 +44,15 @@ class PolicyConfig:
     updates: number of updates. episodes: number of episodes for each update.
     way: cost of a way as long as the candidates' mean distance from the target, in standard deviations of
         the reward of a step: the same plan for a large scene as for a small one.
-    gamma: discount of (4.14). Others as in ``settings.Spec``.
+    hidden, learning_rate: as in ``settings.Spec``.
     """
 
     views: int = 8
     updates: int = 60
     episodes: int = 16
     way: float = 0.4
-    gamma: float = 1.0
     hidden: int = 32
     learning_rate: float = 3e-3
-    clip: float = 0.2
-    passes: int = 4
-    minibatch: int = 64
-    entropy: float = 0.01
 
 
 class Rows:
@@ -174,8 +171,15 @@ def train_policy(
     rng = np.random.default_rng(seed)
     steps = StepFeatures(candidates)
     layout = layout_of(steps, embeddings, config.views, rng)
-    shared = ("hidden", "learning_rate", "clip", "passes", "minibatch", "entropy")
-    spec = Spec("select", layout, target_kl=_ANY_KL, **{name: getattr(config, name) for name in shared})
+    spec = Spec(
+        "select",
+        layout,
+        hidden=config.hidden,
+        learning_rate=config.learning_rate,
+        passes=_PASSES,
+        entropy=_ENTROPY,
+        target_kl=_ANY_KL,
+    )
     rows = Rows(candidates, embeddings, layout)
     usual = np.concatenate([reward(steps.actions([k]))[usable] for k in usable[:: max(len(usable) // 8, 1)]])
     # Rounding makes steps of equal reward differ by 1e-16: as a unit, it would blow the rewards up.
@@ -226,7 +230,7 @@ def _episodes(
     features, closed, chosen, logps, gained, values = (np.stack(part) for part in zip(*kept))
     total, returns = np.zeros(count), np.zeros_like(gained)
     for t in reversed(range(len(gained))):
-        total = returns[t] = gained[t] + config.gamma * total
+        total = returns[t] = gained[t] + total
     return {
         "features": features.reshape(-1, *features.shape[2:]),
         "closed": closed.reshape(-1, closed.shape[-1]),

@@ -242,6 +242,31 @@ def converging_point(origins: Array, directions: Array) -> Array | None:
     return point if np.median(along) > 0 else None
 
 
+# A shorter mean of unit vectors has no meaning: the cameras roll freely.
+_ROLLED = 0.25
+# x axes of cameras that face nearly the same way (about 10 degrees to either side): smallest second eigenvalue of
+# the mean of d d^T that spans a plane.
+_FAN = 0.03
+
+
+def world_up(poses: Array) -> Array:
+    """The up direction, unit vector (3,). poses: camera-to-world (N, 4, 4), N >= 1.
+
+    Cameras are held level, so up is perpendicular to their x axes. If these are parallel (a single camera, a
+    row of cameras), it is the mean of the -y axes, which tilts with cameras that look down.
+    """
+    ups, sides = -poses[:, :3, 1], poses[:, :3, 0]
+    mean = ups.mean(axis=0)
+    if np.linalg.norm(mean) < _ROLLED:
+        mean = ups[0]
+    spread, directions = np.linalg.eigh(sides.T @ sides / len(sides))
+    level = directions[:, 0] * (1.0 if directions[:, 0] @ mean >= 0 else -1.0)
+    # Level cameras that face different ways: their x axes span a plane.
+    if spread[1] > _FAN and spread[0] < 0.1 * spread[1] and level @ mean > _ROLLED:
+        return level
+    return mean / np.linalg.norm(mean)
+
+
 @dataclass(frozen=True)
 class Pinhole:
     """Pinhole intrinsics in pixels (corner origin).

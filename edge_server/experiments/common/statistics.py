@@ -73,12 +73,7 @@ def discoveries(p_values: Sequence[float], rate: float = 0.05) -> list[bool]:
 
     p_values: of all hypotheses that are tested together.
     """
-    order = np.argsort(p_values, kind="stable")
-    ranked = np.array(p_values, float)[order] <= rate * np.arange(1, len(order) + 1) / max(len(order), 1)
-    kept = int(np.flatnonzero(ranked)[-1]) + 1 if ranked.any() else 0
-    found = np.zeros(len(order), bool)
-    found[order[:kept]] = True
-    return [bool(rejected) for rejected in found]
+    return (stats.false_discovery_control(p_values) <= rate).tolist() if len(p_values) else []
 
 
 def interval(values: Iterable[float | None]) -> Interval:

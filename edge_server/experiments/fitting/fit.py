@@ -18,23 +18,21 @@ from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.arguments import OptionError
 from edge_server.experiments.fitting.evaluate import Scored, fit_in_slices, marks_s
 from edge_server.experiments.fitting.misfits import misfits
-from edge_server.experiments.scenes.multiview_still import mean_baselines, open_still, score_views
+from edge_server.experiments.scenes.multiview_still import WHITE, mean_baselines, open_still, score_views
 from edge_server.experiments.scenes.recorded import MultiviewStill
 from edge_server.export.run_source import Source, holds_checkpoint, open_source
 from edge_server.export.viewed_field import ViewedField
-from edge_server.fidelity.images import Color, to_unit
+from edge_server.fidelity.images import to_bytes, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Score, Scorer
 from edge_server.fields import RefinesCameras, checkpoint
 from edge_server.fields.registry import FIELD, make_field, option_help
 from edge_server.fields.splat.scan.settings import scan_options
-from edge_server.live.scoring_thread import to_bytes
 from edge_server.machine import run_facts
 from edge_server.run_records import UpdateRow
 from freshfield.files import write_json
 from freshfield.machine_load import LoadMeter, outside_cores
 
-BACKGROUNDS: dict[str, Color] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 # Number of training views that are scored if no view is held out.
 _SCORED_OF_TRAINING = 8
 
@@ -56,11 +54,10 @@ class Fit(ViewedField):
         options: Mapping[str, Any] | None = None,
         *,
         seed: int = 0,
-        background: str = "white",
         lpips: Path | None = None,
     ) -> None:
         """data: from ``load``. field: name of the representation. options: of the field, e.g. ``{"gaussians": 4096}``.
-        background: white or black, behind transparent images. lpips: folder of LPIPS weights.
+        lpips: folder of LPIPS weights. Transparent images lie over white.
 
         Raises OptionError for a field or option that there is not, DatasetError for a camera that no field can use.
         """
@@ -68,9 +65,9 @@ class Fit(ViewedField):
 
         self.data, self.seed = data, seed
         self.notes: list[str] = []
-        self.background, given = BACKGROUNDS[background], dict(options or {})
+        given = dict(options or {})
         if any(v.image.shape[2] == 4 for v in data.training):
-            given = {"background": background, **given}
+            given = {"background": "white", **given}
         try:
             self.options = {**self._scan_options(field), **given}
             model = make_field(field, self.options, seed=seed)
@@ -86,7 +83,7 @@ class Fit(ViewedField):
         self.rows: list[UpdateRow] = []
         self.outside: float | None = None
         self.spent_s, self.spent_steps = 0.0, 0
-        self._scorer = Scorer(metric, background=self.background)
+        self._scorer = Scorer(metric, background=WHITE)
         self._scored_views = data.held_out or data.training[:_SCORED_OF_TRAINING]
         self._shown: NDArray[np.float32] | None = None
         self._processes: list[dict[str, Any]] = []
@@ -189,7 +186,7 @@ class Fit(ViewedField):
                 [v.camera_to_world for v, _ in refined], [c.camera_to_world for _, c in refined]
             )
             found += [] if common is None else [common.words]
-        found += misfits(self.field, self.data.training, Scorer(None, background=self.background))
+        found += misfits(self.field, self.data.training, Scorer(None, background=WHITE))
         self.notes += found
         return found
 
@@ -205,7 +202,7 @@ class Fit(ViewedField):
         _write_lines(folder / "processes.jsonl", self._processes)
         write_json(folder / "edge.json", self._status())
         if self._shown is not None:
-            truth = to_unit(self._scored_views[0].image, "held-out view", self.background)
+            truth = to_unit(self._scored_views[0].image, "held-out view", WHITE)
             _write_png(folder / "truth.png", np.rint(truth * 255.0).astype(np.uint8))
             _write_png(folder / "rendered.png", to_bytes(self._shown))
         return build_report(folder)
@@ -233,7 +230,7 @@ class Fit(ViewedField):
                 "held_out": [v.camera for v in d.held_out],
                 "missing": d.missing,
             },
-            "baseline": mean_baselines(d.training, d.held_out, self.background),
+            "baseline": mean_baselines(d.training, d.held_out, WHITE),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else "alex",
         }
@@ -282,7 +279,7 @@ def fit(
 
     data: from ``load``, or a path as ``load`` takes it.
     seconds: of fitting; evaluation is not counted. holdout: as of ``load``, where data is a path.
-    field: name of the representation (``edge-server fit --list-options``). options: of it, by name.
+    field: name of the representation (``freshfield scenario keys edge``). options: of it, by name.
     progress: called with each evaluation: ``t_s``, ``psnr_db``, ``ssim``, ...
     Raises DatasetError or OptionError, and KeyboardInterrupt at Ctrl-C; ``Fit.run`` keeps what was fitted until then.
     """

@@ -19,10 +19,10 @@ from edge_server.experiments.common.arguments import (
     run_command,
 )
 from edge_server.experiments.fitting.evaluate import Scored
-from edge_server.experiments.fitting.fit import BACKGROUNDS, Fit, check_seconds
+from edge_server.experiments.fitting.fit import Fit, check_seconds
 from edge_server.experiments.scenes.multiview_still import data_name, open_still
 from edge_server.experiments.scenes.recorded import MultiviewStill
-from edge_server.fields.registry import FIELD, field_names, option_help, settings_of
+from edge_server.fields.registry import FIELD, field_names
 from freshfield.files import out_folder
 from freshfield.scenario import NOTHING_HELD_OUT
 
@@ -32,7 +32,6 @@ Fit a recorded data set as fast as this machine can, and measure fidelity on vie
   edge-server fit ~/data/lego --seconds 60 --holdout 8 --scale 2 --out runs/lego
   edge-server fit ~/data/kitchen --field splat --holdout cam00 --frame 12
   edge-server fit tower --field splat --seconds 10
-  edge-server fit --field splat --list-options
   edge-server fit ~/data/people/calibration.json --holdout cam01 --scale 4 --field ngp --option samples=256
   edge-server fit ~/data/apartment --format eyeful --holdout split
   edge-server fit mine.yaml --seconds 30
@@ -60,7 +59,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     add("--format", choices=list(FORMATS), help="format of the data set [found from its files]")
     add("--field", metavar="NAME", help=f"representation: {', '.join(field_names())} [{FIELD}]")
-    add("--list-options", action="store_true", help="list the options of --field, with defaults, and exit")
     add("--seconds", type=float, default=60.0, metavar="S", help="seconds of fitting [%(default)g]")
     add(
         "--holdout",
@@ -72,19 +70,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     add(
         "--frame", type=at_least(0), default=0, metavar="N", help="frame of a moving scene to fit, from 0 [%(default)s]"
     )
-    add(
-        "--background",
-        choices=sorted(BACKGROUNDS),
-        default="white",
-        help="background of transparent images [%(default)s]",
-    )
     add("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
     add(
         "--option",
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="option of the field, e.g. levels=12 (--list-options); may be repeated",
+        help="option of the field, e.g. levels=12 (freshfield scenario keys edge); may be repeated",
     )
     add_lpips(parser)
     add("--out", type=out_folder, metavar="DIR", help="folder to write [runs/fit-DATA]")
@@ -92,13 +84,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     args.notes = [f"{FIELD} without layers: all views are of one instant"] if args.field is None else []
     args.field = args.field or FIELD
-    if args.list_options:
-        try:
-            known, defaults = option_help(args.field), settings_of(args.field)
-        except ValueError as error:
-            parser.error(str(error))
-        print("\n".join(f"{name:18} {text} [{getattr(defaults, name)}]" for name, text in known.items()))
-        return 0
     if args.data is None:
         parser.error("name a data set: a folder, or the file that describes it")
     args.out = args.out or Path("runs") / f"fit-{data_name(args.data)}"
@@ -116,7 +101,7 @@ def run(request: argparse.Namespace) -> dict[str, Any]:
         raise OptionError(f"--scale {request.scale:g}: expected more than 0 (2 halves the images)")
     options = parse_options(request.option)
     data = open_still(request.data, request.holdout, request.scale, request.frame, request.format)
-    fit = Fit(data, request.field, options, seed=request.seed, background=request.background, lpips=request.lpips)
+    fit = Fit(data, request.field, options, seed=request.seed, lpips=request.lpips)
     fit.notes[:0] = request.notes
     request.out.mkdir(parents=True, exist_ok=True)
     if request.resume:

@@ -1,4 +1,4 @@
-"""Writes the output of the frontier: two CSV files, two figures and tables."""
+"""Writes the output of the frontier: two figures and tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from edge_server.experiments.frontier.update_time import best
 from edge_server.live.frontier import best_point, points_of
 from edge_server.report.style import CYCLE, INK, figure
 from edge_server.settings import LEAST_UPDATE_MS
-from freshfield.files import write_csv
 
 Row = dict[str, Any]
 _LINES = {"layers": "--"}
@@ -21,14 +20,11 @@ _METRICS = (("psnr_db", "PSNR (dB)"), ("ssim", "SSIM"), ("lpips", "LPIPS"))
 
 
 def write_output(out: Path, data: Row) -> str:
-    """Write frontier.csv, frontier.png and, with a moving scene, updates.csv and updates.png; returns the
-    text for the terminal."""
+    """Write frontier.png and, with a moving scene, updates.png; returns the text for the terminal."""
     rows, updates = data["from_scratch"], data["updates"]
-    write_csv(out / "frontier.csv", _flat(rows))
     draw_frontier(out / "frontier.png", rows, data)
     text = [table(rows)]
     if updates:
-        write_csv(out / "updates.csv", _flat(updates))
         draw_updates(out / "updates.png", updates)
         text.append(updates_table(updates))
     return "\n\n".join(["", *text])
@@ -146,8 +142,3 @@ def _seconds_axis(axes: Axes, seconds: Sequence[float]) -> None:
     ticks = sorted(set(seconds))
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
-
-
-def _flat(rows: Sequence[Row]) -> list[Row]:
-    """Rows without the values that do not fit in a single cell of a CSV file."""
-    return [{k: v for k, v in row.items() if not isinstance(v, dict)} for row in rows]

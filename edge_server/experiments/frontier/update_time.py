@@ -57,22 +57,20 @@ class Variant:
 
 @dataclass(frozen=True)
 class MovingScene:
-    """A moving scene and its network. policy: as people write it."""
+    """The cameras of ``room``, where somebody walks, and their network. policy: as people write it."""
 
-    scene: str = "room"
     cameras: int = 13
     size: int = 96
-    fps: float = 15.0
     channel: str = "ch5"
     policy: str = "all"
 
     def scenario(self, speed_m_per_s: float, variant: Variant, **edge: Any) -> Scenario:
         """The deployment as a scenario. edge: further keys of its edge section."""
         name, value = parse_policy(self.policy)
-        world = {"kind": "world", "scene": self.scene, "width": self.size, "height": self.size, "fps": self.fps}
+        world = {"kind": "world", "scene": "room", "width": self.size, "height": self.size, "fps": 15.0}
         return parse(
             {
-                "name": f"{self.scene} at {speed_m_per_s:g} m/s",
+                "name": f"room at {speed_m_per_s:g} m/s",
                 "cameras": {"count": self.cameras, "held_out": ["cam00"], "phase": "spread"},
                 "source": {**world, "speed_m_per_s": speed_m_per_s},
                 "channel": {"preset": self.channel},

@@ -19,8 +19,8 @@ from edge_server.experiments.studies.trial import scenario_of, scene_label, scen
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
 from edge_server.experiments.virtual.simulate import usual_settings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
+from edge_server.fidelity.images import to_bytes
 from edge_server.fidelity.scorer import SHOWN
-from edge_server.live.scoring_thread import to_bytes
 from edge_server.settings import read_config
 from freshfield.frame import Frame, to_request
 from freshfield.scenario import Scenario

@@ -70,7 +70,6 @@ class StudyRequest:
     jobs, ray: as in ``Engine``.
     cases: words in the names of the selected cases, for studies that consist of cases.
     episodes: episodes of one training, for studies that train.
-    field: representation of the trials that do not name one themselves.
     """
 
     quick: bool
@@ -84,7 +83,6 @@ class StudyRequest:
     ray: str | None = None
     cases: tuple[str, ...] = ()
     episodes: int | None = None
-    field: str = "splat"
 
     def chosen(self, cases: Sequence[str], quick: Sequence[str]) -> list[str]:
         """The selected cases: by default all, or ``quick`` in a quick pass. StudyError for an unknown one."""
@@ -113,7 +111,6 @@ class StudyRequest:
         words += [f"--channel {self.channel_name}"] if self.channel is not None else []
         words += [f"--case {case!r}" for case in self.cases]
         words += [f"--episodes {self.episodes}"] if self.episodes else []
-        words += [f"--field {self.field}"] if self.field != "splat" else []
         return " ".join(words)
 
 

@@ -16,7 +16,6 @@ from edge_server.experiments.studies.registry import CAPTURING, CASED, DEPLOYED,
 from edge_server.experiments.studies.study import StudyError, StudyRequest, run_study
 from edge_server.experiments.studies.trial import scenario_of
 from edge_server.experiments.training.trainer import TrainingError
-from edge_server.fields.registry import field_names
 from edge_server.viewpoints.candidates import ViewpointError
 from freshfield.files import out_folder
 from freshfield.scenario import ScenarioError
@@ -62,7 +61,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             ray=args.ray,
             cases=tuple(args.case),
             episodes=args.episodes,
-            field=args.field,
         )
         names = {"all": [n for n in STUDIES if n not in (*CAPTURING, *LEARNING, *DEPLOYED)], "learning": list(LEARNING)}
         for name in checked(names.get(args.study, [args.study]), request):
@@ -96,7 +94,6 @@ def checked(names: list[str], request: StudyRequest) -> list[str]:
         (request.scenes, {*STUDIES} - {*LEARNING}, "--scene: it has scenes of its own"),
         (request.ray, {*STUDIES} - {*CAPTURING}, "--ray: captures are made on this machine"),
         (request.channel is not None, {*ON_A_CHANNEL}, f"--channel is for {', '.join(ON_A_CHANNEL)}"),
-        (request.field != "splat", {*ON_A_CHANNEL} - {"representations"}, "--field: it has its own, or none"),
         (request.cases, {*CASED}, f"--case is for {', '.join(CASED)}"),
         (request.episodes is not None, {*LEARNING}, f"--episodes is for {', '.join(LEARNING)}"),
     ]
@@ -136,12 +133,6 @@ def _parser() -> argparse.ArgumentParser:
         "--channel",
         metavar="FILE|PRESET",
         help="the channel, in place of the study's: a preset, a scenario's file, or one of its channel section alone",
-    )
-    add(
-        "--field",
-        choices=field_names(),
-        default="splat",
-        help="representation, unless the study names its own [%(default)s]",
     )
     add_folders(parser)
     add("--out", type=out_folder, default="runs/study", metavar="DIR", help="folder to write [%(default)s]")

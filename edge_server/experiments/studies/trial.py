@@ -25,6 +25,7 @@ from edge_server.experiments.studies.study import StudyError, StudyRequest, open
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
+from edge_server.fidelity.images import to_bytes
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SHOWN, Scorer
 from edge_server.live.state import Publication
@@ -153,7 +154,7 @@ def usual_trial(request: StudyRequest, scene: str, **more: Any) -> Trial:
         sized = {"scale": scale, "steps": sized["steps"], "speed_m_per_s": None}
     elif Path(scene).suffix:  # somebody's own scenario keeps its cameras and its speed
         sized |= {"cameras": None, "speed_m_per_s": None}
-    return Trial(scene=scene, **{"field": request.field, **sized, **more})
+    return Trial(scene=scene, **{**sized, **more})
 
 
 def scenes_here(request: StudyRequest, default: Sequence[str]) -> list[str]:
@@ -348,4 +349,4 @@ def _rendered(
     assert deployment.truth is not None  # of ``open_stage``
     image, lens, pose = deployment.truth.view(trial.scenario().held_out[0], present_ns)
     color = deployment.updates.field.snapshot(present_ns).render(pose, lens).color
-    return image, np.clip(color * 255.0 + 0.5, 0, 255).astype(np.uint8)
+    return image, to_bytes(color)

@@ -20,9 +20,9 @@ from edge_server.experiments.studies.study import METRICS, Claim, Study, StudyRe
 from edge_server.experiments.studies.trial import scenario_of, scene_label, scenes_here
 from edge_server.experiments.viewpoints.drawing import draw_plan
 from edge_server.experiments.viewpoints.stage import Stage, open_stage
+from edge_server.fidelity.images import to_bytes
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
-from edge_server.live.scoring_thread import to_bytes
 from edge_server.report.style import figure, label_lines
 from edge_server.viewpoints.capture_planner import Budget, Plan, plan_capture
 from edge_server.viewpoints.registry import make_selector

@@ -121,7 +121,7 @@ IMAGE_FIELDS = {"room": "nerfacto", "tower": "splat"}
 def _image_cases(request: StudyRequest) -> list[Point]:
     found = []
     for scene in scenes_here(request, tuple(IMAGE_FIELDS)):
-        of = {"field": "splat" if request.quick else IMAGE_FIELDS.get(scene, request.field)}
+        of = {"field": "splat" if request.quick else IMAGE_FIELDS.get(scene, "splat")}
         conditions = [
             ({**of, "channel": name}, {"channel": channel, **of})
             for name, channel in request.channels({"ch5": {"preset": "ch5"}}).items()

@@ -51,14 +51,10 @@ class Candidate:
     actor: str | Actor
 
 
-def fixed_candidates(
-    kinds: Iterable[str],
-    others: Sequence[str] = ("random", "all"),
-    omegas_ms: Mapping[str, Sequence[float]] = OMEGAS_MS,
-) -> list[Candidate]:
+def fixed_candidates(kinds: Iterable[str], others: Sequence[str] = ("random", "all")) -> list[Candidate]:
     """Every fixed value of each of ``kinds`` (threshold, wait), labeled ``policy`` and ``value``, and ``others``."""
     values = [
-        Candidate({"policy": kind, "value": omega}, f"{kind}:{omega:g}") for kind in kinds for omega in omegas_ms[kind]
+        Candidate({"policy": kind, "value": omega}, f"{kind}:{omega:g}") for kind in kinds for omega in OMEGAS_MS[kind]
     ]
     return [*(Candidate({"policy": name}, name) for name in others), *values]
 

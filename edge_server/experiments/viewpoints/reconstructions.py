@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.experiments.viewpoints.stage import Stage
-from edge_server.fidelity.images import to_unit
+from edge_server.fidelity.images import to_bytes, to_unit
 from edge_server.fields import Field
-from edge_server.live.scoring_thread import to_bytes
 from edge_server.viewpoints.candidates import Candidates
 from edge_server.viewpoints.capture_planner import Budget, Plan, plan_capture
 from edge_server.viewpoints.experts import judge

@@ -17,11 +17,10 @@ from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
 from edge_server.experiments.scenes.multiview_still import WHITE, known_options, score_views
 from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.experiments.virtual.from_scenario import exact_scene
-from edge_server.fidelity.images import BLACK, Color, to_unit
+from edge_server.fidelity.images import BLACK, Color, to_bytes, to_unit
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
-from edge_server.live.scoring_thread import to_bytes
 from edge_server.viewpoints.candidates import Candidates, ViewpointError, from_poses, half_hemisphere
 from edge_server.viewpoints.policy import Embed
 from freshfield.scenario import Scenario, load
@@ -73,9 +72,7 @@ class Stage:
         return score_views(made, self.held_out, scorer)[0]
 
 
-def open_stage(
-    name: str, count: int = 100, size: int | None = None, data: Path | None = None, scale: float = 1.0
-) -> Stage:
+def open_stage(name: str, count: int = 100, size: int | None = None, data: Path | None = None) -> Stage:
     """Open the stage of a scenario: a file or the name of a shipped one.
 
     A synthetic world has ``count`` candidates on a half-hemisphere round its object, at the distance of the
@@ -84,7 +81,6 @@ def open_stage(
 
     size: width and height of a world's images; None: the scenario's.
     data: folder of recorded data sets.
-    scale: divides the sizes of recorded images.
     Raises ScenarioError, DatasetError or ViewpointError.
     """
     scenario = load(name)
@@ -92,7 +88,7 @@ def open_stage(
     if isinstance(source, WorldConfig):
         return _world(scenario, source, count, size)
     if isinstance(source, RecordedConfig):
-        return _recording(scenario, source, data, scale)
+        return _recording(scenario, source, data)
     raise ViewpointError(
         f"{scenario.path}: source: its cameras are real: a plan needs a synthetic world or a recording"
     )
@@ -132,8 +128,8 @@ def _arm_reaches(scenario: Scenario, source: SourceConfig, candidates: Candidate
     return reachable(arm_model(scenario, arm), base_matrix(arm), mount, arm.path, list(candidates.poses))
 
 
-def _recording(scenario: Scenario, source: RecordedConfig, data: Path | None, scale: float) -> Stage:
-    found = load_recorded(find_data(source.data, scenario, data), scale=scale * source.scale)
+def _recording(scenario: Scenario, source: RecordedConfig, data: Path | None) -> Stage:
+    found = load_recorded(find_data(source.data, scenario, data), scale=source.scale)
     views = found.training
     candidates = from_poses([v.camera_to_world for v in views], views[0].intrinsics)
     transparent = views[0].image.shape[2] == 4

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from camera_node.capture import Camera
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
+from edge_server.fidelity.images import to_bytes
 from edge_server.fidelity.refined import render_refined
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import RefinesCameras, Snapshot, View
@@ -121,19 +122,15 @@ class NowAndAll:
         some = np.linspace(0, len(found) - 1, min(_SEEN, len(found))).round().astype(int)
         self._images = {
             "truth_now": self._frames[-1].image,
-            "now": _bytes(found[-1]),
+            "now": to_bytes(found[-1]),
             "truth_all": np.array([self._frames[k].image for k in some]),
-            "all": np.array([_bytes(found[k]) for k in some]),
+            "all": np.array([to_bytes(found[k]) for k in some]),
         }
 
     @staticmethod
     def _shown(shown: Snapshot, frame: View) -> NDArray[np.float32]:
         refined = render_refined(shown, frame)
         return shown.render(frame.camera_to_world, frame.intrinsics).color if refined is None else refined
-
-
-def _bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
 def _facts(run: Path) -> dict[str, Any]:

@@ -316,11 +316,7 @@ def usual_settings(config: EdgeConfig) -> RunSettings:
 
 def _settings(config: EdgeConfig, args: argparse.Namespace) -> RunSettings:
     found = usual_settings(config)
-    return dataclasses.replace(
-        found,
-        steps=found.steps if args.steps is None else args.steps,
-        epoch_ms=found.epoch_ms if args.epoch_ms is None else args.epoch_ms,
-    )
+    return found if args.steps is None else dataclasses.replace(found, steps=args.steps)
 
 
 def _epoch_ms(config: EdgeConfig) -> float:
@@ -352,12 +348,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--steps", type=int, metavar="N", help="optimizer steps of an update [edge.steps, else 100]")
     add("--compute", metavar="zero|MS:MS", help="ms per step and ms per update [edge.compute, else zero]")
-    add(
-        "--epoch-ms",
-        type=float,
-        metavar="MS",
-        help=f"ms between decisions [{_CYCLE_MS:g}; edge.update_ms if updates follow arrivals]",
-    )
     add_folders(parser)
     add(
         "--out",

@@ -20,8 +20,8 @@ def scenario(**edge) -> Scenario:
 def test_defaults_and_values():
     assert read_config(load("room")).embedding is None
     assert read_config(scenario(embedding={})).embedding == EmbeddingConfig()
-    found = read_config(scenario(embedding={"dim": 16, "size": 320})).embedding
-    assert (found.dim, found.size) == (16, 320)
+    found = read_config(scenario(embedding={"dim": 16})).embedding
+    assert found.dim == 16
     assert model_path(EmbeddingConfig().model).name == "detector_int8.onnx"
 
 
@@ -37,7 +37,6 @@ def test_a_model_is_relative_to_the_scenario():
         ({"dims": 3}, "edge.embedding.dims: unknown key; did you mean 'dim'?"),
         ({"dim": 0}, "edge.embedding.dim: expected a whole number, 1 to 4096, got 0"),
         ({"dim": "32"}, "edge.embedding.dim: expected a whole number"),
-        ({"size": 8}, "edge.embedding.size: expected a whole number, 32 to 2048, got 8"),
         ("default", "edge.embedding: expected a mapping"),
     ],
 )

@@ -57,18 +57,14 @@ def test_the_projection_keeps_lengths_and_is_the_same_in_every_process(tmp_path)
         embedder(path, dim=7)
 
 
-def test_the_size_is_the_files_or_the_scenarios_or_the_exporters(tmp_path):
+def test_the_size_is_the_files_or_the_exporters(tmp_path):
     free = detector(tmp_path / "free.onnx", size=None)
     assert embedder(free).backbone.height == 640
-    assert embedder(free, size=96).backbone.width == 96
     noted = detector(tmp_path / "noted.onnx", size=None, meta={"imgsz": "[64, 96]"})
     assert (embedder(noted).backbone.height, embedder(noted).backbone.width) == (64, 96)
     odd = detector(tmp_path / "odd.onnx", size=None, meta={"imgsz": "[" * 300})
     assert embedder(odd).backbone.height == 640, "a note that makes no sense is no note"
-    fixed = detector(tmp_path / "fixed.onnx")
-    assert embedder(fixed, size=32).backbone.height == 32
-    with pytest.raises(EmbeddingError, match="exported for 32 x 32 only"):
-        embedder(fixed, size=64)
+    assert embedder(detector(tmp_path / "fixed.onnx")).backbone.height == 32
 
 
 def test_alpha_is_laid_over_gray(tmp_path):

@@ -15,9 +15,8 @@ from edge_server.page.viewpoint import (
     initial_viewpoint,
     row_band,
     visitor_camera,
-    world_up,
 )
-from freshfield.geometry import look_at, matrix_to_quaternion, quaternion_to_matrix, se3_inverse
+from freshfield.geometry import look_at, matrix_to_quaternion, quaternion_to_matrix, se3_inverse, world_up
 from tests.edge_server.page.preview import BallScene
 
 TARGET = np.array([1.0, -2.0, 0.5])

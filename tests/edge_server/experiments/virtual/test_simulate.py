@@ -187,8 +187,3 @@ def test_a_policy_is_tried_by_name_or_as_an_object_as_the_command_runs_it(tmp_pa
         ff.try_policy("nothing", path)
     with pytest.raises(ScenarioError, match="expected more than 0"):
         ff.try_policy("all", path, seconds=float("nan"))
-
-
-def test_a_key_of_an_earlier_version_says_what_does_the_same(tmp_path: Path, capsys):
-    assert main([str(write(tmp_path, export="mesh"))]) == 2
-    assert "edge.export: is no key any more" in capsys.readouterr().err
