@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from edge_server.fields.splat.layers import settings
+from edge_server.fields.splat.layers.depth import settings as depth_settings
 
 
 @pytest.fixture(autouse=True)
@@ -15,3 +16,9 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(settings, "SCHEDULE", 200)
     monkeypatch.setattr(settings, "ROUNDS_FIRST", 5)
     monkeypatch.setattr(settings, "ROUNDS_AGAIN", 3)
+
+
+@pytest.fixture
+def shown_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What depth teaches, too."""
+    monkeypatch.setattr(depth_settings, "SHOWN_AFTER", (20, 40))

@@ -15,18 +15,15 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
-from edge_server.fields.splat.layers.depth import settings as depth_settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
-from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import world_rays
 from tests.edge_server.fields.scenes import psnr, ring, seen
+from tests.edge_server.fields.splat.layers.depth.moving_ball import FRAME_S, SMALL, measured, place_m
 
-pytestmark = pytest.mark.stability
-
-SMALL = SplatSettings(gaussians=1200, start=700, seed_cells=32, densify_every=20, threads=2)
+pytestmark = [pytest.mark.stability, pytest.mark.usefixtures("shown_soon")]
 RIG = ring(9)
 CAMERAS, HELD = [RIG[0], RIG[2], RIG[4], RIG[6]], RIG[1]
-FRAME_S, FRAMES = 1.0 / 15.0, 36
+FRAMES = 36
 HALF_SECOND, LATER_S = 8, 0.2  # frames; another kind of processor rounds otherwise, and training amplifies that
 DARK = range(18, 22)  # frames
 MIRROR_Y, PANE_Y = 0.85, -0.85  # planes behind and before the plate, as wide as it and 1 m high
@@ -37,13 +34,8 @@ World = Callable[[View, Array], View]
 """What a camera sees, with depth, where the ball is at a place."""
 
 
-def _view(view: View, image: NDArray, distance: Array) -> View:
-    z = np.where(np.isfinite(distance), distance * view.intrinsics.rays()[..., 2], 0.0)
-    return replace(view, image=image.astype(np.uint8), depth=z.astype(np.float32))
-
-
 def _plain(view: View, ball_m: Array) -> View:
-    return _view(view, *seen(view.intrinsics, view.camera_to_world, ball_m))
+    return measured(view, *seen(view.intrinsics, view.camera_to_world, ball_m))
 
 
 def _in_plane(view: View, y: float) -> Array:
@@ -63,7 +55,7 @@ def _mirror(view: View, ball_m: Array) -> View:
     behind[1, 3] = 2.0 * MIRROR_Y
     mirrored, seems = seen(view.intrinsics, behind @ view.camera_to_world, ball_m)
     there = _in_plane(view, MIRROR_Y) < distance
-    return _view(view, np.where(there[..., None], mirrored, image), np.where(there, seems, distance))
+    return measured(view, np.where(there[..., None], mirrored, image), np.where(there, seems, distance))
 
 
 def _glass(view: View, ball_m: Array) -> View:
@@ -72,7 +64,7 @@ def _glass(view: View, ball_m: Array) -> View:
     pane = _in_plane(view, PANE_Y)
     there = pane < distance
     shown = np.where(there[..., None], 0.8 * image + 0.2 * 255.0, image)
-    return _view(view, shown, np.where(there & PATCHES, pane, distance))
+    return measured(view, shown, np.where(there & PATCHES, pane, distance))
 
 
 def _turned(view: View, degrees: float) -> View:
@@ -139,15 +131,6 @@ CASES = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _shown_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(depth_settings, "SHOWN_AFTER", (20, 40))
-
-
-def _ball_m(instant_s: float) -> Array:
-    return np.array([0.25 * np.cos(3 * instant_s), 0.25 * np.sin(3 * instant_s), 0.5])
-
-
 def _curve(case: Case, depth: bool) -> list[float]:
     """PSNR of the held-out view after each frame. depth: whether frames bring it."""
     field, shown_db = LayeredField(SMALL), []
@@ -155,12 +138,12 @@ def _curve(case: Case, depth: bool) -> list[float]:
         views = []
         for k, camera in enumerate(CAMERAS):
             instant_s = (frame + k / len(CAMERAS)) * FRAME_S
-            view = case.world(case.placed(k, camera), _ball_m(instant_s))
+            view = case.world(case.placed(k, camera), place_m(instant_s))
             named = replace(view, camera=camera.camera, generated_ns=round(instant_s * 1e9))
             told = case.told(k, frame, named)
             views.append(told if depth else replace(told, depth=None))
         field.fit(views, Budget(steps=20))
-        truth = case.world(HELD, _ball_m(frame * FRAME_S))
+        truth = case.world(HELD, place_m(frame * FRAME_S))
         last = case.told(len(CAMERAS), FRAMES, truth)
         color = field.snapshot().render(last.camera_to_world, last.intrinsics).color
         assert np.isfinite(color).all()

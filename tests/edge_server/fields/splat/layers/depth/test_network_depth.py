@@ -16,9 +16,10 @@ from edge_server.fields.splat.layers.depth.network_depth import NetworkDepth, al
 from edge_server.fields.splat.layers.depth.surfaces import Surface
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from tests.edge_server.fields.small import same_state
-from tests.edge_server.fields.splat.layers.depth import test_with_depth as with_depth
+from tests.edge_server.fields.splat.layers.depth.moving_ball import SMALL
 from tests.edge_server.fields.splat.layers.depth.room_plates import relative_of, room_plates
 from tests.edge_server.fields.splat.layers.depth.test_plate_stereo import _named, _swept
+from tests.edge_server.fields.splat.layers.depth.test_with_depth import _frame
 
 Image = NDArray[np.float32]
 NAMES = ["cam01", "cam02", "cam03"]
@@ -138,7 +139,7 @@ def _measured(view: View) -> View:
 
 def _of_the_ball(image: NDArray[np.uint8]) -> Image:
     """What a network says of the camera whose image is most like this one."""
-    views = [with_depth._frame(k, 0) for k in range(3)]
+    views = [_frame(k, 0) for k in range(3)]
     k = int(np.argmin([np.mean(np.abs(v.image.astype(float) - image) > 40.0) for v in views]))
     assert views[k].depth is not None
     return relative_of(np.where(views[k].depth > 0, views[k].depth, 6.0), k)
@@ -146,12 +147,12 @@ def _of_the_ball(image: NDArray[np.uint8]) -> Image:
 
 def _run(field: LayeredField, frames: range) -> LayeredField:
     for frame in frames:
-        field.fit([_measured(with_depth._frame(k, frame)) for k in range(3)], Budget(steps=5))
+        field.fit([_measured(_frame(k, frame)) for k in range(3)], Budget(steps=5))
     return field
 
 
 def _field(network: Callable[[NDArray[np.uint8]], Image] | None) -> LayeredField:
-    field = LayeredField(with_depth.SMALL)
+    field = LayeredField(SMALL)
     if network is not None:
         field.use_depth_network(network)
     return field

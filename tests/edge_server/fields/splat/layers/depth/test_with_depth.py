@@ -14,33 +14,20 @@ from numpy.typing import NDArray
 from edge_server.fields import Budget, View
 from edge_server.fields.splat.layers.depth import settings as depth_settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
-from edge_server.fields.splat.settings import SplatSettings
-from tests.edge_server.fields.scenes import psnr, ring, seen
+from tests.edge_server.fields.scenes import ring, seen
 from tests.edge_server.fields.small import same_state
+from tests.edge_server.fields.splat.layers.depth.moving_ball import FRAME_S, SMALL, score, taken
 
-SMALL = SplatSettings(gaussians=1200, start=700, seed_cells=32, densify_every=20, threads=2)
 RIG = ring(9)
 CAMERAS, HELD = [RIG[0], RIG[2], RIG[4]], RIG[1]
-FRAME_S = 1.0 / 15.0
+pytestmark = pytest.mark.usefixtures("shown_soon")
 
 Spoil = Callable[[int, int, NDArray[np.float32]], NDArray[np.float32] | None]
 
 
-@pytest.fixture(autouse=True)
-def _shown_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(depth_settings, "SHOWN_AFTER", (20, 40))
-
-
-def _ball_m(instant_s: float) -> NDArray[np.float64]:
-    return np.array([0.25 * np.cos(3 * instant_s), 0.25 * np.sin(3 * instant_s), 0.5])
-
-
 @cache
 def _frame(camera: int, frame: int) -> View:
-    view, instant_s = CAMERAS[camera], (frame + camera / len(CAMERAS)) * FRAME_S
-    image, distance = seen(view.intrinsics, view.camera_to_world, _ball_m(instant_s))
-    z = np.where(np.isfinite(distance), distance * view.intrinsics.rays()[..., 2], 0.0).astype(np.float32)
-    return replace(view, image=image, generated_ns=round(instant_s * 1e9), depth=z)
+    return taken(CAMERAS[camera], (frame + camera / len(CAMERAS)) * FRAME_S)
 
 
 def _no_depth(camera: int, frame: int, depth: NDArray[np.float32]) -> None:
@@ -57,19 +44,12 @@ def _run(field: Any, frames: range, spoil: Spoil | None = None, cameras: int = 3
         field.fit(views, Budget(steps=steps))
 
 
-def _score(field: LayeredField, frame: int) -> float:
-    truth, _ = seen(HELD.intrinsics, HELD.camera_to_world, _ball_m(frame * FRAME_S))
-    color = field.snapshot().render(HELD.camera_to_world, HELD.intrinsics).color
-    assert np.isfinite(color).all()
-    return psnr(color, truth / 255.0)
-
-
 @cache
 def _usual(kind: str) -> float:
     """Score of the field after 40 frames: ``none``: without depth; ``exact``."""
     field = LayeredField(SMALL)
     _run(field, range(40), _no_depth if kind == "none" else None)
-    return _score(field, 39)
+    return score(field, HELD, 39 * FRAME_S)
 
 
 def test_depth_lets_layers_begin_sooner_and_shows_what_is_between_the_cameras() -> None:
@@ -79,7 +59,7 @@ def test_depth_lets_layers_begin_sooner_and_shows_what_is_between_the_cameras() 
     assert all(" " not in view.camera for view in field.views) and len(field.still.views) > len(field.views)
     _run(field, range(13, 40))
     assert not field.supervision.early and field.supervision.with_depth
-    assert _score(field, 39) > _usual("none") + 0.3
+    assert score(field, HELD, 39 * FRAME_S) > _usual("none") + 0.3
     unseen = field.snapshot().unseen(HELD.camera_to_world, HELD.intrinsics)
     _, distance = seen(HELD.intrinsics, HELD.camera_to_world)
     assert unseen is not None and unseen[~np.isfinite(distance)].mean() > 0.9 > 0.5 > unseen[distance < 9].mean()
@@ -104,7 +84,7 @@ def test_one_camera_with_depth_has_layers() -> None:
 def test_each_fifth_depth_does() -> None:
     field = LayeredField(SMALL)
     _run(field, range(40), lambda camera, frame, depth: depth if frame % 5 == 0 else None)
-    assert _score(field, 39) > _usual("exact") - 1.0
+    assert score(field, HELD, 39 * FRAME_S) > _usual("exact") - 1.0
 
 
 def test_depth_of_another_instant_says_nothing_of_what_moves() -> None:
@@ -124,7 +104,7 @@ def test_depth_of_another_instant_says_nothing_of_what_moves() -> None:
 def test_a_camera_without_depth_beside_others_is_learned_too() -> None:
     field = LayeredField(SMALL)
     _run(field, range(40), lambda camera, frame, depth: None if camera == 1 else depth)
-    assert field.supervision.with_depth and _score(field, 39) > _usual("none")
+    assert field.supervision.with_depth and score(field, HELD, 39 * FRAME_S) > _usual("none")
 
 
 @pytest.mark.parametrize("frames", [6, 12, 30])
@@ -187,4 +167,4 @@ def test_broken_depth_costs_little(kind: str) -> None:
     assert field.layered and len(field.cameras) == 3
     assert tuple(said.split()[3] for said in field.troubles) == _NAMED.get(kind, ())
     # A constant depth of the right order of magnitude, before cameras that share little, is believed.
-    assert _score(field, 39) > _usual("none") - (2.5 if kind == "constant" else 0.5)
+    assert score(field, HELD, 39 * FRAME_S) > _usual("none") - (2.5 if kind == "constant" else 0.5)

@@ -8,36 +8,23 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
 from edge_server.fields.splat.layers import settings as layer_settings
-from edge_server.fields.splat.layers.depth import settings as depth_settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
-from edge_server.fields.splat.settings import SplatSettings
-from tests.edge_server.fields.scenes import psnr, ring, seen
+from tests.edge_server.fields.scenes import psnr, ring
 from tests.edge_server.fields.small import same_state
+from tests.edge_server.fields.splat.layers.depth.moving_ball import FRAME_S, SMALL, score, taken
 
-SMALL = SplatSettings(gaussians=1200, start=700, seed_cells=32, densify_every=20, threads=2)
 RIG = ring(9, 64)
 CAMERAS, HELD = [RIG[0], RIG[1], RIG[3]], RIG[2]
-FRAME_S, FRAMES = 1.0 / 15.0, 36
-
-
-@pytest.fixture(autouse=True)
-def _shown_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(depth_settings, "SHOWN_AFTER", (20, 40))
-
-
-def _ball_m(instant_s: float) -> NDArray[np.float64]:
-    return np.array([0.25 * np.cos(3 * instant_s), 0.25 * np.sin(3 * instant_s), 0.5])
+FRAMES = 36
+pytestmark = pytest.mark.usefixtures("shown_soon")
 
 
 @cache
 def _frame(camera: int, frame: int) -> View:
-    view, instant_s = CAMERAS[camera], (frame + camera / len(CAMERAS)) * FRAME_S
-    image, _ = seen(view.intrinsics, view.camera_to_world, _ball_m(instant_s))
-    return replace(view, image=image, generated_ns=round(instant_s * 1e9))
+    return replace(taken(CAMERAS[camera], (frame + camera / len(CAMERAS)) * FRAME_S), depth=None)
 
 
 def _run(field: LayeredField, frames: range, cameras: int = 3, steps: int = 20) -> None:
@@ -46,8 +33,7 @@ def _run(field: LayeredField, frames: range, cameras: int = 3, steps: int = 20) 
 
 
 def _score(field: LayeredField) -> float:
-    truth, _ = seen(HELD.intrinsics, HELD.camera_to_world, _ball_m((FRAMES - 1) * FRAME_S))
-    return psnr(field.snapshot().render(HELD.camera_to_world, HELD.intrinsics).color, truth / 255.0)
+    return score(field, HELD, (FRAMES - 1) * FRAME_S)
 
 
 def test_stereo_shows_what_is_between_few_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,10 +92,9 @@ def test_other_units_cost_little(unit: float) -> None:
     field = LayeredField(SMALL)
     for frame in range(FRAMES):
         field.fit([scaled(_frame(k, frame)) for k in range(3)], Budget(steps=20))
-    truth, _ = seen(HELD.intrinsics, HELD.camera_to_world, _ball_m((FRAMES - 1) * FRAME_S))
-    held = scaled(HELD)
+    held, truth = scaled(HELD), taken(HELD, (FRAMES - 1) * FRAME_S)
     color = field.snapshot().render(held.camera_to_world, held.intrinsics).color
-    assert psnr(color, truth / 255.0) > _usual() - 0.5
+    assert psnr(color, truth.image / 255.0) > _usual() - 0.5
 
 
 @pytest.mark.stability
