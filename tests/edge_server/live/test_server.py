@@ -49,19 +49,20 @@ def tiny_scenario(tmp_path, held_out=("cam00",), **edge):
 class Feed(threading.Thread):
     """Streams real frames of every camera, one unacknowledged at a time, until stopped."""
 
-    def __init__(self, port: int, cameras, held_out, transport: Transport | None = None, moving: str = "") -> None:
+    def __init__(
+        self, port: int, made: scenario.Scenario, transport: Transport | None = None, moving: str = ""
+    ) -> None:
         super().__init__(daemon=True)
-        self.moving = moving
-        self.cameras, self.held_out = cameras, held_out
+        self.scenario, self.moving = made, moving
         self.transport = transport or Transport()
         self.channel = self.transport.channel(f"127.0.0.1:{port}")
         self.done = threading.Event()
         self.answers = []
 
     def frames(self):
-        angle = {c: 0.5 * i for i, c in enumerate(self.cameras)}
+        angle = {c: 0.5 * i for i, c in enumerate(self.scenario.cameras)}
         for sequence in range(10**6):
-            for camera in self.cameras:
+            for camera in self.scenario.cameras:
                 if self.done.wait(0.01):
                     return
                 turned = angle[camera] + 0.1 * sequence * (camera == self.moving)
@@ -78,7 +79,7 @@ class Feed(threading.Thread):
                         CAMERA,
                         "jpeg",
                         payload.encode(image),
-                        held_out=camera in self.held_out,
+                        held_out=camera in self.scenario.held_out,
                     )
                 )
 
@@ -116,6 +117,23 @@ def serve(tmp_path):
         assert not thread.is_alive()
 
 
+@pytest.fixture
+def fed(serve):
+    """Starts a server and feeds it until it shows something: server, feed, thread."""
+    feeds = []
+
+    def start(*given, **options):
+        server, port, thread = serve(*given, **options)
+        feeds.append(Feed(port, server.scenario))
+        feeds[-1].start()
+        until(server.state.publications)
+        return server, feeds[-1], thread
+
+    yield start
+    for feed in feeds:
+        feed.stop()
+
+
 def until(condition, seconds=60.0):
     deadline = time.perf_counter() + seconds
     while not condition():
@@ -123,10 +141,8 @@ def until(condition, seconds=60.0):
         time.sleep(0.05)
 
 
-def test_a_run_from_first_frame_to_files(serve, tmp_path):
-    server, port, thread = serve(metrics_port=(metrics := free_port()))
-    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
-    feed.start()
+def test_a_run_from_first_frame_to_files(serve, fed, tmp_path):
+    server, feed, thread = fed(metrics_port=(metrics := free_port()))
     until(lambda: any(p.psnr_db is not None for p in server.state.publications()))
     until(lambda: server.scoring.baselines)  # they come after the first score
     with urllib.request.urlopen(f"http://127.0.0.1:{metrics}/metrics") as page:
@@ -172,7 +188,7 @@ def test_operators_see_and_change_a_running_server(serve, tmp_path, request):
     with pytest.raises(grpc.RpcError) as early:
         edge.SaveSnapshot(edge_pb2.SaveSnapshotRequest())
     assert early.value.code() == grpc.StatusCode.FAILED_PRECONDITION
-    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
+    feed = Feed(port, server.scenario)
     feed.start()
     decisions = edge.WatchDecisions(edge_pb2.WatchDecisionsRequest())
     first = next(decisions).decision
@@ -216,7 +232,7 @@ def test_a_camera_that_moves_begins_the_field_anew_as_a_scan_and_a_resumed_run_k
     assert server.state.chosen == (
         "splat in layers, updated at arrivals for 100 ms: no camera moves; the scenario sets field, update_ms"
     )
-    feed = Feed(port, made.cameras, made.held_out, moving="cam02")
+    feed = Feed(port, made, moving="cam02")
     feed.start()
     until(lambda: "cam02 moves" in server.state.chosen)
     moved = server.updater.number
@@ -262,11 +278,8 @@ def test_watchers_are_few_and_a_new_one_always_finds_a_place(serve):
         assert not watching[-1].done()
 
 
-def test_snapshots_do_not_fill_the_disk(serve, tmp_path):
-    server, port, _ = serve()
-    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
-    feed.start()
-    until(lambda: server.state.publications())
+def test_snapshots_do_not_fill_the_disk(fed, tmp_path):
+    server, _, _ = fed()
     with server._snapshot_lock, pytest.raises(RuntimeError, match="another one is being written"):
         server.state.save_snapshot()
     server.state.save_snapshot()
@@ -274,15 +287,11 @@ def test_snapshots_do_not_fill_the_disk(serve, tmp_path):
         (tmp_path / "out" / f"snapshot-9{k:05d}.npz").touch()
     with pytest.raises(RuntimeError, match="holds 20 already: move some away"):
         server.state.save_snapshot()
-    feed.stop()
 
 
-def test_a_final_checkpoint_that_is_not_written_is_said(serve, tmp_path, monkeypatch, caplog):
+def test_a_final_checkpoint_that_is_not_written_is_said(fed, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(UpdateLoop.stop, "__defaults__", (0.1,))
-    server, port, thread = serve()
-    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
-    feed.start()
-    until(lambda: server.state.publications())
+    server, feed, thread = fed()
     begun, goes_on, fit = threading.Event(), threading.Event(), server.updater.fit
 
     def long_update(*arguments):
@@ -300,22 +309,19 @@ def test_a_final_checkpoint_that_is_not_written_is_said(serve, tmp_path, monkeyp
     assert "field.npz: not written: the last update did not end" in caplog.text
 
 
-def test_without_a_held_out_camera_the_selected_views_are_scored_and_it_says_so(serve, tmp_path):
-    server, port, _ = serve(tiny_scenario(tmp_path, held_out=()))
-    feed = Feed(port, server.scenario.cameras, ())
-    feed.start()
+def test_without_a_held_out_camera_the_selected_views_are_scored_and_it_says_so(fed, tmp_path):
+    server, _, _ = fed(tiny_scenario(tmp_path, held_out=()))
     until(lambda: any(p.scored_on == "selected" for p in server.state.publications()))
-    feed.stop()
 
 
 def test_a_token_is_demanded_and_honoured(serve, tmp_path):
     secured = Transport(tokens={"camera:*": "open sesame"})
     server, port, _ = serve(transport=secured)
-    refused = Feed(port, server.scenario.cameras, server.scenario.held_out)
+    refused = Feed(port, server.scenario)
     refused.start()
     refused.join(20)
     assert refused.error.code() == grpc.StatusCode.UNAUTHENTICATED
-    welcome = Feed(port, server.scenario.cameras, server.scenario.held_out, secured)
+    welcome = Feed(port, server.scenario, secured)
     welcome.start()
     until(lambda: len(welcome.answers) > 3)
     welcome.stop()
@@ -334,11 +340,8 @@ def test_every_port_beyond_this_machine_is_protected_or_named(tmp_path):
     assert [words.split(" on ")[0] for words in named] == ["gRPC", "page", "metrics"]
 
 
-def test_the_ledger_is_closed_even_if_nothing_else_can_be_written(serve, tmp_path):
-    server, port, thread = serve()
-    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
-    feed.start()
-    until(lambda: server.state.publications())
+def test_the_ledger_is_closed_even_if_nothing_else_can_be_written(fed, tmp_path):
+    server, feed, thread = fed()
     feed.stop()
     (tmp_path / "out" / "field.npz").mkdir()  # the checkpoint cannot take its place
     server.stop()
@@ -356,17 +359,14 @@ def test_a_time_that_no_timer_takes_is_refused(tmp_path, capsys, option, value):
     assert f"{option} " in said and "expected 0 to 1e+09" in said and said.count("\n") == 1
 
 
-def test_files_are_written_before_anything_that_may_take_long(serve, tmp_path, monkeypatch):
+def test_files_are_written_before_anything_that_may_take_long(fed, tmp_path, monkeypatch):
     closed = []
 
     def page_stops() -> None:
         (ledger,) = read_all(tmp_path / "out")
         closed.append(ledger.closed)
 
-    server, port, thread = serve(open_page=lambda state: SimpleNamespace(url="here", stop=page_stops))
-    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
-    feed.start()
-    until(lambda: server.state.publications())
+    server, feed, thread = fed(open_page=lambda state: SimpleNamespace(url="here", stop=page_stops))
     written, stop = [], server.scoring.stop
     monkeypatch.setattr(
         server.scoring, "stop", lambda *given: written.append((tmp_path / "out/field.npz").exists()) or stop(*given)

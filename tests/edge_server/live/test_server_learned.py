@@ -41,7 +41,7 @@ def test_it_decides_by_what_cameras_see_and_every_decision_can_be_explained(tmp_
     server = server_of(tmp_path, StateLayout(("age", "pose", "semantics"), dim=CHANNELS), port=port)
     thread = threading.Thread(target=server.run)
     thread.start()
-    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
+    feed = Feed(port, server.scenario)
     feed.start()
     try:
         until(lambda: server.updater.number >= 4)
@@ -64,11 +64,10 @@ def test_it_decides_by_what_cameras_see_and_every_decision_can_be_explained(tmp_
     assert "in the picture of" in capsys.readouterr().out
 
 
-def test_a_scenario_that_says_nothing_has_the_usual_embedding_which_is_another(tmp_path):
-    with pytest.raises(scenario.ScenarioError, match=r"tiny\.yaml: edge"):
-        server_of(tmp_path, StateLayout(("semantics",), dim=CHANNELS), embedding=False)
-
-
-def test_with_another_width_it_does_not_start(tmp_path):
-    with pytest.raises(scenario.ScenarioError, match="of 2 numbers"):
-        server_of(tmp_path, StateLayout(("semantics",), dim=2))
+@pytest.mark.parametrize(
+    ("dim", "embedding", "said"), [(CHANNELS, False, r"tiny\.yaml: edge"), (2, True, "of 2 numbers")]
+)
+def test_with_another_embedding_or_another_width_it_does_not_start(tmp_path, dim, embedding, said):
+    """The scenario that names none has the usual embedding, which is another."""
+    with pytest.raises(scenario.ScenarioError, match=said):
+        server_of(tmp_path, StateLayout(("semantics",), dim=dim), embedding)
