@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import yaml
 
 from channel_emu.estimate.fit import Fit, IntervalEstimate
-from freshfield.files import picture
+from freshfield.files import write_bytes
 from freshfield.untrusted import YamlWriter
 
 _MAX_FRAMES = 2000
@@ -46,26 +47,41 @@ def scenario_text(fit: Fit) -> str:
 
 
 def plot(fit: Fit, path: Path) -> None:
-    """Plot the first delays, with the means, and below them the probability of the second state. Raises PlotError."""
+    """Plot the first delays, with the means, and below them the probability of the second state. Raises
+    ValueError if matplotlib is missing or the file cannot be written."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ValueError("a picture needs matplotlib: pip install 'freshfield[emu]'") from None
     cameras, two = fit.recording.cameras, fit.states == 2
     start_s = np.concatenate([c.started_ms for c in cameras]) / 1e3
     order = np.argsort(start_s, kind="stable")[:_MAX_FRAMES]  # frames that did not start come last
     start_s, delay_ms = start_s[order], np.concatenate([c.delay_ms for c in cameras])[order]
-    with picture(path, 1 + two, 1, sharex=True, size=(9, 3 + 1.5 * two), height_ratios=[3, 1][: 1 + two]) as axes:
-        top, bottom = axes[0, 0], axes[-1, 0]
-        top.scatter(start_s, delay_ms, s=5, color="#777777")
-        top.set_ylabel("delay (ms)")
-        bottom.set_xlabel("start of transmission (s)")
-        means = {name: value.value for name, value in fit.parameters.items() if name.startswith("mean")}
-        for (name, mean_ms), color in zip(means.items(), ("#0072B2", "#D55E00")):
-            top.axhline(mean_ms, color=color, lw=0.8, label=f"{name}: {mean_ms:.3g}")
-        if means:
-            top.legend(loc="upper right")
-        if two:
-            bottom.set(ylim=(-0.05, 1.05), ylabel=f"P({fit.channel['chain']['states'][1]})")
-            for (at_ms, _, _), states in zip(fit.lines, fit.second_state):
-                shown = at_ms / 1e3 <= np.nanmax(start_s)
-                bottom.plot(at_ms[shown] / 1e3, states[shown], lw=0.8, color="#D55E00")
+    figure = Figure(figsize=(9, 3 + 1.5 * two), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1 + two, 1, squeeze=False, sharex=True, height_ratios=[3, 1][: 1 + two])
+    top, bottom = axes[0, 0], axes[-1, 0]
+    top.scatter(start_s, delay_ms, s=5, color="#777777")
+    top.set_ylabel("delay (ms)")
+    bottom.set_xlabel("start of transmission (s)")
+    means = {name: value.value for name, value in fit.parameters.items() if name.startswith("mean")}
+    for (name, mean_ms), color in zip(means.items(), ("#0072B2", "#D55E00")):
+        top.axhline(mean_ms, color=color, lw=0.8, label=f"{name}: {mean_ms:.3g}")
+    if means:
+        top.legend(loc="upper right")
+    if two:
+        bottom.set(ylim=(-0.05, 1.05), ylabel=f"P({fit.channel['chain']['states'][1]})")
+        for (at_ms, _, _), states in zip(fit.lines, fit.second_state):
+            shown = at_ms / 1e3 <= np.nanmax(start_s)
+            bottom.plot(at_ms[shown] / 1e3, states[shown], lw=0.8, color="#D55E00")
+    drawn = io.BytesIO()
+    try:
+        figure.savefig(drawn, format=path.suffix[1:] or "png", dpi=120)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, drawn.getvalue())
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: cannot be drawn: {error}") from None
 
 
 def _bic_difference(bic: dict[int, float]) -> str:

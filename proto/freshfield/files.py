@@ -7,14 +7,12 @@ missing.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import csv
-import io
 import json
 import logging
 import os
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -103,36 +101,6 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
         width = max(map(len, cells))
         columns.append([cell.rjust(width) if numbers else cell.ljust(width) for cell in cells])
     return "\n".join("  ".join(cells).rstrip() for cells in zip(*columns))
-
-
-class PlotError(ValueError):
-    """A picture that cannot be drawn; the message says why."""
-
-
-@contextlib.contextmanager
-def picture(path: Path, rows: int, columns: int, size: tuple[float, float], **options: Any) -> Iterator[Any]:
-    """Context manager that yields matplotlib axes (rows, columns); on exit it replaces ``path`` by the
-    figure.
-
-    size: width and height in inches.
-    options: passed to matplotlib's ``subplots``.
-    Raises PlotError if matplotlib is missing or the file cannot be written.
-    """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise PlotError("a picture needs matplotlib: pip install 'freshfield[emu]'") from None
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    yield figure.subplots(rows, columns, squeeze=False, **options)
-    drawn = io.BytesIO()
-    try:
-        figure.savefig(drawn, format=path.suffix[1:] or "png", dpi=120)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, drawn.getvalue())
-    except (OSError, ValueError) as error:
-        raise PlotError(f"{path}: cannot be drawn: {error}") from None
 
 
 class Lines:

@@ -12,8 +12,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic.scene import SCENES
 from edge_server.experiments.common.arguments import add_lpips, add_workers, command_parser, parse_options, run_command
@@ -21,11 +19,10 @@ from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.frontier import from_scratch, update_time
 from edge_server.experiments.frontier.from_scratch import Fit, Still
 from edge_server.experiments.frontier.output import recommendation, write_output
-from edge_server.experiments.frontier.update_time import Charged, MovingRun, MovingScene, variants
+from edge_server.experiments.frontier.update_time import CHANNEL, POLICY, Charged, MovingRun, MovingScene, variants
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import FIELD, field_names, make_field
 from edge_server.machine import machine, versions
-from edge_server.scheduler import make_policy, parse_policy
 from edge_server.settings import ComputeConfig
 from freshfield.files import out_folder, write_json
 from freshfield.scenario import ScenarioError
@@ -134,9 +131,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="KEY=VALUE",
         help="option of the field, as in fit; may be repeated",
     )
-    add("--policy", default="all", metavar="NAME[:VALUE]", help="update policy in figure 2 [%(default)s]")
     add("--seeds", type=int, metavar="N", help="number of seeds [1 with --quick, else 3]")
-    add("--seed", type=int, default=0, metavar="N", help="first random seed [%(default)s]")
     add_workers(parser)
     add_lpips(parser)
     add("--out", type=out_folder, default="runs/frontier", metavar="DIR", help="folder to write [%(default)s]")
@@ -144,8 +139,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
-    make_policy(*parse_policy(args.policy), np.random.default_rng(0))  # rejected now, not between two measurements
-    sweep = replace(sweep, moving=replace(sweep.moving, policy=args.policy))
     if args.seeds is not None:
         if args.seeds < 1:
             raise ValueError(f"--seeds {args.seeds}: expected 1 or more")
@@ -160,7 +153,7 @@ def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
     lpips, missing = open_lpips(args.lpips)
     engine = Engine(args.out / "results.jsonl")
     workers = Engine(args.out / "results.jsonl", args.jobs, args.ray, threads=1)
-    seeds = range(args.seed, args.seed + sweep.seeds)
+    seeds = range(sweep.seeds)
     found = weights if lpips is not None else None
     return Frontier(args.out, engine, workers, sweep, still, fields, options, seeds, found, missing)
 
@@ -199,8 +192,8 @@ class Frontier:
             print(f"figure 2 left out: {why}", flush=True)
         data = {
             "scene": still.describe(),
-            "policy": self.sweep.moving.policy,
-            "channel": self.sweep.moving.channel,
+            "policy": POLICY,
+            "channel": CHANNEL,
             "machine": machine(),
             "versions": versions(),
             "fields": list(self.fields),

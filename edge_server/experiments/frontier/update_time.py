@@ -24,7 +24,6 @@ from edge_server.experiments.rollouts.rollout import named, rollout
 from edge_server.experiments.rollouts.setting import Setting
 from edge_server.experiments.virtual import costs
 from edge_server.fields.registry import option_help
-from edge_server.scheduler import parse_policy
 from edge_server.settings import LEAST_UPDATE_MS, ComputeConfig
 from freshfield.scenario import Scenario, parse
 
@@ -33,6 +32,8 @@ _COSTS_S, _LEAD_S = 1.0, 5.0
 # Steps per second of the static field of layers, which run on another core.
 _STATIC_STEPS_PER_S = 250.0
 MEDIUM, LAYERS = "medium", "layers"
+# The network of the moving scene, and which views its updates use.
+CHANNEL, POLICY = "ch5", "all"
 # What a row has of what was shown: the names of ``Outcome``.
 SHOWN = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
 
@@ -57,27 +58,24 @@ class Variant:
 
 @dataclass(frozen=True)
 class MovingScene:
-    """The cameras of ``room``, where somebody walks, and their network. policy: as people write it."""
+    """The cameras of ``room``, where somebody walks, and their network."""
 
     cameras: int = 13
     size: int = 96
-    channel: str = "ch5"
-    policy: str = "all"
 
     def scenario(self, speed_m_per_s: float, variant: Variant, **edge: Any) -> Scenario:
         """The deployment as a scenario. edge: further keys of its edge section."""
-        name, value = parse_policy(self.policy)
         world = {"kind": "world", "scene": "room", "width": self.size, "height": self.size, "fps": 15.0}
         return parse(
             {
                 "name": f"room at {speed_m_per_s:g} m/s",
                 "cameras": {"count": self.cameras, "held_out": ["cam00"], "phase": "spread"},
                 "source": {**world, "speed_m_per_s": speed_m_per_s},
-                "channel": {"preset": self.channel},
+                "channel": {"preset": CHANNEL},
                 "edge": {
                     "field": variant.field,
                     "field_options": {**variant.options, "layers": True} if variant.layers else dict(variant.options),
-                    "policy": {"name": name, "value": value},
+                    "policy": {"name": POLICY},
                     "updates": "arrivals" if variant.layers else "cycle",
                     **edge,
                 },
@@ -158,7 +156,7 @@ def run_updates(run: MovingRun, weights: Path | None = None) -> dict[str, Any]:
     about = run.moving, run.speed, variant.field, variant.name, json.dumps(dict(variant.options), sort_keys=True)
     factory = _factory(*about, weights)
     factory.setting = run.setting()
-    whole = rollout(factory, run.seed, named(run.moving.policy))[0].whole
+    whole = rollout(factory, run.seed, named(POLICY))[0].whole
     assert whole is not None  # it is deployed
     charged_s = run.compute.charge_ns(run.steps) / 1e9
     return {

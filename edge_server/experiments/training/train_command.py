@@ -144,13 +144,10 @@ def _omegas(args: argparse.Namespace) -> tuple[float, ...]:
         return OMEGAS_MS.get(args.kind, ())
     if args.kind == "select":
         raise ValueError("--omegas: --kind select chooses cameras, not an omega")
-    first, dots, last = args.omegas.partition("..")
     try:
-        if dots:
-            return tuple(float(ms) for ms in range(int(first), int(last) + 1))
         return tuple(float(v) for v in args.omegas.split(","))
     except ValueError:
-        raise ValueError(f"--omegas: expected milliseconds such as 20,60,120 or 0..120, got {args.omegas!r}") from None
+        raise ValueError(f"--omegas: expected milliseconds such as 20,60,120, got {args.omegas!r}") from None
 
 
 def _parts(text: str) -> tuple[str, ...]:
@@ -192,11 +189,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="P,...",
         help=f"parts of the state that the policy sees: {', '.join(STATE_PARTS)} [%(default)s]",
     )
-    add(
-        "--omegas",
-        metavar="MS,...",
-        help="ms that threshold and wait choose from: 20,60,120, or A..B: each whole number",
-    )
+    add("--omegas", metavar="MS,...", help="ms that threshold and wait choose from: 20,60,120")
     add("--scratch", action="store_true", help="each update starts from an empty field, as in the thesis")
     add("--fit-steps", type=int, metavar="N", help="optimizer steps of an update [20; 50 with --scratch]")
     add(

@@ -16,13 +16,11 @@ from typing import Any
 
 from edge_server.live.output.guarded_http import CALLER, serve_guarded
 from edge_server.page import PageError, page_url
-from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.preference_session import PreferenceSession
 from freshfield.access import CHANGE
 from freshfield.transport import Transport
 
-# Of a file of answers: thousands of them.
-MAX_BODY_BYTES = 2**20
+MAX_BODY_BYTES = 2**10  # of an answer: a hundred would do
 _HEADERS = [
     ("Cache-Control", "no-store"),
     ("X-Content-Type-Options", "nosniff"),
@@ -88,7 +86,6 @@ class PreferencePage:
         """The WSGI application."""
         method, path = environ["REQUEST_METHOD"], environ.get("PATH_INFO", "/")
         may_change = environ[CALLER].may(CHANGE)
-        more: list[tuple[str, str]] = []
         try:
             if method == "POST":
                 if not may_change:
@@ -99,12 +96,10 @@ class PreferencePage:
                 raise _Refused(404, "Not found.")
             with self._lock:
                 status, (kind, body) = 200, self._look(path, may_change)
-            if path == "/answers.json":
-                more = [("Content-Disposition", 'attachment; filename="answers.json"')]
         except _Refused as error:
             status, kind, body = error.status, "text/plain; charset=utf-8", str(error).encode()
         about = [("Content-Type", kind), ("Content-Length", str(len(body)))]
-        start_response(f"{status} {_REASONS[status]}", [*about, *more, *_HEADERS])
+        start_response(f"{status} {_REASONS[status]}", [*about, *_HEADERS])
         return [body]
 
     def _look(self, path: str, may_change: bool) -> tuple[str, bytes]:
@@ -116,8 +111,6 @@ class PreferencePage:
             self.seen.set()
         if path in ("/state", "/seen"):
             return "application/json", json.dumps(self.state(session) | {"may_change": may_change}).encode()
-        if path == "/answers.json":
-            return "application/json", json.dumps(session.as_json()).encode()
         if path == "/plan.png" and self._plan is not None:
             return "image/png", self._plan[1]
         asked = session.question
@@ -148,32 +141,26 @@ class PreferencePage:
             self._plan = lines, png
 
     def _change(self, path: str, body: bytes) -> None:
-        """Apply an answer, an undo, an import or the end. What a tab sends about an earlier turn is refused:
+        """Apply an answer, an undo or the end. What a tab sends about an earlier turn is refused:
         two tabs, or two fingers, answer nothing twice."""
         with self._lock:
             session = self.session
             if self.finished.is_set():
                 raise _Refused(409, "The session has ended.")
-            if path == "/import":
-                try:
-                    session = session.imported(body)
-                except ViewpointError as error:
-                    raise _Refused(400, f"Not imported: {error}") from None
+            message = _message(body)
+            if message.get("turn") != self._turn:
+                raise _Refused(409, "This was answered elsewhere; now see the present pair.")
+            if path == "/answer" and message.get("choice") in ("left", "right", "neither"):
+                if session.question is None:
+                    raise _Refused(409, "All questions are answered.")
+                session = session.answered(message["choice"])
+            elif path == "/undo":
+                session = session.undone()
+            elif path == "/finish":
+                self.finished.set()
+                return
             else:
-                message = _message(body)
-                if message.get("turn") != self._turn:
-                    raise _Refused(409, "This was answered elsewhere; now see the present pair.")
-                if path == "/answer" and message.get("choice") in ("left", "right", "neither"):
-                    if session.question is None:
-                        raise _Refused(409, "All questions are answered.")
-                    session = session.answered(message["choice"])
-                elif path == "/undo":
-                    session = session.undone()
-                elif path == "/finish":
-                    self.finished.set()
-                    return
-                else:
-                    raise _Refused(404, "Not found.")
+                raise _Refused(404, "Not found.")
             try:
                 self._keep(session)
             except OSError as error:
