@@ -151,6 +151,7 @@ class Node:
 
     async def _capture_all(self) -> None:
         self._enter("preparing")
+        log.info("preparing frames; a synthetic world is rendered first, once")
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._pool, prepare, self._cameras, self._stopping.is_set)
         if any(camera.schedule(0).lossless for camera in self._cameras):
@@ -159,6 +160,7 @@ class Node:
             while not all(sender.ready for sender in self.senders.values()):
                 await asyncio.sleep(_READY_POLL_S)
         self._enter("streaming")
+        log.info("streaming %s", ", ".join(camera.name for camera in self._cameras))
         start_ns = self._clock.now_ns()
         tasks = [asyncio.ensure_future(self._capture(c, start_ns)) for c in self._cameras]
         try:
