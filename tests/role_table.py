@@ -1,4 +1,4 @@
-"""The table of docs/deploy.md, who may do what: each of its cells is a test."""
+"""The table of docs/how-to/tls.md, who may do what: each of its cells is a test."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ TOKENS = {"camera:cam00": "a camera's", "viewer": "a viewer's", "operator": "an 
 
 def cells() -> list[tuple[str, str, bool]]:
     """What is done, who does it (a name of TOKENS, or "nobody"), whether they may."""
-    lines = iter((ROOT / "docs" / "deploy.md").read_text().splitlines())
+    lines = iter((ROOT / "docs" / "how-to" / "tls.md").read_text().splitlines())
     while next(lines) != "| | camera | viewer | operator | nobody |":
         pass
     next(lines)

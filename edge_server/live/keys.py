@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         description="Make a development certificate authority (CA), and a folder with "
         "certificate, key and CA for each process of a scenario: edge, emulator, every camera, operator and "
         "viewer. The edge's folder also holds tokens.txt, with which people log in to the page; kustomization.yaml "
-        "makes Kubernetes secrets of all that (docs/deploy.md).",
+        "makes Kubernetes secrets of all that (docs/how-to/kubernetes.md).",
     )
     parser.add_argument("scenario", help="scenario file, or the name of a shipped one")
     parser.add_argument("--out", type=out_folder, required=True, metavar="DIR", help="folder to write; must not exist")

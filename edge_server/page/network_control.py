@@ -31,7 +31,7 @@ Setting = tuple[float, float] | None
 class EmulatorControl:
     """Sets delay and loss of the emulator at ``address`` (HOST:PORT).
 
-    transport: must make this process an operator there, see docs/deploy.md.
+    transport: must make this process an operator there, see docs/how-to/tls.md.
     """
 
     def __init__(self, transport: Transport, address: str) -> None:
