@@ -97,7 +97,7 @@ class FlangeCamera(Source):
         mount: Array,
     ) -> None:
         self.camera, self.fps = camera, fps
-        self.intrinsics = effects.reported_lens(lens)
+        self.intrinsics = lens
         self._scene, self._lens, self._effects = scene, lens, effects
         self._poses, self._truth = poses, truth
         self._arm, self._base, self._mount = arm, base, mount
@@ -127,13 +127,12 @@ def open_flange_cameras(
     seen: Mapping[str, tuple[Scene, Pinhole]],
     effects: Mapping[str, Effects | None],
 ) -> dict[str, Source]:
-    """Connect to the arm and open the cameras on its flange. seen: each camera's scene, with its effects, and lens.
+    """Connect to the arm and open the cameras on its flange. seen: each camera's scene and lens.
     Raises ScenarioError and ArmError."""
     for camera in seen:
         made = effects.get(camera)
-        if made is not None and (made.exposure or made.depth):
-            unfit = (*made.exposure, *made.depth)
-            names = ", ".join(type(effect).__module__.rsplit(".", 1)[1] for effect in unfit)
+        if made is not None and made.depth:
+            names = ", ".join(type(effect).__module__.rsplit(".", 1)[1] for effect in made.depth)
             raise ScenarioError(
                 f"{scenario.path}: source.effects: {names}: not for a camera that an arm carries ({camera}): "
                 "they take the camera to stand still"

@@ -29,10 +29,9 @@ def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Eff
     with errors_of(f"{scenario.path}: source.effects"):
         held_out = camera in scenario.held_out
         effects = load_effects(config.effects, lambda name: scenario.rng(f"effect {name}", camera), held_out, camera)
-    if config.kind != "world" and (effects.lens or effects.exposure or effects.delay or effects.mount):
+    if config.kind != "world" and (effects.delay or effects.mount):
         raise ScenarioError(
-            f"{scenario.path}: source.effects: effects of the kinds lens, exposure, delay and mount need source kind "
-            "world"
+            f"{scenario.path}: source.effects: effects of the kinds delay and mount need source kind world"
         )
     return effects
 

@@ -80,7 +80,7 @@ class Scene:
     moving: bool = True
     object_parts: int | None = None
     static_key: str | None = field(default=None, repr=False, compare=False)
-    _renderers: dict[str, CameraRenderer] = field(default_factory=dict, repr=False, compare=False)
+    _renderers: dict[str, CameraRenderer] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def render(self, camera_id: str, t_s: float) -> Image:
         """A camera's image at an instant: uint8 RGB (height, width, 3), exact and free of noise."""
@@ -109,14 +109,6 @@ class Scene:
     def view(self, camera: Pinhole, camera_to_world: Array) -> CameraRenderer:
         """A renderer for any camera. camera_to_world: (4, 4)."""
         return CameraRenderer(self.world, camera, camera_to_world, self.params.supersample)
-
-    def with_world(self, world: World) -> Scene:
-        """The same cameras in another world that repeats after the same time, as effects need it."""
-        return dataclasses.replace(self, world=world, static_key=None, _renderers={})
-
-    def with_cameras(self, cameras: PosedCameras) -> Scene:
-        """The same world with other cameras, as effects on lenses need it."""
-        return dataclasses.replace(self, cameras=cameras, static_key=None, _renderers={})
 
 
 def make_scene(name: str, params: Mapping[str, Any] | None = None) -> Scene:

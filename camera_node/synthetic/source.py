@@ -16,10 +16,10 @@ import numpy as np
 from camera_node.settings import SourceConfig, WorldConfig, errors_of
 from camera_node.sources.base import Shot, Source, pixels, rate
 from camera_node.synthetic import Scene, make_scene
-from camera_node.synthetic.effects import NO_EFFECTS, Effects, Renderer
+from camera_node.synthetic.effects import NO_EFFECTS, Effects
 from camera_node.synthetic.frame_cache import FrameCache, default_folder, renderer_version
 from camera_node.synthetic.motion import PERIOD_UNIT_S
-from camera_node.synthetic.render import Image
+from camera_node.synthetic.render import CameraRenderer, Image
 from freshfield import payload
 from freshfield.depth import DepthImage
 from freshfield.geometry import Array, Pose
@@ -43,7 +43,7 @@ class WorldSource(Source):
     codec, quality: of the encoded frames.
     folder: root of the cache of rendered frames; None renders every frame anew.
     walk: carries the camera, instead of the scene's pose; None: it stands still.
-    Raises ValueError for a rate that is not positive, EffectError for effects that do not fit the scene.
+    Raises ValueError for a rate that is not positive.
 
     Attributes:
     repeats_after: frames until the scene repeats (1 for a static scene); None for more than MAX_FRAMES.
@@ -64,13 +64,12 @@ class WorldSource(Source):
         folder: Path | None = None,
         walk: Walk | None = None,
     ) -> None:
-        self.scene = effects.extend(scene)
+        self.scene = scene
         self.camera, self.camera_id, self.phase_ns = camera, camera_id, phase_ns
         self.fps = Fraction(fps).limit_denominator(1001)
         if self.fps <= 0:
             raise ValueError(f"fps must be positive, got {fps}")
-        lens, matrix = self.scene.cameras[camera_id]
-        self.intrinsics = effects.reported_lens(lens)
+        self.intrinsics, matrix = self.scene.cameras[camera_id]
         self._walk = walk
         self.repeats_after = _repeats_after(self.scene, self.fps, None if walk is None else walk.lap_s)
         self._turns = bool(effects.mount) and walk is None
@@ -82,10 +81,10 @@ class WorldSource(Source):
         # Frames to which image effects are applied later are stored losslessly.
         self._codec, self._quality = "zstd" if effects.image else codec, quality
         self._depth: DepthRenderer | None = None
-        self._placed: tuple[Array, Renderer] | None = None
+        self._placed: tuple[Array, CameraRenderer] | None = None
         self.cache: FrameCache | None = None
         if folder is not None and self.repeats_after is not None:
-            self.cache = FrameCache(self.key(), self._codec, (lens.width, lens.height), folder)
+            self.cache = FrameCache(self.key(), self._codec, (self.intrinsics.width, self.intrinsics.height), folder)
 
     def content(self, tick: int) -> int:
         return tick % self.contents if self.contents else tick
@@ -107,15 +106,14 @@ class WorldSource(Source):
         """As the listed depth sensor measures it. Of a scene that repeats, measurements repeat too."""
         if not self._effects.depth:
             return None
-        lens = self.scene.cameras[self.camera_id][0]
         frame = content % self.repeats_after if self.repeats_after else content
         if self._depth is None or self._walk is not None or self._turns:
             from camera_node.synthetic.depth import DepthRenderer
 
             at = self._placed_at(frame) if self._walk is None else self._walk.pose(self._time_s(frame))
-            self._depth = DepthRenderer(self.scene.world, lens, at)
+            self._depth = DepthRenderer(self.scene.world, self.intrinsics, at)
         exact = self._depth.depth(self._time_s(frame))
-        return self._effects.depth[0].measure(exact, pixels(shot, self._codec), lens, content)
+        return self._effects.depth[0].measure(exact, pixels(shot, self._codec), self.intrinsics, content)
 
     def image(self, frame: int) -> Image:
         """Frame before effects of kind image: uint8 (H, W, 3), exact."""
@@ -132,7 +130,7 @@ class WorldSource(Source):
     def release(self) -> None:
         # Replace the scene by the same one without its renderers.
         self._depth = self._placed = None
-        self.scene = self.scene.with_world(self.scene.world)
+        self.scene = dataclasses.replace(self.scene)
 
     def key(self) -> str:
         """Hash (hex) of everything that determines the frames' bytes."""
@@ -143,7 +141,6 @@ class WorldSource(Source):
             "camera": dataclasses.asdict(camera),
             "pose": np.asarray(pose, dtype=np.float64).tolist(),
             "fps": str(self.fps),
-            "effects": [[name, as_mapping(p)] for name, p in self._effects.rendered],
             "codec": [self._codec, self._quality if self._codec == "jpeg" else None],
             "renderer": renderer_version(),
             "phase_ns": self.phase_ns,
@@ -164,19 +161,17 @@ class WorldSource(Source):
         return data
 
     def _render(self, frame: int) -> Image:
-        if self._turns:
-            view: Renderer = self._mounted(frame)
-        elif self._walk is None:
-            view = self.scene.renderer(self.camera_id)
-        else:
-            view = self._walk.view(self.scene, self.scene.cameras[self.camera_id][0])
-        return self._effects.with_exposure(view).image(self._time_s(frame))
+        t_s = self._time_s(frame)
+        if self._walk is not None:
+            return self._walk.view(self.scene, self.intrinsics).image(t_s)
+        view = self._mounted(frame) if self._turns else self.scene.renderer(self.camera_id)
+        return view.image(t_s)
 
-    def _mounted(self, frame: int) -> Renderer:
+    def _mounted(self, frame: int) -> CameraRenderer:
         """A renderer of where the camera really stands, kept until it stands elsewhere."""
         at = self._placed_at(frame)
         if self._placed is None or not np.array_equal(self._placed[0], at):
-            self._placed = at, self.scene.view(self.scene.cameras[self.camera_id][0], at)
+            self._placed = at, self.scene.view(self.intrinsics, at)
         return self._placed[1]
 
     def _placed_at(self, frame: int) -> Array:
@@ -214,20 +209,19 @@ def open_sources(
     folder = default_folder() if config.motion_seed is None else None
     fps, made = rate(config.fps or WORLD_FPS), dict[str, WorldSource]()
     walks = _walks(scenario, config, scene)
-    with errors_of(f"{scenario.path}: source.effects"):  # of one that does not fit this scene
-        for camera in cameras:
-            made[camera] = WorldSource(
-                camera,
-                scene,
-                names[camera],
-                fps,
-                effects=effects.get(camera) or NO_EFFECTS,
-                codec=config.codec,
-                quality=config.quality,
-                phase_ns=scenario.phase_ns(camera, config.fps or WORLD_FPS),
-                folder=folder,
-                walk=walks.get(camera),
-            )
+    for camera in cameras:
+        made[camera] = WorldSource(
+            camera,
+            scene,
+            names[camera],
+            fps,
+            effects=effects.get(camera) or NO_EFFECTS,
+            codec=config.codec,
+            quality=config.quality,
+            phase_ns=scenario.phase_ns(camera, config.fps or WORLD_FPS),
+            folder=folder,
+            walk=walks.get(camera),
+        )
     if config.arm is not None and any(camera in config.arm.cameras for camera in cameras):
         from camera_node.robot.flange_camera import open_flange_cameras
 

@@ -12,7 +12,6 @@ from fractions import Fraction
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -164,11 +163,8 @@ def effect(name: str) -> Contract:
 
     def use(made: Any, given: list[Any]) -> Any:
         shown, pose, lens, depth_m = parts(given[0])
-        renderer = SimpleNamespace(camera=lens, image=lambda t: shown)
         kinds: dict[str, tuple[Callable[[int, float], Any], Any]] = {  # kind -> asks about a frame, a right answer
             "image": (lambda i, t: made.apply(shown, i, t), shown),
-            "exposure": (lambda i, t: made.expose(renderer, t), shown),
-            "lens": (lambda i, t: made.reported(made.rendered(lens)), lens),
             "clock": (lambda i, t: made.node_ns(round(t * 1e9)), 0),
             "pose": (lambda i, t: made.reported(Pose.from_matrix(pose), i, t).matrix(), pose),
             "delay": (lambda i, t: made.instant_s(t), 0.0),

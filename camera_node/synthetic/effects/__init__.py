@@ -2,8 +2,6 @@
 
 The kinds, by where they act:
 
-* ``lens``     changes a camera's lens, and the lens that its frames report (rendered ahead; free while streaming);
-* ``exposure`` changes how an instant becomes an image (likewise);
 * ``image``    changes each frame as it is streamed, recorded ones too (costs time a frame);
 * ``clock``    changes the node's clock and so its time stamps;
 * ``pose``     changes the pose that frames report, not the image;
@@ -30,23 +28,12 @@ from numpy.typing import NDArray
 
 from camera_node.clocks import ClockError
 from camera_node.synthetic.render import Image
-from camera_node.synthetic.scene import Scene
 from freshfield import plugins
 from freshfield.depth import DepthImage
 from freshfield.geometry import Array, Pinhole, Pose
 from freshfield.settings import ScenarioError, Settings, about, read_settings
 
-NAMES = (
-    "bump",
-    "clock_drift",
-    "depth_sensor",
-    "exposure_drift",
-    "lens_distortion",
-    "motion_blur",
-    "pose_delay",
-    "pose_noise",
-    "sensor_noise",
-)
+NAMES = ("bump", "clock_drift", "depth_sensor", "exposure_drift", "pose_delay", "pose_noise", "sensor_noise")
 
 
 class EffectError(ScenarioError):
@@ -76,7 +63,7 @@ def effect_class(name: str) -> type[EffectParameters]:
         except plugins.PluginError as error:
             raise EffectError(str(error)) from None
         if not (issubclass(found, EffectParameters) and getattr(found, "kind", None) in Effects.__dataclass_fields__):
-            kinds = ", ".join(kind for kind in Effects.__dataclass_fields__ if kind != "rendered")
+            kinds = ", ".join(Effects.__dataclass_fields__)
             raise EffectError(f"effect {name}: expected a subclass of EffectParameters whose kind is one of {kinds}")
         return found
     return getattr(importlib.import_module(f"{__name__}.{name}"), name.title().replace("_", ""))
@@ -85,31 +72,6 @@ def effect_class(name: str) -> type[EffectParameters]:
 def frame_rng(key: NDArray[np.uint64], index: int) -> np.random.Generator:
     """Random stream of frame number ``index`` under a key (2,), independent of the order of the frames."""
     return np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, index]))
-
-
-class LensEffect(Protocol):
-    def rendered(self, camera: Pinhole) -> Pinhole:
-        """The lens that images are rendered with instead of ``camera``."""
-        ...
-
-    def reported(self, camera: Pinhole) -> Pinhole:
-        """The lens that frames report, given the one from ``rendered``."""
-        ...
-
-
-class Renderer(Protocol):
-    """Renders a camera's image at any instant: a CameraRenderer, perhaps with exposure effects around it."""
-
-    @property
-    def camera(self) -> Pinhole: ...
-
-    def image(self, t_s: float) -> Image: ...
-
-
-class ExposureEffect(Protocol):
-    def expose(self, renderer: Renderer, t_s: float) -> Image:
-        """Image of an exposure around an instant."""
-        ...
 
 
 class ImageEffect(Protocol):
@@ -156,38 +118,12 @@ class DepthEffect(Protocol):
 class Effects:
     """The effects of one camera, by kind and in the order listed."""
 
-    lens: tuple[LensEffect, ...] = ()
-    exposure: tuple[ExposureEffect, ...] = ()
     image: tuple[ImageEffect, ...] = ()
     clock: tuple[ClockError, ...] = ()
     pose: tuple[PoseEffect, ...] = ()
     delay: tuple[DelayEffect, ...] = ()
     mount: tuple[MountEffect, ...] = ()
     depth: tuple[DepthEffect, ...] = ()
-    rendered: tuple[tuple[str, Any], ...] = ()  # name and parameters of the effects within cached frames
-
-    def extend(self, scene: Scene) -> Scene:
-        """The scene with effects of the kind lens. Raises EffectError."""
-        if self.lens:
-            scene = scene.with_cameras({c: (self._lens(k), p) for c, (k, p) in scene.cameras.items()})
-        return scene
-
-    def _lens(self, camera: Pinhole) -> Pinhole:
-        for effect in self.lens:
-            camera = effect.rendered(camera)
-        return camera
-
-    def reported_lens(self, camera: Pinhole) -> Pinhole:
-        """The lens that frames report, given the one of the extended scene."""
-        for effect in reversed(self.lens):
-            camera = effect.reported(camera)
-        return camera
-
-    def with_exposure(self, renderer: Renderer) -> Renderer:
-        """``renderer`` with every exposure effect; ``renderer`` itself if there is none."""
-        for effect in self.exposure:
-            renderer = _ExposedRenderer(effect, renderer)
-        return renderer
 
     def apply(self, image: Image, index: int, t_s: float) -> Image:
         """``image`` with every image effect; see ``ImageEffect``."""
@@ -228,19 +164,6 @@ class Effects:
 NO_EFFECTS = Effects()
 
 
-@dataclass(frozen=True)
-class _ExposedRenderer:
-    effect: ExposureEffect
-    renderer: Renderer
-
-    @property
-    def camera(self) -> Pinhole:
-        return self.renderer.camera
-
-    def image(self, t_s: float) -> Image:
-        return self.effect.expose(self.renderer, t_s)
-
-
 def load_effects(
     listed: Mapping[str, Mapping[str, Any] | None],
     rng_for: Callable[[str], np.random.Generator],
@@ -255,7 +178,6 @@ def load_effects(
     Raises EffectError for an unknown effect or parameter.
     """
     found: dict[str, list[Any]] = {}
-    rendered: list[tuple[str, Any]] = []
     for name, given in listed.items():
         try:
             effect = read_settings(effect_class(name), dict(given or {}), f"effect {name}")
@@ -264,8 +186,6 @@ def load_effects(
         if (held_out and not effect.in_truth) or (effect.cameras and camera not in effect.cameras):
             continue
         found.setdefault(effect.kind, []).append(effect.start(rng_for(name)))
-        if effect.kind == "exposure":
-            rendered.append((name, effect))
     if not found:
         return NO_EFFECTS
-    return Effects(rendered=tuple(rendered), **{kind: tuple(made) for kind, made in found.items()})
+    return Effects(**{kind: tuple(made) for kind, made in found.items()})

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from camera_node.capture import Camera
 from camera_node.settings import WorldConfig, source_config
-from camera_node.synthetic.effects import NO_EFFECTS
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.rollouts.setting import GRID_MS, Setting
@@ -161,9 +160,9 @@ class EpisodeFactory:
         source = source_config(scenario)
         self._moving, self._period_ns = False, None
         if isinstance(source, WorldConfig):
-            scene, effects = exact_scene(scenario, source)
+            scene = exact_scene(scenario, source)
             self._moving = scene.moving and setting.motions and hasattr(scene.params, "motion_seed")
-            if scene.moving and effects is NO_EFFECTS and not self._moving:
+            if scene.moving and not self._moving:
                 self._period_ns = round(scene.period_s * 1e9)
         lpips = None if edge.lpips == "none" else open_lpips(folders.lpips)[0]
         self._scorer = Scorer(lpips)

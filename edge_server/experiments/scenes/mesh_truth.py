@@ -51,7 +51,7 @@ def still_scene(scenario: str) -> Scene | None:
     source = source_config(loaded)
     if not isinstance(source, WorldConfig):
         return None
-    scene, _ = exact_scene(loaded, source)
+    scene = exact_scene(loaded, source)
     return None if scene.moving else scene
 
 

@@ -97,7 +97,7 @@ def open_stage(name: str, count: int = 100, size: int | None = None, data: Path 
 def _world(scenario: Scenario, source: WorldConfig, count: int, size: int | None) -> Stage:
     if size is not None:
         source = structs.replace(source, width=size, height=size)
-    scene, _ = exact_scene(scenario, source)
+    scene = exact_scene(scenario, source)
     lens, pose = next(iter(scene.cameras.values()))
     target = np.asarray(scene.target)
     radius_m = float(np.linalg.norm(target - pose[:3, 3]))

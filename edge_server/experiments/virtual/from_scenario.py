@@ -7,14 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from camera_node.capture import Camera, build_cameras
 from camera_node.settings import SourceConfig, WorldConfig, source_config
-from camera_node.sources.with_effects import camera_effects
 from camera_node.synthetic import Scene, make_scene
-from camera_node.synthetic.effects import NO_EFFECTS, Effects
 from channel_emu.model.settings import channel_from_mapping
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.truth import CapturedTruth, ExactTruth
@@ -103,34 +98,21 @@ def build_truth(
     if not scenario.held_out:
         return None
     if isinstance(source, WorldConfig) and not scenario.held_out_every:
-        worlds = {camera: exact_scene(scenario, source, camera) for camera in scenario.held_out}
-        known = next(iter(worlds.values()))[0].cameras
+        scene = exact_scene(scenario, source)
+        known = scene.cameras
         names = dict(zip(scenario.cameras, scenario.cameras if set(scenario.cameras) <= set(known) else known))
-        lenses = {camera: scene.cameras[names[camera]] for camera, (scene, _) in worlds.items()}
-
-        def image(camera: str, t_s: float) -> NDArray[np.uint8]:
-            scene, effects = worlds[camera]
-            return effects.with_exposure(scene.renderer(names[camera])).image(t_s)
-
-        cameras = {camera: (worlds[camera][1].reported_lens(lens), pose) for camera, (lens, pose) in lenses.items()}
-        return ExactTruth(scorer, cameras, image)
+        cameras = {camera: known[names[camera]] for camera in scenario.held_out}
+        return ExactTruth(scorer, cameras, lambda camera, t_s: scene.render(names[camera], t_s))
     held_out = build_cameras(scenario, source, scenario.held_out, data, _CACHE_BYTES)
     return CapturedTruth(scorer, held_out, edge.noisy_truth)
 
 
-def exact_scene(scenario: Scenario, source: WorldConfig, camera: str | None = None) -> tuple[Scene, Effects]:
-    """The world as a camera sees it, and the effects that the scenario lists as part of the truth. camera: None: the
-    first that is held out.
-
-    The caller applies effects of the kinds lens and exposure. Noise and wrong poses belong to captured
-    frames; an exact truth has none.
-    """
+def exact_scene(scenario: Scenario, source: WorldConfig) -> Scene:
+    """The world itself: noise and wrong poses belong to captured frames. Raises ScenarioError."""
     try:
-        scene = make_scene(source.scene, {"count": len(scenario.cameras), **source.scene_parameters()})
+        return make_scene(source.scene, {"count": len(scenario.cameras), **source.scene_parameters()})
     except ValueError as error:
         raise ScenarioError(f"{scenario.path}: source: {error}") from None
-    effects = camera_effects(scenario, source, camera or (scenario.held_out or scenario.cameras)[0])
-    return (scene, NO_EFFECTS) if effects is None else (effects.extend(scene), effects)
 
 
 def _field(edge: EdgeConfig, seed: int) -> Field:

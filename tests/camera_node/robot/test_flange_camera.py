@@ -88,6 +88,6 @@ def test_fixed_cameras_of_the_scenario_need_no_arm():
 
 
 def test_effects_that_take_the_camera_to_stand_still_are_refused():
-    scenario = at(own_address(), effects={"motion_blur": None})
-    with pytest.raises(ScenarioError, match=r"motion_blur: not for a camera that an arm carries \(hand\)"):
+    scenario = at(own_address(), effects={"depth_sensor": None})
+    with pytest.raises(ScenarioError, match=r"depth_sensor: not for a camera that an arm carries \(hand\)"):
         build_cameras(scenario, source_config(scenario), ["hand"])

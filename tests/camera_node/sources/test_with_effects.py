@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +10,8 @@ import pytest
 
 from camera_node.capture import Camera, build_cameras
 from camera_node.settings import source_config
-from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects import NAMES
 from freshfield import payload
-from freshfield.frame import Frame, from_request, to_request
 from freshfield.geometry import Pose
 from freshfield.scenario import ScenarioError, parse
 from tests.camera_node.sources.datasets.photos import opencv_pose, photo_scenario, picture, write_photos
@@ -110,31 +107,10 @@ def test_a_wrong_calibration_is_claimed_of_every_frame_and_costs_nothing_more():
     assert found.capture(1).pose == found.capture(99).pose != plain.capture(1).pose
 
 
-@pytest.mark.parametrize("calibrated", [True, False])
-def test_the_lens_goes_over_the_wire(calibrated):
-    lens = {"k1": -0.1, "k2": 0.01, "p1": 0.001, "p2": 0.0, "calibrated": calibrated}
-    camera = cameras({"lens_distortion": lens})["cam01"]
-    shot = camera.capture(2)
-    frame = Frame("cam01", "s", 2, 1, shot.pose, shot.intrinsics, "zstd", shot.payload)
-    sent = from_request(to_request(frame)).intrinsics
-    assert sent.distortion == ((-0.1, 0.01, 0.001, 0.0) if calibrated else (0.0,) * 4)
-    assert sent == camera.source.intrinsics
-    scene = make_scene("tower", {"count": 3, "width": 24, "height": 16, "supersample": 1})
-    bent, pose = scene.cameras["cam01"]
-    scene = scene.with_cameras({"cam01": (replace(bent, distortion=(-0.1, 0.01, 0.001, 0.0)), pose)})
-    np.testing.assert_array_equal(pixels(camera, 2), scene.render("cam01", 0.2))
-
-
-def test_a_lens_that_does_not_go_with_the_scene_is_one_line_with_the_file_s_name():
-    with pytest.raises(ScenarioError, match=r"^world.yaml: source.effects: effect lens_distortion: k1 -2") as error:
-        cameras({"lens_distortion": {"k1": -2.0}})
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("name", ["bump", "lens_distortion", "motion_blur", "pose_delay"])
-def test_recordings_have_lenses_of_their_own(tmp_path, name):
+@pytest.mark.parametrize("name", ["bump", "pose_delay"])
+def test_recordings_stand_where_they_stood(tmp_path, name):
     scenario = photo_scenario(write_photos(tmp_path, 24), 3, effects={name: None})
-    with pytest.raises(ScenarioError, match="kinds lens, exposure, delay and mount need source kind world"):
+    with pytest.raises(ScenarioError, match="kinds delay and mount need source kind world"):
         build_cameras(scenario, source_config(scenario), scenario.cameras)
 
 

@@ -121,8 +121,6 @@ def test_the_key_follows_all_that_decides_the_bytes(monkeypatch):
         source(room(speed_m_per_s=4.0)),
         source(room(supersample=2)),
         source(room(horizontal_fov_deg=50.0)),
-        source(effects=effects(motion_blur={})),
-        source(effects=effects(motion_blur={"exposure_ms": 9.0})),
     ]
     keys = [made.key() for made in others]
     assert len({base, *keys}) == len(keys) + 1

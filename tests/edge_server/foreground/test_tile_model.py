@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,7 +62,7 @@ def test_a_tile_far_away_is_found(tile, azimuth):
 def test_a_picture_without_the_tile_is_used_whole():
     scene = make_scene("tile", {"count": 1, "bench": True})
     parts = scene.world.static_parts[scene.object_parts :]
-    empty = scene.with_world(type(scene.world)(parts, (), scene.world.light, scene.world.background))
+    empty = replace(scene, world=type(scene.world)(parts, (), scene.world.light, scene.world.background))
     foreground = make_foreground(read_config(load("scan")).foreground)
     for azimuth in (-30, 60, 150):
         image = empty.view(Pinhole.from_fov(128, 128, WIDE), on_sphere((0, 0, 0.03), 0.5, azimuth, 40)).image(0)

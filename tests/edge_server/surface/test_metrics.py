@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -67,7 +69,7 @@ def test_thinning_leaves_one_a_cell():
 def test_the_truth_of_an_object_leaves_out_what_stands_around_it():
     close = scan(24, raster=((-0.2, 0.1, 0.03),))
     bench = make_scene("tile", {"count": 1, "width": 24, "height": 24, "bench": True})
-    found = surface_truth(bench.with_cameras(close.scene.cameras), close.views, spacing_m=0.004)
+    found = surface_truth(replace(bench, cameras=close.scene.cameras), close.views, spacing_m=0.004)
     low, high = close.scene.bounds
     assert len(found.points) > 100 and ((found.points >= low) & (found.points <= high)).all()
 

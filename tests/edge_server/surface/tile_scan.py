@@ -31,7 +31,7 @@ def scan(size: int, raster: tuple[tuple[float, float, float], ...]) -> Scan:
     scene = make_scene("tile", {"count": 1, "width": size, "height": size})
     lens = Pinhole.from_fov(size, size, FOV_DEG)
     poses = [on_sphere(p, DISTANCE_M, a, e) for p in raster for a, e in ANGLES_DEG]
-    scene = scene.with_cameras({f"scan{k:02d}": (lens, pose) for k, pose in enumerate(poses)})
+    scene = replace(scene, cameras={f"scan{k:02d}": (lens, pose) for k, pose in enumerate(poses)})
     views = tuple(View(f"scan{k:02d}", scene.view(lens, p).image(0.0), p, lens) for k, p in enumerate(poses))
     return Scan(scene, views)
 

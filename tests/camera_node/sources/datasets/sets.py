@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -59,7 +59,7 @@ def rig(count: int = 3, lens: Pinhole | None = None) -> list[Taken]:
     """Cameras of the room, each with ``lens`` if one is given."""
     scene = make_scene("room", {"count": count, "width": WIDTH, "height": HEIGHT})
     if lens is not None:
-        scene = scene.with_cameras({name: (lens, pose) for name, (_, pose) in scene.cameras.items()})
+        scene = replace(scene, cameras={name: (lens, pose) for name, (_, pose) in scene.cameras.items()})
     return [
         Taken(name, used, pose, lambda k, name=name: scene.render(name, k / 10))
         for name, (used, pose) in scene.cameras.items()

@@ -7,6 +7,7 @@ import json
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -50,7 +51,7 @@ def shows_the_world(record, t_s=0.0):
     aside[:3, 3] += 0.1 * pose[:3, 0]
     turned[:3, :2] *= -1
     scene = make_scene("room", {"count": 3, "width": 64, "height": 48})
-    scene = scene.with_cameras({"here": (lens, pose), "aside": (lens, aside), "turned": (lens, turned)})
+    scene = replace(scene, cameras={"here": (lens, pose), "aside": (lens, aside), "turned": (lens, turned)})
     picture = record.read().astype(float)
     off = {name: np.abs(picture - scene.render(name, t_s)).mean() for name in scene.cameras}
     # What is left is compression, of videos at a quarter of the colors.
