@@ -1,6 +1,6 @@
-"""A camera in the synthetic world, carried by a simulated arm (thesis 4.2, 4.3).
+"""Motion of a camera in the synthetic world that a simulated arm carries (thesis 4.2, 4.3).
 
-It renders from the arm's true joints at the frame's instant, which the simulated controller knows. The
+Its image is rendered from the arm's true joints at the frame's instant, which the simulated controller knows. The
 frame's pose is computed as on a real bench: joint states with their own stamps, paired by time, forward
 kinematics and hand-eye calibration. The difference of both is the pose error.
 """
@@ -11,23 +11,20 @@ import contextlib
 import json
 import socket
 import threading
-from collections.abc import Mapping
-from fractions import Fraction
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose.providers import Closable, PoseGapError, PoseProvider
+from camera_node.pose.providers import PoseGapError, PoseProvider
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, camera_poses, load_hand_eyes
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.simulated_controller import TRUTH_PORT
 from camera_node.robot.simulated_controller.joint_motion import STEP_S
 from camera_node.settings import ArmConfig
-from camera_node.sources.base import Shot, Source
-from camera_node.synthetic import Scene
-from camera_node.synthetic.effects import NO_EFFECTS, Effects
-from freshfield.geometry import Pinhole
-from freshfield.scenario import Scenario, ScenarioError
+from freshfield.geometry import Pose
+from freshfield.scenario import Scenario
 
 Array = NDArray[np.float64]
 
@@ -80,78 +77,33 @@ class TruthClient:
         self._socket = None
 
 
-class FlangeCamera(Source):
-    """One camera on the flange. base: true world-from-base (4, 4). mount: true flange-from-camera (4, 4)."""
+@dataclass(frozen=True)
+class FlangeMotion:
+    """Motion of one camera on the flange, a ``Carrier`` of the synthetic world.
 
-    def __init__(
-        self,
-        camera: str,
-        fps: Fraction,
-        scene: Scene,
-        lens: Pinhole,
-        effects: Effects,
-        poses: PoseProvider,
-        truth: TruthClient,
-        arm: ArmModel,
-        base: Array,
-        mount: Array,
-    ) -> None:
-        self.camera, self.fps = camera, fps
-        self.intrinsics = lens
-        self._scene, self._lens, self._effects = scene, lens, effects
-        self._poses, self._truth = poses, truth
-        self._arm, self._base, self._mount = arm, base, mount
+    poses: the camera's, as they are known of a real arm. truth: of the simulated one.
+    base: true world-from-base (4, 4). mount: true flange-from-camera (4, 4).
+    """
 
-    def read(self, content: int) -> Shot:
-        """Render the image at the tick's instant. Raises PoseGapError."""
-        t_ns = content * 10**9 * self.fps.denominator // self.fps.numerator
-        true_pose = self._base @ self._arm.forward(self._truth.joints(t_ns)) @ self._mount
-        pose, gap_ns = self._poses.at(t_ns)
-        view = self._scene.view(self._lens, true_pose)
-        image = view.image((t_ns % round(self._scene.period_s * 1e9)) * 1e-9)
-        if self._effects.image:
-            image = self._effects.apply(image, content, t_ns * 1e-9)
-        return Shot(image, self._effects.reported_pose(pose, content, t_ns * 1e-9), self.intrinsics, gap_ns)
+    poses: PoseProvider
+    truth: TruthClient
+    arm: ArmModel
+    base: Array
+    mount: Array
+    lap_s: float | None = None
 
-    def close(self) -> None:
-        """Disconnect from the arm."""
-        if isinstance(self._poses, Closable):
-            self._poses.close()
-        self._truth.close()
+    def pose(self, t_s: float) -> Array:
+        """True camera-to-world (4, 4). Raises PoseGapError."""
+        return self.base @ self.arm.forward(self.truth.joints(round(t_s * 1e9))) @ self.mount
+
+    def measured(self, t_s: float) -> tuple[Pose, int]:
+        """See ``PoseProvider.at``."""
+        return self.poses.at(round(t_s * 1e9))
 
 
-def open_flange_cameras(
-    scenario: Scenario,
-    config: ArmConfig,
-    fps: Fraction,
-    seen: Mapping[str, tuple[Scene, Pinhole]],
-    effects: Mapping[str, Effects | None],
-) -> dict[str, Source]:
-    """Connect to the arm and open the cameras on its flange. seen: each camera's scene and lens.
-    Raises ScenarioError and ArmError."""
-    for camera in seen:
-        made = effects.get(camera)
-        if made is not None and made.depth:
-            names = ", ".join(type(effect).__module__.rsplit(".", 1)[1] for effect in made.depth)
-            raise ScenarioError(
-                f"{scenario.path}: source.effects: {names}: not for a camera that an arm carries ({camera}): "
-                "they take the camera to stand still"
-            )
-    mounts = load_hand_eyes(scenario, config, seen)
-    poses = camera_poses(scenario, config, seen)
+def open_flange(scenario: Scenario, config: ArmConfig, cameras: Sequence[str]) -> dict[str, FlangeMotion]:
+    """Connect to the arm that carries ``cameras``. Raises ScenarioError and ArmError."""
+    mounts = load_hand_eyes(scenario, config, cameras)
+    poses = camera_poses(scenario, config, cameras)
     truth, arm, base = TruthClient(config.host), arm_model(scenario, config), base_matrix(config)
-    return {
-        camera: FlangeCamera(
-            camera,
-            fps,
-            scene,
-            lens,
-            effects.get(camera) or NO_EFFECTS,
-            poses[camera],
-            truth,
-            arm,
-            base,
-            mounts[camera].transform,
-        )
-        for camera, (scene, lens) in seen.items()
-    }
+    return {c: FlangeMotion(poses[c], truth, arm, base, mounts[c].transform) for c in cameras}

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
@@ -28,11 +28,27 @@ from freshfield.settings import as_mapping
 
 if TYPE_CHECKING:
     from camera_node.synthetic.depth import DepthRenderer
-    from camera_node.synthetic.walk import Walk
 
 WORLD_FPS = 15.0
 # A sequence with more different frames counts as not repeating: frames are rendered on demand and not kept.
 MAX_FRAMES = 3000
+
+
+class Carrier(Protocol):
+    """Carries a camera through the world: somebody who walks, or an arm."""
+
+    @property
+    def lap_s(self) -> float | None:
+        """Time after which its motion repeats; None: it does not."""
+        ...
+
+    def pose(self, t_s: float) -> Array:
+        """The camera's true camera-to-world (4, 4) at an instant. Raises PoseGapError if it is not known."""
+        ...
+
+    def measured(self, t_s: float) -> tuple[Pose, int]:
+        """The pose that is known of it, see ``PoseProvider.at``."""
+        ...
 
 
 class WorldSource(Source):
@@ -42,7 +58,7 @@ class WorldSource(Source):
     effects: of this camera, from ``load_effects``.
     codec, quality: of the encoded frames.
     folder: root of the cache of rendered frames; None renders every frame anew.
-    walk: carries the camera, instead of the scene's pose; None: it stands still.
+    carrier: moves the camera, instead of the scene's pose; None: it stands still.
     Raises ValueError for a rate that is not positive.
 
     Attributes:
@@ -62,7 +78,7 @@ class WorldSource(Source):
         quality: int = 92,
         phase_ns: int = 0,
         folder: Path | None = None,
-        walk: Walk | None = None,
+        carrier: Carrier | None = None,
     ) -> None:
         self.scene = scene
         self.camera, self.camera_id, self.phase_ns = camera, camera_id, phase_ns
@@ -70,11 +86,12 @@ class WorldSource(Source):
         if self.fps <= 0:
             raise ValueError(f"fps must be positive, got {fps}")
         self.intrinsics, matrix = self.scene.cameras[camera_id]
-        self._walk = walk
-        self.repeats_after = _repeats_after(self.scene, self.fps, None if walk is None else walk.lap_s)
-        self._turns = bool(effects.mount) and walk is None
-        if self._turns:
-            self.repeats_after = None
+        self._carrier = carrier
+        self._moves = bool(effects.mount) or carrier is not None
+        periods_s = [scene.period_s] if scene.moving else []
+        if self._moves:
+            periods_s.append(math.inf if carrier is None or carrier.lap_s is None else carrier.lap_s)
+        self.repeats_after = _repeats_after(periods_s, self.fps)
         # Frames with equal images but different reported poses are different shots.
         self.contents = None if effects.image or effects.pose_varies else self.repeats_after
         self._pose, self._effects = Pose.from_matrix(matrix), effects
@@ -97,21 +114,20 @@ class WorldSource(Source):
             image = self._effects.apply(self.image(frame), content, self._time_s(content))
         else:
             image = self._stored(frame)
-        t_s, pose = self._time_s(content), self._pose
-        if self._walk is not None:
-            pose = Pose.from_matrix(self._walk.pose(self._effects.pose_instant_s(t_s)))
-        return Shot(image, self._effects.reported_pose(pose, content, t_s), self.intrinsics)
+        t_s, pose, gap_ns = self._time_s(content), self._pose, 0
+        if self._carrier is not None:
+            pose, gap_ns = self._carrier.measured(self._effects.pose_instant_s(t_s))
+        return Shot(image, self._effects.reported_pose(pose, content, t_s), self.intrinsics, gap_ns)
 
     def depth(self, content: int, shot: Shot) -> DepthImage | None:
         """As the listed depth sensor measures it. Of a scene that repeats, measurements repeat too."""
         if not self._effects.depth:
             return None
         frame = content % self.repeats_after if self.repeats_after else content
-        if self._depth is None or self._walk is not None or self._turns:
+        if self._depth is None or self._moves:
             from camera_node.synthetic.depth import DepthRenderer
 
-            at = self._placed_at(frame) if self._walk is None else self._walk.pose(self._time_s(frame))
-            self._depth = DepthRenderer(self.scene.world, self.intrinsics, at)
+            self._depth = DepthRenderer(self.scene.world, self.intrinsics, self._true_pose(frame))
         exact = self._depth.depth(self._time_s(frame))
         return self._effects.depth[0].measure(exact, pixels(shot, self._codec), self.intrinsics, content)
 
@@ -145,8 +161,8 @@ class WorldSource(Source):
             "renderer": renderer_version(),
             "phase_ns": self.phase_ns,
         }
-        if self._walk is not None:
-            what["walk"] = dataclasses.asdict(self._walk)
+        if self._carrier is not None:
+            what["carrier"] = repr(self._carrier)
         # ``count`` determines which cameras there are, not what one of them sees.
         what["params"].pop("count")
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
@@ -161,28 +177,29 @@ class WorldSource(Source):
         return data
 
     def _render(self, frame: int) -> Image:
-        t_s = self._time_s(frame)
-        if self._walk is not None:
-            return self._walk.view(self.scene, self.intrinsics).image(t_s)
-        view = self._mounted(frame) if self._turns else self.scene.renderer(self.camera_id)
-        return view.image(t_s)
+        view = self._view(self._true_pose(frame)) if self._moves else self.scene.renderer(self.camera_id)
+        return view.image(self._time_s(frame))
 
-    def _mounted(self, frame: int) -> CameraRenderer:
-        """A renderer of where the camera really stands, kept until it stands elsewhere."""
-        at = self._placed_at(frame)
+    def _true_pose(self, frame: int) -> Array:
+        t_s = self._time_s(frame)
+        if self._carrier is not None:
+            return self._carrier.pose(t_s)
+        return self._effects.placed(self.scene.cameras[self.camera_id][1], t_s)
+
+    def _view(self, at: Array) -> CameraRenderer:
+        """A renderer of a camera that stands there, kept until it stands elsewhere."""
         if self._placed is None or not np.array_equal(self._placed[0], at):
+            self._placed = None  # two renderers of large images need not fit into memory
             self._placed = at, self.scene.view(self.intrinsics, at)
         return self._placed[1]
-
-    def _placed_at(self, frame: int) -> Array:
-        return self._effects.placed(self.scene.cameras[self.camera_id][1], self._time_s(frame))
 
     def _time_s(self, frame: int) -> float:
         return float(frame / self.fps) + self.phase_ns / 1e9
 
 
-def _repeats_after(scene: Scene, fps: Fraction, lap_s: float | None) -> int | None:
-    periods_s = [scene.period_s] * scene.moving + ([] if lap_s is None else [lap_s])
+def _repeats_after(periods_s: Sequence[float], fps: Fraction) -> int | None:
+    if math.inf in periods_s:
+        return None
     if not periods_s:
         return 1
     period = math.lcm(*(round(s / PERIOD_UNIT_S) for s in periods_s)) * Fraction(PERIOD_UNIT_S).limit_denominator(10)
@@ -208,7 +225,7 @@ def open_sources(
     # Training of a scheduler draws hundreds of motions, each used once.
     folder = default_folder() if config.motion_seed is None else None
     fps, made = rate(config.fps or WORLD_FPS), dict[str, WorldSource]()
-    walks = _walks(scenario, config, scene)
+    carriers = _carriers(scenario, config, scene, cameras)
     for camera in cameras:
         made[camera] = WorldSource(
             camera,
@@ -220,20 +237,22 @@ def open_sources(
             quality=config.quality,
             phase_ns=scenario.phase_ns(camera, config.fps or WORLD_FPS),
             folder=folder,
-            walk=walks.get(camera),
+            carrier=carriers.get(camera),
         )
-    if config.arm is not None and any(camera in config.arm.cameras for camera in cameras):
-        from camera_node.robot.flange_camera import open_flange_cameras
-
-        seen = {c: (made[c].scene, made[c].scene.cameras[names[c]][0]) for c in cameras if c in config.arm.cameras}
-        return {**made, **open_flange_cameras(scenario, config.arm, fps, seen, effects)}
     return {**made}
 
 
-def _walks(scenario: Scenario, config: WorldConfig, scene: Scene) -> dict[str, Walk]:
-    """The walk of each camera that is carried. Raises ScenarioError."""
+def _carriers(scenario: Scenario, config: WorldConfig, scene: Scene, cameras: Sequence[str]) -> dict[str, Carrier]:
+    """What carries each camera that is carried. Connects to an arm that carries one. Raises ScenarioError and
+    ArmError."""
+    carriers: dict[str, Carrier] = {}
+    on_arm = [camera for camera in cameras if config.arm is not None and camera in config.arm.cameras]
+    if config.arm is not None and on_arm:
+        from camera_node.robot.flange_camera import open_flange
+
+        carriers.update(open_flange(scenario, config.arm, on_arm))
     if not config.carried:
-        return {}
+        return carriers
     from camera_node.synthetic.walk import walks_through
 
     unknown = [camera for camera in config.carried if camera not in scenario.cameras]
@@ -243,7 +262,7 @@ def _walks(scenario: Scenario, config: WorldConfig, scene: Scene) -> dict[str, W
             f"got {', '.join(unknown or config.carried)}"
         )
     with errors_of(f"{scenario.path}: source.carried"):
-        return walks_through(scene, config.carried)
+        return {**carriers, **walks_through(scene, config.carried)}
 
 
 def _scene_cameras(scenario: Scenario, scene: Scene) -> dict[str, str]:

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera_node.synthetic.motion import phase_of
-from camera_node.synthetic.render import Image
 from camera_node.synthetic.scene import Scene, SceneError
-from freshfield.geometry import Array, Pinhole, look_at, so3_exp
+from freshfield.geometry import Array, Pose, look_at, so3_exp
 
 # 32 units of .6 s: at 10 captures a second a lap has 192, a multiple of 8, of which each 8th can be held out.
 _LAP_S = 19.2
@@ -51,21 +50,9 @@ class Walk:
         found[:3, :3] = found[:3, :3] @ so3_exp(np.deg2rad(turn))
         return found
 
-    def view(self, scene: Scene, camera: Pinhole) -> CarriedView:
-        """A renderer of what a camera on this walk sees."""
-        return CarriedView(self, scene, camera)
-
-
-@dataclass(frozen=True)
-class CarriedView:
-    """Renders a carried camera: all of each image anew, since every pixel changes."""
-
-    walk: Walk
-    scene: Scene
-    camera: Pinhole
-
-    def image(self, t_s: float) -> Image:
-        return self.scene.view(self.camera, self.walk.pose(t_s)).image(t_s)
+    def measured(self, t_s: float) -> tuple[Pose, int]:
+        """The true pose at an instant, to which it is 0 ns."""
+        return Pose.from_matrix(self.pose(t_s)), 0
 
 
 def walks_through(scene: Scene, cameras: Sequence[str]) -> dict[str, Walk]:
