@@ -30,10 +30,6 @@ _MAX_STATIC_RENDERERS = 2 * MAX_CAMERAS
 _STATIC_RENDERERS: dict[tuple[str, str], CameraRenderer] = {}
 
 
-class SceneError(ScenarioError):
-    """A scene that cannot be made from its parameters; the message says what is valid."""
-
-
 class BaseParams(Settings, frozen=True, kw_only=True):
     """Parameters every scene has."""
 
@@ -88,11 +84,11 @@ class Scene:
 
     def renderer(self, camera_id: str) -> CameraRenderer:
         """The camera's renderer, made on first use (which takes tenths of a second) and kept. Raises
-        SceneError for an unknown camera."""
+        ScenarioError for an unknown camera."""
         if camera_id not in self._renderers:
             if camera_id not in self.cameras:
                 known = ", ".join(self.cameras)
-                raise SceneError(f"scene {self.name}: no camera {camera_id!r}; it has {known}")
+                raise ScenarioError(f"scene {self.name}: no camera {camera_id!r}; it has {known}")
             self._renderers[camera_id] = self._shared_renderer(camera_id) or self.view(*self.cameras[camera_id])
         return self._renderers[camera_id]
 
@@ -114,15 +110,12 @@ class Scene:
 def make_scene(name: str, params: Mapping[str, Any] | None = None) -> Scene:
     """Make the scene ``name``, one of SCENES. params: override its defaults.
 
-    Raises SceneError, listing what is valid, for an unknown scene or parameter or a value out of range.
+    Raises ScenarioError, listing what is valid, for an unknown scene or parameter or a value out of range.
     """
     if name not in SCENES:
-        raise SceneError(f"unknown scene {name!r}; valid scenes: {', '.join(SCENES)}")
+        raise ScenarioError(f"unknown scene {name!r}; valid scenes: {', '.join(SCENES)}")
     module = importlib.import_module(f"camera_node.synthetic.scenes.{name}")
-    try:
-        scene: Scene = module.build(read_settings(module.Params, dict(params or {}), f"scene {name}"))
-    except ScenarioError as error:
-        raise SceneError(str(error)) from None
+    scene: Scene = module.build(read_settings(module.Params, dict(params or {}), f"scene {name}"))
     if getattr(scene.params, "motion_seed", None) is None:
         return scene
     still = {k: v for k, v in as_mapping(scene.params).items() if k not in _MOTION_PARAMETERS}

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera_node.synthetic.motion import phase_of
-from camera_node.synthetic.scene import Scene, SceneError
+from camera_node.synthetic.scene import Scene
 from freshfield.geometry import Array, Pose, look_at, so3_exp
+from freshfield.settings import ScenarioError
 
 # 32 units of .6 s: at 10 captures a second a lap has 192, a multiple of 8, of which each 8th can be held out.
 _LAP_S = 19.2
@@ -56,10 +57,10 @@ class Walk:
 
 
 def walks_through(scene: Scene, cameras: Sequence[str]) -> dict[str, Walk]:
-    """The walk of each camera, which start evenly spread over a lap. Raises SceneError for a scene without a floor to
+    """The walk of each camera, which start evenly spread over a lap. Raises ScenarioError for a scene without a floor to
     walk on."""
     if scene.name not in _ROOMS:
-        raise SceneError(f"scene {scene.name} is no room to walk in: expected {' or '.join(_ROOMS)}")
+        raise ScenarioError(f"scene {scene.name} is no room to walk in: expected {' or '.join(_ROOMS)}")
     low, high = scene.bounds
     center = (float(scene.target[0]), float(scene.target[1]), float(low[2]))
     radius_m = _RADIUS * float(min(high[:2] - low[:2]))

@@ -15,7 +15,7 @@ from camera_node.capture import build_cameras
 from camera_node.node import Node, NodeOptions
 from camera_node.settings import source_config
 from camera_node.sources.base import pixels
-from camera_node.synthetic.effects import EffectError, load_effects
+from camera_node.synthetic.effects import load_effects
 from channel_emu.model.settings import channel_from_mapping
 from edge_server.experiments import compare
 from edge_server.experiments.virtual.simulate import main as simulate
@@ -137,9 +137,9 @@ def test_what_is_of_the_wrong_kind_is_refused_by_name(folder):
     own = f"{folder / 'own.py'}:"
     with pytest.raises(ScenarioError, match=r"does not derive from edge_server\.scheduler\.Policy"):
         make_policy(f"{own}Darker", None, np.random.default_rng(0))
-    with pytest.raises(EffectError, match="expected a subclass of EffectParameters"):
+    with pytest.raises(ScenarioError, match="expected a subclass of EffectParameters"):
         load_effects({f"{own}Late": {}}, lambda name: np.random.default_rng(0))
-    with pytest.raises(EffectError, match="counts"):
+    with pytest.raises(ScenarioError, match="counts"):
         load_effects({f"{own}Darker": {"counts": "many"}}, lambda name: np.random.default_rng(0))
     with pytest.raises(ScenarioError, match=r"does not derive from channel_emu\.model\.link\.Fault"):
         channel_from_mapping({"faults": {f"{own}Youngest": {}}})

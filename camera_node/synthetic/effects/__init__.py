@@ -36,10 +36,6 @@ from freshfield.settings import ScenarioError, Settings, about, read_settings
 NAMES = ("bump", "clock_drift", "depth_sensor", "exposure_drift", "pose_delay", "pose_noise", "sensor_noise")
 
 
-class EffectError(ScenarioError):
-    """An effect that cannot be applied as listed; the message says what is valid."""
-
-
 class EffectParameters(Settings, frozen=True, kw_only=True):
     """Base of the effects' parameters."""
 
@@ -56,15 +52,15 @@ class EffectParameters(Settings, frozen=True, kw_only=True):
 
 def effect_class(name: str) -> type[EffectParameters]:
     """Import and return the class of an effect, one of NAMES or from outside (``freshfield.plugins``). Raises
-    EffectError for an unknown name."""
+    ScenarioError for an unknown name."""
     if name not in NAMES:
         try:
             found: type[EffectParameters] = plugins.find("effect", name, NAMES)
         except plugins.PluginError as error:
-            raise EffectError(str(error)) from None
+            raise ScenarioError(str(error)) from None
         if not (issubclass(found, EffectParameters) and getattr(found, "kind", None) in Effects.__dataclass_fields__):
             kinds = ", ".join(Effects.__dataclass_fields__)
-            raise EffectError(f"effect {name}: expected a subclass of EffectParameters whose kind is one of {kinds}")
+            raise ScenarioError(f"effect {name}: expected a subclass of EffectParameters whose kind is one of {kinds}")
         return found
     return getattr(importlib.import_module(f"{__name__}.{name}"), name.title().replace("_", ""))
 
@@ -175,14 +171,11 @@ def load_effects(
     camera: its name, for effects that list ``cameras``.
     rng_for: gives the random stream of an effect for this camera; called once for each effect that applies.
     held_out: only effects with ``in_truth: true`` apply.
-    Raises EffectError for an unknown effect or parameter.
+    Raises ScenarioError for an unknown effect or parameter.
     """
     found: dict[str, list[Any]] = {}
     for name, given in listed.items():
-        try:
-            effect = read_settings(effect_class(name), dict(given or {}), f"effect {name}")
-        except ScenarioError as error:
-            raise EffectError(str(error)) from None
+        effect = read_settings(effect_class(name), dict(given or {}), f"effect {name}")
         if (held_out and not effect.in_truth) or (effect.cameras and camera not in effect.cameras):
             continue
         found.setdefault(effect.kind, []).append(effect.start(rng_for(name)))

@@ -56,7 +56,7 @@ class Fit:
 
 @cache
 def views_of(still: Still) -> MultiviewStill:
-    """The views of a still scene. Raises SceneError or DatasetError."""
+    """The views of a still scene. Raises ScenarioError or DatasetError."""
     if still.scene in SCENES:
         return synthetic_still(still.scene, size=still.size)
     data = load_recorded(Path(still.scene), still.holdout, still.scale, still.frame)

@@ -29,7 +29,7 @@ _SCENE_SIZE = 128  # image width and height of a synthetic scene, before its sca
 
 def synthetic_still(name: str, cameras: int = 19, size: int = 128, t_s: float = 0.0) -> MultiviewStill:
     """The cameras of scene ``name`` at one instant, ``size`` pixels a side; cam00 is held out. Raises
-    camera_node's SceneError."""
+    ScenarioError."""
     scene = make_scene(name, {"count": cameras, "width": size, "height": size})
     views = [View(c, scene.render(c, t_s), pose, lens) for c, (lens, pose) in scene.cameras.items()]
     held_out = tuple(v for v in views if v.camera == HELD_OUT)

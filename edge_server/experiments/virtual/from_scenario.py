@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from camera_node.capture import Camera, build_cameras
-from camera_node.settings import SourceConfig, WorldConfig, source_config
+from camera_node.settings import SourceConfig, WorldConfig, errors_of, source_config
 from camera_node.synthetic import Scene, make_scene
 from channel_emu.model.settings import channel_from_mapping
 from edge_server.experiments.virtual.run_settings import RunSettings
@@ -109,10 +109,8 @@ def build_truth(
 
 def exact_scene(scenario: Scenario, source: WorldConfig) -> Scene:
     """The world itself: noise and wrong poses belong to captured frames. Raises ScenarioError."""
-    try:
+    with errors_of(f"{scenario.path}: source"):
         return make_scene(source.scene, {"count": len(scenario.cameras), **source.scene_parameters()})
-    except ValueError as error:
-        raise ScenarioError(f"{scenario.path}: source: {error}") from None
 
 
 def _field(edge: EdgeConfig, seed: int) -> Field:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.synthetic import SCENES, SceneError, make_scene
+from camera_node.synthetic import SCENES, make_scene
 from camera_node.synthetic.person import loop_length_m, make_walk
 from camera_node.synthetic.shapes import Box
 from freshfield.geometry import Pose, world_rays
+from freshfield.settings import ScenarioError
 
 SMALL = {"width": 48, "height": 48}
 
@@ -93,13 +94,13 @@ def test_what_does_not_move_is_the_same_at_every_instant(params):
     ],
 )
 def test_an_invalid_scene_is_refused_in_one_line(name, params, message):
-    with pytest.raises(SceneError, match=message) as error:
+    with pytest.raises(ScenarioError, match=message) as error:
         make_scene(name, params)
     assert "\n" not in str(error.value)
 
 
 def test_an_unknown_camera_is_refused_by_name():
-    with pytest.raises(SceneError, match="no camera 'cam13'; it has cam00, cam01"):
+    with pytest.raises(ScenarioError, match="no camera 'cam13'; it has cam00, cam01"):
         make_scene("room", SMALL).render("cam13", 0.0)
 
 
@@ -115,7 +116,7 @@ def test_a_motion_that_is_drawn_follows_from_its_seed_alone(name):
         assert not np.allclose(one, own) and not any(np.allclose(one, other) for other in drawn[:k])
     still = seen(speed_m_per_s=0.0)
     assert np.array_equal(seen(speed_m_per_s=0.0, motion_seed=4), still)
-    with pytest.raises(SceneError, match=r"motion_seed: expected .*0"):
+    with pytest.raises(ScenarioError, match=r"motion_seed: expected .*0"):
         seen(motion_seed=-1)
 
 

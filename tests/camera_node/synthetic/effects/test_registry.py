@@ -15,6 +15,7 @@ from camera_node.synthetic import effects as fx
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.source import WorldSource
 from freshfield.geometry import Pose
+from freshfield.settings import ScenarioError
 from freshfield_up import check_plugin
 
 STREAM = """
@@ -112,7 +113,7 @@ def test_the_held_out_camera_shows_the_truth_unless_in_truth():
     ],
 )
 def test_an_invalid_effect_is_refused_in_one_line(listed, message):
-    with pytest.raises(fx.EffectError, match=message) as error:
+    with pytest.raises(ScenarioError, match=message) as error:
         fx.load_effects(listed, lambda name: np.random.default_rng(0))
     assert "\n" not in str(error.value)
 
@@ -242,6 +243,6 @@ def numbers() -> list[tuple[str, str]]:
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300, -1e300, "much", None, [1.0], True])
 def test_no_number_may_be_nonsense(name, parameter, value):
     """Refused in one line that names the effect and the parameter."""
-    with pytest.raises(fx.EffectError, match=name) as error:
+    with pytest.raises(ScenarioError, match=name) as error:
         load(name, {parameter: value})
     assert "\n" not in str(error.value) and parameter in str(error.value)
