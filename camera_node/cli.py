@@ -24,7 +24,6 @@ EXAMPLES = """examples:
   camera-node run room.yaml --camera cam03 --to emu:7001     one camera, e.g. on its own machine
   camera-node run fox --all --to :7001 --data ~/data         recorded data, from the folder --data
   camera-node run bag/ --as hand --to :7001                  a ROS bag or other recording, as camera "hand"
-  camera-node prepare room --all                             render ahead, so that run starts quickly
   camera-node calibrate hand-eye --help                      pose of a camera on an arm
   camera-node simulate-arm cell                              a simulated arm for the scenario "cell"
   camera-node drive-arm cell                                 move its camera around the target
@@ -36,9 +35,6 @@ In the help of a command, [x] after an option is its default.
 
 exit codes: 0 stopped as asked, 1 failed while running or no frame was taken, 2 wrong scenario, option or data
 """
-
-
-DEFAULT_CACHE_MB, MAX_CACHE_MB = 64.0, 1e6
 
 
 class UsageError(Exception):
@@ -62,12 +58,6 @@ def main(arguments: list[str] | None = None, prog: str = "camera-node") -> int:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
     )
-    prepare = commands.add_parser(
-        "prepare", help="render and cache a scenario's frames, which run otherwise does when it starts"
-    )
-    _add_cameras(prepare)
-    prepare.add_argument("-q", "--quiet", action="store_true", help="print only warnings")
-    prepare.set_defaults(run=_prepare)
     calibrate_command.add_arguments(commands.add_parser("calibrate", help="hand-eye and intrinsic calibration"))
     devices = commands.add_parser(
         "devices",
@@ -92,48 +82,29 @@ def main(arguments: list[str] | None = None, prog: str = "camera-node") -> int:
         return 2
 
 
-def _add_cameras(command: argparse.ArgumentParser) -> argparse._MutuallyExclusiveGroup:
-    """Add what says which cameras of which scenario; returns the group that chooses the cameras."""
-    command.add_argument("scenario", help="scenario file, or the name of a shipped one")
-    who = command.add_mutually_exclusive_group(required=True)
-    who.add_argument("--camera", metavar="ID[,ID]", help="cameras of the scenario to stream or render")
+def _add_run(run: argparse.ArgumentParser) -> None:
+    run.set_defaults(run=_run)
+    run.add_argument("scenario", help="scenario file, or the name of a shipped one")
+    who = run.add_mutually_exclusive_group(required=True)
+    who.add_argument("--camera", metavar="ID[,ID]", help="cameras of the scenario to stream")
     who.add_argument(
         "--camera-index", type=int, metavar="N", help="the camera of this number in the scenario, from 0 (of a pod)"
     )
     who.add_argument("--all", action="store_true", help="all cameras of the scenario")
-    command.add_argument("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
-    command.add_argument("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
-    return who
-
-
-def _add_run(run: argparse.ArgumentParser) -> None:
-    run.set_defaults(run=_run)
-    _add_cameras(run).add_argument(
+    who.add_argument(
         "--as",
         dest="names",
         metavar="ID[=NAME][,...]",
         help="in place of a scenario, play a recording or data set: as camera ID, which in the recording is NAME "
         "[the only one]; none is held out: that takes a scenario with cameras.held_out (docs/data.md)",
     )
+    run.add_argument("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    run.add_argument("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
     run.add_argument("--to", required=True, metavar="HOST:PORT", help="address of the channel emulator or edge server")
     run.add_argument(
         "--out", type=out_folder, metavar="DIR", help="folder to write the ledger and status file to [not written]"
     )
     run.add_argument("--seconds", type=float, metavar="S", help="end after S seconds of capture [on Ctrl-C]")
-    run.add_argument(
-        "--cache-mb",
-        type=float,
-        default=DEFAULT_CACHE_MB,
-        metavar="MB",
-        help="memory for compressed frames kept for the next loop; 0: none [%(default)g]",
-    )
-    run.add_argument(
-        "--response-timeout",
-        type=float,
-        default=5.0,
-        metavar="S",
-        help="reconnect if a frame is not answered within S seconds, or much later than earlier ones [%(default)g]",
-    )
     run.add_argument("-q", "--quiet", action="store_true", help="print only warnings")
     transport.add_arguments(run, listens=False)
 
@@ -159,17 +130,17 @@ def _add_doctor(doctor: argparse.ArgumentParser) -> None:
     transport.add_arguments(doctor, listens=False)
 
 
-def _open(args: argparse.Namespace, cache_mb: float) -> tuple[Scenario, list[Camera]]:
+def _open(args: argparse.Namespace) -> tuple[Scenario, list[Camera]]:
     """The scenario and the chosen cameras, opened. Raises UsageError or ScenarioError."""
     from camera_node.capture import build_cameras
     from camera_node.settings import source_config
 
     arm_cli.log_to_stderr(logging.WARNING if args.quiet else logging.INFO)
-    names = getattr(args, "names", None)  # prepare has no --as
+    names = args.names
     scenario = load(args.scenario, args.seed) if names is None else _recording(Path(args.scenario), names, args.seed)
     try:
         chosen = scenario.cameras if names is not None else _chosen(scenario, args)
-        cameras = build_cameras(scenario, source_config(scenario), chosen, args.data, int(cache_mb * 2**20))
+        cameras = build_cameras(scenario, source_config(scenario), chosen, args.data)
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from None
     return scenario, cameras
@@ -204,32 +175,16 @@ def _doctor(args: argparse.Namespace) -> int:
     return doctor.run(args)
 
 
-def _prepare(args: argparse.Namespace) -> int:
-    from camera_node.capture import prepare
-
-    _, cameras = _open(args, DEFAULT_CACHE_MB)
-    prepare(cameras, lambda: False)
-    return 0
-
-
 def _run(args: argparse.Namespace) -> int:
     from camera_node.node import Node, NodeOptions
 
-    # Written so that they refuse NaN, too.
+    # Written so that it refuses NaN, too.
     if args.seconds is not None and not args.seconds > 0:
         raise UsageError("--seconds: expected a positive number")
-    if not 0 <= args.cache_mb <= MAX_CACHE_MB:
-        raise UsageError(f"--cache-mb: expected 0 to {MAX_CACHE_MB:.0f}")
-    if not args.response_timeout > 0:
-        raise UsageError("--response-timeout: expected a positive number")
     options = NodeOptions(
-        to=transport.peer("--to", args.to),
-        transport=transport.from_arguments(args),
-        out=args.out,
-        seconds=args.seconds,
-        response_timeout_s=args.response_timeout,
+        to=transport.peer("--to", args.to), transport=transport.from_arguments(args), out=args.out, seconds=args.seconds
     )
-    scenario, cameras = _open(args, args.cache_mb)
+    scenario, cameras = _open(args)
 
     async def live() -> str | None:
         node = Node(scenario, cameras, options)

@@ -57,8 +57,8 @@ class Walk:
 
 
 def walks_through(scene: Scene, cameras: Sequence[str]) -> dict[str, Walk]:
-    """The walk of each camera, which start evenly spread over a lap. Raises ScenarioError for a scene without a floor to
-    walk on."""
+    """The walk of each camera, which start evenly spread over a lap. Raises ScenarioError for a scene without a
+    floor to walk on."""
     if scene.name not in _ROOMS:
         raise ScenarioError(f"scene {scene.name} is no room to walk in: expected {' or '.join(_ROOMS)}")
     low, high = scene.bounds

@@ -25,15 +25,8 @@ def test_mistakes_are_one_line_and_exit_code_2(capsys, tmp_path, monkeypatch):
     assert "--to: expected HOST:PORT" in fails(capsys, "run", "room", "--all", "--to", "host")
     for wrong in ("host:0", "host:99999", "::1", "http://host:80"):
         assert "--to: expected HOST:PORT" in fails(capsys, "run", "room", "--all", "--to", wrong)
-    for option, wrong in (
-        ("--seconds", "-1"),
-        ("--seconds", "nan"),
-        ("--response-timeout", "nan"),
-        ("--cache-mb", "-1"),
-        ("--cache-mb", "nan"),
-        ("--cache-mb", "inf"),
-    ):
-        assert f"{option}: expected" in fails(capsys, "run", "room", "--all", option, wrong, *to)
+    for wrong in ("-1", "nan"):
+        assert "--seconds: expected" in fails(capsys, "run", "room", "--all", "--seconds", wrong, *to)
     assert "cannot read" in fails(capsys, "run", "room", "--all", "--token-file", str(tmp_path / "no"), *to)
     assert "seed" in fails(capsys, "run", "room", "--all", "--seed", "-4", *to)
     (tmp_path / "file").write_text("")
