@@ -40,9 +40,9 @@ from camera_node.robot.calibration.settings import (
 )
 from camera_node.robot.calibration.targets import WHICH_PRINT, Target, estimate_pose, to_gray
 from camera_node.settings import ArmConfig, source_config
-from camera_node.sources.base import Source
+from camera_node.sources.base import Source, pixels
 from camera_node.sources.registry import open_sources
-from freshfield import payload, scenario
+from freshfield import scenario
 from freshfield.clock import WallClock
 from freshfield.geometry import Pinhole, se3_inverse
 
@@ -117,10 +117,7 @@ def _shots(source: Source, codec: str, seconds: float | None) -> Iterator[tuple[
         except ValueError as error:
             print(f"\n{error}", file=sys.stderr)
             continue
-        image, lens = shot.image, shot.intrinsics
-        if isinstance(image, bytes):
-            image = payload.decode(image, codec, lens.width, lens.height)
-        yield image, lens, shot.pose.matrix()
+        yield pixels(shot, codec), shot.intrinsics, shot.pose.matrix()
 
 
 def _guide(steps: Iterable[Step]) -> None:

@@ -19,8 +19,6 @@ from camera_node.sources.datasets.records import Dataset, DatasetError, find_fil
 FORMATS = tuple(kind for kind, model in MODELS.items() if issubclass(model, RecordedConfig))
 
 
-# What scanners and other tools leave, and the command of nerfstudio that makes a transforms.json of it.
-_CONVERTED = {"cameras.xml": "metashape"}
 _VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 _OF_VIDEO = "a video and its trajectory are named in a scenario: freshfield scenario init mine.yaml --like video"
 
@@ -107,9 +105,8 @@ def open_dataset(path: Path, scale: float = 1.0, name: str | None = None) -> tup
         raise DatasetError(errors[0])
     if name is not None:
         raise DatasetError(f"{path}: holds no data set of the format {name}")
-    for file_name, tool in _CONVERTED.items():
-        if (path / file_name).exists():
-            raise DatasetError(f"{path}: holds {file_name}, of {tool}: convert it with ns-process-data {tool}")
+    if (path / "cameras.xml").exists():
+        raise DatasetError(f"{path}: holds cameras.xml, of metashape: convert it with ns-process-data metashape")
     raise DatasetError(
         f"{path}: holds no data set: expected transforms.json, transforms_*.json, the calibration JSON of "
         "videos, poses_bounds.npy, annots.npy, Eyeful's cameras.json, a COLMAP model, or an export of a depth camera "

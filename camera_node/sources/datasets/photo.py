@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +38,6 @@ class ImageOptions:
 FULL_SIZE = ImageOptions()
 
 
-class DepthReader(Protocol):
-    def __call__(self, photo: Photo) -> DepthImage: ...
-
-
 @dataclass(frozen=True)
 class Photo:
     """An image file.
@@ -59,7 +55,7 @@ class Photo:
     mask: Path | None = None
     ignored: tuple[Path, bool] | None = None
     upright: bool = False
-    depth: DepthReader | None = None
+    depth: Callable[[Photo], DepthImage] | None = None
 
     def read(self) -> Image:
         """Read it as uint8 RGB or RGBA according to ``options``. Raises DatasetError."""
