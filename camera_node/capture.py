@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from camera_node.capture_schedule import CaptureSchedule, RateSchedule, ScheduledSource
+from camera_node.capture_schedule import CaptureSchedule, RateSchedule
 from camera_node.clocks import ClockError, NodeClock
 from camera_node.settings import DEPTH_STEP, SourceConfig
 from camera_node.sources.base import Shot, Source
@@ -72,8 +72,7 @@ class Camera:
         self.name = source.camera
         self.fps = source.fps
         self.source = source
-        # Replayed frames are compressed already.
-        self.codec = source.codec if isinstance(source, ScheduledSource) else config.codec
+        self.codec = source.codec or config.codec
         # A camera that waits for a device or an arm must not keep others waiting.
         arm = getattr(config, "arm", None)
         self.waits = config.waits or (arm is not None and source.camera in arm.cameras)
@@ -88,9 +87,8 @@ class Camera:
         return NodeClock(true, self._clock_error)
 
     def schedule(self, start_ns: int) -> CaptureSchedule:
-        """The instants at which it captures. start_ns: start of a recording that is played once."""
-        source = self.source
-        return source.schedule(start_ns) if isinstance(source, ScheduledSource) else self.rate_schedule
+        """The instants at which it captures, see ``Source.schedule``."""
+        return self.source.schedule(start_ns)
 
     @property
     def rate_schedule(self) -> RateSchedule:
@@ -165,7 +163,7 @@ class Camera:
         return depth
 
     def _encode_depth(self, content: int, shot: Shot) -> EncodedDepth | None:
-        if isinstance(self.source, ScheduledSource):
+        if self.source.codec is not None:
             return self.source.encoded_depth(content)
         wanted = content * DEPTH_STEP % 2**32 * self._depth_every < 2**32
         measured = self.source.depth(content, shot) if wanted else None

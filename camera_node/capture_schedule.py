@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
-from typing import Protocol, runtime_checkable
-
-from freshfield.depth import EncodedDepth
+from typing import Protocol
 
 
 class CaptureSchedule(Protocol):
@@ -28,20 +26,6 @@ class CaptureSchedule(Protocol):
     def next(self, tick: int, now_ns: int) -> tuple[int | None, int]:
         """The tick to capture after ``tick`` (None if that was the last), and the number of ticks missed in
         between."""
-        ...
-
-
-@runtime_checkable
-class ScheduledSource(Protocol):
-    """A source with its own schedule and codec. ``start_ns``, the same for all cameras of a node, is when a
-    schedule with a beginning begins."""
-
-    codec: str
-
-    def schedule(self, start_ns: int) -> CaptureSchedule: ...
-
-    def encoded_depth(self, content: int) -> EncodedDepth | None:
-        """The depth that came with shot ``content``, as it came. ValueError: it is damaged."""
         ...
 
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.capture_schedule import RateSchedule
+from camera_node.capture_schedule import CaptureSchedule, RateSchedule
 from freshfield import payload
 from freshfield.depth import DepthImage, EncodedDepth
 from freshfield.geometry import Pinhole, Pose
@@ -67,6 +67,7 @@ class Source(ABC):
     contents: number of different shots before they repeat; None if they never repeat.
     repeats_after: number of ticks after which the scene and the camera's path repeat, errors of sensors apart; None if
         they do not, or it is not known.
+    codec: of images that are sent as they were recorded, with their depth; None: the scenario's.
     timed: its shots were taken at known times, so that a tracker gave their poses; False for photos, whose poses were
         computed from them.
 
@@ -80,6 +81,7 @@ class Source(ABC):
     intrinsics: Pinhole
     contents: int | None = None
     repeats_after: int | None = None
+    codec: str | None = None
     timed: bool = True
     phase_ns: int = 0
     Config: ClassVar[Any] = None
@@ -98,6 +100,11 @@ class Source(ABC):
         """The instants of its ticks."""
         return RateSchedule(self.fps, self.phase_ns)
 
+    def schedule(self, start_ns: int) -> CaptureSchedule:
+        """The instants at which a node captures. start_ns: the same for all of its cameras, when a recording that is
+        played once begins."""
+        return self.rate_schedule()
+
     @abstractmethod
     def read(self, content: int) -> Shot:
         """Render, read or decode shot number ``content``. Raises ValueError (DatasetError, PoseGapError) if
@@ -107,6 +114,10 @@ class Source(ABC):
         """What a depth sensor measured with ``shot``, which ``read(content)`` gave; None without a sensor. To be
         asked only for frames that carry depth: it may have to be rendered or decoded. Raises as ``read``."""
         return shot.depth
+
+    def encoded_depth(self, content: int) -> EncodedDepth | None:
+        """The depth that came with shot ``content``, as it came, of a source with a ``codec``. ValueError: damaged."""
+        return None
 
     def prepare(self, stopped: Callable[[], bool]) -> None:  # noqa: B027
         """Render or decode ahead, so that ``read`` is fast. Returns early once ``stopped()`` is true."""

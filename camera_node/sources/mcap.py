@@ -47,7 +47,6 @@ class ReplaySource(Source):
         self._session, self._frames, self._times = session, frames, times_ns
 
     def schedule(self, start_ns: int) -> CaptureSchedule:
-        """Once from ``start_ns`` on."""
         return OnceSchedule(self._times, start_ns)
 
     def content(self, tick: int) -> int:
@@ -59,7 +58,6 @@ class ReplaySource(Source):
         return Shot(self._session.payload(frame), pose, lens, frame.header.pose_gap_ns)
 
     def encoded_depth(self, content: int) -> EncodedDepth | None:
-        """See ``ScheduledSource``."""
         return self._session.depth(self._frames[content])
 
 
