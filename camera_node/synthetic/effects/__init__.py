@@ -12,8 +12,8 @@ The kinds, by where they act:
 To add one, write a file here with a dataclass of the same name (the effect's parameters and ``kind``) and add
 it to ``NAMES``. An effect that draws from a camera's random stream does so in ``start``.
 
-The held-out camera measures: it shows the sharp, noise-free scene at the true time. Effects
-apply to it only if they are listed with ``in_truth: true``.
+The held-out camera measures: it shows the sharp, noise-free scene at the true time. Effects apply to its frames only
+if they are listed with ``in_truth: true``; a run in virtual time that scores against the world itself has none.
 """
 
 from __future__ import annotations
