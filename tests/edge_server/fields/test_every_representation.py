@@ -115,16 +115,6 @@ def test_resuming_continues_bit_for_bit(name: str, extra: dict[str, Any], steps:
 
 
 @every_field
-def test_a_state_of_another_kind_is_refused(name: str) -> None:
-    field, other = small(name), "ngp" if name != "ngp" else "tensorf"
-    with pytest.raises(ValueError, match=f"a field called {other}, this one is {name}"):
-        field.load_state(small(other).state())
-    arrays = {name: array for name, array in field.state().items() if name != "meta"}
-    with pytest.raises(ValueError, match="not a state"):
-        field.load_state(arrays)
-
-
-@every_field
 def test_reset_forgets_everything(name: str) -> None:
     field = small(name)
     before = field.state()

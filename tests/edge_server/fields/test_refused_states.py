@@ -12,7 +12,7 @@ import pytest
 
 from edge_server.fields import Budget
 from tests.edge_server.fields.scenes import ring
-from tests.edge_server.fields.small import every_field, small
+from tests.edge_server.fields.small import every_field, same_state, small
 
 VIEWS = ring(5, size=24)
 State = dict[str, Any]
@@ -70,6 +70,8 @@ DAMAGE: dict[str, Callable[[State], Any]] = {
     "an array that holds infinity": _last_array_not_finite(np.inf),
     "of a later version": _said(lambda meta: meta.update(version=10**9)),
     "of no version": _said(lambda meta: meta.pop("version")),
+    "of another kind of field": _said(lambda meta: meta.update(field="another")),
+    "no facts": _without("meta"),
     "no step count": _said(lambda meta: meta.pop("step")),
     "a step count that is none": _said(lambda meta: meta.update(step=None)),
     "no cameras": _said(lambda meta: meta.pop("cameras")),
@@ -102,8 +104,7 @@ def test_a_refused_state_leaves_the_field_as_it_was(name: str) -> None:
     twin.load_state(before)
     for either in (field, twin):  # nothing that a state does not hold was lost or gained either
         either.fit(VIEWS, Budget(steps=2))
-    one, two = field.state(), twin.state()
-    assert all(np.array_equal(one[key], two[key]) for key in one)
+    same_state(field, twin)
     field.load_state(good)
     assert all(np.array_equal(field.state()[key], good[key]) for key in good)
 

@@ -9,7 +9,7 @@ import torch
 from edge_server.fields import Budget
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT
 from edge_server.fields.common.kernels.rays import COARSE, Space
-from edge_server.fields.common.kernels.train import RaySampling, add_appearance, add_appearance_backward, train_chunks
+from edge_server.fields.common.kernels.train import RaySampling, train_chunks
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW, Weights
 from edge_server.fields.common.occupancy_grid import OccupancyGrid
 from edge_server.fields.nerfacto.field import NerfactoField
@@ -260,31 +260,6 @@ def test_the_proposals_gradient_is_added_up_once() -> None:
     touched = (gradient.reshape(len(dirty), -1) != 0).any(axis=1)
     np.testing.assert_array_equal(dirty, touched)
     assert not dirty[0] and dirty.any()
-
-
-def test_appearances_equal_the_oracle() -> None:
-    rng = np.random.default_rng(5)
-    size, row, a, b = 2, 4, 3, 17
-    raw, embedding = rng.normal(size=(12, 20)).astype(F), rng.normal(size=size).astype(F)
-    wanted = rng.normal(size=(3, 20)).astype(F)
-
-    def oracle(shares: torch.Tensor, e: torch.Tensor) -> torch.Tensor:
-        mixed = shares[1:4] + (e[:, None, None] * shares[row : row + 3 * size].view(size, 3, -1)).sum(dim=0)
-        return mixed[:, a:b]
-
-    shares = torch.as_tensor(raw, dtype=torch.float64).requires_grad_(True)
-    e = torch.as_tensor(embedding, dtype=torch.float64).requires_grad_(True)
-    out = raw.copy()
-    add_appearance(out, row, embedding, a, b)
-    np.testing.assert_allclose(out[1:4, a:b], oracle(shares, e).detach().numpy(), atol=1e-5)
-    np.testing.assert_array_equal(np.delete(out[1:4], np.s_[a:b], axis=1), raw[1:4][:, [0, 1, 2, 17, 18, 19]])
-    (oracle(shares, e) * torch.as_tensor(wanted[:, a:b])).sum().backward()
-    d_out, d_embedding = np.zeros((12, 20), F), np.zeros(size, F)
-    d_out[1:4] = wanted
-    add_appearance_backward(out, d_out, row, embedding, a, b, d_embedding)
-    assert shares.grad is not None and e.grad is not None
-    np.testing.assert_allclose(d_out[4:10, a:b], shares.grad.numpy()[4:10, a:b], atol=1e-5)
-    np.testing.assert_allclose(d_embedding, e.grad.numpy(), rtol=1e-5, atol=1e-5)
 
 
 def test_a_whole_steps_gradients_equal_finite_differences() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -79,26 +77,6 @@ def test_where_something_moved_only_cells_that_most_cameras_see_move_are_scored(
     assert 0.02 < (expected > NOT_SEEN).mean() < 0.8 * (everywhere > NOT_SEEN).mean()
     # Rounding puts the middle of a cell now and then into the next pixel.
     assert (where_marked == expected).mean() > 0.99
-
-
-def test_warming_up_compiles_every_kernel() -> None:
-    """In a process of its own. The first step must not wait for a compiler."""
-    code = """
-from edge_server.fields.common.kernels import plane_sweep
-from edge_server.fields.splat.kernels import bin_tiles, optimizer_step, project, rasterize
-from edge_server.fields.splat.field import StillField
-StillField().warm_up()
-for module in (plane_sweep, project, rasterize, bin_tiles, optimizer_step):
-    for name, thing in vars(module).items():
-        own = hasattr(thing, "signatures") and thing.py_func.__module__ == module.__name__
-        if own and thing.py_func.__code__.co_varnames[0] == "counter":
-            print(name, len(thing.signatures))
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr[-1000:]
-    counts = dict(line.split() for line in done.stdout.splitlines())
-    assert {"project", "bin_tiles", "train_tiles", "render_tiles", "adam_step"} <= counts.keys()
-    assert set(counts.values()) == {"1"}, counts
 
 
 def test_the_number_of_gaussians_grows_to_the_cap_and_no_further() -> None:

@@ -17,12 +17,12 @@ _interval = njit(lambda space, o, d: interval(space, (o[0], o[1], o[2]), (d[0], 
 CELLS = 16
 
 
-def _space(contracted: bool, filled: float, near: float = 0.1) -> Space:
+def _space(contracted: bool, filled: float) -> Space:
     rng = np.random.default_rng(5)
     occupied = (rng.random(CELLS**3) < filled).astype(np.uint8)
     blocks = occupied.reshape([4, 4, 4, 4, 4, 4]).max(axis=(1, 3, 5)).reshape(-1)
     density = np.full(CELLS**3, 1.5, np.float32)
-    return Space(occupied, blocks, density, CELLS, contracted, np.float32(2 * 3**0.5 / 32), np.float32(near))
+    return Space(occupied, blocks, density, CELLS, contracted, np.float32(2 * 3**0.5 / 32), np.float32(0.1))
 
 
 def _single(values) -> tuple[np.float32, ...]:
@@ -77,9 +77,10 @@ def _march_oracle(space: Space, o: torch.Tensor, d: torch.Tensor, jitter: float)
 def test_samples_equal_the_oracle(contracted: bool, filled: float) -> None:
     space = _space(contracted, filled)
     rng = np.random.default_rng(6)
-    for _ in range(20):
+    from_inside = missing = 0
+    for k in range(30):
         o = rng.normal(size=3) * 1.5
-        d = rng.uniform(-0.6, 0.6, 3) - o
+        d = rng.uniform(-0.6, 0.6, 3) - o if k < 20 else rng.normal(size=3)
         d /= np.linalg.norm(d)
         x, ts, dts, _ = _march(space, o, d, 0.3)
         t, delta, u, inside = _march_oracle(space, *(torch.as_tensor(a, dtype=torch.float32) for a in (o, d)), 0.3)
@@ -90,14 +91,9 @@ def test_samples_equal_the_oracle(contracted: bool, filled: float) -> None:
         rows = [int((t - ts[k]).abs().argmin()) for k in np.flatnonzero(same)]
         np.testing.assert_allclose(x[:, same].T, u[rows].numpy(), atol=2e-4)
         np.testing.assert_allclose(dts[same], delta[rows].numpy(), rtol=2e-3)
-
-
-def test_a_ray_that_misses_the_box_has_no_samples() -> None:
-    space = _space(False, 1.0)
-    x, _, _, (t, leave) = _march(space, np.array([3.0, 0, 0]), np.array([0, 1.0, 0]))
-    assert x.size == 0 and t >= leave
-    x, _, _, _ = _march(space, np.array([3.0, 0, 0]), np.array([1.0, 0, 0]))  # looking away
-    assert x.size == 0
+        from_inside += np.abs(o).max() < 1.0  # begins at the near plane
+        missing += not len(t)
+    assert from_inside and (missing or contracted)
 
 
 def test_empty_space_is_skipped_and_room_is_respected() -> None:
@@ -111,11 +107,6 @@ def test_empty_space_is_skipped_and_room_is_respected() -> None:
     n, t, _ = march(space, *way, x, ts, dts, 4, 9, NEVER)
     assert n == 9 and t < leave and (x[:, :4] == 0).all()
     np.testing.assert_array_equal(ts[4:], whole[:5])
-
-
-def test_no_sample_lies_nearer_than_near() -> None:
-    o, d = np.zeros(3), np.array([0.6, 0.0, 0.8])
-    assert _march(_space(True, 1.0, near=0.4), o, d)[1].min() >= 0.4
 
 
 def test_a_ray_ends_where_the_known_density_makes_it_opaque() -> None:

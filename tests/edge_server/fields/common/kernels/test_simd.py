@@ -1,4 +1,7 @@
-"""Exponential, logarithm and random numbers of the kernels against numpy."""
+"""Exponential, logarithm and random numbers of the kernels against numpy.
+
+Arithmetic, masks and sums of vectors are those of ``composite`` and ``align``, which have tests of their own.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from llvmlite import ir
 from numba import njit, types
 from numba.core.errors import TypingError
 from numba.extending import intrinsic
@@ -15,14 +17,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import FAST
 from edge_server.fields.common.kernels.simd import exp32, log32, uniform
-from edge_server.fields.common.kernels.simd_vectors import (
-    LANES,
-    Vector,
-    any_lane,
-    eight_lane_sums,
-    lane_sum,
-    require_contiguous,
-)
+from edge_server.fields.common.kernels.simd_vectors import LANES, Vector, require_contiguous
 
 
 def _of_each(function):
@@ -64,8 +59,8 @@ def test_uniform_is_uniform_and_streams_differ() -> None:
     assert abs(np.corrcoef(a[:-1], a[1:])[0, 1]) < 0.03 and abs(np.corrcoef(a, b)[0, 1]) < 0.03
 
 
-def _run(work: Callable[[Vector, Vector], Any], a: NDArray[np.float32], b: NDArray[np.float32]) -> Any:
-    """What ``work`` makes of two vectors: 16 numbers, or 8, or one."""
+def _run(work: Callable[[Vector, Vector], Vector], a: NDArray[np.float32], b: NDArray[np.float32]) -> Any:
+    """What ``work`` makes of two vectors."""
 
     @intrinsic
     def code(typingctx: Any, x: Any, y: Any, out: Any) -> Any:
@@ -74,12 +69,7 @@ def _run(work: Callable[[Vector, Vector], Any], a: NDArray[np.float32], b: NDArr
                 context.make_array(kind)(context, builder, arg).data
                 for kind, arg in zip(signature.args, args, strict=True)
             ]
-            result = work(Vector.load(builder, data[0]), Vector.load(builder, data[1]))
-            if isinstance(result, Vector):
-                result.store(data[2])
-            else:
-                place = builder.bitcast(data[2], result.type.as_pointer())
-                builder.store(result, place).align = 4
+            work(Vector.load(builder, data[0]), Vector.load(builder, data[1])).store(data[2])
             return context.get_dummy_value()
 
         return types.void(x, y, out), codegen
@@ -91,38 +81,6 @@ def _run(work: Callable[[Vector, Vector], Any], a: NDArray[np.float32], b: NDArr
     out = np.full(LANES, -7.0, np.float32)
     run(a, b, out)
     return out
-
-
-@pytest.fixture
-def pair() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    rng = np.random.default_rng(0)
-    return rng.normal(size=LANES).astype(np.float32), rng.normal(size=LANES).astype(np.float32) + 3.0
-
-
-def test_arithmetic_equals_numpy(pair):
-    a, b = pair
-    got = _run(lambda x, y: (x * y + 2.0 - y) / y + x.one_minus(), a, b)
-    np.testing.assert_allclose(got, (a * b + 2.0 - b) / b + 1.0 - a, rtol=1e-5, atol=1e-6)
-
-
-def test_masks_select_and_combine(pair):
-    a, b = pair
-
-    def chosen(x: Vector, y: Vector) -> Vector:
-        return x.where(x.builder.and_(x.greater_equal(-0.5), x.less(0.5)), 9.0)
-
-    np.testing.assert_array_equal(_run(chosen, a, b), np.where((a >= -0.5) & (a < 0.5), a, np.float32(9.0)))
-
-
-@pytest.mark.parametrize("bound, expected", [(1.0, 1.0), (7.0, 0.0)])
-def test_any_lane_of_a_mask(bound, expected):
-    a = np.zeros(LANES, np.float32)
-    a[11] = 5.0
-
-    def result(x: Vector, y: Vector) -> Any:
-        return x.builder.uitofp(any_lane(x.builder, x.greater_equal(bound)), ir.FloatType())
-
-    assert _run(result, a, a)[0] == expected
 
 
 def test_minimum_and_maximum_replace_nan():
@@ -144,16 +102,7 @@ def test_exp2_clamps_its_argument():
     np.testing.assert_allclose(got, [1, 1, 1, least, least, least, least, least] * 2, rtol=3e-7)
 
 
-def test_lane_sums(pair):
-    a, b = pair
-    assert _run(lambda x, y: lane_sum(x), a, b)[0] == pytest.approx(a.sum(dtype=np.float64), abs=1e-5)
-    got = _run(lambda x, y: eight_lane_sums([x, y, x * y, x + y, x - y, x * x, y * y, x * 3.0]), a, b)
-    expected = [v.sum(dtype=np.float64) for v in (a, b, a * b, a + b, a - b, a * a, b * b, a * 3)]
-    np.testing.assert_allclose(got[:8], expected, rtol=1e-5, atol=1e-4)
-    assert (got[8:] == -7.0).all()
-
-
-def test_strided_arrays_are_refused(pair):
+def test_strided_arrays_are_refused():
     @njit
     def sliced(x):
         checked(x)
@@ -163,6 +112,7 @@ def test_strided_arrays_are_refused(pair):
         require_contiguous(x)
         return types.void(x), lambda context, builder, signature, args: context.get_dummy_value()
 
-    sliced(pair[0])
+    given = np.zeros(2 * LANES, np.float32)
+    sliced(given)
     with pytest.raises(TypingError, match="contiguous"):
-        sliced(pair[0][::2])
+        sliced(given[::2])

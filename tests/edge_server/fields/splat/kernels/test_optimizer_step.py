@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_server.fields.common.camera_rows import camera_rows
-from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, BLOCK, COLOR, OPACITY, QUATERNION, SCALE
@@ -52,10 +51,8 @@ def _update(
     rule: AdamParameters,
     raster: RasterBuffers,
     cams: NDArray[np.float32],
-    pool: Pool | None = None,
 ) -> int:
     """How many gradients were dropped; params and moments are changed."""
-    raster.pool = pool or CallerPool()
     return raster.step(cams, as_gaussians(params), moments, rule)
 
 
@@ -131,19 +128,6 @@ def test_what_is_not_finite_is_dropped_and_counted(column: int, broken: float) -
     assert (moments.m[victim][dropped] == was[dropped]).sum() >= lost
     if column == 7:  # a color's sum reaches that color alone
         assert lost == 1 and dropped[COLOR + 1]
-
-
-def test_threads_do_not_change_a_bit() -> None:
-    params = random_params(COUNT, 1, 3)
-    raster, cams = _raster(params)
-    results = []
-    for pool in (CallerPool(), Pool(3)):
-        after, moments = params.copy(), _moments(params.shape[1], filled=True)
-        _update(after, moments, _adam_parameters(params.shape[1], 1e-3), raster, cams, pool)
-        results.append((after, moments.m, moments.v))
-        pool.close()
-    for a, b in zip(*results, strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_parameters_are_kept_within_their_bounds() -> None:

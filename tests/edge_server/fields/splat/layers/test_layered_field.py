@@ -285,20 +285,22 @@ def test_warming_up_compiles_every_kernel() -> None:
     """Nothing is left to compile when a body moves: in a process of its own."""
     code = """
 from numba.core.dispatcher import Dispatcher
-from edge_server.fields.common.kernels import visual_hull
+from edge_server.fields.common.kernels import plane_sweep, visual_hull
+from edge_server.fields.splat.kernels import bin_tiles, optimizer_step, project, rasterize
 from edge_server.fields.splat.layers.kernels import align, plates, solve
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from tests.edge_server.fields.splat.layers.test_layered_field import SMALL, _run
 def compiled():
     found = {}
-    for module in (align, plates, solve, visual_hull):
+    still = (bin_tiles, optimizer_step, plane_sweep, project, rasterize)
+    for module in (align, plates, solve, visual_hull, *still):
         kernels = {k for k in vars(module).values() if isinstance(k, Dispatcher)}
         found |= {(module.__name__, k.py_func.__name__): len(k.signatures) for k in kernels}
     return found
 field = LayeredField(SMALL)
 field.warm_up()
 before = compiled()
-assert sum(before.values()) > 5
+assert sum(before.values()) > 10
 _run(field, range(60))
 assert field.moving is not None and field.moving.alive and field.part_s["solving"] > 0.0
 assert compiled() == before, (before, compiled())

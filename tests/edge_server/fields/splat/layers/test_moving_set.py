@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields.common.camera_rows import camera_rows
-from edge_server.fields.common.scene_box import scene_box
+from edge_server.fields.common.scene_box import SceneBox, scene_box
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.splat.densification import GaussianCloud
 from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE
@@ -41,14 +41,15 @@ def _frames() -> list[Observation]:
     return frames
 
 
-def _set_of(places_m: np.ndarray) -> MovingSet:
+def set_of(places_m: np.ndarray, box: SceneBox = BOX) -> MovingSet:
     """Small Gaussians at places in meters."""
-    moving = MovingSet(SplatSettings(seed_cells=32), CallerPool(), BOX, 0)
+    moving = MovingSet(SplatSettings(seed_cells=32), CallerPool(), box, 0)
     params = np.zeros((len(places_m), BASE), np.float32)
-    params[:, :3] = BOX.normalise(places_m)
+    params[:, :3] = box.normalise(places_m)
     params[:, SCALE:QUATERNION], params[:, QUATERNION], params[:, OPACITY] = np.log(0.02), 1.0, 2.0
     moving.cloud = GaussianCloud.new(params)
-    moving.renew_anchors(INSTANT_S)
+    if len(params):
+        moving.renew_anchors(INSTANT_S)
     return moving
 
 
@@ -67,7 +68,7 @@ def test_motion_of_few_cameras_is_bound_by_their_distance(
 
 @pytest.mark.parametrize(("cameras", "anchors"), [(4, 48), (5, 60)])
 def test_anchors_grow_with_the_foreground_up_to_a_bound_for_few_cameras(cameras: int, anchors: int) -> None:
-    moving = _set_of(np.random.default_rng(2).uniform(-0.5, 0.5, (700, 3)))
+    moving = set_of(np.random.default_rng(2).uniform(-0.5, 0.5, (700, 3)))
     moving.bind(cameras)
     moving.follow_foreground(1.0)
     moving.renew_anchors(INSTANT_S)
@@ -80,7 +81,7 @@ def test_a_set_that_has_lost_most_of_its_gaussians_forgets_its_motion(outside: i
     rng = np.random.default_rng(0)
     inside_m = BALL_M + rng.uniform(-0.15, 0.15, (20 - outside, 3))
     beside_m = np.array([0.0, 0.0, 1.3]) + rng.uniform(-0.05, 0.05, (outside, 3))
-    moving = _set_of(np.concatenate([inside_m, beside_m]))
+    moving = set_of(np.concatenate([inside_m, beside_m]))
     moving.remove_outside(_frames(), CAMERAS)
     assert len(moving) == left == len(moving.anchor)
     assert (moving.motion.anchors is None) == (left == 0)
@@ -89,7 +90,7 @@ def test_a_set_that_has_lost_most_of_its_gaussians_forgets_its_motion(outside: i
 def test_new_gaussians_lie_where_the_foreground_is_while_the_anchors_are_displaced() -> None:
     """The anchors have moved by half the ball's size since the instant at which displacements were 0."""
     shift = np.array([0.3, -0.2, 0.1]) / BOX.radius_m
-    moving = _set_of(BALL_M - shift * BOX.radius_m + np.random.default_rng(1).uniform(-0.2, 0.2, (20, 3)))
+    moving = set_of(BALL_M - shift * BOX.radius_m + np.random.default_rng(1).uniform(-0.2, 0.2, (20, 3)))
     moving.motion._knots = moving.motion._knots + shift
     before = len(moving)
     moving.seed_missing(_frames(), CAMERAS)

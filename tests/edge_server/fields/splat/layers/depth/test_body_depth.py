@@ -10,15 +10,12 @@ import pytest
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.threads.thread_pool import CallerPool
-from edge_server.fields.splat.densification import GaussianCloud
-from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE
 from edge_server.fields.splat.layers.depth.body_depth import measured_frames
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate
-from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 from edge_server.fields.splat.layers.plates import Plate
-from edge_server.fields.splat.settings import SplatSettings
 from tests.edge_server.fields.scenes import BALL_M, RADIUS_M, ring, seen
+from tests.edge_server.fields.splat.layers.test_moving_set import set_of
 
 VIEWS, INSTANT_S = ring(3), 10.0
 AWAY_M = np.array([9.0, 9.0, 0.5])
@@ -48,17 +45,6 @@ def _still_m(camera: FixedCamera) -> np.ndarray:
     return np.where(inverse > 0, 1.0 / np.maximum(inverse, 1e-6), 0).astype(np.float32)
 
 
-def _set_of(places_m: np.ndarray) -> MovingSet:
-    moving = MovingSet(SplatSettings(), CallerPool(), BOX, 0)
-    params = np.zeros((len(places_m), BASE), np.float32)
-    params[:, :3] = BOX.normalise(places_m)
-    params[:, SCALE:QUATERNION], params[:, QUATERNION], params[:, OPACITY] = np.log(0.02), 1.0, 2.0
-    moving.cloud = GaussianCloud.new(params)
-    if len(params):
-        moving.renew_anchors(INSTANT_S)
-    return moving
-
-
 def _measured(cameras: dict[str, FixedCamera], frames: list[Observation]) -> list[Observation]:
     observations = Observations()
     for o in frames:
@@ -74,7 +60,7 @@ def test_one_frame_with_depth_seeds_the_side_of_the_ball_that_it_sees(known: int
     frame.view.depth[:] *= scale
     camera.depth_scale = 1.0 / scale
     shift = np.array([0.3, -0.2, 0.1]) * (known > 0)
-    moving = _set_of(BALL_M - shift + np.random.default_rng(1).uniform(-0.2, 0.2, (known, 3)))
+    moving = set_of(BALL_M - shift + np.random.default_rng(1).uniform(-0.2, 0.2, (known, 3)), BOX)
     moving.motion._knots = moving.motion._knots + shift / BOX.radius_m
     cameras = {camera.view.camera: camera}
     moving.seed_at_depth(_measured(cameras, [frame]), cameras)
@@ -93,7 +79,7 @@ def test_one_frame_with_depth_seeds_the_side_of_the_ball_that_it_sees(known: int
 def test_what_is_shown_rightly_is_not_seeded_again_and_the_capacity_is_kept() -> None:
     camera, frame = _seen_from(0)
     cameras = {camera.view.camera: camera}
-    frames, moving = _measured(cameras, [frame]), _set_of(BALL_M + np.zeros((1440, 3)))
+    frames, moving = _measured(cameras, [frame]), set_of(BALL_M + np.zeros((1440, 3)), BOX)
     frame.shown = frame.view.image / np.float32(255.0)
     moving.seed_at_depth(frames, cameras)
     assert len(moving) == 1440
@@ -107,7 +93,7 @@ def test_a_gaussian_before_which_nothing_was_measured_is_removed() -> None:
     camera, frame = _seen_from(0)
     eye_m = camera.view.camera_to_world[:3, 3]
     near_m = BALL_M + 0.4 * (eye_m - BALL_M)
-    moving = _set_of(np.concatenate([BALL_M + np.zeros((20, 3)), near_m + np.zeros((9, 3))]))
+    moving = set_of(np.concatenate([BALL_M + np.zeros((20, 3)), near_m + np.zeros((9, 3))]), BOX)
     cameras = {camera.view.camera: camera}
     camera.depth_scale = 0.4  # all that was measured would lie before the Gaussians
     moving.remove_outside([frame], cameras, measured=True)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
 from tests.edge_server.fields.scenes import seen
+from tests.edge_server.fields.small import same_state
 from tests.edge_server.fields.splat.layers.test_hard_cases import (
     AGAIN_S,
     AWAY,
@@ -132,10 +133,7 @@ def test_a_state_goes_on_bit_for_bit_with_depth() -> None:
     assert any(o.body_m is not None for o in other.field.observations)
     for stage in (one, other):
         stage.run(4.0 * FRAME_S, score=False)
-    mine, theirs = one.field.state(), other.field.state()
-    assert mine.keys() == theirs.keys()
-    for name, array in mine.items():
-        np.testing.assert_array_equal(array, theirs[name], err_msg=name)
+    same_state(one.field, other.field)
 
 
 def test_one_camera_alone_from_the_first_frame_on_shows_finite_images() -> None:

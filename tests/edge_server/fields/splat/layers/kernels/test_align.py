@@ -34,8 +34,8 @@ def case(count: int = 40, anchors: int = ANCHORS, seed: int = 0) -> tuple[np.nda
     return random_params(count, seed=seed), anchor, share, image, plate, weight
 
 
-def aligned(params, anchor, share, image, plate, weight, anchors=ANCHORS, pool=None):
-    raster = binned(CAMS, params, differentiate=False, pool=pool)
+def aligned(params, anchor, share, image, plate, weight, anchors=ANCHORS):
+    raster = binned(CAMS, params, differentiate=False)
     return align_view(raster, CAMS[0], params[:, :3], image, plate, weight, anchor, share, anchors)
 
 
@@ -106,12 +106,6 @@ def test_anchors_of_what_lies_together_agree_roughly():
     wanted, right, _ = by_pixels(*given)
     assert np.linalg.norm(matrix - wanted) < 0.05 * np.linalg.norm(wanted)
     assert np.linalg.norm(vector - right) < 0.05 * np.linalg.norm(right)
-
-
-def test_the_number_of_threads_does_not_change_bits():
-    given = case(count=200)
-    for a, b in zip(aligned(*given), aligned(*given, pool=Pool(3)), strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_nothing_is_said_without_weight_or_gaussians():
