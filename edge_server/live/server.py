@@ -37,7 +37,7 @@ from edge_server.machine import run_facts
 from edge_server.run_records import DepthCounts, DepthStatus, EdgeStatus, UpdateCounts
 from edge_server.scheduler import LivePolicies, short_name
 from edge_server.settings import EdgeConfig, cameras_move, described, embedding_for, read_config
-from freshfield.clock import Clock, WallClock
+from freshfield.clock import WallClock
 from freshfield.files import ReplacedJson, write_json
 from freshfield.ledger import Ledger
 from freshfield.limits import MAX_SNAPSHOTS
@@ -100,12 +100,10 @@ class ServerOptions:
 class EdgeServer:
     """One edge server. ``run`` blocks until ``stop`` is called or the update loop fails."""
 
-    def __init__(
-        self, scenario: Scenario, config: EdgeConfig, options: ServerOptions, clock: Clock | None = None
-    ) -> None:
+    def __init__(self, scenario: Scenario, config: EdgeConfig, options: ServerOptions) -> None:
         self.scenario = scenario
         self.options = options
-        self.clock = clock or WallClock()
+        self.clock = WallClock()
         self.start_ns = self.clock.now_ns()
         self._run_facts = run_facts()
         self._stopping = threading.Event()

@@ -18,8 +18,8 @@ from tests.integration.own_classes import Darker, Flat, LastFirst, Late, Turning
 
 OWN = Path(__file__).parent.parent / "integration/own_classes.py"
 # Effects: tests/camera_node/synthetic/effects/test_registry.py.
-BUILT_IN = [("policy", name) for name in POLICIES] + [("selector", name) for name in ("random", "coverage")]
-OTHERS = [("policy", f"{__file__}:ByState"), ("selector", "fisher")]
+BUILT_IN = [("policy", name) for name in POLICIES] + [("fault", name) for name in faults.NAMES]
+BUILT_IN += [("selector", name) for name in ("random", "coverage", "fisher")]
 FAULTS = {"loss": "probability=0.5", "duplication": "probability=0.5", "corruption": "probability=0.5 count=3"}
 FAULTS |= {"blackout": "windows_ms=[[0,50]]", "reset": "mean_interval_ms=100", "bandwidth": "megabits_per_s=1"}
 COUNT = itertools.count()
@@ -76,6 +76,7 @@ UNBOUNDED = {"__annotations__": {"gain": float}, "gain": 1.0}
 NO_DEFAULT = type(Settings)("Params", (Settings,), {"__annotations__": {"ms": float}})
 NO_COPY = {"render": painted(seen), "state": lambda s: {"level": s}, "load_state": take_views}
 BASES = {"policy": Youngest, "effect": Darker, "fault": Late, "field": Flat, "selector": LastFirst, "source": Turning}
+OWN_CLASSES = [(kind, f"{OWN}:{good.__name__}") for kind, good in BASES.items()]
 # Kind -> name of a class -> how it differs from the good one, and what the command says.
 BROKEN = {
     "source": {
@@ -127,16 +128,10 @@ ROWS = [(kind, name, *row) for kind, rows in BROKEN.items() for name, row in row
 globals().update({name: type(BASES[kind])(name, (BASES[kind],), dict(has)) for kind, name, has, _ in ROWS})
 
 
-@pytest.mark.parametrize(
-    ("kind", "name"), [(kind, f"{OWN}:{good.__name__}") for kind, good in BASES.items()] + BUILT_IN + OTHERS
-)
+@pytest.mark.parametrize(("kind", "name"), [*BUILT_IN, *OWN_CLASSES, ("policy", f"{__file__}:ByState")])
 def test_what_keeps_its_contract_passes(kind, name, capsys):
-    assert main(["check-plugin", kind, name]) == 0, capsys.readouterr().out
-
-
-@pytest.mark.parametrize("name", faults.NAMES)
-def test_the_link_s_faults_keep_theirs(name, capsys):
-    assert main(["check-plugin", "fault", name, *FAULTS[name].split()]) == 0, capsys.readouterr().out
+    words = FAULTS[name].split() if name in FAULTS else []
+    assert main(["check-plugin", kind, name, *words]) == 0, capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("kind", "name", "says"), [(kind, name, says) for kind, name, _, says in ROWS])
