@@ -2,12 +2,7 @@ from __future__ import annotations
 
 import os
 
-from edge_server.machine import machine, versions
-
-
-def test_versions_name_what_figures_depend_on():
-    found = versions()
-    assert found["numpy"] and found["freshfield"] and found["python"].count(".") == 2
+from edge_server.machine import machine
 
 
 def test_machine_knows_itself():

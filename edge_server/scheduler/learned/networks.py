@@ -29,8 +29,7 @@ def init_actor(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.flo
     if spec.action == "select":
         weights["own"] = _orthogonal(rng, spec.hidden, spec.hidden, 1.0)
     weights["out"] = _orthogonal(rng, spec.hidden, outputs, 0.01)
-    bias = np.log(spec.start / (1.0 - spec.start)) if spec.action == "select" else 0.0
-    weights["out_b"] = np.full(outputs, bias)
+    weights["out_b"] = np.zeros(outputs)
     return weights
 
 

@@ -19,6 +19,8 @@ W_P, W_S, W_L, W_T = -0.02, 0.2, 0.3, 0.015
 MAX_HIDDEN = 1024
 MAX_OMEGAS = 4096
 MAX_FIRST_WEIGHTS = 2**22
+# In files of earlier versions: what had other values once, and the one that is left.
+_GONE = {"network": "pooled", "cameras": None, "start": 0.5}
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,6 @@ class Spec:
     ``threshold`` choose one of ``omegas_ms`` (6.34, 6.39).
     layout: the features of a state.
     hidden: width of all layers.
-    start: every camera's probability before learning.
     hold_ms: a decision holds until the next multiple of it; 0: every update has one of its own.
     learning_rate, minibatch: of Adam's steps. max_gradient: bound of the gradient's norm (clipping).
     clip: epsilon of (5.23).
@@ -41,7 +42,6 @@ class Spec:
     layout: StateLayout = field(default_factory=lambda: StateLayout(("age",)))
     omegas_ms: tuple[float, ...] = ()
     hidden: int = 64
-    start: float = 0.5
     hold_ms: float = 0.0
     learning_rate: float = 3e-3
     clip: float = 0.2
@@ -72,8 +72,6 @@ class Spec:
             )
         if not 0.0 <= self.hold_ms < 1e9:
             raise ValueError(f"hold_ms: expected milliseconds from 0, got {self.hold_ms:g}")
-        if not 0.0 < self.start < 1.0:
-            raise ValueError(f"start: expected a probability between 0 and 1, got {self.start:g}")
         positive = (self.learning_rate, self.clip, self.max_gradient, self.target_kl)
         if not all(0.0 < p < math.inf for p in positive):
             raise ValueError("learning_rate, clip, max_gradient and target_kl must be positive and finite")
@@ -89,9 +87,9 @@ class Spec:
         """ValueError for what ``as_json`` cannot have written."""
         try:
             values = dict(data)
-            # Written by earlier versions, which had a second network.
-            if values.pop("network", "pooled") != "pooled" or values.pop("cameras", None) is not None:
-                raise ValueError("a flat network, which is read no more: train another policy")
+            for name, only in _GONE.items():
+                if values.pop(name, only) != only:
+                    raise ValueError(f"{name}: only {only} is read; train another policy")
             layout = dict(values.pop("layout"))
             for name in ("parts", "centre", "spread"):
                 layout[name] = tuple(layout[name])

@@ -35,7 +35,6 @@ def test_a_model_is_relative_to_the_scenario():
     "section, told",
     [
         ({"dims": 3}, "edge.embedding.dims: unknown key; did you mean 'dim'?"),
-        ({"dim": 0}, "edge.embedding.dim: expected a whole number, 1 to 4096, got 0"),
         ({"dim": "32"}, "edge.embedding.dim: expected a whole number"),
         ("default", "edge.embedding: expected a mapping"),
     ],

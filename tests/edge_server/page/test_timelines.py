@@ -8,7 +8,7 @@ import numpy as np
 
 from edge_server.live.state import CameraView, Publication
 from edge_server.page import timelines
-from edge_server.page.timelines import MAX_POINTS, RECENT, History, _decimate, _forward_fill, _stairs
+from edge_server.page.timelines import MAX_POINTS, RECENT, History, _decimate
 
 
 def views(*ages: float | None) -> list[CameraView]:
@@ -57,16 +57,6 @@ def test_thinning_keeps_the_newest_and_its_place():
     thin_t, thin_y = _decimate(t, 2 * t)
     assert len(thin_t) <= MAX_POINTS and thin_t[-1] == 999 and np.array_equal(thin_y, 2 * thin_t)
     assert np.array_equal(_decimate(t[:5])[0], t[:5])
-
-
-def test_gaps_are_filled_with_what_was_known():
-    nan = np.nan
-    assert _forward_fill(np.array([nan, 2.0, nan, nan, 5.0, nan])).tolist() == [2, 2, 2, 2, 5, 5]
-
-
-def test_a_staircase_holds_each_value():
-    t, y = _stairs(np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 0.0]))
-    assert t.tolist() == [0, 1, 1, 2, 2] and y.tolist() == [0, 0, 1, 1, 0]
 
 
 def test_the_charts_show_ages_scored_updates_of_the_window_and_states_by_name(monkeypatch):

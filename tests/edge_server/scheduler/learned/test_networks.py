@@ -61,14 +61,6 @@ def test_numpy_and_torch_compute_the_same(spec):
     np.testing.assert_allclose(networks.logits(np, spec, weights, x), found, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("start", [0.1, 0.5, 0.9])
-def test_before_anything_is_learned_every_camera_has_the_probability_asked_for(start):
-    spec = Spec("select", LAYOUT, start=start)
-    weights = networks.init_actor(spec, np.random.default_rng(0))
-    p = 1.0 / (1.0 + np.exp(-networks.logits(np, spec, weights, features(18))))
-    assert np.abs(p - start).max() < 0.03
-
-
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -79,7 +71,6 @@ def test_before_anything_is_learned_every_camera_has_the_probability_asked_for(s
         ({"action": "wait", "omegas_ms": (0.0, float("inf"))}, "from 0 to 3600000"),
         ({"action": "wait", "omegas_ms": (0.0, 1.0, 1e308)}, "from 0 to 3600000"),
         ({"action": "threshold", "omegas_ms": (float("nan"),)}, "from 0 to 3600000"),
-        ({"action": "select", "start": 1.0}, "between 0 and 1"),
         ({"action": "select", "passes": 0}, "whole number"),
         ({"action": "select", "learning_rate": float("nan")}, "positive"),
         ({"action": "select", "entropy": -1.0}, "not negative"),
@@ -96,8 +87,8 @@ def test_a_specification_survives_json():
     layout = StateLayout(("age", "semantics"), dim=2, centre=(0.1, 0.2), spread=(1.0, 3.0))
     spec = Spec("threshold", layout, OMEGAS_MS, learning_rate=1e-4)
     assert Spec.from_json(json.loads(json.dumps(spec.as_json()))) == spec
-    assert Spec.from_json({**spec.as_json(), "network": "pooled", "cameras": None}) == spec
-    with pytest.raises(ValueError, match="a flat network"):
+    assert Spec.from_json({**spec.as_json(), "network": "pooled", "cameras": None, "start": 0.5}) == spec
+    with pytest.raises(ValueError, match="network: only pooled is read"):
         Spec.from_json({**spec.as_json(), "network": "flat", "cameras": 4})
     for damage in ({"layout": None}, {"hold_ms": 10**400}, {"omegas_ms": [0, 10**400]}):
         with pytest.raises(ValueError, match=r"specification|omegas_ms"):
