@@ -83,7 +83,9 @@ class NetworkControl:
                 in_force = None
         self.words.content = note(f"The network is {describe(in_force)}.")
         # Of the scenario's own network what is known: a slider that is moved changes the other one's value too.
-        delay_ms, loss = in_force or (_drawn_ms(status), 0.0)
+        self._place_sliders(*(in_force or (_drawn_ms(status), 0.0)))
+
+    def _place_sliders(self, delay_ms: float, loss: float) -> None:
         values = round(min(delay_ms, MAX_SLIDER_DELAY_MS)), round(100.0 * loss)
         for slider, value in zip((self.delay, self.loss), values):
             if slider.value != value:
@@ -93,7 +95,10 @@ class NetworkControl:
 
     async def _pressed(self, event: Any) -> None:
         # A coroutine runs before the next click is handled, so the group still holds this click's value.
-        self._set_after(0.0, event.client, NETWORKS.get(event.target.value))
+        wanted = NETWORKS.get(event.target.value)
+        self._set_after(0.0, event.client, wanted)
+        # At once: a slider that is moved now sets the other one's value too.
+        self._place_sliders(*(wanted or (float(self.delay.value), 0.0)))
 
     def _moved(self, event: Any) -> None:
         if event.client is not None:  # not set by refresh

@@ -175,22 +175,22 @@ def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publ
         reporting=sum(c.age_ms is not None for c in cameras),
         cameras=len(cameras),
         t_s=state.now_s(),
-        age_parts_ms=age_parts_ms(publications[-AGE_PARTS_OF:]),
+        age_parts_ms=age_parts_ms(publications[-AGE_PARTS_OF:], state.now_s()),
     )
 
 
-def age_parts_ms(publications: Sequence[Publication]) -> dict[str, float]:
+def age_parts_ms(publications: Sequence[Publication], now_s: float) -> dict[str, float]:
     """The parts of the age of what is shown at a random instant, milliseconds, means over some publications:
     network (capture to arrival), waiting (to the decision), computing (to publication), and display (since
     publication; an instant meets long gaps more often). Empty for fewer than two publications, or where no
     network time is known.
 
-    publications: in a row.
+    publications: in a row. now_s: on their clock; nothing has been published since the last one.
     """
     known = [(p.network_ms, p.update_ms, p.aaoi_ms) for p in publications if p.network_ms is not None]
     if len(publications) < 2 or not known:
         return {}
-    gap_ms = 1e3 * np.diff([p.t_s for p in publications])
+    gap_ms = 1e3 * np.diff([*(p.t_s for p in publications), now_s])
     network, computing, age = np.mean(known, axis=0)
     parts = {
         "network": network,

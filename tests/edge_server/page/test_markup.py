@@ -34,13 +34,18 @@ def test_the_age_of_what_is_shown_is_split_into_its_parts():
     def publication(t_s: float, network_ms: float | None) -> Publication:
         return Publication(0, t_s, 0, None, ("cam01",), (100.0,), 100.0, 20.0, network_ms=network_ms)
 
-    parts = age_parts_ms([publication(t_s, 50.0) for t_s in (0.0, 0.02, 0.08)])
+    three = [publication(t_s, 50.0) for t_s in (0.0, 0.02, 0.08)]
+    parts = age_parts_ms(three, 0.08)
     # A random instant lies in the long gap three times out of four, and then 30 ms after its begin.
     assert parts == pytest.approx({"network": 50.0, "waiting": 30.0, "computing": 20.0, "display": 25.0})
     html = markup.status(summary(age_parts_ms=parts))
     assert "125 ms" in html and "width:40.0%" in html
     assert [css(scale_color(k / 3)) in html for k in range(4)] == [True] * 4
-    assert age_parts_ms([publication(0.0, 50.0)]) == age_parts_ms([publication(t, None) for t in (0, 1)]) == {}
+    assert (
+        age_parts_ms([publication(0.0, 50.0)], 0.0) == age_parts_ms([publication(t, None) for t in (0, 1)], 1.0) == {}
+    )
+    # In a blackout nothing is published, and what is shown grows old.
+    assert age_parts_ms(three, 20.08)["display"] == pytest.approx(10_000.0, rel=0.01)
     assert "age of what is shown" not in markup.status(summary())
 
 

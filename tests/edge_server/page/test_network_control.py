@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import subprocess
 import sys
 from dataclasses import replace
-from unittest.mock import MagicMock
+from unittest.mock import MagicMock, patch
 
 import pytest
 
@@ -61,6 +62,17 @@ def test_what_the_emulator_does_not_answer_is_told_to_its_visitor():
     control._set(client, (400.0, 0.2))
     title, words = client.add_notification.call_args.args
     assert title == "The network has not changed" and "UNAVAILABLE" in words and network.in_force is None
+
+
+def test_a_slider_that_is_moved_right_after_a_button_keeps_nothing_of_the_blackout_before():
+    gui = MagicMock()
+    gui.add_slider.side_effect = lambda *words, **more: MagicMock(value=0)
+    control = NetworkControl(gui, EmulatorControl(Transport(), "x:1"))
+    control.refresh({"by_hand": {"delay_ms": 0.0, "loss": 1.0}})
+    for button, values in (("bad", (400, 20)), ("blackout", (0, 100)), ("scenario", (0, 0))):
+        with patch.object(control, "_set_after") as asked:
+            asyncio.run(control._pressed(MagicMock(target=MagicMock(value=button))))
+        assert (control.delay.value, control.loss.value) == values and asked.called
 
 
 @pytest.mark.stability
