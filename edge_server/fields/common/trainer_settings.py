@@ -149,6 +149,5 @@ def settings_from(kind: type[Chosen], options: Mapping[str, Any], seed: int) -> 
     """
     valid = option_help(kind)
     if unknown := sorted(set(options) - set(valid)):
-        renamed = " (harmonics is now sh_degree: 1)" if "harmonics" in unknown and "sh_degree" in valid else ""
-        raise ScenarioError(f"{kind.name} has no option {', '.join(unknown)}{renamed}; it has: {', '.join(valid)}")
+        raise ScenarioError(f"{kind.name} has no option {', '.join(unknown)}; it has: {', '.join(valid)}")
     return read_settings(kind, {"seed": seed, **options}, kind.name)

@@ -26,15 +26,13 @@ def step_key(seed: int, step: int) -> np.uint64:
 
 def active_levels(settings: HashGridSettings, step: int) -> int:
     """Levels in use: coarse to fine, so that few views cannot be explained by fine noise at once."""
-    if settings.levels_every == 0:
-        return settings.levels
     return min(settings.levels, settings.levels_start + step // settings.levels_every)
 
 
 def step_length(settings: TrainerSettings, step: int) -> float:
     """Distance between a ray's samples in scene units: long at first, while there is only fog."""
     first = min(settings.samples_start, settings.samples)
-    done = min(step / settings.samples_ramp, 1.0) if settings.samples_ramp else 1.0
+    done = min(step / settings.samples_ramp, 1.0)
     return 2.0 * float(np.sqrt(3.0)) / (first + done * (settings.samples - first))
 
 

@@ -75,8 +75,8 @@ class NerfactoField(NgpField):
     def _sampling(self) -> ProposalSampling:
         """Settings of the sampling at this step."""
         s = self.settings
-        ramp = min(self.step / s.samples_ramp, 1.0) if s.samples_ramp else 1.0
-        fresh = max(1.0 - self.step / s.anneal, 0.0) if s.anneal else 0.0
+        ramp = min(self.step / s.samples_ramp, 1.0)
+        fresh = max(1.0 - self.step / s.anneal, 0.0)
         even = s.even + (1.0 - s.even) * fresh if s.interlevel > 0 else 1.0
         return ProposalSampling(
             bins=s.bins,

@@ -57,7 +57,7 @@ REFUSED: list[tuple[str, Any, str]] = [
     ("resolution", 2, "4 to 1024"),
     ("levles", 3, "no option levles; it has: "),
     ("rate_net", 0.1, "no option rate_net; it has: "),  # a tuned number, no option
-    ("harmonics", 4, "no option harmonics (harmonics is now sh_degree: 1); it has: "),
+    ("harmonics", 4, "no option harmonics; it has: "),
 ]
 
 
