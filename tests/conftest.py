@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import inspect
 import os
 import signal
 import sys
@@ -55,6 +57,21 @@ _ALONE = (
     "edge_server/live/test_server_learned.py",
     "edge_server/page",
 )
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """A test that is a coroutine runs on an event loop of its own, for two minutes at most."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    arguments = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
+
+    async def limited() -> None:
+        async with asyncio.timeout(120):
+            await pyfuncitem.obj(**arguments)
+
+    asyncio.run(limited())
+    return True
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

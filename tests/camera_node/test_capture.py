@@ -126,17 +126,14 @@ def frame(sequence: int) -> Frame:
     return Frame("cam", "s", sequence, 0, POSE, LENS, "jpeg", b"")
 
 
-def test_an_outbox_that_closes_says_what_still_waits(tmp_path):
-    async def scene():
-        book = ledger.Ledger(tmp_path, "node", "cam", 1)
-        for camera, taken in (("a", False), ("b", True)):
-            box = Outbox(camera, "s", book, VirtualClock(5))
-            box.put(frame(7))
-            if taken:
-                box.take()
-            box.close()
-
-    asyncio.run(scene())
+async def test_an_outbox_that_closes_says_what_still_waits(tmp_path):
+    book = ledger.Ledger(tmp_path, "node", "cam", 1)
+    for camera, taken in (("a", False), ("b", True)):
+        box = Outbox(camera, "s", book, VirtualClock(5))
+        box.put(frame(7))
+        if taken:
+            box.take()
+        box.close()
     (file,) = ledger.read_all(tmp_path)
     assert [(e.camera, e.sequence, e.event) for e in file.events] == [
         ("a", 7, "captured"),
@@ -146,28 +143,24 @@ def test_an_outbox_that_closes_says_what_still_waits(tmp_path):
     ]
 
 
-def test_the_outbox_keeps_the_newest_and_books_each_frame(tmp_path):
-    async def scene():
-        book = ledger.Ledger(tmp_path, "node", "cam", 1)
-        box = Outbox("cam", "s", book, VirtualClock(5))
-        for k in range(4):
-            box.put(frame(k))
-        assert box.waiting == 1
-        await box.wait_frame()
-        assert box.take().sequence == 3 and box.waiting == 0
-        with pytest.raises(LookupError):
+async def test_the_outbox_keeps_the_newest_and_books_each_frame(tmp_path):
+    book = ledger.Ledger(tmp_path, "node", "cam", 1)
+    box = Outbox("cam", "s", book, VirtualClock(5))
+    for k in range(4):
+        box.put(frame(k))
+    assert box.waiting == 1
+    await box.wait_frame()
+    assert box.take().sequence == 3 and box.waiting == 0
+    with pytest.raises(LookupError):
+        box.take()
+    box.record(3, "answered", "accepted")
+    box.put(frame(4))
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(0.02):
             box.take()
-        box.record(3, "answered", "accepted")
-        box.put(frame(4))
-        with pytest.raises(TimeoutError):
-            async with asyncio.timeout(0.02):
-                box.take()
-                await box.wait_frame()  # nothing waits any more
-        book.close(9)
-        return box.counts
-
-    counts = asyncio.run(scene())
-    assert counts == {"captured": 5, "replaced": 3, "sent": 2, "accepted": 1}
+            await box.wait_frame()  # nothing waits any more
+    book.close(9)
+    assert box.counts == {"captured": 5, "replaced": 3, "sent": 2, "accepted": 1}
     (file,) = ledger.read_all(tmp_path)
     written = [(e.event, e.sequence) for e in file.events if e.camera]
     # At every prefix at most one frame waits: a kill between two lines leaves no frame unexplained.

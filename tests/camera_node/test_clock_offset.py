@@ -75,29 +75,25 @@ class _Peer(rpc.ClockServiceServicer):
         return answer
 
 
-def test_the_offset_follows_a_peer_that_comes_back_with_another_clock(monkeypatch):
+async def test_the_offset_follows_a_peer_that_comes_back_with_another_clock(monkeypatch):
     """What the old peer answered, however promptly, says nothing about the new one's clock."""
     monkeypatch.setattr(clock_offset, "PERIOD_S", 0.2)
     monkeypatch.setattr(clock_offset, "_FIRST_PERIOD_S", 0.01)
-
-    async def offsets() -> list[float]:
-        server, peer = grpc.aio.server(), _Peer()
-        rpc.add_ClockServiceServicer_to_server(peer, server)
-        port = server.add_insecure_port("127.0.0.1:0")
-        await server.start()
-        async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
-            sync = ClockSync(channel, (), WallClock())
-            running = asyncio.ensure_future(sync.run())
-            found = []
-            for answers in (5, 11):
-                while peer.answers < answers:
-                    await asyncio.sleep(0.01)
-                found.append(sync.offset().offset_ns / 1e9)
-            running.cancel()
-        await server.stop(None)
-        return found
-
-    before, after = asyncio.run(offsets())
+    server, peer = grpc.aio.server(), _Peer()
+    rpc.add_ClockServiceServicer_to_server(peer, server)
+    port = server.add_insecure_port("127.0.0.1:0")
+    await server.start()
+    async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
+        sync = ClockSync(channel, (), WallClock())
+        running = asyncio.ensure_future(sync.run())
+        found = []
+        for answers in (5, 11):
+            while peer.answers < answers:
+                await asyncio.sleep(0.01)
+            found.append(sync.offset().offset_ns / 1e9)
+        running.cancel()
+    await server.stop(None)
+    before, after = found
     assert abs(before) < 1.0 and abs(after - 3600.0) < 1.0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import re
 import time
@@ -163,15 +162,10 @@ def test_a_camera_at_a_fraction_of_the_rate_that_was_asked_for_is_wrong(capsys, 
         assert f"of the {asked} asked: is it too dark" in said and "USB 2" in said
 
 
-def test_a_peer_tells_its_time():
-    async def offset_ms() -> tuple[float, float]:
-        peer = await Peer(clock=WallClock(offset_ns=3_000_000_000)).start()
-        try:
-            return await doctor._exchange(peer.address, Transport())
-        finally:
-            await peer.stop()
-
-    found, bound = asyncio.run(offset_ms())
+async def test_a_peer_tells_its_time():
+    peer = await Peer(clock=WallClock(offset_ns=3_000_000_000)).start()
+    found, bound = await doctor._exchange(peer.address, Transport())
+    await peer.stop()
     assert abs(found - 3000.0) <= bound + 1.0
 
 

@@ -50,29 +50,25 @@ def node_of(sources: list[Source], to: str = NOBODY, seconds: float | None = Non
     return Node(load("room"), cameras, NodeOptions(to=to, transport=Transport(), seconds=seconds))
 
 
-def test_cameras_that_wait_for_their_devices_keep_no_other_waiting():
+async def test_cameras_that_wait_for_their_devices_keep_no_other_waiting():
     gone = threading.Event()
-
-    async def run() -> int:
-        node = node_of([Eye("cam01", gone), Eye("cam02", gone), Eye("cam03")])
-        running = asyncio.ensure_future(node.run())
-        async with asyncio.timeout(8.0):
-            while not node.outboxes or node.outboxes["cam03"].counts["captured"] < 5:
-                await asyncio.sleep(0.01)
-        waiting = gone.is_set() + sum(node.outboxes[name].counts["captured"] for name in ("cam01", "cam02"))
-        gone.set()
-        node.stop()
-        await running
-        return waiting
-
-    assert asyncio.run(run()) == 0
+    node = node_of([Eye("cam01", gone), Eye("cam02", gone), Eye("cam03")])
+    running = asyncio.ensure_future(node.run())
+    async with asyncio.timeout(8.0):
+        while not node.outboxes or node.outboxes["cam03"].counts["captured"] < 5:
+            await asyncio.sleep(0.01)
+    waiting = gone.is_set() + sum(node.outboxes[name].counts["captured"] for name in ("cam01", "cam02"))
+    gone.set()
+    node.stop()
+    await running
+    assert waiting == 0
 
 
 @pytest.mark.stability
-def test_frames_that_go_without_their_depth_are_counted():
+async def test_frames_that_go_without_their_depth_are_counted():
     camera = Camera(DepthSource("cam01", 10, unit=2.0), CameraConfig(kind="camera"), ShotCache(10**6), depth_every=1)
     node = Node(load("room"), [camera], NodeOptions(to=NOBODY, transport=Transport(), seconds=0.5))
-    asyncio.run(node.run())
+    await node.run()
     status = node.status()["cameras"]["cam01"]
     assert status["depth_failed"] == 10 and status["captured"] > 0 and status["failed"] == 0
 
@@ -86,40 +82,36 @@ def test_frames_that_go_without_their_depth_are_counted():
         (silence, None),
     ],
 )
-def test_the_end_says_if_every_frame_was_refused(respond: Answer, failure: str | None):
-    async def run() -> str | None:
-        peer = await Peer(respond=respond).start()
-        node = node_of([Eye("cam01")], peer.address)
-        running = asyncio.ensure_future(node.run())
-        await peer.until(3 if respond is not silence else 1)
-        node.stop()
-        await running
-        await peer.stop()
-        return node.failure()
-
-    found = asyncio.run(run())
+async def test_the_end_says_if_every_frame_was_refused(respond: Answer, failure: str | None):
+    peer = await Peer(respond=respond).start()
+    node = node_of([Eye("cam01")], peer.address)
+    running = asyncio.ensure_future(node.run())
+    await peer.until(3 if respond is not silence else 1)
+    node.stop()
+    await running
+    await peer.stop()
+    found = node.failure()
     assert found is failure if failure is None else found.startswith(failure)
 
 
-def test_the_end_says_if_nobody_was_reached_or_nothing_was_captured():
+async def test_the_end_says_if_nobody_was_reached_or_nothing_was_captured():
     gone = threading.Event()
     gone.set()
-
-    def failure(eye: Eye) -> str | None:
+    for eye, said in (
+        (Eye("cam01"), f"{NOBODY} was never reached: "),
+        (Eye("cam01", gone), "no frame could be captured ("),
+    ):
         node = node_of([eye], seconds=0.3)
-        asyncio.run(node.run())
-        return node.failure()
-
-    assert failure(Eye("cam01")).startswith(f"{NOBODY} was never reached: ")
-    assert failure(Eye("cam01", gone)).startswith("no frame could be captured (")
+        await node.run()
+        assert node.failure().startswith(said)
 
 
-def test_a_fault_of_the_program_ends_the_node_and_is_told(monkeypatch):
+async def test_a_fault_of_the_program_ends_the_node_and_is_told(monkeypatch):
     """A frame that is missing is counted; what should never happen is not passed over."""
     node = node_of([Eye("cam01"), Eye("cam02")], seconds=5.0)
     monkeypatch.setattr(node, "_frame", MagicMock(side_effect=ZeroDivisionError))
     with pytest.raises(ZeroDivisionError):
-        asyncio.run(node.run())
+        await node.run()
 
 
 def test_reasons_of_refusals_are_logged_once_and_not_without_end(caplog):

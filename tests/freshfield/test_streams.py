@@ -73,71 +73,51 @@ async def poured(channel) -> grpc.StatusCode:
     return await call.code()
 
 
-def run(scene):
-    async def limited():
-        async with asyncio.timeout(30):
-            await scene()
-
-    asyncio.run(limited())
-
-
-def test_a_stream_that_ends_in_the_midst_of_an_answer_is_told_why():
-    async def scene():
-        async with echoing(OpenStreams(8)) as channel:
-            calls = [asyncio.create_task(poured(channel)) for _ in range(200)]
-            while sum(not call.done() for call in calls) > 8:
-                await asyncio.sleep(0.02)
-            ended = [call.result() for call in calls if call.done()]
-            assert ended == 192 * [grpc.StatusCode.RESOURCE_EXHAUSTED]
-            for call in calls:
-                call.cancel()
-
-    run(scene)
+async def test_a_stream_that_ends_in_the_midst_of_an_answer_is_told_why():
+    async with echoing(OpenStreams(8)) as channel:
+        calls = [asyncio.create_task(poured(channel)) for _ in range(200)]
+        while sum(not call.done() for call in calls) > 8:
+            await asyncio.sleep(0.02)
+        ended = [call.result() for call in calls if call.done()]
+        assert ended == 192 * [grpc.StatusCode.RESOURCE_EXHAUSTED]
+        for call in calls:
+            call.cancel()
 
 
-def test_silent_streams_shut_nobody_out():
-    async def scene():
-        streams = OpenStreams(4)
-        async with echoing(streams) as channel:
-            camera = await opened(channel, b"use")
-            silent = [await opened(channel) for _ in range(30)]
-            late = await opened(channel, b"use")
-            assert streams.ended == 28
-            for call in (camera, late):  # both still work
-                await call.write(b"x")
-                assert await call.read() == b"x"
-            assert await silent[0].code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-            assert "too many are open" in await silent[0].details()
-
-    run(scene)
+async def test_silent_streams_shut_nobody_out():
+    streams = OpenStreams(4)
+    async with echoing(streams) as channel:
+        camera = await opened(channel, b"use")
+        silent = [await opened(channel) for _ in range(30)]
+        late = await opened(channel, b"use")
+        assert streams.ended == 28
+        for call in (camera, late):  # both still work
+            await call.write(b"x")
+            assert await call.read() == b"x"
+        assert await silent[0].code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert "too many are open" in await silent[0].details()
 
 
-def test_among_streams_of_use_the_one_that_is_idle_longest_ends():
-    async def scene():
-        streams = OpenStreams(2)
-        async with echoing(streams) as channel:
-            first, second = await opened(channel, b"use"), await opened(channel, b"use")
-            await first.write(b"use")
-            await first.read()
-            await opened(channel)
-            assert await second.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-            await first.write(b"x")
-            assert await first.read() == b"x"
-
-    run(scene)
+async def test_among_streams_of_use_the_one_that_is_idle_longest_ends():
+    streams = OpenStreams(2)
+    async with echoing(streams) as channel:
+        first, second = await opened(channel, b"use"), await opened(channel, b"use")
+        await first.write(b"use")
+        await first.read()
+        await opened(channel)
+        assert await second.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        await first.write(b"x")
+        assert await first.read() == b"x"
 
 
-def test_a_closed_stream_leaves_its_place():
-    async def scene():
-        streams = OpenStreams(2)
-        async with echoing(streams) as channel:
-            for _ in range(10):
-                call = await opened(channel, b"use")
-                await call.done_writing()
-                assert await call.code() is grpc.StatusCode.OK
-            assert streams.ended == 0 and not streams._used and not streams._silent
-
-    run(scene)
+async def test_a_closed_stream_leaves_its_place():
+    streams = OpenStreams(2)
+    async with echoing(streams) as channel:
+        for _ in range(10):
+            call = await opened(channel, b"use")
+            await call.done_writing()
+            assert await call.code() is grpc.StatusCode.OK
+        assert streams.ended == 0 and not streams._used and not streams._silent
 
 
 class Stream:
@@ -183,45 +163,37 @@ async def ended(call) -> grpc.StatusCode:
     return await call.code()
 
 
-def test_a_call_of_which_no_message_comes_ends(monkeypatch):
+async def test_a_call_of_which_no_message_comes_ends(monkeypatch):
     monkeypatch.setattr(served, "FIRST_MESSAGE_TIMEOUT_S", 0.1)
-
-    async def scene():
-        async with echoing(OpenStreams(4)) as channel, asyncio.timeout(20):
-            assert await ended(channel.stream_unary("/t/Unary")()) is grpc.StatusCode.DEADLINE_EXCEEDED
-
-    asyncio.run(scene())
+    async with echoing(OpenStreams(4)) as channel, asyncio.timeout(20):
+        assert await ended(channel.stream_unary("/t/Unary")()) is grpc.StatusCode.DEADLINE_EXCEEDED
 
 
-def test_calls_that_only_begin_and_watches_of_health_are_bounded(monkeypatch):
+async def test_calls_that_only_begin_and_watches_of_health_are_bounded(monkeypatch):
     """Headers without a message reach no handler, Health/Watch never ends: neither shuts a camera out."""
     most, made = 20, []
     monkeypatch.setattr(served, "OpenStreams", lambda _: made.append(OpenStreams(most)) or made[-1])
-
-    async def scene():
-        async with echoing(OpenStreams(4)) as channel:
-            (calls,) = made
-            camera = await opened(channel, b"use")
-            begun, watches = [], []
-            for _ in range(3 * most):
-                begun.append(channel.stream_unary("/t/Unary")())
-                watches.append(channel.unary_stream("/grpc.health.v1.Health/Watch")(b""))
-                await asyncio.sleep(0)
-            async with asyncio.timeout(20):
-                for call in (begun[0], watches[0]):
-                    assert await ended(call) is grpc.StatusCode.RESOURCE_EXHAUSTED
-                while calls.ended < 5 * most:
-                    await asyncio.sleep(0.01)
-            assert len(calls._silent) + len(calls._used) <= most
-            await camera.write(b"still here")
-            assert await camera.read() == b"still here"
-            assert await channel.unary_unary("/t/Unary")(b"new") == b"new"
-            assert not any(type(o).__name__ == "AbortError" for o in gc.get_objects())  # it keeps a call's memory
-            for call in (*begun, *watches):
-                call.cancel()
-            camera.cancel()
-            async with asyncio.timeout(20):
-                while calls._silent or calls._used:
-                    await asyncio.sleep(0.01)
-
-    asyncio.run(scene())
+    async with echoing(OpenStreams(4)) as channel:
+        (calls,) = made
+        camera = await opened(channel, b"use")
+        begun, watches = [], []
+        for _ in range(3 * most):
+            begun.append(channel.stream_unary("/t/Unary")())
+            watches.append(channel.unary_stream("/grpc.health.v1.Health/Watch")(b""))
+            await asyncio.sleep(0)
+        async with asyncio.timeout(20):
+            for call in (begun[0], watches[0]):
+                assert await ended(call) is grpc.StatusCode.RESOURCE_EXHAUSTED
+            while calls.ended < 5 * most:
+                await asyncio.sleep(0.01)
+        assert len(calls._silent) + len(calls._used) <= most
+        await camera.write(b"still here")
+        assert await camera.read() == b"still here"
+        assert await channel.unary_unary("/t/Unary")(b"new") == b"new"
+        assert not any(type(o).__name__ == "AbortError" for o in gc.get_objects())  # it keeps a call's memory
+        for call in (*begun, *watches):
+            call.cancel()
+        camera.cancel()
+        async with asyncio.timeout(20):
+            while calls._silent or calls._used:
+                await asyncio.sleep(0.01)

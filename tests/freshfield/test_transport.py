@@ -76,40 +76,31 @@ def refusal(work) -> grpc.StatusCode:
     return error.value.code()
 
 
-def test_plain_text_and_messages_up_to_the_limit():
+async def test_plain_text_and_messages_up_to_the_limit():
     """Larger ones are refused by who sends them, and where that is a stranger by the server, which lives on."""
-
-    async def scene():
-        async with (
-            serving(Transport()) as port,
-            grpc.aio.insecure_channel(
-                f"localhost:{port}", options=[("grpc.max_send_message_length", -1)]
-            ) as of_stranger,
-        ):
-            assert await ask(Transport(), port) == 42
-            assert await push(Transport(), port, MAX_PAYLOAD_BYTES) == MAX_PAYLOAD_BYTES
-            with pytest.raises(grpc.aio.AioRpcError):
-                await push(Transport(), port, MAX_PAYLOAD_BYTES + 8192)
-            call = frames_pb2_grpc.FrameStreamServiceStub(of_stranger).Push(timeout=20)
-            await call.write(pb.PushRequest(payload=bytes(4 * MAX_PAYLOAD_BYTES)))
-            with pytest.raises(grpc.aio.AioRpcError) as refused:
-                await call.read()
-            assert refused.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
-            assert await ask(Transport(), port) == 42
-
-    asyncio.run(scene())
+    async with (
+        serving(Transport()) as port,
+        grpc.aio.insecure_channel(f"localhost:{port}", options=[("grpc.max_send_message_length", -1)]) as of_stranger,
+    ):
+        assert await ask(Transport(), port) == 42
+        assert await push(Transport(), port, MAX_PAYLOAD_BYTES) == MAX_PAYLOAD_BYTES
+        with pytest.raises(grpc.aio.AioRpcError):
+            await push(Transport(), port, MAX_PAYLOAD_BYTES + 8192)
+        call = frames_pb2_grpc.FrameStreamServiceStub(of_stranger).Push(timeout=20)
+        await call.write(pb.PushRequest(payload=bytes(4 * MAX_PAYLOAD_BYTES)))
+        with pytest.raises(grpc.aio.AioRpcError) as refused:
+            await call.read()
+        assert refused.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert await ask(Transport(), port) == 42
 
 
 RIGHT = Transport(tokens={"camera:*": "right"})
 
 
-def test_a_port_in_use_is_not_shared():
-    async def scene():
-        async with serving(Transport()) as port:
-            with pytest.raises(TransportError, match=f"localhost:{port}"):
-                Transport().bind(Transport().aio_server(), f"localhost:{port}")
-
-    asyncio.run(scene())
+async def test_a_port_in_use_is_not_shared():
+    async with serving(Transport()) as port:
+        with pytest.raises(TransportError, match=f"localhost:{port}"):
+            Transport().bind(Transport().aio_server(), f"localhost:{port}")
 
 
 @pytest.mark.parametrize(
@@ -173,24 +164,20 @@ def test_tls_and_mutual_tls(pem):
     assert refusal(scene(mutual, other)) == grpc.StatusCode.UNAUTHENTICATED  # its name is no caller's
 
 
-def test_a_connection_without_its_tls_handshake_ends(pem, monkeypatch):
+async def test_a_connection_without_its_tls_handshake_ends(pem, monkeypatch):
     sooner = [(name, 500 if "handshake" in name else value) for name, value in transport.SERVER_OPTIONS]
     monkeypatch.setattr(transport, "SERVER_OPTIONS", sooner)
-
-    async def scene():
-        async with serving(Transport(cert=pem / "server.pem", key=pem / "server.key")) as port:
-            reader, writer = await asyncio.open_connection("localhost", port)
-            assert await asyncio.wait_for(reader.read(1), 10.0) == b""
-            writer.close()
-
-    asyncio.run(scene())
+    async with serving(Transport(cert=pem / "server.pem", key=pem / "server.key")) as port:
+        reader, writer = await asyncio.open_connection("localhost", port)
+        assert await asyncio.wait_for(reader.read(1), 10.0) == b""
+        writer.close()
 
 
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # and empty SETTINGS
 
 
 @pytest.mark.parametrize("encrypted", [False, True])
-def test_connections_are_few_and_those_that_do_nothing_end(encrypted, pem, monkeypatch):
+async def test_connections_are_few_and_those_that_do_nothing_end(encrypted, pem, monkeypatch):
     """Over TLS four in their handshake take all places, and end with its time-out; else four without a call,
     which have said that they speak HTTP/2."""
     changed = {"grpc.max_allowed_incoming_connections": 4, "grpc.max_connection_idle_ms": 1000}
@@ -204,22 +191,19 @@ def test_connections_are_few_and_those_that_do_nothing_end(encrypted, pem, monke
         while await reader.read(4096):
             pass
 
-    async def scene():
-        async with serving(tls) as port:
-            kept = [await asyncio.open_connection("localhost", port) for _ in range(4)]
-            if not encrypted:
-                for reader, writer in kept:
-                    writer.write(PREFACE)
-                    await reader.readexactly(1)
-            await asyncio.sleep(0.2)
-            surplus = [await asyncio.open_connection("localhost", port) for _ in range(20)]
-            assert await asyncio.wait_for(asyncio.gather(*(r.read(1) for r, _ in surplus)), 5.0) == [b""] * 20
-            await asyncio.wait_for(asyncio.gather(*(ended(reader) for reader, _ in kept)), 10.0)
-            assert await ask(caller, port) == 42
-            for _, writer in kept + surplus:
-                writer.close()
-
-    asyncio.run(scene())
+    async with serving(tls) as port:
+        kept = [await asyncio.open_connection("localhost", port) for _ in range(4)]
+        if not encrypted:
+            for reader, writer in kept:
+                writer.write(PREFACE)
+                await reader.readexactly(1)
+        await asyncio.sleep(0.2)
+        surplus = [await asyncio.open_connection("localhost", port) for _ in range(20)]
+        assert await asyncio.wait_for(asyncio.gather(*(r.read(1) for r, _ in surplus)), 5.0) == [b""] * 20
+        await asyncio.wait_for(asyncio.gather(*(ended(reader) for reader, _ in kept)), 10.0)
+        assert await ask(caller, port) == 42
+        for _, writer in kept + surplus:
+            writer.close()
 
 
 LISTENING = {
@@ -232,14 +216,10 @@ LISTENING = {
 
 
 @pytest.mark.parametrize("what", LISTENING)
-def test_a_server_refuses_to_listen_unprotected(what):
+async def test_a_server_refuses_to_listen_unprotected(what):
     transport, host, why = LISTENING[what]
-
-    async def scene():
-        with pytest.raises(TransportError, match=why):
-            transport.bind(Transport().aio_server(), f"{host}:0")
-
-    asyncio.run(scene())
+    with pytest.raises(TransportError, match=why):
+        transport.bind(Transport().aio_server(), f"{host}:0")
 
 
 def test_what_protects_a_port_beyond_this_machine():
@@ -254,13 +234,10 @@ def test_what_protects_a_port_beyond_this_machine():
     assert "nothing is encrypted" in words and "nobody is asked" in words
 
 
-def test_a_token_does_not_leave_the_machine_in_plain_text():
-    async def scene():
-        with pytest.raises(TransportError, match="plain text"):
-            RIGHT.aio_channel("edge:7000")
-        await dataclasses.replace(RIGHT, insecure=True).aio_channel("edge:7000").close()
-
-    asyncio.run(scene())
+async def test_a_token_does_not_leave_the_machine_in_plain_text():
+    with pytest.raises(TransportError, match="plain text"):
+        RIGHT.aio_channel("edge:7000")
+    await dataclasses.replace(RIGHT, insecure=True).aio_channel("edge:7000").close()
 
 
 def parsed(*arguments: str) -> Transport:
@@ -299,7 +276,7 @@ def test_files_that_hold_no_certificate_are_refused_by_name(pem, tmp_path, text)
         parsed("--tls-cert", str(damaged), "--tls-key", str(pem / "server.key"))
 
 
-def test_a_slow_reader_is_felt_at_once():
+async def test_a_slow_reader_is_felt_at_once():
     """bdp_probe=0: a client cannot bury a stalled reader under megabytes of frames, which are age."""
 
     class Stalled(frames_pb2_grpc.FrameStreamServiceServicer):
@@ -307,21 +284,18 @@ def test_a_slow_reader_is_felt_at_once():
             await asyncio.sleep(30)
             yield pb.PushResponse()
 
-    async def scene():
-        written = 0
-        async with serving(Transport(), Stalled()) as port, Transport().aio_channel(f"localhost:{port}") as channel:
-            call = frames_pb2_grpc.FrameStreamServiceStub(channel).Push()
-            try:
-                async with asyncio.timeout(2):
-                    while written < 100:
-                        await call.write(pb.PushRequest(payload=bytes(100_000)))
-                        written += 1
-            except TimeoutError:
-                pass
-            call.cancel()
-        return written
-
-    assert asyncio.run(scene()) < 20
+    written = 0
+    async with serving(Transport(), Stalled()) as port, Transport().aio_channel(f"localhost:{port}") as channel:
+        call = frames_pb2_grpc.FrameStreamServiceStub(channel).Push()
+        try:
+            async with asyncio.timeout(2):
+                while written < 100:
+                    await call.write(pb.PushRequest(payload=bytes(100_000)))
+                    written += 1
+        except TimeoutError:
+            pass
+        call.cancel()
+    assert written < 20
 
 
 def test_the_back_off_doubles_to_its_bound_and_draws_once_each_time():

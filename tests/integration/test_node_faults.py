@@ -20,30 +20,26 @@ from tests.integration.test_node_stream import books, check_books, make_node, ru
 CAMERAS = ["cam00", "cam01", "cam02"]
 
 
-def test_a_peer_that_comes_late_and_dies_again_and_again(tmp_path):
-    async def scene():
-        peer = await Peer().start()
-        await peer.stop()  # the port is known now, and nobody listens
-        node = make_node(tmp_path, peer.address)
-        gaps_s = []
+async def test_a_peer_that_comes_late_and_dies_again_and_again(tmp_path):
+    peer = await Peer().start()
+    await peer.stop()  # the port is known now, and nobody listens
+    node = make_node(tmp_path, peer.address)
+    gaps_s = []
 
-        async def work():
-            await asyncio.sleep(0.7)
-            for _ in range(4):
-                begin = time.perf_counter()
-                await peer.start()
-                await peer.until_each(CAMERAS, 5)
-                gaps_s.append(time.perf_counter() - begin)
-                await peer.stop()
-                await asyncio.sleep(0.3)
+    async def work():
+        await asyncio.sleep(0.7)
+        for _ in range(4):
+            begin = time.perf_counter()
             await peer.start()
             await peer.until_each(CAMERAS, 5)
+            gaps_s.append(time.perf_counter() - begin)
+            await peer.stop()
+            await asyncio.sleep(0.3)
+        await peer.start()
+        await peer.until_each(CAMERAS, 5)
 
-        await run_while(node, work())
-        await peer.stop()
-        return peer, node, gaps_s
-
-    peer, node, gaps_s = asyncio.run(scene())
+    await run_while(node, work())
+    await peer.stop()
     counts = check_books(tmp_path / "out")
     for camera in CAMERAS:
         sequences = [f.sequence for f in peer.frames if f.camera == camera]
@@ -73,18 +69,14 @@ def start_node(tmp_path: Path, to: str, *options: str, cameras: str = "--all") -
     return subprocess.Popen([*command, "--out", str(tmp_path / "out"), *options], stderr=subprocess.PIPE)
 
 
-def test_books_close_after_sigkill_of_the_node(tmp_path):
-    async def scene():
-        peer = await Peer().start()
-        node = start_node(tmp_path, peer.address)
-        await peer.until_each(CAMERAS, 30)
-        node.send_signal(signal.SIGKILL)
-        node.wait()
-        await asyncio.sleep(0.3)
-        await peer.stop()
-        return peer
-
-    peer = asyncio.run(scene())
+async def test_books_close_after_sigkill_of_the_node(tmp_path):
+    peer = await Peer().start()
+    node = start_node(tmp_path, peer.address)
+    await peer.until_each(CAMERAS, 30)
+    node.send_signal(signal.SIGKILL)
+    node.wait()
+    await asyncio.sleep(0.3)
+    await peer.stop()
     (file,) = ledger.read_all(tmp_path / "out")
     assert not file.closed
     counts = check_books(tmp_path / "out")
@@ -95,19 +87,16 @@ def test_books_close_after_sigkill_of_the_node(tmp_path):
         assert counts[camera]["captured"] >= 30
 
 
-def test_sigterm_ends_cleanly_with_the_last_answer(tmp_path):
-    async def scene():
-        peer = await Peer().start()
-        node = start_node(tmp_path, peer.address, "--quiet")
-        await peer.until_each(CAMERAS, 10)
-        status = json.loads((tmp_path / "out" / "node-cam00+2.json").read_text())
-        begin = time.perf_counter()
-        node.send_signal(signal.SIGTERM)
-        _, said = await asyncio.to_thread(node.communicate, timeout=10)
-        await peer.stop()
-        return node.returncode, time.perf_counter() - begin, said.decode(), status
-
-    code, seconds, said, status = asyncio.run(scene())
+async def test_sigterm_ends_cleanly_with_the_last_answer(tmp_path):
+    peer = await Peer().start()
+    node = start_node(tmp_path, peer.address, "--quiet")
+    await peer.until_each(CAMERAS, 10)
+    status = json.loads((tmp_path / "out" / "node-cam00+2.json").read_text())
+    begin = time.perf_counter()
+    node.send_signal(signal.SIGTERM)
+    _, said = await asyncio.to_thread(node.communicate, timeout=10)
+    await peer.stop()
+    code, seconds, said = node.returncode, time.perf_counter() - begin, said.decode()
     assert code == 0 and seconds < 5 and said == ""
     assert status["phase"] in ("preparing", "streaming") and status["cameras"]["cam02"]["fps"] == 50
     (file,) = ledger.read_all(tmp_path / "out")

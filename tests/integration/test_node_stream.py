@@ -143,21 +143,18 @@ def test_refusals_are_counted_and_said_once(tmp_path, caplog, outcome, reason, e
 
 
 @pytest.mark.parametrize("respond", [silence, wrong_number])
-def test_a_peer_that_talks_nonsense_or_not_at_all_is_left(tmp_path, respond):
-    async def scene():
-        peer = await Peer(respond=respond).start()
-        node = make_node(tmp_path, peer.address, cameras=2, response_timeout_s=0.3)
+async def test_a_peer_that_talks_nonsense_or_not_at_all_is_left(tmp_path, respond):
+    peer = await Peer(respond=respond).start()
+    node = make_node(tmp_path, peer.address, cameras=2, response_timeout_s=0.3)
 
-        async def work():
-            await peer.until(4)
-            peer.respond = answer()
-            await peer.until(48)
+    async def work():
+        await peer.until(4)
+        peer.respond = answer()
+        await peer.until(48)
 
-        await run_while(node, work())
-        await peer.stop()
-        return peer
-
-    peer = asyncio.run(scene())
+    await run_while(node, work())
+    await peer.stop()
+    peer = peer
     counts = check_books(tmp_path / "out")
     assert peer.streams >= 4  # each camera left its first stream and came back
     assert all(c["broken"] >= 1 and c["answered"] >= 8 for c in counts.values())
@@ -167,24 +164,21 @@ def test_a_peer_that_talks_nonsense_or_not_at_all_is_left(tmp_path, respond):
 
 
 @pytest.mark.slow  # waits out two timeouts
-def test_answers_much_later_than_before_mean_a_dead_stream_and_a_slow_link_is_given_time(tmp_path):
-    async def scene():
-        peer = await Peer().start()
-        node = make_node(tmp_path, peer.address, cameras=2, response_timeout_s=60.0)
+async def test_answers_much_later_than_before_mean_a_dead_stream_and_a_slow_link_is_given_time(tmp_path):
+    peer = await Peer().start()
+    node = make_node(tmp_path, peer.address, cameras=2, response_timeout_s=60.0)
 
-        async def work():
-            await peer.until(40)
-            peer.respond = silence
-            async with asyncio.timeout(20.0):
-                while peer.streams < 4:
-                    await asyncio.sleep(0.05)
-            peer.respond = answer(after_s=1.6)  # more than was waited for until then
-            await peer.until(len(peer.frames) + 12)
+    async def work():
+        await peer.until(40)
+        peer.respond = silence
+        async with asyncio.timeout(20.0):
+            while peer.streams < 4:
+                await asyncio.sleep(0.05)
+        peer.respond = answer(after_s=1.6)  # more than was waited for until then
+        await peer.until(len(peer.frames) + 12)
 
-        await run_while(node, work())
-        await peer.stop()
-
-    asyncio.run(scene())
+    await run_while(node, work())
+    await peer.stop()
     for c in check_books(tmp_path / "out").values():
         assert 1 <= c["broken"] <= 4 and c["answered"] >= 23
 

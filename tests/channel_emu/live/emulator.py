@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import itertools
 from collections import Counter
-from collections.abc import AsyncIterator, Coroutine
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -43,14 +43,6 @@ def frame_of(
     """A real frame: encoded, posed, with a lens."""
     pose = Pose((1, 0, 0, 0), (0, 0, 0))
     return Frame(camera, session, sequence, at_ns, pose, _LENS, "jpeg", _IMAGE, held_out, depth=depth)
-
-
-def run(coroutine: Coroutine[Any, Any, None]) -> None:
-    async def limited() -> None:
-        async with asyncio.timeout(60):
-            await coroutine
-
-    asyncio.run(limited())
 
 
 def make(

@@ -17,7 +17,7 @@ from channel_emu.model.chain import ChainError
 from freshfield.ledger import read_all
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
-from tests.channel_emu.live.emulator import make, offer, run
+from tests.channel_emu.live.emulator import make, offer
 from tests.integration.peer import Peer
 from tests.support import free_port
 
@@ -36,34 +36,30 @@ def fill_the_disk(proxy: Proxy) -> None:
 
 @pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
 @pytest.mark.parametrize("edge_is_there", [False, True], ids=["in the timer", "in the upstream task"])
-def test_a_full_disk_ends_the_emulator_and_its_other_books_are_closed(
+async def test_a_full_disk_ends_the_emulator_and_its_other_books_are_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edge_is_there: bool
 ) -> None:
     """A frame comes due whose fate cannot be recorded: broken at once, or forwarded by the stream's task."""
     monkeypatch.setattr(frame_proxy, "_FIRST_WAIT_S", 5.0 if edge_is_there else 0.1)
-
-    async def live() -> None:
-        edge = await Peer().start() if edge_is_there else None
-        address = edge.address if edge else f"127.0.0.1:{free_port()}"
-        proxy, (flow,) = make(tmp_path, address, SHORT, trace=tmp_path / "t.jsonl")
-        running = asyncio.create_task(proxy.run(asyncio.Event()))
-        while not proxy.port or flow.opened.is_set() is not edge_is_there:
-            await asyncio.sleep(0.01)
-        offer(flow, 0)
-        fill_the_disk(proxy)
-        with pytest.raises(EmulatorFailed, match=r"No space left on device.*is there room"):
-            async with asyncio.timeout(15):
-                await running
-        if edge:
-            await edge.stop()
-
-    run(live())
+    edge = await Peer().start() if edge_is_there else None
+    address = edge.address if edge else f"127.0.0.1:{free_port()}"
+    proxy, (flow,) = make(tmp_path, address, SHORT, trace=tmp_path / "t.jsonl")
+    running = asyncio.create_task(proxy.run(asyncio.Event()))
+    while not proxy.port or flow.opened.is_set() is not edge_is_there:
+        await asyncio.sleep(0.01)
+    offer(flow, 0)
+    fill_the_disk(proxy)
+    with pytest.raises(EmulatorFailed, match=r"No space left on device.*is there room"):
+        async with asyncio.timeout(15):
+            await running
+    if edge:
+        await edge.stop()
     assert json.loads((tmp_path / "channel.json").read_text())["running"] is False
     (ledger,) = read_all(tmp_path)
     assert ledger.closed
 
 
-def test_a_part_that_breaks_ends_the_emulator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_part_that_breaks_ends_the_emulator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A background task and the timer's callback, each with an error that is no OSError."""
     monkeypatch.setattr(frame_proxy, "_FIRST_WAIT_S", 0.1)
 
@@ -81,15 +77,15 @@ def test_a_part_that_breaks_ends_the_emulator(tmp_path: Path, monkeypatch: pytes
     def raising(*_: object) -> None:
         raise ChainError("no such state")
 
-    run(live(lambda proxy, _: setattr(proxy.channel, "forget", raising)))
-    run(live(lambda _, flow: setattr(flow.link, "advance", raising)))
+    await live(lambda proxy, _: setattr(proxy.channel, "forget", raising))
+    await live(lambda _, flow: setattr(flow.link, "advance", raising))
 
 
 STRANGE = pb.PushResponse(sequence=77).SerializeToString()
 
 
 @pytest.mark.parametrize("answers", [[b"\xff\xff\xff"], [STRANGE] * 1000], ids=["no answer", "to no frame"])
-def test_answers_that_are_none_end_the_stream_and_not_the_emulator(tmp_path: Path, answers: list[bytes]) -> None:
+async def test_answers_that_are_none_end_the_stream_and_not_the_emulator(tmp_path: Path, answers: list[bytes]) -> None:
     """Nor do they keep it busy for as long as they come."""
 
     async def nonsense(request: bytes, context: grpc.aio.ServicerContext) -> None:
@@ -98,59 +94,46 @@ def test_answers_that_are_none_end_the_stream_and_not_the_emulator(tmp_path: Pat
             await context.write(answer)
         await asyncio.sleep(60)
 
-    async def live() -> None:
-        server = Transport().aio_server()
-        handler = {"Push": grpc.stream_stream_rpc_method_handler(nonsense)}
-        server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, handler),))
-        address = f"127.0.0.1:{Transport().bind(server, '127.0.0.1:0')}"
-        await server.start()
-        proxy, (flow,) = make(tmp_path, address, {})
-        await proxy.start()
-        offer(flow, 0)
-        async with asyncio.timeout(10):
-            while flow.connections < 2:
-                await asyncio.sleep(0.01)
-        assert flow.broken == 1 and not proxy._failure.done()
-        await proxy.stop()
-        await server.stop(None)
-
-    run(live())
+    server = Transport().aio_server()
+    handler = {"Push": grpc.stream_stream_rpc_method_handler(nonsense)}
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, handler),))
+    address = f"127.0.0.1:{Transport().bind(server, '127.0.0.1:0')}"
+    await server.start()
+    proxy, (flow,) = make(tmp_path, address, {})
+    await proxy.start()
+    offer(flow, 0)
+    async with asyncio.timeout(10):
+        while flow.connections < 2:
+            await asyncio.sleep(0.01)
+    assert flow.broken == 1 and not proxy._failure.done()
+    await proxy.stop()
+    await server.stop(None)
 
 
-def test_cameras_are_let_in_once_the_streams_to_the_edge_stand(tmp_path: Path) -> None:
-    async def live() -> None:
-        edge = await Peer().start()
-        proxy, flows = make(tmp_path, edge.address, {}, ("cam00", "cam01", "cam02"))
-        await proxy.start()
-        assert all(flow.connected for flow in flows)
-        offer(flows[0], 0)
-        assert flows[0].broken == 0
-        await proxy.stop()
-        await edge.stop()
-
-    run(live())
+async def test_cameras_are_let_in_once_the_streams_to_the_edge_stand(tmp_path: Path) -> None:
+    edge = await Peer().start()
+    proxy, flows = make(tmp_path, edge.address, {}, ("cam00", "cam01", "cam02"))
+    await proxy.start()
+    assert all(flow.connected for flow in flows)
+    offer(flows[0], 0)
+    assert flows[0].broken == 0
+    await proxy.stop()
+    await edge.stop()
 
 
-def test_without_an_edge_they_are_let_in_a_moment_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_without_an_edge_they_are_let_in_a_moment_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frame_proxy, "_FIRST_WAIT_S", 0.2)
-
-    async def live() -> None:
-        proxy, _ = make(tmp_path, f"127.0.0.1:{free_port()}", {})
-        await proxy.start()
-        channel = Transport().aio_channel(f"127.0.0.1:{proxy.port}")
-        check = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=5)
-        assert (await check).status == health_pb2.HealthCheckResponse.SERVING
-        await channel.close()
-        await proxy.stop()
-
-    run(live())
+    proxy, _ = make(tmp_path, f"127.0.0.1:{free_port()}", {})
+    await proxy.start()
+    channel = Transport().aio_channel(f"127.0.0.1:{proxy.port}")
+    check = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=5)
+    assert (await check).status == health_pb2.HealthCheckResponse.SERVING
+    await channel.close()
+    await proxy.stop()
 
 
-def test_a_status_that_a_thread_still_holds_does_not_replace_the_last(tmp_path: Path) -> None:
-    async def live() -> None:
-        proxy, _ = make(tmp_path, "127.0.0.1:1", {})
-        proxy._write_status({"running": False})
-        proxy._write_status({"running": True})
-
-    run(live())
+async def test_a_status_that_a_thread_still_holds_does_not_replace_the_last(tmp_path: Path) -> None:
+    proxy, _ = make(tmp_path, "127.0.0.1:1", {})
+    proxy._write_status({"running": False})
+    proxy._write_status({"running": True})
     assert json.loads((tmp_path / "channel.json").read_text()) == {"running": False}

@@ -10,7 +10,7 @@ import numpy as np
 from channel_emu.model import trace
 from channel_emu.model.link import EventKind
 from channel_emu.model.trace import Record
-from tests.channel_emu.live.emulator import CAMERAS, emulate, run
+from tests.channel_emu.live.emulator import CAMERAS, emulate
 from tests.channel_emu.live.test_frame_stream import FAST, frame_account
 
 CHAPTER_5 = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": 8.0}}
@@ -30,14 +30,14 @@ def late_ms(records: list[Record]) -> np.ndarray:
     return np.array([(r.actual_ns - r.ended_ns) / 1e6 for r in records if r.actual_ns is not None and r.ended_ns])
 
 
-def test_a_trace_replayed_twice_is_decided_and_delivered_alike(tmp_path: Path) -> None:
+async def test_a_trace_replayed_twice_is_decided_and_delivered_alike(tmp_path: Path) -> None:
     """Two live replays at different paces and seeds: the decisions are the recording's, each delivery as
     long after its offer as recorded, later by the delay error alone."""
     first, second = tmp_path / "1", tmp_path / "2"
-    run(record(tmp_path / "0", FAST, 0.004, 60))
+    await record(tmp_path / "0", FAST, 0.004, 60)
     recorded = trace.read(tmp_path / "0" / "t.jsonl")
-    run(record(first, CHAPTER_5, 0.006, 60, seed=11, replay=recorded))
-    run(record(second, PARALLEL, 0.009, 60, seed=12, replay=recorded))
+    await record(first, CHAPTER_5, 0.006, 60, seed=11, replay=recorded)
+    await record(second, PARALLEL, 0.009, 60, seed=12, replay=recorded)
     frame_account(first)
     replays = [trace.read(out / "t.jsonl").by_camera() for out in (first, second)]
     apart_ms, errors_ms = [], []

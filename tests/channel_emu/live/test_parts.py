@@ -27,32 +27,28 @@ from tests.channel_emu.live.emulator import frame_of
 
 
 @pytest.mark.parametrize("platform", [sys.platform, "elsewhere"])
-def test_timer_fires_once_armed_and_never_early(platform: str, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_timer_fires_once_armed_and_never_early(platform: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(timer.sys, "platform", platform)
+    fired: list[int] = []
+    woken = asyncio.Event()
 
-    async def live() -> None:
-        fired: list[int] = []
-        woken = asyncio.Event()
+    def fire() -> None:
+        fired.append(time.perf_counter_ns())
+        woken.set()
 
-        def fire() -> None:
-            fired.append(time.perf_counter_ns())
-            woken.set()
-
-        subject = LoopTimer(fire)
-        for span_ns in (0, 3_000_000, 20_000_000):
-            woken.clear()
-            begun = time.perf_counter_ns()
-            subject.arm(10 * 10**9)
-            subject.arm(span_ns)  # instead of what was armed before
-            async with asyncio.timeout(5):
-                await woken.wait()
-            assert fired[-1] >= begun + span_ns
-        subject.arm(30_000_000)
-        subject.close()
-        await asyncio.sleep(0.06)
-        assert len(fired) == 3
-
-    asyncio.run(live())
+    subject = LoopTimer(fire)
+    for span_ns in (0, 3_000_000, 20_000_000):
+        woken.clear()
+        begun = time.perf_counter_ns()
+        subject.arm(10 * 10**9)
+        subject.arm(span_ns)  # instead of what was armed before
+        async with asyncio.timeout(5):
+            await woken.wait()
+        assert fired[-1] >= begun + span_ns
+    subject.arm(30_000_000)
+    subject.close()
+    await asyncio.sleep(0.06)
+    assert len(fired) == 3
 
 
 @given(st.lists(st.floats(0, 1e6), min_size=1, max_size=300), st.sampled_from([1, 50, 95, 99, 100]))
@@ -117,41 +113,34 @@ def test_short_slices_are_asked_for_where_the_call_is_known(monkeypatch, machine
     assert [call.args[:2] for call in library.syscall.call_args_list] == ([] if number is None else [(number, 0)])
 
 
-def test_dropped_messages_hold_no_bytes() -> None:
-    async def live() -> None:
-        flow = CallFlow(0, ServedCall(mock.Mock()), None, lambda: 0)
-        dropped, kept = Message(b"x" * 100, "call0", 0, flow), Message(b"y", "call0", 1, flow)
-        flow.settle(dropped, EventKind.LOST)
-        flow.settle(kept, EventKind.DELIVERED)
-        assert dropped.raw == b"" and kept.raw == b"y"
-
-    asyncio.run(live())
+async def test_dropped_messages_hold_no_bytes() -> None:
+    flow = CallFlow(0, ServedCall(mock.Mock()), None, lambda: 0)
+    dropped, kept = Message(b"x" * 100, "call0", 0, flow), Message(b"y", "call0", 1, flow)
+    flow.settle(dropped, EventKind.LOST)
+    flow.settle(kept, EventKind.DELIVERED)
+    assert dropped.raw == b"" and kept.raw == b"y"
 
 
-def test_behind_a_message_in_the_link_no_more_are_read_than_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_behind_a_message_in_the_link_no_more_are_read_than_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(call_flow, "_MOST_BEHIND", 100)
+    link, read, written = mock.Mock(calls=set()), [], []
+    flow = CallFlow(0, ServedCall(mock.Mock()), link, lambda: 0)
 
-    async def live() -> None:
-        link, read, written = mock.Mock(calls=set()), [], []
-        flow = CallFlow(0, ServedCall(mock.Mock()), link, lambda: 0)
+    async def endless() -> bytes:
+        read.append(len(read))
+        await asyncio.sleep(0)
+        return b"x"
 
-        async def endless() -> bytes:
-            read.append(len(read))
-            await asyncio.sleep(0)
-            return b"x"
+    async def write(raw: bytes) -> None:
+        written.append(raw)
 
-        async def write(raw: bytes) -> None:
-            written.append(raw)
-
-        carrying = asyncio.create_task(flow.carry(endless, write))
-        for _ in range(1000):
-            await asyncio.sleep(0)
-        assert len(read) == 100 and not written
-        for message in list(flow._messages):
-            flow.settle(message, EventKind.DELIVERED)
-        for _ in range(1000):
-            await asyncio.sleep(0)
-        assert len(written) >= 100 and len(read) > 100  # it goes on
-        carrying.cancel()
-
-    asyncio.run(live())
+    carrying = asyncio.create_task(flow.carry(endless, write))
+    for _ in range(1000):
+        await asyncio.sleep(0)
+    assert len(read) == 100 and not written
+    for message in list(flow._messages):
+        flow.settle(message, EventKind.DELIVERED)
+    for _ in range(1000):
+        await asyncio.sleep(0)
+    assert len(written) >= 100 and len(read) > 100  # it goes on
+    carrying.cancel()

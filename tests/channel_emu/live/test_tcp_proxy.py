@@ -14,7 +14,6 @@ from channel_emu.live.proxy import ProxyOptions
 from channel_emu.live.tcp_proxy import BEHIND, PIECE_BYTES, TIMEOUT_S, TcpProxy
 from channel_emu.model.settings import channel_from_mapping
 from freshfield.transport import TransportError
-from tests.channel_emu.live.emulator import run
 from tests.support import free_port
 
 DATA = np.random.default_rng(0).integers(0, 256, 20 * PIECE_BYTES + 5, np.uint8).tobytes()
@@ -58,89 +57,74 @@ async def through(proxy: TcpProxy, data: bytes) -> bytes:
     [{}, {"loss": {"probability": 0.3}}, {"corruption": {"probability": 0.3}}, {"duplication": {"probability": 0.5}}],
 )
 @pytest.mark.parametrize("direction", ["up", "both"])
-def test_everything_arrives_in_order(faults, direction):
-    async def check() -> None:
-        section = {"service": {"law": "exponential", "mean_ms": 2.0}, "faults": faults}
-        async with echo(section, direction=direction) as proxy:
-            both = await asyncio.gather(through(proxy, DATA), through(proxy, DATA[::-1]))
-            assert both == [DATA, DATA[::-1]]
-            report = proxy.report()
-            assert set(report.by_method) == {"up bytes"} | ({"down bytes"} if direction == "both" else set())
-            up = report.by_method["up bytes"]
-            assert up.outcomes["forwarded"] >= 2 * 21 and up.in_flight == 0
-            assert (up.dropped > 0) == ("loss" in faults)
-
-    run(check())
+async def test_everything_arrives_in_order(faults, direction):
+    section = {"service": {"law": "exponential", "mean_ms": 2.0}, "faults": faults}
+    async with echo(section, direction=direction) as proxy:
+        both = await asyncio.gather(through(proxy, DATA), through(proxy, DATA[::-1]))
+        assert both == [DATA, DATA[::-1]]
+        report = proxy.report()
+        assert set(report.by_method) == {"up bytes"} | ({"down bytes"} if direction == "both" else set())
+        up = report.by_method["up bytes"]
+        assert up.outcomes["forwarded"] >= 2 * 21 and up.in_flight == 0
+        assert (up.dropped > 0) == ("loss" in faults)
 
 
-def test_each_piece_takes_a_service_time_and_a_lost_one_a_timeout():
-    async def check() -> None:
-        async with echo({"service": {"law": "deterministic", "mean_ms": 20.0}}) as proxy:
-            began = time.monotonic()
-            assert await through(proxy, DATA[: 10 * PIECE_BYTES]) == DATA[: 10 * PIECE_BYTES]
-            assert time.monotonic() - began > 0.2
-            assert proxy.report().delay_ms["mean"] == pytest.approx(20.0, abs=0.5)
-        blackout = {
-            "faults": {"blackout": {"windows_ms": [[0.0, 300.0]]}},
-            "service": {"law": "deterministic", "mean_ms": 1.0},
-        }
-        async with echo(blackout) as proxy:
-            began = time.monotonic()
-            assert await through(proxy, b"once") == b"once"
-            assert time.monotonic() - began > TIMEOUT_S
-            assert proxy.report().by_method["up bytes"].outcomes["lost"] >= 1
-
-    run(check())
+async def test_each_piece_takes_a_service_time_and_a_lost_one_a_timeout():
+    async with echo({"service": {"law": "deterministic", "mean_ms": 20.0}}) as proxy:
+        began = time.monotonic()
+        assert await through(proxy, DATA[: 10 * PIECE_BYTES]) == DATA[: 10 * PIECE_BYTES]
+        assert time.monotonic() - began > 0.2
+        assert proxy.report().delay_ms["mean"] == pytest.approx(20.0, abs=0.5)
+    blackout = {
+        "faults": {"blackout": {"windows_ms": [[0.0, 300.0]]}},
+        "service": {"law": "deterministic", "mean_ms": 1.0},
+    }
+    async with echo(blackout) as proxy:
+        began = time.monotonic()
+        assert await through(proxy, b"once") == b"once"
+        assert time.monotonic() - began > TIMEOUT_S
+        assert proxy.report().by_method["up bytes"].outcomes["lost"] >= 1
 
 
 @pytest.mark.stability
-def test_a_sender_waits_for_a_slow_link():
-    async def check() -> None:
-        async with echo({"service": {"law": "deterministic", "mean_ms": 60_000.0}}) as proxy:
-            _, writer = await asyncio.open_connection("127.0.0.1", proxy.port)
-            writer.write(bytes(100 * PIECE_BYTES))
-            link = None
-            while link is None or link.model.offered < BEHIND:
-                await asyncio.sleep(0.01)
-                link = proxy.links.get("up bytes")
-            await asyncio.sleep(0.2)
-            assert link.model.offered == BEHIND
-            writer.close()
-
-    run(check())
+async def test_a_sender_waits_for_a_slow_link():
+    async with echo({"service": {"law": "deterministic", "mean_ms": 60_000.0}}) as proxy:
+        _, writer = await asyncio.open_connection("127.0.0.1", proxy.port)
+        writer.write(bytes(100 * PIECE_BYTES))
+        link = None
+        while link is None or link.model.offered < BEHIND:
+            await asyncio.sleep(0.01)
+            link = proxy.links.get("up bytes")
+        await asyncio.sleep(0.2)
+        assert link.model.offered == BEHIND
+        writer.close()
 
 
 @pytest.mark.stability
-def test_a_reset_breaks_connections_and_the_next_one_works():
-    async def check() -> None:
-        section = {"service": {"law": "deterministic", "mean_ms": 5.0}, "faults": {"reset": {"at_ms": [400.0]}}}
-        async with echo(section) as proxy:
-            reader, writer = await asyncio.open_connection("127.0.0.1", proxy.port)
-            with pytest.raises(ConnectionError):
-                while True:
-                    writer.write(b"more")
-                    await writer.drain()
-                    if not await reader.read(4):
-                        raise ConnectionError
-            assert await through(proxy, b"again") == b"again"
-
-    run(check())
+async def test_a_reset_breaks_connections_and_the_next_one_works():
+    section = {"service": {"law": "deterministic", "mean_ms": 5.0}, "faults": {"reset": {"at_ms": [400.0]}}}
+    async with echo(section) as proxy:
+        reader, writer = await asyncio.open_connection("127.0.0.1", proxy.port)
+        with pytest.raises(ConnectionError):
+            while True:
+                writer.write(b"more")
+                await writer.drain()
+                if not await reader.read(4):
+                    raise ConnectionError
+        assert await through(proxy, b"again") == b"again"
 
 
 @pytest.mark.stability
-def test_no_service_and_no_port():
-    async def check() -> None:
-        options = ProxyOptions("127.0.0.1:0", f"127.0.0.1:{free_port()}")
-        proxy = TcpProxy(channel_from_mapping({}), 0, options)
-        await proxy.start()
-        assert await through(proxy, b"anybody?") == b""
-        other = TcpProxy(channel_from_mapping({}), 0, ProxyOptions(f"127.0.0.1:{proxy.port}", "127.0.0.1:1"))
-        with pytest.raises(TransportError, match="cannot listen"):
-            await other.start()
-        open_to_all = TcpProxy(channel_from_mapping({}), 0, ProxyOptions("0.0.0.0:0", "127.0.0.1:1"))
-        with pytest.raises(TransportError):
-            await open_to_all.start()
-        for each in (proxy, other, open_to_all):
-            await each.stop()
-
-    run(check())
+async def test_no_service_and_no_port():
+    options = ProxyOptions("127.0.0.1:0", f"127.0.0.1:{free_port()}")
+    proxy = TcpProxy(channel_from_mapping({}), 0, options)
+    await proxy.start()
+    assert await through(proxy, b"anybody?") == b""
+    other = TcpProxy(channel_from_mapping({}), 0, ProxyOptions(f"127.0.0.1:{proxy.port}", "127.0.0.1:1"))
+    with pytest.raises(TransportError, match="cannot listen"):
+        await other.start()
+    open_to_all = TcpProxy(channel_from_mapping({}), 0, ProxyOptions("0.0.0.0:0", "127.0.0.1:1"))
+    with pytest.raises(TransportError):
+        await open_to_all.start()
+    for each in (proxy, other, open_to_all):
+        await each.stop()

@@ -31,46 +31,38 @@ def of(folder, *more: str) -> Transport:
     return from_arguments(parser.parse_args([w if w[0] == "-" else str(folder / w) for w in files]))
 
 
-def test_a_certificate_lets_its_process_do_its_own_part(keys):
+async def test_a_certificate_lets_its_process_do_its_own_part(keys):
     push, status = "/freshfield.v1.FrameStreamService/Push", "/freshfield.v1.EdgeService/GetStatus"
-
-    async def scene():
-        edge = of(keys / "edge", "--token-file", "tokens.txt")
-        server = edge.aio_server()
-        server.add_generic_rpc_handlers((Every(),))
-        port = edge.bind(server, "0.0.0.0:0")  # beyond this machine, and nothing is amiss
-        await server.start()
-        found = {}
-        for name in ("cam00", "emulator", "viewer", "edge"):
-            async with of(keys / name).aio_channel(f"localhost:{port}") as channel:
-                try:
-                    await channel.unary_unary(status)(b"", timeout=5)
-                    found[name] = "looks"
-                except grpc.aio.AioRpcError as error:
-                    found[name] = error.code().name
-                if name in ("cam00", "emulator"):
-                    call = channel.stream_stream(push)(timeout=5)
-                    await call.write(b"cam01")
-                    found[name] = (await call.read()).decode()
-        tokens = dict(line.split() for line in (keys / "edge" / "tokens.txt").read_text().splitlines())
-        async with Transport(ca=keys / "edge" / "ca.pem").aio_channel(f"localhost:{port}") as channel:
-            with pytest.raises(grpc.aio.AioRpcError):  # no certificate, no connection
+    edge = of(keys / "edge", "--token-file", "tokens.txt")
+    server = edge.aio_server()
+    server.add_generic_rpc_handlers((Every(),))
+    port = edge.bind(server, "0.0.0.0:0")  # beyond this machine, and nothing is amiss
+    await server.start()
+    found = {}
+    for name in ("cam00", "emulator", "viewer", "edge"):
+        async with of(keys / name).aio_channel(f"localhost:{port}") as channel:
+            try:
                 await channel.unary_unary(status)(b"", timeout=5)
-        await server.stop(None)
-        return found, tokens
-
-    found, tokens = asyncio.run(scene())
+                found[name] = "looks"
+            except grpc.aio.AioRpcError as error:
+                found[name] = error.code().name
+            if name in ("cam00", "emulator"):
+                call = channel.stream_stream(push)(timeout=5)
+                await call.write(b"cam01")
+                found[name] = (await call.read()).decode()
+    tokens = dict(line.split() for line in (keys / "edge" / "tokens.txt").read_text().splitlines())
+    async with Transport(ca=keys / "edge" / "ca.pem").aio_channel(f"localhost:{port}") as channel:
+        with pytest.raises(grpc.aio.AioRpcError):  # no certificate, no connection
+            await channel.unary_unary(status)(b"", timeout=5)
+    await server.stop(None)
     assert found == {"cam00": "forbidden_camera", "emulator": "taken", "viewer": "looks", "edge": "looks"}
     assert tokens.keys() == {"operator", "viewer"} and len(set(tokens.values())) == 2
 
 
-def test_a_key_of_another_certificate_is_named(keys):
-    async def scene():
-        mixed = Transport(cert=keys / "edge" / "cert.pem", key=keys / "cam00" / "key.pem", ca=keys / "cert.pem")
-        with pytest.raises(TransportError, match=r"cannot use --tls-cert .* with its --tls-key"):
-            mixed.bind(mixed.aio_server(), "127.0.0.1:0")
-
-    asyncio.run(scene())
+async def test_a_key_of_another_certificate_is_named(keys):
+    mixed = Transport(cert=keys / "edge" / "cert.pem", key=keys / "cam00" / "key.pem", ca=keys / "cert.pem")
+    with pytest.raises(TransportError, match=r"cannot use --tls-cert .* with its --tls-key"):
+        mixed.bind(mixed.aio_server(), "127.0.0.1:0")
 
 
 def test_the_health_check_passes_mutual_tls(keys):
