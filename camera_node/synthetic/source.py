@@ -187,9 +187,10 @@ class WorldSource(Source):
         return self._effects.placed(self.scene.cameras[self.camera_id][1], t_s)
 
     def _view(self, at: Array) -> CameraRenderer:
-        """A renderer of a camera that stands there, kept until it stands elsewhere."""
+        """A renderer of a camera that stands there, kept until it stands elsewhere; of a carried one it is not kept."""
+        if self._carrier is not None:
+            return self.scene.view(self.intrinsics, at)
         if self._placed is None or not np.array_equal(self._placed[0], at):
-            self._placed = None  # two renderers of large images need not fit into memory
             self._placed = at, self.scene.view(self.intrinsics, at)
         return self._placed[1]
 
