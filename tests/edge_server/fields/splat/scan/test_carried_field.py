@@ -206,12 +206,12 @@ def _undisturbed(depth: bool) -> tuple[float, ...]:
         (_leaping, 3, True, False, 21.6, 1.0),
         (_covered, 6, True, True, 20.8, 1.0),
         (_covered, 6, True, False, 21.8, 1.0),
-        (_bright, 6, False, True, 20.0, 1.9),
-        (_bright, 6, False, False, 20.4, 1.7),
-        (_white, 6, True, True, 20.6, 1.2),
+        (_bright, 6, False, True, 20.0, 1.5),
+        (_bright, 6, False, False, 20.4, 1.4),
+        (_white, 6, True, True, 20.6, 1.0),
         (_white, 6, True, False, 21.4, 1.0),
-        (_turning, 10, False, True, 20.4, 1.2),
-        (_turning, 10, False, False, 21.2, 1.2),
+        (_turning, 10, False, True, 20.4, 1.0),
+        (_turning, 10, False, False, 21.2, 1.0),
         (_blurred, 6, False, True, 20.8, 1.0),
         (_blurred, 6, False, False, 21.2, 1.0),
     ],
@@ -219,8 +219,10 @@ def _undisturbed(depth: bool) -> tuple[float, ...]:
 def test_after_a_bad_second_the_picture_recovers_within_one(
     spoil, frames: int, said: bool, depth: bool, least_db: float, lost_db: float
 ) -> None:
-    """least_db: of all held-out frames at the end. lost_db: at most, against a walk without bad frames, a second after
-    the first bad frame and at each one later: half a second after the last."""
+    """least_db: of all held-out frames at the end. lost_db: against a walk without bad frames, on average over four
+    instants, a second after the first bad frame (half a second after the last) and each second later. At one instant
+    two such runs differ by .4 dB for nothing: another scipy moves it as much.
+    """
     views = clean = walk(depth=depth)
     bad = slice(BAD_FROM, BAD_FROM + frames)
     views = [*clean[: bad.start], *map(spoil, clean[bad]), *clean[bad.stop :]]
@@ -228,7 +230,7 @@ def test_after_a_bad_second_the_picture_recovers_within_one(
     assert np.isfinite(field.cloud.params).all()
     assert any("left out" in line for line in field.troubles) or not said
     assert found_db[-1] > least_db
-    assert (np.array(_undisturbed(depth)) - found_db)[1:].max() < lost_db
+    assert (np.array(_undisturbed(depth)) - found_db)[1:].mean() < lost_db
 
 
 def _looks_about(k: int, view: View) -> View:
