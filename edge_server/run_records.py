@@ -229,7 +229,6 @@ class ChannelStatus(Struct, omit_defaults=True):
 class FrontierPoint(Struct, frozen=True):
     """A measured setting of updates, and the fidelity with it.
 
-    effort, options: name and field options of the setting.
     speed_m_per_s: speed of what moves in the scene it was measured on.
     update_ms: time from decision to publication; for a field in layers, from one update to the next.
     psnr_db, psnr_moving_db: PSNR of the whole image, and of the pixels where the scene moves.
@@ -237,12 +236,10 @@ class FrontierPoint(Struct, frozen=True):
     measured: what the PSNR was measured on, what was "shown" or (earlier versions) what was "published".
     """
 
-    effort: str
     update_ms: Number
     psnr_db: Number
     psnr_moving_db: Number
     speed_m_per_s: Number = 1.0
-    options: dict[str, Any] = {}
     error_db: Number = 0.0
     measured: str = "shown"
 

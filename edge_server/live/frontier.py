@@ -51,8 +51,6 @@ def points_of(rows: Sequence[Mapping[str, Any]]) -> list[FrontierPoint]:
     KeyError, TypeError or ValueError where a row is none of these."""
     return [
         FrontierPoint(
-            effort=row["effort"],
-            options=dict(row["options"]),
             speed_m_per_s=float(row["speed_m_per_s"]),
             update_ms=float(row["update_s"]) * 1e3,
             psnr_db=float(row[f"{by}psnr_db"]),

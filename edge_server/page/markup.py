@@ -13,7 +13,6 @@ from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
 from edge_server.fidelity.scorer import SELECTED
-from edge_server.live.frontier import best_point
 from edge_server.live.state import CameraView, Publication
 from edge_server.page.colors import HELD_OUT, MEASURED, PRESENT, RGB, age_color, css, scale_color
 from edge_server.page.settings import FRESH_MS, STALE_MS
@@ -66,19 +65,16 @@ def frontier(found: Frontier, present: tuple[float, float, float | None] | None)
         x = 30.0 + 280.0 * (math.log(max(ms, 1.0)) - left) / wide
         return f"{x:.1f},{8.0 + 84.0 * (1.0 - (db - low) / high):.1f}"
 
-    lines, best = [], best_point(found.points, found.speed_m_per_s)
-    for name in dict.fromkeys(p.effort for p in found.points):
-        mine = sorted((p for p in found.points if p.effort == name), key=lambda p: p.update_ms)
-        for key in ("psnr_db", "psnr_moving_db"):
-            path = " ".join(at(p.update_ms, getattr(p, key)) for p in mine)
-            lines.append((path, name == best.effort, key == "psnr_moving_db"))
+    measured = sorted(found.points, key=lambda p: p.update_ms)
+    whole = " ".join(at(p.update_ms, p.psnr_db) for p in measured)
+    moving = " ".join(at(p.update_ms, p.psnr_moving_db) for p in measured)
     ends = (
         (26, 12, "end", f"{low + high:.0f}"),
         (26, 94, "end", f"{low:.0f} dB"),
         (30, 106, "start", f"{math.exp(left):.0f} ms an update"),
         (310, 106, "end", f"{math.exp(left + wide):.0f} ms"),
     )
-    return str(_panel.frontier(lines, [at(ms, db).split(",") for ms, db in now], ends, found.about))
+    return str(_panel.frontier(whole, moving, [at(ms, db).split(",") for ms, db in now], ends, found.about))
 
 
 def legend() -> str:

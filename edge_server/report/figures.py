@@ -231,11 +231,9 @@ def draw_frontier(report: Report, files: RunFiles, path: Path) -> bool:
         return False
     update_s = (late[-1][0] - late[0][0]) / updates
     with figure(path, height_inch=2.6) as (_, ((ax,),)):
-        for effort, color in zip(dict.fromkeys(p.effort for p in measured.points), (BLUE, GREEN, ORANGE, PURPLE)):
-            of_effort = [p for p in measured.points if p.effort == effort]
-            mine = np.array(sorted((p.update_ms, p.psnr_db, p.psnr_moving_db) for p in of_effort))
-            ax.plot(mine[:, 0] / 1e3, mine[:, 1], color=color, marker=".", label=f"{effort}, whole image")
-            ax.plot(mine[:, 0] / 1e3, mine[:, 2], "--", color=color, marker=".", label=f"{effort}, moving")
+        update_ms, *both = np.array(sorted((p.update_ms, p.psnr_db, p.psnr_moving_db) for p in measured.points)).T
+        for psnr_db, dashes, about in zip(both, ("-", "--"), ("measured, whole image", "measured, moving")):
+            ax.plot(update_ms / 1e3, psnr_db, dashes, color=BLUE, marker=".", label=about)
         for key, label in (("psnr_db", "this run, shown"), ("psnr_moving_db", None)):
             if shown[key] is not None:
                 ax.plot([update_s], [shown[key]], "o", color=VERMILION, markersize=8, label=label)

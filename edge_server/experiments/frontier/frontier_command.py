@@ -241,8 +241,10 @@ class Frontier:
                 runs,
                 "updates",
                 files=lambda run: [self.weights],
-                group=lambda run: (run.variant.label, run.speed),  # they share their renderings
+                group=lambda run: (run.variant.field, run.variant.layers, run.speed),  # they share their renderings
             )
         rows = [{**point, **run.facts()} for run, point in zip(runs, points)]
-        charged = {variant.label: row for variant, row in zip(measured_of, measured)}
+        charged = {
+            update_time.field_label(variant.field, variant.layers): row for variant, row in zip(measured_of, measured)
+        }
         return charged, update_time.mean_over_seeds(rows)

@@ -9,13 +9,12 @@ from typing import Any
 from matplotlib.axes import Axes
 
 from edge_server.experiments.common.tables import markdown_table, number
-from edge_server.experiments.frontier.update_time import best
+from edge_server.experiments.frontier.update_time import best, field_label
 from edge_server.live.frontier import best_point, points_of
 from edge_server.report.style import CYCLE, INK, figure
 from edge_server.settings import LEAST_UPDATE_MS
 
 Row = dict[str, Any]
-_LINES = {"layers": "--"}
 _METRICS = (("psnr_db", "PSNR (dB)"), ("ssim", "SSIM"), ("lpips", "LPIPS"))
 
 
@@ -54,8 +53,11 @@ def updates_table(rows: Sequence[Row]) -> str:
         "shown_ssim": 3,
         "shown_lpips": 3,
     }
-    cells = [(f"{row['field']} {row['effort']}", *(number(row[name], n) for name, n in digits.items())) for row in rows]
-    head = "field, setting|m/s|an update, s|steps|age, ms|shown, dB|moving|SSIM|LPIPS"
+    cells = [
+        (field_label(row["field"], row["layers"]), *(number(row[name], n) for name, n in digits.items()))
+        for row in rows
+    ]
+    head = "field|m/s|an update, s|steps|age, ms|shown, dB|moving|SSIM|LPIPS"
     about = "shown: at random instants, the newest publication carried on; age: of its views at publication"
     return f"{markdown_table(head.split('|'), cells)}\n{about}"
 
@@ -76,7 +78,7 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
     front = sorted((r for r in rows if r["on_front"]), key=lambda r: r["seconds"])
     with figure(path, len(shown), height_inch=2.7, sharex=True) as (fig, axes):
         for ax, (key, label) in zip(axes[:, 0], shown):
-            for field, look in zip(fields, _line_styles([(field,) for field in fields])):
+            for field, look in zip(fields, _line_styles([(field, False) for field in fields])):
                 group = sorted((r for r in rows if r["field"] == field), key=lambda r: r["seconds"])
                 ax.plot(
                     [r["seconds"] for r in group],
@@ -97,9 +99,9 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
 
 def draw_updates(path: Path, rows: Sequence[Row]) -> None:
     """Draw the shown fidelity against seconds per update: a column for each speed, a color for each
-    representation, a line style for each setting, the best of all encircled."""
+    representation, dashed in layers, the best of all encircled."""
     speeds = list(dict.fromkeys(row["speed_m_per_s"] for row in rows))
-    settings = list(dict.fromkeys((row["field"], row["effort"]) for row in rows))
+    settings = list(dict.fromkeys((row["field"], row["layers"]) for row in rows))
     panels = (("psnr_db", "shown, whole image (dB)"), ("psnr_moving_db", "shown where it moves (dB)"))
     with figure(path, len(panels), len(speeds), height_inch=3.0, sharex=True, sharey="row") as (fig, axes):
         for row, (key, label) in enumerate(panels):
@@ -107,10 +109,10 @@ def draw_updates(path: Path, rows: Sequence[Row]) -> None:
             for ax, speed in zip(axes[row], speeds):
                 here = [r for r in rows if r["speed_m_per_s"] == speed and r[f"shown_{key}"] is not None]
                 for who, look in zip(settings, _line_styles(settings)):
-                    group = sorted((r for r in here if (r["field"], r["effort"]) == who), key=lambda r: r["update_s"])
+                    group = sorted((r for r in here if (r["field"], r["layers"]) == who), key=lambda r: r["update_s"])
                     x = [r["update_s"] for r in group]
                     shown = [r[f"shown_{key}"] for r in group]
-                    ax.plot(x, shown, marker=".", linewidth=1.2, label=" ".join(who), **look)
+                    ax.plot(x, shown, marker=".", linewidth=1.2, label=field_label(*who), **look)
                 top = best(here, f"shown_{key}")
                 if top is not None:
                     _encircle(ax, [top["update_s"]], [top[f"shown_{key}"]], "best")
@@ -128,11 +130,12 @@ def _encircle(axes: Axes, x: Sequence[float], y: Sequence[float], label: str) ->
     axes.plot(x, y, "o", markersize=9, mfc="none", color=INK, label=label)
 
 
-def _line_styles(settings: Sequence[tuple[str, ...]]) -> list[Row]:
-    """Color and line style of each (representation, setting)."""
-    fields = list(dict.fromkeys(who[0] for who in settings))
+def _line_styles(settings: Sequence[tuple[str, bool]]) -> list[Row]:
+    """Color and line style of each representation, in layers or not."""
+    fields = list(dict.fromkeys(field for field, _ in settings))
     return [
-        {"color": CYCLE[fields.index(who[0]) % len(CYCLE)], "linestyle": _LINES.get(who[-1], "-")} for who in settings
+        {"color": CYCLE[fields.index(field) % len(CYCLE)], "linestyle": "--" if layers else "-"}
+        for field, layers in settings
     ]
 
 

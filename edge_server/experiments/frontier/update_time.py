@@ -31,29 +31,29 @@ from freshfield.scenario import Scenario, parse
 _COSTS_S, _LEAD_S = 1.0, 5.0
 # Steps per second of the static field of layers, which run on another core.
 _STATIC_STEPS_PER_S = 250.0
-MEDIUM, LAYERS = "medium", "layers"
 # The network of the moving scene, and which views its updates use.
 CHANNEL, POLICY = "ch5", "all"
 # What a row has of what was shown: the names of ``Outcome``.
 SHOWN = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
 
 
+def field_label(field: str, layers: bool) -> str:
+    """A field as tables and figures name it."""
+    return f"{field} in layers" if layers else field
+
+
 @dataclass(frozen=True)
 class Variant:
-    """A field as it is updated: with its own options (MEDIUM), or in layers (LAYERS)."""
+    """A field as it is updated. options: of the field, besides ``layers``."""
 
     field: str
-    name: str
+    layers: bool
     options: Mapping[str, Any]
 
     @property
-    def label(self) -> str:
-        """As tables name it."""
-        return f"{self.field} {self.name}"
-
-    @property
-    def layers(self) -> bool:
-        return self.name == LAYERS
+    def field_options(self) -> dict[str, Any]:
+        """As a scenario has them."""
+        return {**self.options, **({"layers": True} if self.layers else {})}
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class MovingScene:
                 "channel": {"preset": CHANNEL},
                 "edge": {
                     "field": variant.field,
-                    "field_options": {**variant.options, "layers": True} if variant.layers else dict(variant.options),
+                    "field_options": variant.field_options,
                     "policy": {"name": POLICY},
                     "updates": "arrivals" if variant.layers else "cycle",
                     **edge,
@@ -87,10 +87,10 @@ class MovingScene:
 def variants(fields: Sequence[str], options: Mapping[str, Any]) -> list[Variant]:
     """Each field with ``options``, after the same in layers if it has any."""
     return [
-        Variant(name, kind, options)
+        Variant(name, layers, options)
         for name in fields
-        for kind in (LAYERS, MEDIUM)
-        if kind == MEDIUM or "layers" in option_help(name)
+        for layers in (True, False)
+        if not layers or "layers" in option_help(name)
     ]
 
 
@@ -142,8 +142,8 @@ class MovingRun:
         """What a row says of its run."""
         return {
             "field": self.variant.field,
-            "effort": self.variant.name,
-            "options": {**self.variant.options, **({"layers": True} if self.variant.layers else {})},
+            "layers": self.variant.layers,
+            "options": self.variant.field_options,
             "speed_m_per_s": self.speed,
             "planned_update_s": self.update_s,
             "seed": self.seed,
@@ -153,7 +153,7 @@ class MovingRun:
 def run_updates(run: MovingRun, weights: Path | None = None) -> dict[str, Any]:
     """What a run has shown, as means. weights: folder of LPIPS weights."""
     variant = run.variant
-    about = run.moving, run.speed, variant.field, variant.name, json.dumps(dict(variant.options), sort_keys=True)
+    about = run.moving, run.speed, variant.field, variant.layers, json.dumps(dict(variant.options), sort_keys=True)
     factory = _factory(*about, weights)
     factory.setting = run.setting()
     whole = rollout(factory, run.seed, named(POLICY))[0].whole
@@ -169,9 +169,9 @@ def run_updates(run: MovingRun, weights: Path | None = None) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)  # runs that differ in update time and seed follow each other: they share their renderings
 def _factory(
-    moving: MovingScene, speed: float, field: str, name: str, options: str, weights: Path | None
+    moving: MovingScene, speed: float, field: str, layers: bool, options: str, weights: Path | None
 ) -> EpisodeFactory:
-    run = MovingRun(moving, speed, Variant(field, name, json.loads(options)), 0, 1.0, 1.0, ComputeConfig(1.0))
+    run = MovingRun(moving, speed, Variant(field, layers, json.loads(options)), 0, 1.0, 1.0, ComputeConfig(1.0))
     return EpisodeFactory(run.setting(), Folders(lpips=weights))
 
 
@@ -192,9 +192,9 @@ def best(rows: list[dict[str, Any]], metric: str = "shown_psnr_moving_db") -> di
 
 
 def mean_over_seeds(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Means over seeds of the rows with the same field, effort, speed and planned update time, with the
+    """Means over seeds of the rows with the same field, in layers or not, speed and planned update time, with the
     standard errors of the two shown PSNRs (None for a single seed)."""
-    keys = ("field", "effort", "speed_m_per_s", "planned_update_s")
+    keys = ("field", "layers", "speed_m_per_s", "planned_update_s")
     shown = [f"shown_{name}" for name in SHOWN]
     means = over_seeds(rows, keys, ("update_s", "steps", "aaoi_ms", *shown), mean_or_none)
     errors = over_seeds(rows, keys, shown[:2], _standard_error)

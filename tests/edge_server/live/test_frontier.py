@@ -13,17 +13,17 @@ from edge_server.settings import read_config
 from freshfield.scenario import parse
 
 
-def frontier_point(effort, speed, update_ms, whole, moving) -> FrontierPoint:
-    return FrontierPoint(effort, update_ms, whole, moving, speed)
+def frontier_point(speed, update_ms, whole, moving) -> FrontierPoint:
+    return FrontierPoint(update_ms, whole, moving, speed)
 
 
 POINTS = [
-    frontier_point("low", 1.0, 100.0, 20.0, 18.0),
-    frontier_point("low", 1.0, 400.0, 21.0, 17.5),
-    frontier_point("medium", 1.0, 400.0, 24.0, 17.0),
-    frontier_point("medium", 1.0, 2000.0, 24.5, 14.0),
-    frontier_point("low", 4.0, 100.0, 19.0, 17.0),
-    frontier_point("low", 4.0, 400.0, 19.0, 13.0),
+    frontier_point(1.0, 100.0, 20.0, 18.0),
+    frontier_point(1.0, 400.0, 21.0, 17.5),
+    frontier_point(1.0, 400.0, 24.0, 17.0),
+    frontier_point(1.0, 2000.0, 24.5, 14.0),
+    frontier_point(4.0, 100.0, 19.0, 17.0),
+    frontier_point(4.0, 400.0, 19.0, 13.0),
 ]
 
 
@@ -42,7 +42,7 @@ def test_of_points_that_seeds_cannot_tell_apart_the_quickest_is_chosen():
 
 def test_points_are_read_and_errors_say_what_to_do(tmp_path):
     shipped = read_frontier(None, "ngp")
-    assert len({p.effort for p in shipped}) >= 2 and all(p.update_ms > 0 for p in shipped)
+    assert len({p.update_ms for p in shipped}) >= 2 and all(p.update_ms > 0 for p in shipped)
     with pytest.raises(ValueError, match="edge-server frontier --field nothing"):
         read_frontier(None, "nothing")
     for text in ("", "[]", "{}", '{"updates": [{}]}', '{"updates": 3}', '{"updates": [], "updates": []}'):
@@ -53,7 +53,6 @@ def test_points_are_read_and_errors_say_what_to_do(tmp_path):
         read_frontier(tmp_path / "missing.json", "ngp")
     row = {
         "field": "splat",
-        "effort": "low",
         "options": {},
         "speed_m_per_s": 1.0,
         "update_s": 0.1,
@@ -62,11 +61,11 @@ def test_points_are_read_and_errors_say_what_to_do(tmp_path):
         "shown_psnr_db": 25.0,
         "shown_psnr_moving_db": 15.0,
     }
-    layers = row | {"effort": "layers", "options": {"layers": True}, "shown_psnr_db": 29.0}
+    layers = row | {"options": {"layers": True}, "shown_psnr_db": 29.0}
     (tmp_path / "f.json").write_text(json.dumps({"updates": [row, layers]}))
     (plain,), (layered,) = (read_frontier(tmp_path / "f.json", "splat", layers=known) for known in (False, True))
     assert plain.psnr_db == 25.0 and plain.mean_db == 20.0, "by what was shown"
-    assert layered.psnr_db == 29.0 and layered.effort == "layers"
+    assert layered.psnr_db == 29.0
     with pytest.raises(ValueError, match="for ngp in layers"):
         read_frontier(tmp_path / "f.json", "ngp", layers=True)
     (tmp_path / "f.json").write_text(json.dumps({"updates": []}))
@@ -85,7 +84,7 @@ def test_a_scenarios_own_frontier_is_read_beside_it_and_the_shipped_one_otherwis
     assert shipped.speed_m_per_s == 2.0 and len({p.speed_m_per_s for p in shipped.points}) == 1
     with pytest.raises(ValueError, match=r"mine\.json"):
         opened(frontier="mine.json")
-    row = {"field": "ngp", "effort": "a", "options": {}, "speed_m_per_s": 1.0, "update_s": 0.1}
+    row = {"field": "ngp", "options": {}, "speed_m_per_s": 1.0, "update_s": 0.1}
     (tmp_path / "mine.json").write_text(json.dumps({"updates": [row | {"psnr_db": 30.0, "psnr_moving_db": 20.0}]}))
     assert opened(frontier="mine.json").about == "mine.json, at 1 m/s, as published"
     unknown = opened(field="tensorf", frontier=None)

@@ -50,10 +50,10 @@ def test_the_age_of_what_is_shown_is_split_into_its_parts():
 
 
 def test_the_frontier_stands_beside_the_present_or_says_how_to_measure_it():
-    settings = (("low", 50.0, 20.0), ("low", 800.0, 24.0), ("high", 200.0, 28.0))
-    found = Frontier([FrontierPoint(e, ms, db, db - 4.0) for e, ms, db in settings], "f.json, at <1> m/s")
+    measured = ((50.0, 20.0), (800.0, 24.0), (200.0, 28.0))
+    found = Frontier([FrontierPoint(ms, db, db - 4.0) for ms, db in measured], "f.json, at <1> m/s")
     html = markup.frontier(found, None)
-    assert html.count("<polyline") == 4 and html.count('stroke-width="1.8"') == 2 and "<circle" not in html
+    assert html.count("<polyline") == 2 and html.count('stroke-dasharray="4 3"') == 1 and "<circle" not in html
     assert "50 ms an update" in html and "800 ms" in html and "at &lt;1&gt; m/s" in html
     html = markup.frontier(found, (200.0, 28.0, None))
     assert html.count("<circle") == 1 and 'cx="170.0" cy="8.0"' in html, "at the best point, half way"

@@ -261,7 +261,7 @@ def test_a_held_out_camera_that_moves_is_drawn_and_tabled_at_refined_poses(tmp_p
         ("edge.json", "[]", "edge.json left out: Expected `object`"),
         ("channel.json", '{"drawn_delay_ms": {"histogram": [1]}}', "channel.json left out"),
         ("channel.json", '{"drawn_delay_ms": {"histogram": {"edges_ms": [1], "counts": [2]}}}', "do not bound"),
-        ("frontier.json", '{"points": [{"effort": "low", "update_ms": [1]}]}', "frontier.json left out"),
+        ("frontier.json", '{"points": [{"update_ms": [1]}]}', "frontier.json left out"),
         ("ages.jsonl", '{"t_s": 1, "age_ms": [5]}', "ages.jsonl: 1 of 1 lines"),
         ("shown.jsonl", '{"t_s": 1, "age_ms": "x"}', "shown.jsonl: 1 of 1 lines"),
         ("series.jsonl", f'{{"t_s": 1, "update_ms": {10**400}}}', "series.jsonl: 1 of 1 lines"),
@@ -294,7 +294,7 @@ def test_the_run_stands_beside_the_measured_frontier(tmp_path, monkeypatch):
     write_run(tmp_path)
     report, path = assemble(read_run_files(tmp_path)), tmp_path / "figure-frontier.png"
     assert not draw_frontier(report, read_run_files(tmp_path), path), "a run without one"
-    point = {"effort": "low", "update_ms": 50.0, "psnr_db": 20.0, "psnr_moving_db": 16.0}
+    point = {"update_ms": 50.0, "psnr_db": 20.0, "psnr_moving_db": 16.0}
     for points, drawn in (([point], True), ([], False), ([{}], False), (3, False)):
         (tmp_path / "frontier.json").write_text(json.dumps({"points": points, "about": "f.json"}))
         assert draw_frontier(report, read_run_files(tmp_path), path) == drawn
