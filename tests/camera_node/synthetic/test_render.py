@@ -13,6 +13,7 @@ from camera_node.synthetic.render import CameraRenderer, World, cast_rays, rays_
 from camera_node.synthetic.shapes import Box, Quad, Sphere, nearest_hit
 from camera_node.synthetic.textures import Checker, Noise, Plain
 from freshfield.geometry import Pinhole, look_at, se3_inverse, world_rays
+from tests.camera_node.synthetic.test_shapes import STRESSED
 from tests.camera_node.synthetic.worlds import FLAT_LIGHT as FLAT
 from tests.camera_node.synthetic.worlds import body
 
@@ -99,3 +100,26 @@ def test_images_are_the_callers_own():
     kept = first.copy()
     first[:] = 7
     assert np.array_equal(renderer.image(0.0), kept)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("shape", STRESSED[:-1], ids=repr)
+@pytest.mark.filterwarnings("error")
+def test_a_camera_inside_a_shape_sees_its_inside(shape):
+    light = Light(np.array([[0.0, 0.0, 5.0]]), 0.5, 3.0, (0.4,) * 3, (0.6,) * 3)
+    world = World((Part(shape, Checker((0.2,) * 3, (0.9,) * 3, 0.1)),), (), light)
+    pose = look_at([0.01, 0.02, 0.05], [0.3, 0.2, 0.1])
+    renderer = CameraRenderer(world, Pinhole.from_fov(32, 32, 90.0), pose)
+    assert np.isfinite(renderer.distance()).all()
+    assert renderer.image(0.0).min() > 0
+
+
+@pytest.mark.stability
+@pytest.mark.filterwarnings("error")
+def test_a_light_inside_or_on_a_surface_does_no_harm():
+    for z in (0.0, 0.5, 0.499):
+        light = Light(np.array([[0.0, 0.0, z]]), 0.8, 3.0, (0.1,) * 3, (0.2,) * 3)
+        world = World((Part(Sphere(0.5), Checker((0.2,) * 3, (0.9,) * 3, 0.1)),), (), light)
+        pose = look_at([0.0, -2.0, 1.0], [0.0, 0.0, 0.0])
+        image = CameraRenderer(world, Pinhole.from_fov(32, 32, 40.0), pose).image(0.0)
+        assert image.max() > 0

@@ -20,6 +20,17 @@ SHAPES = [
     RoundCone(0.15, 0.45, 0.8),
     capsule(0.3, 0.9),
 ]
+# Their surfaces, edges, corners and axes lie on the grid of origins below.
+STRESSED = [
+    Sphere(0.5),
+    Box((0.5, 0.3, 0.7)),
+    Cylinder(0.4, 0.6),
+    RoundCone(0.4, 0.1, 0.9),
+    RoundCone(0.2, 0.4, 0.3),
+    capsule(0.3, 0.6),
+    Quad((0.5, 0.5)),
+]
+AXES = np.concatenate([np.eye(3), -np.eye(3)]).T
 TOLERANCE = 1e-9
 
 
@@ -99,3 +110,27 @@ def test_quad_is_seen_from_its_front_only():
 def test_a_round_cone_that_is_only_a_ball_is_refused():
     with pytest.raises(ValueError, match="must exceed"):
         RoundCone(0.5, 0.1, 0.3)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("shape", STRESSED, ids=repr)
+@pytest.mark.filterwarnings("error")
+def test_rays_along_the_axes_from_everywhere_are_finite_or_miss(shape):
+    """Origins on a grid that holds the surfaces, edges, corners, axes and center of every shape."""
+    steps = np.array([-2.0, -0.7, -0.5, -0.3, 0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.9, 2.0])
+    for origin in np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3):
+        t = nearest_hit(shape, origin[:, None], AXES)
+        assert not np.isnan(t).any() and (t > 0).all()
+        hit = np.isfinite(t)
+        if hit.any():
+            normal, uv = shape.surface(origin[:, None] + t[hit] * AXES[:, hit])
+            assert np.isfinite(normal).all() and np.isfinite(uv).all()
+
+
+@pytest.mark.stability
+def test_a_ray_does_not_meet_the_surface_it_starts_on():
+    for shape, at in ((Sphere(0.5), [0.5, 0, 0]), (Box((0.5, 0.3, 0.7)), [0.5, 0, 0])):
+        origin = np.array(at, dtype=float)[:, None]
+        assert np.isinf(nearest_hit(shape, origin, np.array([[1.0], [0.0], [0.0]])))[0]
+        across = nearest_hit(shape, origin, np.array([[-1.0], [0.0], [0.0]]))
+        assert across[0] == pytest.approx(1.0)
