@@ -72,7 +72,7 @@ class Camera:
         self.name = source.camera
         self.fps = source.fps
         self.source = source
-        self.codec = source.codec or config.codec
+        self.codec = source.recorded_codec or config.codec
         # A camera that waits for a device or an arm must not keep others waiting.
         arm = getattr(config, "arm", None)
         self.waits = config.waits or (arm is not None and source.camera in arm.cameras)
@@ -163,7 +163,7 @@ class Camera:
         return depth
 
     def _encode_depth(self, content: int, shot: Shot) -> EncodedDepth | None:
-        if self.source.codec is not None:
+        if self.source.recorded_codec is not None:
             return self.source.encoded_depth(content)
         wanted = content * DEPTH_STEP % 2**32 * self._depth_every < 2**32
         measured = self.source.depth(content, shot) if wanted else None

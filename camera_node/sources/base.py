@@ -67,7 +67,7 @@ class Source(ABC):
     contents: number of different shots before they repeat; None if they never repeat.
     repeats_after: number of ticks after which the scene and the camera's path repeat, errors of sensors apart; None if
         they do not, or it is not known.
-    codec: of images that are sent as they were recorded, with their depth; None: the scenario's.
+    recorded_codec: of images that are sent as they were recorded, with their depth; None: they have the scenario's.
     timed: its shots were taken at known times, so that a tracker gave their poses; False for photos, whose poses were
         computed from them.
 
@@ -81,7 +81,7 @@ class Source(ABC):
     intrinsics: Pinhole
     contents: int | None = None
     repeats_after: int | None = None
-    codec: str | None = None
+    recorded_codec: str | None = None
     timed: bool = True
     phase_ns: int = 0
     Config: ClassVar[Any] = None
@@ -116,7 +116,8 @@ class Source(ABC):
         return shot.depth
 
     def encoded_depth(self, content: int) -> EncodedDepth | None:
-        """The depth that came with shot ``content``, as it came, of a source with a ``codec``. ValueError: damaged."""
+        """The depth that came with shot ``content``, as it came, where images have a ``recorded_codec``. Raises
+        ValueError for damaged depth."""
         return None
 
     def prepare(self, stopped: Callable[[], bool]) -> None:  # noqa: B027

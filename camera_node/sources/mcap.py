@@ -40,7 +40,7 @@ class ReplaySource(Source):
     def __init__(self, camera: str, session: Session, frames: Sequence[SessionFrame], times_ns: Sequence[int]) -> None:
         self.camera = camera
         self.contents = len(frames)
-        self.codec = CODEC_NAMES[frames[0].header.codec]
+        self.recorded_codec = CODEC_NAMES[frames[0].header.codec]
         self.intrinsics: Pinhole = pose_and_lens(frames[0].header)[1]
         usual_ns = float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 1e9
         self.fps = Fraction(1e9 / usual_ns).limit_denominator(1001)
