@@ -6,7 +6,8 @@
 
 cosmic-ray makes the edits (operators, comparisons, numbers, conditions, loops); this draws a sample of them, spread
 over the rooms by lines, and runs for each the tests beside the file: those of the same name, then the others of their
-folder. Slow tests are left out. Each edit is written into a copy of the checkout, where nothing else is changed.
+folder, then those of the folder above, which speak for all below it. Slow tests are left out. Each edit is written into
+a copy of the checkout, where nothing else is changed.
 
 (cosmic-ray by itself runs one command for every edit of a file, in the checkout; mutmut imports everything through
 trampolines, which numba cannot compile.)
@@ -167,15 +168,19 @@ def _shares(lines: dict[str, int], count: int) -> dict[str, int]:
 
 def nearest_tests(file: str) -> list[list[str]]:
     """Tests to run in turn: those of the file's name, then the others of their folder, or of the first folder above
-    that has any."""
+    that has any, then those of the folder above it within the package."""
     source = next(folder for folder in SOURCES if file.startswith(f"{folder}/"))
     path = Path(file)
-    folder = ROOT / SOURCES[source] / path.parent.relative_to(source)
+    package = ROOT / SOURCES[source]
+    folder = package / path.parent.relative_to(source)
     while not list(folder.glob("test_*.py")):
         folder = folder.parent
-    every = sorted(str(test.relative_to(ROOT)) for test in folder.glob("test_*.py"))
+    every, above = (
+        sorted(str(test.relative_to(ROOT)) for test in of.glob("test_*.py")) for of in (folder, folder.parent)
+    )
     same = [test for test in every if Path(test).stem.startswith(f"test_{path.stem}")]
-    return [tests for tests in (same, [test for test in every if test not in same]) if tests]
+    others = [test for test in every if test not in same]
+    return [tests for tests in (same, others, above if folder != package else []) if tests]
 
 
 def passes(copy: Path, tests: Sequence[str], limit_s: float) -> bool:

@@ -41,8 +41,8 @@ def test_budgets_as_people_type_them():
 @pytest.mark.parametrize("alpha", [False, True])
 def test_candidates_of_a_recording_are_its_training_views_and_transparent_ones_stand_before_white(tmp_path, alpha):
     write_photos(tmp_path / "set", 9, alpha=alpha)
-    (tmp_path / "own.yaml").write_text("source: {kind: transforms, data: set}\ncameras: {count: 2}\n")
-    stage = open_stage(str(tmp_path / "own.yaml"), data=tmp_path, scale=2.0)
+    (tmp_path / "own.yaml").write_text("source: {kind: transforms, data: set, scale: 2}\ncameras: {count: 2}\n")
+    stage = open_stage(str(tmp_path / "own.yaml"), data=tmp_path)
     assert (len(stage.candidates), len(stage.held_out)) == (7, 2)
     view = stage.take(3)
     assert view is stage.recorded[3] and view.image.shape == (16, 16, 4 if alpha else 3)
