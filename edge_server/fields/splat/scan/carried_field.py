@@ -16,21 +16,20 @@ from numpy.typing import NDArray
 
 from edge_server.fields import SEPARATOR, View
 from edge_server.fields.common.camera_rows import camera_rows
-from edge_server.fields.common.cameras.pose_corrections import normal_matrix
 from edge_server.fields.common.kernels.camera import CAMERA
 from edge_server.fields.common.supervision import CameraMemory, check_view
 from edge_server.fields.common.view_store import Arrays
 from edge_server.fields.splat.densification import opacity
 from edge_server.fields.splat.kernels.rasterize import EXPOSURE, Targets
 from edge_server.fields.splat.scan import settings as tuned
-from edge_server.fields.splat.scan.discs import filled, usable_depth
+from edge_server.fields.splat.scan.discs import usable_depth
 from edge_server.fields.splat.scan.plausibility import moved_in, troubles
-from edge_server.fields.splat.scan.scan_field import ScanField, Shown
+from edge_server.fields.splat.scan.scan_field import ScanField, Shown, aim_of
 from edge_server.fields.splat.scan.sweep import sweep_depth
 from edge_server.fields.splat.scan.tracking import Alignment, Rendered, align, gray
 
-# What a field that begins anew still knows of its cameras and their frames.
-_OF_CAMERAS = ("_pixels", "_taken", "_blind", "_bare", "_seen", "_left_out", "_in_a_row", "_moving", "_depths")
+# What a field that begins anew, which no depth was measured for, still knows of its cameras and their frames.
+_OF_CAMERAS = ("_pixels", "_taken", "_blind", "_bare", "_seen", "_seen_m", "_left_out", "_in_a_row")
 
 
 class CarriedField(ScanField):
@@ -249,8 +248,10 @@ class CarriedField(ScanField):
 
     def _begin_anew(self) -> None:
         """Find the box and the first Gaussians from all keyframes so far: without depth, the first few say little, and
-        a field that was fitted to them is not mended by later ones."""
-        views, kept = self._views, {name: getattr(self, name) for name in _OF_CAMERAS}
+        a field that was fitted to them is not mended by later ones. The depth that is found also serves the box and the
+        poses: steps that take the scene for farther than it is overshoot."""
+        swept = {view.camera: view for view in self._swept()}
+        views, kept = [swept.get(v.camera, v) for v in self._views], {name: getattr(self, name) for name in _OF_CAMERAS}
         due = self._due_before + self.step // tuned.STEPS_A_KEYFRAME
         self._begin(views)
         for name, value in kept.items():
@@ -259,7 +260,10 @@ class CarriedField(ScanField):
         for view in views:
             self._follow(view)
             self._append(view, self._aim(view, None))
-        self._seed()
+        if swept:
+            self._seed_on(list(swept.values()), nearer=False)
+        else:
+            self._seed()
 
     def _append(self, view: View, aim: tuple[NDArray[np.float64], float]) -> None:
         """Learn from a view from now on. Its depth has served."""
@@ -277,13 +281,9 @@ class CarriedField(ScanField):
 
     def _aim(self, view: View, shown: Shown | None) -> tuple[NDArray[np.float64], float]:
         """What ``PoseCorrections.descend`` needs of a view."""
-        depth, box = view.depth, self.view_store.box
-        assert box is not None
-        if depth is None and shown is not None:
-            depth = np.where(shown.opacity >= tuned.COVERED, shown.depth, np.float32(0.0))
-        depth = np.zeros(view.image.shape[:2], np.float32) if depth is None else filled(depth)
-        depth = depth if depth.min() > 0 else np.full_like(depth, box.distance_m)
-        return normal_matrix(view, depth), float(np.median(depth)) / view.intrinsics.fx
+        if view.depth is None and shown is not None:
+            view = replace(view, depth=np.where(shown.opacity >= tuned.COVERED, shown.depth, np.float32(0.0)))
+        return aim_of(view, self._distance_m())
 
     def _expose(self, view: View, shown: Shown) -> None:
         """Find the exposure of a view at its first rendering, from pixels that look as expected."""

@@ -33,15 +33,9 @@ class Exposures:
         """Gains and biases (2, 3) between those of others. neighbors: the others and their weights."""
         if not neighbors:
             return _NEUTRAL
-        parts = [(share, self.of(name)) for name, share in neighbors.items()]
-        logs, biases = (
-            sum(share * part for share, part in each)
-            for each in (
-                [(share, np.log(known[0])) for share, known in parts],
-                [(share, known[1]) for share, known in parts],
-            )
-        )
-        return np.stack([np.exp(logs), biases])
+        parts = [(share, *self.of(name)) for name, share in neighbors.items()]
+        logs = sum(share * np.log(gain) for share, gain, _ in parts)
+        return np.stack([np.exp(logs), sum(share * bias for share, _, bias in parts)])
 
     def row(self, camera: str) -> NDArray[np.float32]:
         """A row of ``Targets.exposure``. An error counts as it does in the image."""

@@ -113,7 +113,7 @@ class ScanField(StillField):
             return
         assert self.view_store.box is not None
         seen_m = self._seen_m or self.view_store.box.distance_m
-        self._aims = [_aim(v, seen_m) for v in views]
+        self._aims = [aim_of(v, seen_m) for v in views]
         self._index = {v.camera: k for k, v in enumerate(views)}
         rows = [self._exposures.row(v.camera) for v in views]
         self._targets = self._targets._replace(exposure=np.stack(rows))
@@ -159,22 +159,25 @@ class ScanField(StillField):
         views = _some(measured, tuned.SEED_VIEWS) or self._swept()
         if not views:
             return super()._seed()
+        self._seed_on(views, nearer=bool(measured))
+
+    def _seed_on(self, views: Sequence[View], nearer: bool) -> None:
+        """Replace the Gaussians by seeds on the depth of ``views``. nearer: see ``_seeds_of``."""
         self.cloud = GaussianCloud.empty(self.settings)
         for view in views:
-            self._add(self._seeds_of(view, nearer=bool(measured)))
+            self._add(self._seeds_of(view, nearer=nearer))
 
     def _swept(self) -> list[View]:
         """Views with depth that others tell, see ``sweep_depth``: none where poses tell nothing. Also learns how far
-        away is what cameras see."""
-        box = self.view_store.box
+        away is what cameras see. Poses are those given: a field without good depth refines them to fit its errors."""
+        box, views = self.view_store.box, self._views
         assert box is not None
-        posed = [replace(view, camera_to_world=self._pose_of(view)) for view in self._views]
-        some = _some(range(len(posed)), tuned.SWEPT_VIEWS)
-        depths = [usable_depth(sweep_depth(posed[k], posed, box.distance_m, self.pool)) for k in some]
-        found = {k: depth for k, depth in zip(some, depths) if depth is not None}
+        some = _some(views, tuned.SWEPT_VIEWS)
+        depths = [usable_depth(sweep_depth(view, views, box.distance_m, self.pool)) for view in some]
+        found = [(view, depth) for view, depth in zip(some, depths) if depth is not None]
         if found:
-            self._seen_m = float(np.median([np.median(depth[depth > 0]) for depth in found.values()]))
-        return [replace(self._views[k], depth=depth) for k, depth in found.items()]
+            self._seen_m = float(np.median([np.median(depth[depth > 0]) for _, depth in found]))
+        return [replace(view, depth=depth) for view, depth in found]
 
     def _seeds_of(self, view: View, shown: Shown | None = None, nearer: bool = True) -> NDArray[np.float32]:
         """Gaussians where the field shows no surface.
@@ -269,13 +272,13 @@ def _some(items: Sequence[T], most: int) -> list[T]:
     return [items[k] for k in np.unique(np.linspace(0, len(items) - 1, most).astype(int))] if items else []
 
 
-def _aim(view: View, seen_m: float) -> tuple[NDArray[np.float64], float]:
+def aim_of(view: View, seen_m: float) -> tuple[NDArray[np.float64], float]:
     """What ``PoseCorrections.descend`` needs of a view: the normal matrix, and the shift of a pixel in meters.
 
-    seen_m: depth, where none is measured."""
-    depth = np.full(view.image.shape[:2], seen_m, np.float32)
-    if view.depth is not None:
-        depth = filled(view.depth)
+    seen_m: depth, where none is known."""
+    depth = None if view.depth is None else filled(view.depth)
+    if depth is None or not depth.min() > 0:
+        depth = np.full(view.image.shape[:2], seen_m, np.float32)
     return normal_matrix(view, depth), float(np.median(depth)) / view.intrinsics.fx
 
 
