@@ -16,15 +16,12 @@ from typing import Any, TypeVar
 import cv2
 
 from edge_server.experiments.engine.content_key import plain, result_key, surroundings
+from edge_server.experiments.engine.settings import BATCH, PARENT_EVERY_S, RETRIES
 from edge_server.fields.common.threads.thread_pool import MOST_USEFUL, THREADS_VARIABLE
 from freshfield.files import Lines
 from freshfield.machine_load import usable_cores
 
 Input = TypeVar("Input")
-# Inputs of one group in a task: enough to share images, few enough that Ctrl-C loses little work.
-_BATCH = 6
-_RETRIES = 3  # of a task whose worker or machine died; one that ends every worker it gets is not tried for ever
-_PARENT_EVERY_S = 0.5
 
 
 class EngineError(RuntimeError):
@@ -97,7 +94,7 @@ class Engine:
         *,
         files: Callable[[Input], Iterable[Path | None]] | None = None,
         group: Callable[[Input], Hashable] | None = None,
-        batch: int = _BATCH,
+        batch: int = BATCH,
     ) -> list[Any]:
         """The result of ``work`` for each of ``inputs``, in their order; known ones are not computed again.
 
@@ -196,7 +193,7 @@ def _on_ray(
 
     remote = ray.remote(_compute_on_ray).options(
         num_cpus=threads or 1,
-        max_retries=_RETRIES,
+        max_retries=RETRIES,
         runtime_env={"env_vars": {THREADS_VARIABLE: str(threads or 1)}},  # read when kernels are imported
     )
     shared = ray.put(work)  # may hold a policy's weights
@@ -207,7 +204,7 @@ def _on_ray(
             number, results = ray.get(ended)
             yield tasks[number], results
     except (ray.exceptions.WorkerCrashedError, ray.exceptions.NodeDiedError, ray.exceptions.OutOfMemoryError) as error:
-        raise EngineError(f"--ray: a task ended its worker {_RETRIES + 1} times: {error}") from None
+        raise EngineError(f"--ray: a task ended its worker {RETRIES + 1} times: {error}") from None
     finally:
         for left in waiting:
             ray.cancel(left, force=True)
@@ -257,7 +254,7 @@ def _init_worker(threads: int, exact: bool) -> None:
 
 def _end_with(parent: int) -> None:
     while os.getppid() == parent:
-        time.sleep(_PARENT_EVERY_S)
+        time.sleep(PARENT_EVERY_S)
     os._exit(1)  # at once: nobody waits for half a result
 
 

@@ -1,8 +1,9 @@
 """What one visitor is sent, and when: never more than their link takes.
 
 The window of bytes under way follows delay, as in LEDBAT (RFC 6817): a link whose round trip grows beyond its
-shortest is full. What does not fit is left out in this order: small Gaussians, static sets that changed little,
-moving sets; knots, which move what is there already, come last.
+shortest is full. A link whose delays scatter by themselves is sent few large messages, and is full where those take
+much longer than small ones that are sent alone. What does not fit is left out in this order: small Gaussians, static
+sets that changed little, moving sets; knots, which move what is there already, come last.
 """
 
 from __future__ import annotations
@@ -44,9 +45,11 @@ class LinkWindow:
         self.rate_bytes_per_s = 0.0
         self._sent: deque[tuple[int, int, float]] = deque()  # number, bytes, when
         self._round_trips: deque[tuple[float, float]] = deque()  # when, seconds
-        self._last_trips_s: deque[float] = deque(maxlen=tuned.JITTER_OF - 1)
+        self._last_trips_s: deque[float] = deque(maxlen=tuned.JITTER_OF)
+        self._probe_trips_s: deque[float] = deque(maxlen=tuned.PROBES_KEPT)
+        self._probe = -1  # number of the newest probe: a small message on an empty link
+        self._since_probe, self._probed_s = 0, -np.inf  # messages since then; when it was sent
         self._backed_off_s = -np.inf
-        self._drained_s = np.inf
         self._since_s, self._acknowledged = 0.0, 0
 
     @property
@@ -57,13 +60,19 @@ class LinkWindow:
     @property
     def room(self) -> int:
         """Bytes that may be sent now."""
-        return max(int(self.window) - self.under_way, 0)
+        free = max(int(self.window) - self.under_way, 0)
+        if not self.scatters:
+            return free
+        return min(free, max(int(self.window) // tuned.SCATTERING_UNDER_WAY, tuned.LEAST_WINDOW))
 
     def sent(self, number: int, size: int, now_s: float) -> None:
         """Note a message of so many bytes."""
         if not self._sent and not self._acknowledged:
             self._since_s = now_s
-        self._drained_s = min(self._drained_s, now_s)
+        if self.probes(now_s):
+            self._probe, self._probed_s, self._since_probe = number, now_s, 0
+        else:
+            self._since_probe += 1
         self._sent.append((number, size, now_s))
         self.under_way += size
 
@@ -82,15 +91,48 @@ class LinkWindow:
         while self._round_trips and self._round_trips[0][0] < now_s - tuned.FORGET_RTT_S:
             self._round_trips.popleft()
         self._round_trips.append((now_s, round_trip_s))
-        # The least of the last few: a single late message says that the link jitters, not that it is full.
-        late_s = min([*self._last_trips_s, round_trip_s]) - self.round_trip_s
         self._last_trips_s.append(round_trip_s)
+        if number == self._probe:
+            self._probe_trips_s.append(round_trip_s)
+        self._fit_window(size, round_trip_s, now_s)
+
+    def _fit_window(self, size: int, round_trip_s: float, now_s: float) -> None:
+        """Fit the window to the newest round trips, of which the last brought an acknowledgement of ``size`` bytes."""
+        if self.scatters:
+            # In small steps either way, so that what counts is their mean over many messages.
+            below = max(1.0 - (round_trip_s - self.round_trip_s) / self._full_s, -1.0)
+            if below < 0.0 or self.short:
+                window = self.window + tuned.SCATTERING_GAIN * below * size
+                self.window = min(max(window, tuned.LEAST_WINDOW), tuned.MOST_WINDOW)
+            return
+        # The least of the last few: a single late message says that the link jitters, not that it is full.
+        late_s = (round_trip_s if self.few else min(self._last_trips_s)) - self.round_trip_s
         if late_s > tuned.QUEUE_S:
             if now_s - self._backed_off_s > round_trip_s:
                 self._backed_off_s = now_s
                 self.window = max(self.window * tuned.BACK_OFF, tuned.LEAST_WINDOW)
         elif self.short:  # a window that suffices says nothing of the link
             self.window = min(self.window + size, tuned.MOST_WINDOW)
+
+    @property
+    def scatter_s(self) -> float:
+        """By how much a small message alone takes longer than the shortest round trip, on average."""
+        return float(np.mean(self._probe_trips_s)) - self.round_trip_s if self._probe_trips_s else 0.0
+
+    @property
+    def scatters(self) -> bool:
+        """Whether round trips scatter without a queue."""
+        return len(self._probe_trips_s) >= tuned.FIRST_PROBES and self.scatter_s > tuned.QUEUE_S
+
+    @property
+    def few(self) -> bool:
+        """Whether few large messages are sent: round trips scatter, or nothing tells yet whether they do."""
+        return len(self._probe_trips_s) < tuned.FIRST_PROBES or self.scatters
+
+    @property
+    def _full_s(self) -> float:
+        """Lateness from which the link counts as full."""
+        return tuned.QUEUE_S + (tuned.FULL_OF_SCATTER * self.scatter_s if self.scatters else 0.0)
 
     def _count(self, size: int, now_s: float) -> None:
         self._acknowledged += size
@@ -101,13 +143,29 @@ class LinkWindow:
     @property
     def bound_bytes_per_s(self) -> float:
         """What the window lets through: its bytes in a round trip that is as long as a full link's."""
-        return self.window / (self.round_trip_s + tuned.QUEUE_S if self._round_trips else 1.0)
+        return self.window / (self.round_trip_s + self._full_s if self._round_trips else 1.0)
 
-    def drains(self, now_s: float) -> bool:
-        """Whether to send nothing until all has arrived, so that the next round trip is measured without a queue."""
-        if self.under_way == 0:
-            self._drained_s = now_s
-        return now_s - self._drained_s > tuned.DRAIN_EVERY_S
+    @property
+    def lately_bytes_per_s(self) -> float:
+        """As ``bound_bytes_per_s``, and no more than in the longer of the last two round trips."""
+        longest_s = max([tuned.QUEUE_S, *self._last_trips_s])
+        return min(self.bound_bytes_per_s, self.window / longest_s)
+
+    def probes(self, now_s: float) -> bool:
+        """Whether the next message is to be a small one, whose round trip has no queue of ours in it."""
+        return self.under_way == 0 and self._probe_due(now_s)
+
+    def waits(self, now_s: float) -> bool:
+        """Whether to send nothing until what is under way has arrived."""
+        if not self._round_trips or not self._sent:
+            return False
+        most = tuned.SCATTERING_UNDER_WAY if self.scatters else 1
+        return self._probe_due(now_s) or (self.few and len(self._sent) >= most)
+
+    def _probe_due(self, now_s: float) -> bool:
+        if len(self._probe_trips_s) < tuned.FIRST_PROBES:
+            return self._since_probe >= 1
+        return self._since_probe >= tuned.PROBE_EVERY and now_s - self._probed_s > tuned.PROBE_EVERY_S
 
 
 class Visitor:
@@ -149,23 +207,24 @@ class Visitor:
         published: None while there is nothing to draw.
         present_s: the present, seconds since the run began. status: what all visitors are told; the link's is added.
         """
-        if self.link.room < tuned.LEAST_WINDOW // 4 or self.link.drains(now_s):
+        if self.link.room < tuned.LEAST_WINDOW // 4 or self.link.waits(now_s):
             self.link.short = True
             return None
-        room = self.link.room
+        probes = self.link.probes(now_s)
+        room = tuned.PROBE_BYTES if probes else self.link.room
         self.link.short = False
         blocks: list[bytes] = []
         if published is not None and published.scene.field != self._field:
             self._field = published.scene.field
             self._forget_static()
             blocks.append(write_block(published.scene))
-        told = now_s >= self._status_s + tuned.STATUS_EVERY_S
+        told = not probes and now_s >= self._status_s + tuned.STATUS_EVERY_S
         if told:
             blocks.append(write_block(StatusBlock(status | {"link": self._link(published)})))
         room -= sum(map(len, blocks))
         if published is not None:
             blocks += self._newest(published, room, now_s)
-        if not blocks:
+        if not blocks and not probes:
             return None
         if told:
             self._status_s = now_s
@@ -178,8 +237,9 @@ class Visitor:
         """Knots, moving set and static chunks, as far as there is room."""
         blocks = self._moving(published, room, now_s)
         room -= sum(map(len, blocks))
-        # No more than the link takes until the next: what a message takes itself is not to be taken for a queue.
-        room = min(room, max(round(tuned.TICK_S * self.link.bound_bytes_per_s), _LEAST_BYTES))
+        if not self.link.few:
+            # No more than the link takes until the next: what a message takes itself is not to be taken for a queue.
+            room = min(room, max(round(tuned.TICK_S * self.link.bound_bytes_per_s), _LEAST_BYTES))
         return blocks + self._static(published.static, room)
 
     def _moving(self, published: Published, room: int, now_s: float) -> list[bytes]:
@@ -200,7 +260,8 @@ class Visitor:
         if cut is not None:
             blocks.append(write_block(cut))
             takes_s = len(blocks[-1]) / (tuned.MOVING_SHARE * self.link.bound_bytes_per_s)
-            self._moving_s = now_s + max(tuned.MOVING_EVERY_S, takes_s)
+            # Each of few large messages has its share of moving Gaussians.
+            self._moving_s = now_s + (0.0 if self.link.few else max(tuned.MOVING_EVERY_S, takes_s))
             # A set that was cut is sent again when the link takes more, even if it stays the newest.
             self._whole = moving if len(cut.records) == len(moving.records) else None
         return blocks
@@ -215,13 +276,15 @@ class Visitor:
     def _link(self, published: Published | None) -> dict[str, Any]:
         return {
             "bytes_per_s": round(self.link.rate_bytes_per_s),
-            "round_trip_ms": round(1e3 * self.link.round_trip_s, 1),
+            "round_trip_ms": round(1e3 * (self.link.round_trip_s + self.link.scatter_s), 1),
+            "shortest_ms": round(1e3 * self.link.round_trip_s, 1),
             "static": [len(self._sent), 0 if published is None else len(published.static.records)],
         }
 
     def _cut(self, moving: MovingBlock, room: int) -> MovingBlock | None:
         """The moving set's largest Gaussians, as many as the link takes in time; None: not now."""
-        takes = tuned.MOVING_SHARE * self.link.bound_bytes_per_s * tuned.MOVING_EVERY_S
+        link = self.link
+        takes = tuned.MOVING_SHARE * (link.room if link.few else link.bound_bytes_per_s * tuned.MOVING_EVERY_S)
         count = min(len(moving.records), max(int(takes) // _MOVING_BYTES, tuned.LEAST_MOVING))
         if count * _MOVING_BYTES > room:
             self.link.short = True
@@ -261,7 +324,7 @@ class Visitor:
 
     def _takes(self) -> int:
         """Static Gaussians that the link takes in the time of a new set."""
-        return int(tuned.NEW_SET_S * self.link.bound_bytes_per_s) // RECORD.itemsize
+        return int(tuned.NEW_SET_S * self.link.lately_bytes_per_s) // RECORD.itemsize
 
     def _take(self, newest: StaticRecords, wider: bool) -> None:
         """Find what of the newest records is to be sent: chunks that have changed, those with most weight in what

@@ -35,7 +35,7 @@ function present() {
 
 /** Messages are late by what the link took; the one that was late least tells the clocks apart, up to half a round trip. */
 function keepTime(instant) {
-  const halfTrip = (reader.status.link?.round_trip_ms ?? 0) / 2000;
+  const halfTrip = (reader.status.link?.shortest_ms ?? 0) / 2000;
   const offset = instant + halfTrip - performance.now() / 1000;
   clockOffset = clockOffset === null || Math.abs(offset - clockOffset) > 5 ? offset : Math.max(offset, clockOffset - LIGHT_LAG_S);
 }
