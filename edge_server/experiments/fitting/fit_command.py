@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         type=Path,
         nargs="?",
         metavar="DATA",
-        help="data set (folder or file), scenario file, or synthetic scene",
+        help="data set (folder or file), scenario (file, or the name of a shipped one), or synthetic scene",
     )
     add("--format", choices=list(FORMATS), help="format of the data set [found from its files]")
     add("--field", metavar="NAME", help=f"representation: {', '.join(field_names())} [{FIELD}]")

@@ -22,6 +22,7 @@ from edge_server.fidelity.images import BLACK, Color
 from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import Field, View
+from freshfield.scenario import SCENARIO_FOLDER
 
 WHITE: Color = (1.0, 1.0, 1.0)
 _SCENE_SIZE = 128  # image width and height of a synthetic scene, before its scale
@@ -39,13 +40,13 @@ def synthetic_still(name: str, cameras: int = 19, size: int = 128, t_s: float = 
 def open_still(
     data: Path, holdout: str | None = None, scale: float = 1.0, frame: int = 0, format: str | None = None
 ) -> MultiviewStill:
-    """The views of a data set, of the carried camera of a scenario file, or of a synthetic scene by its name, unless a
-    file or folder has that name.
+    """The views of a data set, of the carried camera of a scenario (its file, or the name of a shipped one), or of a
+    synthetic scene by its name. A file or folder hides a scene or shipped scenario of its name.
 
     The arguments are those of ``load_recorded``. Raises DatasetError; OptionError for an argument that a scenario, or
     a synthetic scene, whose held-out camera is given, cannot have.
     """
-    if data.suffix in SUFFIXES:
+    if _is_scenario(data):
         if scale != 1.0 or frame or format is not None:
             raise OptionError(f"--scale, --frame and --format are for data sets: {data} says its scale and its kind")
         return load_captures(data, holdout)
@@ -61,13 +62,18 @@ def open_still(
 
 def data_name(data: Path) -> str:
     """The name of a scene or data set in folders and reports."""
-    if data.suffix in SUFFIXES:
+    if _is_scenario(data):
         return data.stem
     return str(data) if _is_scene(data) else (data if data.is_dir() else data.parent).resolve().name
 
 
 def _is_scene(data: Path) -> bool:
     return str(data) in SCENES and not data.exists()
+
+
+def _is_scenario(data: Path) -> bool:
+    shipped = str(data) not in SCENES and not data.exists() and (SCENARIO_FOLDER / f"{data}.yaml").is_file()
+    return data.suffix in SUFFIXES or shipped
 
 
 def mean_baselines(training: Sequence[View], held_out: Sequence[View], color: Color = BLACK) -> dict[str, float | None]:

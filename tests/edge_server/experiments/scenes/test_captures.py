@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import yaml
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.arguments import OptionError
-from edge_server.experiments.scenes.multiview_still import open_still
+from edge_server.experiments.scenes.multiview_still import data_name, open_still
 from tests.edge_server.experiments.sets import write_photos
 
 FRAMES = 20
@@ -76,3 +78,9 @@ def test_what_cannot_be_used_is_said_and_costs_nothing_else(tmp_path):
         open_still(_scenario(tmp_path, kind="world", scene="room"))
     with pytest.raises(DatasetError, match=r"mine\.yaml"):
         open_still(_scenario(tmp_path, kind="video", data="none.mp4"))
+
+
+def test_a_shipped_scenario_is_found_by_its_name_and_hides_no_scene():
+    assert data_name(Path("redkitchen")) == "redkitchen" and data_name(Path("room")) == "room"
+    with pytest.raises(OptionError, match="are for data sets: redkitchen says its scale"):
+        open_still(Path("redkitchen"), scale=2.0)
