@@ -147,7 +147,7 @@ def _open(args: argparse.Namespace) -> tuple[Scenario, list[Camera]]:
 
 
 def _recording(path: Path, names: str, seed: int | None) -> Scenario:
-    """The scenario that plays a recording or data set. names: as for --as. Raises UsageError or ScenarioError."""
+    """The scenario that plays a recording or data set. names: as for --as. Raises UsageError."""
     from camera_node.sources.datasets.formats import find_format
     from camera_node.sources.datasets.records import DatasetError
 
@@ -158,7 +158,10 @@ def _recording(path: Path, names: str, seed: int | None) -> Scenario:
         raise UsageError(str(error)) from None
     assignment = {camera: name for camera, _, name in pairs if name}
     source = {"kind": kind, "data": str(path.resolve()), "assignment": assignment}
-    return parse({"cameras": {"ids": [camera for camera, *_ in pairs]}, "source": source}, path, seed)
+    try:
+        return parse({"cameras": {"ids": [camera for camera, *_ in pairs]}, "source": source}, path, seed)
+    except ScenarioError as error:
+        raise UsageError(f"--as {names}: {error}") from None
 
 
 def _devices(_: argparse.Namespace) -> int:
