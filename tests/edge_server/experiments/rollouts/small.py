@@ -8,6 +8,7 @@ from typing import Any
 
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.rollouts.setting import Setting
+from edge_server.experiments.training.evaluation import Candidate
 from freshfield.scenario import Scenario, parse
 from tests.support import small_world
 
@@ -48,3 +49,8 @@ def reported(**more: Any) -> Setting:
     """The same with cam04 to report."""
     apart = scenario(cameras={"count": 5, "held_out": ["cam00", "cam04"]})
     return dataclasses.replace(setting(**more), scenario=apart, report=("cam04",))
+
+
+def thresholds(*omegas_ms: float) -> list[Candidate]:
+    """Policies that leave out views older than each of ``omegas_ms``."""
+    return [Candidate({"policy": "threshold", "value": ms}, f"threshold:{ms:g}") for ms in omegas_ms]

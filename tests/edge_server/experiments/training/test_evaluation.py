@@ -14,7 +14,7 @@ from edge_server.experiments.training.evaluation import Candidate, Evaluation, e
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.settings import Spec
-from tests.edge_server.experiments.rollouts.small import NOTHING, reported
+from tests.edge_server.experiments.rollouts.small import NOTHING, reported, thresholds
 
 OMEGAS = (20, 40, 60, 80, 100, 120, 150, 200, 300, 500)
 BY_PSNR = Reward("psnr", psnr=1.0, ssim=0.0, distance=0.0)
@@ -98,7 +98,7 @@ def test_the_best_fixed_value_is_chosen_on_seeds_that_it_is_not_measured_on():
 
 
 def test_every_fit_is_scored_once_by_all_held_out_cameras(tmp_path):
-    candidates = [*fixed_candidates(["threshold"], ("random", "all"), {"threshold": (40.0, 120.0)})]
+    candidates = [*fixed_candidates([]), *thresholds(40.0, 120.0)]
     candidates.append(Candidate({"policy": "learned"}, Learner(Spec("select"), 0).actor))
     engine = Engine(tmp_path / "known.jsonl", threads=1, say=lambda line: None)
     found = evaluate(reported(), NOTHING, engine, seeds(0, "test", 3), candidates)

@@ -24,7 +24,7 @@ from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
-from tests.edge_server.experiments.rollouts.small import NOTHING, RAW, scenario, setting
+from tests.edge_server.experiments.rollouts.small import NOTHING, RAW, scenario, setting, thresholds
 
 REWARD = make_reward("set", distance=0.0)
 CONFIG = TrainingConfig(Spec("select", StateLayout(("age", "pose")), hidden=16), REWARD, episodes=6, batch=2)
@@ -86,7 +86,8 @@ def test_it_learns_to_use_fresh_views_where_only_age_counts(tmp_path: Path):
     config = TrainingConfig(spec, Reward("age", 0.0, 0.0, 0.0, age=-0.01), episodes=60, batch=6)
     learner = trained(tmp_path, setting(steps=1), config)
     candidates = [
-        *fixed_candidates(["threshold"], ("random",), {"threshold": omegas}),
+        *fixed_candidates([], ("random",)),
+        *thresholds(*omegas),
         Candidate({"policy": "learned"}, learner.actor),
     ]
     engine = Engine(threads=1, say=quiet)
@@ -207,7 +208,7 @@ def test_where_nothing_ever_arrives_training_says_so_instead_of_learning_nothing
     with pytest.raises(TrainingError, match="nothing had arrived"):
         weights_after(silent, config(spec), tmp_path)
     assert not (tmp_path / "policy.npz").exists()
-    candidates = fixed_candidates(["threshold"], ("random",), {"threshold": (50.0,)})
+    candidates = [*fixed_candidates([], ("random",)), *thresholds(50.0)]
     found = evaluate(silent, NOTHING, Engine(threads=1, say=lambda line: None), seeds(0, "test", 2), candidates)
     assert all(row["reward"] is None for row in found.rows(REWARD, ["cam00"]))
 
