@@ -56,6 +56,10 @@ class AffectedSource(Source):
     def content(self, tick: int) -> int:
         return tick if self._each_differs else self._source.content(tick)
 
+    @property
+    def poses_refused(self) -> int:
+        return self._source.poses_refused
+
     def read(self, content: int) -> Shot:
         shot = self._source.read(self._source.content(content) if self._each_differs else content)
         t_s = float(content / self.fps)

@@ -136,8 +136,9 @@ class Launcher:
         load, next_line_s, next_sample_s = LoadMeter(), 0.0, 0.0
         while not self._stop_requested.wait(TICK_S):
             now_s = time.monotonic()
+            # A short recording may be over while kernels are compiled, before the first update.
             node = self.processes.node.process
-            if self._ready_s is not None and node is not None and node.poll() == 0:
+            if self.processes.emulator.process is not None and node is not None and node.poll() == 0:
                 self._say("the recording is over")
                 return
             if not self._check_alive():

@@ -38,8 +38,8 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
     """PSNR (whole image, moving pixels, both baselines), SSIM and LPIPS at every publication; of held-out cameras that
     move, PSNR and SSIM of the newest frame and of all so far."""
     series, found = report["fidelity"]["series"], report["fidelity"]
-    if found["so_far"] is not None:
-        return _draw_so_far(report, files, path)
+    if found["so_far"] is not None and _draw_so_far(report, files, path):
+        return True  # runs of earlier versions kept no such rows
     if not _points(series, "psnr_db")[0]:
         return False
     scored = any(_points(series, name)[0] for name in ("ssim", "lpips"))

@@ -72,7 +72,8 @@ def _is_scene(data: Path) -> bool:
 
 
 def _is_scenario(data: Path) -> bool:
-    shipped = str(data) not in SCENES and not data.exists() and (SCENARIO_FOLDER / f"{data}.yaml").is_file()
+    named = data.name == str(data) and data.name not in SCENES and not data.exists()
+    shipped = named and (SCENARIO_FOLDER / f"{data}.yaml").is_file()
     return data.suffix in SUFFIXES or shipped
 
 

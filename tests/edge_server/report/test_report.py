@@ -237,10 +237,11 @@ def test_a_held_out_camera_that_moves_is_drawn_and_tabled_at_refined_poses(tmp_p
     so_far = {"now_psnr_db": 23.5, "all_psnr_db": 24.7, "now_ssim": 0.79, "all_ssim": 0.8125, "frames": 9}
     edit_edge(tmp_path, so_far={**so_far, "refined": True})
     lines = [json.loads(line) for line in (tmp_path / "shown.jsonl").read_text().splitlines()]
-    assert not draw_fidelity(page_of(tmp_path)[0], read_run_files(tmp_path), tmp_path / "figure.png")
+    assert draw_fidelity(page_of(tmp_path)[0], read_run_files(tmp_path), tmp_path / "of an earlier version.png")
     (tmp_path / "shown.jsonl").write_text("".join(json.dumps({**line, "so_far": so_far}) + "\n" for line in lines))
     report, page = page_of(tmp_path)
     assert draw_fidelity(report, read_run_files(tmp_path), tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").read_bytes() != (tmp_path / "of an earlier version.png").read_bytes()
     text = re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", page))
     for words in (
         "0.812 SSIM of the same",

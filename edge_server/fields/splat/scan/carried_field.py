@@ -247,9 +247,9 @@ class CarriedField(ScanField):
         return (*left_out, *moving, *poses)
 
     def _begin_anew(self) -> None:
-        """Find the box and the first Gaussians from all keyframes so far: without depth, the first few say little, and
-        a field that was fitted to them is not mended by later ones. The depth that is found also serves the box and the
-        poses: steps that take the scene for farther than it is overshoot."""
+        """Find the first Gaussians from all keyframes so far: without depth, the first few say little, and a field that
+        was fitted to them is not mended by later ones. The depth that is found also serves the box and the poses: steps
+        that take the scene for farther than it is overshoot. Where none is found, the box stays."""
         swept = {view.camera: view for view in self._swept()}
         views, kept = [swept.get(v.camera, v) for v in self._views], {name: getattr(self, name) for name in _OF_CAMERAS}
         due = self._due_before + self.step // tuned.STEPS_A_KEYFRAME
@@ -263,6 +263,7 @@ class CarriedField(ScanField):
         if swept:
             self._seed_on(list(swept.values()), nearer=False)
         else:
+            self._seen_m = 0.0  # what an earlier start found says nothing of this one's guesses
             self._seed()
 
     def _append(self, view: View, aim: tuple[NDArray[np.float64], float]) -> None:

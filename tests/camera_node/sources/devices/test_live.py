@@ -17,6 +17,8 @@ from camera_node.settings import CameraConfig, source_config
 from camera_node.sources.devices import opencv as opencv_camera
 from camera_node.sources.devices.feed import CameraError, select_device
 from camera_node.sources.devices.live import LiveSource, open_live
+from camera_node.sources.with_effects import AffectedSource
+from camera_node.synthetic.effects import NO_EFFECTS
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.geometry import Pinhole, Pose
@@ -110,6 +112,7 @@ def test_a_tracker_gives_the_poses_of_a_camera_that_moves(tmp_path, network_came
     shot = read(camera := opened(scenario(tmp_path, network_camera.address, trajectory=trajectory)))
     assert shot.pose.translation_m == pytest.approx((1.0, 2.0, 3.5)) and shot.pose_gap_ns < WITHIN_S * 1e9
     assert camera.source.poses_refused == 1
+    assert AffectedSource(camera.source, NO_EFFECTS, "jpeg").poses_refused == 1
     camera.source.close()
     with pytest.raises(ScenarioError, match=r"trajectory\.start_s: is for recordings"):
         opened(scenario(tmp_path, network_camera.address, trajectory={**trajectory, "start_s": 1.0}))
