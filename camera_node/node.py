@@ -151,7 +151,8 @@ class Node:
 
     async def _capture_all(self) -> None:
         self._enter("preparing")
-        log.info("preparing frames; a synthetic world is rendered first, once")
+        world = self._scenario.source.get("kind") == "world"
+        log.info("preparing frames%s", "; a synthetic world is rendered first, once" if world else "")
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._pool, prepare, self._cameras, self._stopping.is_set)
         if any(camera.schedule(0).lossless for camera in self._cameras):

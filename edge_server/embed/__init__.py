@@ -35,7 +35,7 @@ class EmbeddingConfig(Settings, frozen=True):
     """The section ``edge.embedding`` of a scenario."""
 
     model: Annotated[str, about("a YOLO detection ONNX, relative to the scenario, or default")] = DEFAULT
-    dim: Annotated[int, within(1, 4096, "length of an embedding, at most the channels of the tapped layer")] = 32
+    dim: Annotated[int, within(1, 4096, "length of an embedding, at most the channels at the backbone's end")] = 32
 
 
 def read_embedding(mapping: Mapping[str, Any], scenario: Path) -> EmbeddingConfig:

@@ -279,7 +279,7 @@ def fit(
 
     data: from ``load``, or a path as ``load`` takes it.
     seconds: of fitting; evaluation is not counted. holdout: as of ``load``, where data is a path.
-    field: name of the representation (``freshfield scenario keys edge``). options: of it, by name.
+    field: name of the representation (``freshfield scenario keys edge NAME``). options: of it, by name.
     progress: called with each evaluation: ``t_s``, ``psnr_db``, ``ssim``, ...
     Raises DatasetError or OptionError, and KeyboardInterrupt at Ctrl-C; ``Fit.run`` keeps what was fitted until then.
     """

@@ -76,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="option of the field, e.g. levels=12 (freshfield scenario keys edge); may be repeated",
+        help="option of the field, e.g. levels=12 (freshfield scenario keys edge NAME); may be repeated",
     )
     add_lpips(parser)
     add("--out", type=out_folder, metavar="DIR", help="folder to write [runs/fit-DATA]")

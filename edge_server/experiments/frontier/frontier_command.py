@@ -160,7 +160,7 @@ def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
 
 @dataclass
 class Frontier:
-    """A run of the command: measures the missing points, then writes tables, CSV and figures.
+    """A run of the command: measures the missing points, then writes tables and figures.
 
     engine: measures times, one after another in this process. workers: runs in virtual time, from ``--jobs`` and
         ``--ray``; with the same file of results.
