@@ -37,6 +37,7 @@ REFUSED = {
     ],
     "simulate": [
         ("SMALL --compute x", "--compute x"),
+        ("SMALL --policy hope", "policy 'hope' is not known"),
         ("SMALL --policy threshold:soon", "'soon' is not a number"),
         ("SMALL --policy wait:1e308", "omega_ms: expected 0 to 3600000, got 1e+308"),
         ("SMALL --seconds 0", "--seconds"),
@@ -44,9 +45,11 @@ REFUSED = {
     ],
     "study": [
         ("mat --seeds 0", "--seeds"),
+        ("mat --jobs 0", "--jobs: expected at least 1"),
         ("mat --scene moon", "moon"),
         ("mat --scene cell", "its camera moves"),
         ("mat --channel nowhere.yaml", "nowhere.yaml"),
+        ("mat --channel sms", "expected one of ideal, ch5"),
         ("metrics --channel ch5", "--channel is for mat"),
         ("preferences --scene tower", "its cameras look outward"),
         ("ppo-wait --scene tower", "scenes of its own"),
@@ -71,6 +74,7 @@ REFUSED = {
         ("tile --budget 4 --travel -1", "--travel"),
         ("tile --budget 4 --selector ppo:none.npz", "not a viewpoint policy"),
         ("nowhere --budget 4", "nowhere"),
+        ("tower --budget 4", "its cameras look outward"),
     ],
 }
 QUICK = {"fit": SMALL_WORDS, "frontier": ["--quick"], "study": ["--quick"]}
@@ -87,8 +91,11 @@ def test_what_cannot_be_done_is_refused_in_one_line(
         write_photos(tmp_path / "set", 3)
     places = {"SMALL": str(tmp_path / "small.yaml"), "SET": str(tmp_path / "set")}
     given = [places.get(word, word) for word in words.split()]
-    out = ["--json" if command == "compare" else "--out", str(tmp_path / "out")]
-    assert main([command, *QUICK.get(command, []), *given, *out]) == 2
+    out = tmp_path / "out"
+    written = ["--out", str(out)]
+    if command == "compare":  # results: a line for each run
+        written = ["--json", str(out / "scores.json"), "--results", str(out / "results.jsonl")]
+    assert main([command, *QUICK.get(command, []), *given, *written]) == 2
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1
-    assert not any(path.is_file() and path.stat().st_size for path in (tmp_path / "out").rglob("*"))
+    assert not out.is_file() and not any(path.is_file() and path.stat().st_size for path in out.rglob("*"))

@@ -83,10 +83,10 @@ def cut_out(view: View) -> View:
     return replace(view, image=np.dstack([view.image, np.where(sky, 0, 255).astype(np.uint8)]))
 
 
-def same_state(a: Any, b: Any) -> None:
-    """Both hold the same numbers, bit for bit."""
+def same_state(a: Any, b: Any, settings: bool = False) -> None:
+    """Both hold the same numbers, bit for bit; with ``settings`` the same settings too, of which threads are one."""
     one, two = a.state(), b.state()
     assert one.keys() == two.keys()
     for name in one:
-        if not name.endswith("meta"):  # settings are in it: threads may differ
+        if settings or not name.endswith("meta"):
             np.testing.assert_array_equal(one[name], two[name], err_msg=name)

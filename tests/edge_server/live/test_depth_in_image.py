@@ -128,23 +128,26 @@ def test_a_lens_with_distortion_takes_in_only_what_it_sees():
 
 @pytest.mark.stability
 @pytest.mark.parametrize(
-    ("side", "width", "height", "fov_deg", "moved"),
+    ("side", "width", "height", "fov_deg", "step", "moved"),
     [
-        (128, 1280, 1280, 70.0, 1.02 * MAX_DEPTH_POINTS * 128**2),  # about as many as a small image has pixels
-        (128, 1280, 1280, 100.0, 1.02 * MAX_DEPTH_POINTS * 128**2),
-        (128, 1280, 1280, 175.0, 1.02 * MAX_DEPTH_POINTS * 128**2),
-        (1200, 848, 480, 70.0, 848 * 480),  # what sensors measure at this size is moved whole
-        (1200, 1280, 720, 70.0, MOST_DEPTH_MOVED),
-        (1200, 1280, 1280, 70.0, MOST_DEPTH_MOVED),
+        (128, 1280, 1280, 70.0, 0, 1.02 * MAX_DEPTH_POINTS * 128**2),  # about as many as a small image has pixels
+        (128, 1280, 1280, 100.0, 0, 1.02 * MAX_DEPTH_POINTS * 128**2),
+        (128, 1280, 1280, 175.0, 0, 1.02 * MAX_DEPTH_POINTS * 128**2),
+        (1200, 848, 480, 70.0, 1, 848 * 480),  # what sensors measure at this size is moved whole
+        (1200, 1280, 720, 70.0, 2, MOST_DEPTH_MOVED),
+        (1200, 1280, 1280, 70.0, 2, MOST_DEPTH_MOVED),
     ],
 )
-def test_of_large_depth_few_points_are_moved_and_they_leave_no_gaps(side, width, height, fov_deg, moved):
+def test_of_large_depth_few_points_are_moved_and_they_leave_no_gaps(side, width, height, fov_deg, step, moved):
     image, sensor = Pinhole.from_fov(side, side, 60.0), Pinhole.from_fov(width, height, fov_deg)
     module._kept.clear()
     found = depth_in_image(depth(np.full((height, width), 2000), intrinsics=sensor), image, 0)
     (rays,) = module._kept.values()
     assert 0.2 * moved < rays[..., 0].size <= moved
     inside = found[side // 3 : 2 * side // 3, side // 4 : 3 * side // 4]
+    if side == 1200:
+        assert rays.shape[:2] == (height // step, width // step)
+        assert (inside == np.float32(2.0)).all()
     assert (inside == np.float32(2.0)).mean() > 0.97
 
 

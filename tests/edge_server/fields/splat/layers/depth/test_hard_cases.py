@@ -133,7 +133,7 @@ def test_a_state_goes_on_bit_for_bit_with_depth() -> None:
     assert any(o.body_m is not None for o in other.field.observations)
     for stage in (one, other):
         stage.run(4.0 * FRAME_S, score=False)
-    same_state(one.field, other.field)
+    same_state(one.field, other.field, settings=True)
 
 
 def test_one_camera_alone_from_the_first_frame_on_shows_finite_images() -> None:
