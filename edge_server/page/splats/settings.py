@@ -50,8 +50,8 @@ SCATTERING_UNDER_WAY = 2
 """Messages under way on a link whose round trips scatter. The emulator's TCP takes as long for a small piece as for 16
 kB: with many small messages it carries a twelfth of what it could."""
 FULL_OF_SCATTER = 4.0
-"""Such a link counts as full from a lateness of so many times its scatter. With 4 it carries 52 % of what it takes,
-with 2.5 37 %, and what is shown is .8 s younger (mean delay .4 s, loss .2)."""
+"""Such a link counts as full from a lateness of so many times its scatter. With 4 it carries 52 % of what it takes
+(mean delay 0.4 s, loss 0.2). With 2.5 it carries 37 %, and what is shown is 0.8 s younger."""
 SCATTERING_GAIN = 0.5
 """Of what was acknowledged, most that the window of such a link changes by."""
 MOVING_SHARE = 0.6

@@ -117,12 +117,14 @@ class LinkWindow:
     @property
     def scatter_s(self) -> float:
         """By how much a small message alone takes longer than the shortest round trip, on average."""
-        return float(np.mean(self._probe_trips_s)) - self.round_trip_s if self._probe_trips_s else 0.0
+        return max(float(np.mean(self._probe_trips_s)) - self.round_trip_s, 0.0) if self._probe_trips_s else 0.0
 
     @property
     def scatters(self) -> bool:
-        """Whether round trips scatter without a queue."""
-        return len(self._probe_trips_s) >= tuned.FIRST_PROBES and self.scatter_s > tuned.QUEUE_S
+        """Whether round trips scatter without a queue: most of them, as one outage makes a single probe very late."""
+        if len(self._probe_trips_s) < tuned.FIRST_PROBES:
+            return False
+        return float(np.median(self._probe_trips_s)) - self.round_trip_s > tuned.QUEUE_S
 
     @property
     def few(self) -> bool:
@@ -207,8 +209,10 @@ class Visitor:
         published: None while there is nothing to draw.
         present_s: the present, seconds since the run began. status: what all visitors are told; the link's is added.
         """
-        if self.link.room < tuned.LEAST_WINDOW // 4 or self.link.waits(now_s):
+        if self.link.room < tuned.LEAST_WINDOW // 4:
             self.link.short = True
+            return None
+        if self.link.waits(now_s):
             return None
         probes = self.link.probes(now_s)
         room = tuned.PROBE_BYTES if probes else self.link.room
@@ -223,7 +227,7 @@ class Visitor:
             blocks.append(write_block(StatusBlock(status | {"link": self._link(published)})))
         room -= sum(map(len, blocks))
         if published is not None:
-            blocks += self._newest(published, room, now_s)
+            blocks += self._newest(published, room, now_s, probes)
         if not blocks and not probes:
             return None
         if told:
@@ -233,14 +237,15 @@ class Visitor:
         self._number = (self._number + 1) & 0xFFFFFFFF
         return data
 
-    def _newest(self, published: Published, room: int, now_s: float) -> list[bytes]:
+    def _newest(self, published: Published, room: int, now_s: float, probes: bool) -> list[bytes]:
         """Knots, moving set and static chunks, as far as there is room."""
         blocks = self._moving(published, room, now_s)
         room -= sum(map(len, blocks))
         if not self.link.few:
             # No more than the link takes until the next: what a message takes itself is not to be taken for a queue.
             room = min(room, max(round(tuned.TICK_S * self.link.bound_bytes_per_s), _LEAST_BYTES))
-        return blocks + self._static(published.static, room)
+        blocks += self._static(published.static, room)
+        return blocks if probes else blocks + self._newly_unseen()
 
     def _moving(self, published: Published, room: int, now_s: float) -> list[bytes]:
         """Knots of a new publication, and the moving set when it is due."""
@@ -314,10 +319,15 @@ class Visitor:
             blocks.append(write_block(StaticBlock(self._set, len(self._sent), first, static.scales, records)))
             self._sent[first : first + len(records)] = records
             self._known[first : first + len(records)] = True
-        if self._known.all() and static.unseen is not None and static.unseen is not self._unseen:
-            self._unseen = static.unseen
-            blocks.append(write_block(UnseenBlock(self._set, static.unseen[: len(self._sent)])))
         return blocks
+
+    def _newly_unseen(self) -> list[bytes]:
+        """What no camera has seen, once all records are known."""
+        static = self._source
+        if static is None or static.unseen is None or static.unseen is self._unseen or not self._known.all():
+            return []
+        self._unseen = static.unseen
+        return [write_block(UnseenBlock(self._set, static.unseen[: len(self._sent)]))]
 
     def _same(self, newest: StaticRecords) -> bool:
         return self._source is not None and newest.number == self._source.number

@@ -156,6 +156,7 @@ def test_a_bad_last_mile_makes_it_less_and_later_but_breaks_nothing():
         drawer.read_until(lambda: len(drawer.reader.at(NEWEST_S)) == 6120)
         link = drawer.reader.status["link"]
         assert link["static"] == [6000, 6000] and link["round_trip_ms"] > 20.0
+        assert 0 < link["shortest_ms"] < link["round_trip_ms"]
         drawer.socket.close()
 
 
