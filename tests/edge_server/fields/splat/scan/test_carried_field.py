@@ -225,7 +225,7 @@ def test_after_a_bad_second_the_picture_recovers_within_one(
 ) -> None:
     """least_db: of all held-out frames at the end. lost_db: against a walk without bad frames, on average over four
     instants, a second after the first bad frame (half a second after the last) and each second later. At one instant
-    two such runs differ by .4 dB for nothing: another scipy moves it as much.
+    two such runs differ by .4 dB for nothing: another scipy moves it as much, so a single one may lose 1 dB more.
     """
     views = clean = walk(depth=depth)
     bad = slice(BAD_FROM, BAD_FROM + frames)
@@ -234,7 +234,8 @@ def test_after_a_bad_second_the_picture_recovers_within_one(
     assert np.isfinite(field.cloud.params).all()
     assert any("left out" in line for line in field.troubles) or not said
     assert found_db[-1] > least_db
-    assert (np.array(_undisturbed(depth)) - found_db)[1:].mean() < lost_db
+    lost = (np.array(_undisturbed(depth)) - found_db)[1:]
+    assert lost.mean() < lost_db and lost.max() < lost_db + 1.0
 
 
 def _looks_about(k: int, view: View) -> View:
