@@ -306,7 +306,6 @@ def _add_proxy(commands: Any) -> None:
         default="up",
         help="messages that pass the link: to the service (up), its answers (down) or both [%(default)s]",
     )
-    sub.add_argument("--shared", action="store_true", help="one link for all methods [one for each]")
     sub.add_argument(
         "--tcp",
         action="store_true",
@@ -328,7 +327,7 @@ def _proxy(args: argparse.Namespace) -> int:
     proxy: Callable[..., Proxy] = Proxy
     if args.tcp:
         from channel_emu.live.tcp_proxy import TcpProxy as proxy
-    status, report = _serve(args, proxy, config, args.seed, direction=args.direction, shared=args.shared)
+    status, report = _serve(args, proxy, config, args.seed, direction=args.direction)
     if report is not None:
         print(json.dumps(report.plain()) if args.json else show(report))
     return status
@@ -350,12 +349,6 @@ def _add_fit(commands: Any) -> None:
         help="number of hidden states; auto: chosen by BIC [%(default)s]",
     )
     sub.add_argument(
-        "--scope",
-        choices=("shared", "per-camera"),
-        default="shared",
-        help="one Markov chain for all cameras, or one for each [%(default)s]",
-    )
-    sub.add_argument(
         "--discipline", choices=FITTED_DISCIPLINES, help="for a CSV: what the busy link did with a new frame [drop-new]"
     )
     sub.add_argument("--out", type=out_file, metavar="FILE.yaml", help="write a scenario with the fitted channel")
@@ -368,7 +361,7 @@ def _fit(args: argparse.Namespace) -> int:
     from channel_emu.estimate import report
     from channel_emu.estimate.fit import fit
 
-    result = fit(args.trace, args.states, discipline=args.discipline, scope=args.scope)
+    result = fit(args.trace, args.states, discipline=args.discipline)
     if args.out:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.write_text(report.scenario_text(result))

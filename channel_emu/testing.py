@@ -57,7 +57,6 @@ class EmulatedLink:
     to: HOST:PORT of the service.
     seed: of the link's decisions.
     direction: the messages that pass the link: up (to the service), down (its answers) or both.
-    shared: one link for all methods of a direction, instead of one each.
     listen: HOST:PORT of the link; port 0 takes any free one.
     trace: record to this file.
     replay: repeat the decisions of a trace file.
@@ -74,7 +73,6 @@ class EmulatedLink:
         to: str,
         seed: int = 0,
         direction: str = "up",
-        shared: bool = False,
         listen: str = "127.0.0.1:0",
         trace: Path | None = None,
         replay: Path | None = None,
@@ -84,7 +82,7 @@ class EmulatedLink:
         self.config = section if isinstance(section, ChannelConfig) else channel_from_mapping(section)
         self.seed = seed
         replayed = traces.read(replay) if replay is not None else None
-        self.options = ProxyOptions(listen, to, transport or Transport(), direction, shared, trace, replayed)
+        self.options = ProxyOptions(listen, to, transport or Transport(), direction, trace, replayed)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="channel", daemon=True)
         self._thread.start()

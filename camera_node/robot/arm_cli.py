@@ -66,8 +66,7 @@ A network stylus sends UDP datagrams of JSON to the port, 50 to 1000 per second:
 
 t_ns: time of the measurement (any clock); p: meters, z up; q: orientation; clutch: follow while true, after
 it was false once. For a 3D Systems Touch: p = [x, -z, y] / 1000 of HD_CURRENT_TRANSFORM, clutch from
-HD_CURRENT_BUTTONS. With --stylus-key, which a HOST that other machines reach needs, a datagram is the JSON, a space
-and the hexadecimal HMAC-SHA256 of the JSON under the file's key, and t_ns must grow, such as time since 1970.
+HD_CURRENT_BUTTONS. Only drivers on this machine are heard: whoever sends a datagram moves the arm.
 """
 
 
@@ -82,7 +81,6 @@ def _add_teleop(commands: Any) -> None:
     add = teleop.add_argument
     add("scenario", help="a scenario with a source.arm")
     add("--stylus", required=True, metavar="WHICH", help="keyboard, network:[HOST:]PORT [HOST: 127.0.0.1]")
-    add("--stylus-key", type=Path, metavar="FILE", help="key that signs a network stylus's messages")
     add("--dry-run", type=Path, metavar="FILE", help="write the trajectory to FILE (CSV) instead of moving an arm")
     add("--seconds", type=float, metavar="S", help="end after S seconds [on Ctrl-C]")
     add("--yes", action="store_true", help="the arm's workspace is clear: do not ask")

@@ -8,7 +8,7 @@ bootstrap: the fitted channel draws recordings with frames at the same instants,
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +68,7 @@ class Fit:
     parameters: by name, in 1/ms and ms.
     bic: by number of states.
     channel: the ``channel:`` section for a scenario.
-    lines: the transmissions, one timeline a chain; second_state: probability of the second state at each.
+    sent: the transmissions. second_state: probability of the second state at each; None of a channel with one.
     """
 
     recording: Recording
@@ -78,9 +78,9 @@ class Fit:
     parameters: dict[str, IntervalEstimate]
     bic: dict[int, float]
     channel: dict[str, Any]
-    warnings: list[str] = field(default_factory=list)
-    lines: list[Transmissions] = field(default_factory=list)
-    second_state: list[NDArray[np.float64]] = field(default_factory=list)
+    warnings: list[str]
+    sent: Transmissions
+    second_state: NDArray[np.float64] | None
 
     def summary(self) -> dict[str, Any]:
         """The fit as plain values, as the command prints it with --json."""
@@ -115,14 +115,11 @@ class _Candidate:
     model: TwoStates | None = None
 
 
-def fit(
-    path: Path, states: str = "auto", *, discipline: str | None = None, scope: str = "shared", samples: int = SAMPLES
-) -> Fit:
+def fit(path: Path, states: str = "auto", *, discipline: str | None = None, samples: int = SAMPLES) -> Fit:
     """Fit a channel to the recording in ``path`` (``recording`` describes the format).
 
     states: number of states: "1", "2" or "auto" (BIC decides).
     discipline: queue discipline of the recorded link, for rows only; None: drop-new.
-    scope: one chain for all cameras (shared), or one each with equal parameters (per-camera).
     samples: number of bootstrap samples.
     Raises RecordingError or TraceError (both ValueError) if the recording cannot be read or fitted.
     """
@@ -131,19 +128,18 @@ def fit(
     recording = read_recording(path, discipline)
     delays_ms = _usable_delays_ms(recording)
     constant = float(delays_ms.std()) <= _CONSTANT_CV * float(delays_ms.mean())
-    lines = transmissions(recording, scope == "shared")
-    lost = np.concatenate([line[2] for line in lines])
+    sent = transmissions(recording)
+    _, delay_ms, lost = sent
     loses = bool((lost == 1.0).any())
     warnings = _data_warnings(recording, constant, loses, states)
-    hides_lost = all(np.isnan(delay[lost == 1.0]).all() for _, delay, lost in lines)
-    data = two_states.segments(lines, hides_lost)
+    data = two_states.segments(sent, bool(np.isnan(delay_ms[lost == 1.0]).all()))
     laws = ("constant",) if constant else ("exponential", "gamma")
     best = {1: min((_one_state(delays_ms, lost, law) for law in laws), key=lambda each: each.bic)}
     if states != "1" and (loses or not constant):
         best[2] = min((_two_states(data, delays_ms, lost, law) for law in laws), key=lambda each: each.bic)
     chosen = best[1]
     if 2 in best:
-        why_not = _reject_two_states(best[2], data, lines)
+        why_not = _reject_two_states(best[2], data, sent)
         if states == "2" or (not why_not and best[2].bic < best[1].bic):
             chosen = best[2]
             warnings += [f"two states as asked, though {why_not}"] if why_not else []
@@ -157,7 +153,7 @@ def fit(
     kind, period_ms = _arrivals(recording)
     if kind == "poisson":
         parameters["rate_per_ms"] = _arrival_rate(recording)
-    channel = _channel_section(recording, parameters, chosen.law, kind, period_ms, scope)
+    channel = _channel_section(recording, parameters, chosen.law, kind, period_ms)
     try:
         channel_from_mapping(channel, "the fitted channel")
     except ScenarioError as error:
@@ -173,8 +169,8 @@ def fit(
         {k: each.bic for k, each in best.items()},
         channel,
         warnings,
-        lines,
-        [] if chosen.model is None else _second_state(chosen.model, data, lines, chosen.law),
+        sent,
+        None if chosen.model is None else _second_state(chosen.model, data, len(lost), chosen.law),
     )
 
 
@@ -260,25 +256,20 @@ def _two_states(data: Segments, delays_ms: NDArray[np.float64], lost: NDArray[np
     return _Candidate(2, law, bic, one, model.ordered(law != "constant"))
 
 
-def _second_state(model: TwoStates, data: Segments, lines: list[Transmissions], law: str) -> list[NDArray[np.float64]]:
-    """Probability of the second state at each transmission, one array a timeline."""
-    flat = two_states.step(model, data, law)[2][0]
-    found, row = [], 0
-    for start, _, _ in lines:
-        rows = -(-len(start) // two_states.SEGMENT)
-        found.append(flat[row : row + rows].ravel()[: len(start)] if rows > 1 else flat[row][: len(start)])
-        row += rows
-    return found
+def _second_state(model: TwoStates, data: Segments, count: int, law: str) -> NDArray[np.float64]:
+    """Probability of the second state at each of ``count`` transmissions."""
+    return np.asarray(two_states.step(model, data, law)[2][0].ravel()[:count])
 
 
-def _reject_two_states(found: _Candidate, data: Segments, lines: list[Transmissions]) -> str | None:
+def _reject_two_states(found: _Candidate, data: Segments, sent: Transmissions) -> str | None:
     """The reason to reject two states whatever their likelihood, or None."""
     assert found.model is not None
-    second = np.concatenate(_second_state(found.model, data, lines, found.law))
+    start_ms, _, _ = sent
+    second = _second_state(found.model, data, len(start_ms), found.law)
     frames = min(float(second.sum()), float((1 - second).sum()))
     if frames < _MIN_FRAMES:
         return f"one of them rests on {frames:.0f} frames"
-    span_ms = sum(float(start[-1] - start[0]) for start, _, _ in lines)
+    span_ms = float(start_ms[-1] - start_ms[0])
     visits = float(found.model.leave_per_ms[0, 0] * found.model.stationary()[0, 0]) * span_ms
     if visits < _MIN_VISITS:
         return f"the chain changed state {2 * visits:.0f} times only: record longer"
@@ -394,7 +385,7 @@ def _arrival_rate(recording: Recording) -> IntervalEstimate:
 
 
 def _channel_section(
-    recording: Recording, parameters: dict[str, IntervalEstimate], law: str, arrivals: str, period_ms: float, scope: str
+    recording: Recording, parameters: dict[str, IntervalEstimate], law: str, arrivals: str, period_ms: float
 ) -> dict[str, Any]:
     """The ``channel:`` section, rounded to six digits."""
 
@@ -411,7 +402,7 @@ def _channel_section(
         section["arrivals"]["rate_per_ms"] = number("rate_per_ms")
     if "mu1_per_ms" in parameters:
         rates = {name: number(name) for name in ("mu1_per_ms", "mu2_per_ms")}
-        section["chain"] = {**rates, "states": ["low", "high"], "scope": scope}
+        section["chain"] = {**rates, "states": ["low", "high"], "scope": "shared"}
     mean = by_state("mean_ms", "mean_{}_ms")
     name = {"constant": "deterministic"}.get(law, law)
     section["service"] = {"law": "none"} if mean == 0.0 else {"law": name, "mean_ms": mean}

@@ -249,19 +249,12 @@ Transmissions = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float
 """Start in ms, delay in ms (NaN: unknown) and loss (1 or 0; NaN: unknown) of frames, each (N,)."""
 
 
-def transmissions(recording: Recording, shared: bool) -> list[Transmissions]:
-    """The frames that were transmitted, in the order of their starts; lost ones whose start is unknown count from
-    their offer.
-
-    shared: one timeline of all cameras, which share a chain; otherwise one a camera. Empty ones are left out.
-    """
-    groups = [recording.cameras] if shared else [[camera] for camera in recording.cameras]
-    lines = [[np.concatenate(column) for column in zip(*map(_transmitted, group))] for group in groups]
-    return [
-        (start[order], delay[order], lost[order])
-        for start, delay, lost in lines
-        if len(order := np.argsort(start, kind="stable"))
-    ]
+def transmissions(recording: Recording) -> Transmissions:
+    """The frames that all cameras, which share a chain, transmitted, in the order of their starts; lost ones whose
+    start is unknown count from their offer."""
+    start, delay, lost = (np.concatenate(column) for column in zip(*map(_transmitted, recording.cameras)))
+    order = np.argsort(start, kind="stable")
+    return start[order], delay[order], lost[order]
 
 
 def _transmitted(camera: Camera) -> Transmissions:

@@ -72,9 +72,10 @@ def plot(fit: Fit, path: Path) -> None:
         top.legend(loc="upper right")
     if two:
         bottom.set(ylim=(-0.05, 1.05), ylabel=f"P({fit.channel['chain']['states'][1]})")
-        for (at_ms, _, _), states in zip(fit.lines, fit.second_state):
-            shown = at_ms / 1e3 <= np.nanmax(start_s)
-            bottom.plot(at_ms[shown] / 1e3, states[shown], lw=0.8, color="#D55E00")
+        assert fit.second_state is not None
+        at_s = fit.sent[0] / 1e3
+        shown = at_s <= np.nanmax(start_s)
+        bottom.plot(at_s[shown], fit.second_state[shown], lw=0.8, color="#D55E00")
     drawn = io.BytesIO()
     try:
         figure.savefig(drawn, format=path.suffix[1:] or "png", dpi=120)

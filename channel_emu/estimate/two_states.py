@@ -12,7 +12,6 @@ segments, and over all bootstrap samples, at once. Arrays have the axes (samples
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,13 +83,13 @@ class TwoStates:
         return TwoStates(leave, mean, loss, self.shape)
 
 
-def segments(timelines: Sequence[tuple[Array, Array, Array]], hides_lost: bool) -> Segments:
-    """Cut timelines, each of (start_ms, delay_ms, lost) in the order of the starts, into one sample of segments."""
+def segments(frames: tuple[Array, Array, Array], hides_lost: bool) -> Segments:
+    """Cut frames (start_ms, delay_ms, lost), in the order of their starts, into one sample of segments."""
+    start, delay, lost = frames
     rows: list[tuple[Array, Array, Array]] = []
-    for start, delay, lost in timelines:
-        for first in range(0, len(start), SEGMENT):
-            part = slice(first, first + SEGMENT)
-            rows.append((np.diff(start[part], prepend=start[first]), delay[part], lost[part]))
+    for first in range(0, len(start), SEGMENT):
+        part = slice(first, first + SEGMENT)
+        rows.append((np.diff(start[part], prepend=start[first]), delay[part], lost[part]))
     longest = max(len(span) for span, _, _ in rows)
     columns = [np.full((1, len(rows), longest), fill) for fill in (0.0, np.nan, np.nan)]
     for n, row in enumerate(rows):

@@ -61,7 +61,6 @@ class ProxyOptions:
     to: HOST:PORT of the service.
     transport: TLS and tokens of both sides.
     direction: the messages that are delayed: up (to the service), down (its answers) or both.
-    shared: one link for all methods of a direction, instead of one each.
     trace: record to this file; None: no trace.
     replay: repeat the decisions of this trace instead of making new ones.
     """
@@ -70,7 +69,6 @@ class ProxyOptions:
     to: str
     transport: Transport = field(default_factory=Transport)
     direction: str = "up"
-    shared: bool = False
     trace: Path | None = None
     replay: Trace | None = None
 
@@ -281,7 +279,7 @@ class Proxy(grpc.GenericRpcHandler):
     def _link_of(self, direction: str, method: str) -> LiveLink | None:
         if self.options.direction not in (direction, "both"):
             return None
-        name = direction if self.options.shared else f"{direction} {method}"
+        name = f"{direction} {method}"
         if name not in self.links and len(self.links) >= _MOST_METHODS:
             name = f"{direction} {_OTHERS}"
         return self.link(name)

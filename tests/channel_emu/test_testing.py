@@ -230,18 +230,6 @@ def test_damage_and_doubles(channel, greeter, client) -> None:
     assert len(answer) == 7 and sum(a != b for a, b in zip(answer, b"payload")) == 1
 
 
-def test_one_link_may_carry_all_methods(channel, greeter, client) -> None:
-    section = {"service": {"law": "deterministic", "mean_ms": 700.0}}
-    link = channel(section, to=greeter.address, shared=True)
-    stub = client(link)
-    slow = stub.unary_unary(HELLO).future(b"you", timeout=20)
-    while not link.report().offered:
-        time.sleep(0.005)
-    assert _code(lambda: stub.unary_unary(FAIL)(b"", timeout=20)) == "UNAVAILABLE"  # the link is busy
-    assert slow.result().startswith(b"hello")
-    assert set(link.report().by_method) == {"up"}
-
-
 def test_methods_that_a_client_invents_share_one_link(channel, greeter, client, monkeypatch) -> None:
     monkeypatch.setattr(proxy, "_MOST_METHODS", 2)
     link = channel("ideal", to=greeter.address)

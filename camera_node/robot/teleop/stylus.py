@@ -8,7 +8,6 @@ the datagrams. No stylus knows the arm; ``limits`` makes every sample safe for i
 from __future__ import annotations
 
 import contextlib
-import hmac
 import ipaddress
 import json
 import logging
@@ -18,11 +17,8 @@ import select
 import socket
 import sys
 import termios
-import time
 import tty
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -30,7 +26,6 @@ from numpy.typing import NDArray
 
 from camera_node.robot.teleop import TeleopError
 from freshfield.geometry import matrix_to_quaternion, quaternion_multiply, quaternion_normalize, so3_exp
-from freshfield.untrusted import read_bytes
 
 log = logging.getLogger("camera-node.teleop")
 
@@ -63,8 +58,6 @@ _ESCAPE, _END_OF_FILE, _MAX_BYTES = "\x1b", "\x04", 32
 MAX_BYTES = 2048
 _MAX_MESSAGES = 64  # per poll, so that a flood does not delay the arm
 _OWNED_NS = 1_000_000_000
-_SIGNED_WITHIN_NS = 5_000_000_000  # of a signed message's time from ours, clocks' offsets included
-_LEAST_KEY_BYTES, _MOST_KEY_BYTES = 16, 4096
 
 
 @dataclass(frozen=True)
@@ -168,24 +161,20 @@ class KeyboardStylus:
 
 
 class NetworkStylus:
-    """Listens at ``host``:``port``; port 0 takes a free one, which ``port`` then tells. Raises TeleopError.
+    """Listens at ``host``:``port``; port 0 takes a free one, which ``port`` then tells. Raises TeleopError, also for an
+    address that other machines reach: whoever sends a datagram moves the arm.
 
-    Only the first sender counts, until it has been silent for a second. With a ``key`` messages must be signed with it,
-    and their times must grow and lie within 5 s of the time since 1970, so that none can be sent again. Addresses that
-    other machines reach need one: whoever sends a datagram moves the arm. wall_ns: the time since 1970.
+    Only the first sender counts, until it has been silent for a second.
     """
 
     ended = False
 
-    def __init__(
-        self, host: str, port: int, key: bytes | None = None, wall_ns: Callable[[], int] = time.time_ns
-    ) -> None:
-        if key is None and not _is_loopback(host):
+    def __init__(self, host: str, port: int) -> None:
+        if not _is_loopback(host):
             raise TeleopError(
-                f"--stylus network: other machines reach {host}, and a message moves the arm: sign them with a key, "
-                "--stylus-key FILE"
+                f"--stylus network: other machines reach {host}, and a message moves the arm: run the stylus's driver "
+                "on this machine, and name network:PORT"
             )
-        self._key, self._newest_ns, self._wall_ns = key, -1, wall_ns
         self._owner: tuple[str, int] | None = None
         self._heard_ns = 0
         try:
@@ -209,18 +198,14 @@ class NetworkStylus:
                 break  # nothing there
             if self._owner is not None and sender[:2] != self._owner and now_ns - self._heard_ns < _OWNED_NS:
                 continue
-            sample = parse(data, self._key)
-            if sample is None or (self._key is not None and not self._fresh(sample.t_ns)):
+            sample = parse(data)
+            if sample is None:
                 continue
-            self._newest_ns = sample.t_ns
             if self._owner != sender[:2]:
                 log.info("stylus: messages come from %s:%d", *sender[:2])
             self._owner, self._heard_ns = sender[:2], now_ns
             found.append(sample)
         return found
-
-    def _fresh(self, t_ns: int) -> bool:
-        return t_ns > self._newest_ns and abs(t_ns - self._wall_ns()) <= _SIGNED_WITHIN_NS
 
     def close(self) -> None:
         self._socket.close()
@@ -233,15 +218,10 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def parse(data: bytes, key: bytes | None = None) -> StylusSample | None:
-    """Parse a message; None if it is malformed, or not signed with ``key``. Its numbers are checked later
-    (``StylusSample.is_valid``)."""
+def parse(data: bytes) -> StylusSample | None:
+    """Parse a message; None if it is malformed. Its numbers are checked later (``StylusSample.is_valid``)."""
     if len(data) > MAX_BYTES:
         return None
-    if key is not None:
-        data, _, signature = data.rpartition(b" ")
-        if not hmac.compare_digest(signature, _signature(data, key)):
-            return None
     try:
         message = json.loads(data)
         t_ns, clutch = message["t_ns"], message["clutch"]
@@ -255,31 +235,15 @@ def parse(data: bytes, key: bytes | None = None) -> StylusSample | None:
     return StylusSample(t_ns, position, quaternion, clutch)
 
 
-def encode(sample: StylusSample, key: bytes | None = None) -> bytes:
-    """The datagram of a sample, signed if there is a key, for senders in Python."""
+def encode(sample: StylusSample) -> bytes:
+    """The datagram of a sample, for senders in Python."""
     message = {"t_ns": sample.t_ns, "p": sample.position_m, "q": sample.quaternion, "clutch": sample.clutch}
-    data = json.dumps(message).encode()
-    return data if key is None else data + b" " + _signature(data, key)
+    return json.dumps(message).encode()
 
 
-def _signature(data: bytes, key: bytes) -> bytes:
-    return hmac.new(key, data, "sha256").hexdigest().encode()
-
-
-def read_key(file: Path) -> bytes:
-    """The key in a file, without white space around it. Raises TeleopError."""
-    try:
-        key = read_bytes(file, _MOST_KEY_BYTES).strip()
-    except OSError as error:
-        raise TeleopError(f"--stylus-key: {file}: cannot be read: {error.strerror}") from None
-    if len(key) < _LEAST_KEY_BYTES:
-        raise TeleopError(f"--stylus-key: {file}: expected at least {_LEAST_KEY_BYTES} characters, got {len(key)}")
-    return key
-
-
-def open_stylus(text: str, key_file: Path | None = None) -> Stylus:
-    """Open a stylus by its name on the command line: ``keyboard``, ``network:PORT`` or ``network:HOST:PORT``, whose
-    messages are signed with the key in ``key_file``. Raises TeleopError."""
+def open_stylus(text: str) -> Stylus:
+    """Open a stylus by its name on the command line: ``keyboard``, ``network:PORT`` or ``network:HOST:PORT``. Raises
+    TeleopError."""
     kind, _, rest = text.partition(":")
     if kind == "keyboard" and not rest:
         keyboard = KeyboardStylus()
@@ -289,8 +253,7 @@ def open_stylus(text: str, key_file: Path | None = None) -> Stylus:
         host, _, port = rest.rpartition(":")
         if not port.isdigit() or not 0 < int(port) < 65536:
             raise TeleopError(f"--stylus: expected network:PORT or network:HOST:PORT, got {text!r}")
-        key = None if key_file is None else read_key(key_file)
-        stylus = NetworkStylus(host.strip("[]") or "127.0.0.1", int(port), key)
+        stylus = NetworkStylus(host.strip("[]") or "127.0.0.1", int(port))
         log.info("waiting for a stylus at UDP port %d", stylus.port)
         return stylus
     raise TeleopError(f"--stylus: expected keyboard or network:PORT, got {text!r}")

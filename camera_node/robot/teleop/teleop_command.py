@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         if asks and not confirm_motion(arm_config.host, "follow the stylus"):
             return 2
         # After the question, because a keyboard stylus switches the terminal's line mode off.
-        stylus = open_stylus(args.stylus, args.stylus_key)
+        stylus = open_stylus(args.stylus)
         sink = _sink(args.dry_run, stream, model, config)
         status = _run_loop(operator, stylus, sink, args.seconds)
     finally:

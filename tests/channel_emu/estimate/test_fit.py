@@ -105,16 +105,6 @@ def test_one_state_and_arrivals_that_sample_frames(tmp_path: Path) -> None:
     assert found.channel["discipline"] == "newest-waits"
 
 
-def test_cameras_with_chains_of_their_own(tmp_path: Path) -> None:
-    section = {**SLOW, "chain": {**SLOW["chain"], "scope": "per-camera"}}
-    path = write_trace(tmp_path / "t.jsonl", section, 5, cameras=3, seconds=100)
-    found = fit(path, scope="per-camera", samples=20)
-    check(found, SLOW_TRUE)
-    assert found.channel["chain"]["scope"] == "per-camera"
-    # One chain for all of them explains these delays worse.
-    assert fit(path, "2", samples=3).bic[2] > found.bic[2] + 100
-
-
 def test_rows_behind_a_waiting_place(tmp_path: Path) -> None:
     """Transmission starts when the link becomes free; without a word of it the waiting would count as delay."""
     path = write_rows(tmp_path / "rows.csv", {**SLOW, "discipline": "newest-waits"}, 7)

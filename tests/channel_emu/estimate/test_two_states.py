@@ -38,7 +38,7 @@ def test_likelihood_states_and_losses_are_sums_over_all_paths() -> None:
         total += p
         states[range(count), path] += p
     states /= total
-    data = two_states.segments([(START_MS, DELAY_MS, LOST)], True)
+    data = two_states.segments((START_MS, DELAY_MS, LOST), True)
     after, log_likelihood, second = two_states.step(MODEL, data, "exponential")
     assert log_likelihood[0] == pytest.approx(math.log(total), rel=1e-12)
     assert second[0, 0] == pytest.approx(states[:, 1], rel=1e-10)
@@ -51,7 +51,7 @@ def test_a_step_gives_the_expected_jumps_over_the_expected_time() -> None:
     """Two frames 40 ms apart, and the way between them in four thousand steps of the chain."""
     parts, span = 4000, 40.0
     start, delay, lost = np.array([0.0, span]), np.array([5.0, 150.0]), np.array([0.0, 0.0])
-    after, _, _ = two_states.step(MODEL, two_states.segments([(start, delay, lost)], True), "exponential")
+    after, _, _ = two_states.step(MODEL, two_states.segments((start, delay, lost), True), "exponential")
     q, h = two_state_generator(*LEAVE), span / parts
     small = linalg.expm(q * h)
     ahead = np.empty((parts + 1, 2))
@@ -67,7 +67,7 @@ def test_a_step_gives_the_expected_jumps_over_the_expected_time() -> None:
 
 
 def test_the_maximum_is_higher_than_all_around_it() -> None:
-    base = two_states.segments([(np.arange(1500) * 30.0, np.ones(1500), np.zeros(1500))], False)
+    base = two_states.segments((np.arange(1500) * 30.0, np.ones(1500), np.zeros(1500)), False)
     data = two_states.draw(MODEL, base, 1, np.random.default_rng(1))
     found, best = two_states.maximize(MODEL, data, "gamma")
     for k, parameter in itertools.product((0, 1), ("leave_per_ms", "mean_ms", "loss")):
@@ -78,7 +78,7 @@ def test_the_maximum_is_higher_than_all_around_it() -> None:
 
 
 def test_samples_are_drawn_from_the_model_and_fitted_apart() -> None:
-    base = two_states.segments([(np.arange(3000) * 30.0, np.ones(3000), np.zeros(3000))], True)
+    base = two_states.segments((np.arange(3000) * 30.0, np.ones(3000), np.zeros(3000)), True)
     data = two_states.draw(MODEL, base, 3, np.random.default_rng(0))
     assert np.isnan(data.delay_ms[data.lost == 1.0]).all()
     share = MODEL.stationary()[0]
