@@ -7,7 +7,7 @@ file ends.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -84,7 +84,7 @@ class PreferenceSession:
 
     scenario: str
     orders: tuple[tuple[int, ...], ...]
-    features: NDArray[np.float64]
+    features: NDArray[np.float64] = field(compare=False)  # an array has no single truth value; orders say the same
     wanted: int = 60
     seed: int = 0
     by: str = PERSON
