@@ -20,6 +20,9 @@ from freshfield.scenario import load
 from freshfield.transport import TransportError
 
 _REQUEST = "openssl req -x509 -days 365 -noenc -newkey ec -pkeyopt ec_paramgen_curve:prime256v1"
+# Of the authority. Python 3.13 verifies strictly (RFC 5280): an authority says what its key is for, and every
+# certificate which key it holds and which signed it.
+_AUTHORITY = ("basicConstraints=critical,CA:TRUE", "keyUsage=critical,keyCertSign,cRLSign", "subjectKeyIdentifier=hash")
 _MOST_NAME_CHARS = 64  # in a certificate's common name
 _HERE = ("localhost", "127.0.0.1", "::1")
 
@@ -71,12 +74,13 @@ def make_keys(out: Path, cameras: Sequence[str], edge: Sequence[str], emulator: 
         with tempfile.TemporaryDirectory(prefix=".keys-", dir=out.parent) as unfinished:
             whole = Path(unfinished) / "keys"
             whole.mkdir()
-            _certify(whole, "freshfield development", ["basicConstraints=critical,CA:TRUE"])
+            _certify(whole, "freshfield development", _AUTHORITY)
             for process, name in names.items():
                 folder = whole / process
                 folder.mkdir()
-                extension = f"subjectAltName={','.join(alternatives[process])}"
-                _certify(folder, name, [extension], authority=whole)
+                reached = f"subjectAltName={','.join(alternatives[process])}"
+                keys = ("subjectKeyIdentifier=hash", "authorityKeyIdentifier=keyid")
+                _certify(folder, name, (reached, *keys), authority=whole)
                 (folder / "ca.pem").write_bytes((whole / "cert.pem").read_bytes())
             lines = [f"{name} {secrets.token_urlsafe(24)}\n" for name in ("operator", "viewer")]
             (whole / "edge" / "tokens.txt").write_text("".join(lines))

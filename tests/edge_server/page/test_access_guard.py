@@ -178,6 +178,7 @@ def test_tls_and_login_or_words_or_no_page(tmp_path, caplog) -> None:
     with page_of(bare_state(), Transport(**files, tokens=TOKENS), "0.0.0.0") as page:
         assert page.url.startswith("https://localhost:")
         context = ssl.create_default_context(cafile=tmp_path / "keys" / "edge" / "ca.pem")
+        context.verify_flags |= ssl.VERIFY_X509_STRICT  # the default from Python 3.13 on
         for number, path in ((page.port, "/"), (port, "/metrics")):
             connection = http.client.HTTPSConnection("localhost", number, timeout=10, context=context)
             connection.request("GET", path, headers=login("viewer"))
