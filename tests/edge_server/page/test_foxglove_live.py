@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import is_dataclass
 from importlib import import_module
 from itertools import count
-from types import SimpleNamespace
+from types import SimpleNamespace, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import cv2
 import numpy as np
@@ -18,6 +21,8 @@ import websocket
 
 pytest.importorskip("foxglove", reason="needs the extra foxglove")
 pytest.importorskip("foxglove_schemas_protobuf", reason="needs the extra mcap")
+
+from foxglove import layouts
 
 from edge_server.cli import main as edge_server
 from edge_server.fields.common.scene_box import SceneBox
@@ -178,6 +183,36 @@ def test_the_layout_shows_topics_and_values_that_are_served(served):
         panels |= {node} if isinstance(node, str) else set()
         pending += [] if isinstance(node, str) else [node["first"], node["second"]]
     assert panels == set(layout["configById"])
+
+
+def test_panels_of_the_layout_have_the_keys_that_foxglove_knows():
+    """``foxglove.layouts`` is generated from the app's own schema."""
+    types = {"3D": layouts.ThreeDeeConfig, "Image": layouts.ImageConfig, "Plot": layouts.PlotConfig}
+    types["RawMessages"] = layouts.RawMessagesConfig
+    layout = json.loads((ROOT / "deploy/foxglove-layout.json").read_text())
+    for name, config in layout["configById"].items():
+        kind = types[name.partition("!")[0]]
+        config.pop("foxglovePanelTitle", None)  # of any panel
+        assert fits(config, kind), name
+        assert not fits(config | {"title": "a key of no panel"}, kind)
+
+
+def fits(value: Any, wanted: Any) -> bool:
+    """Whether a part of a layout has the keys and values that Foxglove's own types (``foxglove.layouts``) have."""
+    kind, options = get_origin(wanted), get_args(wanted)
+    if is_dataclass(wanted):
+        hints = {re.sub("_(.)", lambda m: m[1].upper(), k): hint for k, hint in get_type_hints(wanted).items()}
+        if not isinstance(value, dict) or not set(value) <= set(hints):
+            return False
+        return all(fits(each, hints[k]) for k, each in value.items())
+    if kind in (Union, UnionType):
+        return any(fits(value, option) for option in options)
+    if kind is Literal:
+        return value in options
+    if kind in (list, dict):
+        children = value.values() if isinstance(value, dict) else value
+        return isinstance(value, kind) and all(fits(each, options[-1]) for each in children)
+    return isinstance(value, (int, float) if wanted is float else wanted)
 
 
 def test_it_is_refused_beside_a_login_which_it_would_go_around(tmp_path, capsys):

@@ -6,7 +6,9 @@ import json
 import re
 from collections import Counter
 from types import SimpleNamespace
+from typing import Any
 
+import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 
 from edge_server.live.ingest import DepthArrivals
@@ -66,3 +68,24 @@ def test_every_query_of_the_dashboard_names_a_metric_that_the_edge_exports():
     assert asked == exported, "each metric is drawn"
     places = [tuple(panel["gridPos"][k] for k in "xywh") for panel in dashboard["panels"]]
     assert len({(x, y) for x, y, *_ in places}) == len(places) and all(x + w <= 24 for x, _, w, _ in places)
+
+
+def test_grafana_reads_all_of_the_dashboard():
+    """Grafana's published types leave out what they do not know; ``__inputs`` is for its import alone."""
+    models = pytest.importorskip("grafana_foundation_sdk.models.dashboard", reason="needs the extra dev")
+    from grafana_foundation_sdk.cog.encoder import JSONEncoder
+
+    dashboard = json.loads((ROOT / "deploy/grafana.json").read_text())
+    for wrong in ({}, {"width": 12}):
+        dashboard["panels"][0]["gridPos"] |= wrong
+        read = json.loads(json.dumps(models.Dashboard.from_json(dashboard), cls=JSONEncoder))
+        assert lost(dashboard, read) == ["/__inputs", *(f"/panels/0/gridPos/{key}" for key in wrong)]
+
+
+def lost(sent: Any, read: Any, where: str = "") -> list[str]:
+    """What of ``sent`` is not in ``read``, which may have more."""
+    if isinstance(sent, dict) and isinstance(read, dict):
+        return [each for k, v in sent.items() for each in lost(v, read.get(k), f"{where}/{k}")]
+    if isinstance(sent, list) and isinstance(read, list) and len(sent) == len(read):
+        return [each for k, pair in enumerate(zip(sent, read)) for each in lost(*pair, f"{where}/{k}")]
+    return [] if sent == read else [where]
