@@ -173,7 +173,8 @@ def load(messages: Messages, options: ImageOptions) -> Dataset:
             continue
         images += _posed(messages, name, found[name], tracks, options, start_ns, notes)
     if not images:
-        raise DatasetError(f"{where}: no image in {messages.name} that has a lens and a pose: {'; '.join(notes)}")
+        why = "; ".join(notes) or "there is no image"
+        raise DatasetError(f"{where}: no image in {messages.name} that has a lens and a pose: {why}")
     apart = any(not np.array_equal(image.camera_to_world, images[0].camera_to_world) for image in images)
     carried = apart and len({image.camera for image in images}) == 1
     return Dataset(tuple(images), carried=carried, notes=tuple(notes))

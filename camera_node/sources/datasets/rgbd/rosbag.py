@@ -63,13 +63,14 @@ class BagMessages:
     def read(self, topic: str | None = None, log_ns: int = 0) -> Iterator[tuple[str, int, Record]]:
         kinds = (_IMAGE, _COMPRESSED_IMAGE, _INFO, *_TRANSFORMS)
         bag = self._bag
-        wanted = [c for c in bag.connections if c.msgtype in kinds and topic in (None, c.topic)]
+        wanted = [c for c in bag.connections if _kind(c.msgtype) in kinds and topic in (None, c.topic)]
         between = {} if topic is None else {"start": log_ns, "stop": log_ns + 1}
         with self._lock:
             try:
                 for connection, t_ns, data in bag.messages(wanted, **between) if wanted else ():
-                    message: Any = bag.deserialize(data, connection.msgtype)
-                    for record in _records(message, connection.msgtype, connection.topic, t_ns):
+                    kind = _kind(connection.msgtype)
+                    message: Any = bag.deserialize(data, kind)
+                    for record in _records(message, kind, connection.topic, t_ns):
                         yield connection.topic, t_ns, record
             except Exception as error:
                 raise self._unreadable(error) from None
@@ -77,6 +78,11 @@ class BagMessages:
     def _unreadable(self, error: Exception) -> DatasetError:
         text = str(error) or type(error).__name__
         return DatasetError(f"{self.where}: cannot be read as a ROS bag: {text}; cut short?")
+
+
+def _kind(name: str) -> str:
+    """A message's type; some writers of ROS 2 bags name it as ROS 1 does, without ``msg``."""
+    return name if name.count("/") != 1 else name.replace("/", "/msg/")
 
 
 def _records(message: Any, kind: str, topic: str, log_ns: int) -> Iterator[Record]:

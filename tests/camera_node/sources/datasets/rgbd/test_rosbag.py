@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -123,6 +125,17 @@ def test_images_depth_and_the_chain_of_transforms_of_a_bag(tmp_path, storage, as
         assert (record.intrinsics.cx, record.intrinsics.cy) == (16.0, 12.0)
         depth = record.depth()
         assert np.array_equal(depth.counts, MM) and depth.after_image_ns == 8_000_000
+
+
+def test_types_named_without_msg_are_known(tmp_path):
+    """As in the MCAP of amber's soccer goal: sensor_msgs/Image, without a definition."""
+    bag = write(tmp_path / "run", robot() + pictures(), "SQLITE3")
+    with closing(sqlite3.connect(next(bag.glob("*.db3")))) as tables:
+        tables.execute("UPDATE topics SET type = replace(type, '/msg/', '/')")
+        tables.execute("DELETE FROM message_definitions")
+        tables.commit()
+    (bag / "metadata.yaml").unlink()
+    assert np.array_equal(open_dataset(next(bag.iterdir()))[1][2].read(), PICTURE)
 
 
 def png(values: np.ndarray) -> bytes:
