@@ -15,12 +15,13 @@ uniform mat3 turn;             // world axes to camera axes (x right, y down, z 
 uniform vec3 eye;              // scene units
 uniform float near, focal, depthView;
 uniform vec2 size, limit;
-out vec2 offset;               // from the middle, in standard deviations along the axes of the ellipse
-flat out vec4 color;
+out vec2 offset;               // from the middle along the axes of the ellipse: its square is the exponent of 2
+flat out vec4 color;           // and the exponent in the middle
 flat out uint guessed;
 
 const float ZONE = ${Math.SQRT2 - 1};
 const float LOW_PASS = 0.3;
+const float PER_SIGMA = ${Math.sqrt(0.5 / Math.LN2)}; // exp(-x * x / 2) is exp2(-y * y) of y = x * PER_SIGMA
 
 ivec2 cell(uint n) { return ivec2(int(n % ${WIDTH}u), int(n / ${WIDTH}u)); }
 vec3 expand(vec3 u) {
@@ -71,10 +72,11 @@ void main() {
   float longer = middle + spread, shorter = max(middle - spread, 1e-6);
   vec2 along = abs(f) < 1e-9 ? (e >= h ? vec2(1.0, 0.0) : vec2(0.0, 1.0)) : normalize(vec2(f, longer - e));
   vec2 corner = vec2(float(gl_VertexID & 1), float((gl_VertexID >> 1) & 1)) * 2.0 - 1.0;
-  offset = corner * sqrt(most);
+  vec2 sigmas = corner * sqrt(most);
+  offset = sigmas * PER_SIGMA;
   vec2 pixel = focal * ratio + 0.5 * size
-    + offset.x * sqrt(longer) * along + offset.y * sqrt(shorter) * vec2(along.y, -along.x);
-  color = vec4(unpack(w.w) * (2.0 / 255.0) - 0.5, alpha);
+    + sigmas.x * sqrt(longer) * along + sigmas.y * sqrt(shorter) * vec2(along.y, -along.x);
+  color = vec4(unpack(w.w) * (2.0 / 255.0) - 0.5, log2(alpha));
   if (depthView > 0.5) color.rgb = vec3(p.z);
   gl_Position = vec4(pixel / size * vec2(2.0, -2.0) + vec2(-1.0, 1.0), 0.0, 1.0);
 }`;
@@ -87,7 +89,7 @@ uniform float depthView;
 in vec2 offset; flat in vec4 color; flat in uint guessed;
 out vec4 result;
 void main() {
-  float a = min(color.a * exp(-0.5 * dot(offset, offset)), 0.99);
+  float a = min(exp2(color.a - dot(offset, offset)), 0.99);
   if (a < 1.0 / 255.0) discard;
   vec3 c = color.rgb;
   ${striped ? STRIPES : ""}
@@ -145,7 +147,9 @@ export class SplatRenderer {
   _prepare() {
     const gl = this.gl;
     // Colors of Gaussians leave [0, 1]: with 8 bits each blend would cut them, and the picture be 16 dB less alike.
-    this.half = gl.getExtension("EXT_color_buffer_float") !== null || gl.getExtension("EXT_color_buffer_half_float") !== null;
+    this.floats = gl.getExtension("EXT_color_buffer_float") !== null || gl.getExtension("EXT_color_buffer_half_float") !== null;
+    // Without a GPU, half floats take two fifths of a frame: each blend converts them, there and back.
+    this.format = withoutGpu(gl) && gl.getExtension("EXT_float_blend") !== null ? gl.RGBA32F : gl.RGBA16F;
     this.plainProgram = link(gl, VERTEX, fragment(false));
     this.stripedProgram = null; // linked once a set has what no camera has seen
     this.show = link(gl, SHOW_VERTEX, SHOW_FRAGMENT);
@@ -290,7 +294,7 @@ export class SplatRenderer {
     gl.clearColor(red, green, blue, depth ? 0 : 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
     if (count > 0) this._drawGaussians(reader, camera, count, focal, near, depth);
-    if (this.half) {
+    if (this.floats) {
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
       gl.useProgram(this.show.program);
       gl.bindVertexArray(this.plain);
@@ -305,15 +309,15 @@ export class SplatRenderer {
 
   _bindTarget(width, height) {
     const gl = this.gl;
-    if (this.half && (this.target === null || this.targetSize !== `${width}x${height}`)) {
+    if (this.floats && (this.target === null || this.targetSize !== `${width}x${height}`)) {
       this._remove(this.target);
-      this.target = createTexture(gl, gl.RGBA16F, width, height);
+      this.target = createTexture(gl, this.format, width, height);
       this.targetSize = `${width}x${height}`;
       this.frame ??= gl.createFramebuffer();
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.target, 0);
     }
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.half ? this.frame : null);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.floats ? this.frame : null);
   }
 
   _drawGaussians(reader, camera, count, focal, near, depth) {
@@ -368,6 +372,13 @@ export class SplatRenderer {
     gl.drawArrays(gl.LINES, 0, 2 * lines.length);
     gl.bindVertexArray(null);
   }
+}
+
+/** Whether the browser draws with the processor alone, as far as it says so. */
+function withoutGpu(gl) {
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = gl.getParameter(info === null ? gl.RENDERER : info.UNMASKED_RENDERER_WEBGL);
+  return /swiftshader|llvmpipe|softpipe|basic render/i.test(name);
 }
 
 /** Places (xyz each, scene units) of records first to end. */

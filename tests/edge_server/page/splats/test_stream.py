@@ -229,7 +229,10 @@ def test_the_browser_draws_what_the_edge_renders():
         publish(state, shown)
         arrived = "window.splats && splats.reader.moves && splats.reader.shown.total + splats.reader.moving.count"
         browser.wait_for(lambda: browser.evaluate(arrived) == 820, "all Gaussians")
-        for ahead_s in (0.0, 0.12, 0.9):
+        assert browser.evaluate("splats.renderer.format === splats.renderer.gl.RGBA32F")
+        # Last in half floats, as with a GPU.
+        for ahead_s, format_ in ((0.0, "RGBA32F"), (0.12, "RGBA32F"), (0.9, "RGBA16F")):
+            browser.evaluate(f"splats.renderer.format = splats.renderer.gl.{format_}; splats.renderer.targetSize = ''")
             assert psnr(drawn(browser, NEWEST_S + ahead_s, state.start_ns), rendered(shown, NEWEST_S + ahead_s)) > 50.0
         assert (
             psnr(drawn(browser, NEWEST_S, state.start_ns), rendered(shown, NEWEST_S + 0.2)) < 40.0
