@@ -62,7 +62,8 @@ def main(arguments: list[str] | None = None, prog: str = "camera-node") -> int:
     devices = commands.add_parser(
         "devices",
         help="list the cameras that are plugged in",
-        description="Lists the cameras that are plugged in: the kind of source, and what to write as source.devices.",
+        description="Lists the cameras that are plugged in: the kind of source, and what to write as source.devices. "
+        "Videos of fixed cameras take their place by: freshfield scenario init FILE.yaml --like videos",
     )
     devices.set_defaults(run=_devices)
     arm_cli.add_commands(commands)

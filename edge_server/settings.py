@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from edge_server.embed.embedder import Embedder
 
 
+LONG_WORK_S = 10.0
+"""Of a stage of a command that is announced in a pipe, too: nobody wonders about less."""
+REDRAWN_S = 1.0
+"""Between two drawings of a command's progress: the seconds that it tells change no faster."""
 LEAST_UPDATE_MS = 10.0
 """Shortest fitting time of an update: a shorter one is not worth the decoding of its views."""
 MOST_MS = 1e9

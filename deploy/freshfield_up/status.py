@@ -83,10 +83,9 @@ def _edge_line(edge: Status) -> str:
     if isinstance(so_far, dict):
         scores = [f"held out {held_out(so_far)}"]
     else:
-        scores = [
-            f"PSNR {fmt(number(edge, 'scores', 'psnr_db'), '.2f')} dB{views}",
-            f"moving {fmt(number(edge, 'scores', 'psnr_moving_db'), '.2f')} dB",
-        ]
+        scores = [f"PSNR {fmt(number(edge, 'scores', 'psnr_db'), '.2f')} dB{views}"]
+        if not views:
+            scores += [f"moving {fmt(number(edge, 'scores', 'psnr_moving_db'), '.2f')} dB"]
     parts = [
         f"{updates:.0f} updates",
         f"{fmt(number(edge, 'updates', 'ms_p50'), '.0f')} ms each",

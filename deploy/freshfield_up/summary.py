@@ -11,19 +11,18 @@ from freshfield_up.status import fmt, held_out
 
 
 def summarize(out: Path) -> str:
-    """The main results and where the report is. Missing numbers are shown as ``-``."""
+    """The main results and where the report is. Missing numbers are shown as ``-``; what needs a held-out camera is
+    left out without one."""
     report: dict[str, Any] = json.loads((out / "report.json").read_text())
     frames, age = report.get("frames", {}), report.get("age_ms", {})
     updates, fidelity = report.get("updates", {}), report.get("fidelity", {})
-    baseline = fidelity.get("baseline") or {}
     rejected = sum(frames.get("rejected", {}).values())
     shed = f", {n} of them left out for lack of time" if (n := updates.get("shed")) else ""
     idle = updates.get("without_step") or 0
     lines = [
         "",
         *_fidelity(fidelity),
-        f"baselines  mean color {fmt(baseline.get('mean_colour_db'), '.1f')} dB, "
-        f"nearest view {fmt(baseline.get('nearest_view_db'), '.1f')} dB",
+        *_baselines(fidelity.get("baseline") or {}),
         f"age        mean {fmt(age.get('mean'), '.0f')} ms, p95 {fmt(age.get('p95'), '.0f')} ms",
         f"updates    {fmt(updates.get('count'), 'd')} of {fmt(updates.get('ms_p50'), '.0f')} ms "
         f"(p95 {fmt(updates.get('ms_p95'), '.0f')} ms), the first after {_seconds(updates.get('first_ms'))}"
@@ -44,15 +43,26 @@ def _fidelity(fidelity: dict[str, Any]) -> list[str]:
     if so_far:
         given = f"; {fmt(shown.get('psnr_db'), '.2f')} dB at given ones" if so_far.get("refined") else ""
         return [f"held out   {held_out(so_far)}{given}", f"shown      {age}"]
-    views = f" on {NOTHING_HELD_OUT}" if "selected" in fidelity.get("scored_on", ()) else ""
-    return [
+    trained = "selected" in fidelity.get("scored_on", ())
+    views = f" on {NOTHING_HELD_OUT}" if trained else ""
+    seen = [
         f"shown      PSNR {fmt(shown.get('psnr_db'), '.2f')} dB over the last fifth of the run "
         f"(moving pixels {fmt(shown.get('psnr_moving_db'), '.2f')} dB, still "
-        f"{fmt(shown.get('psnr_still_db'), '.2f')}), {age}",
+        f"{fmt(shown.get('psnr_still_db'), '.2f')}), {age}"
+    ]
+    return [
+        *([] if trained else seen),
         f"published  PSNR {fmt(final.get('psnr_db'), '.2f')} dB over the last fifth of the run{views} "
         f"(moving pixels {fmt(final.get('psnr_moving_db'), '.2f')} dB, SSIM {fmt(final.get('ssim'), '.3f')}, "
         f"LPIPS {fmt(final.get('lpips'), '.3f')})",
     ]
+
+
+def _baselines(baseline: dict[str, Any]) -> list[str]:
+    mean, nearest = (baseline.get(name) for name in ("mean_colour_db", "nearest_view_db"))
+    if mean is nearest is None:
+        return []
+    return [f"baselines  mean color {fmt(mean, '.1f')} dB, nearest view {fmt(nearest, '.1f')} dB"]
 
 
 def _accounted(frames: dict[str, Any]) -> str:

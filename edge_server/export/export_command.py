@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from edge_server.export import ExportError
-from edge_server.export.exporter import KINDS, Exporter, ProgressLine, check, check_installed
+from edge_server.export.exporter import KINDS, Exporter, check, check_installed
 from edge_server.export.run_source import open_source
 from edge_server.export.settings import POINTS
+from edge_server.progress import ProgressLine
 from edge_server.surface import SurfaceError
 from edge_server.surface.settings import MeshSettings
 from freshfield.files import out_file, out_folder

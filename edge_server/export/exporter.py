@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_server.export import ExportError, PosedImage
-from edge_server.export.settings import LONG_S, PIXELS_A_POINT, POINTS
+from edge_server.export.settings import PIXELS_A_POINT, POINTS
 from edge_server.fields import Field, View
 from edge_server.surface.settings import MeshSettings
 
@@ -143,32 +142,3 @@ class Exporter:
         self._points(folder / "points.ply")
         path = write_transforms(folder, self._shots, "points.ply")
         self._say(f"{path}: {len(self._shots)} frames")
-
-
-class ProgressLine:
-    """One line of a terminal with the stage, its share and the seconds that are left. In a pipe, nothing but the
-    estimate of a stage that takes longer than LONG_S, once a second of it has passed."""
-
-    def __init__(self, stream: Any) -> None:
-        self._stream = stream
-        self._stage, self._printed_s, self._began = "", 0.0, (0.0, 0.0)
-        self._announced = False
-
-    def __call__(self, stage: str, share: float) -> None:
-        now = time.perf_counter()
-        known = stage == self._stage
-        if share < 1.0 and known and now - self._printed_s < 1.0:
-            return
-        if not known:
-            self._stage, self._began, self._announced = stage, (now, share), False
-        self._printed_s = now
-        began_s, first = self._began
-        left_s = (now - began_s) * (1.0 - share) / (share - first) if share > first else 0.0
-        if not self._stream.isatty():
-            if left_s > LONG_S and not self._announced:
-                self._announced = True
-                print(f"  {stage}: some {left_s:.0f} s", file=self._stream, flush=True)
-            return
-        left = f", {left_s:.0f} s left" if left_s else ""
-        end = "\n" if share >= 1.0 else ""
-        print(f"\r  {stage:10} {100 * share:3.0f} %{left:16}", end=end, file=self._stream, flush=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from edge_server.export.run_source import Source, open_source
 from edge_server.export.viewed_field import checked_size
 from edge_server.fidelity.images import to_bytes
 from edge_server.fields import Rendering
+from edge_server.progress import ProgressLine
 from freshfield.files import out_file
 
 DESCRIPTION = """\
@@ -90,12 +90,13 @@ def _render(args: argparse.Namespace) -> None:
         return [s.render(steps[index].camera_to_world, cameras[index]) for s in snapshots]
 
     shown = _depth_colors(render, len(steps)) if args.depth else lambda rendering: to_bytes(rendering.color)
-    began = time.monotonic()
+    progress = ProgressLine(sys.stderr)
 
     def images() -> Iterator[Image]:
         for index in range(len(steps)):
+            progress("images", index / len(steps))
             yield np.concatenate([shown(each) for each in render(index)], axis=1)
-            _progress(index + 1, len(steps), began)
+        progress("images", 1.0)
 
     count, width, height = write_video(args.file, images(), fps)
     print(f"{args.file}: {count} image{'s' * (count > 1)} of {width} x {height}")
@@ -141,12 +142,3 @@ def _depth_colors(render: Callable[[int], list[Rendering]], count: int) -> Calla
         return np.asarray(np.where(there[..., None], map_bgr[..., ::-1], 0), np.uint8)
 
     return colors
-
-
-def _progress(done: int, count: int, began: float) -> None:
-    """One line in a terminal, nothing in a pipe."""
-    if sys.stderr.isatty() and count > 1:
-        left_s = (time.monotonic() - began) / done * (count - done)
-        print(
-            f"\r{done} of {count} images, {left_s:.0f} s left ", end="\n" * (done == count), file=sys.stderr, flush=True
-        )

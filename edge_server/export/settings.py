@@ -6,8 +6,11 @@ POINTS = 20_000
 """Of a sparse model of usual size: more only slows its readers."""
 PIXELS_A_POINT = 1000
 """At most, of the depth that points are drawn from: 20 million pixels take 8 s of processor time."""
-LONG_S = 10.0
-"""Of a stage that is announced in a pipe, too."""
+
+DEFAULT_HEIGHT_PX = 480
+"""Of a rendering, at the shape of the cameras' images."""
+MOST_NAMED = 20
+"""Cameras in an error."""
 
 FRAMES_PER_S = 30
 """At which players show a sequence, unless told otherwise."""

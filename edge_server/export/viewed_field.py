@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from edge_server.export import ExportError, PosedImage, file_names
 from edge_server.export.camera_paths import Step, lens, orbit, vertical_fov_deg
+from edge_server.export.settings import DEFAULT_HEIGHT_PX, MOST_NAMED
 from edge_server.fields import SEPARATOR, Field, RefinesCameras, Rendering, View
 from freshfield.geometry import Pinhole
 from freshfield.limits import MAX_IMAGE_SIDE_PX
 
 Kind = Literal["splats", "points", "mesh"]
-DEFAULT_HEIGHT = 480  # pixels, at the shape of the cameras' images
-MOST_NAMED = 20  # cameras in an error
 
 
 class ViewedField:
@@ -91,9 +90,9 @@ class ViewedField:
         return [step.camera_to_world for step in orbit(self.views, count, fov)]
 
     def usual_size(self) -> tuple[int, int]:
-        """Width and height near DEFAULT_HEIGHT, even: video codecs ask for that."""
+        """Width and height near DEFAULT_HEIGHT_PX, even: video codecs ask for that."""
         like: Pinhole = self.views[0].intrinsics
-        return 2 * round(DEFAULT_HEIGHT * like.width / like.height / 2), DEFAULT_HEIGHT
+        return 2 * round(DEFAULT_HEIGHT_PX * like.width / like.height / 2), DEFAULT_HEIGHT_PX
 
     def export(self, file: Path | str, kind: Kind | None = None) -> None:
         """Write the field for other programs.

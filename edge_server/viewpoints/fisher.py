@@ -13,13 +13,8 @@ from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.kernels.fisher_information import MOMENTS, fisher_information
 from edge_server.viewpoints.registry import CaptureState
+from edge_server.viewpoints.settings import CAMERAS_A_RUN, PRIOR
 from freshfield.geometry import Pinhole
-
-_CAMERAS_A_RUN = 8  # number of cameras whose tile lists are in memory at a time
-# Prior information about a parameter, as a share of what the views give on average over all Gaussians: that
-# has the parameter's unit, and bounds the value of an unseen Gaussian. With a share of .01 the views go to
-# the edge of the dome: on four captures of tile, 8 views gave 19.8 dB, and with 1, 22.2 dB.
-PRIOR = 1.0
 
 
 def information(
@@ -35,8 +30,8 @@ def information(
         raise ViewpointError("Fisher information is known for splats with sh_degree: 0 only")
     raster = RasterBuffers(snapshot.pool)
     moments = np.zeros((snapshot.pool.threads, len(gaussians.params), MOMENTS))
-    for first in range(0, len(poses), _CAMERAS_A_RUN):
-        some = slice(first, first + _CAMERAS_A_RUN)
+    for first in range(0, len(poses), CAMERAS_A_RUN):
+        some = slice(first, first + CAMERAS_A_RUN)
         cams = camera_rows(poses[some], lenses[some], snapshot.box)
         raster.project_and_bin(cams, gaussians)
         found = np.empty((len(cams), *gaussians.params.shape), np.float32)

@@ -7,17 +7,10 @@ from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import Candidates
 from edge_server.viewpoints.registry import CaptureState
+from edge_server.viewpoints.settings import ALIKE_RAD, MOST_WANTED, SAMPLES_A_SIDE, UNKNOWN_SIZE
 from freshfield.geometry import seen_from
 
 Array = NDArray[np.float64]
-
-_SAMPLES_A_SIDE = 8  # points along each side of a face of the object's box
-# The likeness of two views this far apart is exp(-1), for small angles.
-_ALIKE_RAD = 0.5
-_MOST_WANTED = 128  # directions to cover; with more candidates, only every second, third, ... counts
-# An object of unknown size is assumed to reach this far from the target, as a share of the distance to the
-# nearest camera.
-_UNKNOWN_SIZE = 0.3
 
 
 class RandomOrder:
@@ -42,9 +35,9 @@ class Coverage:
         sees = weight > 0.0
         total = np.zeros(len(weight))
         usable = np.flatnonzero(state.candidates.reachable)
-        for wanted in usable[:: max(len(usable) // _MOST_WANTED, 1)]:
+        for wanted in usable[:: max(len(usable) // MOST_WANTED, 1)]:
             cosine = np.einsum("npd,pd->np", toward, toward[wanted])
-            alike = np.where(sees, np.exp(-2.0 * (1.0 - cosine) / _ALIKE_RAD**2), 0.0)
+            alike = np.where(sees, np.exp(-2.0 * (1.0 - cosine) / ALIKE_RAD**2), 0.0)
             known = alike[state.order].max(axis=0, initial=0.0)
             total += np.maximum(alike - known, 0.0) @ weight[wanted]
         return total
@@ -71,8 +64,8 @@ def _box(candidates: Candidates) -> tuple[Array, Array]:
         low, high = candidates.bounds
     else:
         nearest = np.linalg.norm(candidates.poses[:, :3, 3] - candidates.target, axis=1).min()
-        low, high = candidates.target - _UNKNOWN_SIZE * nearest, candidates.target + _UNKNOWN_SIZE * nearest
-    middles = (np.arange(_SAMPLES_A_SIDE) + 0.5) / _SAMPLES_A_SIDE
+        low, high = candidates.target - UNKNOWN_SIZE * nearest, candidates.target + UNKNOWN_SIZE * nearest
+    middles = (np.arange(SAMPLES_A_SIDE) + 0.5) / SAMPLES_A_SIDE
     u, v = (w.ravel() for w in np.meshgrid(middles, middles))
     points, normals = [], []
     for axis in range(3):

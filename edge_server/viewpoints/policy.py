@@ -23,17 +23,13 @@ from edge_server.scheduler.learned.state import State, StateLayout
 from edge_server.viewpoints.candidates import Candidates, ViewpointError
 from edge_server.viewpoints.features import GEOMETRY, StepFeatures
 from edge_server.viewpoints.registry import CaptureState
+from edge_server.viewpoints.settings import ANY_KL, CLOSED, ENTROPY, PASSES, STEP_MS
 from freshfield.geometry import so3_log
 
 Array = NDArray[np.float64]
 Embed = Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]]
 
 KIND = "viewpoint policy"
-_STEP_MS = 1000.0  # an age of one step, in the unit of the schedulers' state
-_CLOSED = -1e9
-# Of an update: what a learned reward allows; a capture's return is not discounted (4.14).
-_PASSES, _ENTROPY = 4, 0.01
-_ANY_KL = 1e9  # passes never end early
 
 
 @dataclass(frozen=True)
@@ -76,7 +72,7 @@ class Rows:
         candidates = self.steps.candidates
         ages = np.full(len(candidates), np.inf)
         for age, k in enumerate(reversed(order)):
-            ages[k] = age * _STEP_MS
+            ages[k] = age * STEP_MS
         # What is not captured yet has the usual embedding, which is 0 once it is standardized.
         seen = np.tile(self.layout.centre[len(GEOMETRY) :], (len(candidates), 1))
         if self.embeddings is not None and len(order):
@@ -97,7 +93,7 @@ def layout_of(steps: StepFeatures, embeddings: Array | None, views: int, rng: np
     centre = np.concatenate([part.mean(axis=0) for part in parts])
     spread = np.concatenate([np.maximum(part.std(axis=0), 1e-3) for part in parts])
     return StateLayout(
-        dim=len(centre), age_scale_ms=_STEP_MS, centre=tuple(centre.tolist()), spread=tuple(spread.tolist())
+        dim=len(centre), age_scale_ms=STEP_MS, centre=tuple(centre.tolist()), spread=tuple(spread.tolist())
     )
 
 
@@ -176,9 +172,9 @@ def train_policy(
         layout,
         hidden=config.hidden,
         learning_rate=config.learning_rate,
-        passes=_PASSES,
-        entropy=_ENTROPY,
-        target_kl=_ANY_KL,
+        passes=PASSES,
+        entropy=ENTROPY,
+        target_kl=ANY_KL,
     )
     rows = Rows(candidates, embeddings, layout)
     usual = np.concatenate([reward(steps.actions([k]))[usable] for k in usable[:: max(len(usable) // 8, 1)]])
@@ -218,7 +214,7 @@ def _episodes(
         closed = np.tile(~rows.steps.candidates.reachable, (count, 1))
         for line, order in zip(closed, orders):
             line[order] = True
-        logits = np.where(closed, _CLOSED, networks.logits(np, spec, actor, features))
+        logits = np.where(closed, CLOSED, networks.logits(np, spec, actor, features))
         logps = logits - np.logaddexp.reduce(logits, axis=1, keepdims=True)
         chosen = np.argmax(logps + rng.gumbel(size=logps.shape), axis=1)
         taken = np.stack([rows.steps.actions(order)[k] for order, k in zip(orders, chosen)])
@@ -266,7 +262,7 @@ def _improve(
 
     def evaluate(some: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         logits = networks.logits(torch, spec, actor, features[some])
-        logps = torch.log_softmax(logits.masked_fill(closed[some], _CLOSED), dim=-1)
+        logps = torch.log_softmax(logits.masked_fill(closed[some], CLOSED), dim=-1)
         now = logps.gather(1, chosen[some, None])[:, 0]
         entropy = -(logps.exp() * logps).masked_fill(closed[some], 0.0).sum(dim=-1)
         return now, entropy, networks.value(torch, critic, features[some])

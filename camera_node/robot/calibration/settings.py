@@ -62,3 +62,5 @@ MOMENT_S, STILL_PX = 0.5, 0.5
 NEW_SHARE = 0.05
 # A live camera without a new frame for so long shows nothing at that moment.
 LIVE_WAIT_S = 1.0
+# Horizontal angle of view that a live camera is opened with. Any will do: its lens is estimated from the pictures.
+UNKNOWN_FOV_DEG = 60.0

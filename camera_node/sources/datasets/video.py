@@ -27,7 +27,7 @@ from freshfield.geometry import Pinhole
 
 import cv2  # isort: skip
 
-FILES = ("calib*.json",)
+FILES = ("calib*.json", "rig*.json")
 _PLACES = ("videos/{}.mp4", "{}.mp4")
 # Up to this distance, decoding forward is cheaper than seeking, which decodes from a key frame.
 _SKIP_FRAMES = 30
@@ -75,7 +75,8 @@ def load_dataset(
         if video is not None:
             found[name] = video
         elif name in files:
-            raise DatasetError(f"{calibration.parent / files[name]}: no such video (camera {name})")
+            missing = calibration.parent / files[name]
+            raise DatasetError(f"{missing}: no such video (camera {name}), relative to {calibration.name}")
     if not found:
         raise DatasetError(f"{calibration}: none of its cameras has a video at {' or '.join(_PLACES)}")
     return rig_dataset({name: (cameras[name], Clip(found[name])) for name in found}, path, options, require_poses)
@@ -126,7 +127,7 @@ def _find_calibration(folder: Path) -> Path:
     found = find_files(folder, FILES)
     if len(found) != 1:
         names = ", ".join(p.name for p in found) or "none"
-        raise DatasetError(f"{folder}: expected one calib*.json, found {names}; name the file itself")
+        raise DatasetError(f"{folder}: expected one {' or '.join(FILES)}, found {names}; name the file itself")
     return found[0]
 
 

@@ -93,14 +93,17 @@ def _open(camera: str, device: str) -> cv2.VideoCapture:
         capture = cv2.VideoCapture(device, cv2.CAP_FFMPEG, limits)
         advice = "is the address right, and does the camera answer there?"
     else:
+        if Path(device).is_file():
+            raise CameraError(
+                f"{camera}: no camera at {device}: it is a file, not a device: a recorded video is a source of kind "
+                "video (freshfield scenario init FILE.yaml --like videos)"
+            )
         if device.isdecimal():
             missing = not Path(f"/dev/video{device}").exists()
             capture = cv2.VideoCapture() if missing else cv2.VideoCapture(int(device), cv2.CAP_V4L2)
         else:
             capture = cv2.VideoCapture(device, cv2.CAP_V4L2) if Path(device).exists() else cv2.VideoCapture()
         advice = "is it plugged in, is the user in the group video, does another program hold it?"
-        if Path(device).is_file():
-            advice = "it is a file, not a device: a recorded video is a source of kind video"
     if not capture.isOpened():
         raise CameraError(f"{camera}: no camera at {device}: {advice}")
     return capture

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import platform
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
@@ -18,6 +20,7 @@ import cv2
 from edge_server.experiments.engine.content_key import plain, result_key, surroundings
 from edge_server.experiments.engine.settings import BATCH, PARENT_EVERY_S, RETRIES
 from edge_server.fields.common.threads.thread_pool import MOST_USEFUL, THREADS_VARIABLE
+from edge_server.progress import ProgressLine
 from freshfield.files import Lines
 from freshfield.machine_load import usable_cores
 
@@ -63,6 +66,10 @@ class ResultStore:
             self._lines.close()
 
 
+def _say(line: str) -> None:
+    print(line, flush=True)  # also in a pipe, before the first result
+
+
 @dataclass
 class Engine:
     """Computes results and keeps them; see the package's docstring.
@@ -71,7 +78,7 @@ class Engine:
     jobs: number of processes; 1 computes in this one.
     ray: address of a Ray cluster (``auto``, ``local`` or HOST:PORT) to use instead of processes.
     threads: number of threads of each process; None: an equal share of the cores.
-    say: called with each line of progress.
+    say: called with what is to be computed; how far it is, is a line of a terminal (``ProgressLine``).
     Raises EngineError for less than one process.
     """
 
@@ -79,7 +86,7 @@ class Engine:
     jobs: int = 1
     ray: str | None = None
     threads: int | None = None
-    say: Callable[[str], None] = print
+    say: Callable[[str], None] = _say
     _store: ResultStore | None = None
 
     def __post_init__(self) -> None:
@@ -107,15 +114,16 @@ class Engine:
         store = self._store = self._store or ResultStore(self.file)
         keys = [result_key(work, one, files(one) if files else ()) for one in inputs]
         wanted = {key: one for key, one in zip(keys, inputs) if key not in store.results}
-        total, done, began = len(wanted), 0, time.monotonic()
-        if total:
-            self.say(f"{name}: {total} to compute, {len(set(keys)) - total} known")
-        for task, results in self._results(work, _tasks(wanted, group, batch)):
-            for (key, one), result in zip(task, results):
-                store.put(key, one, result)
-                done += 1
-            spent_s = time.monotonic() - began
-            self.say(f"{name}: {done}/{total}, {spent_s:.0f} s, {spent_s / done * (total - done):.0f} s left")
+        total, done, progress = len(wanted), 0, ProgressLine(sys.stderr)
+        if not total:
+            return [store.results[key] for key in keys]
+        self.say(f"{name}: {total} to compute, {len(set(keys)) - total} known")
+        with progress.running(name):
+            for task, results in self._results(work, _tasks(wanted, group, batch)):
+                for (key, one), result in zip(task, results):
+                    store.put(key, one, result)
+                    done += 1
+                progress(name, done / total)
         return [store.results[key] for key in keys]
 
     def close(self) -> None:
@@ -139,8 +147,8 @@ class Engine:
         else:
             if self.threads is not None and tasks:
                 limit_threads(self.threads)
-            for task in tasks:
-                yield task, _compute(work, task, 0)[1]
+            for one in itertools.chain(*tasks):
+                yield [one], _compute(work, [one], 0)[1]
 
 
 _Task = list[tuple[str, Input]]

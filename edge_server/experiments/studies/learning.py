@@ -20,11 +20,11 @@ from edge_server.experiments.studies.study import StudyRequest, open_engine
 from edge_server.experiments.studies.trial import Trial
 from edge_server.experiments.training.evaluation import Candidate, evaluate, fixed_candidates
 from edge_server.experiments.training.learning_curve import draw_curve
+from edge_server.experiments.training.settings import QUICK_FIELDS
 from edge_server.experiments.training.trainer import TrainingConfig, read_log, train
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.settings import Action, Spec
 
-FIELD_OPTIONS = {"gaussians": 4096, "start": 2048}
 SIZE = 64
 FOUR_VIEWPOINTS = ("cam00", "cam04", "cam09", "cam17")
 # Cameras that judge trained policies: they give no reward and no update uses them.
@@ -90,7 +90,7 @@ def room(channel: Mapping[str, Any] | str = "ch5", **more: Any) -> Setting:
     """
     section = {"preset": channel} if isinstance(channel, str) else dict(channel)
     held_out = more.pop("held_out", ("cam00",))
-    scenario = Trial("room", 0, section, size=SIZE, field_options=FIELD_OPTIONS).scenario()
+    scenario = Trial("room", 0, section, size=SIZE, field_options=QUICK_FIELDS["splat"]).scenario()
     apart = tuple(c for c in scenario.cameras if c in {*held_out, *REPORT})
     scenario = dataclasses.replace(scenario, held_out=apart)
     return Setting(scenario, report=REPORT, **{"steps": 50 if more.get("scratch") else 20, **more})

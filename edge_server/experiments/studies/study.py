@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -301,6 +300,4 @@ def markdown(study: Study, request: StudyRequest, table: SeedTable, verdicts: Se
 
 def open_engine(request: StudyRequest, name: str, threads: int | None = None) -> Engine:
     """The engine of a study's cases, with results in OUT/results/NAME.jsonl."""
-    return Engine(
-        request.out / "results" / f"{name}.jsonl", request.jobs, request.ray, threads, partial(print, flush=True)
-    )
+    return Engine(request.out / "results" / f"{name}.jsonl", request.jobs, request.ray, threads)

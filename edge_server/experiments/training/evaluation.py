@@ -19,6 +19,7 @@ from edge_server.experiments.engine import Engine
 from edge_server.experiments.rollouts.episode import Outcome, mean_outcome
 from edge_server.experiments.rollouts.rollout import run_rollouts
 from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting
+from edge_server.experiments.training.settings import FITS
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.rewards import Reward
 
@@ -38,9 +39,6 @@ BASELINE_POLICIES = (
     "age-driven",
 )
 ORACLE = "oracle"
-# Fits of every choice: the choice that is best in one is measured by the other, because the maximum of noisy
-# fits is biased upwards.
-FITS = 2
 
 
 @dataclass(frozen=True)

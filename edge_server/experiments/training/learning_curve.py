@@ -8,10 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from edge_server.experiments.training.settings import SMOOTHED_BATCHES
 from edge_server.report.style import CYCLE, figure, label_lines
-
-# Number of batches averaged in a point of the smoothed curve.
-_SMOOTH = 9
 
 
 def draw_curve(path: Path, rows: Sequence[dict[str, Any]]) -> None:
@@ -35,7 +33,7 @@ def draw_curve(path: Path, rows: Sequence[dict[str, Any]]) -> None:
         label_lines(bottom, "terms of the reward,\nchange since the start", "episodes")
 
 
-def smoothed(values: np.ndarray, count: int = _SMOOTH) -> np.ndarray:
+def smoothed(values: np.ndarray, count: int = SMOOTHED_BATCHES) -> np.ndarray:
     """Moving average over the last ``count`` values, fewer at the beginning, without NaN."""
     parts = [values[max(0, i + 1 - count) : i + 1] for i in range(len(values))]
     return np.array([np.nan if np.isnan(p).all() else np.nanmean(p) for p in parts])

@@ -15,6 +15,7 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.engine import EngineError
 from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
 from edge_server.experiments.training.learning_curve import draw_curve
+from edge_server.experiments.training.settings import QUICK_FIELDS
 from edge_server.experiments.training.trainer import TrainingConfig, TrainingError, read_log, train
 from edge_server.fields.registry import field_names
 from edge_server.scheduler import BANDIT, STATE_PARTS
@@ -54,11 +55,6 @@ OUT/policy.npz is the learned policy, OUT/actor.npz the part of it that decides,
 learning curve with each term of the reward. edge-server compare says what it shows, on seeds it was not trained
 on. After Ctrl-C the same command continues, bit for bit, whatever --jobs and --ray are.
 """
-# Options with which a field learns the small images of a training faster than with its defaults.
-QUICK_FIELDS = {
-    "splat": {"gaussians": 4096, "start": 2048},
-    "ngp": {"levels": 6, "log2_table": 14, "batch_samples": 8192, "samples": 96},
-}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 Say = Callable[[str], None]
-_PROGRESS_EVERY_S = 5.0
 
 
 class TrainingError(ValueError):
@@ -107,7 +106,7 @@ def train(
         learner = _new_learner(setting, config, folders, jobs, ray)
     for number in range(first, config.batches):
         batch_began = time.monotonic()
-        engine = Engine(jobs=jobs, ray=ray, threads=1, say=_now_and_then(say))
+        engine = Engine(jobs=jobs, ray=ray, threads=1, say=lambda line: None)
         row = _train_batch(setting, config, folders, engine, learner, number)
         rows.append({**row, "seconds": round(time.monotonic() - batch_began, 3)})
         checkpoint.save(learner, rows)
@@ -204,19 +203,6 @@ def _row(
 def _complete(found: RewardTerms) -> float:
     """A reward that lacks a term cannot be compared with others: NaN."""
     return float("nan") if found.total is None or not found.complete else found.total
-
-
-def _now_and_then(say: Say) -> Say:
-    """``say`` at most every few seconds."""
-    last_s = time.monotonic()
-
-    def sometimes(line: str) -> None:
-        nonlocal last_s
-        if time.monotonic() - last_s >= _PROGRESS_EVERY_S:
-            last_s = time.monotonic()
-            say(line)
-
-    return sometimes
 
 
 def _missing_reward_reason(outcomes: list[Outcome], found: list[RewardTerms]) -> str:

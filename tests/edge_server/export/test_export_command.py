@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 import sys
 import tracemalloc
@@ -14,7 +13,6 @@ import pytest
 from edge_server.cli import main as edge_server
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.export import ExportError
-from edge_server.export.exporter import ProgressLine
 from edge_server.export.run_source import open_source
 from edge_server.fields import Budget, checkpoint
 from edge_server.fields.registry import make_field
@@ -69,17 +67,6 @@ def test_depth_is_sharpened_for_a_mesh_alone(run, tmp_path, monkeypatch):
     monkeypatch.setattr(sys.stderr, "write", written.append, raising=False)
     assert export(run, "--mesh", tmp_path / "m.ply", "--voxel", 10) == 0 and sharpened
     assert any(text.startswith("\r  sharpen") for text in written)
-
-
-def test_a_pipe_is_told_of_long_work_alone(monkeypatch):
-    now, out = [0.0], io.StringIO()
-    monkeypatch.setattr("edge_server.export.exporter.time.perf_counter", lambda: now[0])
-    line = ProgressLine(out)
-    for stage, each_s in (("depth", 0.05), ("sharpen", 2.0), ("fuse", 0.05)):
-        for step in range(11):
-            line(stage, step / 10)
-            now[0] += each_s
-    assert out.getvalue() == "  sharpen: some 18 s\n"
 
 
 def test_points_of_large_pictures_are_drawn_from_a_part_of_them(run, tmp_path, capsys, monkeypatch):

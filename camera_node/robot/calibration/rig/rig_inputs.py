@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.inputs import find_corners, list_images
-from camera_node.robot.calibration.settings import LIVE_WAIT_S, MOMENT_S, NEW_SHARE, STILL_PX
+from camera_node.robot.calibration.settings import LIVE_WAIT_S, MOMENT_S, NEW_SHARE, STILL_PX, UNKNOWN_FOV_DEG
 from camera_node.robot.calibration.targets import Corners, Target, to_gray
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
@@ -113,12 +113,13 @@ Grab = Callable[[], GrayImage | None]
 def watch(cameras: Mapping[str, Grab], target: Target, seconds: float | None, tell: Callable[[str], None]) -> RigViews:
     """Views taken live while somebody moves the target about and holds it still, until ``seconds`` are over or Ctrl-C.
 
-    cameras: name -> function that returns its newest image, None without one. tell: what to do next, a line each time
-    that a moment was kept.
+    cameras: name -> function that returns its newest image, None without one. tell: gets a line with the number of
+    moments of each camera each time that one was kept, or that a camera went silent or came back.
     """
     views = RigViews({name: {} for name in cameras})
     before: dict[str, Corners | None] = dict.fromkeys(cameras)
     kept: dict[str, Corners | None] = dict.fromkeys(cameras)
+    silent: list[str] = []
     began = time.monotonic()
     try:
         for moment in itertools.count(1):
@@ -131,13 +132,16 @@ def watch(cameras: Mapping[str, Grab], target: Target, seconds: float | None, te
                 if image is not None:
                     views.sizes[name] = (image.shape[1], image.shape[0])
             still = {n: c for n, c in now.items() if c and (b := before[n]) and moved_px(b, c) < 2 * STILL_PX}
-            new = [
-                n for n, c in still.items() if (k := kept[n]) is None or moved_px(k, c) > NEW_SHARE * views.sizes[n][0]
-            ]
-            if new and len(still) == sum(c is not None for c in now.values()):
+            new = len(still) == sum(c is not None for c in now.values()) and any(
+                (k := kept[n]) is None or moved_px(k, c) > NEW_SHARE * views.sizes[n][0] for n, c in still.items()
+            )
+            if new:
                 for name, corners in still.items():
                     views.corners[name][f"{moment}"] = kept[name] = corners
-                tell(", ".join(f"{name} {len(seen)}" for name, seen in views.corners.items()))
+            silent, before_silent = [name for name, image in images.items() if image is None], silent
+            if new or silent != before_silent:
+                counts = ", ".join(f"{name} {len(seen)}" for name, seen in views.corners.items())
+                tell(counts + (f"; no picture of {', '.join(silent)}: unplugged?" if silent else ""))
             before = now
     except KeyboardInterrupt:
         print("stopped; what there is:", file=sys.stderr)
@@ -166,7 +170,7 @@ def open_cameras(scenario_file: str) -> tuple[dict[str, Grab], Callable[[], None
         feed = open_feed(camera, config, fps, WallClock())
         first = feed.grab(config.first_frame_s)
         if first is not None:  # a source wants a lens; any will do, it is estimated here
-            feed.intrinsics = Pinhole.from_fov(first[1].shape[1], first[1].shape[0], 60.0)
+            feed.intrinsics = Pinhole.from_fov(first[1].shape[1], first[1].shape[0], UNKNOWN_FOV_DEG)
         return feed
 
     def close() -> None:

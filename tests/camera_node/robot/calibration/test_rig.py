@@ -249,6 +249,23 @@ def test_a_live_session_keeps_each_new_place_once_the_target_rests():
     assert said[-1] == f"cam1 {len(views.corners['cam1'])}, cam2 {len(views.corners['cam2'])}"
 
 
+@pytest.mark.stability
+def test_a_live_camera_that_is_unplugged_is_named_and_the_others_go_on():
+    target = parse_target(BOARD)
+    still = photo("cam1", boards(1)[0], 2.0, 0)
+    rounds = iter([True, True, False, False, True, None])
+    said: list[str] = []
+
+    def unplugged_for_a_while():
+        if (there := next(rounds)) is None:
+            raise KeyboardInterrupt
+        return still if there else None
+
+    views = rig_inputs.watch({"cam1": lambda: still, "cam2": unplugged_for_a_while}, target, None, said.append)
+    assert said == ["cam1 1, cam2 1", "cam1 1, cam2 1; no picture of cam2: unplugged?", "cam1 1, cam2 1"]
+    assert len(views.corners["cam1"]) == 1
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -311,7 +311,7 @@ def test_what_does_not_fit_is_named(tmp_path):
         opened(video_scenario(file))
     (tmp_path / "a/videos/cam00.mp4").unlink()
     (tmp_path / "b/videos").mkdir(parents=True)
-    with pytest.raises(DatasetError, match=r"expected one calib\*.json, found none"):
+    with pytest.raises(DatasetError, match=r"expected one calib\*.json or rig\*.json, found none"):
         opened(video_scenario(tmp_path / "b"))
     (tmp_path / "a/videos/cam00.mp4").write_bytes(b"no video at all")
     file.write_text(json.dumps(rig))

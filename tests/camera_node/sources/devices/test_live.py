@@ -364,5 +364,5 @@ def test_the_camera_that_is_meant_is_the_one_named_or_the_only_one():
 
 def test_a_video_file_is_no_device(tmp_path):
     (tmp_path / "left.mp4").write_bytes(b"any")
-    with pytest.raises(CameraError, match=r"left\.mp4: it is a file, not a device: a recorded"):
+    with pytest.raises(CameraError, match=r"left\.mp4: it is a file, not a device: a recorded .* --like videos"):
         opencv_camera._open("left", str(tmp_path / "left.mp4"))

@@ -128,7 +128,7 @@ def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(tmp_path: Pat
     small = {"steps": 3, "decisions": 1, "lead_ms": 1000.0, "span_ms": 400.0}
     monkeypatch.setattr(learning, "Setting", lambda *a, **more: usual(*a, **{**more, **small}))
     monkeypatch.setattr(learning, "SIZE", 24)
-    monkeypatch.setattr(learning, "FIELD_OPTIONS", FIELD)
+    monkeypatch.setitem(learning.QUICK_FIELDS, "splat", FIELD)
     monkeypatch.setitem(learning.TRAININGS, True, 2)
     (tmp_path / "no weights").mkdir()  # images of 24 pixels are too small for LPIPS
     request = StudyRequest(

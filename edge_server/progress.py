@@ -1,0 +1,72 @@
+"""How far long work is: one line of a terminal, and nearly nothing in a pipe."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TextIO
+
+from edge_server.settings import LONG_WORK_S, REDRAWN_S
+
+
+class ProgressLine:
+    """One line of a terminal with the stage, its share, and the seconds that are left, or were spent until there is
+    something to reckon with. In a pipe, nothing but the estimate of a stage that takes longer than LONG_WORK_S, once
+    a second of it has passed.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream, self._terminal = stream, stream.isatty()
+        self._stage, self._share = "", 0.0
+        self._printed_s, self._began = 0.0, (0.0, 0.0)
+        self._announced = False
+        self._lock = threading.Lock()
+
+    def __call__(self, stage: str, share: float) -> None:
+        """Say that ``share`` of ``stage`` is done, in [0, 1]."""
+        with self._lock:
+            now = time.perf_counter()
+            known, self._share = stage == self._stage, share
+            if not known:
+                self._stage, self._began, self._announced = stage, (now, share), False
+            if share >= 1.0 or not known or now - self._printed_s >= REDRAWN_S:
+                self._print(now)
+
+    @contextmanager
+    def running(self, stage: str) -> Iterator[None]:
+        """While ``stage`` runs, redraw the line of a terminal although no part of it ends."""
+        self(stage, 0.0)
+        ended = threading.Event()
+
+        def redraw() -> None:
+            while not ended.wait(REDRAWN_S):
+                with self._lock:
+                    self._print(time.perf_counter())
+
+        drawer = threading.Thread(target=redraw, name="progress", daemon=True)
+        if self._terminal:
+            drawer.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            if self._terminal:
+                drawer.join()
+
+    def _print(self, now: float) -> None:
+        self._printed_s = now
+        began_s, first = self._began
+        spent_s, done = now - began_s, self._share - first
+        left_s = spent_s * (1.0 - self._share) / done if done > 0.0 else 0.0
+        if not self._terminal:
+            if left_s > LONG_WORK_S and not self._announced:
+                self._announced = True
+                print(f"  {self._stage}: some {left_s:.0f} s", file=self._stream, flush=True)
+            return
+        told = f", {left_s:.0f} s left" if left_s else f", {spent_s:.0f} s" if spent_s > REDRAWN_S else ""
+        line = f"\r  {self._stage:10} {100 * self._share:3.0f} %{told:16}"
+        if self._share >= 1.0:  # results follow
+            line = "\r" + " " * len(line) + "\r"
+        print(line, end="", file=self._stream, flush=True)

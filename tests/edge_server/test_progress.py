@@ -1,0 +1,36 @@
+"""What long work says of its progress, in a terminal and in a pipe."""
+
+from __future__ import annotations
+
+import io
+
+from edge_server.progress import ProgressLine
+from tests.support import wait_until
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_pipe_is_told_of_long_work_alone(monkeypatch):
+    now, out = [0.0], io.StringIO()
+    monkeypatch.setattr("edge_server.progress.time.perf_counter", lambda: now[0])
+    line = ProgressLine(out)
+    for stage, each_s in (("depth", 0.05), ("sharpen", 2.0), ("fuse", 0.05)):
+        for step in range(11):
+            line(stage, step / 10)
+            now[0] += each_s
+    assert out.getvalue() == "  sharpen: some 18 s\n"
+
+
+def test_a_terminal_sees_the_time_spent_until_a_part_is_done_and_then_what_is_left(monkeypatch):
+    monkeypatch.setattr("edge_server.progress.REDRAWN_S", 0.05)
+    out = Terminal()
+    line = ProgressLine(out)
+    with line.running("compare"):
+        wait_until(lambda: "  0 %, 0 s " in out.getvalue(), "the line is not drawn again", 5.0)
+        line("compare", 0.5)
+        wait_until(lambda: " 50 %, 0 s left" in out.getvalue(), "what is left is not told", 5.0)
+        line("compare", 1.0)
+    assert out.getvalue().endswith(" \r") and "\n" not in out.getvalue()
