@@ -62,7 +62,7 @@ endef
 BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrome 2>/dev/null))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test docs lint format types bench figures mutants pythons proto proto-check lock images clean
+.PHONY: help demo test docs lint format types figures mutants pythons proto proto-check lock images clean
 
 help:  ## what there is to make
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 22
@@ -97,10 +97,6 @@ format: .venv/.ok-test  ## ruff: apply the format and the safe fixes
 types: .venv/.ok-test  ## mypy
 	$(PY) -m mypy
 	MYPYPATH=proto:deploy $(PY) -m mypy deploy/freshfield_up
-
-bench: .venv/.ok-test  ## how much later the emulator hands a message on: runs/bench-emulator.txt
-	@mkdir -p runs
-	$(PY) -m tests.tools.message_through_proxy | tee runs/bench-emulator.txt
 
 figures: .venv/.ok-test  ## the thesis's figures, hours to days: docs/results/thesis; DATA=FOLDER JOBS=2 STUDY=--quick
 	for name in $(FIGURES); do \

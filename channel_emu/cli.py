@@ -215,7 +215,6 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--discipline", choices=DISCIPLINES, help="what a busy link does with a new frame [the preset's, else drop-new]"
     )
-    sub.add_argument("--shared-server", action="store_true", help="one server for all cameras [one for each]")
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -262,8 +261,6 @@ def _config_of(args: argparse.Namespace) -> ChannelConfig:
         section["faults"] = dict(section.get("faults") or {})
         for text in args.fault:
             section["faults"] |= notation.fault(text)
-    if args.shared_server:
-        section["server"] = {"shared": True}
     return channel_from_mapping(section, "channel", folder)
 
 

@@ -8,7 +8,6 @@ bytes go apart, and zstandard compresses both.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,7 +53,7 @@ class EncodedDepth:
         if not (0 < self.width <= MAX_IMAGE_SIDE_PX and 0 < self.height <= MAX_IMAGE_SIDE_PX):
             raise PayloadError("too_large", f"{self.width} x {self.height} is not within 1..{MAX_IMAGE_SIDE_PX} a side")
         least, most = METERS_PER_COUNT
-        if not (math.isfinite(self.meters_per_count) and least <= self.meters_per_count <= most):
+        if not least <= self.meters_per_count <= most:  # nor is NaN
             raise PayloadError("bad_header", f"{self.meters_per_count:g} m a count is not within {least:g}..{most:g}")
         if abs(self.after_image_ns) > MAX_DEPTH_GAP_NS:
             raise PayloadError("bad_header", f"measured {self.after_image_ns / 1e9:g} s after its image")

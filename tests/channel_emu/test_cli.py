@@ -44,12 +44,6 @@ def test_simulate_takes_the_short_notation(capsys) -> None:
     assert again["mean_age_ms"] == found["mean_age_ms"]  # the same channel in other words
 
 
-def test_six_cameras_wait_for_one_line(capsys) -> None:
-    line = "--preset ch5 --discipline newest-waits --cameras 6 --seconds 60"
-    ages = [simulate(capsys, line + more)["mean_age_ms"] for more in ("", " --shared-server")]
-    assert ages[1] > 2 * ages[0]
-
-
 def test_a_chain_of_any_number_of_states(capsys) -> None:
     chain = "{generator_per_ms: [[-0.3, 0.2, 0.1], [0.05, -0.05, 0], [0.4, 0.4, -0.8]], initial: s2}"
     found = simulate(capsys, "--service exp:5ms,exp:20ms,exp:80ms --seconds 300 --chain", chain)
@@ -170,10 +164,6 @@ def test_proxy_puts_a_service_behind_a_link_until_told(tmp_path: Path) -> None:
     assert set(found["by_method"]) == {f"up {HELLO}", f"down {HELLO}"} and found["seed"] == 2
     assert found["delivered"] == found["offered"] == 2 and found["delay_ms"]["mean"] == 30
     assert main(["proxy", "--to", "x", "--listen", "nowhere", "--no-priority"]) == 2
-
-
-def test_bare_mmpp_is_the_thesiss() -> None:
-    assert notation.arrivals("mmpp") == notation.arrivals("mmpp:1/120ms,1/30ms")
 
 
 def test_a_path_that_cannot_be_written_is_said_in_one_line(capsys, scenario: Path, tmp_path: Path) -> None:

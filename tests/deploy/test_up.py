@@ -37,6 +37,7 @@ edge: {field: ngp, update_ms: 300, lpips: none}
 """
 # A first run compiles the field's kernels.
 READY_S = 400.0
+SLEEPS = "import time; time.sleep(60)"
 pytestmark = pytest.mark.timeout(600)
 
 
@@ -134,42 +135,44 @@ def test_a_run_ends_when_its_time_is_up_with_a_report(up: Callable[..., Up]) -> 
     prepare(run.out, {}).close()  # knows all the names that a run writes
 
 
+Asleep = Callable[..., launcher.Launcher]
+
+
+@pytest.fixture
+def asleep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Asleep:
+    """Makes a launcher whose edge and emulator only sleep, and whose node runs the given words."""
+
+    def make(node: str) -> launcher.Launcher:
+        monkeypatch.setattr(launcher.signal, "signal", lambda *_: None)
+        words = {"edge": SLEEPS, "emulator": SLEEPS, "node": node}
+        made = [Child(k, f"the {k}", [sys.executable, "-c", v], tmp_path / "run" / k) for k, v in words.items()]
+        processes = ProcessSet(*made, "127.0.0.1:1", "")
+        monkeypatch.setattr(launcher, "process_set", lambda *_: processes)
+        (tmp_path / "small.yaml").write_text(SMALL)
+        run = launcher.Launcher(load(tmp_path / "small.yaml"), launcher.Options(tmp_path / "run", port=free_port()))
+        run.processes = processes
+        return run
+
+    return make
+
+
 def test_a_process_that_dies_ends_the_run_is_named_and_the_others_are_stopped(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    asleep: Asleep, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Processes that only sleep stand for edge, emulator and node."""
-    monkeypatch.setattr(launcher.signal, "signal", lambda *_: None)
-
-    def child(name: str, words: str) -> Child:
-        return Child(name, f"the {name}", [sys.executable, "-c", words], tmp_path / "run" / f"log-{name}.txt")
-
-    sleeps, dies = (
-        "import time; time.sleep(60)",
-        "import os, time; print('so much'); time.sleep(0.8); os.kill(os.getpid(), 9)",
-    )
-    made = ProcessSet(child("edge", sleeps), child("emulator", sleeps), child("node", dies), "127.0.0.1:1", "")
-    monkeypatch.setattr(launcher, "process_set", lambda *_: made)
-    (tmp_path / "small.yaml").write_text(SMALL)
-    run = launcher.Launcher(load(tmp_path / "small.yaml"), launcher.Options(tmp_path / "run", port=free_port()))
+    run = asleep("import os, time; print('so much'); time.sleep(0.8); os.kill(os.getpid(), 9)")
     assert run.run() == 1
-    said = capfd.readouterr().out
+    said, made = capfd.readouterr().out, run.processes
     assert "the node was killed by SIGKILL" in said and "  | so much" in said
     assert said.endswith("no report: the run did not start\n")
     assert not any(child.running for child in made.children) and made.emulator.process is None
-    rows = [json.loads(line) for line in (tmp_path / "run" / "processes.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in (run.options.out / "processes.jsonl").read_text().splitlines()]
     assert rows[0]["edge"]["pid"] == made.edge.pid and "machine" in rows[0]
 
 
 def test_a_recording_that_is_over_ends_the_run_well(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    asleep: Asleep, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Processes that only sleep stand for edge, emulator and node."""
-    monkeypatch.setattr(launcher.signal, "signal", lambda *_: None)
-    sleeps = [[sys.executable, "-c", f"import time; time.sleep({seconds})"] for seconds in (60, 60, 0.5)]
-    children = [Child(f"{k}", f"{k}", words, tmp_path / f"{k}.txt") for k, words in enumerate(sleeps)]
-    monkeypatch.setattr(launcher, "process_set", lambda *_: ProcessSet(*children, "127.0.0.1:1", ""))
-    (tmp_path / "small.yaml").write_text(SMALL)
-    run = launcher.Launcher(load(tmp_path / "small.yaml"), launcher.Options(tmp_path / "run", port=free_port()))
+    run = asleep("import time; time.sleep(0.5)")
     # It is over before the first update: kernels are still being compiled.
     monkeypatch.setattr(
         run, "_continue_start", lambda now_s: run.processes.emulator.process or run.processes.emulator.start()
@@ -178,20 +181,14 @@ def test_a_recording_that_is_over_ends_the_run_well(
     assert "the recording is over" in capfd.readouterr().out
 
 
-def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """``freshfield demo room | head -3``; processes that only sleep stand for edge, emulator and node."""
-    monkeypatch.setattr(launcher.signal, "signal", lambda *_: None)
-    reader, writer = os.pipe()
-    sleeps = [sys.executable, "-c", "import time; time.sleep(60)"]
-    children = [Child(name, name, sleeps, tmp_path / f"{name}.txt") for name in ("edge", "emulator", "node")]
-    made = ProcessSet(*children[:3], "127.0.0.1:1", "")
-    monkeypatch.setattr(launcher, "process_set", lambda *_: made)
-    monkeypatch.setattr(made.edge, "start", lambda: (Child.start(made.edge), os.close(reader)))
+def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(asleep: Asleep, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``freshfield demo room | head -3``."""
+    run = asleep(SLEEPS)
+    edge, (reader, writer) = run.processes.edge, os.pipe()
+    monkeypatch.setattr(edge, "start", lambda: (Child.start(edge), os.close(reader)))
     monkeypatch.setattr(sys, "stdout", os.fdopen(writer, "w"))
-    (tmp_path / "small.yaml").write_text(SMALL)
-    run = launcher.Launcher(load(tmp_path / "small.yaml"), launcher.Options(tmp_path / "run", port=free_port()))
     assert run.run() == 0
-    assert made.edge.process is not None and not any(child.running for child in children)
+    assert edge.process is not None and not any(child.running for child in run.processes.children)
 
 
 @pytest.mark.slow  # 6 s

@@ -28,13 +28,13 @@ from freshfield.limits import MAX_CAMERAS
 from freshfield.machine_load import rss_mb
 from freshfield.transport import Transport
 from tests.channel_emu.live.emulator import Edge, frame_of, make
-from tests.tools.message_through_proxy import PUSH
 
 CAMERAS = (1, 10, 100, 1000)
 RECKONED = (10, 100, 1000, 10_000)
 FRAMES_PER_S = 15  # of a camera of the scenario `room`
 FRAME_BYTES = 12_000  # of its pictures: 128 x 128, JPEG of quality 92
 RATE = 200.0  # frames a second that are offered in all: a quarter of a core
+_PUSH = "/freshfield.v1.FrameStreamService/Push"
 _SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -96,7 +96,7 @@ async def push(port: int, cameras: tuple[str, ...], seconds: float) -> int:
 
     async def camera(name: str, first_s: float) -> None:
         nonlocal answers
-        call = channel.stream_stream(PUSH)()
+        call = channel.stream_stream(_PUSH)()
         due_s, sequence = monotonic() + first_s, 0
         while due_s < end_s:
             await asyncio.sleep(max(due_s - monotonic(), 0.0))

@@ -320,14 +320,8 @@ def test_what_does_not_fit_is_named(tmp_path):
 
 
 UNKNOWN = {
-    "dist": [0.1],
     "camera_model": "OPENCV_FISHEYE",
-    "model": "fisheye",
     "coeffs": [0, 0.1],
-    "radial": [0.1],
-    "rotate": 90,
-    "binning": 2,
-    "roi": [0, 0, 9, 9],
     "T_cam_to_world": [[1, 0]],
     "dist_k3": 0.1,
     "units": "mm",
