@@ -73,7 +73,7 @@ HD_CURRENT_BUTTONS. Only drivers on this machine are heard: whoever sends a data
 def _add_teleop(commands: Any) -> None:
     teleop = commands.add_parser(
         "teleop",
-        help="move an arm by keyboard or a stylus on the network",
+        help="move an arm by keyboard or by the driver of a stylus",
         description=TELEOP,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

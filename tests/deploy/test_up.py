@@ -169,16 +169,20 @@ def test_a_process_that_dies_ends_the_run_is_named_and_the_others_are_stopped(
     assert rows[0]["edge"]["pid"] == made.edge.pid and "machine" in rows[0]
 
 
-def test_a_recording_that_is_over_ends_the_run_well(
-    asleep: Asleep, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("last", "code", "text"),
+    [("pass", 0, "the recording is over"), ("import os; os.kill(os.getpid(), 9)", 1, "the node was killed by SIGKILL")],
+)
+def test_a_recording_that_is_over_ends_the_run_well_and_a_kill_does_not(
+    asleep: Asleep, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, last: str, code: int, text: str
 ) -> None:
-    run = asleep("import time; time.sleep(0.5)")
+    run = asleep(f"import time; time.sleep(0.5); {last}")
     # It is over before the first update: kernels are still being compiled.
     monkeypatch.setattr(
         run, "_continue_start", lambda now_s: run.processes.emulator.process or run.processes.emulator.start()
     )
-    assert run.run() == 0
-    assert "the recording is over" in capfd.readouterr().out
+    assert run.run() == code
+    assert text in capfd.readouterr().out
 
 
 def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(asleep: Asleep, monkeypatch: pytest.MonkeyPatch) -> None:
