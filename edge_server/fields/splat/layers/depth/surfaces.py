@@ -138,11 +138,12 @@ class SurfaceScene:
 
     def render(
         self, poses: Sequence[Array], lens: Pinhole, pool: Pool
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Draw the surfaces from each pose, camera-to-world (4, 4). lens: without distortion.
 
-        Returns color, float32 (B, H, W, 3) in [0, 1], and agreement, float32 (B, H, W) in [0, 1]: how far the cameras
-        say what is there; 0 where none does.
+        Returns color, float32 (B, H, W, 3) in [0, 1]; agreement, float32 (B, H, W) in [0, 1]: how far the cameras say
+        what is there, 0 where none does; and inverse depth of the nearest surface that one puts there, float32
+        (B, H, W), 1 / m, 0 where none does.
         """
         targets = _rows(poses, [lens] * len(poses), self.center)
         shape = len(poses), lens.height, lens.width
@@ -150,7 +151,7 @@ class SurfaceScene:
         color, agreement = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
         pool.run(draw_meshes, self.meshes, targets, inverse)
         pool.run(shade_surfaces, self.meshes, targets, inverse, color, agreement)
-        return color, agreement
+        return color, agreement, inverse.max(axis=1)
 
 
 def _rows(poses: Sequence[Array], lenses: Sequence[Pinhole], center: Array) -> NDArray[np.float32]:

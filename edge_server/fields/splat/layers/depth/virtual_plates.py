@@ -74,7 +74,8 @@ def _halton(number: int, base: int) -> float:
 def virtual_plates(
     scene: SurfaceScene, surfaces: Sequence[Surface], poses: Sequence[Array], fill: bool, pool: Pool
 ) -> list[PlateImage]:
-    """What cameras between the real ones would see, with weights: how sure that is.
+    """What cameras between the real ones would see, with weights: how sure that is, and little beside silhouettes.
+    There sensors measure what is behind, and smoothing mixes both, so that the cameras' own plates know better.
 
     scene: of ``surfaces``. poses: of all cameras. fill: whether pixels that no camera sees get a color, and little
         weight, or none: a camera without depth may see them.
@@ -82,12 +83,27 @@ def virtual_plates(
     lens = replace(surfaces[0].lens, distortion=(0.0, 0.0, 0.0, 0.0))
     between = poses_between(poses, surfaces, tuned.VIRTUAL_PLATES)
     plates = []
-    for k, (pose, color, agreement) in enumerate(zip(between, *scene.render(between, lens, pool), strict=True)):
+    drawn = zip(between, *scene.render(between, lens, pool), strict=True)
+    for k, (pose, color, agreement, inverse) in enumerate(drawn):
         picture = np.float32(255.0) * np.clip(fill_unseen(color, agreement), 0.0, 1.0)
         weight = np.maximum(agreement, tuned.UNSEEN_WEIGHT) if fill else agreement
+        weight = np.where(beside_silhouettes(inverse), tuned.UNSEEN_WEIGHT * weight, weight)
         view = View(NAME.format(k), np.zeros(picture.shape, np.uint8), pose, lens)
         plates.append(PlateImage(view, picture, weight.astype(np.float32)))
     return plates
+
+
+def beside_silhouettes(inverse: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """The pixels near a jump of depth, bool (H, W): inverse depth bends there by more than CUT, on a plane not at all.
+    None in a small picture, of which little else would be left. inverse: float32 (H, W), 1 / m, 0 unknown."""
+    near = min(tuned.RADIUS, inverse.shape[1] // tuned.SILHOUETTE_SHARE)
+    if near == 0:
+        return np.zeros(inverse.shape, bool)
+    wide = np.pad(inverse, 1, mode="edge")
+    across = wide[1:-1, :-2] + wide[1:-1, 2:] - 2.0 * inverse
+    down = wide[:-2, 1:-1] + wide[2:, 1:-1] - 2.0 * inverse
+    jumps = (np.maximum(np.abs(across), np.abs(down)) > tuned.CUT).astype(np.uint8)
+    return np.asarray(cv2.dilate(jumps, np.ones((2 * near + 1, 2 * near + 1), np.uint8)) > 0)
 
 
 def fill_unseen(color: NDArray[np.float32], agreement: NDArray[np.float32]) -> NDArray[np.float32]:

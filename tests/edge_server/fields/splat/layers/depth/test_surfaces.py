@@ -17,7 +17,12 @@ from edge_server.fields.splat.layers.depth.depth_plate import smooth
 from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
 from edge_server.fields.splat.layers.depth.overlaps import contradicting, exposures
 from edge_server.fields.splat.layers.depth.surfaces import Surface, SurfaceScene
-from edge_server.fields.splat.layers.depth.virtual_plates import fill_unseen, poses_between, virtual_plates
+from edge_server.fields.splat.layers.depth.virtual_plates import (
+    beside_silhouettes,
+    fill_unseen,
+    poses_between,
+    virtual_plates,
+)
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import Pinhole, look_at, quaternion_to_matrix
 from tests.edge_server.fields.scenes import psnr, ring, seen
@@ -59,7 +64,7 @@ def test_normals_and_points_are_those_of_a_plane() -> None:
 def test_a_held_out_view_is_drawn_as_it_is() -> None:
     held = CAMERAS[6]
     truth, distance = seen(held.intrinsics, held.camera_to_world)
-    (color,), (agreement,) = SCENE.render([held.camera_to_world], held.intrinsics, POOL)
+    (color,), (agreement,), _ = SCENE.render([held.camera_to_world], held.intrinsics, POOL)
     there, sure = np.isfinite(distance), agreement > settings.SURE
     assert sure[there].mean() > 0.9 and sure[~there].mean() < 0.1
     assert psnr(color[sure & there], truth[sure & there] / 255.0) > 17.0
@@ -90,7 +95,7 @@ def test_what_more_cameras_see_through_is_not_drawn() -> None:
     for k, pose in enumerate(poses):
         pose[0, 3] = 0.05 * k
     walls = [_wall(lens, poses[0], 1.0, 50.0), _wall(lens, poses[1], 2.0, 200.0), _wall(lens, poses[2], 2.0, 200.0)]
-    (color,), (agreement,) = SurfaceScene.of(walls).render([poses[1]], lens, POOL)
+    (color,), (agreement,), _ = SurfaceScene.of(walls).render([poses[1]], lens, POOL)
     inside = np.s_[4:28, 4:28]
     np.testing.assert_allclose(color[inside], 200.0 / 255.0, atol=1e-3)
     assert (agreement[inside] == 1.0).all()
@@ -110,6 +115,28 @@ def test_virtual_plates_are_spread_between_the_cameras() -> None:
     assert len(plates) == settings.VIRTUAL_PLATES and all(" " in plate.view.camera for plate in plates)
     assert all(plate.known.min() == np.float32(settings.UNSEEN_WEIGHT) for plate in plates)
     assert any((plate.known == 0).any() for plate in virtual_plates(SCENE, SURFACES, poses, False, POOL))
+
+
+@pytest.mark.parametrize(("width", "near"), [(48, None), (128, 2), (640, 3)])
+def test_pixels_beside_a_silhouette_are_found(width: int, near: int | None) -> None:
+    q = np.tile(np.linspace(0.2, 0.5, 40, dtype=np.float32)[:, None], (1, width))  # a floor
+    assert not beside_silhouettes(q).any()
+    q[10:20, 8:18] += np.float32(2.0 * settings.CUT)  # a box on it: the jump lies between two pixels
+    left, right = (range(k - 1 - near, k + 1 + near) if near is not None else () for k in (8, 18))
+    assert np.flatnonzero(beside_silhouettes(q)[15]).tolist() == [*left, *right]
+
+
+def test_beside_silhouettes_virtual_plates_count_little() -> None:
+    larger = ring(7, size=96)
+    surfaces = [surface_of(view) for view in larger[:2]]
+    scene, poses = SurfaceScene.of(surfaces), [view.camera_to_world for view in larger[:2]]
+    _, agreements, inverses = scene.render(poses_between(poses, surfaces, 12), surfaces[0].lens, POOL)
+    plates = virtual_plates(scene, surfaces, poses, False, POOL)
+    for plate, agreement, inverse in zip(plates, agreements, inverses, strict=True):
+        beside = beside_silhouettes(inverse)
+        assert 0.05 < beside.mean() < 0.5
+        expected = agreement * np.where(beside, np.float32(settings.UNSEEN_WEIGHT), np.float32(1.0))
+        np.testing.assert_allclose(plate.known, expected, rtol=1e-6)
 
 
 def test_what_nobody_sees_fades_to_the_mean_color() -> None:
