@@ -54,6 +54,7 @@ class ProgressLine:
             ended.set()
             if self._terminal:
                 drawer.join()
+                self(stage, 1.0)  # also after an error
 
     def _print(self, now: float) -> None:
         self._printed_s = now

@@ -153,7 +153,7 @@ class Proxy(grpc.GenericRpcHandler):
             if self.streams_last:  # the grace period would wait in vain
                 for call in {call for link in self.links.values() for call in link.calls}:
                     if isinstance(call, ServedCall):
-                        call.task.cancel()
+                        call.end(grpc.StatusCode.UNAVAILABLE, "the channel emulator ends")
             await self._server.stop(_STOP_GRACE_S)
             await self.service_channel.close()
 

@@ -43,7 +43,7 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
 
     def __init__(self, state: EdgeState) -> None:
         self._state = state
-        self._watchers = OpenStreams(MAX_WATCHERS)
+        self.watchers = OpenStreams(MAX_WATCHERS)
 
     async def GetStatus(
         self, request: edge_pb2.GetStatusRequest, context: grpc.aio.ServicerContext
@@ -67,7 +67,7 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
     async def WatchDecisions(self, request: edge_pb2.WatchDecisionsRequest, context: grpc.aio.ServicerContext) -> None:
         last = self._state.newest()
         seen = -1 if last is None else last.number
-        async with self._watchers.open(context) as call:
+        async with self.watchers.open(context) as call:
             while True:
                 for publication in self._state.publications(since=seen):
                     seen = publication.number
@@ -170,7 +170,8 @@ class GrpcThread:
         server = self._transport.aio_server()
         self._ingest.add_to_server(server)
         clock_pb2_grpc.add_ClockServiceServicer_to_server(ClockService(self._clock), server)
-        edge_pb2_grpc.add_EdgeServiceServicer_to_server(EdgeService(self._state), server)
+        edge_service = EdgeService(self._state)
+        edge_pb2_grpc.add_EdgeServiceServicer_to_server(edge_service, server)
         checks = await serve_health(
             server,
             [
@@ -185,4 +186,6 @@ class GrpcThread:
         self._ready.set()
         await asyncio.to_thread(self._stopping.wait)
         await checks.enter_graceful_shutdown()
+        for streams in (self._ingest.streams, edge_service.watchers):
+            streams.end_all("the edge server ends")
         await server.stop(0.5)

@@ -148,6 +148,11 @@ class OpenStreams:
                 self._silent.pop(call, None)
                 self._used.pop(call, None)
 
+    def end_all(self, why: str) -> None:
+        """End every stream, before the server stops. gRPC would cancel them and print a traceback for each."""
+        for call in [*self._silent, *self._used]:
+            call.end(grpc.StatusCode.UNAVAILABLE, why)
+
     def use(self, call: ServedCall) -> None:
         """Mark a stream as used: it carried a frame that was accepted."""
         call.use()

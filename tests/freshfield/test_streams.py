@@ -98,6 +98,16 @@ async def test_silent_streams_shut_nobody_out():
         assert "too many are open" in await silent[0].details()
 
 
+async def test_before_the_server_stops_every_stream_is_told_so_and_nothing_is_logged(caplog):
+    streams = OpenStreams(4)
+    async with echoing(streams) as channel:
+        calls = [await opened(channel, b"use"), await opened(channel)]
+        streams.end_all("the server ends")
+        assert [await call.code() for call in calls] == 2 * [grpc.StatusCode.UNAVAILABLE]
+        assert [await call.details() for call in calls] == 2 * ["the server ends"]
+    assert not caplog.records
+
+
 async def test_among_streams_of_use_the_one_that_is_idle_longest_ends():
     streams = OpenStreams(2)
     async with echoing(streams) as channel:

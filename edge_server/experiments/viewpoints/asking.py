@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from edge_server.experiments.viewpoints.reconstructions import (
     varied_plans,
 )
 from edge_server.experiments.viewpoints.stage import Stage
+from edge_server.progress import ProgressLine
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.capture_planner import Plan
 from edge_server.viewpoints.experts import SimulatedExpert
@@ -101,10 +103,16 @@ def _on_the_page(
 
     transport.guard(page[0], "preference page", http=True)  # before the fits, which take minutes
 
-    def progress(k: int) -> None:
-        print(f"\rreconstruction {k + 1} of {len(plans)}", end="\n" if k + 1 == len(plans) else "", flush=True)
-
-    made = sprites(stage, plans, about.steps, about.seed, about.out / "reconstructions", progress)
+    progress = ProgressLine(sys.stderr)
+    with progress.running("reconstructions"):
+        made = sprites(
+            stage,
+            plans,
+            about.steps,
+            about.seed,
+            about.out / "reconstructions",
+            lambda k: progress("reconstructions", (k + 1) / len(plans)),
+        )
     path = about.out / ANSWERS
     asking = PreferencePage(session, made, FRAMES, COLUMNS, lambda s: write_json(path, s.as_json()))
     try:
