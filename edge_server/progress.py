@@ -20,7 +20,7 @@ class ProgressLine:
     def __init__(self, stream: TextIO) -> None:
         self._stream, self._terminal = stream, stream.isatty()
         self._stage, self._share = "", 0.0
-        self._printed_s, self._began = 0.0, (0.0, 0.0)
+        self._printed_s, self._changed_s, self._began = 0.0, 0.0, (0.0, 0.0)
         self._announced = False
         self._lock = threading.Lock()
 
@@ -28,7 +28,9 @@ class ProgressLine:
         """Say that ``share`` of ``stage`` is done, in [0, 1]."""
         with self._lock:
             now = time.perf_counter()
-            known, self._share = stage == self._stage, share
+            known = stage == self._stage
+            if not known or share != self._share:
+                self._share, self._changed_s = share, now
             if not known:
                 self._stage, self._began, self._announced = stage, (now, share), False
             if share >= 1.0 or not known or now - self._printed_s >= REDRAWN_S:
@@ -59,14 +61,15 @@ class ProgressLine:
     def _print(self, now: float) -> None:
         self._printed_s = now
         began_s, first = self._began
-        spent_s, done = now - began_s, self._share - first
-        left_s = spent_s * (1.0 - self._share) / done if done > 0.0 else 0.0
+        done, left_s = self._share - first, 0.0
+        if done > 0.0:  # at the pace so far, less what has passed since the last part ended
+            left_s = (self._changed_s - began_s) * (1.0 - self._share) / done - (now - self._changed_s)
         if not self._terminal:
             if left_s > LONG_WORK_S and not self._announced:
                 self._announced = True
                 print(f"  {self._stage}: some {left_s:.0f} s", file=self._stream, flush=True)
             return
-        told = f", {left_s:.0f} s left" if left_s else f", {spent_s:.0f} s" if spent_s > REDRAWN_S else ""
+        told = f", {max(left_s, 0.0):.0f} s left" if done > 0.0 else f", {now - began_s:.0f} s"
         line = f"\r  {self._stage:10} {100 * self._share:3.0f} %{told:16}"
         if self._share >= 1.0:  # results follow
             line = "\r" + " " * len(line) + "\r"
