@@ -178,11 +178,11 @@ def visit_rendered(port: int, count: int, seconds: float, pid: int | None) -> di
 
 
 @contextlib.contextmanager
-def last_mile(name: str, to: str) -> Iterator[int]:
+def last_mile(name: str, to: str, seed: int) -> Iterator[int]:
     """The port of the emulator's TCP proxy before ``to``, on conditions that the live page calls so."""
     delay_ms, loss = NETWORKS[name]
     port = free_port()
-    words = [sys.executable, "-m", "channel_emu.cli", "proxy", "--tcp", "--direction", "both", "--seed", "1"]
+    words = [sys.executable, "-m", "channel_emu.cli", "proxy", "--tcp", "--direction", "both", "--seed", str(seed)]
     words += ["--to", to, "--listen", f"127.0.0.1:{port}"]
     words += ["--service", f"exp:{delay_ms:g}ms", "--fault", f"loss:{loss:g}"] if delay_ms else []
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -193,9 +193,9 @@ def last_mile(name: str, to: str) -> Iterator[int]:
         process.wait(timeout=20)
 
 
-def through(name: str, host: str, seconds: float) -> dict[str, Any]:
-    """A visitor behind the proxy beside one without it."""
-    with last_mile(name, host) as port:
+def through(name: str, host: str, seconds: float, seed: int) -> dict[str, Any]:
+    """A visitor behind the proxy beside one without it. seed: of the proxy's delays and losses."""
+    with last_mile(name, host, seed) as port:
         time.sleep(2.0 * SETTLE_S)  # Python starts, numpy is imported
         with reading(f"ws://{host}{STREAM}", f"ws://127.0.0.1:{port}{STREAM}") as (near, far):
             began_s, pairs = time.monotonic(), []
@@ -207,7 +207,7 @@ def through(name: str, host: str, seconds: float) -> dict[str, Any]:
         compared = [compare(near.reader, *pair) for pair in pairs if len(pair[1])]
     median = [round(float(np.nanmedian(values)), 1) for values in zip(*compared)]
     return (
-        {"last_mile": name, "mean_delay_ms": NETWORKS[name][0], "loss": NETWORKS[name][1]}
+        {"last_mile": name, "seed": seed, "mean_delay_ms": NETWORKS[name][0], "loss": NETWORKS[name][1]}
         | found
         | dict(zip(("db", "db_where_it_moves"), median))
     )
@@ -237,6 +237,7 @@ def main() -> None:
     parser.add_argument("url", help="of the live page")
     parser.add_argument("--visitors", type=int, nargs="+", default=[], metavar="N")
     parser.add_argument("--through", nargs="+", default=[], choices=("ideal", "good", "bad"))
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="runs of each last mile")
     parser.add_argument("--browser", action="store_true")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--pid", type=int, help="of the edge server")
@@ -249,7 +250,7 @@ def main() -> None:
         found["streams"] = [visit(f"ws://{host}{STREAM}", n, args.seconds, args.pid) for n in args.visitors]
         found["rendered"] = [visit_rendered(port, n, args.seconds, args.pid) for n in args.visitors if n]
     if args.through:
-        found["through"] = [through(name, host, args.seconds) for name in args.through]
+        found["through"] = [through(name, host, args.seconds, n) for name in args.through for n in range(args.seeds)]
     if args.browser:
         with reading(f"ws://{host}{STREAM}") as (reader,):
             present_s = time.monotonic() + reader.ahead_s
