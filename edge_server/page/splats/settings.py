@@ -44,14 +44,19 @@ PROBE_EVERY_S, PROBE_EVERY = 4.0, 5
 queue of ours in it."""
 PROBE_BYTES = 1_024
 """Of a probe, at most: knots of a publication."""
-FIRST_PROBES, PROBES_KEPT = 5, 16
-"""Until so many, each second message is a probe; the mean of so many tells how far round trips scatter."""
+FIRST_PROBES, PROBES_KEPT = 4, 16
+"""Until so many, each second message is a probe; the mean of so many tells how far round trips scatter. One very late
+probe of four does not decide; with five, a link that scatters by a second is held back for two seconds more."""
 SCATTERING_UNDER_WAY = 2
 """Messages under way on a link whose round trips scatter. The emulator's TCP takes as long for a small piece as for 16
 kB: with many small messages it carries a twelfth of what it could."""
 FULL_OF_SCATTER = 4.0
-"""Such a link counts as full from a lateness of so many times its scatter. With 4 it carries 52 % of what it takes
-(mean delay 0.4 s, loss 0.2). With 2.5 it carries 37 %, and what is shown is 0.8 s younger."""
+"""Such a link counts as full from a lateness of so many times its scatter. With 4 it carries 56 % of what it takes
+(mean delay 0.4 s, loss 0.2)."""
+SCATTERING_MOST = 32_768
+"""Bytes of a message on such a link, two pieces of the emulator's TCP: the next message waits for all of it."""
+SCATTERING_SET_S = 8.0
+"""As NEW_SET_S, on such a link: it is slow, and the set that is shown stays meanwhile."""
 SCATTERING_GAIN = 0.5
 """Of what was acknowledged, most that the window of such a link changes by."""
 MOVING_SHARE = 0.6

@@ -63,7 +63,8 @@ class LinkWindow:
         free = max(int(self.window) - self.under_way, 0)
         if not self.scatters:
             return free
-        return min(free, max(int(self.window) // tuned.SCATTERING_UNDER_WAY, tuned.LEAST_WINDOW))
+        share = int(self.window) // tuned.SCATTERING_UNDER_WAY
+        return min(free, max(min(share, tuned.SCATTERING_MOST), tuned.LEAST_WINDOW))
 
     def sent(self, number: int, size: int, now_s: float) -> None:
         """Note a message of so many bytes."""
@@ -110,7 +111,9 @@ class LinkWindow:
         if late_s > tuned.QUEUE_S:
             if now_s - self._backed_off_s > round_trip_s:
                 self._backed_off_s = now_s
-                self.window = max(self.window * tuned.BACK_OFF, tuned.LEAST_WINDOW)
+                # Until it is known whether round trips scatter, one message at a time is under way: no long queue.
+                least = tuned.LEAST_WINDOW if self._known else tuned.FIRST_WINDOW
+                self.window = max(self.window * tuned.BACK_OFF, least)
         elif self.short:  # a window that suffices says nothing of the link
             self.window = min(self.window + size, tuned.MOST_WINDOW)
 
@@ -120,16 +123,19 @@ class LinkWindow:
         return max(float(np.mean(self._probe_trips_s)) - self.round_trip_s, 0.0) if self._probe_trips_s else 0.0
 
     @property
+    def _known(self) -> bool:
+        """Whether there were enough probes to tell how far round trips scatter."""
+        return len(self._probe_trips_s) >= tuned.FIRST_PROBES
+
+    @property
     def scatters(self) -> bool:
         """Whether round trips scatter without a queue: most of them, as one outage makes a single probe very late."""
-        if len(self._probe_trips_s) < tuned.FIRST_PROBES:
-            return False
-        return float(np.median(self._probe_trips_s)) - self.round_trip_s > tuned.QUEUE_S
+        return self._known and float(np.median(self._probe_trips_s)) - self.round_trip_s > tuned.QUEUE_S
 
     @property
     def few(self) -> bool:
         """Whether few large messages are sent: round trips scatter, or nothing tells yet whether they do."""
-        return len(self._probe_trips_s) < tuned.FIRST_PROBES or self.scatters
+        return not self._known or self.scatters
 
     @property
     def _full_s(self) -> float:
@@ -165,7 +171,7 @@ class LinkWindow:
         return self._probe_due(now_s) or (self.few and len(self._sent) >= most)
 
     def _probe_due(self, now_s: float) -> bool:
-        if len(self._probe_trips_s) < tuned.FIRST_PROBES:
+        if not self._known:
             return self._since_probe >= 1
         return self._since_probe >= tuned.PROBE_EVERY and now_s - self._probed_s > tuned.PROBE_EVERY_S
 
@@ -334,7 +340,8 @@ class Visitor:
 
     def _takes(self) -> int:
         """Static Gaussians that the link takes in the time of a new set."""
-        return int(tuned.NEW_SET_S * self.link.lately_bytes_per_s) // RECORD.itemsize
+        takes_s = tuned.SCATTERING_SET_S if self.link.scatters else tuned.NEW_SET_S
+        return int(takes_s * self.link.lately_bytes_per_s) // RECORD.itemsize
 
     def _take(self, newest: StaticRecords, wider: bool) -> None:
         """Find what of the newest records is to be sent: chunks that have changed, those with most weight in what

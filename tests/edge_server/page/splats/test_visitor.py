@@ -187,6 +187,7 @@ def test_a_link_whose_delays_scatter_gets_half_of_what_it_takes_and_has_no_long_
         sent += sum(len(block.records) * 21 for block in link.of(MovingBlock, since_s=15.0))
         ages_s = link.ages_s[len(link.ages_s) // 4 :]
         assert np.median(ages_s) < 3.0 and np.quantile(ages_s, 0.9) < 6.0 and max(link.ages_s) < 10.0
+        assert len(link.reader._shown.params) == COUNT  # all that stands still, after a minute
     assert sent / (3 * 45.0) > 0.5 * PIECE_BYTES * (1.0 - loss) / mean_s
 
 
