@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import signal
 import subprocess
@@ -85,6 +86,7 @@ class Launcher:
         self.failures: list[str] = []
         self._say = say
         self._signals: list[str] = []
+        self._troubles_said: set[str] = set()
         self._stop_requested = threading.Event()
         self._began_s = time.monotonic()
         self._ready_s: float | None = None
@@ -156,8 +158,17 @@ class Launcher:
                 next_line_s = now_s + LINE_EVERY_S
                 line = status_line(self.options.out, len(self.scenario.cameras))
                 self._say(f"[{self._headline(now_s)}] {line}")
+                self._say_troubles()
             if self._ready_s and self.options.duration_s and now_s - self._ready_s >= self.options.duration_s:
                 return
+
+    def _say_troubles(self) -> None:
+        """Say what the edge finds wrong with frames and poses, each kind once: numbers within change."""
+        for line in read_json(self.options.out / "edge.json").get("troubles") or ():
+            kind = re.sub(r"[\d.]+", "", str(line))
+            if kind not in self._troubles_said:
+                self._troubles_said.add(kind)
+                self._say(str(line))
 
     def _continue_start(self, now_s: float) -> None:
         """One step of the start: the node once its arm answers, the emulator once the edge serves, and the

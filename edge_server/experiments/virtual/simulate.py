@@ -106,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         write_output(args.out, found, deployment, scenario.channel.get("preset"))
         if watched is not None:
             watched.write(args.out)
-    print(json.dumps(found) if args.json else show(found))
+    print(json.dumps(found) if args.json else "\n  ".join([show(found), *deployment.updates.troubles]))
     return 0
 
 

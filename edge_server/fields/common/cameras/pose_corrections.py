@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,16 +11,18 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.cameras import settings as tuned
-from freshfield.geometry import so3_exp, so3_log
+from freshfield.geometry import se3, se3_inverse, so3_exp, so3_log
 
 Array = NDArray[np.float64]
 
 
 @dataclass
-class _Correction:
+class PoseCorrection:
     """given: (4, 4), the pose it belongs to: a camera with another pose starts anew.
     rotation, shift_m: (3,), a rotation vector in radians and meters, world axes.
-    at_ns: when the view was taken. steps: how many ``descend`` has made for it. track: see ``PoseCorrections``."""
+    at_ns: when the view was taken. steps: how many ``descend`` has made for it. track: see ``PoseCorrections``.
+    reported: (4, 4), the pose that the camera reported, where its picture was found elsewhere: at ``given``.
+    scale: factor of reported shifts with which they led here from the view before; 0: they did not."""
 
     given: Array
     rotation: Array = field(default_factory=lambda: np.zeros(3))
@@ -28,6 +30,14 @@ class _Correction:
     at_ns: int = 0
     steps: int = 0
     track: str = ""
+    reported: Array | None = None
+    scale: float = 0.0
+
+    def moved(self, reported: Array) -> Array:
+        """The pose (4, 4) of a camera that reported ``reported``, if it moved from here as it reported."""
+        move = se3_inverse(self.given if self.reported is None else self.reported) @ reported
+        move[:3, 3] *= self.scale
+        return self.pose @ move
 
     @property
     def pose(self) -> Array:
@@ -49,7 +59,7 @@ class PoseCorrections:
 
     def __init__(self, most_m: float, most_deg: float) -> None:
         self.most_m, self.most_rad = most_m, np.deg2rad(most_deg)
-        self.known: dict[str, _Correction] = {}
+        self.known: dict[str, PoseCorrection] = {}
         self._sorted: dict[str, list[str]] = {}  # names by track, in the order of time; empty: not known
         self._ranks: dict[str, int] = {}
 
@@ -61,10 +71,12 @@ class PoseCorrections:
 
     def begin(self, view: View, track: str) -> None:
         """Assign a view to a track, with the correction of the one before it there, if any."""
-        before = self.neighbors_in_time(view, track)
-        pose = self.pose_between(view, before)
+        near = self.neighbors_in_time(view, track)
+        pose = self.pose_between(
+            view, {name: share for name, share in near.items() if self.known[name].reported is None}
+        )
         given = np.asarray(view.camera_to_world, dtype=np.float64)
-        self.known[view.camera] = _Correction(given, at_ns=view.generated_ns, track=track)
+        self.known[view.camera] = PoseCorrection(given, at_ns=view.generated_ns, track=track)
         self._sorted = {}
         self.set_pose(view, pose)
 
@@ -74,12 +86,28 @@ class PoseCorrections:
         known.rotation = _at_most(so3_log(pose[:3, :3] @ known.given[:3, :3].T), self.most_rad)
         known.shift_m = _at_most(pose[:3, 3] - known.given[:3, 3], self.most_m)
 
+    def within(self, given: Array, pose: Array, share: float) -> bool:
+        """Whether a correction from ``given`` to ``pose``, (4, 4), takes at most a share of what is allowed."""
+        turned = np.linalg.norm(so3_log(pose[:3, :3] @ given[:3, :3].T))
+        shifted = np.linalg.norm(pose[:3, 3] - given[:3, 3])
+        return bool(turned <= share * self.most_rad and shifted <= share * self.most_m)
+
+    def place(self, view: View, pose: Array, scale: float) -> View:
+        """The view at another pose (4, 4) than the reported one. scale: see ``PoseCorrection``."""
+        known = self._of(view)
+        pose = se3(so3_exp(so3_log(pose[:3, :3])), pose[:3, 3])  # else errors of rounding grow from view to view
+        zero = np.zeros(3)
+        self.known[view.camera] = replace(
+            known, given=pose, rotation=zero, shift_m=zero, reported=known.given, scale=scale
+        )
+        return replace(view, camera_to_world=pose)
+
     def forget(self, camera: str) -> None:
         """Forget a view's correction."""
         del self.known[camera]
         self._sorted = {}
 
-    def newest(self, track: str, count: int) -> list[_Correction]:
+    def newest(self, track: str, count: int) -> list[PoseCorrection]:
         """The corrections of a track's newest views, at most ``count``, in the order of time."""
         return [self.known[name] for name in self._order(track)[-count:]]
 
@@ -104,6 +132,10 @@ class PoseCorrections:
         neighbors: the others and their weights, see ``neighbors_in_time``; none: the pose as given.
         """
         given = np.asarray(view.camera_to_world, dtype=np.float64)
+        near = [self.known[name] for name in neighbors]
+        if any(each.reported is not None for each in near):
+            poses = [each.moved(given) if all(each.scale for each in near) else each.pose for each in near]
+            return _between(poses, list(neighbors.values()))
         rotation, shift_m = np.zeros(3), np.zeros(3)
         for name, share in neighbors.items():
             other = self.known[name]
@@ -112,11 +144,11 @@ class PoseCorrections:
             shift_m += share * (given[:3, :3] @ (other.given[:3, :3].T @ other.shift_m))
         return _corrected(given, rotation, shift_m)
 
-    def _of(self, view: View) -> _Correction:
+    def _of(self, view: View) -> PoseCorrection:
         given = np.asarray(view.camera_to_world, dtype=np.float64)
         known = self.known.get(view.camera)
         if known is None or not np.allclose(known.given, given, atol=tuned.SAME_POSE):
-            known = self.known[view.camera] = _Correction(given, at_ns=view.generated_ns)
+            known = self.known[view.camera] = PoseCorrection(given, at_ns=view.generated_ns)
             self._sorted = {}
         return known
 
@@ -234,15 +266,19 @@ class PoseCorrections:
         """What a state keeps: exact, ready for JSON."""
         return {
             name: [c.given.tolist(), c.rotation.tolist(), c.shift_m.tolist(), c.at_ns, c.steps, c.track]
+            + ([] if c.reported is None else [c.reported.tolist(), c.scale])
             for name, c in self.known.items()
         }
 
     def load(self, meta: dict[str, Any]) -> None:
         """Restore what ``meta`` returned."""
         self.known, self._sorted = {}, {}
-        for name, (given, rotation, shift_m, at_ns, steps, track) in meta.items():
+        for name, (given, rotation, shift_m, at_ns, steps, track, *located) in meta.items():
             given, rotation, shift_m = (np.array(each, dtype=np.float64) for each in (given, rotation, shift_m))
-            self.known[name] = _Correction(given, rotation, shift_m, int(at_ns), int(steps), str(track))
+            known = PoseCorrection(given, rotation, shift_m, int(at_ns), int(steps), str(track))
+            if located:
+                known.reported, known.scale = np.array(located[0], dtype=np.float64), float(located[1])
+            self.known[name] = known
 
     def neighbors_in_time(self, view: View, track: str = "") -> dict[str, float]:
         """The views of a track taken last before and first after ``view``, and how much each counts, the nearer one
@@ -264,6 +300,13 @@ def _corrected(given: Array, rotation: Array, shift_m: Array) -> Array:
     pose[:3, :3] = so3_exp(rotation) @ given[:3, :3]
     pose[:3, 3] += shift_m
     return pose
+
+
+def _between(poses: Sequence[Array], shares: Sequence[float]) -> Array:
+    """The pose (4, 4) between one or two, which count by their shares."""
+    first, last, share = poses[0], poses[-1], shares[-1]
+    turn = so3_exp(share * so3_log(first[:3, :3].T @ last[:3, :3]))
+    return se3(first[:3, :3] @ turn, first[:3, 3] + share * (last[:3, 3] - first[:3, 3]))
 
 
 def _at_most(vector: Array, most: float) -> Array:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import SEPARATOR, View
 from edge_server.fields.common.camera_rows import camera_rows
+from edge_server.fields.common.cameras.pose_corrections import PoseCorrection
 from edge_server.fields.common.kernels.camera import CAMERA
 from edge_server.fields.common.supervision import CameraMemory, check_view
 from edge_server.fields.common.view_store import Arrays
@@ -23,6 +24,7 @@ from edge_server.fields.splat.densification import opacity
 from edge_server.fields.splat.kernels.rasterize import EXPOSURE, Targets
 from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.discs import usable_depth
+from edge_server.fields.splat.scan.own_motion import misfit, search
 from edge_server.fields.splat.scan.plausibility import moved_in, troubles
 from edge_server.fields.splat.scan.scan_field import ScanField, Shown, aim_of
 from edge_server.fields.splat.scan.sweep import sweep_depth
@@ -30,6 +32,10 @@ from edge_server.fields.splat.scan.tracking import Alignment, Rendered, align, g
 
 # What a field that begins anew, which no depth was measured for, still knows of its cameras and their frames.
 _OF_CAMERAS = ("_pixels", "_taken", "_blind", "_bare", "_seen", "_seen_m", "_left_out", "_in_a_row")
+
+_BY_CAMERA = ("left_out", "doubts", "replaced")  # counts that a state keeps
+
+_NO_DEPTH = "its frames tell no depth (it only turns, or sees plain walls): distances are guessed, move it sideways"
 
 
 class CarriedField(ScanField):
@@ -47,6 +53,8 @@ class CarriedField(ScanField):
         self._due_before = 0  # keyframes that were due before the field began anew, which counts steps from 0 again
         self._left_out: dict[str, int] = {}  # frames of each camera that show something else
         self._in_a_row: dict[str, int] = {}
+        self._doubts: dict[str, int] = {}  # keyframes in a row that were not where reported motion led
+        self._replaced: dict[str, int] = {}  # keyframes of each camera that were located by their pictures
         self._moving: dict[str, float] = {}  # share of a camera's newest keyframe where something moves
         self._depths: dict[str, View] = {}  # the newest keyframe of each camera that had depth
         self._measured = False  # whether any keyframe had depth
@@ -119,11 +127,13 @@ class CarriedField(ScanField):
         self._seen[given.camera] = given
         self._follow(view)
         shown = self._look(view)
-        if self._rigid is not None and len(self.cloud) and self._agreeing(view, shown) < tuned.SURE:
-            wrong = self._flat(view, shown) or not self._plausible(view, self._track(view))
-            if wrong and self._founded:
+        doubted = self._doubted(view, shown)
+        if self._rigid is not None and len(self.cloud) and (doubted or self._agreeing(view, shown) < tuned.SURE):
+            placed = self._placed(view, shown, doubted)
+            if placed is None and self._founded:
                 self._leave_out(view)
                 return
+            view = placed or view
             shown = self._look(view)
         self._taken += 1
         self._bare &= _is_bare(view)
@@ -176,12 +186,76 @@ class CarriedField(ScanField):
         """Correct the pose of a view by what it shows."""
         frame = gray(view.image)
         for _ in range(tuned.ALIGNMENTS):
-            shown, pose = self._look(view, tuned.RENDERED_HALVINGS), self._pose_of(view)
-            lens = view.intrinsics.halved(tuned.RENDERED_HALVINGS)
-            rendered = Rendered(pose, lens, gray(shown.color), shown.depth, shown.opacity)
-            found = align(rendered, frame, view.camera_to_world)
+            found = align(self._rendered(view, self._pose_of(view)), frame, view.camera_to_world)
             self._poses.set_pose(view, found.pose)
         return found
+
+    def _doubted(self, view: View, shown: Shown) -> bool:
+        """Whether to look for a view elsewhere first: reports of its camera do not fit, or lead out of sight."""
+        camera, seen = _carrier(view), (shown.opacity >= tuned.ALIGNED_OPACITY).mean()
+        if not self._measured or seen < tuned.LEAST_OVERLAP:
+            return self._measured
+        if self._astray(camera) and self._agreeing(view, shown) >= tuned.SURE:
+            self._doubts[camera] = 0
+        return self._astray(camera)
+
+    def _astray(self, camera: str) -> bool:
+        return self._doubts.get(camera, 0) >= tuned.DOUBTS
+
+    def _placed(self, view: View, shown: Shown, doubted: bool) -> View | None:
+        """A view where its picture was taken: near its reported pose, else near the view before. None: it shows
+        something else than is to be seen from there."""
+        camera = _carrier(view)
+        if doubted:
+            found = self._search(view)
+            if found is not None:
+                return self._located(view, *found)
+            if self._astray(camera):
+                return self._lost(view)
+        if self._flat(view, shown):
+            return None
+        tracked = self._track(view)
+        if self._measured and tracked.overlap >= tuned.LEAST_OVERLAP and tracked.agreeing < tuned.DOUBTFUL:
+            found = self._search(view)
+            if found is not None and found[1] != 1.0:
+                if tracked.agreeing >= tuned.LEAST_AGREEING:
+                    self._doubts[camera] = self._doubts.get(camera, 0) + 1
+                if self._astray(camera) or self._in_a_row.get(camera, 0) >= tuned.LEAPED:
+                    return self._located(view, *found)
+            elif found is not None:
+                self._doubts[camera] = 0
+        return view if self._plausible(view, tracked) else None
+
+    def _search(self, view: View) -> tuple[NDArray[np.float64], float] | None:
+        """See ``own_motion.search``."""
+        last, before = self._depths.get(_carrier(view)), self._before(view)
+        if last is None or last.depth is None or not before:
+            return None
+        kept = Rendered(self._pose_of(last), last.intrinsics, gray(last.image), last.depth, np.ones_like(last.depth))
+        return search(view, kept, before, self._poses, lambda pose: self._rendered(view, pose))
+
+    def _rendered(self, view: View, pose: NDArray[np.float64]) -> Rendered:
+        shown, lens = self._look(view, tuned.RENDERED_HALVINGS, pose), view.intrinsics.halved(tuned.RENDERED_HALVINGS)
+        return Rendered(pose, lens, gray(shown.color), shown.depth, shown.opacity)
+
+    def _located(self, view: View, pose: NDArray[np.float64], scale: float) -> View:
+        """The view at a pose that its picture was found at, and no longer at the reported one."""
+        camera = _carrier(view)
+        self._in_a_row[camera] = 0
+        self._replaced[camera] = self._replaced.get(camera, 0) + 1
+        self._doubts[camera] = tuned.DOUBTS
+        return self._poses.place(view, pose, scale)
+
+    def _lost(self, view: View) -> View | None:
+        """Leave out a view that was not found, or take it where the one before was, if that was not found either."""
+        camera, before = _carrier(view), self._before(view)
+        row = self._in_a_row[camera] = self._in_a_row.get(camera, 0) + 1
+        return self._located(view, before[-1].pose, 0.0) if row > tuned.LOST and before else None
+
+    def _before(self, view: View) -> list[PoseCorrection]:
+        """Corrections of the newest keyframes of a view's camera that were taken before it, in the order of time."""
+        newest = self._poses.newest(_carrier(view), tuned.JUDGED)
+        return [each for each in newest if each.at_ns < view.generated_ns]
 
     def _agreeing(self, view: View, shown: Shown) -> float:
         """The share of a view's pixels, of those where the field shows a surface, that look as expected."""
@@ -238,13 +312,20 @@ class CarriedField(ScanField):
                 f"{camera}: {count} frames left out: they show something else than is to be seen from their poses"
                 for camera, count in self._left_out.items()
             ]
+            located = [
+                f"{camera}: {count} of its poses left out: they do not fit its pictures, which say where it is instead"
+                + misfit(self._poses.newest(camera, tuned.JUDGED))
+                for camera, count in self._replaced.items()
+            ]
             moving = [
                 f"{camera}: something moves in {100 * share:.0f} % of its picture: left out of learning"
                 for camera, share in self._moving.items()
                 if share > 0.0
             ]
             poses = troubles(self._poses) if self._rigid is not None else []
-        return (*left_out, *moving, *poses)
+            guessed = self._taken > tuned.BEGINS[-1] and not self._founded
+            unknown = [f"{camera}: {_NO_DEPTH}" for camera in self._seen] if guessed else []
+        return (*left_out, *located, *moving, *poses, *unknown)
 
     def _begin_anew(self) -> None:
         """Find the first Gaussians from all keyframes so far: without depth, the first few say little, and a field that
@@ -373,7 +454,7 @@ class CarriedField(ScanField):
             self.cloud.keep(kept)
 
     def _counters(self) -> dict[str, Any]:
-        names = ("taken", "blind", "bare", "took_at", "due_before", "pixels", "measured", "left_out")
+        names = ("taken", "blind", "bare", "took_at", "due_before", "pixels", "measured", *_BY_CAMERA)
         return {**super()._counters(), **{name: getattr(self, f"_{name}") for name in names}}
 
     def _arrays(self) -> Arrays:
@@ -385,7 +466,8 @@ class CarriedField(ScanField):
         self._taken, self._took_at, self._pixels = (int(meta[name]) for name in ("taken", "took_at", "pixels"))
         self._due_before, self._measured = int(meta["due_before"]), bool(meta["measured"])
         self._blind, self._bare = int(meta["blind"]), bool(meta["bare"])
-        self._left_out = {str(camera): int(count) for camera, count in meta["left_out"].items()}
+        for name in _BY_CAMERA:
+            setattr(self, f"_{name}", {str(camera): int(count) for camera, count in meta[name].items()})
         self._clear_views()
         views, aims = self.view_store.views, np.asarray(state["aims"], np.float64)
         if aims.shape != (len(views), 37) or not np.isfinite(aims).all():

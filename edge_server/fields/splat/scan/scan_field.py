@@ -247,15 +247,15 @@ class ScanField(StillField):
         """The largest number of Gaussians."""
         return self.settings.gaussians
 
-    def _look(self, view: View, halvings: int = 0) -> Shown:
-        """Render the field from a view's corrected pose, at its size or less."""
+    def _look(self, view: View, halvings: int = 0, pose: NDArray[np.float64] | None = None) -> Shown:
+        """Render the field from a view's corrected pose or from ``pose``, (4, 4), at its size or less."""
         box, lens = self.view_store.box, view.intrinsics.halved(halvings)
         assert box is not None
         h, w = lens.height, lens.width
         color, depth, alpha = (np.zeros((h, w, *more), np.float32) for more in ((3,), (), ()))
         if len(self.cloud):
-            raster = self._render_raster
-            raster.project_and_bin(camera_rows([self._pose_of(view)], [lens], box), self.cloud.gaussians(), False)
+            raster, pose = self._render_raster, self._pose_of(view) if pose is None else pose
+            raster.project_and_bin(camera_rows([pose], [lens], box), self.cloud.gaussians(), False)
             self.pool.run(render_tiles, raster.first, self.view_store.background(), color, depth, alpha)
         return Shown(color, depth * np.float32(box.radius_m), alpha)
 

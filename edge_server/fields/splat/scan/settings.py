@@ -85,6 +85,21 @@ SOFT = 0.1  # gray levels: what differs by more disagrees, and counts little
 PRIOR_RAD, PRIOR_M, PRIOR_ERROR = 0.02, 0.03, 1e-3  # so far from the given pose costs as much as that squared error
 LONGEST_RAD = 0.05  # rotation a step
 
+# --- a camera whose reported poses do not fit its pictures: it is located by them ---
+GUESSED_ERROR = 4e-5  # as PRIOR_ERROR, around a guess: five times as far costs as much
+ENOUGH_OVERLAP = 0.6  # guesses that have more in view are as good
+DOUBTFUL = 0.9  # share of pixels that look as expected, below which another place than the reported one is tried
+LOCATED = 0.7  # least share of pixels for another place to be believed
+FARTHEST = 6.0  # largest corrections, that a camera may move between two keyframes: more is a wrong match
+LOST = 1  # frames in a row that are not found, after which one is taken where the one before was
+LEAPED = 3  # frames in a row that show something else, after which a camera is taken to have leaped for good
+DOUBTS = 2  # keyframes in a row for which another place fits better, from which on reports are not believed
+ASTRAY_FOR = 4  # keyframes from which on it is said why reported poses do not fit
+SAME_TURN = 1e-6  # of matrices' numbers: a tracker's noise is more
+OTHER_UNIT, UNIT_LOG = 2.0, 0.45  # ratio of distances that is no error of single poses; deviation of its logarithm
+FOLLOWED = 0.1  # share of pixels by which fewer may look as expected where reported motion leads than at best
+FASTEST = 3.0  # times that the last motion may have gone on since
+
 # --- frames and poses that cannot be right ---
 LEAST_OVERLAP, LEAST_AGREEING = 0.3, 0.5  # with this much of the field in view, fewer pixels as expected: left out
 FLAT = 0.15  # of the contrast that is expected, less is that of a covered lens; an exposure of a third has 0.33

@@ -7,6 +7,7 @@ second-order minimization of Benhimane and Malis 2004).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -50,16 +51,25 @@ def gray(image: NDArray) -> Gray:
     return found
 
 
-def align(shown: Rendered, frame: Gray, given: Array) -> Alignment:
+def align(
+    shown: Rendered,
+    frame: Gray,
+    given: Array,
+    begin: Array | None = None,
+    levels: Sequence[tuple[int, int]] = tuned.LEVELS,
+    prior: float = tuned.PRIOR_ERROR,
+) -> Alignment:
     """Find the pose of a frame near that of a rendering.
 
     frame: (H, W) in [0, 1], of the rendering's size or larger. given: its pose as reported, (4, 4), from which it
-    moves away reluctantly. A size of too few pixels is left out; where equations cannot be solved, the rendering's pose
-    stays.
+    moves away reluctantly. begin: the pose to begin with, (4, 4); None: the rendering's. levels: see ``LEVELS``.
+    prior: see ``PRIOR_ERROR``. A size of too few pixels is left out; where equations cannot be solved, the pose to
+    begin with stays.
     """
-    motion, light = np.eye(4), np.array([1.0, 0.0])
+    motion = np.eye(4) if begin is None else se3_inverse(begin) @ shown.pose
+    light = np.array([1.0, 0.0])
     offset, overlap, agreeing = se3_inverse(shown.pose) @ given, 0.0, 0.0
-    for halvings, iterations in tuned.LEVELS:
+    for halvings, iterations in levels:
         level = _Level(shown, frame, halvings)
         for _ in range(iterations):
             found = level.equations(motion, light)
@@ -67,17 +77,26 @@ def align(shown: Rendered, frame: Gray, given: Array) -> Alignment:
                 break
             hessian, gradient, count, overlap, agreeing = found
             away = motion @ offset
-            weight = tuned.PRIOR_ERROR * count / np.square([tuned.PRIOR_RAD] * 3 + [tuned.PRIOR_M] * 3)
+            weight = prior * count / np.square([tuned.PRIOR_RAD] * 3 + [tuned.PRIOR_M] * 3)
             damping = np.append(weight, [tuned.TOWARDS_ONE * count] * 2)
             pull = np.concatenate([so3_log(away[:3, :3]), away[:3, 3], light - [1.0, 0.0]])
             step = -np.linalg.solve(hessian + np.diag(damping), gradient + damping * pull)
             if not np.isfinite(step).all():
-                return Alignment(shown.pose, overlap, agreeing)
+                return Alignment(shown.pose if begin is None else begin, overlap, agreeing)
             step[:3] *= min(1.0, tuned.LONGEST_RAD / max(float(np.linalg.norm(step[:3])), 1e-12))
             move = np.eye(4)
             move[:3, :3], move[:3, 3] = so3_exp(step[:3]), step[3:6]
             motion, light = move @ motion, light + step[6:]
     return Alignment(shown.pose @ se3_inverse(motion), overlap, agreeing)
+
+
+def align_from(shown: Rendered, frame: Gray, candidates: Sequence[Array]) -> Alignment:
+    """Find the pose of a frame from several guesses, (4, 4) each: the one that fits best at the coarse sizes is
+    followed to the finest."""
+    coarse, finest = tuned.LEVELS[:-1], tuned.LEVELS[-1:]
+    found = [align(shown, frame, pose, pose, coarse, tuned.GUESSED_ERROR) for pose in candidates]
+    best = max(found, key=lambda each: min(each.overlap, tuned.ENOUGH_OVERLAP) * each.agreeing)
+    return align(shown, frame, best.pose, best.pose, finest, tuned.GUESSED_ERROR)
 
 
 class _Level:

@@ -332,3 +332,46 @@ def test_poses_late_by_a_tenth_of_a_second_are_said_and_mended() -> None:
         (said,) = (line for line in field.troubles if line.startswith(f"hand: its poses are {word} by some"))
         assert 50 <= int(said.split(" ms or more")[0].split()[-1]) <= 100, said  # corrections follow a part of it
         assert _db(field, shifted)[1] > right_db - 0.8
+
+
+def _in_unit(scale: float) -> Callable[[int, View], View]:
+    def other(k: int, view: View) -> View:
+        pose = view.camera_to_world.copy()
+        pose[:3, 3] *= scale
+        return replace(view, camera_to_world=pose)
+
+    return other
+
+
+def _without_rotation(k: int, view: View) -> View:
+    pose = WALK[0].camera_to_world.copy()
+    pose[:3, 3] = view.camera_to_world[:3, 3]
+    return replace(view, camera_to_world=pose)
+
+
+def _leaped_for_good(k: int, view: View) -> View:
+    return _leaping(view) if k >= BAD_FROM else view
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    ("spoil", "words", "lost_db"),
+    [
+        (_in_unit(1000.0), "times as far apart", 3.5),
+        (_in_unit(0.001), "times as far apart", 3.5),
+        (_without_rotation, "no rotation", 3.7),
+        (_leaped_for_good, "left out", 2.5),
+    ],
+)
+def test_poses_that_do_not_fit_cost_little_where_depth_is_measured(spoil, words: str, lost_db: float) -> None:
+    """lost_db: at most, against right poses, from the fourth second on; as they are, such poses cost up to 11 dB for as
+    long as was looked. The walk takes a keyframe each 4 degrees and 15 cm, which 48 x 40 pixels show coarsely."""
+    views = [spoil(k, view) for k, view in enumerate(WALK)]
+    field, found_db = _by_seconds(views, views)
+    assert np.isfinite(field.cloud.params).all() and len(field.views) > 60
+    assert (np.array(_undisturbed(True)) - found_db).max() < lost_db
+    assert any(words in line for line in field.troubles)
+    resumed = _field()
+    resumed.load_state(field.state())
+    assert resumed.troubles == field.troubles
+    same_state(field, resumed)
