@@ -57,17 +57,17 @@ def align(
     given: Array,
     begin: Array | None = None,
     levels: Sequence[tuple[int, int]] = tuned.LEVELS,
-    prior: float = tuned.PRIOR_ERROR,
+    prior: float | None = None,
 ) -> Alignment:
     """Find the pose of a frame near that of a rendering.
 
     frame: (H, W) in [0, 1], of the rendering's size or larger. given: its pose as reported, (4, 4), from which it
     moves away reluctantly. begin: the pose to begin with, (4, 4); None: the rendering's. levels: see ``LEVELS``.
-    prior: see ``PRIOR_ERROR``. A size of too few pixels is left out; where equations cannot be solved, the pose to
+    prior: None: ``PRIOR_ERROR``. A size of too few pixels is left out; where equations cannot be solved, the pose to
     begin with stays.
     """
     motion = np.eye(4) if begin is None else se3_inverse(begin) @ shown.pose
-    light = np.array([1.0, 0.0])
+    prior, light = tuned.PRIOR_ERROR if prior is None else prior, np.array([1.0, 0.0])
     offset, overlap, agreeing = se3_inverse(shown.pose) @ given, 0.0, 0.0
     for halvings, iterations in levels:
         level = _Level(shown, frame, halvings)
