@@ -377,6 +377,15 @@ def find_data(name: str, scenario: Scenario, base: Path | None, key: str = "data
         return beside
     if not path.is_absolute():
         folder = base or (Path(os.environ["FRESHFIELD_DATA"]) if os.environ.get("FRESHFIELD_DATA") else None)
+        if (
+            scenario.source.get("kind") == "video"
+            and path.suffix == ".json"
+            and not (folder and (folder / path).exists())
+        ):
+            raise ScenarioError(
+                f"{where}: {name}: neither beside {scenario.path.name} nor in the data folder (--data DIR or "
+                "FRESHFIELD_DATA); camera-node calibrate rig writes it"
+            )
         if folder is None:
             raise ScenarioError(
                 f"{where}: {name!r} is looked for in the data folder: give --data DIR or set FRESHFIELD_DATA"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shlex
 import signal
 import subprocess
@@ -69,6 +68,20 @@ def command_line(argv: Sequence[str]) -> str:
     script = Path(argv[0])
     ours = script.name == "freshfield" or script.parent.name == "freshfield_up"  # python -m freshfield_up
     return shlex.join(["freshfield", *argv[1:]] if ours else ["python", *argv])
+
+
+def _without_numbers(text: str) -> str:
+    """The words of ``text`` but numbers. The first stays: it may be a camera, whose name may be a number."""
+    words = text.split()
+    return " ".join(words[:1] + [word for word in words[1:] if not _is_number(word.strip("(),:;%"))])
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 class Launcher:
@@ -165,10 +178,10 @@ class Launcher:
     def _say_troubles(self) -> None:
         """Say what the edge finds wrong with frames and poses, each kind once: numbers within change."""
         for line in read_json(self.options.out / "edge.json").get("troubles") or ():
-            kind = re.sub(r"[\d.]+", "", str(line))
+            kind = _without_numbers(str(line))
             if kind not in self._troubles_said:
                 self._troubles_said.add(kind)
-                self._say(str(line))
+                self._say(f"note: {line}")
 
     def _continue_start(self, now_s: float) -> None:
         """One step of the start: the node once its arm answers, the emulator once the edge serves, and the

@@ -67,7 +67,10 @@ def _init(args: argparse.Namespace) -> int:
     for target in targets[1:]:
         shutil.copytree(beside, target)
     args.file.write_text(re.sub(r"(?m)^name: .*$", f'name: "{name}"', text), encoding="utf-8")
-    print(f"wrote {args.file}, like {model.name}; next: freshfield scenario check {args.file}")
+    step = f"freshfield scenario check {args.file}"
+    if model.source.get("data") == "rig.json":  # a video's calibration
+        step = "camera-node calibrate rig (its first lines say how)"
+    print(f"wrote {args.file}, like {model.name}; next: {step}")
     return 0
 
 

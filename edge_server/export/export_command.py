@@ -130,6 +130,7 @@ def _export(args: argparse.Namespace, files: dict[str, Path], compare: Compariso
     check_installed(files)  # after the options: what is written wrong is told also where it is missing
     source = open_source(args.run, args.allow_plugins)
     print(f"{source.file}: {source.name}, {len(source.views)} cameras", flush=True)
+    progress = ProgressLine(sys.stderr)
     exporter = Exporter(
         source.name,
         source.field,
@@ -138,10 +139,11 @@ def _export(args: argparse.Namespace, files: dict[str, Path], compare: Compariso
         count=args.count,
         mesh=settings,
         say=lambda line: print(line, flush=True),
-        progress=ProgressLine(sys.stderr),
+        progress=progress,
         measure=measure,
     )
-    exporter.write(files)
+    with progress.running():
+        exporter.write(files)
 
 
 def _mesh_settings(args: argparse.Namespace) -> MeshSettings:

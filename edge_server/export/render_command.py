@@ -96,9 +96,9 @@ def _render(args: argparse.Namespace) -> None:
         for index in range(len(steps)):
             progress("images", index / len(steps))
             yield np.concatenate([shown(each) for each in render(index)], axis=1)
-        progress("images", 1.0)
 
-    count, width, height = write_video(args.file, images(), fps)
+    with progress.running("images"):
+        count, width, height = write_video(args.file, images(), fps)
     print(f"{args.file}: {count} image{'s' * (count > 1)} of {width} x {height}")
 
 

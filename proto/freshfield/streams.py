@@ -128,6 +128,7 @@ class OpenStreams:
 
     def __init__(self, most: int) -> None:
         self.ended = 0
+        self._closed: str | None = None
         self._most = most
         self._silent: OrderedDict[ServedCall, None] = OrderedDict()
         self._used: OrderedDict[ServedCall, None] = OrderedDict()
@@ -143,13 +144,18 @@ class OpenStreams:
             self._silent[call] = None
             call.held_in.append(self)
             try:
+                if self._closed is not None:  # it opens between ``end_all`` and the server's stop
+                    call.end(grpc.StatusCode.UNAVAILABLE, self._closed)
+                    await asyncio.sleep(0)  # is cancelled here, and ends in ``Admission``, before it writes anything
                 yield call
             finally:
                 self._silent.pop(call, None)
                 self._used.pop(call, None)
 
     def end_all(self, why: str) -> None:
-        """End every stream, before the server stops. gRPC would cancel them and print a traceback for each."""
+        """End every stream, and each that opens from now on, before the server stops. gRPC would cancel them and
+        print a traceback for each."""
+        self._closed = why
         for call in [*self._silent, *self._used]:
             call.end(grpc.StatusCode.UNAVAILABLE, why)
 

@@ -66,6 +66,8 @@ def test_data_is_found_below_the_folder_that_was_given(tmp_path, monkeypatch):
     assert find_data("set", scenario, None) == tmp_path / "set"
     with pytest.raises(ScenarioError, match="does not exist"):
         find_data("other", scenario, None)
+    with pytest.raises(ScenarioError, match=r"rig\.json: neither beside s\.yaml nor .*; camera-node calibrate rig"):
+        find_data("rig.json", parse({"cameras": {"count": 2}, "source": {"kind": "video"}}, Path("s.yaml")), None)
     # What lies beside the scenario comes first.
     (tmp_path / "mine/set").mkdir(parents=True)
     mine = parse({"cameras": {"count": 2}}, tmp_path / "mine/s.yaml")

@@ -40,10 +40,12 @@ def test_the_list_names_each_shipped_scenario_and_the_data_that_it_needs(capsys)
     assert "[--data: fox]" in lines["fox"] and "--data" not in lines["room"]
 
 
-@pytest.mark.parametrize("name", ["quad", "card"])
+@pytest.mark.parametrize("name", ["quad", "card", "videos"])
 def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path, capsys):
     mine = tmp_path / "new" / "mine.yaml"
-    printed(capsys, "scenario", "init", str(mine), "--like", name)
+    said = printed(capsys, "scenario", "init", str(mine), "--like", name)
+    step = "camera-node calibrate rig" if name == "videos" else f"freshfield scenario check {mine}"
+    assert f"next: {step}" in said
     text = printed(capsys, "scenario", "show", str(mine))
     assert '\nname: "mine"\n' in text and text.count("\n") == printed(capsys, "scenario", "show", name).count("\n")
     assert "valid" in printed(capsys, "scenario", "check", str(mine))

@@ -169,6 +169,18 @@ def test_a_process_that_dies_ends_the_run_is_named_and_the_others_are_stopped(
     assert rows[0]["edge"]["pid"] == made.edge.pid and "machine" in rows[0]
 
 
+def test_a_trouble_is_said_once_of_each_camera_though_its_numbers_change(asleep: Asleep) -> None:
+    run, said = asleep("pass"), []
+    run._say = said.append
+    run.options.out.mkdir()
+    first = [f"cam0{k}: its poses drift: the picture asks for 9 cm and .5 degrees" for k in range(2)]
+    plugin = "policy Mine failed 3 times: all views were used"
+    for troubles in ([*first, plugin], [first[0].replace("9 cm", "1e+03 cm"), plugin.replace("3", "14")]):
+        (run.options.out / "edge.json").write_text(json.dumps({"troubles": troubles}))
+        run._say_troubles()
+    assert said == [f"note: {line}" for line in (*first, plugin)]
+
+
 @pytest.mark.parametrize(
     ("last", "code", "text"),
     [("pass", 0, "the recording is over"), ("import os; os.kill(os.getpid(), 9)", 1, "the node was killed by SIGKILL")],

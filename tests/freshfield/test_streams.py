@@ -108,6 +108,17 @@ async def test_before_the_server_stops_every_stream_is_told_so_and_nothing_is_lo
     assert not caplog.records
 
 
+async def test_a_stream_that_opens_while_the_server_ends_is_told_so_and_nothing_is_logged(caplog):
+    streams = OpenStreams(4)
+    async with echoing(streams) as channel:
+        streams.end_all("the server ends")
+        late = channel.stream_stream("/t/Echo")()
+        assert (await late.code(), await late.details()) == (grpc.StatusCode.UNAVAILABLE, "the server ends")
+        assert await poured(channel) is grpc.StatusCode.UNAVAILABLE  # one that begins with an answer
+        assert not streams._silent and not streams._used
+    assert not caplog.records
+
+
 async def test_among_streams_of_use_the_one_that_is_idle_longest_ends():
     streams = OpenStreams(2)
     async with echoing(streams) as channel:

@@ -27,7 +27,7 @@ from freshfield.geometry import Pinhole
 
 import cv2  # isort: skip
 
-FILES = ("calib*.json", "rig*.json")
+FILES = ("calib*.json", "rig*.json")  # a folder's rig*.json counts where it has no calib*.json
 _PLACES = ("videos/{}.mp4", "{}.mp4")
 # Up to this distance, decoding forward is cheaper than seeking, which decodes from a key frame.
 _SKIP_FRAMES = 30
@@ -124,7 +124,7 @@ def rig_dataset(
 def _find_calibration(folder: Path) -> Path:
     if not folder.is_dir():
         raise DatasetError(f"{folder}: no such file or folder")
-    found = find_files(folder, FILES)
+    found = find_files(folder, FILES[:1]) or find_files(folder, FILES[1:])
     if len(found) != 1:
         names = ", ".join(p.name for p in found) or "none"
         raise DatasetError(f"{folder}: expected one {' or '.join(FILES)}, found {names}; name the file itself")

@@ -78,7 +78,8 @@ class Engine:
     jobs: number of processes; 1 computes in this one.
     ray: address of a Ray cluster (``auto``, ``local`` or HOST:PORT) to use instead of processes.
     threads: number of threads of each process; None: an equal share of the cores.
-    say: called with what is to be computed; how far it is, is a line of a terminal (``ProgressLine``).
+    say: called with what is to be computed; how far it is, is a line of a terminal (``ProgressLine``). None: a pipe
+        gets no line, for callers that say themselves how far they are.
     Raises EngineError for less than one process.
     """
 
@@ -86,7 +87,7 @@ class Engine:
     jobs: int = 1
     ray: str | None = None
     threads: int | None = None
-    say: Callable[[str], None] = _say
+    say: Callable[[str], None] | None = _say
     _store: ResultStore | None = None
 
     def __post_init__(self) -> None:
@@ -114,10 +115,11 @@ class Engine:
         store = self._store = self._store or ResultStore(self.file)
         keys = [result_key(work, one, files(one) if files else ()) for one in inputs]
         wanted = {key: one for key, one in zip(keys, inputs) if key not in store.results}
-        total, done, progress = len(wanted), 0, ProgressLine(sys.stderr)
+        total, done, progress = len(wanted), 0, ProgressLine(sys.stderr, quiet_in_pipe=self.say is None)
         if not total:
             return [store.results[key] for key in keys]
-        self.say(f"{name}: {total} to compute, {len(set(keys)) - total} known")
+        if self.say is not None:
+            self.say(f"{name}: {total} to compute, {len(set(keys)) - total} known")
         with progress.running(name):
             for task, results in self._results(work, _tasks(wanted, group, batch)):
                 for (key, one), result in zip(task, results):

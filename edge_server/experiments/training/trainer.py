@@ -106,7 +106,7 @@ def train(
         learner = _new_learner(setting, config, folders, jobs, ray)
     for number in range(first, config.batches):
         batch_began = time.monotonic()
-        engine = Engine(jobs=jobs, ray=ray, threads=1, say=lambda line: None)
+        engine = Engine(jobs=jobs, ray=ray, threads=1, say=None)
         row = _train_batch(setting, config, folders, engine, learner, number)
         rows.append({**row, "seconds": round(time.monotonic() - batch_began, 3)})
         checkpoint.save(learner, rows)
@@ -225,7 +225,7 @@ def _new_learner(setting: Setting, config: TrainingConfig, folders: Folders, job
     spec = config.spec
     if "semantics" in spec.layout.parts and not spec.layout.centre:
         work = partial(embeddings_seen, setting=setting, folders=folders)
-        rows = Engine(jobs=jobs, ray=ray, threads=1, say=lambda line: None).run(work, list(config.seeds(0)))
+        rows = Engine(jobs=jobs, ray=ray, threads=1, say=None).run(work, list(config.seeds(0)))
         seen = np.array([z for of in rows for z in of], np.float64).reshape(-1, spec.layout.dim)
         spec = dataclasses.replace(spec, layout=spec.layout.standardized(seen))
     return Learner(spec, config.seed)

@@ -70,6 +70,14 @@ def test_pixel_centres_gain_a_half_and_poses_are_inverted(tmp_path):
     np.testing.assert_allclose(camera.pose.matrix(), look_at([3, 1, 1], [0, 0, 0]), atol=1e-9)
 
 
+def test_a_rig_beside_a_calibration_is_not_taken_for_it(tmp_path):
+    file = write_rig(tmp_path)
+    (tmp_path / "rig.json").write_text("{}")
+    assert load_dataset(tmp_path).cameras == ("cam00", "cam01")
+    file.rename(tmp_path / "rig.json")
+    assert load_dataset(tmp_path).cameras == ("cam00", "cam01")
+
+
 def test_opencv_projects_to_the_same_pixels():
     """cv2.projectPoints with the file's own numbers, shifted by half a pixel, is our projection."""
     file = data_dir("pose2sim_single_person") / "calibration_opencv.json"
