@@ -22,7 +22,7 @@ class PoseCorrection:
     rotation, shift_m: (3,), a rotation vector in radians and meters, world axes.
     at_ns: when the view was taken. steps: how many ``descend`` has made for it. track: see ``PoseCorrections``.
     reported: (4, 4), the pose that the camera reported, where its picture was found elsewhere: at ``given``.
-    scale: factor of reported shifts with which they led here from the view before; 0: they did not."""
+    scale: factor on reported shifts that makes them lead here from the view before; 0: none does."""
 
     given: Array
     rotation: Array = field(default_factory=lambda: np.zeros(3))
@@ -72,9 +72,8 @@ class PoseCorrections:
     def begin(self, view: View, track: str) -> None:
         """Assign a view to a track, with the correction of the one before it there, if any."""
         near = self.neighbors_in_time(view, track)
-        pose = self.pose_between(
-            view, {name: share for name, share in near.items() if self.known[name].reported is None}
-        )
+        near = {name: share for name, share in near.items() if self.known[name].reported is None}
+        pose = self.pose_between(view, {name: share / sum(near.values()) for name, share in near.items()})
         given = np.asarray(view.camera_to_world, dtype=np.float64)
         self.known[view.camera] = PoseCorrection(given, at_ns=view.generated_ns, track=track)
         self._sorted = {}

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from edge_server.fields import SEPARATOR, View
 from edge_server.fields.common.camera_rows import camera_rows
-from edge_server.fields.common.cameras.pose_corrections import PoseCorrection
 from edge_server.fields.common.kernels.camera import CAMERA
 from edge_server.fields.common.supervision import CameraMemory, check_view
 from edge_server.fields.common.view_store import Arrays
@@ -24,7 +23,7 @@ from edge_server.fields.splat.densification import opacity
 from edge_server.fields.splat.kernels.rasterize import EXPOSURE, Targets
 from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.discs import usable_depth
-from edge_server.fields.splat.scan.own_motion import misfit, search
+from edge_server.fields.splat.scan.own_motion import OwnMotion, search
 from edge_server.fields.splat.scan.plausibility import moved_in, troubles
 from edge_server.fields.splat.scan.scan_field import ScanField, Shown, aim_of
 from edge_server.fields.splat.scan.sweep import sweep_depth
@@ -33,7 +32,7 @@ from edge_server.fields.splat.scan.tracking import Alignment, Rendered, align, g
 # What a field that begins anew, which no depth was measured for, still knows of its cameras and their frames.
 _OF_CAMERAS = ("_pixels", "_taken", "_blind", "_bare", "_seen", "_seen_m", "_left_out", "_in_a_row")
 
-_BY_CAMERA = ("left_out", "doubts", "replaced")  # counts that a state keeps
+_BY_CAMERA = ("left_out", "in_a_row")  # counts that a state keeps
 
 _NO_DEPTH = "its frames tell no depth (it only turns, or sees plain walls): distances are guessed, move it sideways"
 
@@ -53,8 +52,7 @@ class CarriedField(ScanField):
         self._due_before = 0  # keyframes that were due before the field began anew, which counts steps from 0 again
         self._left_out: dict[str, int] = {}  # frames of each camera that show something else
         self._in_a_row: dict[str, int] = {}
-        self._doubts: dict[str, int] = {}  # keyframes in a row that were not where reported motion led
-        self._replaced: dict[str, int] = {}  # keyframes of each camera that were located by their pictures
+        self._own = OwnMotion(self._poses)
         self._moving: dict[str, float] = {}  # share of a camera's newest keyframe where something moves
         self._depths: dict[str, View] = {}  # the newest keyframe of each camera that had depth
         self._measured = False  # whether any keyframe had depth
@@ -135,6 +133,8 @@ class CarriedField(ScanField):
                 return
             view = placed or view
             shown = self._look(view)
+        else:
+            self._own.trust(given.camera)
         self._taken += 1
         self._bare &= _is_bare(view)
         self._pixels = max(self._pixels, view.image.shape[0] * view.image.shape[1])
@@ -191,27 +191,26 @@ class CarriedField(ScanField):
         return found
 
     def _doubted(self, view: View, shown: Shown) -> bool:
-        """Whether to look for a view elsewhere first: reports of its camera do not fit, or lead out of sight."""
+        """Whether to look for a view elsewhere first: reports of its camera do not fit, or leap out of sight."""
         camera, seen = _carrier(view), (shown.opacity >= tuned.ALIGNED_OPACITY).mean()
-        if not self._measured or seen < tuned.LEAST_OVERLAP:
-            return self._measured
-        if self._astray(camera) and self._agreeing(view, shown) >= tuned.SURE:
-            self._doubts[camera] = 0
-        return self._astray(camera)
-
-    def _astray(self, camera: str) -> bool:
-        return self._doubts.get(camera, 0) >= tuned.DOUBTS
+        if self._own.leaps(view, camera) and seen < tuned.LEAST_OVERLAP and self._measured:
+            self._own.doubt(camera)
+            return True
+        return self._measured and self._own.astray(camera)
 
     def _placed(self, view: View, shown: Shown, doubted: bool) -> View | None:
         """A view where its picture was taken: near its reported pose, else near the view before. None: it shows
         something else than is to be seen from there."""
         camera = _carrier(view)
         if doubted:
+            if not self._own.astray(camera):
+                return None
+            if self._own.fits_again(camera, self._fits_as_reported(view, shown)):
+                return view
             found = self._search(view)
             if found is not None:
-                return self._located(view, *found)
-            if self._astray(camera):
-                return self._lost(view)
+                return self._own.located(view, camera, *found)
+            return self._own.lost(view, camera, self._has_depth_of(view) is not None)
         if self._flat(view, shown):
             return None
         tracked = self._track(view)
@@ -219,17 +218,29 @@ class CarriedField(ScanField):
             found = self._search(view)
             if found is not None and found[1] != 1.0:
                 if tracked.agreeing >= tuned.LEAST_AGREEING:
-                    self._doubts[camera] = self._doubts.get(camera, 0) + 1
-                if self._astray(camera) or self._in_a_row.get(camera, 0) >= tuned.LEAPED:
-                    return self._located(view, *found)
+                    self._own.doubt(camera)
+                if self._own.astray(camera):
+                    return self._own.located(view, camera, *found)
             elif found is not None:
-                self._doubts[camera] = 0
+                self._own.trust(camera)
         return view if self._plausible(view, tracked) else None
+
+    def _fits_as_reported(self, view: View, shown: Shown) -> bool:
+        if self._flat(view, shown):
+            return False
+        tracked = self._track(view)
+        return tracked.overlap >= tuned.LEAST_OVERLAP and tracked.agreeing >= tuned.LOCATED
+
+    def _has_depth_of(self, view: View) -> View | None:
+        """The newest keyframe with depth of a view's camera, if it was taken not long before."""
+        last, before = self._depths.get(_carrier(view)), self._own.before(view, _carrier(view))
+        recent = last is not None and bool(before) and last.generated_ns >= before[0].at_ns
+        return last if recent else None
 
     def _search(self, view: View) -> tuple[NDArray[np.float64], float] | None:
         """See ``own_motion.search``."""
-        last, before = self._depths.get(_carrier(view)), self._before(view)
-        if last is None or last.depth is None or not before:
+        last, before = self._has_depth_of(view), self._own.before(view, _carrier(view))
+        if last is None or last.depth is None:
             return None
         kept = Rendered(self._pose_of(last), last.intrinsics, gray(last.image), last.depth, np.ones_like(last.depth))
         return search(view, kept, before, self._poses, lambda pose: self._rendered(view, pose))
@@ -237,25 +248,6 @@ class CarriedField(ScanField):
     def _rendered(self, view: View, pose: NDArray[np.float64]) -> Rendered:
         shown, lens = self._look(view, tuned.RENDERED_HALVINGS, pose), view.intrinsics.halved(tuned.RENDERED_HALVINGS)
         return Rendered(pose, lens, gray(shown.color), shown.depth, shown.opacity)
-
-    def _located(self, view: View, pose: NDArray[np.float64], scale: float) -> View:
-        """The view at a pose that its picture was found at, and no longer at the reported one."""
-        camera = _carrier(view)
-        self._in_a_row[camera] = 0
-        self._replaced[camera] = self._replaced.get(camera, 0) + 1
-        self._doubts[camera] = tuned.DOUBTS
-        return self._poses.place(view, pose, scale)
-
-    def _lost(self, view: View) -> View | None:
-        """Leave out a view that was not found, or take it where the one before was, if that was not found either."""
-        camera, before = _carrier(view), self._before(view)
-        row = self._in_a_row[camera] = self._in_a_row.get(camera, 0) + 1
-        return self._located(view, before[-1].pose, 0.0) if row > tuned.LOST and before else None
-
-    def _before(self, view: View) -> list[PoseCorrection]:
-        """Corrections of the newest keyframes of a view's camera that were taken before it, in the order of time."""
-        newest = self._poses.newest(_carrier(view), tuned.JUDGED)
-        return [each for each in newest if each.at_ns < view.generated_ns]
 
     def _agreeing(self, view: View, shown: Shown) -> float:
         """The share of a view's pixels, of those where the field shows a surface, that look as expected."""
@@ -312,16 +304,12 @@ class CarriedField(ScanField):
                 f"{camera}: {count} frames left out: they show something else than is to be seen from their poses"
                 for camera, count in self._left_out.items()
             ]
-            located = [
-                f"{camera}: {count} of its poses left out: they do not fit its pictures, which say where it is instead"
-                + misfit(self._poses.newest(camera, tuned.JUDGED))
-                for camera, count in self._replaced.items()
-            ]
             moving = [
                 f"{camera}: something moves in {100 * share:.0f} % of its picture: left out of learning"
                 for camera, share in self._moving.items()
                 if share > 0.0
             ]
+            located = self._own.troubles()
             poses = troubles(self._poses) if self._rigid is not None else []
             guessed = self._taken > tuned.BEGINS[-1] and not self._founded
             unknown = [f"{camera}: {_NO_DEPTH}" for camera in self._seen] if guessed else []
@@ -455,11 +443,17 @@ class CarriedField(ScanField):
 
     def _counters(self) -> dict[str, Any]:
         names = ("taken", "blind", "bare", "took_at", "due_before", "pixels", "measured", *_BY_CAMERA)
-        return {**super()._counters(), **{name: getattr(self, f"_{name}") for name in names}}
+        own = {name: getattr(self, f"_{name}") for name in names}
+        own |= {"own_motion": self._own.meta(), "depths": {camera: view.camera for camera, view in self._kept_depths()}}
+        return {**super()._counters(), **own}
+
+    def _kept_depths(self) -> list[tuple[str, View]]:
+        return [(camera, view) for camera, view in self._depths.items() if view.camera in self._index]
 
     def _arrays(self) -> Arrays:
         aims = [np.append(normal, pixel_m) for normal, pixel_m in self._aims]
-        return {**super()._arrays(), "aims": np.stack(aims) if aims else np.zeros((0, 37))}
+        depths = {f"depth_{k}": np.asarray(view.depth) for k, (_, view) in enumerate(self._kept_depths())}
+        return {**super()._arrays(), **depths, "aims": np.stack(aims) if aims else np.zeros((0, 37))}
 
     def _load(self, meta: dict[str, Any], state: Arrays) -> None:
         super()._load(meta, state)
@@ -468,6 +462,7 @@ class CarriedField(ScanField):
         self._blind, self._bare = int(meta["blind"]), bool(meta["bare"])
         for name in _BY_CAMERA:
             setattr(self, f"_{name}", {str(camera): int(count) for camera, count in meta[name].items()})
+        self._own.load(meta["own_motion"])
         self._clear_views()
         views, aims = self.view_store.views, np.asarray(state["aims"], np.float64)
         if aims.shape != (len(views), 37) or not np.isfinite(aims).all():
@@ -477,6 +472,12 @@ class CarriedField(ScanField):
             view = view if moved is None else replace(view, weight=(~moved).astype(np.float32))
             self._append(view, (aim[:36].reshape(6, 6), float(aim[36])))
             self._seen[_carrier(view)] = view
+        for k, (camera, name) in enumerate(meta["depths"].items()):
+            view = self._views[self._index[name]]
+            depth = np.array(state[f"depth_{k}"], np.float32)
+            if depth.shape != view.image.shape[:2]:
+                raise ValueError(f"the state's depth_{k} must be {view.image.shape[:2]}, not {depth.shape}")
+            self._depths[camera] = replace(view, depth=depth, weight=None)
 
 
 def _carrier(view: View) -> str:

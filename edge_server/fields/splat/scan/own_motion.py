@@ -1,9 +1,10 @@
-"""Where a carried camera may be when the poses that it reports do not fit its pictures: guesses from where it was."""
+"""Where a carried camera is when the poses that it reports do not fit its pictures: found from where it was."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,98 @@ from freshfield.geometry import se3, se3_inverse, so3_exp, so3_log
 
 Array = NDArray[np.float64]
 
+_COUNTS = ("doubts", "fits", "missed", "replaced")  # that a state keeps
+
 UNITS = {"millimeters": 1000.0, "centimeters": 100.0, "inches": 39.37, "feet": 3.281, "kilometers": 0.001}
+
+
+class OwnMotion:
+    """Which cameras' reported poses do not fit their pictures, and where their views are taken to be instead.
+
+    poses: of all keyframes, where located views are noted.
+    replaced: number of keyframes of each camera that were located by their pictures.
+    """
+
+    def __init__(self, poses: PoseCorrections) -> None:
+        self._poses = poses
+        self.doubts: dict[str, int] = {}  # keyframes in a row that were not where reported motion led
+        self.fits: dict[str, int] = {}  # keyframes in a row of a camera astray that fit near where it reports them
+        self.missed: dict[str, int] = {}  # frames in a row of a camera astray that were not found
+        self.replaced: dict[str, int] = {}
+        self._reported_m: dict[str, Array] = {}  # position of a camera's newest view, (3,)
+
+    def astray(self, camera: str) -> bool:
+        """Whether reported poses of a camera are not believed."""
+        return self.doubts.get(camera, 0) >= tuned.DOUBTS
+
+    def doubt(self, camera: str) -> None:
+        """Note that a view fits better elsewhere than where reported motion leads."""
+        self.doubts[camera] = self.doubts.get(camera, 0) + 1
+
+    def trust(self, camera: str) -> None:
+        """Believe reported poses."""
+        self.doubts[camera] = self.fits[camera] = 0
+
+    def fits_again(self, camera: str, fits: bool) -> bool:
+        """Note whether a view of a camera astray fits near where it is reported. Returns whether so many in a row did
+        that reported poses are believed again."""
+        self.fits[camera] = self.fits.get(camera, 0) + 1 if fits else 0
+        if self.fits[camera] < tuned.DOUBTS:
+            return False
+        self.trust(camera)
+        return True
+
+    def before(self, view: View, camera: str) -> list[PoseCorrection]:
+        """Corrections of the newest keyframes of a view's camera that were taken before it, in the order of time."""
+        newest = self._poses.newest(camera, tuned.JUDGED)
+        return [each for each in newest if each.at_ns < view.generated_ns]
+
+    def leaps(self, view: View, camera: str) -> bool:
+        """Whether a view is reported farther from the one before than a camera can have moved. A tracker that loses
+        its place leaps once; in another unit each view leaps. A quick turn is none."""
+        here = view.camera_to_world[:3, 3]
+        before = self._reported_m.get(camera, here)
+        self._reported_m[camera] = here
+        return bool(np.linalg.norm(here - before) > tuned.FARTHEST * self._poses.most_m)
+
+    def located(self, view: View, camera: str, pose: Array, scale: float) -> View:
+        """The view at a pose (4, 4) that its picture was found at, and no longer at the reported one."""
+        self.missed[camera] = 0
+        self.replaced[camera] = self.replaced.get(camera, 0) + 1
+        self.doubts[camera] = tuned.DOUBTS
+        return self._poses.place(view, pose, scale)
+
+    def lost(self, view: View, camera: str, measured: bool) -> View | None:
+        """A view that was not found: None where it is to be left out; at the second in a row the view where the one
+        before was taken. Without depth nothing can be found: it has moved as reported.
+
+        measured: whether a view not long before has depth.
+        """
+        before = self.before(view, camera)
+        if before and not measured:
+            scale = shift_scale(before)
+            return self.located(view, camera, replace(before[-1], scale=scale).moved(view.camera_to_world), scale)
+        missed = self.missed[camera] = self.missed.get(camera, 0) + 1
+        return self.located(view, camera, before[-1].pose, 0.0) if missed > tuned.LOST and before else None
+
+    def troubles(self) -> list[str]:
+        """What is wrong with the cameras' reported poses, for people."""
+        return [
+            f"{camera}: {count} reported poses do not fit its pictures and were replaced by what the pictures show"
+            + misfit(self._poses.newest(camera, tuned.JUDGED))
+            for camera, count in self.replaced.items()
+        ]
+
+    def meta(self) -> dict[str, Any]:
+        """What a state keeps, ready for JSON."""
+        places = {camera: place.tolist() for camera, place in self._reported_m.items()}
+        return {**{name: getattr(self, name) for name in _COUNTS}, "reported_m": places}
+
+    def load(self, meta: dict[str, Any]) -> None:
+        """Restore what ``meta`` returned."""
+        for name in _COUNTS:
+            setattr(self, name, {str(camera): int(count) for camera, count in meta[name].items()})
+        self._reported_m = {str(camera): np.array(place) for camera, place in meta["reported_m"].items()}
 
 
 def search(
@@ -96,14 +188,18 @@ def misfit(known: Sequence[PoseCorrection]) -> str:
     """
     if sum(each.reported is not None for each in known) < tuned.ASTRAY_FOR:
         return ""
-    reported = np.array([_reported(each) for each in known])
-    if np.abs(reported[:, :3, :3] - reported[0, :3, :3]).max() < tuned.SAME_TURN:
+    turned, turns = (
+        np.ptp([pose[:3, :3] for pose in poses], axis=0).max()
+        for poses in ([_reported(each) for each in known], [each.pose for each in known])
+    )
+    if turned < tuned.SAME_TURN and turns > tuned.TURNED:
         return ": reported poses have no rotation"
     scale = 1.0 / max(shift_scale(known), 1e-12)
     if 1.0 / tuned.OTHER_UNIT < scale < tuned.OTHER_UNIT:
         return ""
-    named = next((name for name, size in UNITS.items() if abs(np.log(scale / size)) < tuned.UNIT_LOG), "another unit")
-    return f": reported positions are some {scale:.3g} times as far apart, as in {named} instead of meters"
+    named = next((f", as in {name}" for name, size in UNITS.items() if abs(np.log(scale / size)) < tuned.UNIT_LOG), "")
+    about = f"{float(f'{scale:.2g}'):g}"
+    return f": reported positions are some {about} times as far apart as meters are{named}"
 
 
 def _reported(known: PoseCorrection) -> Array:

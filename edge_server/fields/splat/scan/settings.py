@@ -90,13 +90,13 @@ GUESSED_ERROR = 4e-5  # as PRIOR_ERROR, around a guess: five times as far costs 
 ENOUGH_OVERLAP = 0.6  # guesses that have more in view are as good
 DOUBTFUL = 0.9  # share of pixels that look as expected, below which another place than the reported one is tried
 LOCATED = 0.7  # least share of pixels for another place to be believed
-FARTHEST = 6.0  # largest corrections, that a camera may move between two keyframes: more is a wrong match
+FARTHEST = 6.0  # largest corrections, that a camera may move between two keyframes: more is a wrong match, or a leap
 LOST = 1  # frames in a row that are not found, after which one is taken where the one before was
-LEAPED = 3  # frames in a row that show something else, after which a camera is taken to have leaped for good
 DOUBTS = 2  # keyframes in a row for which another place fits better, from which on reports are not believed
 ASTRAY_FOR = 4  # keyframes from which on it is said why reported poses do not fit
-SAME_TURN = 1e-6  # of matrices' numbers: a tracker's noise is more
-OTHER_UNIT, UNIT_LOG = 2.0, 0.45  # ratio of distances that is no error of single poses; deviation of its logarithm
+SAME_TURN, TURNED = 1e-6, 0.05  # of matrices' numbers: a tracker's noise is more; a camera that turns
+OTHER_UNIT = 2.5  # ratio of distances that is no error of single poses: feet in meters are 3.3
+UNIT_LOG = 0.45  # deviation of its logarithm, up to which it is that of two units
 FOLLOWED = 0.1  # share of pixels by which fewer may look as expected where reported motion leads than at best
 FASTEST = 3.0  # times that the last motion may have gone on since
 
