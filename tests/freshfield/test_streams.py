@@ -18,6 +18,12 @@ from freshfield.streams import OpenStreams, SessionStreams, serve_health
 from freshfield.transport import Transport
 
 
+def _said(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """What was logged, but for gRPC's poller: it may wake the closed event loop of an earlier test."""
+    said = [record.getMessage() for record in caplog.records]
+    return [line for line in said if "PollerCompletionQueue._handle_events" not in line]
+
+
 @asynccontextmanager
 async def echoing(streams: OpenStreams):
     """A server that answers each message; ``use`` marks a stream that sent b"use". Yields a channel."""
@@ -105,7 +111,7 @@ async def test_before_the_server_stops_every_stream_is_told_so_and_nothing_is_lo
         streams.end_all("the server ends")
         assert [await call.code() for call in calls] == 2 * [grpc.StatusCode.UNAVAILABLE]
         assert [await call.details() for call in calls] == 2 * ["the server ends"]
-    assert not caplog.records
+    assert not _said(caplog)
 
 
 async def test_a_stream_that_opens_while_the_server_ends_is_told_so_and_nothing_is_logged(caplog):
@@ -116,7 +122,7 @@ async def test_a_stream_that_opens_while_the_server_ends_is_told_so_and_nothing_
         assert (await late.code(), await late.details()) == (grpc.StatusCode.UNAVAILABLE, "the server ends")
         assert await poured(channel) is grpc.StatusCode.UNAVAILABLE  # one that begins with an answer
         assert not streams._silent and not streams._used
-    assert not caplog.records
+    assert not _said(caplog)
 
 
 async def test_among_streams_of_use_the_one_that_is_idle_longest_ends():

@@ -6,6 +6,7 @@ most votes is the plate, once it has enough of them. Colors are in steps of 255.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -293,3 +294,15 @@ def clean_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     fill[0] = 0
     out[top:bottom, left:right] = part | fill.take(np.asarray(label, np.int32))
     return out
+
+
+def plain_share(colors: Sequence[NDArray[np.float32]]) -> float:
+    """Share of the pixels around which nothing tells one place from the next: in no channel do colors differ by
+    PLAIN_STEPS (standard deviation) within PLAIN_PX pixels. colors: of plates, float32 (H, W, 3), steps of 255."""
+    plain = []
+    for color in colors:
+        size = (tuned.PLAIN_PX, tuned.PLAIN_PX)
+        mean = cv2.blur(color, size)
+        variance = cv2.blur(color * color, size) - mean * mean
+        plain.append(float((variance.max(axis=2) < tuned.PLAIN_STEPS**2).mean()))
+    return float(np.mean(plain))

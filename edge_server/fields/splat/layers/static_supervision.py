@@ -18,6 +18,7 @@ from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.exposures import equalize_exposures
 from edge_server.fields.splat.layers.observations import FixedCamera, Observations
+from edge_server.fields.splat.layers.plates import plain_share
 from edge_server.fields.splat.layers.static_layer import PlateImage, StaticLayer
 from edge_server.fields.splat.layers.tracker import PartTimes
 from edge_server.fields.splat.snapshot import SplatSnapshot
@@ -42,6 +43,8 @@ class StaticSupervision:
     anew: whether the static field is to begin anew.
     with_depth: whether it begins, or has begun, with depth. early: whether it began before plates were certain.
     depth: None as long as no camera has measured depth.
+    plain: whether so much of the plates is plain that stereo helps; None before they are certain, and where it does not
+        matter.
     earlier: what the static field showed before it began anew; None if it has become better than that.
     """
 
@@ -52,6 +55,7 @@ class StaticSupervision:
         self.fine = False
         self.exposure_rounds = 0
         self.anew = self.with_depth = self.early = False
+        self.plain: bool | None = None
         self.warned = False  # that one camera alone tells no depth
         self.depth: DepthSupervision | None = None
         self.earlier: SplatSnapshot | None = None
@@ -109,9 +113,13 @@ class StaticSupervision:
         known = [c.depth.is_known(c.plate.known) for c in observed if c.depth is not None and c.depth.count.any()]
         return 2 * len(known) >= max(len(observed), 1) and all(known)
 
+    @property
+    def _stereo_cameras(self) -> int:
+        return tuned.PLAIN_CAMERAS if self.plain else tuned.STEREO_CAMERAS
+
     def _stereo_helps(self, cameras: Cameras) -> bool:
         """Whether few cameras see the scene, and less than half of them have measured depth."""
-        few = tuned.LEAST_CAMERAS <= len(cameras) <= tuned.STEREO_CAMERAS
+        few = tuned.LEAST_CAMERAS <= len(cameras) <= self._stereo_cameras
         measure = sum(c.depth is not None and bool(c.depth.count.any()) for c in cameras.values())
         return few and 2 * measure < len(cameras)
 
@@ -199,9 +207,14 @@ class StaticSupervision:
         """
         begun, now_s = self.times.now(), observations.newest_s
         certain = self.early and now_s >= tuned.PLATE_S
+        more = tuned.STEREO_CAMERAS < len(cameras) <= tuned.PLAIN_CAMERAS
+        if self.plain is None and more and now_s >= tuned.PLATE_S:
+            plates = [camera.plate_image(fine=False).color for camera in cameras.values()]
+            least, most = tuned.PLAIN_SHARE
+            self.plain = least < plain_share(plates) < most
         stereo = self._stereo_helps(cameras)
         if stereo:
-            self.make_depth()
+            self.make_depth().stereo_cameras = self._stereo_cameras
         if self.anew:
             pass
         elif self.with_depth:

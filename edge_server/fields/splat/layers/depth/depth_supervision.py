@@ -80,7 +80,7 @@ class DepthSupervision:
     wrong: cameras whose depth contradicts the others', and is not used.
     corrections: camera -> its pose and the scale of its depth, where registration has found them.
     scene: the surfaces as they were last learned; None before that, or where none can be used.
-    stereo: of the plates; None where it was not needed.
+    stereo: of the plates; None where it was not needed. stereo_cameras: up to so many, it finds what has no depth.
     """
 
     def __init__(self, settings: SplatSettings, pool: Pool, network: NetworkDepth | None = None) -> None:
@@ -90,6 +90,7 @@ class DepthSupervision:
         self.corrections: dict[str, Correction] = {}
         self.scene: SurfaceScene | None = None
         self.stereo: PlateStereo | None = None
+        self.stereo_cameras = of_layers.STEREO_CAMERAS
         self._learned: dict[str, NDArray[np.float32]] = {}  # camera -> inverse depths as learned
 
     def forget_camera(self, camera: str) -> None:
@@ -146,7 +147,7 @@ class DepthSupervision:
             self._take_corrections(list(measured), register(list(measured.values())))
         surfaces = [self._corrected(c, measured.get(c.name)) for c in cameras]
         whole = _are_whole(cameras, surfaces)
-        if not whole and len(cameras) <= of_layers.STEREO_CAMERAS:
+        if not whole and len(cameras) <= self.stereo_cameras:
             surfaces, whole = self._filled(cameras, surfaces, anew)
         poses = [surface.pose for surface in surfaces]
         surfaces = [surface for surface in surfaces if surface.inverse.any()]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields.common.threads.thread_pool import CallerPool
-from edge_server.fields.splat.layers.plates import FinePlate, Plate, clean_mask
+from edge_server.fields.splat.layers.plates import FinePlate, Plate, clean_mask, plain_share
 from edge_server.fields.splat.layers.settings import CLOSE, HOLE, SPECK
 from tests.edge_server.fields.scenes import ring
 
@@ -142,3 +142,16 @@ def test_a_mask_is_cleaned_as_a_whole(seed: int) -> None:
 
 def test_an_empty_mask_stays_empty() -> None:
     assert not clean_mask(np.zeros((9, 9), np.uint8)).any()
+
+
+def test_plain_is_what_changes_by_less_than_two_steps_within_nine_pixels() -> None:
+    rng = np.random.default_rng(1)
+    grained = rng.normal(128.0, 3.0, (60, 80, 3)).astype(np.float32)
+    faint = rng.normal(128.0, 1.0, (60, 80, 3)).astype(np.float32)
+    half = np.hstack([grained[:, :40], faint[:, :40]])  # plain where at most three of nine columns are grained
+    assert plain_share([grained]) == 0.0 and plain_share([faint]) == 1.0
+    assert plain_share([half]) == pytest.approx(39 / 80, abs=0.02)
+    assert plain_share([half, faint]) == pytest.approx((39 / 80 + 1.0) / 2, abs=0.01)
+    one = faint.copy()
+    one[..., 2] = grained[..., 2]
+    assert plain_share([one]) < 0.01  # one channel tells places apart

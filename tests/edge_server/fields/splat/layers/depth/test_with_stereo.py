@@ -38,6 +38,7 @@ def _score(field: LayeredField) -> float:
 
 def test_stereo_shows_what_is_between_few_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
     scores = []
+    monkeypatch.setattr(layer_settings, "PLAIN_CAMERAS", 0)
     for most in (0, layer_settings.STEREO_CAMERAS):
         monkeypatch.setattr(layer_settings, "STEREO_CAMERAS", most)
         field = LayeredField(SMALL)
@@ -45,6 +46,28 @@ def test_stereo_shows_what_is_between_few_cameras(monkeypatch: pytest.MonkeyPatc
         assert field.supervision.with_depth == (most > 0)
         scores.append(_score(field))
     assert scores[1] > scores[0] + 1.0
+
+
+@pytest.mark.parametrize(("plain_rows", "plain"), [(0, False), (14, True), (64, False)])
+def test_with_more_cameras_stereo_is_used_where_some_of_the_plates_is_plain(
+    plain_rows: int, plain: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the images the uppermost rows show a plain sky, which the others would, too, but for a grain."""
+    monkeypatch.setattr(layer_settings, "STEREO_CAMERAS", 2)
+    monkeypatch.setattr(layer_settings, "PLAIN_CAMERAS", 3)
+    grain = np.random.default_rng(0).integers(-12, 13, CAMERAS[0].image.shape)
+    grain[:plain_rows] = 0
+    field = LayeredField(SMALL)
+    for frame in range(24):
+        views = [_frame(k, frame) for k in range(3)]
+        grained = [replace(v, image=np.clip(v.image + grain, 0, 255).astype(np.uint8)) for v in views]
+        field.fit(grained, Budget(steps=5))
+    assert field.supervision.plain == plain and field.supervision.with_depth == plain
+    stereo = field.supervision.depth is not None and field.supervision.depth.stereo is not None
+    assert stereo == plain
+    again = LayeredField(SMALL)
+    again.load_state(field.state())
+    assert again.supervision.plain == plain
 
 
 def test_it_resumes_bit_for_bit() -> None:
