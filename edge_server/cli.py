@@ -11,7 +11,7 @@ import threading
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "edge-server") -> int:
     try:
         if words and words[0] in _COMMANDS:
             command = importlib.import_module(f"edge_server.{_COMMANDS[words[0]][0]}").main
-            more = {"export": (_compare_with_scene,), "render": (f"{prog} render",)}.get(words[0], ())
+            more = (f"{prog} render",) if words[0] == "render" else ()
             return int(command(words[1:], *more))
         args = parser.parse_args(words)
         return args.run(args)
@@ -107,11 +107,6 @@ _COMMANDS = {
     "keys": ("live.keys", "make a development CA, certificates and tokens for a scenario's processes"),
     "fetch-lpips": ("fidelity.fetch_lpips", "fetch LPIPS weights with the public package and convert them for --lpips"),
 }
-
-
-def _compare_with_scene(*args: Any) -> Any:
-    """``export --measure``: it needs the synthetic world, so experiments do it, imported only when called."""
-    return importlib.import_module("edge_server.experiments.scenes.mesh_truth").compare_with_scene(*args)
 
 
 def _add_run(commands: argparse._SubParsersAction) -> None:

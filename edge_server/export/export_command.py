@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from edge_server.export import ExportError
 from edge_server.export.exporter import KINDS, Exporter, check, check_installed
@@ -23,8 +22,7 @@ DESCRIPTION = """\
 Write the results of a run or fit as files for other programs. RUN is its folder, or a checkpoint in it.
 
   edge-server export runs/demo --mesh tile.ply
-  edge-server export runs/cell --mesh tile.ply --measure cell      and its distance to the true surface
-  edge-server export runs/fit-tile --mesh tile.glb --voxel 1 --watertight
+  edge-server export runs/fit-tile --mesh tile.glb --voxel 1
   edge-server export runs/demo/snapshot-000120.npz --splats tile.ply
   edge-server export runs/demo --colmap out/colmap --transforms out/nerf
   edge-server export room.ffsplats --splats room.ply    a saved splat stream: room-0000.ply and so on
@@ -38,25 +36,20 @@ Write the results of a run or fit as files for other programs. RUN is its folder
 --transforms   DIR/transforms.json, DIR/images and DIR/points.ply, for nerfstudio and others
 
 Several can be given at once. Lengths in the files are meters, and z points up (in GLB: y). A mesh is fused on
-a grid from the depth that the cameras see; what no camera saw stays open, or is closed with --watertight. Of more
-than 10 million pixels only the depth of those images is sharpened and used that see most together.
+a grid from the depth that the cameras see; what no camera saw stays open. Of more than 10 million pixels only the
+depth of those images is sharpened and used that see most together.
 """
 
 
-# scenario -> (mesh, views) -> a sentence on the distance to the true surface, to print.
-Comparison = Callable[[str], Callable[[Any, Any], str]]
-
-
-def main(argv: Sequence[str] | None = None, compare: Comparison | None = None) -> int:
-    """Run the command; returns its exit status. compare: implements --measure. It is passed in because it
-    needs the synthetic world, which the edge does not import."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
     parser = _parser()
     args = parser.parse_args(argv)
     files = {kind: path for kind in KINDS if (path := getattr(args, kind)) is not None}
     if not files:
         parser.error(f"say what to write: {', '.join(f'--{kind}' for kind in KINDS)}")
     try:
-        _export(args, files, compare)
+        _export(args, files)
     except (ExportError, SurfaceError) as error:
         print(f"edge-server export: {error}", file=sys.stderr)
         return 2
@@ -92,7 +85,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="box to mesh: lower and upper corner, meters [what the cameras see]",
     )
-    mesh("--watertight", action="store_true", help="close the surface where no camera looked")
     mesh("--method", default="tsdf", help="tsdf, or sdf: a distance function fitted with an eikonal term [tsdf]")
     mesh(
         "--no-sharpen",
@@ -100,15 +92,10 @@ def _parser() -> argparse.ArgumentParser:
         help="use the field's depth as it is, without refining it by "
         "multi-view consistency: faster, works for moving scenes, less accurate",
     )
-    mesh(
-        "--measure",
-        metavar="SCENARIO",
-        help="scenario of the run; if its scene is synthetic and static, print the mesh's distance to the true surface",
-    )
     return parser
 
 
-def _export(args: argparse.Namespace, files: dict[str, Path], compare: Comparison | None) -> None:
+def _export(args: argparse.Namespace, files: dict[str, Path]) -> None:
     """Check all options, then write every file. Raises ExportError, SurfaceError."""
     check(files, args.count)
     if args.run.suffix == SAVED_STREAM:
@@ -119,13 +106,6 @@ def _export(args: argparse.Namespace, files: dict[str, Path], compare: Compariso
         check_installed(files)
         print(f"{args.run}: {write_sequence(files['splats'], args.run)} frames", flush=True)
         return
-    measure = None
-    if args.measure is not None:
-        if args.mesh is None:
-            raise ExportError("--measure is for --mesh FILE")
-        if compare is None:
-            raise ExportError("--measure: run it as edge-server export")
-        measure = compare(args.measure)
     settings = _mesh_settings(args)
     check_installed(files)  # after the options: what is written wrong is told also where it is missing
     source = open_source(args.run, args.allow_plugins)
@@ -140,7 +120,6 @@ def _export(args: argparse.Namespace, files: dict[str, Path], compare: Compariso
         mesh=settings,
         say=lambda line: print(line, flush=True),
         progress=progress,
-        measure=measure,
     )
     with progress.running():
         exporter.write(files)
@@ -157,5 +136,4 @@ def _mesh_settings(args: argparse.Namespace) -> MeshSettings:
         sharpen=not args.no_sharpen,
         voxel_m=None if args.voxel is None else 1e-3 * args.voxel,
         bounds=box,
-        watertight=args.watertight,
     )

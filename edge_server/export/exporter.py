@@ -49,7 +49,6 @@ class Exporter:
     count: number of points in points, colmap and transforms.
     mesh: settings of a mesh.
     say: gets a line for each file. progress: gets the stage and the share that is done.
-    measure: gets the mesh and the views, returns a line on its distance to the true surface.
     """
 
     def __init__(
@@ -63,11 +62,10 @@ class Exporter:
         mesh: MeshSettings | None = None,
         say: Callable[[str], None] = lambda line: None,
         progress: Callable[[str, float], None] = lambda stage, share: None,
-        measure: Callable[[Any, Any], str] | None = None,
     ) -> None:
         self._name, self._field, self._views, self._shots = name, field, views, shots
         self._count, self._settings = count, mesh or MeshSettings()
-        self._say, self._progress, self._measure = say, progress, measure
+        self._say, self._progress = say, progress
 
     def write(self, files: Mapping[str, Path]) -> None:
         """Write every file. files: kind, one of KINDS -> its file or folder. Raises ExportError and SurfaceError."""
@@ -107,10 +105,7 @@ class Exporter:
         else:
             from edge_server.export.ply import write_mesh
         write_mesh(path, mesh.vertices, mesh.faces, mesh.color)
-        closed = ", watertight" if mesh.watertight else ""
-        self._say(f"{path}: {len(mesh.faces)} triangles, {len(mesh.vertices)} vertices{closed}")
-        if self._measure is not None:
-            self._say(f"  {self._measure(mesh, self._views)}")
+        self._say(f"{path}: {len(mesh.faces)} triangles, {len(mesh.vertices)} vertices")
 
     def _points(self, path: Path) -> None:
         from edge_server.export.ply import write_points

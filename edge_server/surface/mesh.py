@@ -30,16 +30,6 @@ class Mesh:
     faces: NDArray[np.int32]
     color: NDArray[np.uint8]
 
-    @property
-    def watertight(self) -> bool:
-        """Whether every edge belongs to exactly two faces with opposite directions along it."""
-        if not len(self.faces):
-            return False
-        edges = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-        count = len(self.vertices)
-        one, other = np.sort(edges[:, 0] * count + edges[:, 1]), np.sort(edges[:, 1] * count + edges[:, 0])
-        return bool((one[1:] != one[:-1]).all() and np.array_equal(one, other))
-
     def areas_m2(self) -> NDArray[np.float64]:
         """Area of every face (F,), square meters."""
         corners = self.vertices[self.faces].astype(np.float64)
@@ -48,15 +38,14 @@ class Mesh:
         return areas
 
 
-def extract_mesh(volume: Volume, min_weight: float = 0.0, watertight: bool = False) -> Mesh:
+def extract_mesh(volume: Volume, min_weight: float = 0.0) -> Mesh:
     """Extract the zero level set (Lorensen and Cline 1987, in Lewiner's topologically sound variant).
 
     min_weight: voxels need more fused weight than this to be known; faces connect only known voxels.
-    watertight: treat space in the box that no camera looked through as solid; this closes the surface.
     SurfaceError: scikit-image is missing, there is no surface, or the box has more than ``MOST_VOXELS``.
     """
     marching_cubes = import_marching_cubes()
-    dense = _Dense(volume, min_weight, watertight)
+    dense = _Dense(volume, min_weight)
     distance, known = dense.distances()
     # scikit-image reads a cell's mask at its upper corner.
     cells = np.zeros(known.shape, np.bool_)
@@ -99,18 +88,14 @@ def _crosses_surface(distance: Floats) -> NDArray[np.bool_]:
 
 
 class _Dense:
-    """A volume as dense arrays. Indices start at the first voxel of block ``low``. A watertight surface adds one
-    empty layer before the first voxel and one after the last; indices include it."""
+    """A volume as dense arrays. Indices start at the first voxel of block ``low``."""
 
-    def __init__(self, volume: Volume, min_weight: float, watertight: bool) -> None:
-        self.volume, self.min_weight, self.watertight = volume, min_weight, watertight
+    def __init__(self, volume: Volume, min_weight: float) -> None:
+        self.volume, self.min_weight = volume, min_weight
         place = volume.blocks.place
         if not len(place):
             raise SurfaceError("the depth maps hold no surface within the bounds")
         low, high = place.min(axis=0), place.max(axis=0) + 1
-        if watertight:
-            low, high = np.zeros(3, np.int64), volume.grid.blocks
-        self.pad = int(watertight)
         self.low, self.high = low.astype(np.int64), high.astype(np.int64)
         voxels = int(np.prod((self.high - self.low) * SIDE))
         if voxels > MOST_VOXELS:
@@ -123,29 +108,21 @@ class _Dense:
     def distances(self) -> tuple[Floats, NDArray[np.bool_]]:
         """Distances of all voxels (X, Y, Z), meters, and whether each is known."""
         grid, blocks = self.volume.grid, self.volume.blocks
-        box = tuple(map(slice, self.low, self.high))
-        table = self.volume.table[box]
+        table = self.volume.table[tuple(map(slice, self.low, self.high))]
         known = table >= 0
         distance = np.full((*table.shape, CELLS), grid.band_m, np.float32)
         sure = np.zeros((*table.shape, CELLS), np.bool_)
         distance[known] = blocks.distance[table[known]]
         sure[known] = blocks.weight[table[known]] > self.min_weight
-        if self.watertight:
-            distance = np.where(sure, distance, np.float32(-grid.band_m))
-            distance[self.volume.through[box] & ~known] = grid.band_m
-            sure[:] = True
         least = np.float32(LEAST * grid.voxel_m)
         dense, sure = unblock(distance), unblock(sure)
         dense = np.where(np.abs(dense) < least, np.where(dense < 0, -least, least), dense)
-        if self.pad:
-            dense = np.pad(dense, self.pad, constant_values=grid.band_m)
-            sure = np.pad(sure, self.pad, constant_values=True)
         return np.ascontiguousarray(dense), sure
 
     def meters(self, index: NDArray[np.float64]) -> NDArray[np.float64]:
         """World coordinates (N, 3), meters, of voxel indices (N, 3)."""
         grid = self.volume.grid
-        voxels = index - self.pad + SIDE * self.low
+        voxels = index + SIDE * self.low
         meters: NDArray[np.float64] = np.array(grid.lower) + voxels * grid.voxel_m
         return meters
 
@@ -160,7 +137,7 @@ class _Dense:
     def _color_sums(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
         """Weighted colors and weights (N, 4) of voxels; 0 outside the blocks."""
         table = self.volume.table
-        block, inside = np.divmod(index - self.pad + SIDE * self.low, SIDE)
+        block, inside = np.divmod(index + SIDE * self.low, SIDE)
         within = ((block >= 0) & (block < table.shape)).all(axis=1)
         number = np.where(within, table[tuple(np.where(within[:, None], block, 0).T)], -1)
         cell = (inside[:, 0] * SIDE + inside[:, 1]) * SIDE + inside[:, 2]

@@ -81,7 +81,7 @@ def mesh_from_depth_maps(maps: Sequence[DepthMap], settings: MeshSettings, say: 
         volume = fit_sdf(grid, maps, say)
     else:
         volume = fuse_maps(grid, maps, on_map=lambda done: say("fuse", done / len(maps)))
-    mesh = remove_small_components(extract_mesh(volume, MIN_WEIGHT, settings.watertight))
+    mesh = remove_small_components(extract_mesh(volume, MIN_WEIGHT))
     say("extract", 1.0)
     return mesh
 

@@ -22,7 +22,6 @@ class MeshSettings:
     sharpen: refine depth by photo-consistency (``refine_depth``).
     voxel_m: None: the size of a pixel at the surface.
     bounds: lower and upper corner, meters; None: from the depth maps.
-    watertight: close the surface in unobserved space.
     Raises SurfaceError for an unknown method.
     """
 
@@ -30,7 +29,6 @@ class MeshSettings:
     sharpen: bool = True
     voxel_m: float | None = None
     bounds: tuple[Corner, Corner] | None = None
-    watertight: bool = False
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:

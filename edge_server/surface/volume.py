@@ -69,13 +69,11 @@ class Grid:
 
 @dataclass(frozen=True)
 class Volume:
-    """Fused blocks. table: int32 (X, Y, Z), block index or -1. through: bool (X, Y, Z), whether a block's
-    center lies in front of some map's surface."""
+    """Fused blocks. table: int32 (X, Y, Z), block index or -1."""
 
     grid: Grid
     blocks: Blocks
     table: NDArray[np.int32]
-    through: NDArray[np.bool_]
 
 
 def bounding_box(
@@ -114,30 +112,18 @@ def fuse_maps(
             f"allowed: take {1e3 * least_m:.2g} mm or more, or smaller bounds"
         )
     table[tuple(place.T)] = np.arange(len(place), dtype=np.int32)
-    blocks = _blocks(place, np.array(grid.lower), grid.band_m)
-    # Fuse block centers too: they tell free from hidden space where no voxels are allocated.
-    side = SIDE * grid.voxel_m
-    across = -(-grid.blocks // SIDE)
-    coarse = np.argwhere(np.ones(across, np.bool_)).astype(np.int32)
-    middles = _blocks(coarse, np.array(grid.lower) + 0.5 * (side - grid.voxel_m), grid.band_m)
-    for done, found in enumerate(maps, 1):
-        depths = kernel_depth(found)
-        pool.run(fuse, blocks, depths, float(grid.voxel_m), float(grid.band_m))
-        pool.run(fuse, middles, depths, float(side), float(grid.band_m))
-        if on_map is not None:
-            on_map(done)
-    free = unblock(((middles.weight > 0) & (middles.distance > 0)).reshape(*across, CELLS))
-    return Volume(grid, blocks, table, free[: table.shape[0], : table.shape[1], : table.shape[2]])
-
-
-def _blocks(place: NDArray[np.int32], lowest: NDArray[np.float64], band_m: float) -> Blocks:
-    return Blocks(
+    blocks = Blocks(
         place=place,
-        lowest=lowest.astype(np.float64),
-        distance=np.full((len(place), CELLS), band_m, np.float32),
+        lowest=np.array(grid.lower, np.float64),
+        distance=np.full((len(place), CELLS), grid.band_m, np.float32),
         weight=np.zeros((len(place), CELLS), np.float32),
         color=np.zeros((len(place), CELLS, 4), np.float32),
     )
+    for done, found in enumerate(maps, 1):
+        pool.run(fuse, blocks, kernel_depth(found), float(grid.voxel_m), float(grid.band_m))
+        if on_map is not None:
+            on_map(done)
+    return Volume(grid, blocks, table)
 
 
 def unblock(blocks: NDArray) -> NDArray:
