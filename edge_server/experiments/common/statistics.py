@@ -250,29 +250,3 @@ def move_of_optimum(
     lows, highs = np.percentile(found[1:], [2.5, 97.5], axis=0) if len(seeds) >= FEWEST else np.full((2, 2), np.nan)
     line, move = (Interval(float(m), float(a), float(b), len(seeds)) for m, a, b in zip(found[0], lows, highs))
     return line, move
-
-
-def share_closed(
-    policy: Mapping[int, float | None], base: Mapping[int, float | None], limit: Mapping[int, float | None]
-) -> Interval:
-    """(policy - base) / (limit - base), a ratio of means over the seeds that have all three, with an interval
-    by resampling seeds. NaN if the limit is not better than the base."""
-    rows = [
-        (p, b, n)
-        for s in policy
-        if (p := policy[s]) is not None and (b := base.get(s)) is not None and (n := limit.get(s)) is not None
-    ]
-    if not rows:
-        return Interval(np.nan, np.nan, np.nan, 0)
-    table = np.array(rows, float)
-    gap = table[:, 2].mean() - table[:, 1].mean()
-    if gap <= 0:
-        return Interval(np.nan, np.nan, np.nan, len(rows))
-    share = float((table[:, 0].mean() - table[:, 1].mean()) / gap)
-    if len(rows) < FEWEST:
-        return Interval(share, np.nan, np.nan, len(rows))
-    means = table[_picks(len(rows))].mean(1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shares = (means[:, 0] - means[:, 1]) / (means[:, 2] - means[:, 1])
-    low, high = np.nanpercentile(shares, [2.5, 97.5])
-    return Interval(share, float(low), float(high), len(rows))

@@ -18,9 +18,8 @@ from edge_server.experiments.common.statistics import (
     move_of_optimum,
     optimum,
     paired,
-    share_closed,
 )
-from edge_server.experiments.common.tables import complete_mean, number
+from edge_server.experiments.common.tables import number
 from edge_server.experiments.studies.study import METRICS, Finding, Statistic
 
 NO_DELAY, USE_ALL = "no delay", "all"
@@ -221,15 +220,15 @@ def half_way(mine: Row, base: Row, limit: Row) -> Statistic:
     """``mine`` is more than half of the way from ``base`` to ``limit``."""
 
     def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
+        digits = METRICS[metric].digits
         (low,), (high,) = (table.runs(metric, **{**labels, **of}) or [{}] for of in (base, limit))
         half: PerSeed = {s: None if (a := low[s]) is None or (b := high.get(s)) is None else (a + b) / 2 for s in low}
         ours = table.runs(metric, **{**labels, **mine})
         above = difference(ours, [half])
         if not above.count:
             return None
-        share = share_closed({s: complete_mean([run.get(s) for run in ours]) for s in ours[0]}, low, high)
-        counted = _counted(table, {**labels, **mine}, above)
-        return Finding(f"{share.text(2)} of the way over {counted} (interval over seeds alone).", (above,))
+        way, counted = number(paired(high, low).mean, digits), _counted(table, {**labels, **mine}, above)
+        return Finding(f"{above.text(digits)} beyond half of a way of {way}, over {counted}.", (above,))
 
     return found
 

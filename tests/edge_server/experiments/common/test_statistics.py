@@ -7,15 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from edge_server.experiments.common.statistics import (
-    Interval,
-    at_its_best,
-    crossed,
-    interval,
-    optimum,
-    paired,
-    share_closed,
-)
+from edge_server.experiments.common.statistics import Interval, at_its_best, crossed, interval, optimum, paired
 
 
 def test_an_interval_covers_the_mean_in_95_of_100():
@@ -83,16 +75,6 @@ def test_seeds_that_lack_a_point_are_left_out():
     assert optimum(curve).over_last.count == 23
     with pytest.raises(ValueError, match="no seed"):
         optimum({1.0: {0: None}, 2.0: {0: 1.0}})
-
-
-def test_the_share_of_a_gap():
-    rng = np.random.default_rng(4)
-    base = {s: float(rng.normal(20, 1)) for s in range(30)}
-    limit = {s: v + 4.0 for s, v in base.items()}
-    half = {s: v + 2.0 + 0.1 * float(rng.normal()) for s, v in base.items()}
-    found = share_closed(half, base, limit)
-    assert 0.45 < found.low < 0.5 < found.high < 0.55
-    assert math.isnan(share_closed(half, limit, base).mean), "nothing to close where the limit is no better"
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.3, 1.0])
