@@ -84,7 +84,7 @@ class Pool:
         self.threads = default_threads() if threads is None else int(threads)
         if self.threads < 1:
             raise ValueError(f"a pool needs at least one thread, not {self.threads}")
-        self.nice = nice
+        self.nice, self._engaged = nice, self.threads
         self._inboxes: list[SimpleQueue[_Job | None]] = [SimpleQueue() for _ in range(self.threads)]
         self._turn, self._closed = threading.Lock(), False
         for worker in range(0 if nice else 1, self.threads):
@@ -94,7 +94,7 @@ class Pool:
     def run(self, kernel: Callable[..., Any], *args: Any) -> None:
         """Run ``kernel`` on all workers and wait for them; raises what a worker raised. RuntimeError: the
         pool is closed."""
-        job = _Job(kernel, args, self.threads)
+        job = _Job(kernel, args, self._engaged)
         with self._turn:
             if self._closed:
                 raise RuntimeError("the pool is closed")
@@ -109,6 +109,11 @@ class Pool:
                 raise error
             finally:
                 del error, job  # or its arrays would live in its traceback
+
+    def spare(self, count: int) -> None:
+        """Leave so many workers idle in the jobs to come, but for one: others compute beside them, and two threads that
+        share a core wait for each other."""
+        self._engaged = max(self.threads - count, 1)
 
     def close(self) -> None:
         """End the workers once they have finished the jobs that were begun."""
@@ -149,8 +154,9 @@ class Pool:
             job.over.put(None)
 
     def _wake_others(self, worker: int, job: _Job | None) -> None:
+        count = self.threads if job is None else len(job.finished)
         for other in (2 * worker + 1, 2 * worker + 2):
-            if other < self.threads:
+            if other < count:
                 self._inboxes[other].put(job)
 
 

@@ -184,7 +184,11 @@ class LayeredField:
         self.supervision.compare(self.cameras, self.observations, beside)
         self._find_rows()
         parameters = self.still.adam_parameters(tuned.STEP_PROGRESS)
-        steps, rays, samples = tracker.follow(pace, parameters)
+        steps = rays = samples = 0
+        if budget.seconds is not None and not self.supervision.layers_shown:
+            self.static.wait(budget.seconds - pace.elapsed_s())  # it has the processor: nobody sees yet what moves
+        else:
+            steps, rays, samples = tracker.follow(pace, parameters)
         loss = 0.0
         if not beside:
             begun = self.now()

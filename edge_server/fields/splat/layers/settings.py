@@ -7,6 +7,7 @@ LEAST_CAMERAS = 2  # one alone gives no depth: the still field learns its frames
 PLATE_FRAMES, PLATE_S = 8, 3.2  # frames of each camera, and time since the first, before plates are certain
 # Layers begin with what is known of the plates then: nine tenths in `room`. At PLATE_S the still field begins anew.
 EARLY_S = 1.0
+PLATES_SURE_S = 6.0  # until then a thread beside may first show what it has learned since EARLY_S
 PLATES_EVERY_S = 0.5  # how often plates are compared with what the still field has learned
 EVIDENCE_S = 0.8  # largest age of a frame from which motion is estimated
 RENDERINGS_A_FIT = 2  # renderings of the still field that plates take over in a fit
@@ -21,7 +22,8 @@ STANDS_FRAMES = 60  # frames from one place, after which earlier moves are forgo
 MAX_AHEAD_S = 0.3  # motion is extrapolated no farther than this: people turn
 
 # --- plates at full resolution, where frames are taken in at a lower one ---
-FINE_EVERY_S = 0.05  # least time from a frame that is taken in at its full resolution to the next
+# Least time from a frame that is taken in at its full resolution to the next, before and after all are known.
+FIRST_FINE_EVERY_S, FINE_EVERY_S = 0.01, 0.05
 FINE_FRAMES = 4  # frames of each camera before the still field learns from fine plates
 FINE_MEMORY, FINE_KNOWN = 16, 3  # frames that a fine plate is the mean of; fewest that make it known
 

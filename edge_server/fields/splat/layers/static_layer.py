@@ -57,6 +57,7 @@ class StaticLayer:
     def forget(self) -> None:
         """Forget the plates and the schedule; the field stays as it is."""
         self.stop()
+        self.field.pool.spare(0)
         self.shown: SplatSnapshot | None = None
         self.rendered: dict[str, tuple[int, Rendering]] = {}
         self.grows_until = tuned.SCHEDULE  # step
@@ -168,6 +169,7 @@ class StaticLayer:
         """Train in a thread, until nothing is left to learn, and render ``views`` meanwhile. The thread must not be at
         work. begin: called first, in the thread."""
         self._stopping = False
+        self.field.pool.spare(1)  # the caller, who follows what moves, takes one
         self._thread = threading.Thread(target=self._main, args=(begin, views), name="static-field", daemon=True)
         self._thread.start()
 
@@ -176,6 +178,11 @@ class StaticLayer:
         """Whether the thread is at work. Raises what ended it early."""
         self._raise_failure()
         return self._thread is not None and self._thread.is_alive()
+
+    def wait(self, seconds: float) -> None:
+        """Leave the thread the processor for a time, or until it ends."""
+        if self._thread is not None:
+            self._thread.join(max(seconds, 0.0))
 
     def end_soon(self) -> None:
         """Have the thread end after a few steps."""

@@ -46,6 +46,7 @@ class StaticSupervision:
     plain: whether so much of the plates is plain that stereo helps; None before they are certain, and where it does not
         matter.
     earlier: what the static field showed before it began anew; None if it has become better than that.
+    layers_shown: whether anything is shown that was learned from plates, since the layers began.
     """
 
     def __init__(self, static: StaticLayer, times: PartTimes, network: NetworkDepth | None = None) -> None:
@@ -59,11 +60,12 @@ class StaticSupervision:
         self.warned = False  # that one camera alone tells no depth
         self.depth: DepthSupervision | None = None
         self.earlier: SplatSnapshot | None = None
+        self.layers_shown = False
 
     def begin_again(self) -> None:
         """Forget how the static field has begun; plates stay."""
         self.exposure_rounds = 0
-        self.anew = self.with_depth = self.early = False
+        self.anew = self.with_depth = self.early = self.layers_shown = False
 
     # --- depth --------------------------------------------------------------------------------
 
@@ -206,7 +208,9 @@ class StaticSupervision:
         beside: in a thread, until it has learned them; or else only note that there is something to learn.
         """
         begun, now_s = self.times.now(), observations.newest_s
-        certain = self.early and now_s >= tuned.PLATE_S
+        # On a busy machine nothing may have been shown of what was learned so far: first it is, or is given up.
+        shown = not beside or self.layers_shown or now_s >= tuned.PLATES_SURE_S
+        certain = self.early and now_s >= tuned.PLATE_S and shown
         more = tuned.STEREO_CAMERAS < len(cameras) <= tuned.PLAIN_CAMERAS
         if self.plain is None and more and now_s >= tuned.PLATE_S:
             plates = [camera.plate_image(fine=False).color for camera in cameras.values()]
@@ -266,10 +270,9 @@ class StaticSupervision:
         people as background, and going on with it keeps them."""
         static, self.anew = self.static, False
         static.forget()
+        shown_after = self._shown_after()
         if self.with_depth:
-            from edge_server.fields.splat.layers.depth.settings import SHOWN_AFTER
-
-            depth, copies, shown_after = self.make_depth(), self._copied(cameras), SHOWN_AFTER[0 if self.early else 1]
+            depth, copies = self.make_depth(), self._copied(cameras)
             box = static.field.view_store.box
             assert box is not None
 
@@ -279,9 +282,6 @@ class StaticSupervision:
                 static.begin(plates, shown_after)
         else:
             images = self._plates(cameras)
-            # On a busy machine nothing worth seeing may have been learned until now: it is soon better than that.
-            seen = self.earlier is not None and self.earlier.step >= tuned.EARLY_SHOWN_AFTER
-            shown_after = tuned.SHOWN_AFTER if seen else tuned.EARLY_SHOWN_AFTER
 
             def begin() -> None:
                 static.field.begin_anew(None)
@@ -291,6 +291,18 @@ class StaticSupervision:
             static.train_beside(begin, [camera.view for camera in cameras.values()])
         else:
             begin()
+
+    def _shown_after(self) -> int:
+        """Steps after which a field that begins anew is better than what is shown: at most as many as that has had,
+        which on a busy machine are few."""
+        least, most = tuned.EARLY_SHOWN_AFTER, tuned.SHOWN_AFTER
+        if self.with_depth:
+            from edge_server.fields.splat.layers.depth.settings import SHOWN_AFTER
+
+            least, most = SHOWN_AFTER
+        if self.early or self.earlier is None:
+            return least
+        return min(max(self.earlier.step, least), most)
 
     def _learn_again(self, cameras: Cameras, beside: bool) -> None:
         static, depth = self.static, self.depth
@@ -337,7 +349,8 @@ class StaticSupervision:
         views = {v.camera: v for v in taken if v.whole is not None}
         seen = [o for o in observations if o.camera in views and o.view.generated_ns == views[o.camera].generated_ns]
         alone = len(cameras) < tuned.LEAST_CAMERAS
-        if not seen or alone or observations.newest_s - self.fine_s < tuned.FINE_EVERY_S:
+        every_s = tuned.FINE_EVERY_S if self.fine else tuned.FIRST_FINE_EVERY_S
+        if not seen or alone or observations.newest_s - self.fine_s < every_s:
             return
         self.fine_s = observations.newest_s
         o = min(seen, key=lambda o: cameras[o.camera].fine_count)
@@ -357,7 +370,7 @@ class StaticSupervision:
         """The static field, or what it showed before it began anew, until it is better; None if that is of another
         box."""
         if self.earlier is None or self.static.ready:
-            self.earlier = None
+            self.earlier, self.layers_shown = None, True
             return self.static.shown
         return self.earlier if self.earlier.box == box else None
 

@@ -58,6 +58,19 @@ def test_all_workers_compute_at_once_and_each_task_is_done_once(threads: int, ni
 
 
 @either_priority
+def test_workers_that_are_spared_stay_idle(nice: int) -> None:
+    pool, done = Pool(3, nice), np.zeros(1000, np.int64)
+    for spared, engaged in ((1, [0, 1]), (9, [0]), (0, [0, 1, 2])):
+        seen: list[int] = []
+        pool.spare(spared)
+        pool.run(lambda counter, worker, seen=seen: seen.append(worker))
+        pool.run(_share, done)
+        assert sorted(seen) == engaged
+    assert (done == 3).all()
+    pool.close()
+
+
+@either_priority
 def test_an_error_reaches_the_caller_after_all_are_done_and_the_pool_lives_on(nice: int) -> None:
     pool, done = Pool(2, nice), []
 

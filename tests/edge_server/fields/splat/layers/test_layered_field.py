@@ -186,7 +186,7 @@ def test_one_camera_alone_begins_no_layers() -> None:
     assert field.layered and field.moving is None and not field.learning and field.part_s["static field"] > 0.0
     for frame in range(20, 30):
         field.fit([_frame(k, frame, True) for k in range(2)], Budget(steps=1))
-    assert field.moving is not None and field.learning.endswith("of 200 steps")
+    assert field.moving is not None and field.learning.endswith("of 50 steps")  # little was shown before
 
 
 def test_nothing_moves_where_nothing_moves() -> None:
@@ -324,6 +324,40 @@ def test_in_seconds_the_static_field_learns_beside_what_moves() -> None:
     assert _score(field.snapshot(round(frame * FRAME_S * 1e9)), frame * FRAME_S) > 20.0
 
 
+def test_in_seconds_what_moves_is_followed_once_anything_is_shown_of_it() -> None:
+    """Until then the still field has the processor."""
+    field = LayeredField(SMALL)
+    _run(field, range(17), steps=5)
+    assert field.tracker is not None and not field.supervision.layers_shown
+    followed = field.tracker.fits
+    for frame in range(17, 300):
+        field.fit([_frame(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+        if field.supervision.layers_shown:
+            break
+        assert field.tracker.fits == followed
+    assert field.static.ready
+    for frame in range(frame + 1, frame + 5):
+        field.fit([_frame(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+    assert field.tracker.fits == followed + 4
+    field.static.stop()
+
+
+@pytest.mark.parametrize(("shown_after", "anew_s"), [(20, 1.2), (10_000, 2.0)])
+def test_in_seconds_the_still_field_begins_anew_after_it_was_shown_or_late(
+    monkeypatch: pytest.MonkeyPatch, shown_after: int, anew_s: float
+) -> None:
+    """Else nobody would ever see what a slow machine learns before plates are certain."""
+    for name, value in {"EARLY_S": 0.6, "PLATE_S": 1.2, "PLATES_SURE_S": 2.0, "EARLY_SHOWN_AFTER": shown_after}.items():
+        monkeypatch.setattr(settings, name, value)
+    field, frame = LayeredField(SMALL), 0
+    while not field.tracker or field.supervision.early:
+        assert (frame - 1) * FRAME_S < anew_s, "it goes on"
+        field.fit([_frame(k, frame, False) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+        frame += 1
+    assert field.observations.newest_s == pytest.approx(anew_s, abs=FRAME_S)
+    field.static.stop()
+
+
 def test_a_camera_that_shows_something_else_is_refused_and_changes_nothing() -> None:
     without, field = LayeredField(SMALL), LayeredField(SMALL)
     rng = np.random.default_rng(0)
@@ -459,3 +493,14 @@ def test_fine_plates_are_collected_from_the_first_frame_on() -> None:
         fewest = min(counts)
         assert max(counts) - fewest <= 1 and (sum(counts) == frame + 1 or field.supervision.exposure_rounds > 0)
     assert field.supervision.fine and fewest == 4
+
+
+def test_fine_plates_are_collected_in_each_fit_until_they_are_known_and_then_less_often() -> None:
+    field, taken = LayeredField(SMALL), []
+    for frame in range(60):
+        for cameras in (range(6), range(6, len(CAMERAS))):  # 33 ms apart
+            field.fit([_small(k, frame) for k in cameras], Budget(steps=1))
+            taken.append((field.supervision.fine, sum(camera.fine_count for camera in field.cameras.values())))
+    known = next(k for k, (fine, _) in enumerate(taken) if fine)
+    before, after = np.diff([count for _, count in taken[:known]]), np.diff([count for _, count in taken[known:]])
+    assert (before == 1).mean() > 0.9 and after.sum() == len(after) // 2
