@@ -336,8 +336,8 @@ def test_in_seconds_what_moves_is_followed_once_anything_is_shown_of_it() -> Non
             break
         assert field.tracker.fits == followed
     assert field.static.ready
-    for frame in range(frame + 1, frame + 5):
-        field.fit([_frame(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+    for later in range(frame + 1, frame + 5):
+        field.fit([_frame(k, later, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
     assert field.tracker.fits == followed + 4
     field.static.stop()
 
