@@ -171,9 +171,10 @@ def vote(counter, worker, image, blurred, difference, foreground, votes, held, p
                     if (foreground[y, x] == 0) & plate.known[y, x] & (d < np.float32(3.0) * limit):
                         plate.deviation[y, x] = old + (d - old) * rate
                     plate.total[y, x] = plate.total[y, x] * decay + _F1
-                    for k in range(MODES):
-                        plate.weight[k, y, x] *= decay
                     least = np.float32(tuned.LEAST_WEIGHT)
+                    for k in range(MODES):  # what is forgotten becomes 0: a processor is slow with subnormal numbers
+                        weight = plate.weight[k, y, x] * decay
+                        plate.weight[k, y, x] = weight if weight > least else _F0
                     alone = (plate.weight[1, y, x] <= least) & (plate.weight[2, y, x] <= least)
                     if votes[y, x] and alone and d <= np.float32(tuned.THRESHOLD) and plate.weight[0, y, x] > least:
                         _join_plate(plate, y, x, image, blurred)

@@ -8,7 +8,7 @@ import pytest
 
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.splat.layers.plates import FinePlate, Plate, clean_mask, plain_share
-from edge_server.fields.splat.layers.settings import CLOSE, HOLE, SPECK
+from edge_server.fields.splat.layers.settings import CLOSE, HOLE, LEAST_WEIGHT, SPECK
 from tests.edge_server.fields.scenes import ring
 
 SIZE = 48
@@ -39,6 +39,20 @@ def test_a_body_that_passes_is_foreground_and_leaves_no_trace() -> None:
         foreground = plate.take(_frame(at))
         assert (foreground != expected).sum() < 60 and foreground[expected].mean() > 0.95
     np.testing.assert_allclose(plate.picture, WALL, atol=1.0)
+
+
+@pytest.mark.stability
+def test_colors_that_fade_count_nothing_instead_of_subnormal_numbers() -> None:
+    """Which a processor takes several times as long for, some minutes later."""
+    plate = _seen()
+    for at in (4, 20, 20, 8, 20):
+        plate.take(_frame(at))
+    weight = plate.arrays.weight
+    assert (weight[1:] > 0).any()
+    for _ in range(300):
+        plate.take(_frame())
+        assert ((weight == 0) | (weight > LEAST_WEIGHT)).all()
+    assert (weight[1:] == 0).all()
 
 
 def test_a_body_that_stays_becomes_the_plate_unless_it_is_held() -> None:

@@ -114,6 +114,7 @@ def test_votes() -> None:
                 plain.deviation[y, x] += 0.05 * (difference[y, x] - plain.deviation[y, x])
             plain.total[y, x] = plain.total[y, x] * (1 - 1 / MEMORY) + 1
             plain.weight[:, y, x] *= 1 - 1 / MEMORY
+            plain.weight[:, y, x] *= plain.weight[:, y, x] > 0.05
             if votes[y, x]:
                 _vote_plainly(plain, y, x, image, blurred)
             else:
