@@ -61,7 +61,6 @@ class Scene:
     bounds: (2, 3), lower and upper corner in meters of everything that can be seen.
     period_s: time after which frames repeat, a multiple of 0.6 s.
     moving: False if all instants look the same.
-    object_parts: number of static parts, from the first, that form the object of interest; None: all.
     static_key: identifies the static parts of scenes with a motion_seed, whose renderers share their static
         images; None for others.
     """
@@ -74,7 +73,6 @@ class Scene:
     bounds: Array
     period_s: float
     moving: bool = True
-    object_parts: int | None = None
     static_key: str | None = field(default=None, repr=False, compare=False)
     _renderers: dict[str, CameraRenderer] = field(default_factory=dict, init=False, repr=False, compare=False)
 

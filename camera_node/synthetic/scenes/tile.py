@@ -60,23 +60,21 @@ def build(params: Params) -> Scene:
         ambient_below=(0.28, 0.29, 0.31),
         ambient_above=(0.50, 0.52, 0.54),
     )
-    tile = object_parts()
     around = _bench() if params.bench else []
     return Scene(
         name="tile",
         params=params,
         cameras=build_rig(_ANGLES_DEG, _TARGET, _RADIUS_M, params.count, pinhole(params)),
         target=_TARGET,
-        world=World((*tile, *around), (), light, _BACKGROUND),
+        world=World((*object_parts(), *around), (), light, _BACKGROUND),
         bounds=np.array(_BENCH_BOUNDS if params.bench else [[-0.26, -0.20, -0.07], [0.26, 0.20, 0.13]]),
         period_s=PERIOD_UNIT_S,
         moving=False,
-        object_parts=len(tile),
     )
 
 
 def object_parts() -> list[Part]:
-    """The tile itself, its lowest point ``BOTTOM_M`` high."""
+    """The tile itself, the first parts of the scene, its lowest point ``BOTTOM_M`` high."""
     return _carrier() + _segments() + _bolts()
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from camera_node.synthetic.scene import make_scene
+from camera_node.synthetic.scenes.tile import object_parts
 from edge_server.foreground import ForegroundConfig
 from edge_server.foreground.foreground import Foreground, make_foreground
 from edge_server.settings import read_config
@@ -61,7 +62,7 @@ def test_a_tile_far_away_is_found(tile, azimuth):
 
 def test_a_picture_without_the_tile_is_used_whole():
     scene = make_scene("tile", {"count": 1, "bench": True})
-    parts = scene.world.static_parts[scene.object_parts :]
+    parts = scene.world.static_parts[len(object_parts()) :]
     empty = replace(scene, world=type(scene.world)(parts, (), scene.world.light, scene.world.background))
     foreground = make_foreground(read_config(load("scan")).foreground)
     for azimuth in (-30, 60, 150):
