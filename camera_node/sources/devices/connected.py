@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from camera_node.sources.devices.feed import CameraError
+from camera_node.sources.devices import oak, realsense
+from camera_node.sources.devices.feed import CameraError, Plugged
 
 
 class Connected(NamedTuple):
@@ -24,8 +25,8 @@ def connected(root: Path = Path("/")) -> Iterator[Connected]:
     root: folder that holds the system's ``dev`` and ``sys``.
     """
     yield from _video_devices(root)
-    yield from _oak()
-    yield from _realsense()
+    yield from _of_library("oak", oak.plugged_in)
+    yield from _of_library("realsense", realsense.plugged_in)
 
 
 def _video_devices(root: Path) -> Iterator[Connected]:
@@ -47,28 +48,12 @@ def _video_devices(root: Path) -> Iterator[Connected]:
         yield Connected("camera", "", "no video device is plugged in, or this is not Linux")
 
 
-def _oak() -> Iterator[Connected]:
+def _of_library(kind: str, plugged_in: Callable[[], Sequence[Plugged]]) -> Iterator[Connected]:
     try:
-        from camera_node.sources.devices.oak import library
-
-        there = library().Device.getAllAvailableDevices()
-        yield from (Connected("oak", each.getDeviceId(), f"{each.name} {each.state.name}") for each in there)
-        if not there:
-            yield Connected("oak", "", "none is plugged in")
+        there = plugged_in()
     except (CameraError, RuntimeError) as error:
-        yield Connected("oak", "", str(error))
-
-
-def _realsense() -> Iterator[Connected]:
-    try:
-        from camera_node.sources.devices.realsense import library
-
-        rs = library()
-        there = rs.context().query_devices()
-        for each in there:
-            about = each.get_info(rs.camera_info.name)
-            yield Connected("realsense", each.get_info(rs.camera_info.serial_number), about)
-        if not len(there):
-            yield Connected("realsense", "", "none is plugged in")
-    except (CameraError, RuntimeError) as error:
-        yield Connected("realsense", "", str(error))
+        yield Connected(kind, "", str(error))
+        return
+    yield from (Connected(kind, each.serial, each.about) for each in there)
+    if not there:
+        yield Connected(kind, "", "none is plugged in")

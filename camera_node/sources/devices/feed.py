@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,22 +49,37 @@ def as_camera_error(camera: str, error: Exception) -> CameraError:
     return CameraError(f"{camera}: {type(error).__name__}: {' '.join(str(error).split())}")
 
 
-def select_device(camera: str, make: str, device: str | None, serials: Sequence[str]) -> int:
-    """Index in ``serials`` of the device to use.
+class Plugged(NamedTuple):
+    """A device that is there. about: its make, for people. handle: what its driver opens, where not the serial."""
+
+    serial: str
+    about: str
+    handle: Any = None
+
+
+def select_device(
+    camera: str, make: str, device: str | None, plugged_in: Callable[[], Sequence[Plugged]], advice: str
+) -> Plugged:
+    """The device to use.
 
     camera, make: for error messages.
     device: its serial number; None: the only one.
-    serials: serial numbers of the connected devices, at least one.
-    Raises CameraError if the device is not connected, or None was given and there are several.
+    plugged_in: finds those that are there; may raise RuntimeError while one is being plugged in.
+    advice: what to look for where there is none.
+    Raises CameraError if the device is not there, or None was given and there are several.
     """
-    names = ", ".join(serials)
-    if device is None:
-        if len(serials) > 1:
-            raise CameraError(f"{camera}: several {make} cameras, name one in source.devices: {names}")
-        return 0
-    if device not in serials:
+    try:
+        there = {each.serial: each for each in plugged_in()}
+    except RuntimeError as error:
+        raise as_camera_error(camera, error) from None
+    if not there:
+        raise CameraError(f"{camera}: no {make} camera found: {advice}")
+    names = ", ".join(there)
+    if device is None and len(there) > 1:
+        raise CameraError(f"{camera}: several {make} cameras, name one in source.devices: {names}")
+    if device is not None and device not in there:
         raise CameraError(f"{camera}: no {make} camera {device}; there are {names}")
-    return serials.index(device)
+    return there[next(iter(there)) if device is None else device]
 
 
 def intrinsics_or_reason(find: Callable[[], Pinhole]) -> tuple[Pinhole | None, str]:

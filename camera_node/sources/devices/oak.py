@@ -15,19 +15,15 @@ from typing import Any, cast
 import numpy as np
 
 from camera_node.settings import OakConfig
-from camera_node.sources.devices.feed import (
-    CameraError,
-    Feed,
-    Image,
-    as_camera_error,
-    intrinsics_or_reason,
-    select_device,
-)
+from camera_node.sources.devices.feed import CameraError, Feed, Image, Plugged, intrinsics_or_reason, select_device
 from freshfield.clock import Clock
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole
 
 _SEARCH_MS = "2000"
+_ADVICE = (
+    "is it plugged in (USB 3, its own supply), and may this user open it (udev rule for vendor 03e7, see deploy/lab)?"
+)
 # Of the pair's images: what the mono cameras of all models offer, and what depth is computed from.
 _STEREO_SIZE = (640, 400)
 METERS_PER_COUNT = 0.001  # depthai's depth is in millimeters unless told otherwise
@@ -46,20 +42,10 @@ def library() -> Any:
     return depthai
 
 
-def find(camera: str, device: str | None) -> Any:
-    """The device with the serial number ``device``; None: the only one. Raises CameraError naming those that
-    are there."""
-    try:
-        there = library().Device.getAllAvailableDevices()
-        ids = [each.getDeviceId() for each in there]
-    except RuntimeError as error:  # while one is being plugged in
-        raise as_camera_error(camera, error) from None
-    if not there:
-        raise CameraError(
-            f"{camera}: no OAK camera found: is it plugged in (USB 3, its own supply), and may this "
-            "user open it (udev rule for vendor 03e7, see deploy/lab)?"
-        )
-    return there[select_device(camera, "OAK", device, ids)]
+def plugged_in() -> list[Plugged]:
+    """The devices. Raises CameraError without the library, RuntimeError while one is being plugged in."""
+    there = library().Device.getAllAvailableDevices()
+    return [Plugged(each.getDeviceId(), f"{each.name} {each.state.name}", each) for each in there]
 
 
 class OakFeed(Feed):
@@ -76,7 +62,7 @@ class OakFeed(Feed):
         self._pipeline: Any = None
         self._depths: DepthQueue | None = None
         try:
-            self._device = dai.Device(find(camera, device))
+            self._device = dai.Device(select_device(camera, "OAK", device, plugged_in, _ADVICE).handle)
             self._pipeline = dai.Pipeline(self._device)
             socket = getattr(dai.CameraBoardSocket, config.socket)
             node = self._pipeline.create(dai.node.Camera).build(socket)

@@ -23,6 +23,7 @@ from camera_node.sources.devices.feed import (
     CameraError,
     Feed,
     Image,
+    Plugged,
     as_camera_error,
     intrinsics_or_reason,
     select_device,
@@ -33,6 +34,7 @@ from freshfield.geometry import Pinhole, Pose, se3
 
 log = logging.getLogger("camera-node")
 
+_ADVICE = "is it plugged in (USB 3), and may this user open it (udev rules of librealsense, see deploy/lab)?"
 _LONGEST_EXPOSURE_US = 200_000  # the color sensors of the series expose at most 165 ms
 
 
@@ -51,23 +53,14 @@ def library() -> Any:
     return pyrealsense2
 
 
-def find(camera: str, device: str | None) -> str:
-    """The serial number of the camera to use: ``device``, or the only one if None. Raises CameraError naming
-    those that are there.
+def plugged_in() -> list[Plugged]:
+    """The devices. Raises CameraError without the library, RuntimeError while one is being plugged in.
 
     Queries the context, because a pipeline would search for a camera for 15 s.
     """
     rs = library()
-    try:
-        serials = [each.get_info(rs.camera_info.serial_number) for each in rs.context().query_devices()]
-    except RuntimeError as error:  # while one is being plugged in
-        raise as_camera_error(camera, error) from None
-    if not serials:
-        raise CameraError(
-            f"{camera}: no RealSense camera found: is it plugged in (USB 3), and may this user open it (udev "
-            "rules of librealsense, see deploy/lab)?"
-        )
-    return serials[select_device(camera, "RealSense", device, serials)]
+    serial, name = rs.camera_info.serial_number, rs.camera_info.name
+    return [Plugged(each.get_info(serial), each.get_info(name)) for each in rs.context().query_devices()]
 
 
 class RealsenseFeed(Feed):
@@ -80,7 +73,8 @@ class RealsenseFeed(Feed):
         self._camera = camera
         self._pipeline = rs.pipeline()
         self._sensor: DepthSensor | None = None
-        serial, size_and_rate = find(camera, device), (config.width, config.height, round(fps))
+        serial = select_device(camera, "RealSense", device, plugged_in, _ADVICE).serial
+        size_and_rate = (config.width, config.height, round(fps))
         try:
             profile = self._start(serial, size_and_rate, bool(config.depth_every))
         except RuntimeError as error:

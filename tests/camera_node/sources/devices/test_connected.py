@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from camera_node.cli import main
+from camera_node.sources.devices import oak, realsense
 from camera_node.sources.devices.connected import Connected, connected
+from camera_node.sources.devices.feed import Plugged
 
 
 def test_video_devices_are_listed_with_the_name_that_lasts(tmp_path: Path) -> None:
@@ -31,3 +33,16 @@ def test_kinds_without_a_camera_say_so(tmp_path: Path, capsys) -> None:
     assert main(["devices"]) == 0
     kinds = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
     assert list(dict.fromkeys(kinds)) == ["camera", "oak", "realsense"]
+
+
+def test_devices_of_a_library_are_listed_by_serial_number_and_its_trouble_in_their_place(tmp_path, monkeypatch) -> None:
+    def being_plugged_in() -> list[Plugged]:
+        raise RuntimeError("busy")
+
+    monkeypatch.setattr(oak, "plugged_in", lambda: [Plugged("14", "OAK-D unlocked"), Plugged("15", "OAK-1 unlocked")])
+    monkeypatch.setattr(realsense, "plugged_in", being_plugged_in)
+    assert [camera for camera in connected(tmp_path) if camera.kind != "camera"] == [
+        Connected("oak", "14", "OAK-D unlocked"),
+        Connected("oak", "15", "OAK-1 unlocked"),
+        Connected("realsense", "", "busy"),
+    ]

@@ -15,7 +15,7 @@ from camera_node.capture import build_cameras
 from camera_node.pose.providers import FixedPose
 from camera_node.settings import CameraConfig, source_config
 from camera_node.sources.devices import opencv as opencv_camera
-from camera_node.sources.devices.feed import CameraError, select_device
+from camera_node.sources.devices.feed import CameraError, Plugged, select_device
 from camera_node.sources.devices.live import LiveSource, open_live
 from camera_node.sources.with_effects import AffectedSource
 from camera_node.synthetic.effects import NO_EFFECTS
@@ -355,11 +355,23 @@ def test_the_first_frame_decides_whose_stamps_count(monkeypatch, clock, ages_ms,
 
 
 def test_the_camera_that_is_meant_is_the_one_named_or_the_only_one():
-    assert select_device("eye", "OAK", None, ["a"]) == 0 and select_device("eye", "OAK", "b", ["a", "b"]) == 1
+    def chosen(device, *serials):
+        there = [Plugged(serial, "OAK-D", serial.upper()) for serial in serials]
+        return select_device("eye", "OAK", device, lambda: there, "is it plugged in?").handle
+
+    def being_plugged_in():
+        raise RuntimeError("busy\nnow")
+
+    assert chosen(None, "a") == "A" and chosen("b", "a", "b") == "B"
     with pytest.raises(CameraError, match=r"^eye: several OAK cameras, name one in source.devices: a, b$"):
-        select_device("eye", "OAK", None, ["a", "b"])
+        chosen(None, "a", "b")
     with pytest.raises(CameraError, match=r"^eye: no OAK camera c; there are a, b$"):
-        select_device("eye", "OAK", "c", ["a", "b"])
+        chosen("c", "a", "b")
+    for device in (None, "c"):
+        with pytest.raises(CameraError, match=r"^eye: no OAK camera found: is it plugged in\?$"):
+            chosen(device)
+    with pytest.raises(CameraError, match=r"^eye: RuntimeError: busy now$"):
+        select_device("eye", "OAK", None, being_plugged_in, "")
 
 
 def test_a_video_file_is_no_device(tmp_path):

@@ -16,7 +16,7 @@ import pytest
 from camera_node.pose.providers import FixedPose
 from camera_node.settings import source_config
 from camera_node.sources.devices import oak
-from camera_node.sources.devices.feed import CameraError
+from camera_node.sources.devices.feed import CameraError, Plugged
 from camera_node.sources.devices.live import LiveSource, open_feed
 from freshfield.clock import WallClock
 from freshfield.depth import DepthImage
@@ -154,7 +154,7 @@ def test_a_device_without_calibration_opens_all_the_same(monkeypatch):
     monkeypatch.setattr(dai, "Device", lambda info: device)
     pipeline = MagicMock()
     monkeypatch.setattr(dai, "Pipeline", pipeline)
-    monkeypatch.setattr(oak, "find", lambda camera, name: None)
+    monkeypatch.setattr(oak, "plugged_in", lambda: [Plugged("1", "OAK")])
     scenario = plan()
     feed = oak.OakFeed("eye", None, source_config(scenario), Fraction(10), WallClock())
     assert feed.intrinsics is None and "name the file in source.calibration" in feed.no_intrinsics
@@ -170,7 +170,7 @@ def test_a_lens_that_can_focus_stays_where_it_was_calibrated(monkeypatch):
     device, pipeline = MagicMock(), MagicMock()
     monkeypatch.setattr(dai, "Device", lambda info: device)
     monkeypatch.setattr(dai, "Pipeline", pipeline)
-    monkeypatch.setattr(oak, "find", lambda camera, name: None)
+    monkeypatch.setattr(oak, "plugged_in", lambda: [Plugged("1", "OAK")])
     control = pipeline.return_value.create.return_value.build.return_value.initialControl
     device.readCalibration.return_value = known = calibration()
     for position in (0, 131):  # 0: a fixed lens

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from camera_node.settings import source_config
-from camera_node.sources.devices.feed import CameraError
+from camera_node.sources.devices.feed import CameraError, Plugged
 from camera_node.sources.devices.live import open_feed
 from freshfield.clock import VirtualClock, WallClock
 from freshfield.geometry import look_at
@@ -87,7 +87,7 @@ def test_a_lens_that_is_not_opencvs_opens_all_the_same(monkeypatch):
     stream = pipeline.start.return_value.get_stream.return_value.as_video_stream_profile.return_value
     stream.get_intrinsics.return_value = intrinsics(rs.distortion.kannala_brandt4)
     monkeypatch.setattr(rs, "pipeline", lambda: pipeline)
-    monkeypatch.setattr(realsense, "find", lambda camera, device: "1")
+    monkeypatch.setattr(realsense, "plugged_in", lambda: [Plugged("1", "D435I")])
     scenario = parse({"cameras": {"ids": ["eye"]}, "source": {"kind": "realsense"}}, Path("scenario.yaml"))
     feed = realsense.RealsenseFeed("eye", None, source_config(scenario), Fraction(15), WallClock())
     assert feed.intrinsics is None and "name the file in source.calibration" in feed.no_intrinsics
@@ -192,7 +192,7 @@ def test_a_camera_that_cannot_stream_both_streams_color(monkeypatch, caplog, eve
     )
     pipeline.profile.get_streams.return_value = []
     monkeypatch.setattr(rs, "pipeline", lambda: pipeline)
-    monkeypatch.setattr(realsense, "find", lambda camera, device: "1")
+    monkeypatch.setattr(realsense, "plugged_in", lambda: [Plugged("1", "D435I")])
     source = {"kind": "realsense", "depth_every": every}
     scenario = parse({"cameras": {"ids": ["eye"]}, "source": source}, Path("scenario.yaml"))
     feed = realsense.RealsenseFeed("eye", None, source_config(scenario), Fraction(15), WallClock())
