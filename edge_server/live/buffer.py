@@ -6,9 +6,10 @@ frames form the temporally inconsistent set Omega(t) of (5.6).
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from freshfield.frame import Frame
@@ -18,6 +19,9 @@ MOST_UNSELECTED = 8  # most frames of a camera that are kept for a field that wa
 # After this many takes without a frame of a camera, its next one goes first, however old (after a blackout).
 LONGEST_WAIT = 16
 _AS_YOUNG_NS = 1_000_000  # ages, measured from the youngest frame, are compared in steps of this length
+# Of two cameras, the one before which e times as much moves goes first, unless its frame is older by so much: about the
+# time from one frame to the next in `kitchen`, where it was chosen.
+_FADES_MS = 40.0
 
 
 class FrameBuffer:
@@ -70,19 +74,23 @@ class FrameBuffer:
                     {camera: deque(maxlen=MOST_UNSELECTED) for camera in self.cameras} if wanted else None
                 )
 
-    def take(self, selected: Sequence[Frame], most: int | None = None) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
+    def take(
+        self, selected: Sequence[Frame], most: int | None = None, moving: Mapping[str, float] | None = None
+    ) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
         """Take frames for an update.
 
         selected: newest frames that the policy selected.
         most: largest number of frames to take that were not taken before; None: all.
+        moving: by camera, the share of its image that moves; 1 where nothing is known.
         Returns the frames of ``selected`` to use, and the other frames of their cameras that had arrived by
         then, in the order of their arrival. Without ``keep_every_frame`` these are ``selected`` and none.
 
         ``most`` admits the newest frame of each camera first, then the second newest of each, and so on.
         Frames of equal rank go in this order: cameras without a frame in the last ``LONGEST_WAIT`` takes, the
-        longest wait first; then the youngest frame; among equally young ones, the camera that has waited
-        longest. What exceeds ``most`` is dropped and counted in ``shed``, except for a camera's newest
-        frame, which waits on. Frames of cameras that were not selected are dropped.
+        longest wait first; then those of cameras before which most moves, each counting less with its age
+        (``_FADES_MS``); among equals, the camera that has waited longest. What exceeds ``most`` is dropped and
+        counted in ``shed``, except for a camera's newest frame, which waits on. Frames of cameras that were not
+        selected are dropped.
         """
         until_ns = max((item.received_ns for item in selected), default=0)
         own = {item.camera: item for item in selected}
@@ -99,11 +107,12 @@ class FrameBuffer:
                     arrived.append(waiting.popleft())
                 if camera in own:
                     arrived.sort(key=lambda item: (-item.generated_edge_ns, item is not own[item.camera]))
-                    last = self._last_take[camera]
+                    last, share = self._last_take[camera], (moving or {}).get(camera, 1.0)
                     waits_on = self._takes - last <= LONGEST_WAIT
                     for k, item in enumerate(arrived):
-                        older = (youngest_ns - item.generated_edge_ns) // _AS_YOUNG_NS if waits_on else 0
-                        ranked.append(((k, waits_on, older, last, -item.generated_edge_ns), item))
+                        older_ms = max(youngest_ns - item.generated_edge_ns, 0) // _AS_YOUNG_NS
+                        worth = share * math.exp(-older_ms / _FADES_MS) if waits_on else 0.0
+                        ranked.append(((k, waits_on, -worth, last, -item.generated_edge_ns), item))
             ordered = [item for _, item in sorted(ranked, key=lambda one: one[0])]
             taken = ordered if most is None else ordered[:most]
             for k, item in enumerate(taken):  # within one take, the first camera has waited longest

@@ -209,7 +209,8 @@ class FieldUpdater:
         if not chosen:
             return None
         self._selected_of = total
-        items, others = self.buffer.take(chosen, self._most_new(budget, most_new))
+        moving = getattr(self.field, "moving_shares", None)
+        items, others = self.buffer.take(chosen, self._most_new(budget, most_new), moving)
         if self.field.frame_s is not None:
             own = {item.camera: item for item in items}
             arrivals = len(others) + sum(self._selected.get(c) is not item for c, item in own.items())

@@ -5,6 +5,7 @@ import time
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
 
 from edge_server.live.buffer import MOST_UNSELECTED, FrameBuffer
 from freshfield.frame import Frame
@@ -162,6 +163,18 @@ def test_where_there_is_no_time_for_all_the_youngest_are_taken():
             buffer.put(frame(camera, sequence=sequence, generated_ns=at_ns - int(lag) * 20 * MS), at_ns)
         used, _ = buffer.take(list(buffer.newest().values()), most=2)
         assert {lags[item.camera] for item in used} == {0, 1}
+
+
+@pytest.mark.parametrize(("most", "taken"), [(1, ["cam03"]), (2, ["cam01", "cam03"]), (3, ["cam00", "cam01", "cam03"])])
+def test_the_more_moves_before_a_camera_the_older_its_frame_may_be(most, taken):
+    """By 28 ms for twice as much: 40 ms times the logarithm of 2. cam03, of which nothing is known, goes first."""
+    moving = {"cam00": 0.1, "cam01": 0.2, "cam02": 0.2, "cam04": 0.0}
+    buffer = FrameBuffer([*moving, "cam03"])
+    buffer.keep_every_frame(True)
+    for camera, lag_ms in {"cam00": 0, "cam01": 26, "cam02": 30, "cam03": 60, "cam04": 0}.items():
+        buffer.put(frame(camera, generated_ns=(1000 - lag_ms) * MS), 1000 * MS)
+    used, _ = buffer.take(list(buffer.newest().values()), most, moving)
+    assert sorted(item.camera for item in used) == taken
 
 
 def test_a_camera_goes_first_in_the_seventeenth_take_after_its_last():

@@ -112,8 +112,10 @@ def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
     assert (u.buffer.shed, u.buffer.arrivals) == (6, 16)
     for camera in cameras:
         u.buffer.put(frame(camera, sequence=50, generated_ns=50 * MS), 50 * MS)
+    u.field.moving_shares = {camera: 0.01 * k for k, camera in enumerate(cameras)}
     views, _ = u.fit(u.select(u.plan(60 * MS), 60 * MS, Budget(seconds=1e-3)), Budget(seconds=1e-3))
-    assert len(views) == 4 and len(decoded) == 14 and u.buffer.shed == 6  # four newest ones wait
+    assert [v.camera for v in views] == list(cameras[4:])  # before which most moves
+    assert len(decoded) == 14 and u.buffer.shed == 6  # the newest frames of the others wait
     u.on_arrivals = True
     views, _ = u.fit(u.select(u.plan(61 * MS), 61 * MS, Budget(seconds=1e-3)), Budget(seconds=1e-3))
     assert len(decoded) == 18 and u.buffer.shed == 6  # and are taken although nothing has arrived since

@@ -113,6 +113,11 @@ class LayeredField:
         return tuned.MOST_PIXELS if self.layered else None
 
     @property
+    def moving_shares(self) -> dict[str, float]:
+        """Share of the pixels of each camera's newest frame that shows what moves, where that is known."""
+        return {o.camera: o.share for o in self.observations}
+
+    @property
     def troubles(self) -> tuple[str, ...]:
         """What is wrong with poses and measured depth, for people."""
         depth = self.supervision.depth

@@ -397,6 +397,7 @@ def test_plates_do_not_wait_for_a_camera_that_has_gone_silent() -> None:
     for frame in range(20):
         field.fit([_frame(k, frame, False) for k in range(len(CAMERAS) if frame < 3 else 6)], Budget(steps=1))
     assert field.moving is not None
+    assert list(field.moving_shares.values()) == [0.0] * 6  # of those that still tell
 
 
 def test_it_wants_every_frame_and_tells_how_long_one_takes_until_a_camera_moves() -> None:
