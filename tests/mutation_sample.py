@@ -17,15 +17,15 @@ from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import hashlib
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
 import sys
-import tempfile
-import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -44,6 +44,7 @@ from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator
 
 from edge_server.experiments.engine.engine import ResultStore
+from edge_server.fields.common.kernels.jit import cache_folder
 
 ROOT = Path(__file__).resolve().parent.parent
 # Folders of sources, and where their tests are.
@@ -72,8 +73,8 @@ OPERATORS = (
 _PASSED_OVER = (ast.Raise, ast.JoinedStr, ast.Assert, ast.Import, ast.ImportFrom)
 _SPOKEN = ("print(", "log.", "__name__ ==")
 _SELECT = "not slow and not browser and not chaos"
-_LEAST_LIMIT_S, _TIMES = 30.0, 5.0
-_COMPILING_S = 600.0  # more for an edit of a kernel or of a number in it: all kernels are compiled anew
+_LIMIT_S = 100.0  # processor seconds of one quick test, or a third of its wall-clock time: kernels may be compiled
+_COMPILING_S = 600.0  # with an edit of a kernel, or of a number in it
 Span = tuple[tuple[int, int], tuple[int, int]]
 
 
@@ -166,79 +167,132 @@ def _shares(lines: dict[str, int], count: int) -> dict[str, int]:
     return found
 
 
+@cache
+def _texts() -> dict[str, str]:
+    """Every file of tests, as it stands."""
+    return {str(test.relative_to(ROOT)): test.read_text() for test in sorted((ROOT / "tests").rglob("test_*.py"))}
+
+
 def nearest_tests(file: str) -> list[list[str]]:
-    """Tests to run in turn: those of the file's name, then the others of their folder, or of the first folder above
-    that has any, then those of the folder above it within the package."""
+    """Tests to run in turn: those of the file's name, those that import it, the others of their folder, or of the first
+    folder above that has any, and those of the folder above it within the package."""
     source = next(folder for folder in SOURCES if file.startswith(f"{folder}/"))
     path = Path(file)
     package = ROOT / SOURCES[source]
     folder = package / path.parent.relative_to(source)
     while not list(folder.glob("test_*.py")):
         folder = folder.parent
-    every, above = (
-        sorted(str(test.relative_to(ROOT)) for test in of.glob("test_*.py")) for of in (folder, folder.parent)
-    )
-    same = [test for test in every if Path(test).stem.startswith(f"test_{path.stem}")]
-    others = [test for test in every if test not in same]
-    return [tests for tests in (same, others, above if folder != package else []) if tests]
+    home, above = (str(of.relative_to(ROOT)) for of in (folder, folder.parent if folder != package else folder))
+    module = file.removeprefix("proto/").removeprefix("deploy/").removesuffix(".py").replace("/", ".")
+    parent, _, name = module.rpartition(".")
+    imports = re.compile(rf"\b{re.escape(module)}\b|from {re.escape(parent)} import [^\n]*\b{name}\b")
+    groups: list[list[str]] = [[], [], [], []]
+    for test, text in _texts().items():
+        near = str(Path(test).parent)
+        ranks = (Path(test).stem == f"test_{path.stem}" and near == home, imports.search(text), near == home)
+        rank = next((k for k, belongs in enumerate(ranks) if belongs), 3 if near == above else None)
+        if rank is not None:
+            groups[rank].append(test)
+    groups[1].sort(key=lambda test: not test.startswith(home))
+    return [tests for tests in groups if tests]
 
 
-def passes(copy: Path, tests: Sequence[str], limit_s: float) -> bool:
-    """Whether tests pass in the copy within the time, in a fork that has all libraries."""
-    until_s = time.monotonic() + limit_s
+class _Watch:
+    """Writes down the test that runs, and ends the process where one takes too long (SIGPROF, SIGALRM)."""
+
+    def __init__(self, note: Path, limit_s: float) -> None:
+        self._note, self._limit_s = note, limit_s
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        self._note.write_text(nodeid)
+        signal.setitimer(signal.ITIMER_PROF, self._limit_s)
+        signal.setitimer(signal.ITIMER_REAL, 3 * self._limit_s)
+
+
+def failure(copy: Path, tests: Sequence[str], limit_s: float, passed_over: Sequence[str] = ()) -> str | None:
+    """The first test that fails in the copy or takes longer than the limit, in a fork that has all libraries."""
+    note = copy / "runs-now.txt"
+    note.write_text("(collecting)")
     child = os.fork()
     if not child:
         os.setsid()
         for stream in (1, 2):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+        for number in (signal.SIGPROF, signal.SIGALRM):
+            signal.signal(number, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_REAL, 3 * limit_s)
         os.chdir(copy)
         sys.path[:0] = [str(copy / part) for part in ("proto", "", "deploy")]
+        os.environ["PYTHONPATH"] = os.pathsep.join(sys.path[:3])
         ours = {"tests", "freshfield", "camera_node", "channel_emu", "edge_server", "freshfield_up"}
         for name in [name for name in sys.modules if name.partition(".")[0] in ours]:
             del sys.modules[name]
-        code = pytest.main(["-qx", "-m", _SELECT, "-p", "no:cacheprovider", "-p", "no:randomly", *tests])
+        options = ["-qx", "-m", _SELECT, "-p", "no:cacheprovider", "-p", "no:randomly"]
+        options += [f"--deselect={test}" for test in passed_over]
+        code = pytest.main([*options, *tests], plugins=[_Watch(note, limit_s)])
         os._exit(0 if code in (0, 5) else 1)  # 5: none is quick
-    while (ended := os.waitpid(child, os.WNOHANG))[0] == 0:
-        if time.monotonic() > until_s:
-            os.killpg(child, signal.SIGKILL)
-        time.sleep(0.05)
-    return ended[1] == 0
+    code = os.waitpid(child, 0)[1]
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(child, signal.SIGKILL)  # what a test left behind
+    return note.read_text() if code else None
 
 
 class Runner:
-    """Runs edits in a copy of the checkout."""
+    """Runs edits in a copy of the checkout, always at the same place: compiled kernels are kept by place."""
 
     def __init__(self, copy: Path) -> None:
         self.copy = copy
+        shutil.rmtree(copy, ignore_errors=True)
         listed = subprocess.run(["git", "-C", str(ROOT), "ls-files"], capture_output=True, text=True, check=True).stdout
         for name in listed.splitlines():
             if (ROOT / name).is_file():
                 (copy / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(ROOT / name, copy / name)
-        self._taken_s = cache(self._taken)
+        self._kernels = cache_folder(copy / "edge_server")
+        self._fails = cache(lambda test: failure(self.copy, [test], _COMPILING_S) is not None)
+        self._compiled = cache(lambda tests: failure(self.copy, tests, _COMPILING_S, self._broken))
+        self._broken: list[str] = []
 
     def outcome(self, edit: Edit) -> dict[str, Any]:
-        """{caught_by: the tests that fail with the edit, or None; broken: tests that fail without it}."""
+        """{caught_by: a test that fails with the edit and passes without it, or None; broken: tests that fail in both
+        cases}."""
         broken: list[str] = []
         for tests in nearest_tests(edit.file):
-            taken_s = self._taken_s(tuple(tests))
-            if taken_s is None:
-                broken += tests
-                continue
-            compiles = "/kernels/" in edit.file or ("/fields/" in edit.file and edit.file.endswith("settings.py"))
-            limit_s = _LEAST_LIMIT_S + _TIMES * taken_s + (_COMPILING_S if compiles else 0.0)
-            (self.copy / edit.file).write_text(edit.made())
-            try:
-                if not passes(self.copy, tests, limit_s):
-                    return {"caught_by": tests, "broken": broken}
-            finally:
-                shutil.copy2(ROOT / edit.file, self.copy / edit.file)
+            while found := self._failure(edit, tests):
+                if found == "(collecting)" or not self._fails(found):
+                    return {"caught_by": found, "broken": broken}
+                broken.append(found)
+                self._broken.append(found)
         return {"caught_by": None, "broken": broken}
 
-    def _taken(self, tests: tuple[str, ...]) -> float | None:
-        """Seconds of the tests without an edit, in which kernels may be compiled; None: they fail."""
-        begun = time.monotonic()
-        return time.monotonic() - begun if passes(self.copy, tests, 1800.0) else None
+    def _failure(self, edit: Edit, tests: list[str]) -> str | None:
+        compiles = "/kernels/" in edit.file or ("/fields/" in edit.file and edit.file.endswith("settings.py"))
+        if compiles:
+            self._compiled(tuple(tests))
+        (self.copy / edit.file).write_text(edit.made())
+        changed = cache_folder(self.copy / "edge_server")
+        try:
+            if changed != self._kernels and self._kernels.is_dir():
+                shutil.copytree(self._kernels, changed, dirs_exist_ok=True)
+                for module in _inlining(edit.file):
+                    for kept in changed.rglob(f"{module}.*.nbi"):
+                        kept.unlink()
+            return failure(self.copy, tests, _COMPILING_S if compiles else _LIMIT_S, self._broken)
+        finally:
+            shutil.copy2(ROOT / edit.file, self.copy / edit.file)
+            if changed != self._kernels:
+                shutil.rmtree(changed, ignore_errors=True)
+
+
+def _inlining(file: str) -> set[str]:
+    """Names of the modules of kernels that import a file, and that import those."""
+    kernels = {path: path.read_text() for path in (ROOT / "edge_server").rglob("kernels/*.py")}
+    known, stems = {Path(file).stem}, {Path(file).stem}
+    while known:
+        imports = re.compile(rf"^(from|import) .*\b({'|'.join(known)})\b", re.MULTILINE)
+        known = {path.stem for path, text in kernels.items() if imports.search(text)} - stems
+        stems |= known
+    return stems
 
 
 def share(caught: int, total: int) -> str:
@@ -269,20 +323,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.list:
         print("\n".join(f"{number:3} {edit.text()}" for number, edit in sample))
         return 0
-    store, outcomes = ResultStore(args.out), []
-    with tempfile.TemporaryDirectory(prefix="freshfield-mutants-") as folder:
-        runner = None
-        for number, edit in sample:
-            source = hashlib.sha256((ROOT / edit.file).read_bytes()).hexdigest()[:16]
-            key = f"{source} {edit.file} {edit.operator} {edit.occurrence}"
-            if key not in store.results:
-                runner = runner or Runner(Path(folder))
-                store.put(key, {**asdict(edit), "text": edit.text()}, runner.outcome(edit))
-            found = store.results[key]
-            word = "SURVIVED" if found["caught_by"] is None else "caught"
-            note = f" (fail without it: {', '.join(found['broken'])})" if found["broken"] else ""
-            print(f"{number:3} {word:8} {edit.text()}{note}", flush=True)
-            outcomes.append((edit, found["caught_by"] is not None))
+    store, outcomes, runner = ResultStore(args.out), [], None
+    for number, edit in sample:
+        source = hashlib.sha256((ROOT / edit.file).read_bytes()).hexdigest()[:16]
+        key = f"{source} {edit.file} {edit.operator} {edit.occurrence}"
+        if key not in store.results:
+            runner = runner or Runner(args.out.with_suffix("").resolve())
+            store.put(key, {**asdict(edit), "text": edit.text()}, runner.outcome(edit))
+        found = store.results[key]
+        word = "SURVIVED" if found["caught_by"] is None else "caught"
+        note = f" (fail without it: {', '.join(found['broken'])})" if found["broken"] else ""
+        print(f"{number:3} {word:8} {edit.text()}{note}", flush=True)
+        outcomes.append((edit, found["caught_by"] is not None))
     print(f"\nsurvivors of seed {args.seed}:")
     for edit, _ in (one for one in outcomes if not one[1]):
         print(f"  {edit.text()}")
