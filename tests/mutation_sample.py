@@ -1,7 +1,6 @@
 """Draw careless edits from a seed, and see whether the nearest quick tests notice.
 
     python -m tests.mutation_sample --seed 1 --count 200                 # resumes; hours on two cores
-    python -m tests.mutation_sample --seed 1 --count 200 --part 1/2      # half of them, beside another process
     python -m tests.mutation_sample --seed 1 --count 200 --only 7,31
 
 cosmic-ray makes the edits (operators, comparisons, numbers, conditions, loops); this draws a sample of them, spread
@@ -26,6 +25,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -75,6 +75,7 @@ _SPOKEN = ("print(", "log.", "__name__ ==")
 _SELECT = "not slow and not browser and not chaos"
 _LIMIT_S = 100.0  # processor seconds of one quick test, or a third of its wall-clock time: kernels may be compiled
 _COMPILING_S = 600.0  # with an edit of a kernel, or of a number in it
+_ENOUGH_S, _ENOUGH_OF_ALL_S = 30.0, 60.0  # processor seconds of a group's tests, and of all: those of a far one wait
 Span = tuple[tuple[int, int], tuple[int, int]]
 
 
@@ -173,9 +174,17 @@ def _texts() -> dict[str, str]:
     return {str(test.relative_to(ROOT)): test.read_text() for test in sorted((ROOT / "tests").rglob("test_*.py"))}
 
 
+def _importing(file: str) -> re.Pattern[str]:
+    """Finds the import of a file in a text."""
+    module = file.removeprefix("proto/").removeprefix("deploy/").removesuffix(".py").replace("/", ".")
+    parent, _, name = module.rpartition(".")
+    return re.compile(rf"\b{re.escape(module)}\b|from {re.escape(parent)} import [^\n]*\b{name}\b")
+
+
 def nearest_tests(file: str) -> list[list[str]]:
     """Tests to run in turn: those of the file's name, those that import it, the others of their folder, or of the first
-    folder above that has any, and those of the folder above it within the package."""
+    folder above that has any, those of the folder above it within the package, and those that import a file which
+    imports it."""
     source = next(folder for folder in SOURCES if file.startswith(f"{folder}/"))
     path = Path(file)
     package = ROOT / SOURCES[source]
@@ -183,27 +192,35 @@ def nearest_tests(file: str) -> list[list[str]]:
     while not list(folder.glob("test_*.py")):
         folder = folder.parent
     home, above = (str(of.relative_to(ROOT)) for of in (folder, folder.parent if folder != package else folder))
-    module = file.removeprefix("proto/").removeprefix("deploy/").removesuffix(".py").replace("/", ".")
-    parent, _, name = module.rpartition(".")
-    imports = re.compile(rf"\b{re.escape(module)}\b|from {re.escape(parent)} import [^\n]*\b{name}\b")
-    groups: list[list[str]] = [[], [], [], []]
+    imports = _importing(file)
+    users = [_importing(user) for user in files() if user != file and imports.search((ROOT / user).read_text())]
+    groups: list[list[str]] = [[], [], [], [], []]
     for test, text in _texts().items():
         near = str(Path(test).parent)
-        ranks = (Path(test).stem == f"test_{path.stem}" and near == home, imports.search(text), near == home)
-        rank = next((k for k, belongs in enumerate(ranks) if belongs), 3 if near == above else None)
-        if rank is not None:
-            groups[rank].append(test)
+        ranks = (
+            Path(test).stem == f"test_{path.stem}" and near == home,
+            imports.search(text),
+            near == home,
+            near == above,
+            any(user.search(text) for user in users),
+        )
+        for group in (group for group, belongs in zip(groups, ranks) if belongs):
+            group.append(test)
+            break
     groups[1].sort(key=lambda test: not test.startswith(home))
     return [tests for tests in groups if tests]
 
 
 class _Watch:
-    """Writes down the test that runs, and ends the process where one takes too long (SIGPROF, SIGALRM)."""
+    """Writes down the test that runs, begins none after ``_ENOUGH_S``, and ends the process where one takes too long
+    (SIGPROF, SIGALRM)."""
 
     def __init__(self, note: Path, limit_s: float) -> None:
         self._note, self._limit_s = note, limit_s
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
+        if time.process_time() > (_ENOUGH_S if self._limit_s < _COMPILING_S else _COMPILING_S):
+            pytest.exit("enough", returncode=0)
         self._note.write_text(nodeid)
         signal.setitimer(signal.ITIMER_PROF, self._limit_s)
         signal.setitimer(signal.ITIMER_REAL, 3 * self._limit_s)
@@ -257,7 +274,10 @@ class Runner:
         """{caught_by: a test that fails with the edit and passes without it, or None; broken: tests that fail in both
         cases}."""
         broken: list[str] = []
+        begun_s = os.times().children_user
         for tests in nearest_tests(edit.file):
+            if os.times().children_user - begun_s > _ENOUGH_OF_ALL_S:
+                break
             while found := self._failure(edit, tests):
                 if found == "(collecting)" or not self._fails(found):
                     return {"caught_by": found, "broken": broken}
@@ -310,15 +330,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--seed", type=int, default=1, help="seed of the sample [%(default)s]")
     add("--count", type=int, default=200, help="number of edits [%(default)s]")
     add("--only", type=lambda text: [int(n) for n in text.split(",")], metavar="K,...", help="only these of them")
-    add("--part", default="1/1", metavar="K/N", help="only the K-th of N parts [%(default)s]")
     add("--list", action="store_true", help="print the sample, and run nothing")
     add("--out", type=Path, default="runs/mutants.jsonl", metavar="FILE", help="where results are kept [%(default)s]")
     args = parser.parse_args(argv)
-    part, parts = map(int, args.part.split("/"))
     sample = [
         (number, edit)
         for number, edit in enumerate(drawn(args.seed, args.count))
-        if number % parts == part - 1 and (args.only is None or number in args.only)
+        if args.only is None or number in args.only
     ]
     if args.list:
         print("\n".join(f"{number:3} {edit.text()}" for number, edit in sample))

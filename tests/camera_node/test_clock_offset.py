@@ -97,10 +97,12 @@ async def test_the_offset_follows_a_peer_that_comes_back_with_another_clock(monk
     assert abs(before) < 1.0 and abs(after - 3600.0) < 1.0
 
 
-def test_exchanges_follow_each_other_quickly_at_first(monkeypatch):
-    pauses, answers = [], iter([True] * 5 + [False, True])
+def test_exchanges_follow_each_other_quickly_at_first_and_four_replace_an_old_estimate(monkeypatch):
+    pauses, in_use, answers = [], [], iter([True] * 5 + [False] + [True] * 5)
+    sync = ClockSync(AsyncMock(), (), WallClock())
 
-    async def exchanged(*_) -> bool:
+    async def exchanged(channel, metadata, clock, estimator, timeout_s) -> bool:
+        in_use.append(estimator is sync._estimator)
         return next(answers)
 
     async def pause(seconds: float) -> None:
@@ -109,5 +111,6 @@ def test_exchanges_follow_each_other_quickly_at_first(monkeypatch):
     monkeypatch.setattr(clock_offset, "exchange", exchanged)
     monkeypatch.setattr(clock_offset.asyncio, "sleep", pause)
     with pytest.raises(RuntimeError):  # the answers are over
-        asyncio.run(ClockSync(AsyncMock(), (), WallClock()).run())
-    assert pauses == [0.05, 0.05, 0.05, 1.0, 1.0, 1.0, 0.05]
+        asyncio.run(sync.run())
+    assert pauses == [0.05, 0.05, 0.05, 1.0, 1.0, 1.0, 0.05, 0.05, 0.05, 1.0, 1.0]
+    assert in_use == [True] * 6 + [False] * 4 + [True] * 2

@@ -208,6 +208,15 @@ def test_a_service_that_is_not_there_says_so(channel, client) -> None:
     assert _code(lambda: client(link).unary_unary(HELLO)(b"", timeout=5)) == "UNAVAILABLE"
 
 
+def test_a_link_that_failed_says_so_and_still_closes(channel) -> None:
+    link = channel("ideal", to="127.0.0.1:1")
+    link._loop.call_soon_threadsafe(link._proxy.fail, OSError(28, "No space left on device"))
+    with pytest.raises(proxy.EmulatorFailed, match="room on the disk"):
+        link.settle()
+    link.close()
+    assert link.describe().endswith("no call was made")
+
+
 def test_a_reset_cuts_the_streams_on_it(channel, greeter, client) -> None:
     link = channel({"faults": {"reset": {"at_ms": [700.0]}}}, to=greeter.address)
     call = client(link).stream_stream(ECHO)(paced(10_000, 0.01), timeout=20)

@@ -11,7 +11,7 @@ import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.scenes.multiview_still import synthetic_still
-from edge_server.export.camera_paths import lens, orbit, vertical_fov_deg
+from edge_server.export.camera_paths import lens, orbit, read_nerfstudio, vertical_fov_deg
 from edge_server.fields import Budget, View, checkpoint
 from edge_server.fields.registry import make_field
 from freshfield.geometry import Pinhole, look_at
@@ -141,6 +141,9 @@ def test_a_path_of_nerfstudio_keeps_its_size_and_poses(run, tmp_path, capsys):
     assert "2 images of 64 x 48" in capsys.readouterr().out
     (path).write_text(json.dumps(nerfstudio(seconds=0)))  # the rate is given: its seconds do not count
     assert render(run, "--path", path, tmp_path / "flight.mp4") == 0
+    timeless = {key: value for key, value in nerfstudio().items() if key not in ("fps", "seconds")}
+    (tmp_path / "timeless.json").write_text(json.dumps(timeless))
+    assert read_nerfstudio(tmp_path / "timeless.json")[1] == 2.0  # two poses take a second
     # The same viewpoint, said by eye and target.
     assert render(run, "--path", path, tmp_path / "a.png") == 0
     assert render(run, "--pose", 0, -0.5, 0, 0, 0, 0, tmp_path / "b.png", "--fov", 40, "--size", "64x48") == 0

@@ -96,6 +96,10 @@ def test_singular_postures_are_named():
     assert "elbow" in UR3E.singularities(np.where(np.arange(6) == 2, 0.0, free))
 
 
+def test_a_joint_turns_a_full_turn_either_way():
+    assert np.degrees((UR3E.lower_rad, UR3E.upper_rad)) == pytest.approx(np.array([[-360.0] * 6, [360.0] * 6]))
+
+
 def test_a_calibration_moves_the_flange_and_the_inverse_follows_it(factory):
     arm = apply_calibration(UR3E, factory)
     assert np.linalg.norm((arm.forward(POSTURES) - UR3E.forward(POSTURES))[:, :3, 3], axis=1).max() > 1e-3

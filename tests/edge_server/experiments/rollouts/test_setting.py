@@ -11,6 +11,7 @@ from camera_node.synthetic import make_scene
 from edge_server.experiments.rollouts.episode import Choice, EpisodeFactory, Outcome
 from edge_server.experiments.rollouts.setting import Setting
 from tests.edge_server.experiments.rollouts.small import NOTHING, RAW, reported, scenario, setting
+from tests.edge_server.experiments.sets import write_recording
 
 
 def one_of(what: Setting, seed: int = 5, camera: str = "cam00") -> Outcome:
@@ -55,10 +56,11 @@ def test_every_episode_has_a_motion_of_its_own_and_its_cameras_see_the_same_one(
     assert same.stage(1) is same.stage(2_000_001)
 
 
-def test_motions_are_drawn_where_something_moves_and_nowhere_else():
+def test_motions_are_drawn_where_something_moves_and_nowhere_else(tmp_path):
     still = {**RAW["source"], "speed_m_per_s": 0.0}
     tile = {"kind": "world", "scene": "tile", "width": 24, "height": 24, "params": {"supersample": 1}}
-    for source in (still, tile):
+    recorded = {"kind": "transforms", "data": str(write_recording(tmp_path))}
+    for source in (still, tile, recorded):
         what = dataclasses.replace(setting(motions=True), scenario=scenario(source=source))
         assert "motion_seed" not in EpisodeFactory(what, NOTHING).scenario(3).source
     assert EpisodeFactory(setting(motions=True), NOTHING).scenario(3).source["motion_seed"] == 3
