@@ -122,6 +122,11 @@ REFUSED = {
 }
 
 
+@pytest.mark.parametrize("size", [(4096, 1), (1, 4096)])
+def test_the_longest_sides_are_taken(size):
+    image(np.ones(size)).encode().check(replace(LENS, width=size[1], height=size[0]), 0)
+
+
 @pytest.mark.stability
 @pytest.mark.parametrize("kind", REFUSED)
 def test_what_must_not_be_decoded_is_refused_by_name(kind):

@@ -13,8 +13,10 @@ from freshfield.geometry import (
     GeometryError,
     Pinhole,
     Pose,
+    converging_point,
     look_at,
     matrix_to_quaternion,
+    on_sphere,
     quaternion_multiply,
     quaternion_normalize,
     quaternion_to_matrix,
@@ -137,6 +139,27 @@ def test_look_at_refuses_a_point_and_survives_straight_down():
         look_at([1, 1, 1], [1, 1, 1])
     Pose.from_matrix(look_at([0, 0, 5], [0, 0, 0]))
     Pose.from_matrix(look_at([5, 0, 0], [0, 0, 0], up=(1, 0, 0)))
+
+
+def test_a_pose_on_a_sphere_looks_at_its_middle_or_away_from_it():
+    away = np.array([0.75**0.5, 0.0, 0.5])
+    for outward, sign in ((False, -1.0), (True, 1.0)):
+        pose = on_sphere([1.0, 2.0, 3.0], 2.0, 90.0, 30.0, outward)
+        assert pose[:3, 3] == pytest.approx(np.array([1.0, 2.0, 3.0]) + 2.0 * away)
+        assert pose[:3, 2] == pytest.approx(sign * away)
+    assert on_sphere(np.zeros(3), 1.0, 0.0, 0.0)[:3, 3] == pytest.approx([0.0, -1.0, 0.0])
+
+
+def test_rays_converge_where_least_squares_says():
+    rng = np.random.default_rng(0)
+    origins = rng.standard_normal((5, 3)) * 4.0
+    ways = np.array([1.0, 2.0, 3.0]) + 0.1 * rng.standard_normal((5, 3)) - origins
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    across = np.eye(3) - ways[:, :, None] * ways[:, None, :]
+    wanted = np.linalg.lstsq(across.reshape(-1, 3), (across @ origins[..., None]).ravel(), rcond=None)[0]
+    assert converging_point(origins, ways) == pytest.approx(wanted)
+    assert converging_point(origins, -ways) is None, "they run apart"
+    assert converging_point(origins, np.tile(ways[0], (5, 1))) is None, "they are parallel"
 
 
 def test_interpolated_poses_move_in_a_straight_line():

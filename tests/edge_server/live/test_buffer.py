@@ -191,3 +191,14 @@ def test_a_camera_goes_first_in_the_seventeenth_take_after_its_last():
         used, _ = buffer.take(list(buffer.newest().values()), most=1)
         served += [(take, item.camera) for item in used if item.sequence == take]
     assert served == [(take, "cam00" if take == 18 else "cam01") for take in range(2, 20)]
+
+
+def test_who_came_first_in_a_take_has_waited_longest_in_the_next():
+    buffer = FrameBuffer(["cam00", "cam01"])
+    buffer.keep_every_frame(True)
+    for take, (first, second) in enumerate((("cam00", "cam01"), ("cam01", "cam00"))):
+        for k, camera in enumerate((first, second)):  # the second is younger, by less than counts
+            at_ns = 100 * take * MS + k * MS // 10
+            buffer.put(frame(camera, sequence=take, generated_ns=at_ns), at_ns)
+        used, _ = buffer.take(list(buffer.newest().values()), most=2 - take)
+    assert ("cam01", 1) in _sequences(used) and ("cam00", 1) not in _sequences(used)

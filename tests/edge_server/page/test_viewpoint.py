@@ -144,7 +144,7 @@ def test_never_more_rows_than_the_window_has():
     _, camera = visitor_camera((0, 0, 0), (1, 0, 0, 0), 0.9, 300, 200, 720)
     assert (camera.width, camera.height) == (300, 200)
     _, tiny = visitor_camera((0, 0, 0), (1, 0, 0, 0), 0.9, 1, 1, 100)
-    assert (tiny.width, tiny.height) == (1, 1)
+    assert (tiny.width, tiny.height) == (1, 1) and tiny.fx == pytest.approx(tiny.fy)
 
 
 def test_bands_are_the_image():

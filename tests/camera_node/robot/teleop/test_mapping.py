@@ -114,3 +114,18 @@ def test_the_filter_is_smooth_when_slow_and_quick_when_fast():
         lag_fast, lag_slow = at - fast(at, turn, 0.001)[0], at - slow(at, turn, 0.001)[0]
     # A first-order low-pass of 2 Hz lags by 1 / (2 pi 2 Hz) once it has settled.
     assert lag_fast[0] < 0.2 * lag_slow[0] and lag_slow[0] < 0.0796
+
+
+@pytest.mark.parametrize("axis", np.eye(3))
+def test_the_filter_follows_each_part_by_its_own_speed(axis):
+    def share(hz: float) -> float:
+        return 0.02 * np.pi * hz / (0.02 * np.pi * hz + 1.0)
+
+    def turned(angle_rad: float) -> np.ndarray:
+        return np.array([np.cos(angle_rad / 2), *np.sin(angle_rad / 2) * axis])
+
+    filtered = OneEuro(2.0, 3.0)
+    filtered(np.zeros(3), turned(0.5), 0.01)
+    position, quaternion = filtered(0.02 * axis, turned(0.7), 0.01)  # 2 m/s, 20 rad/s
+    assert position == pytest.approx(0.02 * share(2.0 + 3.0 * share(2.0) * 2.0) * axis)
+    assert quaternion == pytest.approx(turned(0.5 + 0.2 * share(2.0 + 3.0 * share(2.0) * 20.0)))
