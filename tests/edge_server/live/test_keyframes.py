@@ -69,6 +69,15 @@ def test_a_slow_camera_leaves_as_many_viewpoints_behind_as_a_fast_one(step_deg):
     assert len(kept) <= 21 and min(v.generated_ns for v in given) >= 1_000_000_000
 
 
+def test_a_camera_on_its_way_out_leaves_a_picture_from_half_way_at_most():
+    kept = Keyframes(KeyframesConfig(apart_m=1.0, apart_deg=90.0))
+    for t_ms, x_m in enumerate((0.0, 0.4, 0.6, 1.0)):
+        pose = np.eye(4)
+        pose[0, 3] = x_m
+        given = kept.with_earlier([dataclasses.replace(view("hand", 0, t_ms), camera_to_world=pose)])
+    assert [(v.camera, v.camera_to_world[0, 3]) for v in given] == [("hand", 1.0), ("hand#0", 0.4)]
+
+
 def test_a_camera_that_trembles_keeps_one_viewpoint_and_its_newest_picture():
     kept = Keyframes(KeyframesConfig(apart_m=0.1))
     for t_ms in range(20):
