@@ -290,6 +290,7 @@ async def test_the_credits_at_the_edge_hold_for_bytes_too(tmp_path: Path) -> Non
     for _ in range(6):
         flow.send(large)
     assert flow.pending == 2 and flow.broken == 4  # one on its way, the newest held
+    assert proxy._snapshot()["counts"]["in_flight"] == 2
     await proxy.stop()
     await edge.stop()
 

@@ -251,6 +251,8 @@ def test_running_statistics_of_rewards_are_those_of_all_of_them():
         assert running.variance == pytest.approx(whole.var(), rel=1e-12)
     standardized = running.standardized(np.concatenate(batches))
     assert standardized.std() == pytest.approx(1.0) and standardized.mean() == pytest.approx(0.0, abs=1e-12)
+    running.add(np.zeros(5000))
+    assert running.count == 4096, "what is older fades"
 
 
 def test_a_minibatch_is_clipped_where_its_ratio_leaves_the_range():
