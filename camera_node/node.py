@@ -96,6 +96,7 @@ class Node:
             ledger = Ledger(self._options.out, "node", self.name, self._clock.now_ns())
         channel = self._options.transport.aio_channel(self._options.to)
         metadata = self._options.transport.metadata()
+        troubles: dict[str, str] = {}
         for camera in self._cameras:
             outbox = Outbox(camera.name, self.session, ledger, self._clock)
             self.outboxes[camera.name] = outbox
@@ -106,6 +107,7 @@ class Node:
                 metadata,
                 self._syncs[camera.name].offset,
                 self._scenario.rng("backoff", camera.name),
+                troubles,
                 self._options.response_timeout_s,
             )
         try:

@@ -58,6 +58,7 @@ class Sender:
     metadata: of the calls.
     offset: returns the current estimate of the peer's clock minus the camera's, which each frame carries.
     jitter: random generator for the pauses between attempts.
+    troubles: camera to what is wrong, of all senders of a node: what one has said, the others do not repeat.
     response_timeout_s: the stream counts as dead if an answer takes longer than this, or much longer than the
         recent ones. After each such timeout the allowed time is doubled, up to this one.
     """
@@ -69,13 +70,14 @@ class Sender:
         metadata: tuple[tuple[str, str], ...],
         offset: Callable[[], Offset | None],
         jitter: np.random.Generator,
+        troubles: dict[str, str],
         response_timeout_s: float = 5.0,
     ) -> None:
         self.outbox = outbox
         self.connected = False
         self.busy = False
         self.connections = 0
-        self.trouble = ""
+        self._troubles = troubles
         self._channel = channel
         self._stub = rpc.FrameStreamServiceStub(channel)
         self._metadata = metadata
@@ -85,6 +87,11 @@ class Sender:
         self._slowest_s = 0.0
         self._reasons: dict[str, int] = {}
         self._offset_awaited = False
+
+    @property
+    def trouble(self) -> str:
+        """Why the camera's last stream failed, until a frame is answered again; empty if nothing is wrong."""
+        return self._troubles.get(self.outbox.camera, "")
 
     @property
     def ready(self) -> bool:
@@ -170,9 +177,7 @@ class Sender:
             if not answered:
                 self.outbox.record(frame.sequence, "broken")
         self._count(frame, response)
-        if self.trouble:
-            log.info("%s: connected again", frame.camera)
-            self.trouble = ""
+        self._answered()
 
     def _stamped(self, frame: Frame) -> Frame:
         offset = self._offset() or UNKNOWN_OFFSET
@@ -190,15 +195,21 @@ class Sender:
             outcome = f"rejected:{reason}"
         self.outbox.record(frame.sequence, "answered", outcome)
 
+    def _answered(self) -> None:
+        """Forget what was wrong, and say so once no other camera of the node has the same trouble."""
+        trouble = self._troubles.pop(self.outbox.camera, "")
+        if trouble and trouble not in self._troubles.values():
+            log.info("%s: connected again", self.outbox.camera)
+
     def _report(self, error: Exception) -> None:
-        """Log what failed, once per kind of trouble and not once per attempt."""
+        """Log what failed, once per kind of trouble: not once per attempt, nor once per camera of a node."""
         if isinstance(error, grpc.aio.AioRpcError):
             text = f"{error.code().name}: {peer_text(error.details())}"
         else:
             text = str(error) or "peer not reachable"
-        if text != self.trouble:
+        if text not in self._troubles.values():
             log.warning("%s: %s; trying again", self.outbox.camera, text)
-            self.trouble = text
+        self._troubles[self.outbox.camera] = text
 
 
 async def _status(call: grpc.aio.StreamStreamCall) -> Exception:

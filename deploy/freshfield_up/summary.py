@@ -9,6 +9,9 @@ from typing import Any
 from freshfield.scenario import NOTHING_HELD_OUT
 from freshfield_up.status import fmt, held_out
 
+SHARE = 0.05  # of updates that learned nothing, from which on advice is worth a line; as in the report's conclusion
+TOO_SHORT = "smaller pictures (source.scale, or width and height) or longer updates (edge.update_ms) give them time"
+
 
 def summarize(out: Path) -> str:
     """The main results and where the report is. Missing numbers are shown as ``-``; what needs a held-out camera is
@@ -27,6 +30,7 @@ def summarize(out: Path) -> str:
         f"updates    {fmt(updates.get('count'), 'd')} of {fmt(updates.get('ms_p50'), '.0f')} ms "
         f"(p95 {fmt(updates.get('ms_p95'), '.0f')} ms), the first after {_seconds(updates.get('first_ms'))}"
         + (f"; {idle} of them had no time for a step of training" if idle else ""),
+        *([f"           {TOO_SHORT}"] if idle > SHARE * (updates.get("count") or 0) else []),
         f"frames     {fmt(frames.get('captured'), 'd')} captured, {fmt(frames.get('sent'), 'd')} sent, "
         f"{fmt(frames.get('delivered'), 'd')} delivered{shed}, {rejected} rejected; "
         f"{_accounted(frames)}",

@@ -20,6 +20,8 @@ USUAL = "once a machine, usually 20 to 50 s"
 """Of ``splat`` in layers: 20 s on a fast core; 35 s on a slow one, 46 with the kernels of depth."""
 LOG_EVERY_S = 10.0
 """Between two lines of the log: a long compilation shows that it goes on, and a short one is a single line."""
+PAUSE_S = 5.0
+"""Without a compilation: the next one counts anew. Kernels of depth or of a mesh may come minutes after the first."""
 
 
 class Teller(event.Listener):
@@ -31,11 +33,14 @@ class Teller(event.Listener):
         self._count = 0
         self._began_s = 0.0
         self._said_s = -every_s
+        self._ended_s = -PAUSE_S
+        self._within = 0  # one compilation may need another
 
     def on_start(self, event: event.Event) -> None:
         now_s = time.perf_counter()
-        if not self._count:
-            self._began_s = now_s
+        if now_s - self._ended_s >= PAUSE_S and not self._within:
+            self._began_s, self._count = now_s, 0
+        self._within += 1
         self._count += 1
         if now_s - self._said_s >= self._every_s:
             self._said_s = now_s
@@ -44,7 +49,8 @@ class Teller(event.Listener):
             self._say(f"compiling the field's kernels ({USUAL}): {name}, number {self._count}, after {passed_s:.0f} s")
 
     def on_end(self, event: event.Event) -> None:
-        pass
+        self._within -= 1
+        self._ended_s = time.perf_counter()
 
 
 @contextmanager

@@ -19,6 +19,7 @@ log = logging.getLogger(__name__)
 
 # Longest sleep before the loop looks at the controls again.
 _MAX_SLEEP_S = 0.2
+_USED = 0.5  # share of an update's time; shares between are rare: updates end early or when their time is over
 _TOO_SHORT = 3  # updates in a row without a step, after which a warning is due
 _SHED_EVERY_S = 30.0  # between two warnings that frames are left out
 STOP_S = 20.0
@@ -159,11 +160,13 @@ class UpdateLoop:
 
     def _warn_without_steps(self, report: FitReport) -> None:
         """Log once, and again if it recurs, that updates are too short to learn anything."""
-        self._without_steps = self._without_steps + 1 if report.steps == 0 and not report.note else 0
+        # An update that ended long before its time had nothing to learn.
+        short = report.steps == 0 and not report.note and report.seconds >= _USED * self.update_ms / 1e3
+        self._without_steps = self._without_steps + 1 if short else 0
         if self._without_steps == _TOO_SHORT:
             log.warning(
-                "an update of %.0f ms made no step: all its time went into taking in new pictures. Give "
-                "updates more (edge.update_ms), or take a field that needs less of it",
+                "an update of %.0f ms made no step: all its time went into taking in new pictures. Send smaller ones "
+                "(source.scale, or width and height), or give updates more time (edge.update_ms)",
                 report.seconds * 1e3,
             )
 
@@ -176,7 +179,7 @@ class UpdateLoop:
         if buffer.shed > shed:
             log.warning(
                 "%d of %d frames were left out, mostly the oldest: the field has no time for them. Send "
-                "fewer or smaller ones, or give updates more (edge.update_ms)",
+                "fewer or smaller ones (source.fps, source.scale), or give updates more time (edge.update_ms)",
                 buffer.shed - shed,
                 buffer.arrivals - arrived,
             )

@@ -119,7 +119,12 @@ def _delivery(report: Report) -> list[str]:
     shares = (
         (undelivered, sent, "of the frames sent did not pass the network"),
         (updates["shed"] or 0, delivered, "of those delivered were left out for lack of time"),
-        (updates["without_step"], updates["count"], "of the updates had no time for a step of training"),
+        (
+            updates["without_step"],
+            updates["count"],
+            "of the updates had no time for a step of training (smaller pictures, source.scale, or longer updates, "
+            "edge.update_ms, give them some)",
+        ),
     )
     said = [f"{part / whole:.0%} {what}" for part, whole, what in shares if whole and part >= SHARE * whole]
     return [", ".join(said) + "."] if said else []

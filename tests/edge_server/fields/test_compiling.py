@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from numba.core import event
 
 from edge_server.cli import main
+from edge_server.fields import compiling
 from edge_server.fields.compiling import LOG_EVERY_S, USUAL, Teller, told
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.splat.layers.layered_field import LayeredField
@@ -46,6 +48,25 @@ def test_compiling_is_told_and_loading_is_not(tmp_path: Path) -> None:
     assert len(lines) == 2, "the third was loaded from numba's cache"
     assert _kernel(source)(4j) == 8j
     assert len(lines) == 2, "nobody is told after the end of the block"
+
+
+def test_kernels_that_are_compiled_later_are_counted_and_timed_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(compiling.time, "perf_counter", lambda: clock[0])
+    lines: list[str] = []
+    teller = Teller(lines.append, every_s=0.0)
+
+    def f() -> None: ...
+
+    began = event.Event("numba:compile", event.EventStatus.START, {"dispatcher": SimpleNamespace(py_func=f)})
+    for now_s, starts in ((1.0, True), (3.0, True), (11.0, False), (12.0, False), (300.0, True), (302.0, False)):
+        clock[0] = now_s
+        (teller.on_start if starts else teller.on_end)(began)
+    assert [line.split("): ")[1] for line in lines] == [
+        "f, number 1, after 0 s",
+        "f, number 2, after 2 s",
+        "f, number 1, after 0 s",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -130,7 +130,7 @@ def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
 class Running:
     """A loop on the wall clock, with what it published and its status lines."""
 
-    def __init__(self, u: FieldUpdater, grace_ms: float = 0.0) -> None:
+    def __init__(self, u: FieldUpdater, grace_ms: float = 0.0, update_ms: float = 100.0) -> None:
         self.published, self.lines, self.saved, self.events = [], [], [], []
         self.clock = WallClock()
         self.controls = Controls(u.policy.name, u.policy.value)
@@ -138,7 +138,7 @@ class Running:
             u,
             self.clock,
             self.controls,
-            100.0,
+            update_ms,
             grace_ms,
             lambda p, r, v: self.published.append((p, r)),
             self.lines.append,
@@ -196,18 +196,22 @@ def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(running, tm
     assert run.published[-1][0].omega_ms == 0.0 and not run.controls.reset_requested
 
 
-def test_an_update_without_time_to_learn_is_warned_of_once_and_again_if_it_comes_back(running, caplog):
+@pytest.mark.parametrize(("update_ms", "warnings"), [(1e-3, 2), (1e7, 0)])
+def test_an_update_without_time_to_learn_is_warned_of_once_and_again_if_it_comes_back(
+    update_ms, warnings, running, caplog
+):
+    """But not one that had time left."""
     u = updates()
     fit = u.fit  # no time at all, then some, then none again
     u.fit = lambda selection, _: fit(selection, Budget(steps=1) if u.number == 4 else Budget(seconds=1e-6))
     now = WallClock().now_ns()
     u.buffer.put(frame("cam01", generated_ns=now), now)
-    run = running(u)
+    run = running(u, update_ms=update_ms)
     run.until(lambda: len(run.published) >= 8)
     run.loop.stop()
     assert [publication.steps for publication, _ in run.published[:8]] == [0, 0, 0, 0, 1, 0, 0, 0]
-    warnings = [record.message for record in caplog.records if "made no step" in record.message]
-    assert len(warnings) == 2 and "edge.update_ms" in warnings[0]
+    told = [record.message for record in caplog.records if "made no step" in record.message]
+    assert len(told) == warnings and all("source.scale" in each and "edge.update_ms" in each for each in told)
 
 
 def test_a_camera_that_never_reports_does_not_hold_the_others_up(running):
