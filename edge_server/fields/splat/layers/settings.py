@@ -107,6 +107,9 @@ STEREO_CAMERAS = 10  # up to so many, stereo of plates helps (`room`: 2.4 dB wit
 # share is the backdrop of an object: `tile` loses 1.3.
 PLAIN_CAMERAS, PLAIN_SHARE, PLAIN_STEPS, PLAIN_PX = 12, (0.04, 0.25), 2.0, 9
 FEW_ANCHORS, FEW_ACCELERATION_M_PER_S2, FEW_NEIGHBOR_M_PER_S, FEW_SEED_EVERY_S = 32, 3.0, 3.0, 0.07
+# Steps of appearance for each stride, where a frame has more pixels than this: with STEPS, updates of the recorded
+# kitchen before four cameras take 4 ms longer and show less (few-cameras.json).
+FEW_STEPS, FEW_STEPS_PIXELS = 6, 20_000
 FEW_MOST_ANCHORS = 48  # however large the foreground: the time of an update grows with their square
 
 # --- following motion (tracker) ---

@@ -77,7 +77,9 @@ class MotionTracker:
             self.seeded_s = newest_s
             self._seed()
             self._seed_time.add(self.times.add("seeding", begun) - begun)
-        return self._train_appearance(pace, parameters, tuned.STEPS * len(strides))
+        large = next(iter(self.observations)).foreground.size > tuned.FEW_STEPS_PIXELS
+        steps = tuned.FEW_STEPS if moving.few and large else tuned.STEPS
+        return self._train_appearance(pace, parameters, steps * len(strides))
 
     def _strides(self) -> list[float]:
         """Instants up to which motion is followed, one after the other: the last is the newest frame's, and

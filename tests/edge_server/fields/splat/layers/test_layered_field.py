@@ -400,6 +400,16 @@ def test_plates_do_not_wait_for_a_camera_that_has_gone_silent() -> None:
     assert list(field.moving_shares.values()) == [0.0] * 6  # of those that still tell
 
 
+def test_few_cameras_with_large_pictures_train_fewer_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    field, size = LayeredField(SMALL), CAMERAS[0].intrinsics.width * CAMERAS[0].intrinsics.height
+    for frame in range(40):
+        field.fit([_frame(k, frame, True) for k in range(4)], Budget(steps=30))
+    for frame, (most_pixels, steps) in enumerate([(size, 10), (size - 1, 6)], 40):
+        monkeypatch.setattr(settings, "FEW_STEPS_PIXELS", most_pixels)
+        report = field.fit([_frame(k, frame, True) for k in range(4)], Budget(steps=30))
+        assert report.steps == steps
+
+
 def test_it_wants_every_frame_and_tells_how_long_one_takes_until_a_camera_moves() -> None:
     field, ticks = LayeredField(SMALL), itertools.count()
     views = [_frame(k, frame, True) for frame in range(2) for k in range(len(CAMERAS))]
