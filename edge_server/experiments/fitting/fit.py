@@ -299,7 +299,7 @@ def fit(
 def check_seconds(seconds: float) -> None:
     """OptionError for a time that no fit can take."""
     if not 0.0 < seconds <= 1e6:
-        raise OptionError(f"--seconds {seconds:g}: expected more than 0")
+        raise OptionError(f"--seconds {seconds:g}: expected more than 0 and at most 1e6")
 
 
 def _read_lines(path: Path) -> list[dict[str, Any]]:

@@ -8,6 +8,10 @@ import pytest
 import yaml
 
 from edge_server.cli import main
+from edge_server.experiments.common.arguments import OptionError
+from edge_server.experiments.fitting import fit
+from edge_server.experiments.virtual import simulate
+from freshfield.scenario import ScenarioError
 from tests.edge_server.experiments.rollouts.small import RAW
 from tests.edge_server.experiments.sets import SMALL_WORDS, write_photos
 
@@ -99,3 +103,12 @@ def test_what_cannot_be_done_is_refused_in_one_line(
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1
     assert not out.is_file() and not any(path.is_file() and path.stat().st_size for path in out.rglob("*"))
+
+
+@pytest.mark.parametrize("check", [fit.check_seconds, simulate.check_seconds])
+def test_a_time_is_more_than_nothing_and_at_most_a_million_seconds(check):
+    check(1e-9)
+    check(1e6)
+    for seconds in (0.0, -1.0, 1e6 + 0.5, float("nan"), float("inf")):
+        with pytest.raises((OptionError, ScenarioError), match="more than 0 and at most 1e6"):
+            check(seconds)
