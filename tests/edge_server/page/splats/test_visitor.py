@@ -14,6 +14,7 @@ from edge_server.page.splats.messages import (
     KnotsBlock,
     MovingBlock,
     StaticBlock,
+    StatusBlock,
     StreamReader,
     UnseenBlock,
     read_message,
@@ -284,3 +285,17 @@ def test_what_no_camera_has_seen_is_said_also_when_it_is_known_later():
 
 
 BITS = np.arange(COUNT) % 3 == 0
+
+
+def test_a_moving_set_that_found_no_room_lets_the_window_grow():
+    link = Link(2e6)
+
+    def shown(now_s: float):
+        return snapshot(gaussians(COUNT, 0), movers=1000, newest_s=NEWEST_S + now_s)
+
+    link.run(ticks(3.0), shown)  # all that stands still is there
+    window = link.visitor.link
+    window.window -= window.room - 1500.0
+    published = link.publisher.take(shown(4.0), 4.0)
+    data = link.visitor.message(published, NEWEST_S, {}, 4.0)
+    assert [type(block) for block in read_message(data)[2]] == [StatusBlock, KnotsBlock] and window.short
