@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import pytest
 
-from camera_node.settings import WorldConfig, find_data, source_config
+from camera_node.settings import PathConfig, WorldConfig, find_data, source_config
 from freshfield.scenario import ScenarioError, parse
 
 VIDEO = {"kind": "video", "data": "x"}
@@ -52,6 +53,15 @@ def test_errors_name_file_and_key(source, message):
     with pytest.raises(ScenarioError, match=message) as error:
         config(**source)
     assert str(error.value).startswith("s.yaml: source") and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("elevation_deg", [-89.1, -89.0, 89.0, 89.1])
+def test_rings_of_a_tour_lie_off_the_poles(elevation_deg):
+    if abs(elevation_deg) == 89.0:
+        assert msgspec.convert({"elevations_deg": [elevation_deg]}, PathConfig).elevations_deg == (elevation_deg,)
+    else:
+        with pytest.raises(msgspec.ValidationError):
+            msgspec.convert({"elevations_deg": [elevation_deg]}, PathConfig)
 
 
 def test_data_is_found_below_the_folder_that_was_given(tmp_path, monkeypatch):

@@ -145,7 +145,10 @@ def test_a_printed_target_measures_what_is_said(spec, size, tmp_path, capsys):
     file = tmp_path / "board.png"
     assert main(["calibrate", "target", spec, "--out", str(file), "--dpi", "200"]) == 0
     assert f"it must measure {size} mm" in capsys.readouterr().out
-    corners = parse_target(spec).find(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
+    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    width = round(parse_target(spec).size_m[0] / 0.0254 * 200)
+    assert image.shape[1] == width + 2 * (width // 10), "a white border of a tenth"
+    corners = parse_target(spec).find(image)
     # Pixels a meter, over the whole target: what --dpi says.
     pixels = np.ptp(corners.pixels[:, 0]) / np.ptp(corners.points[:, 0])
     assert pixels == pytest.approx(200 / 0.0254, rel=0.001)

@@ -80,6 +80,7 @@ def test_easy_handeye_saves_the_base_in_the_flange_for_a_camera_that_stands(tmp_
         ({"hand_world_samples": {"transforms": [1]}, "camera_marker_samples": {"transforms": []}}, "expected a list"),
         ([{"robot": named(FLANGES[0])}], "pair 1: .*tracking"),
         ([[[0.0] * 7, seven(TARGETS[0])]], "pair 1: .*no unit quaternion"),
+        ([[[0.0] * 6 + [1.02], seven(TARGETS[0])]], "pair 1: .*no unit quaternion"),
         ([[seven(FLANGES[0])[:6], seven(TARGETS[0])]], "pair 1: .*4 x 4"),
     ],
 )
