@@ -5,8 +5,8 @@
 
 cosmic-ray makes the edits (operators, comparisons, numbers, conditions, loops); this draws a sample of them, spread
 over the rooms by lines, and runs for each the tests nearest to the file, for 40 processor seconds: those of its name,
-those that import it, those beside and above them, those that import what imports it. Slow tests are left out. Each edit
-is written into a copy of the checkout, where nothing else is changed.
+those beside them, those that import it, those above, those that import what imports it. Slow tests are left out. Each
+edit is written into a copy of the checkout, where nothing else is changed.
 
 (cosmic-ray by itself runs one command for every edit of a file, in the checkout; mutmut imports everything through
 trampolines, which numba cannot compile.)
@@ -183,8 +183,8 @@ def _importing(file: str) -> re.Pattern[str]:
 
 
 def nearest_tests(file: str) -> list[list[str]]:
-    """Tests to run in turn: those of the file's name, those that import it, the others of their folder, or of the first
-    folder above that has any, those of the folder above it within the package, and those that import a file which
+    """Tests to run in turn: those of the file's name, the others of their folder, or of the first folder above that has
+    any, those that import the file, those of the folder above within the package, and those that import a file which
     imports it."""
     source = next(folder for folder in SOURCES if file.startswith(f"{folder}/"))
     path = Path(file)
@@ -200,15 +200,15 @@ def nearest_tests(file: str) -> list[list[str]]:
         near = str(Path(test).parent)
         ranks = (
             Path(test).stem == f"test_{path.stem}" and near == home,
-            imports.search(text),
             near == home,
+            imports.search(text),
             near == above,
             any(user.search(text) for user in users),
         )
         for group in (group for group, belongs in zip(groups, ranks) if belongs):
             group.append(test)
             break
-    groups[1].sort(key=lambda test: not test.startswith(home))
+    groups[1].sort(key=lambda test: not imports.search(_texts()[test]))
     return [tests[k : k + 8] for tests in groups for k in range(0, len(tests), 8)]  # importing all takes long
 
 
