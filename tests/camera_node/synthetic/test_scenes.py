@@ -183,7 +183,7 @@ def test_motions_stay_within_the_bounds_off_the_cameras_and_out_of_the_furniture
 
 
 @pytest.mark.stability
-@pytest.mark.parametrize("turns", [1, 1000, 208_333_333])  # the last is 1e9 seconds
+@pytest.mark.parametrize("turns", [-1000, 1, 208_333_333])  # the last is 1e9 seconds
 def test_the_world_repeats_however_late_it_is(turns):
     scene = make_scene("room", TINY)
     for t in (0.0, 0.3, 2.0, 4.7):
@@ -191,14 +191,6 @@ def test_the_world_repeats_however_late_it_is(turns):
         difference = np.abs(early.astype(int) - late)
         # 1e9 s has a resolution of 1e-7 s: edges move by nanometers, a ray in a thousand may flip.
         assert (difference > 2).mean() < 2e-3
-
-
-@pytest.mark.stability
-@pytest.mark.parametrize("t", [-1e9, -0.1, 1e-300, 1e9, 1e15])
-def test_any_finite_instant_gives_a_sound_image(t):
-    scene = make_scene("room", TINY)
-    usual = scene.render("cam01", 1.0).mean()
-    assert abs(scene.render("cam01", t).mean() - usual) < 10
 
 
 @pytest.mark.stability
