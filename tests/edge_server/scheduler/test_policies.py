@@ -133,6 +133,12 @@ def test_a_value_out_of_range_is_refused_by_name(name, value):
         make_policy(name, value, np.random.default_rng(0))
 
 
+@pytest.mark.parametrize(("value", "said"), [(3.0, "a learned policy has no value to set"), (None, "none.npz")])
+def test_a_learned_policy_takes_no_value(value, said):
+    with pytest.raises((ValueError, OSError), match=said):
+        make_policy("bandit:none.npz", value, np.random.default_rng(0))
+
+
 def test_an_unknown_policy_lists_the_known_ones():
     for name in ("best", "wait+mask", ""):
         with pytest.raises(ValueError, match=f"{re.escape(repr(name))} is not known.*; there are: .*freshest-k"):

@@ -9,7 +9,7 @@ import pytest
 
 from edge_server.fields import Budget, View
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
-from freshfield.geometry import so3_exp
+from freshfield.geometry import so3_exp, so3_log
 from tests.edge_server.fields.small import SEEN, same_state, score, small
 
 
@@ -89,3 +89,32 @@ def test_a_camera_that_moved_starts_anew() -> None:
     poses.known[SEEN[0].camera].rotation = np.array([0.01, 0.0, 0.0])
     moved = replace(SEEN[0], camera_to_world=SEEN[1].camera_to_world)
     np.testing.assert_allclose(poses.pose(moved), moved.camera_to_world)
+
+
+def test_a_step_by_rendered_colors_is_gauss_newtons_and_its_mean_is_taken_from_all() -> None:
+    gray = replace(SEEN[0], image=np.full_like(SEEN[0].image, 128))
+    poses, lens, given = PoseCorrections(1.0, 60.0), gray.intrinsics, gray.camera_to_world
+    poses.pose(SEEN[1])
+    scale = np.array([1.0 / lens.fx] * 3 + [0.01] * 3)
+
+    def slopes(points: np.ndarray) -> np.ndarray:
+        """Of three colors by six parameters, per pixel's worth of motion."""
+        return 0.05 * np.sin(points[:, :1, None] * np.arange(1, 4)[:, None] + points[:, 1:, None] * np.arange(6))
+
+    def render(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+        moved = np.concatenate([so3_log(pose[:3, :3] @ given[:3, :3].T), pose[:3, 3] - given[:3, 3]])
+        return 0.52 + slopes(points) @ (moved / scale)
+
+    poses.correct(gray, render, 0.01, np.random.default_rng(0), np.zeros(3, np.float32))
+    rng = np.random.default_rng(0)
+    s = slopes(np.stack([rng.integers(0, side, 384) for side in (lens.width, lens.height)], axis=-1) + 0.5)
+    error = 0.52 - 128 / 255
+    weight = 1.0 / (1.0 + 3.0 * error**2 / 0.15**2) / 384
+    prior = 0.01 / (np.array([np.deg2rad(60.0)] * 3 + [1.0] * 3) / scale) ** 2
+    step = np.linalg.solve(
+        np.einsum("nci,ncj->ij", s, s) * weight + np.diag(prior), s.sum(axis=(0, 1)) * error * weight
+    )
+    assert np.abs(step).max() < 1.0
+    for view, share in ((gray, -0.4), (SEEN[1], 0.4)):
+        known = poses.known[view.camera]
+        assert np.concatenate([known.rotation, known.shift_m]) == pytest.approx(share * step * scale, rel=1e-6)
