@@ -56,7 +56,13 @@ def test_every_query_of_the_dashboard_names_a_metric_that_the_edge_exports():
     registry = CollectorRegistry()
     depth = {"cam01": DepthArrivals(3, 2500, state.now_ns())}
     registry.register(EdgeCollector(state, ingest({"crc": 4}, depth)))
-    exported = set(re.findall(r"^(\w+)[{ ]", generate_latest(registry).decode(), re.MULTILINE)) - {"#"}
+    text = generate_latest(registry).decode()
+    exported = set(re.findall(r"^(\w+)[{ ]", text, re.MULTILINE)) - {"#"}
+    values = {name: float(value) for name, value in re.findall(r"^freshfield_(\w+?)(?:{.*})? (\S+)$", text, re.M)}
+    seconds = {"camera_age": 0.012, "update": 0.005, "aaoi": 0.015, "check": 0.001}
+    counts = {"updates_total": 4, "selected_views": 1, "frames_delivered_total": 3, "frames_shed_total": 2}
+    wanted = {f"{name}_seconds": value for name, value in seconds.items()} | counts
+    assert {name: values[name] for name in wanted} == pytest.approx(wanted)
     dashboard = json.loads((ROOT / "deploy/grafana.json").read_text())
     queries = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
     queries.append(dashboard["templating"]["list"][0]["query"]["query"])

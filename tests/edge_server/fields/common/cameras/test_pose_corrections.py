@@ -50,6 +50,15 @@ def _depth(view: View) -> np.ndarray:
     return ((WALL_M - view.camera_to_world[2, 3]) / ahead[..., 2, 0]).astype(np.float32)
 
 
+def test_a_pose_that_was_set_is_the_one_that_is_told() -> None:
+    view, poses = _view(), PoseCorrections(0.3, 5.0)
+    pose = view.camera_to_world.copy()
+    pose[:3, :3] = so3_exp([0.01, -0.015, 0.02]) @ pose[:3, :3]
+    pose[:3, 3] += (0.02, -0.01, 0.015)
+    poses.set_pose(view, pose)
+    np.testing.assert_allclose(poses.pose(view), pose, atol=1e-12)
+
+
 def test_a_wrong_pose_comes_back_to_where_the_image_was_taken() -> None:
     true = _view()
     wrong = true.camera_to_world.copy()

@@ -93,10 +93,11 @@ def test_rows_that_are_not_finite_or_too_old_are_left_out():
     nan, huge = good[0].matrix.copy(), good[1].vector.copy()
     nan[3, 4], huge[0] = np.nan, np.inf
     bad = [good[0]._replace(matrix=nan), good[1]._replace(vector=huge), good[2]._replace(instant_s=np.nan)]
-    late = [good[3]._replace(instant_s=motion.oldest_s - 1.0)]
+    late = [good[3]._replace(instant_s=t) for t in (141 / 15 - 1e-6, 152 / 15 + 1e-6)]  # of knots 139 to 151
+    assert (motion.oldest_s, motion.newest_s) == pytest.approx((141 / 15, 152 / 15))
     twin = moving()
     twin.solve(good)
-    assert motion.solve([*bad, *good, *late]) == 4
+    assert motion.solve([*bad, *good, *late]) == 5
     np.testing.assert_array_equal(motion._knots, twin._knots)
 
 
