@@ -24,6 +24,7 @@ from freshfield_up.deployment import DeploymentError
 from freshfield_up.folder import EARLIER, prepare
 from freshfield_up.processes import Child
 from freshfield_up.status import read_json
+from tests.conftest import ROOT
 from tests.support import free_port
 
 SMALL = """
@@ -267,6 +268,14 @@ def test_times_are_read_as_people_write_them(text: str, seconds: float) -> None:
     from freshfield_up import demo_command as script
 
     assert script.seconds(text) == seconds
+
+
+@pytest.mark.parametrize(("duration_s", "headline"), [(0.0, "12 s"), (60.0, "12 of 60 s")])
+def test_a_line_says_how_much_of_its_time_a_run_has_run(tmp_path: Path, duration_s: float, headline: str) -> None:
+    options = launcher.Options(tmp_path, duration_s=duration_s)
+    run = launcher.Launcher(load(ROOT / "deploy" / "scenarios" / "room.yaml"), options)
+    run._ready_s = 100.0
+    assert run._headline(112.9) == headline
 
 
 def test_a_deployment_in_a_script_says_why_it_cannot_start(tmp_path: Path) -> None:
