@@ -41,3 +41,8 @@ def test_the_mean_is_that_over_all_instants(steps: list[tuple[int, int]], after:
     newest = [max(born for at, born in deliveries if at < now) for now in middles]
     expected = float((middles - newest).mean()) / 1e6
     assert RunningAge(deliveries).mean_age_ms(at_ns + after) == pytest.approx(expected)
+
+
+def test_a_frame_that_comes_twice_changes_nothing():
+    once, twice = RunningAge([(10, 0), (20, 10)]), RunningAge([(10, 0), (12, 0), (20, 10), (25, 10)])
+    assert (twice.mean_age_ms(30), twice.peak_age_ms()) == (once.mean_age_ms(30), once.peak_age_ms())
