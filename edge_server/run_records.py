@@ -7,8 +7,10 @@ file, unreadable.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from msgspec import Meta, Struct, field
 
 Number = Annotated[float, Meta(ge=-1e15, le=1e15)]
@@ -34,6 +36,7 @@ class UpdateRow(Struct, kw_only=True):
     psnr_refined_db: Number | None = None
     ssim_refined: Number | None = None
     truth_gap_ms: Number | None = None
+    network_ms: Number | None = None
     scored_on: str | None = None
 
 
@@ -44,6 +47,29 @@ class AgeParts(Struct):
     waiting: Number | None = None
     computing: Number | None = None
     display: Number | None = None
+
+
+def age_parts_ms(updates: Sequence[Any], now_s: float) -> dict[str, float]:
+    """The parts of the age of what is shown at a random instant, milliseconds, means over some updates: network
+    (capture to arrival), waiting (to the decision), computing (to publication), and display (since publication; an
+    instant meets long gaps more often). Empty for fewer than two updates, or where no network time is known.
+
+    updates: in order, each with number, t_s, network_ms, update_ms, aaoi_ms (``UpdateRow``, ``Publication``). Where
+    numbers are left out, publications lie evenly between. now_s: on their clock; nothing is published since the last.
+    """
+    known = [(u.network_ms, u.update_ms, u.aaoi_ms) for u in updates if u.network_ms is not None]
+    if len(updates) < 2 or not known:
+        return {}
+    gap_ms = 1e3 * np.diff([*(u.t_s for u in updates), now_s])
+    gaps = np.diff([*(u.number for u in updates), updates[-1].number + 1])
+    network, computing, age = np.mean(known, axis=0)
+    parts = {
+        "network": network,
+        "waiting": age - network - computing,
+        "computing": computing,
+        "display": np.sum(gap_ms**2 / gaps) / max(2.0 * np.sum(gap_ms), 1e-3),
+    }
+    return {name: max(float(ms), 0.0) for name, ms in parts.items()}
 
 
 class SoFarScores(Struct):

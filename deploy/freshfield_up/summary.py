@@ -55,7 +55,7 @@ def _fidelity(fidelity: dict[str, Any]) -> list[str]:
         f"{fmt(shown.get('psnr_still_db'), '.2f')}), {age}"
     ]
     return [
-        *([] if trained else seen),
+        *(([f"shown      {age}"] if any(shown["age_ms"].values()) else []) if trained else seen),
         f"published  PSNR {fmt(final.get('psnr_db'), '.2f')} dB over the last fifth of the run{views} "
         f"(moving pixels {fmt(final.get('psnr_moving_db'), '.2f')} dB, SSIM {fmt(final.get('ssim'), '.3f')}, "
         f"LPIPS {fmt(final.get('lpips'), '.3f')})",

@@ -19,6 +19,7 @@ from edge_server.page.diagnosis import poor_picture
 from edge_server.page.network_control import EmulatorControl, NetworkControl
 from edge_server.page.settings import AGE_PARTS_OF, LEAST_SCENE_PX, POSE_NOISE
 from edge_server.page.timelines import History, Timelines
+from edge_server.run_records import age_parts_ms
 from freshfield import coverage
 
 MAIN_WIDTH = 372
@@ -177,28 +178,6 @@ def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publ
         t_s=state.now_s(),
         age_parts_ms=age_parts_ms(publications[-AGE_PARTS_OF:], state.now_s()),
     )
-
-
-def age_parts_ms(publications: Sequence[Publication], now_s: float) -> dict[str, float]:
-    """The parts of the age of what is shown at a random instant, milliseconds, means over some publications:
-    network (capture to arrival), waiting (to the decision), computing (to publication), and display (since
-    publication; an instant meets long gaps more often). Empty for fewer than two publications, or where no
-    network time is known.
-
-    publications: in a row. now_s: on their clock; nothing has been published since the last one.
-    """
-    known = [(p.network_ms, p.update_ms, p.aaoi_ms) for p in publications if p.network_ms is not None]
-    if len(publications) < 2 or not known:
-        return {}
-    gap_ms = 1e3 * np.diff([*(p.t_s for p in publications), now_s])
-    network, computing, age = np.mean(known, axis=0)
-    parts = {
-        "network": network,
-        "waiting": age - network - computing,
-        "computing": computing,
-        "display": np.sum(gap_ms**2) / max(2.0 * np.sum(gap_ms), 1e-3),
-    }
-    return {name: max(float(ms), 0.0) for name, ms in parts.items()}
 
 
 def side_by_side(truth: NDArray[np.uint8], rendered: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -15,7 +15,16 @@ from edge_server.report.conclusion import conclusion
 from edge_server.report.events import events
 from edge_server.report.frame_accounting import account_frames
 from edge_server.report.run_files import RunFiles, read_run_files
-from edge_server.run_records import AgesRow, Baseline, DepthStatus, EdgeStatus, ShownRow, UpdateCounts, UpdateRow
+from edge_server.run_records import (
+    AgesRow,
+    Baseline,
+    DepthStatus,
+    EdgeStatus,
+    ShownRow,
+    UpdateCounts,
+    UpdateRow,
+    age_parts_ms,
+)
 from freshfield.files import write_json, write_text
 from freshfield.machine_load import outside_load
 
@@ -69,7 +78,7 @@ def assemble(files: RunFiles) -> dict[str, Any]:
         "age_ms": ages(files.ages),
         "updates": updates(series, edge.updates or UpdateCounts()),
         "foreground": edge.foreground,
-        "fidelity": {**fidelity(series, seconds, edge), "shown": shown(files.shown, seconds)},
+        "fidelity": {**fidelity(series, seconds, edge), "shown": shown(files.shown, series, seconds)},
         "channel": msgspec.to_builtins(files.channel),
         "notes": notes + accounting.notes,
     }
@@ -151,13 +160,16 @@ def fidelity(series: Sequence[UpdateRow], seconds: float, edge: EdgeStatus) -> d
     }
 
 
-def shown(rows: Sequence[ShownRow], seconds: float) -> dict[str, Any]:
+def shown(rows: Sequence[ShownRow], series: Sequence[UpdateRow], seconds: float) -> dict[str, Any]:
     """What was shown at random instants of the last fifth of the run's ``seconds``: mean of each score, count
     of the instants, and age_ms {network, waiting, computing, display}: the parts of the mean age of the views
-    behind what was shown."""
+    behind what was shown. Where nothing is held out, no instant is scored: the age follows from the updates."""
     late = _last_fifth(rows, seconds)
     parts = ("network", "waiting", "computing", "display")
-    return {**_means(late, SHOWN), "count": len(late), "age_ms": _means([row.age_ms for row in late], parts)}
+    ages = _means([row.age_ms for row in late], parts)
+    if not late:
+        ages |= age_parts_ms([row for row in _last_fifth(series, seconds) if row.number is not None], seconds)
+    return {**_means(late, SHOWN), "count": len(late), "age_ms": ages}
 
 
 def _last_fifth(rows: Sequence[Any], seconds: float) -> list[Any]:

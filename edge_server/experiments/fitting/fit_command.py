@@ -113,6 +113,11 @@ def run(request: argparse.Namespace) -> dict[str, Any]:
     held_out = bool(data.held_out)
     if not fit.run(request.seconds, lambda at: _say(progress_line(at, fit.outside, held_out))):
         _say("stopped early")
+    elif not fit.rows or fit.rows[-1].steps == 0:
+        _say(
+            f"no step of training within {request.seconds:g} s: taking in the views took all of them. Give it more "
+            f"(--resume with larger --seconds), or --scale {2 * request.scale:g}"
+        )
     for line in fit.findings():
         _say(line)
     report = fit.save(request.out)

@@ -7,8 +7,7 @@ import pytest
 from edge_server.live.state import CameraView, Publication
 from edge_server.page import markup
 from edge_server.page.colors import HELD_OUT, STALE, css, scale_color
-from edge_server.page.panel import age_parts_ms
-from edge_server.run_records import Frontier, FrontierPoint
+from edge_server.run_records import Frontier, FrontierPoint, age_parts_ms
 
 
 def summary(**changes) -> markup.Summary:
@@ -31,10 +30,10 @@ def summary(**changes) -> markup.Summary:
 
 
 def test_the_age_of_what_is_shown_is_split_into_its_parts():
-    def publication(t_s: float, network_ms: float | None) -> Publication:
-        return Publication(0, t_s, 0, None, ("cam01",), (100.0,), 100.0, 20.0, network_ms=network_ms)
+    def publication(t_s: float, network_ms: float | None, number: int = 0) -> Publication:
+        return Publication(number, t_s, 0, None, ("cam01",), (100.0,), 100.0, 20.0, network_ms=network_ms)
 
-    three = [publication(t_s, 50.0) for t_s in (0.0, 0.02, 0.08)]
+    three = [publication(t_s, 50.0, number) for number, t_s in enumerate((0.0, 0.02, 0.08))]
     parts = age_parts_ms(three, 0.08)
     # A random instant lies in the long gap three times out of four, and then 30 ms after its begin.
     assert parts == pytest.approx({"network": 50.0, "waiting": 30.0, "computing": 20.0, "display": 25.0})
@@ -44,6 +43,8 @@ def test_the_age_of_what_is_shown_is_split_into_its_parts():
     assert (
         age_parts_ms([publication(0.0, 50.0)], 0.0) == age_parts_ms([publication(t, None) for t in (0, 1)], 1.0) == {}
     )
+    # Of updates 1 and 2 no line was written: they lie evenly between those of 0 and 3.
+    assert age_parts_ms([three[0], publication(0.06, 50.0, 3)], 0.06)["display"] == pytest.approx(10.0)
     # In a blackout nothing is published, and what is shown grows old.
     assert age_parts_ms(three, 20.08)["display"] == pytest.approx(10_000.0, rel=0.01)
     assert "age of what is shown" not in markup.status(summary())

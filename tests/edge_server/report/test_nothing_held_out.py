@@ -107,3 +107,17 @@ def test_a_score_on_training_views_is_called_what_it_is(place, tmp_path, monkeyp
     selected, held_out = place(tmp_path / "a", SELECTED, *more), place(tmp_path / "b", "cam00", *more)
     assert NOTHING_HELD_OUT in selected and "present" not in selected.lower()
     assert NOTHING_HELD_OUT not in held_out
+
+
+def test_the_age_of_what_was_shown_is_told_without_a_held_out_camera(tmp_path):
+    folder = run_of(tmp_path, SELECTED)
+    (folder / "shown.jsonl").unlink()
+    lines = [json.loads(line) | {"network_ms": 50.0} for line in (folder / "series.jsonl").read_text().splitlines()]
+    (folder / "series.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    report, page = page_of(folder)
+    age = report["fidelity"]["shown"]["age_ms"]
+    # Updates of some 745 ms follow each other: an image is shown for 750, and counts as old as it is in the middle.
+    assert age["network"] == 50.0 and age["computing"] == pytest.approx(757, abs=20)
+    assert age["display"] == pytest.approx(375, abs=40)
+    assert "shown      age of 50 ms network" in summarize(folder)
+    assert "ms network" in page

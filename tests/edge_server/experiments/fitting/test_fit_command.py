@@ -50,6 +50,15 @@ def test_it_learns_goes_on_and_leaves_report_pictures_and_checkpoint(tmp_path, c
     assert "give more --seconds" in capsys.readouterr().err
 
 
+def test_a_fit_without_time_for_a_step_says_what_gives_it_time(tmp_path, capsys):
+    write_photos(tmp_path / "set", 9)
+    words = ["fit", str(tmp_path / "set"), "--out", str(tmp_path / "out"), "--scale", "2", "--seconds"]
+    assert edge_server([*words, "0.001"]) == 0
+    assert "no step of training within 0.001 s" in (printed := capsys.readouterr().out) and "--scale 4" in printed
+    assert edge_server([*words, "2", "--resume"]) == 0
+    assert "no step of training" not in capsys.readouterr().out
+
+
 def test_a_scene_of_ours_is_fitted_by_its_name(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["fit", "tower", *SMALL_WORDS, "--seconds", "1", "--scale", "4", "--frame", "6"]
