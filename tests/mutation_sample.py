@@ -76,6 +76,7 @@ _SPOKEN = ("print(", "log.", "__name__ ==")
 _SELECT = "not slow and not browser and not chaos"
 _LIMIT_S = 100.0  # processor seconds of one quick test, or a third of its wall-clock time: kernels may be compiled
 _COMPILING_S = 600.0  # with an edit of a kernel, or of a number in it
+_COLLECTING = "(collecting)"
 _ENOUGH_S, _ENOUGH_OF_ALL_S = 20.0, 40.0  # processor seconds of a group's tests, and of all: those of a far one wait
 Span = tuple[tuple[int, int], tuple[int, int]]
 
@@ -227,10 +228,11 @@ class _Watch:
         signal.setitimer(signal.ITIMER_REAL, 3 * self._limit_s)
 
 
-def failure(copy: Path, tests: Sequence[str], limit_s: float, passed_over: Sequence[str] = ()) -> str | None:
-    """The first test that fails in the copy or takes longer than the limit, in a fork that has all libraries."""
+def failure(copy: Path, tests: Sequence[str], limit_s: float, words: Sequence[str] = ()) -> str | None:
+    """The first test that fails in the copy or takes longer than the limit, in a fork that has all libraries. words:
+    further ones for pytest."""
     note = copy / "runs-now.txt"
-    note.write_text("(collecting)")
+    note.write_text(_COLLECTING)
     child = os.fork()
     if not child:
         os.setsid()
@@ -246,8 +248,7 @@ def failure(copy: Path, tests: Sequence[str], limit_s: float, passed_over: Seque
         for name in [name for name in sys.modules if name.partition(".")[0] in ours]:
             del sys.modules[name]
         options = ["-qx", "-m", _SELECT, "-p", "no:cacheprovider", "-p", "no:randomly"]
-        options += [f"--deselect={test}" for test in passed_over]
-        code = pytest.main([*options, *tests], plugins=[_Watch(note, limit_s)])
+        code = pytest.main([*options, *words, *tests], plugins=[_Watch(note, limit_s)])
         os._exit(0 if code in (0, 5) else 1)  # 5: none is quick
     code = os.waitpid(child, 0)[1]
     with contextlib.suppress(ProcessLookupError):
@@ -268,7 +269,8 @@ class Runner:
                 shutil.copy2(ROOT / name, copy / name)
         self._kernels = cache_folder(copy / "edge_server")
         self._fails = cache(lambda test: failure(self.copy, [test], _COMPILING_S) is not None)
-        self._compiled = cache(lambda tests: failure(self.copy, tests, _COMPILING_S, self._broken))
+        self._uncollected = cache(lambda tests: failure(self.copy, tests, _LIMIT_S, ["--collect-only"]) is not None)
+        self._compiled = cache(lambda tests: failure(self.copy, tests, _COMPILING_S, self._without()))
         self._broken: list[str] = []
 
     def outcome(self, edit: Edit) -> dict[str, Any]:
@@ -280,11 +282,17 @@ class Runner:
             if os.times().children_user - begun_s > _ENOUGH_OF_ALL_S:
                 break
             while found := self._failure(edit, tests):
-                if found == "(collecting)" or not self._fails(found):
+                fails = self._uncollected(tuple(tests)) if found == _COLLECTING else self._fails(found)
+                if not fails:
                     return {"caught_by": found, "broken": broken}
                 broken.append(found)
+                if found == _COLLECTING:
+                    break
                 self._broken.append(found)
         return {"caught_by": None, "broken": broken}
+
+    def _without(self) -> list[str]:
+        return [f"--deselect={test}" for test in self._broken]
 
     def _failure(self, edit: Edit, tests: list[str]) -> str | None:
         compiles = "/kernels/" in edit.file or ("/fields/" in edit.file and edit.file.endswith("settings.py"))
@@ -298,7 +306,7 @@ class Runner:
                 for module in _inlining(edit.file):
                     for kept in changed.rglob(f"{module}.*.nbi"):
                         kept.unlink()
-            return failure(self.copy, tests, _COMPILING_S if compiles else _LIMIT_S, self._broken)
+            return failure(self.copy, tests, _COMPILING_S if compiles else _LIMIT_S, self._without())
         finally:
             shutil.copy2(ROOT / edit.file, self.copy / edit.file)
             if changed != self._kernels:
