@@ -226,7 +226,10 @@ def _clock() -> str:
     longs = [ctypes.c_long.from_buffer(buffer, word * k).value for k in range(1, 5)]
     status = ctypes.c_int.from_buffer(buffer, word * 5).value
     if status & _UNSYNCHRONISED:
-        raise CheckFailed("the clock is not synchronized: install chrony, or timedatectl set-ntp true")
+        raise CheckFailed(
+            "the clock is not synchronized: install chrony, or timedatectl set-ntp true (not needed where one machine "
+            "runs everything)"
+        )
     return f"synchronized, off by {longs[2] / 1e3:.1f} ms at most"
 
 
