@@ -4,6 +4,7 @@ A pose T (camera to world) becomes G T C: C is of the camera (a hand-eye calibra
 the world, which nothing holds, and the rest are errors of single poses. For small corrections both follow from linear
 least squares. How well is told by leaving out one part of the path after the other (jackknife), since errors of
 neighboring poses are alike: what a camera has turned too little to tell C from G by comes out differently each time.
+Corrections of a short path are all alike, so that how much the camera has turned is asked, too.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ class ConstantCorrection:
     rotation_deg, shift_mm: (3,), rotation vector and shift in the camera's axes, from the given to the true camera.
     error_deg, error_mm: their standard errors, of all axes together.
     scatter_deg, scatter_mm: root mean square length of what is left of single poses.
+    told: whether the camera has turned enough, about two axes, to tell its own part from the world's.
     """
 
     rotation_deg: Array
@@ -35,6 +37,7 @@ class ConstantCorrection:
     error_mm: float
     scatter_deg: float
     scatter_mm: float
+    told: bool
 
     @property
     def cancels_m(self) -> float | None:
@@ -50,7 +53,7 @@ class ConstantCorrection:
     @property
     def sure(self) -> bool:
         """Whether a constant part is beyond doubt."""
-        if self.cancels_m is not None:
+        if not self.told or self.cancels_m is not None:
             return False
         turned, shifted = float(np.linalg.norm(self.rotation_deg)), float(np.linalg.norm(self.shift_mm))
         return turned > max(tuned.SURE * self.error_deg, tuned.STANDS_OUT * self.scatter_deg) or shifted > max(
@@ -64,6 +67,7 @@ class ConstantCorrection:
         single = f"single poses scatter by {self.scatter_deg:.2f} degrees and {self.scatter_mm:.1f} mm"
         if not self.sure:
             why = "" if self.cancels_m is None else f" (a turn and a shift that cancel {self.cancels_m:.1f} m ahead)"
+            why = why if self.told else " (the camera has turned too little to tell)"
             return f"corrections of poses have no sure part in common in the camera's axes{why}; {single}"
         return (
             f"corrections of poses have in common {turned:.2f} degrees (+- {self.error_deg:.2f}) about "
@@ -93,6 +97,7 @@ def constant_correction(given: Sequence[Array], corrected: Sequence[Array]) -> C
         1e3 * error_m,
         float(np.rad2deg(_length(left_rad))),
         1e3 * _length(left_m),
+        whole.told,
     )
 
 
@@ -122,6 +127,12 @@ class _Corrections:
         shifted = self.shifted - np.einsum("nij,nj->ni", self.local, np.cross(world, self.places))
         (shift, _), left_m = self._solved(shifted)
         return (camera, shift), (left_rad, left_m)
+
+    @property
+    def told(self) -> bool:
+        """Whether the camera has turned enough, about two axes, to tell its part from the world's."""
+        mean = self.local.mean(axis=0)  # I - mean mean^T: the normal matrix of c that is left beside g, a pose
+        return bool(np.linalg.eigvalsh(np.eye(3) - mean @ mean.T)[0] > tuned.TOLD)
 
     def _solved(self, found: Array) -> tuple[tuple[Array, Array], Array]:
         """The camera's and the world's part (3,) of ``found`` (N, 3), and the rest."""

@@ -28,6 +28,10 @@ SURE, STANDS_OUT = 2.0, 1.5
 # Distances at which a turn and a shift may undo each other, meters, and the share of the shift that may be left: drift
 # of 60 s and 270 s of `redkitchen` cancels 2.0 to 2.2 m ahead, and leaves .18 to .31.
 CANCELS_M, CANCELS = (0.3, 20.0), 0.5
+# Least variance of directions as the camera sees them, of all axes, from which on a correction of the camera is told
+# from one of the world: .1 are turns of 18 degrees to either side, about two axes. `redkitchen` after 8 s has .006,
+# and its corrections are split into 2.2 degrees of the camera and 1.5 back of the world.
+TOLD = 0.1
 COMMON_PRIOR = 0.01  # share of the largest singular value added for the camera: what is not told is left to the world
 
 # --- poses and appearances of fields that render rays ---

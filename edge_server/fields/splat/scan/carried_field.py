@@ -24,7 +24,7 @@ from edge_server.fields.splat.kernels.rasterize import EXPOSURE, Targets
 from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.discs import usable_depth
 from edge_server.fields.splat.scan.own_motion import OwnMotion, search
-from edge_server.fields.splat.scan.plausibility import moved_in, troubles
+from edge_server.fields.splat.scan.plausibility import moved_in, troubles, unturned
 from edge_server.fields.splat.scan.scan_field import ScanField, Shown, aim_of
 from edge_server.fields.splat.scan.sweep import sweep_depth
 from edge_server.fields.splat.scan.tracking import Alignment, Rendered, align, gray
@@ -122,6 +122,9 @@ class CarriedField(ScanField):
         box = self.view_store.box
         assert box is not None
         view = replace(given, camera=f"{given.camera}{SEPARATOR}{self._taken}", depth=usable_depth(given.depth))
+        last = self._seen.get(given.camera)
+        if last is not None and not self._measured:
+            self._own.compare_turns(given.camera, unturned(last, given))
         self._seen[given.camera] = given
         self._follow(view)
         shown = self._look(view)
@@ -312,7 +315,8 @@ class CarriedField(ScanField):
             located = self._own.troubles()
             poses = troubles(self._poses) if self._rigid is not None else []
             guessed = self._taken > tuned.BEGINS[-1] and not self._founded
-            unknown = [f"{camera}: {_NO_DEPTH}" for camera in self._seen] if guessed else []
+            blind = [camera for camera in self._seen if guessed and not self._own.has_no_rotation(camera)]
+            unknown = [f"{camera}: {_NO_DEPTH}" for camera in blind]
         return (*left_out, *located, *moving, *poses, *unknown)
 
     def _begin_anew(self) -> None:
@@ -321,8 +325,9 @@ class CarriedField(ScanField):
         that take the scene for farther than it is overshoot. Where none is found, the box stays."""
         swept = {view.camera: view for view in self._swept()}
         views, kept = [swept.get(v.camera, v) for v in self._views], {name: getattr(self, name) for name in _OF_CAMERAS}
-        due = self._due_before + self.step // tuned.STEPS_A_KEYFRAME
+        due, turns = self._due_before + self.step // tuned.STEPS_A_KEYFRAME, self._own.unturned
         self._begin(views)
+        self._own.unturned = turns
         for name, value in kept.items():
             setattr(self, name, value)
         self._due_before = due

@@ -17,7 +17,7 @@ from freshfield.geometry import se3, se3_inverse, so3_exp, so3_log
 
 Array = NDArray[np.float64]
 
-_COUNTS = ("doubts", "fits", "missed", "replaced")  # that a state keeps
+_COUNTS = ("doubts", "fits", "missed", "replaced", "unturned")  # that a state keeps
 
 UNITS = {"millimeters": 1000.0, "centimeters": 100.0, "inches": 39.37, "feet": 3.281, "kilometers": 0.001}
 
@@ -35,6 +35,7 @@ class OwnMotion:
         self.fits: dict[str, int] = {}  # keyframes in a row of a camera astray that fit near where it reports them
         self.missed: dict[str, int] = {}  # frames in a row of a camera astray that were not found
         self.replaced: dict[str, int] = {}
+        self.unturned: dict[str, int] = {}  # see ``compare_turns``
         self._reported_m: dict[str, Array] = {}  # position of a camera's newest view, (3,)
 
     def astray(self, camera: str) -> bool:
@@ -58,6 +59,15 @@ class OwnMotion:
         self.trust(camera)
         return True
 
+    def compare_turns(self, camera: str, contradicted: bool) -> None:
+        """Note whether a picture contradicts that its camera has not turned."""
+        count = self.unturned.get(camera, 0) + (1 if contradicted else -1)
+        self.unturned[camera] = min(max(count, 0), 2 * tuned.UNTURNED)
+
+    def has_no_rotation(self, camera: str) -> bool:
+        """Whether a camera turns while the rotation that it reports stays, as far as is known without depth."""
+        return self.unturned.get(camera, 0) >= tuned.UNTURNED
+
     def before(self, view: View, camera: str) -> list[PoseCorrection]:
         """Corrections of the newest keyframes of a view's camera that were taken before it, in the order of time."""
         newest = self._poses.newest(camera, tuned.JUDGED)
@@ -76,6 +86,9 @@ class OwnMotion:
         self.missed[camera] = 0
         self.replaced[camera] = self.replaced.get(camera, 0) + 1
         self.doubts[camera] = tuned.DOUBTS
+        before = self.before(view, camera)
+        if len(before) == 1 and before[0].reported is None:
+            before[0].reported, before[0].scale = before[0].given, scale  # for frames before the first keyframe
         return self._poses.place(view, pose, scale)
 
     def lost(self, view: View, camera: str, measured: bool) -> View | None:
@@ -97,6 +110,10 @@ class OwnMotion:
             f"{camera}: {count} reported poses do not fit its pictures and were replaced by what the pictures show"
             + misfit(self._poses.newest(camera, tuned.JUDGED))
             for camera, count in self.replaced.items()
+        ] + [
+            f"{camera}: reported poses have no rotation, but its pictures turn: look at how they are exported and read"
+            for camera in self.unturned
+            if self.has_no_rotation(camera)
         ]
 
     def meta(self) -> dict[str, Any]:

@@ -43,6 +43,30 @@ def moved_in(now: View, pose: Array, before: View, before_pose: Array) -> NDArra
     return cv2.resize(found, size, interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
+def unturned(before: View, now: View) -> bool:
+    """Whether two views of a camera are reported with the same rotation, and their pictures contradict that: most
+    corners do not move as the reported shift moves them, whatever their depth."""
+    turned = np.abs(now.camera_to_world[:3, :3] - before.camera_to_world[:3, :3]).max()
+    if turned > tuned.SAME_TURN or before.image.shape != now.image.shape:
+        return False
+    shift = now.camera_to_world[:3, :3].T @ (now.camera_to_world - before.camera_to_world)[:3, 3]
+    first, second = (cv2.cvtColor(np.ascontiguousarray(v.image[..., :3]), cv2.COLOR_RGB2GRAY) for v in (before, now))
+    corners = cv2.goodFeaturesToTrack(first, tuned.CORNERS, 0.01, tuned.CORNERS_APART_PX)
+    if corners is None or second.std() < 255.0 * tuned.BARE:
+        return False
+    found, known, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, np.zeros_like(corners))
+    here, there = (each[known.ravel() == 1].reshape(-1, 2).astype(np.float64) + 0.5 for each in (corners, found))
+    if len(here) < tuned.LEAST_CORNERS:
+        return False
+    rays, others = before.intrinsics.rays(here), now.intrinsics.rays(there)
+    at, flow = rays[:, :2] / rays[:, 2:], others[:, :2] / others[:, 2:] - rays[:, :2] / rays[:, 2:]
+    way = at * shift[2] - shift[:2]  # away from where the camera moves to, the farther the nearer a corner is
+    way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
+    beside = flow - np.maximum((flow * way).sum(axis=1, keepdims=True), 0.0) * way
+    moved_px, beside_px = (now.intrinsics.fx * np.median(np.linalg.norm(each, axis=1)) for each in (flow, beside))
+    return bool(beside_px > max(tuned.BESIDE_PX, tuned.BESIDE_SHARE * moved_px))
+
+
 def troubles(poses: PoseCorrections) -> list[str]:
     """What corrections of poses say that is wrong with them, a line each."""
     found = []

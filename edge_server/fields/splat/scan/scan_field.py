@@ -170,14 +170,23 @@ class ScanField(StillField):
     def _swept(self) -> list[View]:
         """Views with depth that others tell, see ``sweep_depth``: none where poses tell nothing. Also learns how far
         away is what cameras see. Poses are those given: a field without good depth refines them to fit its errors."""
-        box, views = self.view_store.box, self._views
+        box, some = self.view_store.box, _some(self._views, tuned.SWEPT_VIEWS)
         assert box is not None
-        some = _some(views, tuned.SWEPT_VIEWS)
-        depths = [usable_depth(sweep_depth(view, views, box.distance_m, self.pool)) for view in some]
-        found = [(view, depth) for view, depth in zip(some, depths) if depth is not None]
+        found: list[tuple[View, NDArray[np.float32]]] = []
+        for distance_m in (box.distance_m, self._distance_by_path()):
+            if not found and distance_m >= box.distance_m:
+                depths = [usable_depth(sweep_depth(view, self._views, distance_m, self.pool)) for view in some]
+                found = [(view, depth) for view, depth in zip(some, depths) if depth is not None]
         if found:
             self._seen_m = float(np.median([np.median(depth[depth > 0]) for _, depth in found]))
         return [replace(view, depth=depth) for view, depth in found]
+
+    def _distance_by_path(self) -> float:
+        """How far away what cameras see may be, by how far apart they are, whatever the unit of their poses: one camera
+        alone tells no distance, and a guess in meters is too near for poses in millimeters."""
+        places = np.stack([view.camera_to_world[:3, 3] for view in self._views])
+        spread = float(np.median(np.linalg.norm(places - places.mean(axis=0), axis=1)))
+        return spread / float(np.tan(np.deg2rad(tuned.SWEPT_ANGLES_DEG[1])))
 
     def _seeds_of(self, view: View, shown: Shown | None = None, nearer: bool = True) -> NDArray[np.float32]:
         """Gaussians where the field shows no surface.

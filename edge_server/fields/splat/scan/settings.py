@@ -95,6 +95,11 @@ LOST = 1  # frames in a row that are not found, after which one is taken where t
 DOUBTS = 2  # keyframes in a row for which another place fits better, from which on reports are not believed
 ASTRAY_FOR = 4  # keyframes from which on it is said why reported poses do not fit
 SAME_TURN, TURNED = 1e-6, 0.05  # of matrices' numbers: a tracker's noise is more; a camera that turns
+CORNERS, LEAST_CORNERS, CORNERS_APART_PX = 200, 8, 3  # of a picture, followed to the next keyframe
+# Median by which they move elsewhere than reported, pixels and share of the way. Keyframes of `redkitchen`, .3 s apart,
+# have a share of more than .2 in one of ten pairs once their turns are taken out, in three of four as they are.
+BESIDE_PX, BESIDE_SHARE = 1.0, 0.25
+UNTURNED = 6  # by so many pairs of keyframes contradict reported poses more than agree: then no rotation is said
 OTHER_UNIT = 2.5  # ratio of distances that is no error of single poses: feet in meters are 3.3
 UNIT_LOG = 0.45  # deviation of its logarithm, up to which it is that of two units
 FOLLOWED = 0.1  # share of pixels by which fewer may look as expected where reported motion leads than at best

@@ -17,8 +17,9 @@ from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.carried_field import CarriedField
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import look_at, so3_exp
+from tests.edge_server.fields.scenes import seen
 from tests.edge_server.fields.small import same_state
-from tests.edge_server.fields.splat.scan.walk import WALK, at, spoiled, walk
+from tests.edge_server.fields.splat.scan.walk import LENS, WALK, at, spoiled, walk
 
 HELD = 8  # one in so many frames is held out
 BAD_FROM = 40  # frame of a walk, four seconds after its begin
@@ -366,6 +367,39 @@ def test_poses_that_never_fit_give_way_to_pictures_where_depth_is_measured(spoil
     assert np.isfinite(field.cloud.params).all() and len(field.views) > 60
     assert (np.array(_undisturbed(True)) - found_db).max() < lost_db
     assert any("reported poses do not fit" in line and words in line for line in field.troubles)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("turns", [True, False])
+def test_without_depth_it_is_said_that_poses_have_no_rotation(turns: bool) -> None:
+    """A camera that slides along the scene without turning is not accused. In pictures of the walk, half as large, a
+    keyframe moves corners by less than a pixel."""
+    field, lens, views = _field(), LENS.scaled(2.0), []
+    for k in range(20):
+        pose = WALK[0].camera_to_world.copy()
+        pose[:3, 3] += (0.04 * k - 0.4) * pose[:3, 0]
+        if turns:
+            pose[:3, :3] = pose[:3, :3] @ so3_exp(np.deg2rad([6.0 * np.sin(0.5 * k), 12.0 * np.cos(0.5 * k), 0.0]))
+        reported = np.array([*WALK[0].camera_to_world.T[:3], pose.T[3]]).T
+        views.append(View("hand", seen(lens, pose)[0], reported, lens, 100_000_000 * k))
+    for view in views:
+        field.fit([view], Budget(steps=tuned.STEPS_A_KEYFRAME))
+    assert np.isfinite(field.cloud.params).all()
+    assert any("hand: reported poses have no rotation" in line for line in field.troubles) is turns
+    resumed = _field()
+    resumed.load_state(field.state())
+    assert resumed.troubles == field.troubles
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("scale", [1000.0, 10.0])
+def test_without_depth_any_unit_of_poses_is_as_good(scale: float) -> None:
+    """With a distance that was guessed in meters, poses in millimeters ended 10 dB lower."""
+    right = walk(depth=False)[:30]
+    views = [_in_unit(scale)(k, view) for k, view in enumerate(right)]
+    field = _played(views)
+    assert _db(field, views)[1] > _db(_played(right), right)[1] - 1.0
+    assert not any("tell no depth" in line or "hand-eye" in line for line in field.troubles)
 
 
 @pytest.mark.stability

@@ -11,7 +11,7 @@ import pytest
 from edge_server.fields import View
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
 from edge_server.fields.splat.scan import settings as tuned
-from edge_server.fields.splat.scan.plausibility import moved_in, troubles
+from edge_server.fields.splat.scan.plausibility import moved_in, troubles, unturned
 from edge_server.fields.splat.scan.tracking import Rendered, align, gray
 from freshfield.geometry import Pinhole, se3_inverse, so3_exp
 from tests.edge_server.fields.common.cameras.test_constant_correction import arm_poses
@@ -85,6 +85,31 @@ def test_what_has_come_is_told_from_what_was_not_seen_before() -> None:
     found = moved_in(replace(now, depth=depth), there, before, np.eye(4))
     assert found[45:75, 65:105].mean() > 0.95 and found[:30].mean() < 0.02
     assert not moved_in(now, there, replace(before, depth=depth), np.eye(4))[:, :40].any()
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    ("turn_deg", "shift_m", "reported_m", "contradicted"),
+    [
+        ([0.0, -8.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.0, 0.0], True),  # along the shift, but against its direction
+        ([4.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.0, 0.0], True),
+        ([0.0, 4.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], True),
+        ([0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.0, 0.0], False),  # it slides, whatever the unit of its poses
+        ([0.0, 0.0, 0.0], [0.0, -0.1, 0.05], [0.0, -100.0, 50.0], False),
+        ([0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.02, 0.0], False),  # as a tracker errs
+        ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], False),
+    ],
+)
+def test_pictures_contradict_poses_without_rotation_and_no_camera_that_slides(
+    turn_deg, shift_m, reported_m, contradicted: bool
+) -> None:
+    true, reported = np.eye(4), np.eye(4)
+    true[:3, :3], true[:3, 3], reported[:3, 3] = so3_exp(np.deg2rad(turn_deg)), shift_m, reported_m
+    images = [np.repeat((255 * _wall(pose)[0][..., None]).astype(np.uint8), 3, axis=2) for pose in (np.eye(4), true)]
+    before, now = (View("hand", each, pose, WALL) for each, pose in zip(images, (np.eye(4), reported)))
+    assert unturned(before, now) is contradicted
+    assert not unturned(before, replace(now, camera_to_world=true)) or not any(turn_deg), "it reports that it turns"
+    assert not unturned(before, replace(now, image=np.full_like(images[0], 90))), "nothing to follow"
 
 
 def test_late_and_drifting_poses_are_said() -> None:
