@@ -212,15 +212,17 @@ def test_only_what_the_pixels_of_a_png_need_is_inflated():
         decode(png(64, 48, rows=bytes(9263)), "png", 64, 48)
 
 
-def test_an_interlaced_png_is_decoded():
-    """5 x 3, gray: which columns and rows the seven passes of Adam7 have, written out."""
-    image = np.arange(15, dtype=np.uint8).reshape(3, 5) * 17
-    passes = [((0,), (0,)), ((4,), (0,)), ((), ()), ((2,), (0,)), ((0, 2, 4), (2,)), ((1, 3), (0, 2)), (range(5), (1,))]
-    rows = b"".join(b"\0" + bytes(image[y, x] for x in columns) for columns, lines in passes for y in lines)
-    back = decode(png(5, 3, 8, 0, rows, interlaced=1), "png", 5, 3)
+@pytest.mark.parametrize(("width", "height"), [(5, 3), (17, 25)])
+def test_an_interlaced_png_is_decoded(width, height):
+    """Gray: the seven passes of Adam7, written out."""
+    image = (np.arange(width * height) * 17 % 256).astype(np.uint8).reshape(height, width)
+    passes = [image[::8, ::8], image[::8, 4::8], image[4::8, ::4], image[::4, 2::4], image[2::4, ::2]]
+    passes += [image[::2, 1::2], image[1::2]]
+    rows = b"".join(b"\0" + row.tobytes() for each in passes if each.size for row in each)
+    back = decode(png(width, height, 8, 0, rows, interlaced=1), "png", width, height)
     np.testing.assert_array_equal(back, np.repeat(image[..., None], 3, axis=2))
     with pytest.raises(PayloadError, match="more than"):
-        decode(png(5, 3, 8, 0, rows + b"\0", interlaced=1), "png", 5, 3)
+        decode(png(width, height, 8, 0, rows + b"\0", interlaced=1), "png", width, height)
 
 
 @pytest.mark.parametrize("codec", ["jpeg", "png", "zstd"])
