@@ -130,7 +130,7 @@ class UpdateCounts(Struct):
 class Baseline(Struct, frozen=True):
     """PSNR of two baselines that need no field: a flat image in the mean color, and the nearest camera's own image."""
 
-    mean_colour_db: Number | None = None
+    mean_color_db: Number | None = None
     nearest_view_db: Number | None = None
 
 

@@ -63,7 +63,7 @@ def _fidelity(fidelity: dict[str, Any]) -> list[str]:
 
 
 def _baselines(baseline: dict[str, Any]) -> list[str]:
-    mean, nearest = (baseline.get(name) for name in ("mean_colour_db", "nearest_view_db"))
+    mean, nearest = (baseline.get(name) for name in ("mean_color_db", "nearest_view_db"))
     if mean is None and nearest is None:
         return []
     return [f"baselines  mean color {fmt(mean, '.1f')} dB, nearest view {fmt(nearest, '.1f')} dB"]

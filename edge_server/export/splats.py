@@ -78,7 +78,7 @@ def splat_table(gaussians: Gaussians, box: SceneBox) -> NDArray[np.void]:
     p, extra = gaussians.params.astype(np.float64), 3 * gaussians.sh_degree
     rest = p[:, BASE:].reshape(len(p), extra, 3) * SIGNS[:extra, None]
     columns = {
-        **_three("xyz", p[:, POSITION:SCALE] * box.radius_m + np.array(box.centre_m)),
+        **_three("xyz", p[:, POSITION:SCALE] * box.radius_m + np.array(box.center_m)),
         **_three(("nx", "ny", "nz"), np.zeros((len(p), 3))),
         **_three(("f_dc_0", "f_dc_1", "f_dc_2"), (p[:, COLOR:BASE] - 0.5) / Y0),
         # Channel by channel: all of red, then green, then blue.

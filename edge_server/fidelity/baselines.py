@@ -34,12 +34,12 @@ def baseline(views: Sequence[View], truth: NDArray, camera_to_world: ArrayLike, 
     if not views:
         return Baseline()
     return Baseline(
-        mean_colour_db=mean_colour_db([v.image for v in views], truth, background),
+        mean_color_db=mean_color_db([v.image for v in views], truth, background),
         nearest_view_db=view_db(nearest_view(views, camera_to_world).image, truth, background),
     )
 
 
-def mean_colour_db(images: Sequence[NDArray], truth: NDArray, background: Color = BLACK) -> float:
+def mean_color_db(images: Sequence[NDArray], truth: NDArray, background: Color = BLACK) -> float:
     """PSNR of a flat image in the mean color of the training images (each image weighs the same)."""
     mean = np.mean([to_unit(i, "training view", background).mean((0, 1)) for i in images], axis=0)
     return psnr_of_mse(float(((to_unit(truth, "truth", background) - mean) ** 2).mean()))

@@ -188,7 +188,7 @@ class EdgeServer:
             field_name=config.field,
             chosen=described(scenario, config, self._moving),
             troubles=lambda: self.updater.troubles,
-            flat_db=lambda: self.scoring.baselines.mean.mean_colour_db,
+            flat_db=lambda: self.scoring.baselines.mean.mean_color_db,
             so_far=lambda: self.scoring.so_far,
         )
         log.info("%s", self.state.chosen)

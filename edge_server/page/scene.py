@@ -178,7 +178,7 @@ class Scene:
         known = (len(poses), box is not None)
         if known > self._placed_for and complete and now - self._first_seen < SETTLE_S:
             self._placed_for = known
-            self._viewpoint = initial_viewpoint(np.stack(poses), None if box is None else box.centre_m)
+            self._viewpoint = initial_viewpoint(np.stack(poses), None if box is None else box.center_m)
             start, view = self._server.initial_camera, self._viewpoint
             self._server.scene.set_up_direction(view.up)
             start.position, start.look_at, start.up = view.position, view.look_at, view.up

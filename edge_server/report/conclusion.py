@@ -47,7 +47,7 @@ def _shown(report: Report) -> str:
         text += f" on {NOTHING_HELD_OUT}" if SELECTED in fidelity["scored_on"] else ""
         if found["psnr_moving_db"] is not None:
             text += f", {found['psnr_moving_db']:.1f} dB where the scene moves"
-    flat = fidelity["baseline"]["mean_colour_db"]
+    flat = fidelity["baseline"]["mean_color_db"]
     if flat is None:
         return f"{text}."
     if db < flat:
@@ -91,7 +91,7 @@ def _age(report: Report) -> str:
 def _limit(report: Report) -> str:
     """What limited the picture: the cameras where even what stands still is a blur, else the largest part of age."""
     fidelity = report["fidelity"]
-    shown, flat, so_far = fidelity["shown"], fidelity["baseline"]["mean_colour_db"], fidelity["so_far"]
+    shown, flat, so_far = fidelity["shown"], fidelity["baseline"]["mean_color_db"], fidelity["so_far"]
     # Where held-out cameras move, `shown` is scored at given poses, which may be wrong where the picture is not.
     still = shown["psnr_still_db"] if so_far is None else so_far["all_psnr_db"]
     lost = "; ".join(_delivery(report)).rstrip(".")

@@ -86,7 +86,7 @@ def _draw_so_far(report: Report, files: RunFiles, path: Path) -> bool:
 
 
 def _plot_baselines(axes: Axes, report: Report) -> None:
-    flat = {"nearest_view_db": "nearest view", "mean_colour_db": "mean color"}
+    flat = {"nearest_view_db": "nearest view", "mean_color_db": "mean color"}
     for (key, label), dash in zip(flat.items(), ("--", ":")):
         if (level := report["fidelity"]["baseline"].get(key)) is not None:
             axes.axhline(level, color=GRAY, linestyle=dash, linewidth=1.2, label=label)

@@ -70,9 +70,9 @@ def half_hemisphere(
     azimuths_deg: tuple[float, float] = (-90.0, 90.0),
     offset: float = 0.5,
 ) -> Candidates:
-    """``count`` viewpoints that cover a sector of a sphere evenly and look at its centre.
+    """``count`` viewpoints that cover a sector of a sphere evenly and look at its center.
 
-    target: (3,) centre of the sphere, meters. lens: intrinsics of the camera.
+    target: (3,) center of the sphere, meters. lens: intrinsics of the camera.
     elevations_deg, azimuths_deg: of the sector; azimuth 0 is on the target's -y side, 90 on its +x side.
     offset: shifts the azimuths, in parts of the sector: two sets of different offsets share no viewpoint.
 
@@ -104,8 +104,8 @@ def from_poses(poses: Sequence[ArrayLike], lens: Pinhole, target: ArrayLike | No
         raise ViewpointError("no candidate viewpoints: give at least one pose")
     if not np.isfinite(array).all():
         raise ViewpointError("a candidate's pose is not finite")
-    centre = _looked_at(array) if target is None else np.asarray(target, np.float64)
-    return Candidates(array, lens, centre, np.ones(len(array), bool))
+    center = _looked_at(array) if target is None else np.asarray(target, np.float64)
+    return Candidates(array, lens, center, np.ones(len(array), bool))
 
 
 def _looked_at(poses: Array) -> Array:

@@ -74,7 +74,7 @@ class Rows:
         for age, k in enumerate(reversed(order)):
             ages[k] = age * STEP_MS
         # What is not captured yet has the usual embedding, which is 0 once it is standardized.
-        seen = np.tile(self.layout.centre[len(GEOMETRY) :], (len(candidates), 1))
+        seen = np.tile(self.layout.center[len(GEOMETRY) :], (len(candidates), 1))
         if self.embeddings is not None and len(order):
             seen[list(order)] = self.embeddings[list(order)]
         both = np.column_stack([self.steps.actions(order), seen])
@@ -90,10 +90,10 @@ def layout_of(steps: StepFeatures, embeddings: Array | None, views: int, rng: np
         for t in range(1, views + 1)
     ]
     parts = [np.concatenate(some), *([] if embeddings is None else [embeddings])]
-    centre = np.concatenate([part.mean(axis=0) for part in parts])
+    center = np.concatenate([part.mean(axis=0) for part in parts])
     spread = np.concatenate([np.maximum(part.std(axis=0), 1e-3) for part in parts])
     return StateLayout(
-        dim=len(centre), age_scale_ms=STEP_MS, centre=tuple(centre.tolist()), spread=tuple(spread.tolist())
+        dim=len(center), age_scale_ms=STEP_MS, center=tuple(center.tolist()), spread=tuple(spread.tolist())
     )
 
 

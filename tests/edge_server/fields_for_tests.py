@@ -10,7 +10,7 @@ TINY = {
     "rays": 256,
     "batch_samples": 4096,
     "samples": 24,
-    "centre_m": [0.0, 0.0, 0.0],
+    "center_m": [0.0, 0.0, 0.0],
     "radius_m": 1.0,
 }
 

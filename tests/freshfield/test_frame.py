@@ -276,11 +276,11 @@ def test_a_lens_whose_rays_are_finite_but_wrong_is_refused():
 @settings(max_examples=300)
 @given(
     f=st.floats(4, 200),
-    centre=st.tuples(st.floats(-64, 128), st.floats(-48, 96)),
+    center=st.tuples(st.floats(-64, 128), st.floats(-48, 96)),
     k=st.tuples(*[st.one_of(st.floats(-0.1, 0.1), st.floats(-100, 100))] * 4),
 )
-def test_every_admitted_lens_has_rays(f, centre, k):
-    camera = Pinhole(64, 48, f, f, *centre, k)
+def test_every_admitted_lens_has_rays(f, center, k):
+    camera = Pinhole(64, 48, f, f, *center, k)
     try:
         admitted = sent_through(camera)
     except FrameRejected as error:

@@ -188,7 +188,7 @@ lenses = st.builds(
 
 @given(lenses, st.integers(0, 2**32))
 def test_projection_agrees_with_opencv(camera, seed):
-    """OpenCV counts pixel centres as whole numbers, we the image's corner as zero: half a pixel apart."""
+    """OpenCV counts pixel centers as whole numbers, we the image's corner as zero: half a pixel apart."""
     points = np.random.default_rng(seed).uniform([-1, -1, 2], [1, 1, 5], (20, 3))
     theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), *camera.opencv())
     np.testing.assert_allclose(camera.project(points), theirs[:, 0] + 0.5, atol=1e-6)

@@ -31,7 +31,7 @@ def problems(out: Path) -> list[str]:
         "every frame could be decoded": updates["undecodable"] == 0,
         "the held-out view was scored": fidelity["final"]["psnr_db"] is not None,
         "the field beats an image of the mean color": (fidelity["final"]["psnr_db"] or 0.0)
-        > (baseline["mean_colour_db"] or 0.0),
+        > (baseline["mean_color_db"] or 0.0),
         "every camera reported": all(age is not None for age in report["age_ms"]["by_camera"].values()),
     }
     return [f"not true: {what}" for what, holds in checks.items() if not holds]

@@ -82,7 +82,7 @@ def mean_baselines(training: Sequence[View], held_out: Sequence[View], color: Co
     the background."""
     masked = any(v.weight is not None for v in held_out)  # the baselines know no masks
     found = [] if masked else [baseline(training, v.image, v.camera_to_world, color) for v in held_out]
-    names = ("mean_colour_db", "nearest_view_db")
+    names = ("mean_color_db", "nearest_view_db")
     return {name: statistics.fmean(getattr(b, name) for b in found) if found else None for name in names}
 
 
@@ -91,7 +91,7 @@ def known_options(scene: Scene, nearest_m: float) -> dict[str, Any]:
     cameras."""
     low, high = scene.bounds
     return {
-        "centre_m": [float(c) for c in 0.5 * (low + high)],
+        "center_m": [float(c) for c in 0.5 * (low + high)],
         "radius_m": float(0.5 * (high - low).max()) + 0.01,
         "near_m": nearest_m,
         "contracted": False,

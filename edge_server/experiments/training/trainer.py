@@ -223,7 +223,7 @@ def _new_learner(setting: Setting, config: TrainingConfig, folders: Folders, job
     from edge_server.scheduler.learned.ppo import Learner
 
     spec = config.spec
-    if "semantics" in spec.layout.parts and not spec.layout.centre:
+    if "semantics" in spec.layout.parts and not spec.layout.center:
         work = partial(embeddings_seen, setting=setting, folders=folders)
         rows = Engine(jobs=jobs, ray=ray, threads=1, say=None).run(work, list(config.seeds(0)))
         seen = np.array([z for of in rows for z in of], np.float64).reshape(-1, spec.layout.dim)

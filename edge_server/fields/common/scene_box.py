@@ -29,7 +29,7 @@ PLAIN = 8  # of 255: a plain background varies by no more than this
 
 @dataclass(frozen=True)
 class SceneBox:
-    """Scene coordinates are (world - centre_m) / radius_m.
+    """Scene coordinates are (world - center_m) / radius_m.
 
     contracted: whether the scene goes on beyond the box.
     near_m: how near to a camera density may be.
@@ -37,7 +37,7 @@ class SceneBox:
     pixel_m: width of a pixel there, for most cameras.
     """
 
-    centre_m: tuple[float, float, float]
+    center_m: tuple[float, float, float]
     radius_m: float
     near_m: float
     contracted: bool
@@ -51,7 +51,7 @@ class SceneBox:
 
     def normalise(self, points_m: Array) -> Array:
         """World meters (..., 3) -> scene units."""
-        return (points_m - np.asarray(self.centre_m)) / self.radius_m
+        return (points_m - np.asarray(self.center_m)) / self.radius_m
 
 
 # The box of a field that has seen nothing yet.
@@ -60,7 +60,7 @@ UNIT_BOX = SceneBox((0.0, 0.0, 0.0), 1.0, 0.1, False, 1.0, 0.01)
 
 def scene_box(
     views: Sequence[View],
-    centre_m: tuple[float, float, float] | None = None,
+    center_m: tuple[float, float, float] | None = None,
     radius_m: float | None = None,
     near_m: float | None = None,
     contracted: bool | None = None,
@@ -74,28 +74,28 @@ def scene_box(
     poses = np.stack([v.camera_to_world for v in views])
     origins, axes = poses[:, :3, 3], poses[:, :3, 2]
     point = _meeting_point(origins, axes)
-    if centre_m is not None:
-        centre = np.asarray(centre_m, dtype=np.float64)
+    if center_m is not None:
+        center = np.asarray(center_m, dtype=np.float64)
     elif point is not None:
-        centre = point
+        center = point
     elif len(views) > 1 and np.linalg.norm(axes.mean(axis=0)) < 0.5:
-        centre = _main_group(origins).mean(axis=0)  # looking outwards
+        center = _main_group(origins).mean(axis=0)  # looking outwards
     else:
         # Nothing tells how far the scene is: a few times the group's own extent, or a room's width.
         group = _main_group(origins)
         spread = float(np.linalg.norm(group - group.mean(axis=0), axis=1).max())
-        centre = group.mean(axis=0) + axes.mean(axis=0) * (3.0 * spread if spread > 1e-3 else 3.0)
-    distance = float(np.median(np.linalg.norm(origins - centre, axis=1)))
+        center = group.mean(axis=0) + axes.mean(axis=0) * (3.0 * spread if spread > 1e-3 else 3.0)
+    distance = float(np.median(np.linalg.norm(origins - center, axis=1)))
     distance = distance if distance > 1e-6 else 1.0
     pixel = distance / float(np.median([v.intrinsics.fx for v in views]))
     if contracted is None:
         transparent = any(v.image.shape[2] == 4 for v in views)
         contracted = not transparent and plain_background(views) is None
     if radius_m is None:
-        radius_m = distance if contracted else _seen_radius(views, centre)
+        radius_m = distance if contracted else _seen_radius(views, center)
     if near_m is None:
         near_m = NEAR_SHARE * distance if contracted else max(0.05 * distance, distance - 1.8 * radius_m)
-    x, y, z = map(float, centre)
+    x, y, z = map(float, center)
     return SceneBox((x, y, z), float(radius_m), float(near_m), contracted, distance, pixel)
 
 
@@ -181,12 +181,12 @@ def plain_background(views: Sequence[View]) -> NDArray[np.float32] | None:
     return (color / 255.0).astype(np.float32) if np.percentile(plain, 20) >= 0.6 else None
 
 
-def _seen_radius(views: Sequence[View], centre: Array) -> float:
-    """Radius in meters of the ball around ``centre`` that nine of ten cameras see whole."""
+def _seen_radius(views: Sequence[View], center: Array) -> float:
+    """Radius in meters of the ball around ``center`` that nine of ten cameras see whole."""
     radii = []
     for view in views:
         camera = view.intrinsics
         half = min(0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
-        distance = np.linalg.norm(view.camera_to_world[:3, 3] - centre)
+        distance = np.linalg.norm(view.camera_to_world[:3, 3] - center)
         radii.append(distance * half / np.hypot(1.0, half))
     return max(float(np.percentile(radii, 10)), 1e-6)

@@ -29,7 +29,7 @@ class FieldSettings(Settings, frozen=True):
 
     name: ClassVar[str]
 
-    centre_m: Annotated[
+    center_m: Annotated[
         tuple[float, float, float] | None,
         about("center of the scene's box, x y z in meters; None: found from the cameras"),
     ] = None

@@ -65,7 +65,7 @@ class ViewStore:
         if self.box is None or self._box_cameras < min(len(self.memory), FINAL_BOX_CAMERAS):
             # Two or three cameras say little about where the scene is: find it anew when there are more.
             s = self.settings
-            box = scene_box(self.views, s.centre_m, s.radius_m, s.near_m, s.contracted)
+            box = scene_box(self.views, s.center_m, s.radius_m, s.near_m, s.contracted)
             if self.box is None or not _similar(box, self.box):
                 self.box, box_changed = box, True
             self._box_cameras = len(self.memory)
@@ -121,7 +121,7 @@ class ViewStore:
         self._box_cameras = int(meta["box_cameras"])
         self.background_is_plain = bool(meta.get("plain", False))
         box = meta["box"]
-        self.box = SceneBox(**{**box, "centre_m": tuple(box["centre_m"])}) if box else None
+        self.box = SceneBox(**{**box, "center_m": tuple(box["center_m"])}) if box else None
         if self.box is not None:
             _check_box(self.box)
         self.auto_background = np.array(arrays["behind"], dtype=np.float32)
@@ -161,10 +161,10 @@ def _find_background(views: Sequence[View]) -> tuple[NDArray[np.float32], bool]:
 def _check_box(box: SceneBox) -> None:
     """ValueError for a box that ``scene_box`` never makes."""
     lengths = (box.radius_m, box.distance_m, box.pixel_m)
-    if not np.isfinite([*box.centre_m, *lengths, box.near_m]).all() or min(lengths) <= 0 or box.near_m < 0:
+    if not np.isfinite([*box.center_m, *lengths, box.near_m]).all() or min(lengths) <= 0 or box.near_m < 0:
         raise ValueError(f"the state's scene box is none: {box}")
 
 
 def _similar(a: SceneBox, b: SceneBox) -> bool:
-    apart = float(np.linalg.norm(np.subtract(a.centre_m, b.centre_m)))
+    apart = float(np.linalg.norm(np.subtract(a.center_m, b.center_m)))
     return apart < 0.1 * b.radius_m and abs(a.radius_m - b.radius_m) < 0.1 * b.radius_m

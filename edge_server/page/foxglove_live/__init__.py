@@ -258,7 +258,7 @@ def point_cloud(field: Snapshot) -> NDArray[np.void] | None:
     chosen = np.argsort(-weight, kind="stable")[: min(MOST_POINTS, int((weight > 0).sum()))]
     kinds = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue", "alpha")]
     points = np.zeros(len(chosen), kinds)
-    at = params[chosen, POSITION:SCALE] * field.box.radius_m + np.asarray(field.box.centre_m)
+    at = params[chosen, POSITION:SCALE] * field.box.radius_m + np.asarray(field.box.center_m)
     color = np.rint(255 * np.clip(params[chosen, COLOR:BASE], 0, 1))
     for k in range(3):
         points["xyz"[k]], points[("red", "green", "blue")[k]] = at[:, k], color[:, k]

@@ -86,7 +86,7 @@ class Publisher:
         if snapshot is self._snapshot and before is not None and static is before.static:
             return self._newest
         red, green, blue = map(float, snapshot.background)
-        scene = SceneBlock(self._fields, box.centre_m, box.radius_m, box.near_m / box.radius_m, (red, green, blue))
+        scene = SceneBlock(self._fields, box.center_m, box.radius_m, box.near_m / box.radius_m, (red, green, blue))
         records, knots = (None, None) if moving is None else self._moving(moving)
         serial = 0 if self._newest is None else self._newest.serial + 1
         self._snapshot = snapshot
@@ -116,7 +116,7 @@ class Publisher:
         unseen = before.unseen if before is not None and same else None
         if surfaces is not None and unseen is None and layered is not None:
             box = layered.box
-            unseen = surfaces.unseen_points(params[:, :3] * box.radius_m + np.asarray(box.centre_m))
+            unseen = surfaces.unseen_points(params[:, :3] * box.radius_m + np.asarray(box.center_m))
         records = to_records(params, scales)
         made = StaticRecords(self._sets, self._versions, scales, records, weights(params), unseen)
         self._static_due_s = now_s + max(STATIC_EVERY_S, _BUSY * (perf_counter() - began))

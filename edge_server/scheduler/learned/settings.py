@@ -91,7 +91,7 @@ class Spec:
                 if values.pop(name, only) != only:
                     raise ValueError(f"{name}: only {only} is read; train another policy")
             layout = dict(values.pop("layout"))
-            for name in ("parts", "centre", "spread"):
+            for name in ("parts", "center", "spread"):
                 layout[name] = tuple(layout[name])
             values["omegas_ms"] = tuple(values["omegas_ms"])
             return Spec(layout=StateLayout(**layout), **values)

@@ -72,7 +72,7 @@ class StateLayout:
     age_scale_ms: ages enter as log(1 + age / scale): fine where ages differ by a frame, coarse for very old
     ones.
     oldest_ms: ages are clipped to it.
-    centre, spread: (d,) mean and standard deviation of embeddings, from ``standardized``; empty: used
+    center, spread: (d,) mean and standard deviation of embeddings, from ``standardized``; empty: used
     unscaled.
     embedding: name of the embedder the policy was trained with; empty: not said.
     """
@@ -81,7 +81,7 @@ class StateLayout:
     dim: int = 0
     age_scale_ms: float = 100.0
     oldest_ms: float = 60_000.0
-    centre: tuple[float, ...] = ()
+    center: tuple[float, ...] = ()
     spread: tuple[float, ...] = ()
     embedding: str = ""
 
@@ -95,10 +95,10 @@ class StateLayout:
             raise ValueError(f"state: dim {self.dim} with parts {', '.join(self.parts)}: semantics has a dim")
         if not (0 < self.age_scale_ms < np.inf and 0 < self.oldest_ms < np.inf):
             raise ValueError("state: age_scale_ms and oldest_ms must be positive and finite")
-        if not len(self.centre) == len(self.spread) in (0, self.dim):
-            raise ValueError(f"state: centre and spread of embeddings must have {self.dim} values, or none")
-        if not (np.isfinite(self.centre).all() and all(0.0 < s < np.inf for s in self.spread)):
-            raise ValueError("state: centre of embeddings must be finite, spread positive and finite")
+        if not len(self.center) == len(self.spread) in (0, self.dim):
+            raise ValueError(f"state: center and spread of embeddings must have {self.dim} values, or none")
+        if not (np.isfinite(self.center).all() and all(0.0 < s < np.inf for s in self.spread)):
+            raise ValueError("state: center of embeddings must be finite, spread positive and finite")
 
     @property
     def columns(self) -> dict[str, slice]:
@@ -142,7 +142,7 @@ class StateLayout:
         if len(rows) < 2:
             return self
         spread = np.maximum(rows.std(axis=0), _MIN_SPREAD * max(1.0, float(np.abs(rows).max())))
-        return replace(self, centre=tuple(rows.mean(axis=0).tolist()), spread=tuple(spread.tolist()))
+        return replace(self, center=tuple(rows.mean(axis=0).tolist()), spread=tuple(spread.tolist()))
 
     def _age(self, state: State) -> NDArray[np.float64]:
         # A camera whose clock is ahead has age 0. NaN rows are masked by the caller.
@@ -161,8 +161,8 @@ class StateLayout:
         z = state.embeddings.astype(np.float64)
         unknown = ~np.isfinite(z).all(axis=1)
         z[unknown] = 0.0
-        if self.centre:
-            z = (z - np.array(self.centre)) / np.array(self.spread)
+        if self.center:
+            z = (z - np.array(self.center)) / np.array(self.spread)
             z[unknown] = 0.0
         # A whole embedding initially weighs as much as one other feature; otherwise its d features drown the
         # age.

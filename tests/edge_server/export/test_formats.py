@@ -178,7 +178,7 @@ def test_a_saved_stream_becomes_a_sequence_of_what_a_visitor_saw(tmp_path, capsy
     assert sorted(path.name for path in out.parent.iterdir()) == [f"room-{k:04d}.ply" for k in range(5)]
     for k in (0, 3):
         got = read_floats(out.with_stem(f"room-{k:04d}"))
-        moved = shown.moving.params_at(k / 30)[:, :3] * BOX.radius_m + np.array(BOX.centre_m)
+        moved = shown.moving.params_at(k / 30)[:, :3] * BOX.radius_m + np.array(BOX.center_m)
         got_places = np.stack([got[n] for n in "xyz"], axis=-1)[700:]
         assert np.linalg.norm(got_places[:, None] - moved, axis=-1).min(axis=0).max() < 2e-3  # meters; order is another
 

@@ -111,7 +111,7 @@ def test_constant_black_and_saturated_pictures(name: str, value: int, channels: 
 
 @every_field
 def test_cameras_that_miss_the_box_turn_from_it_or_stand_inside(name: str) -> None:
-    field = tiny(name, centre_m=(50.0, 0.0, 0.0), radius_m=0.5, contracted=False)
+    field = tiny(name, center_m=(50.0, 0.0, 0.0), radius_m=0.5, contracted=False)
     report = field.fit(VIEWS, Budget(steps=20))
     assert report.steps == 20 and report.rays > 0
     assert report.samples == 0 or name == "splat"  # which has no samples along rays

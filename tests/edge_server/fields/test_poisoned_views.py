@@ -154,6 +154,6 @@ def test_a_picture_repeated_is_not_a_scene_in_motion(name: str) -> None:
 def test_the_box_is_not_moved_by_one_wrong_pose(poison: Poison) -> None:
     wrong = [poison(v, 0) if k == BAD else v for k, v in enumerate(SEEN)]
     box, expected = scene_box(wrong), scene_box(SEEN)
-    assert np.linalg.norm(np.subtract(box.centre_m, expected.centre_m)) < 0.06 * expected.distance_m
+    assert np.linalg.norm(np.subtract(box.center_m, expected.center_m)) < 0.06 * expected.distance_m
     assert box.radius_m == pytest.approx(expected.radius_m, rel=0.1)
     assert box.near_m == pytest.approx(expected.near_m, rel=0.1) and box.contracted == expected.contracted

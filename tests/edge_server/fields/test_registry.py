@@ -18,7 +18,7 @@ from tests.edge_server.fields.small import CLASSES, every_field
 @pytest.mark.parametrize(
     ("name", "options", "expected"),
     [
-        ("ngp", {"levels": 3, "centre_m": [1, 2, 3]}, {"levels": 3, "centre_m": (1.0, 2.0, 3.0)}),
+        ("ngp", {"levels": 3, "center_m": [1, 2, 3]}, {"levels": 3, "center_m": (1.0, 2.0, 3.0)}),
         ("ngp", {"changed_share": 1e-3, "radius_m": None}, {"changed_share": 1e-3, "radius_m": None}),
         ("nerfacto", {"samples": 40, "appearance": 4}, {"samples": 40, "appearance": 4}),
         ("tensorf", {"resolution": 99}, {"resolution": 99}),
@@ -41,7 +41,7 @@ REFUSED: list[tuple[str, Any, str]] = [
     ("near_m", 0.0, "a number, more than 0"),
     ("background", 3, "text"),
     ("background", "pink", "#80c0ff"),
-    ("centre_m", [1, 2], "a list of 3"),
+    ("center_m", [1, 2], "a list of 3"),
     ("threads", 0, "1 to 1024"),
     ("nice", 20, "0 to 19"),
     ("rays", 0, "1 to 1048576"),

@@ -138,7 +138,7 @@ def test_one_camera_is_first_seen_from_before_it_and_then_from_where_the_fields_
     np.testing.assert_array_equal(server.scene.add_camera_frustum.return_value.image, thumbnail(seen))
     ahead = scene._viewpoint.look_at - seen.pose.translation_m
     assert np.allclose(ahead, np.linalg.norm(ahead) * seen.pose.matrix()[:3, 2])
-    state.publish(publication(0), SimpleNamespace(box=replace(UNIT_BOX, centre_m=(0.5, 0.0, 0.25))))
+    state.publish(publication(0), SimpleNamespace(box=replace(UNIT_BOX, center_m=(0.5, 0.0, 0.25))))
     scene.refresh(state.cameras(), watched=True)
     assert server.initial_camera.look_at.tolist() == [0.5, 0.0, 0.25]
 

@@ -53,7 +53,7 @@ def test_three_sentences_say_what_was_shown_its_age_and_its_limit(tmp_path: Path
     [
         ({"updates.count": 0}, 0, "Nothing was shown: the field was never updated."),
         ({"fidelity.shown.psnr_db": 12.0}, 0, "worse than an image of one mean color, which reads 14.5 dB."),
-        ({"fidelity.baseline.mean_colour_db": None}, 0, "17.0 dB where the scene moves."),
+        ({"fidelity.baseline.mean_color_db": None}, 0, "17.0 dB where the scene moves."),
         ({"fidelity.shown.psnr_db": None, "fidelity.final.psnr_db": None}, 0, "is not known"),
         ({"fidelity.so_far": {"now_psnr_db": 20.0, "all_psnr_db": 23.0, "frames": 9}}, 0, "all 9 so far 23.0 dB"),
         ({"fidelity.shown.age_ms.waiting": 0.0}, 2, "Waiting for an update and computing it were the limit"),

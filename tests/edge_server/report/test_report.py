@@ -39,7 +39,7 @@ def test_report_json_holds_what_is_returned_and_every_documented_key(run):
     assert report["policy"] == {"name": "threshold", "value": 120.0} and report["kind"] == "live"
     assert set(report["age_ms"]) == {"mean", "p50", "p95", "by_camera"}
     assert set(report["fidelity"]["final"]) == set(report["fidelity"]["mean"]) == set(METRICS)
-    assert report["fidelity"]["baseline"] == {"mean_colour_db": 14.5, "nearest_view_db": 13.8}
+    assert report["fidelity"]["baseline"] == {"mean_color_db": 14.5, "nearest_view_db": 13.8}
     assert all(tuple(row) == SERIES for row in report["fidelity"]["series"])
     assert report["channel"] == CHANNEL
     words = ("network set: 400 ms, 20 % lost", "the scenario's network again")

@@ -88,13 +88,13 @@ class CarriedField(ScanField):
         box, depths = self.view_store.box, [usable_depth(view.depth) for view in views]
         assert box is not None
         measured = [(view, float(np.median(z[z > 0]))) for view, z in zip(views, depths) if z is not None]
-        if measured and self.settings.centre_m is None:
+        if measured and self.settings.center_m is None:
             distance_m = float(np.median([z for _, z in measured]))
             ahead = [v.camera_to_world[:3, 3] + v.camera_to_world[:3, 2] * distance_m for v, _ in measured]
             x, y, z = map(float, np.mean(ahead, axis=0))
             lens = measured[0][0].intrinsics
             box = replace(
-                box, centre_m=(x, y, z), radius_m=distance_m, distance_m=distance_m, pixel_m=distance_m / lens.fx
+                box, center_m=(x, y, z), radius_m=distance_m, distance_m=distance_m, pixel_m=distance_m / lens.fx
             )
             self.view_store.box = box
         self.view_store.forget_views()

@@ -37,7 +37,7 @@ class Taken:
 
     @property
     def k(self) -> np.ndarray:
-        """OpenCV's: pixel centres are whole numbers."""
+        """OpenCV's: pixel centers are whole numbers."""
         lens = self.lens
         return np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
 

@@ -1,4 +1,4 @@
-"""Videos with a calibration: real files, exact frames, poses and pixel centres."""
+"""Videos with a calibration: real files, exact frames, poses and pixel centers."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def shade(shot) -> int:
     return round((float(shot.image.mean()) - 13) / 6)
 
 
-def test_pixel_centres_gain_a_half_and_poses_are_inverted(tmp_path):
+def test_pixel_centers_gain_a_half_and_poses_are_inverted(tmp_path):
     rig = load_calibration(write_rig(tmp_path))
     camera = rig["cam01"]
     assert (camera.intrinsics.cx, camera.intrinsics.cy) == (32.0, 24.0)

@@ -40,7 +40,7 @@ def test_it_learns_goes_on_and_leaves_report_pictures_and_checkpoint(tmp_path, c
     series = report["fidelity"]["series"]
     assert series[: len(before)] == before
     assert before[-1]["t_s"] < series[-1]["t_s"] == pytest.approx(2.5, rel=0.2)
-    assert series[-1]["psnr_db"] > report["fidelity"]["baseline"]["mean_colour_db"] + 1.0
+    assert series[-1]["psnr_db"] > report["fidelity"]["baseline"]["mean_color_db"] + 1.0
     for name in ("report.html", "truth.png", "rendered.png", "figure-comparison.png", "figure-fidelity.png"):
         assert (out / name).stat().st_size > 100, name
     state, about = checkpoint.load(out / "field")

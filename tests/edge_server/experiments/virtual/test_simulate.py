@@ -65,7 +65,7 @@ def test_the_charge_is_the_scenarios_or_the_commands(tmp_path: Path, capsys):
     assert run(path, capsys, "--policy", "wait-flush:60")["policy"] == "wait-flush"
 
 
-def test_what_a_learnt_policy_decided_can_be_explained_as_of_a_live_run(tmp_path: Path, capsys):
+def test_what_a_learned_policy_decided_can_be_explained_as_of_a_live_run(tmp_path: Path, capsys):
     Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), 1).save(tmp_path / "policy.npz")
     out, file = tmp_path / "out", write(tmp_path)
     words = ["--seconds", "1.5", "--out", str(out), "--policy", f"bandit:{tmp_path / 'policy.npz'}"]

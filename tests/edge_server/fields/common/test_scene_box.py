@@ -19,7 +19,7 @@ VIEWS = [replace(view, image=image) for view, image in zip(RING, NOISE)]  # surr
 
 def test_the_box_is_where_the_axes_meet() -> None:
     box = scene_box(VIEWS)
-    np.testing.assert_allclose(box.centre_m, [0, 0, 0.4], atol=1e-6)
+    np.testing.assert_allclose(box.center_m, [0, 0, 0.4], atol=1e-6)
     assert box.contracted and 2.0 < box.radius_m < 3.2
     # Nothing is nearer to a lens than two fifths of the way: haze there would fit any picture.
     assert box.near_m == pytest.approx(0.4 * box.distance_m)
@@ -36,7 +36,7 @@ def test_it_moves_and_scales_with_the_rig() -> None:
         grown.append(replace(view, camera_to_world=pose))
     a, b = scene_box(VIEWS), scene_box(grown)
     assert b.radius_m == pytest.approx(100 * a.radius_m) and b.near_m == pytest.approx(100 * a.near_m)
-    np.testing.assert_allclose(b.centre_m, 100 * np.array(a.centre_m) + [5, 6, 7], atol=1e-6)
+    np.testing.assert_allclose(b.center_m, 100 * np.array(a.center_m) + [5, 6, 7], atol=1e-6)
 
 
 def test_axes_that_meet_less_than_a_meter_ahead_meet() -> None:
@@ -67,19 +67,19 @@ def test_a_plain_background_shows_an_object_too() -> None:
 
 def test_what_is_given_is_kept() -> None:
     box = scene_box(VIEWS, (1.0, 2.0, 3.0), 4.0, 0.5, False)
-    assert (box.centre_m, box.radius_m, box.near_m, box.contracted) == ((1.0, 2.0, 3.0), 4.0, 0.5, False)
+    assert (box.center_m, box.radius_m, box.near_m, box.contracted) == ((1.0, 2.0, 3.0), 4.0, 0.5, False)
 
 
 def test_parallel_outward_and_single_cameras_have_a_box_too() -> None:
     pose = VIEWS[0].camera_to_world
     assert converging_point(np.zeros((2, 3)), np.array([[0, 0, 1.0], [0, 0, 1.0]])) is None
     one = scene_box(VIEWS[:1])
-    ahead = (np.array(one.centre_m) - pose[:3, 3]) @ pose[:3, 2]
+    ahead = (np.array(one.center_m) - pose[:3, 3]) @ pose[:3, 2]
     assert ahead > 1.0
     eyes = [v.camera_to_world[:3, 3] for v in VIEWS]
     outward = [replace(v, camera_to_world=look_at(eye, 2 * eye)) for v, eye in zip(VIEWS, eyes)]
     box = scene_box(outward)
-    assert np.linalg.norm(np.array(box.centre_m)[:2]) < 0.2 and np.isfinite(box.radius_m)
+    assert np.linalg.norm(np.array(box.center_m)[:2]) < 0.2 and np.isfinite(box.radius_m)
     same = [replace(VIEWS[0], camera=str(k)) for k in range(5)]
     assert np.isfinite(scene_box(same).radius_m) and scene_box(same).radius_m > 0
 
@@ -97,7 +97,7 @@ def test_a_camera_that_is_far_away_does_not_move_the_box(scene: str, off_m: floa
             pose = view.camera_to_world.copy()
             pose[:3, 3] += off_m * direction
             box = scene_box([*views[:k], replace(view, camera_to_world=pose), *views[k + 1 :]])
-            moved_m = np.linalg.norm(np.subtract(box.centre_m, expected.centre_m))
+            moved_m = np.linalg.norm(np.subtract(box.center_m, expected.center_m))
             assert moved_m < 0.15 * expected.radius_m and box.contracted == expected.contracted
             assert box.radius_m == pytest.approx(expected.radius_m, rel=0.2)
 
@@ -115,4 +115,4 @@ def test_where_many_cameras_disagree_all_are_heard() -> None:
     axes = np.stack([v.camera_to_world[:3, 2] for v in poses])
     expected = converging_point(origins, axes)
     assert expected is not None
-    np.testing.assert_allclose(np.array(scene_box(poses).centre_m), expected)
+    np.testing.assert_allclose(np.array(scene_box(poses).center_m), expected)

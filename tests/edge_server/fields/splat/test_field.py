@@ -65,7 +65,7 @@ def test_where_something_moved_only_cells_that_most_cameras_see_move_are_scored(
         places = np.where(far > 1.0, places / ((2.0 - far) * far), places)
     seen, unmarked = np.zeros(len(places), int), np.zeros(len(places), int)
     for k, view in enumerate(SEEN):
-        away = places * box.radius_m + box.centre_m - view.camera_to_world[:3, 3]
+        away = places * box.radius_m + box.center_m - view.camera_to_world[:3, 3]
         local = away @ view.camera_to_world[:3, :3]
         ahead = local[:, 2] > max(0.01 * box.radius_m, box.near_m)
         u, v = np.where(ahead[:, None], view.intrinsics.project(np.where(ahead[:, None], local, 1.0)), -1.0).T

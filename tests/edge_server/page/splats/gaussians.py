@@ -18,7 +18,7 @@ from freshfield.geometry import Pinhole, look_at
 BOX = SceneBox((0.5, -0.2, 1.0), 2.0, 0.2, True, 3.0, 0.01)
 BACKGROUND = np.array([0.2, 0.3, 0.4], np.float32)
 LENS = Pinhole.from_fov(160, 120, 60.0)
-POSE = look_at((0.5, -5.0, 2.2), BOX.centre_m)
+POSE = look_at((0.5, -5.0, 2.2), BOX.center_m)
 NEWEST_S = 10.0
 ORIGIN_NS = 7_000_000_000
 

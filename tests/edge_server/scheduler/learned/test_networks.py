@@ -84,7 +84,7 @@ def test_what_cannot_be_learned_is_refused(words, says):
 def test_a_specification_survives_json():
     import json
 
-    layout = StateLayout(("age", "semantics"), dim=2, centre=(0.1, 0.2), spread=(1.0, 3.0))
+    layout = StateLayout(("age", "semantics"), dim=2, center=(0.1, 0.2), spread=(1.0, 3.0))
     spec = Spec("threshold", layout, OMEGAS_MS, learning_rate=1e-4)
     assert Spec.from_json(json.loads(json.dumps(spec.as_json()))) == spec
     assert Spec.from_json({**spec.as_json(), "network": "pooled", "cameras": None, "start": 0.5}) == spec

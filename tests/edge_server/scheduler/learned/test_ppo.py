@@ -46,7 +46,7 @@ def test_omegas_are_learned_in_512_decisions(seed):
 
 
 def test_a_batch_of_one_decision_learns_against_the_value():
-    """Algorithms 1 and 2 update after every slot: centred by its batch, an advantage would be zero."""
+    """Algorithms 1 and 2 update after every slot: centered by its batch, an advantage would be zero."""
     learner = Learner(Spec("wait", Waits().layout, OMEGAS_MS), 0)
     teach(learner, Waits(), 1)
     for better in (1.0, -1.0):
@@ -145,8 +145,8 @@ WRONG = {
     "hidden is no whole number": {"hidden": 64.0},
     "hidden is text": {"hidden": "64"},
     "minibatch is no whole number": {"minibatch": 1.5},
-    "spread is zero": {"layout": {"parts": ["semantics"], "dim": 1, "centre": [0.0], "spread": [0.0]}},
-    "centre is infinite": {"layout": {"parts": ["semantics"], "dim": 1, "centre": [np.inf], "spread": [1.0]}},
+    "spread is zero": {"layout": {"parts": ["semantics"], "dim": 1, "center": [0.0], "spread": [0.0]}},
+    "center is infinite": {"layout": {"parts": ["semantics"], "dim": 1, "center": [np.inf], "spread": [1.0]}},
 }
 
 

@@ -71,7 +71,7 @@ def test_a_batch_pads_with_cameras_that_never_reported():
         ({"parts": ("age",), "dim": 4}, "dim 4"),
         ({"parts": ("semantics",)}, "dim 0"),
         ({"parts": ("age",), "age_scale_ms": 0.0}, "positive"),
-        ({"parts": ("semantics",), "dim": 2, "centre": (0.0,), "spread": (1.0,)}, "2 values"),
+        ({"parts": ("semantics",), "dim": 2, "center": (0.0,), "spread": (1.0,)}, "2 values"),
     ],
 )
 def test_a_wrong_layout_is_refused_by_name(values, says):

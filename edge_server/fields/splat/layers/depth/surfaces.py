@@ -156,4 +156,4 @@ class SurfaceScene:
 
 def _rows(poses: Sequence[Array], lenses: Sequence[Pinhole], center: Array) -> NDArray[np.float32]:
     x, y, z = map(float, center)
-    return camera_rows(poses, lenses, replace(UNIT_BOX, centre_m=(x, y, z)))
+    return camera_rows(poses, lenses, replace(UNIT_BOX, center_m=(x, y, z)))

@@ -30,8 +30,8 @@ def field() -> NgpField:
     return fitted()
 
 
-def _centres(cells: int, contracted: bool) -> tuple[NDArray, NDArray]:
-    """Scene points (cells^3, 3), x fastest, of a grid's centres and by how much space is contracted there."""
+def _centers(cells: int, contracted: bool) -> tuple[NDArray, NDArray]:
+    """Scene points (cells^3, 3), x fastest, of a grid's centers and by how much space is contracted there."""
     side = (np.arange(cells) + 0.5) / cells * 2.0 - 1.0
     k, j, i = np.meshgrid(side, side, side, indexing="ij")
     inside = np.stack([i, j, k], axis=-1).reshape(-1, 3) * (2.0 if contracted else 1.0)
@@ -42,8 +42,8 @@ def _centres(cells: int, contracted: bool) -> tuple[NDArray, NDArray]:
 
 
 @pytest.mark.parametrize("contracted", [False, True])
-def test_centres_of_cells_are_those_of_contracted_space(contracted: bool) -> None:
-    points, stretch = _centres(CELLS, contracted)
+def test_centers_of_cells_are_those_of_contracted_space(contracted: bool) -> None:
+    points, stretch = _centers(CELLS, contracted)
     for mine, expected in zip(cell_centers(CELLS, contracted), (points, stretch)):
         np.testing.assert_allclose(mine, expected, rtol=1e-6)
 
@@ -56,10 +56,10 @@ def test_cells_where_most_cameras_see_motion_are_occupied() -> None:
     memory = {v.camera: CameraMemory(v, moved if k < 3 else None) for k, v in enumerate(VIEWS)}
     grid.density[:] = 0.0
     grid.recount_views(CallerPool(), cast(ViewStore, SimpleNamespace(box=box, views=VIEWS, memory=memory)))
-    points, _ = _centres(16, box.contracted)
+    points, _ = _centers(16, box.contracted)
     seen, marked = np.zeros(len(points), int), np.zeros(len(points), int)
     for k, view in enumerate(VIEWS):
-        local = (points * box.radius_m + box.centre_m - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]
+        local = (points * box.radius_m + box.center_m - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]
         u, v = view.intrinsics.project(np.where(local[:, 2:] > box.near_m, local, 1.0)).T
         inside = (local[:, 2] > box.near_m) & (u >= 0) & (u < 24) & (v >= 0) & (v < 24)
         seen += inside
@@ -103,7 +103,7 @@ def test_density_of_cells_is_the_oracles(field: NgpField, contracted: bool, phas
     grid = to_torch(field._encoding, dtype=torch.float64)
     params = torch.as_tensor(field._net.params, dtype=torch.float64)
     raw = mlp(field._net.widths.tolist(), params, encode(grid, SETTINGS.levels, torch.as_tensor(places)))
-    sigma = raw[:, 0].clamp(RAW_LOW, RAW_HIGH).exp().numpy() * _centres(CELLS, contracted)[1][looked]
+    sigma = raw[:, 0].clamp(RAW_LOW, RAW_HIGH).exp().numpy() * _centers(CELLS, contracted)[1][looked]
     expected = np.maximum(before[looked] * fade, sigma)
     assert 0.05 < np.mean(expected == sigma) < 0.95, "both the old and the new density must win somewhere"
     np.testing.assert_allclose(density[looked], expected, rtol=2e-4)

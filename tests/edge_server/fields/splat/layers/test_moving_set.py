@@ -94,7 +94,7 @@ def test_new_gaussians_lie_where_the_foreground_is_while_the_anchors_are_displac
     moving.motion._knots = moving.motion._knots + shift
     before = len(moving)
     moving.seed_missing(_frames(), CAMERAS)
-    new_m = moving.places(INSTANT_S)[before:] * BOX.radius_m + np.array(BOX.centre_m)
+    new_m = moving.places(INSTANT_S)[before:] * BOX.radius_m + np.array(BOX.center_m)
     assert len(new_m) > 50
     away_m = np.linalg.norm(new_m - BALL_M, axis=1)
     assert np.median(np.abs(away_m - RADIUS_M)) < 0.15 and (away_m < 1.5 * RADIUS_M).mean() > 0.9

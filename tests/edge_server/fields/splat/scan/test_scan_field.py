@@ -59,7 +59,7 @@ def test_first_gaussians_lie_on_measured_depth() -> None:
     box = field.view_store.box
     assert box is not None
     measured = field.cloud.params[opacity(field.cloud.params) > 0.7]  # the others stand for the sky
-    at = measured[:, :3] * box.radius_m + np.asarray(box.centre_m)
+    at = measured[:, :3] * box.radius_m + np.asarray(box.center_m)
     from_ball, from_ground = np.linalg.norm(at - BALL_M, axis=1) - RADIUS_M, at[:, 2]
     near = np.minimum(np.abs(from_ball), np.abs(from_ground)) < 0.05
     assert len(near) > 50 and near.mean() > 0.9

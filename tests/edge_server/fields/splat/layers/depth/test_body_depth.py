@@ -64,7 +64,7 @@ def test_one_frame_with_depth_seeds_the_side_of_the_ball_that_it_sees(known: int
     moving.motion._knots = moving.motion._knots + shift / BOX.radius_m
     cameras = {camera.view.camera: camera}
     moving.seed_at_depth(_measured(cameras, [frame]), cameras)
-    places_m = moving.places(INSTANT_S)[known:] * BOX.radius_m + np.array(BOX.centre_m)
+    places_m = moving.places(INSTANT_S)[known:] * BOX.radius_m + np.array(BOX.center_m)
     assert len(places_m) > 100 and len(moving.anchor) == len(moving)
     off_m = np.abs(np.linalg.norm(places_m - BALL_M, axis=1) - RADIUS_M)
     assert np.median(off_m) < 0.01 and off_m.max() < 0.06
