@@ -57,7 +57,7 @@ def age_parts_ms(updates: Sequence[Any], now_s: float) -> dict[str, float]:
     updates: in order, each with number, t_s, network_ms, update_ms, aaoi_ms (``UpdateRow``, ``Publication``). Where
     numbers are left out, publications lie evenly between. now_s: on their clock; nothing is published since the last.
     """
-    known = [(u.network_ms, u.update_ms, u.aaoi_ms) for u in updates if u.network_ms is not None]
+    known = [each for u in updates if None not in (each := (u.network_ms, u.update_ms, u.aaoi_ms))]
     if len(updates) < 2 or not known:
         return {}
     gap_ms = 1e3 * np.diff([*(u.t_s for u in updates), now_s])
@@ -115,7 +115,8 @@ class AgesRow(Struct, omit_defaults=True):
 
 
 class UpdateCounts(Struct):
-    """The edge's own counts of its updates. refused: by camera, how often the field left its view out."""
+    """The edge's own counts of its updates. without_step: updates that had no time for a step of training; None where
+    nobody has counted them. refused: by camera, how often the field left its view out."""
 
     count: Count = 0
     ms_p50: Number | None = None
@@ -123,7 +124,7 @@ class UpdateCounts(Struct):
     first_ms: Number | None = None
     undecodable: Count | None = None
     shed: Count | None = None
-    without_step: Count = 0
+    without_step: Count | None = None
     refused: dict[str, Count] = field(default_factory=dict)
 
 

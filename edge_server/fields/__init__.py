@@ -67,6 +67,7 @@ class FitReport:
     dropped: rays and gradients that were not finite and were left out.
     refused: cameras whose view contradicts the others' background, and was left out (``splat`` in layers).
     note: why nothing was done, if so.
+    short: whether there was no time for a step.
     """
 
     steps: int
@@ -77,6 +78,7 @@ class FitReport:
     dropped: int = 0
     refused: tuple[str, ...] = ()
     note: str = ""
+    short: bool = False
 
 
 @dataclass(frozen=True)

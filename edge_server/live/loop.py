@@ -19,7 +19,6 @@ log = logging.getLogger(__name__)
 
 # Longest sleep before the loop looks at the controls again.
 _MAX_SLEEP_S = 0.2
-_USED = 0.5  # share of an update's time; shares between are rare: updates end early or when their time is over
 _TOO_SHORT = 3  # updates in a row without a step, after which a warning is due
 _SHED_EVERY_S = 30.0  # between two warnings that frames are left out
 STOP_S = 20.0
@@ -64,7 +63,7 @@ class UpdateLoop:
         self._checkpoints: Queue[tuple[Path, Future[Path]]] = Queue()
         self._stop = threading.Event()
         self._paused = False
-        self._without_steps = 0  # updates in a row
+        self.without_step, self._in_a_row = 0, 0  # updates without time for a step: all, and the newest
         self._warned_of = (0, 0, clock.now_ns() / 1e9)  # frames shed and arrived, and when
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._main, name="loop", daemon=True)
@@ -160,10 +159,9 @@ class UpdateLoop:
 
     def _warn_without_steps(self, report: FitReport) -> None:
         """Log once, and again if it recurs, that updates are too short to learn anything."""
-        # An update that ended long before its time had nothing to learn.
-        short = report.steps == 0 and not report.note and report.seconds >= _USED * self.update_ms / 1e3
-        self._without_steps = self._without_steps + 1 if short else 0
-        if self._without_steps == _TOO_SHORT:
+        self.without_step += report.short
+        self._in_a_row = self._in_a_row + 1 if report.short else 0
+        if self._in_a_row == _TOO_SHORT:
             log.warning(
                 "an update of %.0f ms made no step: all its time went into taking in new pictures. Send smaller ones "
                 "(source.scale, or width and height), or give updates more time (edge.update_ms)",
@@ -178,8 +176,8 @@ class UpdateLoop:
             return
         if buffer.shed > shed:
             log.warning(
-                "%d of %d frames were left out, mostly the oldest: the field has no time for them. Send "
-                "fewer or smaller ones (source.fps, source.scale), or give updates more time (edge.update_ms)",
+                "%d of %d frames were left out, mostly the oldest: the field has no time for them. Send fewer or "
+                "smaller ones (source.fps; source.scale, or width and height), or longer updates (edge.update_ms)",
                 buffer.shed - shed,
                 buffer.arrivals - arrived,
             )

@@ -268,7 +268,7 @@ class EdgeServer:
         if counts.first_ms is None:
             counts.first_ms = publication.t_s * 1e3
         self._update_ms.add(publication.update_ms)
-        counts.without_step += publication.steps == 0
+        counts.without_step = self.loop.without_step
         for camera in publication.refused:
             counts.refused[camera] = counts.refused.get(camera, 0) + 1
         self.state.publish(publication, renderer)

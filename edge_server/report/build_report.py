@@ -139,7 +139,7 @@ def updates(series: Sequence[UpdateRow], edge: UpdateCounts) -> dict[str, Any]:
         "first_ms": edge.first_ms if edge.first_ms is not None or not series else 1e3 * series[0].t_s,
         "undecodable": edge.undecodable,
         "shed": edge.shed,
-        "without_step": max(sum(row.steps == 0 for row in series), edge.without_step),
+        "without_step": edge.without_step or 0,
         "refused": dict(sorted((refused | Counter(edge.refused)).items())),
     }
 

@@ -122,8 +122,8 @@ def _delivery(report: Report) -> list[str]:
         (
             updates["without_step"],
             updates["count"],
-            "of the updates had no time for a step of training (smaller pictures, source.scale, or longer updates, "
-            "edge.update_ms, give them some)",
+            "of the updates had no time for a step of training (smaller pictures, source.scale or width and height, or "
+            "longer updates, edge.update_ms, give them some)",
         ),
     )
     said = [f"{part / whole:.0%} {what}" for part, whole, what in shares if whole and part >= SHARE * whole]

@@ -77,6 +77,14 @@ def test_it_says_how_many_frames_were_left_out(tmp_path, shed, said):
     assert f"{said} rejected" in summarize(tmp_path)
 
 
+@pytest.mark.parametrize(("short", "advised"), [(0, False), (5, False), (6, True)])
+def test_it_advises_where_updates_have_no_time_to_learn(tmp_path, short, advised):
+    (tmp_path / "report.json").write_text(json.dumps({"updates": {"count": 100, "without_step": short}}))
+    said = summarize(tmp_path)
+    assert (f"{short} of them had no time for a step" in said) == (short > 0)
+    assert ("source.scale, or width and height" in said) == advised
+
+
 def test_a_moving_held_out_camera_reads_its_frames_at_refined_poses(tmp_path: Path) -> None:
     so_far = {"now_psnr_db": 24.0, "all_psnr_db": 25.0, "frames": 9, "refined": True}
     fidelity = {"so_far": so_far, "shown": {"psnr_db": 14.0, "age_ms": {"network": 20.0}}}

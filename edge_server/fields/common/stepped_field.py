@@ -100,7 +100,8 @@ class SteppedField(ABC, Generic[S]):
             step_budget.end_step()
         self.dropped += dropped
         loss = float(np.mean(losses)) if losses else 0.0
-        return FitReport(step_budget.steps, step_budget.elapsed_s(), loss, rays, samples, dropped)
+        steps = step_budget.steps
+        return FitReport(steps, step_budget.elapsed_s(), loss, rays, samples, dropped, short=steps == 0)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """Render a camera from the present parameters."""

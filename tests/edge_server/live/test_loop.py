@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -196,20 +197,24 @@ def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(running, tm
     assert run.published[-1][0].omega_ms == 0.0 and not run.controls.reset_requested
 
 
-@pytest.mark.parametrize(("update_ms", "warnings"), [(1e-3, 2), (1e7, 0)])
-def test_an_update_without_time_to_learn_is_warned_of_once_and_again_if_it_comes_back(
-    update_ms, warnings, running, caplog
-):
-    """But not one that had time left."""
+@pytest.mark.parametrize(("short", "warnings"), [(True, 2), (False, 0)])
+def test_an_update_without_time_to_learn_is_warned_of_once_and_again_if_it_comes_back(short, warnings, running, caplog):
+    """But not one that had nothing to learn."""
     u = updates()
     fit = u.fit  # no time at all, then some, then none again
-    u.fit = lambda selection, _: fit(selection, Budget(steps=1) if u.number == 4 else Budget(seconds=1e-6))
+
+    def fitted(selection, _):
+        views, report = fit(selection, Budget(steps=1) if u.number == 4 else Budget(seconds=1e-6))
+        return views, replace(report, short=report.short and short)
+
+    u.fit = fitted
     now = WallClock().now_ns()
     u.buffer.put(frame("cam01", generated_ns=now), now)
-    run = running(u, update_ms=update_ms)
+    run = running(u)
     run.until(lambda: len(run.published) >= 8)
     run.loop.stop()
     assert [publication.steps for publication, _ in run.published[:8]] == [0, 0, 0, 0, 1, 0, 0, 0]
+    assert run.loop.without_step >= 7 * short
     told = [record.message for record in caplog.records if "made no step" in record.message]
     assert len(told) == warnings and all("source.scale" in each and "edge.update_ms" in each for each in told)
 

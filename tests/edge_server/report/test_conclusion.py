@@ -67,6 +67,7 @@ def test_three_sentences_say_what_was_shown_its_age_and_its_limit(tmp_path: Path
             2,
             "the limit: it takes",
         ),
+        ({"updates.without_step": 3, "updates.count": 50}, 2, "6% of the updates had no time for a step of training"),
         ({"updates.shed": 70}, 2, "92% of those delivered were left out for lack of time"),
     ],
 )

@@ -114,8 +114,10 @@ class LayeredField:
 
     @property
     def moving_shares(self) -> dict[str, float]:
-        """Share of the pixels of each camera's newest frame that shows what moves, where that is known."""
-        return {o.camera: o.share for o in self.observations}
+        """Share of the pixels of each camera's newest frame that shows what moves, where that is known; of one that
+        shows something else than its plate the least."""
+        shares = {o.camera: max(o.share, tuned.LEAST_SHARE) for o in self.observations}
+        return shares | dict.fromkeys(self.refused, tuned.LEAST_SHARE)
 
     @property
     def troubles(self) -> tuple[str, ...]:
@@ -132,7 +134,7 @@ class LayeredField:
         if self.tracker is None:
             frames = min(min(camera.plate.count for camera in self.cameras.values()), tuned.PLATE_FRAMES)
             return f"learning the background: {frames} of {tuned.PLATE_FRAMES} frames of each camera"
-        if self.supervision.early and len(self.observations):
+        if self.supervision.early and len(self.observations) and self.observations.newest_s < tuned.PLATE_S:
             return f"learning the background: {self.observations.newest_s:.1f} of {tuned.PLATE_S:g} s"
         static, earlier = self.supervision.static, self.supervision.earlier
         if not static.ready and (earlier is None or earlier.step < tuned.EARLY_SHOWN_AFTER):
@@ -190,7 +192,9 @@ class LayeredField:
         self._find_rows()
         parameters = self.still.adam_parameters(tuned.STEP_PROGRESS)
         steps = rays = samples = 0
-        if budget.seconds is not None and not self.supervision.layers_shown:
+        follows = budget.seconds is None or self.supervision.layers_shown
+        self.pool.spare(1 if beside and follows and self.static.at_work else 0)  # this thread computes, too
+        if budget.seconds is not None and not follows:
             self.static.wait(budget.seconds - pace.elapsed_s())  # it has the processor: nobody sees yet what moves
         else:
             steps, rays, samples = tracker.follow(pace, parameters)
@@ -212,6 +216,7 @@ class LayeredField:
             rays,
             samples,
             note=note,
+            short=follows and steps == 0 and pace.steps == 0 and tracker.moving.alive > 0,
             refused=tuple(camera for camera in cameras_of(views) if camera in self.refused),
         )
 

@@ -15,6 +15,7 @@ from edge_server.fields import View
 from edge_server.fields.common.field_state import unpack_meta
 from edge_server.fields.common.supervision import check_view
 from edge_server.fields.splat.field import StillField
+from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.layers.motion import ViewRow
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
@@ -26,10 +27,10 @@ from freshfield.geometry import Pinhole
 Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
-VERSION = 9
+VERSION = 10
 COUNTERS = ("layered", "origin_ns")  # of the field
 # Of its supervision.
-SUPERVISED = ("plates_s", "fine_s", "fine", "exposure_rounds", "anew", "with_depth", "early", "plain")
+SUPERVISED = ("plates_s", "fine_s", "fine", "exposure_rounds", "anew", "with_depth", "early", "plain", "layers_shown")
 TRACKED = ("anchors_s", "seeded_s", "fits")  # of its tracker
 OF_CAMERA = ("newest_s", "rendered_step", "moves", "anew", "depth_scale", "looked_ns")
 ARRAYS_OF_CAMERA = ("away", "depth_m", "reported", "bumped")  # or None
@@ -65,6 +66,8 @@ def pack(field: Any) -> Arrays:
     state |= _prefixed("still.", field.still.state()) | _prefixed("static.", field.static.state())
     if field.supervision.depth is not None:
         state |= _prefixed("depth.", field.supervision.depth.state())
+    if (earlier := field.supervision.earlier) is not None:
+        state |= {"earlier": earlier.gaussians.params.copy(), "earlier_step": np.array(earlier.step)}
     tracked = None
     if field.tracker is not None:
         state |= _prefixed("moving.", field.tracker.moving.state())
@@ -115,6 +118,12 @@ def unpack(field: Any, state: Arrays) -> None:
         field.observations.add(_observation(field, facts, _under(f"frame_{k}.", state)))
     _set(field, COUNTERS, meta)
     _set(field.supervision, SUPERVISED, meta)
+    if "earlier" in state:
+        params, now = np.array(state["earlier"]), field.still.snapshot()
+        if params.ndim != 2 or params.shape[1:] != now.gaussians.params.shape[1:] or params.dtype != np.float32:
+            raise ValueError("what was shown before layers are is damaged")
+        gaussians = Gaussians(params, field.settings.sh_degree)
+        field.supervision.earlier = replace(now, gaussians=gaussians, step=int(state["earlier_step"]))
     field.refused = set(meta["refused"])
     if meta["tracked"] is not None:
         if field.still.view_store.box is None:

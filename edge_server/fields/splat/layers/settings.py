@@ -7,7 +7,8 @@ LEAST_CAMERAS = 2  # one alone gives no depth: the still field learns its frames
 PLATE_FRAMES, PLATE_S = 8, 3.2  # frames of each camera, and time since the first, before plates are certain
 # Layers begin with what is known of the plates then: nine tenths in `room`. At PLATE_S the still field begins anew.
 EARLY_S = 1.0
-PLATES_SURE_S = 6.0  # until then a thread beside may first show what it has learned since EARLY_S
+# Until then a thread beside may first show what it has learned since EARLY_S: two cores show 12 cameras after 3 s.
+PLATES_SURE_S = 6.0
 PLATES_EVERY_S = 0.5  # how often plates are compared with what the still field has learned
 EVIDENCE_S = 0.8  # largest age of a frame from which motion is estimated
 RENDERINGS_A_FIT = 2  # renderings of the still field that plates take over in a fit
@@ -15,6 +16,7 @@ RENDERINGS_A_FIT = 2  # renderings of the still field that plates take over in a
 EARLY_SHOWN_AFTER = 200
 SHOWN_AFTER = 400  # steps, after which a still field that began anew is better than what was shown before
 MOST_PIXELS = 400_000  # of one image of every camera together, if 15 frames a second of each are taken in
+LEAST_SHARE = 0.01  # of a picture that counts as moving: which of calmer cameras is taken in, a frame's age decides
 FRAMES_KNOWN = 256  # instants of earlier frames that are remembered for each camera
 SAME_POSE = 1e-3  # largest difference of poses of one place, meters and entries of the rotation
 MOST_MOVES = 3  # places from which a camera shows something, above which it moves
@@ -22,7 +24,8 @@ STANDS_FRAMES = 60  # frames from one place, after which earlier moves are forgo
 MAX_AHEAD_S = 0.3  # motion is extrapolated no farther than this: people turn
 
 # --- plates at full resolution, where frames are taken in at a lower one ---
-# Least time from a frame that is taken in at its full resolution to the next, before and after all are known.
+# Least time from a frame that is taken in at its full resolution to the next, before all are known (one an update: 1.4
+# ms of each) and after.
 FIRST_FINE_EVERY_S, FINE_EVERY_S = 0.01, 0.05
 FINE_FRAMES = 4  # frames of each camera before the still field learns from fine plates
 FINE_MEMORY, FINE_KNOWN = 16, 3  # frames that a fine plate is the mean of; fewest that make it known

@@ -44,7 +44,7 @@ class StaticLayer:
     """What stands still. ``learn`` says from which plates; ``train`` spends steps on them.
 
     shown: the field as it was last published. rendered: camera -> step and rendering, for the caller to take.
-    Nothing waits for the thread of ``train_beside`` but ``stop``.
+    Nothing waits for the thread of ``train_beside`` but ``stop`` and, for a time, ``wait``.
     """
 
     def __init__(self, field: StillField) -> None:
@@ -57,7 +57,7 @@ class StaticLayer:
     def forget(self) -> None:
         """Forget the plates and the schedule; the field stays as it is."""
         self.stop()
-        self.field.pool.spare(0)
+        self.field.pool.spare(0)  # see ``LayeredField.fit``
         self.shown: SplatSnapshot | None = None
         self.rendered: dict[str, tuple[int, Rendering]] = {}
         self.grows_until = tuned.SCHEDULE  # step
@@ -169,15 +169,19 @@ class StaticLayer:
         """Train in a thread, until nothing is left to learn, and render ``views`` meanwhile. The thread must not be at
         work. begin: called first, in the thread."""
         self._stopping = False
-        self.field.pool.spare(1)  # the caller, who follows what moves, takes one
         self._thread = threading.Thread(target=self._main, args=(begin, views), name="static-field", daemon=True)
         self._thread.start()
+
+    @property
+    def at_work(self) -> bool:
+        """Whether the thread is at work."""
+        return self._thread is not None and self._thread.is_alive()
 
     @property
     def training(self) -> bool:
         """Whether the thread is at work. Raises what ended it early."""
         self._raise_failure()
-        return self._thread is not None and self._thread.is_alive()
+        return self.at_work
 
     def wait(self, seconds: float) -> None:
         """Leave the thread the processor for a time, or until it ends."""

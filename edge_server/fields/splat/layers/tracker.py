@@ -77,7 +77,7 @@ class MotionTracker:
             self.seeded_s = newest_s
             self._seed()
             self._seed_time.add(self.times.add("seeding", begun) - begun)
-        large = next(iter(self.observations)).foreground.size > tuned.FEW_STEPS_PIXELS
+        large = max(o.foreground.size for o in self.observations) > tuned.FEW_STEPS_PIXELS
         steps = tuned.FEW_STEPS if moving.few and large else tuned.STEPS
         return self._train_appearance(pace, parameters, steps * len(strides))
 

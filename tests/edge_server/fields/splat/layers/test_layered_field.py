@@ -243,6 +243,35 @@ def test_a_state_continues_bit_for_bit() -> None:
     np.testing.assert_array_equal(one, two)
 
 
+def test_a_state_of_a_field_that_is_not_shown_yet_continues_bit_for_bit() -> None:
+    """What it shows meanwhile, too."""
+    field, other = LayeredField(SMALL), LayeredField(SMALL)
+    _run(field, range(17), steps=5)
+    assert field.supervision.earlier is not None and not field.supervision.layers_shown
+    other.load_state(field.state())
+    for frame in range(17, 45):
+        for one in (field, other):
+            _run(one, range(frame, frame + 1), steps=5)
+        one, two = (f.render(HELD.camera_to_world, HELD.intrinsics).color for f in (field, other))
+        np.testing.assert_array_equal(one, two)
+    assert field.supervision.layers_shown
+    same_state(field, other)
+    damaged = LayeredField(SMALL)
+    _run(damaged, range(17), steps=5)
+    with pytest.raises(ValueError, match="what was shown before layers are"):
+        damaged.load_state({**damaged.state(), "earlier": np.zeros((5, 3), np.float32)})
+
+
+def test_it_tells_how_much_moves_before_each_camera_in_its_newest_frame() -> None:
+    field = LayeredField(SMALL)
+    field.load_state(_moving().state())
+    newest = {o.camera: o.share for o in sorted(field.observations, key=lambda o: o.instant_s)}
+    assert max(newest.values()) > 0.02 and len({*newest.values()}) > 3
+    assert field.moving_shares == {name: max(share, 0.01) for name, share in newest.items()}
+    field.refused = {CAMERAS[0].camera}
+    assert field.moving_shares[CAMERAS[0].camera] == 0.01
+
+
 def test_the_order_and_the_threads_change_nothing() -> None:
     one, two = LayeredField(SMALL), LayeredField(structs.replace(SMALL, threads=1))
     for field in (one, two):
@@ -331,14 +360,37 @@ def test_in_seconds_what_moves_is_followed_once_anything_is_shown_of_it() -> Non
     assert field.tracker is not None and not field.supervision.layers_shown
     followed = field.tracker.fits
     for frame in range(17, 300):
-        field.fit([_frame(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+        report = field.fit([_frame(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
         if field.supervision.layers_shown:
             break
-        assert field.tracker.fits == followed
+        assert field.tracker.fits == followed and not report.short
     assert field.static.ready
     for later in range(frame + 1, frame + 5):
         field.fit([_frame(k, later, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
     assert field.tracker.fits == followed + 4
+    while not field.moving.alive and later < 400:
+        later += 1
+        report = field.fit([_frame(k, later, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+        assert field.moving.alive or not report.short, "there was nothing to learn"
+    assert field.fit([_frame(k, later + 1, True) for k in range(len(CAMERAS))], Budget(seconds=1e-4)).short
+    field.static.stop()
+
+
+def test_the_pool_has_all_its_workers_but_while_motion_is_followed_beside_training(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    field, spared = LayeredField(SMALL), []
+    spare = field.pool.spare
+    monkeypatch.setattr(field.pool, "spare", lambda count: (spared.append(count), spare(count)))
+    _run(field, range(17), steps=5)
+    spared.clear()
+    for frame in range(17, 400):
+        field.fit([_frame(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+        if field.static.finished and not field.static.training:
+            break
+    field.fit([_frame(k, frame + 1, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+    told = [count for count, _ in itertools.groupby(spared)]
+    assert told[0] == 0 and 1 in told and spared[-1] == 0, "waiting, following, at the end"
     field.static.stop()
 
 
@@ -397,7 +449,7 @@ def test_plates_do_not_wait_for_a_camera_that_has_gone_silent() -> None:
     for frame in range(20):
         field.fit([_frame(k, frame, False) for k in range(len(CAMERAS) if frame < 3 else 6)], Budget(steps=1))
     assert field.moving is not None
-    assert list(field.moving_shares.values()) == [0.0] * 6  # of those that still tell
+    assert list(field.moving_shares.values()) == [settings.LEAST_SHARE] * 6  # of those that still tell
 
 
 def test_few_cameras_with_large_pictures_train_fewer_steps(monkeypatch: pytest.MonkeyPatch) -> None:
