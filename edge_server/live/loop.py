@@ -176,8 +176,8 @@ class UpdateLoop:
             return
         if buffer.shed > shed:
             log.warning(
-                "%d of %d frames were left out, mostly the oldest: the field has no time for them. Send fewer or "
-                "smaller ones (source.fps; source.scale, or width and height), or longer updates (edge.update_ms)",
+                "%d of %d frames were left out, mostly the oldest: the field has no time for them. Fewer or smaller "
+                "ones (source.fps; source.scale, or width and height) or longer updates (edge.update_ms) help",
                 buffer.shed - shed,
                 buffer.arrivals - arrived,
             )
