@@ -194,6 +194,14 @@ def test_the_world_repeats_however_late_it_is(turns):
 
 
 @pytest.mark.stability
+@pytest.mark.parametrize("t", [-0.1, 1e-300, 1e15])
+def test_any_finite_instant_gives_a_sound_image(t):
+    scene = make_scene("room", TINY)
+    usual = scene.render("cam01", 1.0).mean()
+    assert abs(scene.render("cam01", t).mean() - usual) < 10
+
+
+@pytest.mark.stability
 @pytest.mark.parametrize("fov", [5.0, 150.0])
 @pytest.mark.parametrize("shape", [(8, 8), (64, 8), (8, 64)])
 @pytest.mark.filterwarnings("error")
