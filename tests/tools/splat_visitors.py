@@ -65,7 +65,12 @@ class Reader(threading.Thread):
 
     def run(self) -> None:
         while not self.done:
-            data = self._socket.recv()
+            try:
+                data = self._socket.recv()
+            except websocket.WebSocketConnectionClosedException:
+                if self.done:  # the proxy before it has ended
+                    return
+                raise
             with self.lock:
                 self.reader.read(data)
             self._socket.send(data[:4], websocket.ABNF.OPCODE_BINARY)
