@@ -224,9 +224,10 @@ def _run(args: argparse.Namespace) -> int:
         raise
     except ValueError as error:  # field options, a checkpoint that does not fit: the message says what
         raise ScenarioError(f"{scenario.path}: {error}") from None
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) != signal.SIG_IGN:  # under nohup, SIGHUP is
-            signal.signal(number, lambda *_: server.stop())
+    # A shell starts what a script puts in its background with SIGINT ignored; nohup means SIGHUP alone.
+    hangs_up = signal.getsignal(signal.SIGHUP) != signal.SIG_IGN
+    for number in (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hangs_up else [])):
+        signal.signal(number, lambda *_: server.stop())
     if args.seconds is not None:
         timer = threading.Timer(args.seconds, server.stop)
         timer.daemon = True

@@ -378,11 +378,13 @@ def test_files_are_written_before_anything_that_may_take_long(fed, tmp_path, mon
     assert STOP_S <= GRACE_S - 10.0, "the launcher would kill it before"
 
 
-def test_a_terminal_that_is_closed_ends_the_run_as_ctrl_c_does(tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT])
+def test_a_closed_terminal_and_an_interrupt_in_a_scripts_background_end_the_run(number, tmp_path, monkeypatch):
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell starts it there
 
     def closed(server):
-        os.kill(os.getpid(), signal.SIGHUP)
+        os.kill(os.getpid(), number)
         assert server._stopping.wait(5)
 
     monkeypatch.setattr(EdgeServer, "run", closed)
