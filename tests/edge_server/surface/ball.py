@@ -14,6 +14,7 @@ from freshfield.geometry import Pinhole, look_at, world_rays
 RADIUS_M = 0.1
 LENS = Pinhole.from_fov(64, 64, 40.0)
 DISTORTED_LENS = Pinhole(64, 64, 88.0, 87.0, 31.0, 33.0, (-0.2, 0.05, 0.002, -0.001))
+TILTED_LENS = Pinhole(64, 64, 88.0, 87.0, 31.0, 33.0, (0.0, 0.0, 0.0, -0.02))
 
 
 def ball_depth(camera: Pinhole, pose: NDArray, radius_m: float = RADIUS_M) -> NDArray[np.float32]:

@@ -9,12 +9,20 @@ from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.kernels.fuse import SIDE
 from edge_server.surface.volume import BLOCK_BYTES, Grid, bounding_box, fuse_maps
-from tests.edge_server.surface.ball import DISTORTED_LENS, LENS, RADIUS_M, ball_maps, plain_fuse, voxel_points
+from tests.edge_server.surface.ball import (
+    DISTORTED_LENS,
+    LENS,
+    RADIUS_M,
+    TILTED_LENS,
+    ball_maps,
+    plain_fuse,
+    voxel_points,
+)
 
 BOX = Grid((-0.13,) * 3, (0.13,) * 3, 0.008, 0.032)
 
 
-@pytest.mark.parametrize("camera", [LENS, DISTORTED_LENS], ids=["straight", "distorted"])
+@pytest.mark.parametrize("camera", [LENS, DISTORTED_LENS, TILTED_LENS], ids=["straight", "distorted", "tilted"])
 def test_the_kernel_fuses_as_the_equations_say(camera):
     maps = ball_maps(5, camera)
     volume = fuse_maps(BOX, maps)

@@ -11,12 +11,13 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.engine.content_key import surroundings
-from edge_server.experiments.engine.engine import _compute_on_ray
+from edge_server.experiments.engine.engine import _compute_on_ray, join_cluster
 from tests.edge_server.experiments.engine.jobs import Point, end_worker, fail, measure, measure_on_ray, note
 from tests.support import wait_until
 
@@ -49,6 +50,16 @@ def test_results_come_in_the_order_of_the_inputs_as_they_come_back_from_a_file(s
 
 def test_processes_compute_the_same_bit_for_bit(serial):
     assert repr(run(Engine(jobs=2), group=lambda p: p.scene, batch=3)) == repr(serial)
+
+
+@pytest.mark.parametrize("joined", [False, True])
+def test_a_cluster_is_joined_once(joined, monkeypatch):
+    asked = []
+    ray = SimpleNamespace(is_initialized=lambda: joined, init=lambda address, **_: asked.append(address))
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    join_cluster("10.0.0.1:6379")
+    assert asked == ([] if joined else ["10.0.0.1:6379"])
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,14 @@ from edge_server.experiments.rollouts.setting import Setting, reward_of, seeds
 from edge_server.experiments.training.evaluation import Candidate, evaluate, fixed_candidates
 from edge_server.experiments.training.learning_curve import draw_curve
 from edge_server.experiments.training.train_command import main
-from edge_server.experiments.training.trainer import TrainingConfig, TrainingError, read_log, sibling_advantages, train
+from edge_server.experiments.training.trainer import (
+    TrainingConfig,
+    TrainingError,
+    _progress_text,
+    read_log,
+    sibling_advantages,
+    train,
+)
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward, make_reward
@@ -47,6 +54,11 @@ def command_line(folder: Path, words: str, raw: dict = RAW) -> tuple[list[str], 
     (folder / "small.yaml").write_text(yaml.safe_dump(raw))
     out = folder / "out"
     return [str(folder / "small.yaml"), *words.split(), "--jobs", "1", "--out", str(out)], out
+
+
+def test_progress_has_as_many_decimals_as_it_needs():
+    row = {"episodes": 4, "reward": 0.12344, "views": 2.26, "omega_ms": 19.6}
+    assert _progress_text(CONFIG, row) == "4/6 episodes: reward 0.1234, 2.3 views, omega 20 ms"
 
 
 def test_a_stopped_training_continues_bit_for_bit(tmp_path: Path):

@@ -7,10 +7,11 @@ import json
 import cv2
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
 from edge_server.cli import main
 from edge_server.experiments.common.arguments import OptionError
-from edge_server.experiments.viewpoints.reconstructions import viewing_path
+from edge_server.experiments.viewpoints.reconstructions import sprites, viewing_path
 from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
 from edge_server.experiments.viewpoints.viewpoints_command import read_budget
 from edge_server.page.preferences import PreferencePage
@@ -20,13 +21,16 @@ from freshfield.geometry import Pinhole
 from tests.edge_server.experiments.sets import write_photos
 
 
-def test_a_capture_is_planned_and_written(tmp_path, capsys):
+def test_a_capture_is_planned_and_written(tmp_path, capsys, monkeypatch):
+    numbers = []
+    monkeypatch.setattr(Axes, "annotate", lambda at, text, *place, **how: numbers.append(text))
     words = ["viewpoints", "tile", "--budget", "4,5m", "--candidates", "24", "--steps", "3"]
     assert main([*words, "--out", str(tmp_path)]) == 0
     plan = json.loads((tmp_path / "plan.json").read_text())
     assert plan["views"] == len(plan["stops"]) == 4 and plan["path_m"] <= 5.0 and plan["candidates"] == 24
     assert np.array(plan["stops"][0]["camera_to_world"]).shape == (4, 4)
     assert plan["held_out"]["psnr_db"] > 5.0 and (tmp_path / "plan.png").stat().st_size > 10_000
+    assert numbers == ["1", "2", "3", "4"], "the drawing says which comes when"
     said = capsys.readouterr().out
     assert "4 views" in said and "m away" in said and "held out: PSNR" in said
 
@@ -48,6 +52,15 @@ def test_candidates_of_a_recording_are_its_training_views_and_transparent_ones_s
     assert view is stage.recorded[3] and view.image.shape == (16, 16, 4 if alpha else 3)
     np.testing.assert_allclose(stage.candidates.poses[3], view.camera_to_world)
     assert (stage.background, stage.options) == (((1.0,) * 3, {"background": "white"}) if alpha else ((0.0,) * 3, {}))
+
+
+def test_what_a_page_shows_is_begun_in_an_empty_folder_and_anew_for_other_steps(tmp_path):
+    stage = open_stage("tile", 4, 16)
+    about = []
+    for steps in (1, 2):
+        assert sprites(stage, [], steps, 0, tmp_path / "shown", print) == []
+        about.append((tmp_path / "shown/about.json").read_text())
+    assert about[0] != about[1]
 
 
 def test_an_arm_says_which_candidates_it_reaches():

@@ -10,7 +10,7 @@ import pytest
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget, View
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.plane_sweep import GUIDE_RAYS, depth_guide, foreground_mask
+from edge_server.fields.common.plane_sweep import GUIDE_RAYS, depth_guide, foreground_mask, sweep_depths
 from edge_server.fields.common.scene_box import SceneBox, scene_box
 from edge_server.fields.common.supervision import pack_views
 from edge_server.fields.common.threads.thread_pool import shared_pool
@@ -53,6 +53,14 @@ def test_what_is_transparent_or_of_one_color_has_no_depth() -> None:
     assert (found[~sky] > 0).mean() > 0.5 and (found[sky] == 0).all()
     views = [replace(v, image=np.full_like(v.image, 128)) for v in SEEN]
     assert (_guide(views, *_packed(views)) == 0).all()
+
+
+def test_of_places_that_score_the_same_the_one_at_the_usual_distance_is_taken() -> None:
+    data, box = _packed(ring(4, 24))
+    cells, pixels = 64, np.arange(0, 24 * 24, 7)
+    scores, view_of = np.full(cells**3, 0.5, np.float32), np.zeros(len(pixels), np.int64)
+    found = sweep_depths(shared_pool(2), box, data, view_of, pixels, scores, cells)
+    np.testing.assert_allclose(found, box.distance_m / box.radius_m, rtol=0.05)
 
 
 def _silent(view: View) -> View:

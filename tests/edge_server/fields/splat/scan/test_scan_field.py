@@ -13,7 +13,8 @@ from edge_server.experiments.fitting.misfits import misfits
 from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, RefinesCameras, View
-from edge_server.fields.splat.densification import opacity
+from edge_server.fields.splat.densification import opacity, raw_opacity
+from edge_server.fields.splat.kernels.project import OPACITY
 from edge_server.fields.splat.scan.scan_field import ScanField
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import look_at
@@ -63,6 +64,16 @@ def test_first_gaussians_lie_on_measured_depth() -> None:
     from_ball, from_ground = np.linalg.norm(at - BALL_M, axis=1) - RADIUS_M, at[:, 2]
     near = np.minimum(np.abs(from_ball), np.abs(from_ground)) < 0.05
     assert len(near) > 50 and near.mean() > 0.9
+
+
+def test_what_is_transparent_goes_every_hundredth_step() -> None:
+    field, left = ScanField(SETTINGS), []
+    field.fit(WALK, Budget(steps=0))
+    field.cloud.params[:5, OPACITY] = raw_opacity(0.01)
+    for field.step in (99, 100):
+        field._grow_if_due()
+        left.append(int((opacity(field.cloud.params) < 0.02).sum()))
+    assert left == [5, 0]
 
 
 def test_poses_and_exposures_are_refined_and_held_out_frames_take_their_neighbors() -> None:

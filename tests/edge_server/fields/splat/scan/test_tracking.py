@@ -115,7 +115,7 @@ def test_pictures_contradict_poses_without_rotation_and_no_camera_that_slides(
 def test_late_and_drifting_poses_are_said() -> None:
     times, moves = np.arange(40) / 5.0, np.random.default_rng(3).normal(0.0, 0.15, (40, 3)).cumsum(axis=0)
     smooth = np.stack([np.convolve(m, np.ones(5) / 5, "same") for m in moves.T], axis=1)
-    for late_s, drift_m, words in ((0.1, 0.0, "late by some 1"), (0.0, 0.0, None), (0.0, 0.4, "drift")):
+    for late_s, drift_m, words in ((0.1, 0.0, "late by some 100 ms or more"), (0.0, 0.0, None), (0.0, 0.4, "drift")):
         poses, speed = PoseCorrections(0.5, 5.0), np.gradient(smooth, times, axis=0)
         for k, t in enumerate(times):
             pose = np.eye(4)

@@ -1,0 +1,20 @@
+"""Figures that several studies draw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from edge_server.experiments.common.seed_table import SeedTable
+from edge_server.experiments.studies import drawing
+from tests.edge_server.experiments.studies.invented import request
+
+
+def test_the_lowest_panel_alone_names_the_axis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    metrics, named = ("psnr_db", "ssim", "aaoi_ms"), []
+    monkeypatch.setattr(drawing, "label_lines", lambda at, y, x: named.append(x))
+    row = {"scene": "room", "channel": "ch5", **dict.fromkeys(metrics, 20.0)}
+    table = SeedTable([{**row, "gamma_ms": gamma, "seed": seed} for gamma in (30.0, 60.0) for seed in (0, 1)])
+    drawing.curves("mat", "gamma_ms", "maximum age (ms)", metrics, "channel")(request(tmp_path), table)
+    assert named == [None, None, "maximum age (ms)"] and (tmp_path / "mat-room-0.png").is_file()
