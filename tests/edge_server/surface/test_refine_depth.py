@@ -244,6 +244,20 @@ def test_a_pixel_is_compared_with_those_that_see_the_same_from_aside(rig):
     assert [s for s in view.chosen[36, 36] if s >= 0][-1] == 1
 
 
+def test_planes_that_maps_offer_each_other_meet_the_rays_where_the_plate_does(rig):
+    from edge_server.surface.refine_depth import _offers
+
+    maps, pictures, exact = rig
+    gray = [p[..., 0].astype(np.float32) for p in pictures]
+    images, views = _kernel_view(0, maps, gray)[0], [_kernel_view(k, maps, gray)[1] for k in range(len(maps))]
+    up = np.broadcast_to(np.float32([0, 0, 1]), (*exact[0].shape, 3))
+    offered = _offers(images, views, [Planes(depth, up, np.zeros_like(depth)) for depth in exact], "cheapest", POOL)
+    for found, depth in zip(offered, exact):
+        some = found.depth > 0
+        assert some.mean() > 0.3
+        np.testing.assert_allclose(found.depth[some], depth[some], rtol=1e-4)
+
+
 def test_normals_are_those_of_the_plate(rig):
     _, _, exact = rig
     normal = smooth_normals(exact[1], LENS.rays() @ POSES[1][:3, :3].T)
