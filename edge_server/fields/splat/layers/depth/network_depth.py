@@ -118,7 +118,9 @@ def _line(r: NDArray[np.float64], q: NDArray[np.float64]) -> tuple[float, float]
     does."""
     rng = np.random.default_rng(0)  # the same points give the same line
     i, j = rng.integers(0, r.size, (2, tuned.NETWORK_LINES))
-    use = (q[i] - q[j]) * (r[i] - r[j]) > 0
+    # Two points of one flat wall tell no scale: rounding would choose it, and the wall's pixels outvote all others.
+    apart = np.abs(q[i] - q[j]) > tuned.NETWORK_AGREE * np.maximum(q[i], q[j])
+    use = apart & ((q[i] - q[j]) * (r[i] - r[j]) > 0)
     scales = (q[i] - q[j])[use] / (r[i] - r[j])[use]
     if not scales.size:
         return 0.0, float(np.median(q))
