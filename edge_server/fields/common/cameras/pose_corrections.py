@@ -55,10 +55,11 @@ class PoseCorrections:
     one are of the track "".
 
     most_m, most_deg: largest shift in meters and largest rotation in degrees.
+    full_steps: steps of a view in ``descend`` after which they get shorter, as 1 / steps (Robbins and Monro 1951).
     """
 
-    def __init__(self, most_m: float, most_deg: float) -> None:
-        self.most_m, self.most_rad = most_m, np.deg2rad(most_deg)
+    def __init__(self, most_m: float, most_deg: float, full_steps: float = np.inf) -> None:
+        self.most_m, self.most_rad, self.full_steps = most_m, np.deg2rad(most_deg), full_steps
         self.known: dict[str, PoseCorrection] = {}
         self._sorted: dict[str, list[str]] = {}  # names by track, in the order of time; empty: not known
         self._ranks: dict[str, int] = {}
@@ -226,6 +227,7 @@ class PoseCorrections:
         damped = normal + np.diag(tuned.DAMPING * view.image[..., :3].size / np.square(tuned.USUAL))
         farthest = tuned.FARTHEST * np.array([pixel_m] * 3 + [1.0 / view.intrinsics.fx] * 3)
         step = np.clip(-0.5 * np.linalg.solve(damped, local), -farthest, farthest)
+        step /= max(known.steps / self.full_steps, 1.0)
         known.steps += 1
         changed = self._around(view.camera)
         for name, share in changed.items():

@@ -41,6 +41,7 @@ class CarriedField(ScanField):
     """See ``ScanField``. It asks for every frame: depth may come with each fifth only."""
 
     frame_s = 0.0
+    full_steps = np.inf
 
     def _forget_parameters(self) -> None:
         super()._forget_parameters()

@@ -50,6 +50,8 @@ class Shown(NamedTuple):
 class ScanField(StillField):
     """See ``StillField``."""
 
+    full_steps: float = tuned.FULL_STEPS  # see ``PoseCorrections``
+
     # --- cameras ------------------------------------------------------------------------------
 
     def correction(self, view: View) -> Correction | None:
@@ -94,7 +96,7 @@ class ScanField(StillField):
         distance_m = 1.0 if box is None else box.distance_m
         if box is not None and box.contracted and self.settings.near_m is None:
             self.view_store.box = replace(box, near_m=tuned.NEAR_SHARE * distance_m)
-        self._poses = PoseCorrections(tuned.MOST_SHARE * distance_m, tuned.MOST_DEG)
+        self._poses = PoseCorrections(tuned.MOST_SHARE * distance_m, tuned.MOST_DEG, self.full_steps)
         self._exposures = Exposures()
         self._seen_m = 0.0  # usual depth of what cameras see, where frames tell it and none measure it
         self._given: tuple[View, ...] = ()  # the newest views, with depth as it came

@@ -91,9 +91,10 @@ def test_poses_and_exposures_are_refined_and_held_out_frames_take_their_neighbor
     np.testing.assert_array_equal(before["held"].gain, again.gain)
 
 
-def test_exact_poses_are_hardlyspoiled() -> None:
-    _, plain_db, _ = _fit(WALK)
-    _, _, refined_db = _fit(WALK, refine=True)
+def test_exact_poses_are_hardly_spoiled_however_long_they_are_refined() -> None:
+    """With steps that never get shorter they lose 2 dB."""
+    _, plain_db, _ = _fit(WALK, 1200)
+    _, _, refined_db = _fit(WALK, 1200, refine=True)
     assert refined_db is not None and refined_db > plain_db - 0.3
 
 
