@@ -25,7 +25,7 @@ from freshfield.files import write_json
 def median_curve(runs: Sequence[Path]) -> dict[str, Any]:
     """Of runs of one kind, by reported instant, medians over the runs.
 
-    Of fits ``t_s``, ``psnr_db``, ``ssim`` and ``lpips``; of simulations ``t_s``, ``psnr_db`` and ``psnr_moving_db``,
+    Of fits ``t_s``, ``psnr_db``, ``ssim`` and, where every run measured it, ``lpips``; of simulations ``t_s``, ``psnr_db`` and ``psnr_moving_db``,
     None where nothing that moves was shown.
 
     runs: folders of ``edge-server fit`` or ``edge-server simulate``. Raises OSError and ValueError for a folder that is
@@ -44,8 +44,11 @@ def median_curve(runs: Sequence[Path]) -> dict[str, Any]:
     }
     curve: dict[str, Any] = {"runs": len(runs)}
     for name, keys in columns.items():
-        values = [[next(row[k] for k in keys if row.get(k) is not None) for row in of_run] for of_run in rows]
-        curve[name] = np.round(np.median(values, axis=0), 3).tolist()
+        values: list[list[Any]] = [
+            [next((row[k] for k in keys if row.get(k) is not None), None) for row in of_run] for of_run in rows
+        ]
+        if not any(None in of_run for of_run in values):  # LPIPS needs its network: a run without it has no such column
+            curve[name] = np.round(np.median(values, axis=0), 3).tolist()
     return curve
 
 

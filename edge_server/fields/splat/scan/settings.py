@@ -57,8 +57,8 @@ TOWARDS_ONE = 0.02  # damping of the least squares towards gain 1 and bias 0, sq
 EXPOSURE_SHARE = 0.3  # of the way to a new estimate
 GAINS, MOST_BIAS = (0.4, 2.5), 0.3
 GAUGE_EVERY, GAUGE_SHARE = 40, 0.04  # steps between corrections of the gauge; share of the mean shift taken back
-# Steps of a view's pose after which they get shorter: later ones follow the noise of single steps. A field of views that
-# come one after the other is young where they are, and takes all in full.
+# Steps of a view's pose after which they get shorter: later ones follow the noise of single steps. A field of views
+# that come one after the other is young where they are, and takes all in full.
 FULL_STEPS = 3
 MOST_DEG, MOST_SHARE = 5.0, 0.1  # largest correction of a pose; share of the cameras' distance to the scene
 

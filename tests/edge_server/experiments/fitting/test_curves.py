@@ -22,12 +22,12 @@ def test_medians_at_refined_poses(tmp_path):
         write_fit(tmp_path / str(db), [row(1.0, 3.0, psnr_refined_db=db, ssim_refined=0.7)])
         for db in (20.0, 26.0, 22.0)
     ]
-    exact = write_fit(tmp_path / "exact", [row(1.0, 30.0, psnr_refined_db=None)])
+    exact = write_fit(tmp_path / "exact", [row(1.0, 30.0, psnr_refined_db=None, lpips=None)])
     fits = ["carried=" + ",".join(map(str, refined)), f"exact={exact}"]
     assert main([*fits, "--out", str(tmp_path / "both")]) == 0
     curves = json.loads((tmp_path / "both.json").read_text())["curves"]
     assert curves["carried"] == {"runs": 3, "t_s": [1.0], "psnr_db": [22.0], "ssim": [0.7], "lpips": [0.2]}
-    assert curves["exact"]["psnr_db"] == [30.0]
+    assert curves["exact"]["psnr_db"] == [30.0] and "lpips" not in curves["exact"]
     assert (tmp_path / "both.png").stat().st_size > 1000
 
 
