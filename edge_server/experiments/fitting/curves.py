@@ -25,8 +25,8 @@ from freshfield.files import write_json
 def median_curve(runs: Sequence[Path]) -> dict[str, Any]:
     """Of runs of one kind, by reported instant, medians over the runs.
 
-    Of fits ``t_s``, ``psnr_db``, ``ssim`` and, where every run measured it, ``lpips``; of simulations ``t_s``, ``psnr_db`` and ``psnr_moving_db``,
-    None where nothing that moves was shown.
+    Of fits ``t_s``, ``psnr_db``, ``ssim`` and, where every run measured it, ``lpips``; of simulations ``t_s``,
+    ``psnr_db`` and ``psnr_moving_db``, None where nothing that moves was shown.
 
     runs: folders of ``edge-server fit`` or ``edge-server simulate``. Raises OSError and ValueError for a folder that is
     none, or for fits whose instants differ in number from the others'.

@@ -23,10 +23,12 @@ from tests.edge_server.fields.splat.scan.walk import LENS, WALK, at, spoiled, wa
 
 HELD = 8  # one in so many frames is held out
 BAD_FROM = 40  # frame of a walk, four seconds after its begin
+# Training amplifies rounding, and processors round differently: a single training says little where much is lost.
+SEEDS = (0, 1, 2)
 
 
-def _field(threads: int = 2, gaussians: int = 3000) -> CarriedField:
-    options = {"gaussians": gaussians, "start": 500, "seed_cells": 32, "contracted": False}
+def _field(threads: int = 2, gaussians: int = 3000, seed: int = 0) -> CarriedField:
+    options = {"gaussians": gaussians, "start": 500, "seed_cells": 32, "contracted": False, "seed": seed}
     return CarriedField(SplatSettings(scan=True, refine=True, carried=True, threads=threads, **options))
 
 
@@ -182,10 +184,10 @@ def _blurred(view: View) -> View:
     return replace(view, image=(np.mean(parts, axis=0) + 0.5).astype(np.uint8))
 
 
-def _by_seconds(views: list[View], clean: list[View]) -> tuple[CarriedField, list[float]]:
+def _by_seconds(views: list[View], clean: list[View], seed: int = 0) -> tuple[CarriedField, list[float]]:
     """The field after all frames, and after each second from the fourth on the mean PSNR of the held-out frames so far
     of a walk without bad frames."""
-    field, found = _field(), []
+    field, found = _field(seed=seed), []
     for end in range(10, len(views) + 1, 10):
         part = views[end - 10 : end]
         for k, view in enumerate(part, end - 10):
@@ -197,8 +199,8 @@ def _by_seconds(views: list[View], clean: list[View]) -> tuple[CarriedField, lis
 
 
 @cache
-def _undisturbed(depth: bool) -> tuple[float, ...]:
-    return tuple(_by_seconds(walk(depth=depth), walk(depth=depth))[1])
+def _undisturbed(depth: bool, seed: int = 0) -> tuple[float, ...]:
+    return tuple(_by_seconds(walk(depth=depth), walk(depth=depth), seed)[1])
 
 
 @pytest.mark.stability
@@ -259,12 +261,12 @@ def _under_a_hand(k: int, view: View) -> View:
 
 
 @cache
-def _walk_after(begin: Callable[[int, View], View] | None, depth: bool) -> tuple[float, ...]:
+def _walk_after(begin: Callable[[int, View], View] | None, depth: bool, seed: int) -> tuple[float, ...]:
     """Mean PSNR of the held-out frames so far, two to five seconds after two seconds of a bad beginning."""
     clean = walk(depth=depth)[:50]
     bad = [begin(k, clean[0]) for k in range(20)] if begin else []
     views = [replace(view, generated_ns=100_000_000 * k) for k, view in enumerate([*bad, *clean])]
-    field, found = _field(), []
+    field, found = _field(seed=seed), []
     for k, view in enumerate(views, -len(bad)):
         if k < 0 or k % HELD:
             field.fit([replace(view, camera="hand")], Budget(steps=tuned.STEPS_A_KEYFRAME))
@@ -280,17 +282,17 @@ def _walk_after(begin: Callable[[int, View], View] | None, depth: bool) -> tuple
     [
         (_looks_about, True, 1.0),
         (_looks_about, False, 1.0),
-        (_at_a_wall, True, 1.0),
-        (_at_a_wall, False, 3.5),
-        (_under_a_hand, True, 1.2),
+        (_at_a_wall, True, 1.2),
+        (_at_a_wall, False, 1.4),
+        (_under_a_hand, True, 1.0),
         (_under_a_hand, False, 3.0),
     ],
 )
 def test_a_bad_beginning_is_forgotten_within_two_seconds(begin, depth: bool, lost_db: float) -> None:
-    """lost_db: at most, against a walk without that beginning. What a camera that only turns, or sees nothing, guesses
-    of the scene cost up to 11 dB for as long as it was kept."""
-    lost = np.array(_walk_after(None, depth)) - _walk_after(begin, depth)
-    assert lost.max() < lost_db
+    """lost_db: at most, against a walk without that beginning, on average over four instants of three trainings. What a
+    camera that only turns, or sees nothing, guesses of the scene cost up to 11 dB for as long as it was kept."""
+    lost = [np.array(_walk_after(None, depth, seed)) - _walk_after(begin, depth, seed) for seed in SEEDS]
+    assert np.mean(lost) < lost_db
 
 
 @pytest.mark.stability
@@ -354,19 +356,22 @@ def _without_rotation(k: int, view: View) -> View:
 @pytest.mark.parametrize(
     ("spoil", "words", "lost_db"),
     [
-        (_in_unit(1000.0), "times as far apart as meters are", 3.5),
-        (_in_unit(0.001), "times as far apart as meters are", 3.5),
-        (_without_rotation, "no rotation", 3.7),
+        (_in_unit(1000.0), "times as far apart as meters are", 1.8),
+        (_in_unit(0.001), "times as far apart as meters are", 4.2),
+        (_without_rotation, "no rotation", 3.2),
     ],
 )
 def test_poses_that_never_fit_give_way_to_pictures_where_depth_is_measured(spoil, words: str, lost_db: float) -> None:
-    """lost_db: at most, against right poses, from the fourth second on; as they are, such poses cost up to 11 dB for as
-    long as was looked. The walk takes a keyframe each 4 degrees and 15 cm, which 48 x 40 pixels show coarsely."""
-    views = [spoil(k, view) for k, view in enumerate(WALK)]
-    field, found_db = _by_seconds(views, views)
-    assert np.isfinite(field.cloud.params).all() and len(field.views) > 60
-    assert (np.array(_undisturbed(True)) - found_db).max() < lost_db
-    assert any("reported poses do not fit" in line and words in line for line in field.troubles)
+    """lost_db: at most, against right poses, from the fourth second on, on average over five instants of three
+    trainings; as they are, such poses cost up to 11 dB for as long as was looked. The walk takes a keyframe each 4
+    degrees and 15 cm, which 48 x 40 pixels show coarsely."""
+    views, lost = [spoil(k, view) for k, view in enumerate(WALK)], []
+    for seed in SEEDS:
+        field, found_db = _by_seconds(views, views, seed)
+        assert np.isfinite(field.cloud.params).all() and len(field.views) > 60
+        assert any("reported poses do not fit" in line and words in line for line in field.troubles)
+        lost.append(np.array(_undisturbed(True, seed)) - found_db)
+    assert np.mean(lost) < lost_db
 
 
 @pytest.mark.stability

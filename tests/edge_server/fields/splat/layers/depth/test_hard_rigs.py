@@ -1,7 +1,9 @@
 """Four cameras with depth in scenes and rigs that deceive sensors: what depth must still be worth there.
 
 A ball moves on a plate. Each case is compared with the same images without depth, or with the easy scene, and says
-after how many seconds of virtual time the picture has recovered.
+after how many seconds of virtual time the picture has recovered. Training amplifies rounding, and processors round
+differently: a single training says little, so each figure is a mean of three, and each bound lies three standard errors
+of such a mean beside that of eight.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from msgspec import structs
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
@@ -24,7 +27,8 @@ pytestmark = [pytest.mark.stability, pytest.mark.usefixtures("shown_soon")]
 RIG = ring(9)
 CAMERAS, HELD = [RIG[0], RIG[2], RIG[4], RIG[6]], RIG[1]
 FRAMES = 36
-HALF_SECOND, LATER_S = 8, 0.2  # frames; another kind of processor rounds otherwise, and training amplifies that
+HALF_SECOND = 8  # frames
+SEEDS = (0, 1, 2)
 DARK = range(18, 22)  # frames
 MIRROR_Y, PANE_Y = 0.85, -0.85  # planes behind and before the plate, as wide as it and 1 m high
 PATCHES = np.kron(np.random.default_rng(4).random((12, 12)) < 0.4, np.ones((4, 4), bool))
@@ -78,8 +82,8 @@ def _turned(view: View, degrees: float) -> View:
 class Case:
     """world: what is there. placed: where the cameras really stand. told: what reaches the field of camera k's frame.
     gains_db: how much better than without depth the held-out view must be; None: not compared. below_easy_db: how much
-    worse than in the easy scene it may be. recovers_s: measured, see ``_recovered_s``; since the first frame, or since
-    frame ``over``."""
+    worse than in the easy scene it may be; both in the last half second. recovers_s: at most, see ``_recovered_s``;
+    since the first frame, or since frame ``over``."""
 
     recovers_s: float
 
@@ -111,29 +115,29 @@ def _near(k: int, frame: int, view: View) -> View:
 
 
 CASES = {
-    "mirror": Case(0.0, _mirror, gains_db=1.5),
-    "glass": Case(0.7, _glass, gains_db=1.0),
-    "two thirds out of range": Case(1.1, told=_near, gains_db=0.7),
+    "mirror": Case(0.5, _mirror, gains_db=0.7),
+    "glass": Case(0.9, _glass, gains_db=1.1),
+    "two thirds out of range": Case(1.5, told=_near, gains_db=0.9),
     "scale 5 % off": Case(
-        1.1, told=_of_first(lambda v: replace(v, depth=v.depth * np.float32(1.05))), below_easy_db=1.5
+        1.1, told=_of_first(lambda v: replace(v, depth=v.depth * np.float32(1.05))), below_easy_db=0.9
     ),
-    "pose 3 degrees off": Case(0.7, told=_of_first(lambda v: _turned(v, 3.0)), gains_db=-0.3),
-    "two at one place": Case(0.6, placed=lambda k, view: CAMERAS[1] if k == 0 else view, gains_db=2.0),
-    "nothing in common": Case(0.3, placed=lambda k, view: _turned(view, (-24.0, 24.0, -24.0, 24.0)[k]), gains_db=0.4),
+    "pose 3 degrees off": Case(0.7, told=_of_first(lambda v: _turned(v, 3.0)), gains_db=-0.1),
+    "two at one place": Case(0.6, placed=lambda k, view: CAMERAS[1] if k == 0 else view, gains_db=2.5),
+    "nothing in common": Case(0.3, placed=lambda k, view: _turned(view, (-24.0, 24.0, -24.0, 24.0)[k]), gains_db=1.1),
     "light off": Case(
-        0.1,
+        0.3,
         told=lambda k, frame, v: replace(v, image=v.image // 40) if frame in DARK else v,
-        below_easy_db=1.0,
+        below_easy_db=0.2,
         over=DARK.stop,
     ),
-    "a third as large": Case(0.8, told=_scaled(1.0 / 3.0), below_easy_db=1.0),
-    "twice as large": Case(1.0, told=_scaled(2.0), below_easy_db=1.0),
+    "a third as large": Case(0.9, told=_scaled(1.0 / 3.0), below_easy_db=1.5),
+    "twice as large": Case(0.9, told=_scaled(2.0), below_easy_db=0.7),
 }
 
 
-def _curve(case: Case, depth: bool) -> list[float]:
+def _curve(case: Case, depth: bool, seed: int) -> list[float]:
     """PSNR of the held-out view after each frame. depth: whether frames bring it."""
-    field, shown_db = LayeredField(SMALL), []
+    field, shown_db = LayeredField(structs.replace(SMALL, seed=seed)), []
     for frame in range(FRAMES):
         views = []
         for k, camera in enumerate(CAMERAS):
@@ -152,12 +156,21 @@ def _curve(case: Case, depth: bool) -> list[float]:
     return shown_db
 
 
+def _curves(case: Case, depth: bool = True) -> NDArray[np.float64]:
+    """PSNR of the held-out view after each frame of each seed, (seeds, FRAMES)."""
+    return np.array([_curve(case, depth, seed) for seed in SEEDS])
+
+
+def _end_db(curves: NDArray[np.float64]) -> float:
+    return float(curves[:, -HALF_SECOND:].mean())
+
+
 @cache
 def _easy_db() -> float:
-    return _curve(Case(0.0), True)[-1]
+    return _end_db(_curves(Case(0.0)))
 
 
-def _recovered_s(curve: list[float], over: int) -> float:
+def _recovered_s(curve: NDArray[np.float64], over: int) -> float:
     """Seconds after frame ``over`` from which on each half second's mean is within 1 dB of the last one's."""
     means = np.convolve(curve, np.full(HALF_SECOND, 1.0 / HALF_SECOND), "valid")
     below = np.flatnonzero(means < means[-1] - 1.0)
@@ -167,9 +180,9 @@ def _recovered_s(curve: list[float], over: int) -> float:
 @pytest.mark.parametrize("name", CASES)
 def test_depth_is_worth_something_where_sensors_are_deceived(name: str) -> None:
     case = CASES[name]
-    curve = _curve(case, True)
+    curves = _curves(case)
     if case.gains_db is not None:
-        assert curve[-1] > _curve(case, False)[-1] + case.gains_db
+        assert _end_db(curves) > _end_db(_curves(case, depth=False)) + case.gains_db
     if case.below_easy_db is not None:
-        assert curve[-1] > _easy_db() - case.below_easy_db
-    assert _recovered_s(curve, case.over) <= case.recovers_s + LATER_S
+        assert _end_db(curves) > _easy_db() - case.below_easy_db
+    assert np.mean([_recovered_s(curve, case.over) for curve in curves]) <= case.recovers_s

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
@@ -20,6 +21,7 @@ from tests.edge_server.fields.splat.layers.depth.moving_ball import FRAME_S, SMA
 
 RIG = ring(9)
 CAMERAS, HELD = [RIG[0], RIG[2], RIG[4]], RIG[1]
+SEEDS = (0, 1, 2)
 pytestmark = pytest.mark.usefixtures("shown_soon")
 
 Spoil = Callable[[int, int, NDArray[np.float32]], NDArray[np.float32] | None]
@@ -159,12 +161,30 @@ def test_depth_of_another_size_is_refused() -> None:
         LayeredField(SMALL).fit([view], Budget(steps=1))
 
 
+def _spoiled(spoil: Spoil, seed: int) -> tuple[LayeredField, float]:
+    """The field after 40 frames, and the mean PSNR of its last half second."""
+    field, shown_db = LayeredField(structs.replace(SMALL, seed=seed)), []
+    for frame in range(40):
+        _run(field, range(frame, frame + 1), spoil)
+        if frame >= 32:
+            shown_db.append(score(field, HELD, frame * FRAME_S))
+    return field, float(np.mean(shown_db))
+
+
+@cache
+def _without_depth_db() -> float:
+    return float(np.mean([_spoiled(_no_depth, seed)[1] for seed in SEEDS]))
+
+
 @pytest.mark.stability
 @pytest.mark.parametrize("kind", _SPOILED)
 def test_broken_depth_costs_little(kind: str) -> None:
-    field = LayeredField(SMALL)
-    _run(field, range(40), _SPOILED[kind])
-    assert field.layered and len(field.cameras) == 3
-    assert tuple(said.split()[3] for said in field.troubles) == _NAMED.get(kind, ())
+    """Three trainings, since a single one differs between processors by up to 1 dB."""
+    shown_db = []
+    for seed in SEEDS:
+        field, of_seed_db = _spoiled(_SPOILED[kind], seed)
+        shown_db.append(of_seed_db)
+        assert field.layered and len(field.cameras) == 3
+        assert tuple(said.split()[3] for said in field.troubles) == _NAMED.get(kind, ())
     # A constant depth of the right order of magnitude, before cameras that share little, is believed.
-    assert score(field, HELD, 39 * FRAME_S) > _usual("none") - (2.5 if kind == "constant" else 0.5)
+    assert np.mean(shown_db) > _without_depth_db() - (2.5 if kind == "constant" else 0.5)
