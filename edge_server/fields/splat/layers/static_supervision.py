@@ -161,11 +161,13 @@ class StaticSupervision:
         return agree
 
     def _begin(self, plates: Sequence[PlateImage]) -> None:
-        """Have the still field forget what it has learned, and begin with ``plates``. What it showed is shown until it
-        is better."""
+        """Have the still field learn ``plates``: at first on top of the views, so that layers are shown at once. Later,
+        or where exposures differ, which it has learned too, from nothing. What it showed is shown until it is better.
+        """
         self.earlier = self.earlier or self.static.field.snapshot()
         self.static.forget()
-        self.static.field.reset()
+        if self.exposure_rounds > 0 or not self.early:
+            self.static.field.reset()
         self.static.begin(plates, tuned.EARLY_SHOWN_AFTER if self.early else None)
 
     def _equalize(self, cameras: Cameras) -> bool:

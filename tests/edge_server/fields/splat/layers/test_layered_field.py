@@ -131,8 +131,8 @@ def test_what_was_shown_before_the_plates_are_known_is_shown_until_the_still_fie
 def test_layers_begin_before_plates_are_certain_and_the_still_field_anew_when_they_are(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What is shown meanwhile stays until the new still field is better; a part of the plates that becomes known early
-    is learned at once."""
+    """It goes on from the views with the plates known so far, and learns what becomes known of them at once; what it
+    shows stays until the one that begins anew is better."""
     monkeypatch.setattr(settings, "EARLY_S", 0.6)
     monkeypatch.setattr(settings, "PLATE_S", 2.0)
     monkeypatch.setattr(settings, "EARLY_SHOWN_AFTER", 40)
@@ -147,6 +147,7 @@ def test_layers_begin_before_plates_are_certain_and_the_still_field_anew_when_th
     field = LayeredField(SMALL)
     _run(field, range(14), steps=10)
     assert field.tracker is not None and field.supervision.early and len(known) <= 6
+    assert field.still.step > 140 and field.static.ready  # ten in each fit since the first frame
     assert field.learning == "learning the background: 0.9 of 2 s"
     _run(field, range(14, 30), steps=10)
     assert len(known) > 2 and known[-1] >= known[0] and field.static.ready
