@@ -346,7 +346,8 @@ class StaticSupervision:
     # --- plates at full resolution ------------------------------------------------------------
 
     def take_whole(self, taken: Sequence[View], cameras: Cameras, observations: Observations) -> None:
-        """Take one of the frames into its camera's fine plate, now and then; the cameras take turns."""
+        """Take frames into their cameras' fine plates: some in each fit until all are known, then one now and then. The
+        cameras take turns."""
         begun = self.times.now()
         views = {v.camera: v for v in taken if v.whole is not None}
         seen = [o for o in observations if o.camera in views and o.view.generated_ns == views[o.camera].generated_ns]
@@ -355,10 +356,11 @@ class StaticSupervision:
         if not seen or alone or observations.newest_s - self.fine_s < every_s:
             return
         self.fine_s = observations.newest_s
-        o = min(seen, key=lambda o: cameras[o.camera].fine_count)
-        camera, decode = cameras[o.camera], views[o.camera].whole
-        if camera.fine is not None and decode is not None and (whole := decode()) is not None:
-            camera.fine.take(whole.image, o.foreground | ~camera.plate.known, camera.plate.gain)
+        seen.sort(key=lambda o: cameras[o.camera].fine_count)
+        for o in seen[: 1 if self.fine else tuned.FIRST_FINE]:
+            camera, decode = cameras[o.camera], views[o.camera].whole
+            if camera.fine is not None and decode is not None and (whole := decode()) is not None:
+                camera.fine.take(whole.image, o.foreground | ~camera.plate.known, camera.plate.gain)
         self.times.add("fine plates", begun)
 
     def _fine_plates_are_known(self, cameras: Cameras, observations: Observations) -> bool:
