@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from camera_node.depth_check import DepthView, DepthWrong, check, first_views
+from camera_node.depth_check import DepthView, DepthWrong, check, edge_contrast, first_views
 from camera_node.settings import source_config
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.depth import DepthRenderer
@@ -129,6 +129,15 @@ def test_cameras_that_see_nothing_in_common_and_blank_images_are_described():
     pixel = DepthImage(np.full((1, 1), 900, np.uint16), 0.001)
     with pytest.raises(DepthWrong, match="nearly all of it is the same"):
         check(replace(blank, depth=pixel), [away])
+
+
+@pytest.mark.parametrize(("count", "is_said"), [(199, False), (200, True)])
+def test_edges_of_fewer_than_200_pixels_say_nothing(count, is_said):
+    halves, lens = np.indices((count, 64))[1] // 32, Pinhole.from_fov(64, count, 60.0)
+    image = np.repeat(200 * halves[..., None], 3, axis=-1).astype(np.uint8)
+    depth = DepthImage((1000 + 1000 * halves).astype(np.uint16), 0.001)
+    found = edge_contrast(DepthView("cam01", image, lens, Pose.from_matrix(np.eye(4)), depth))
+    assert (found is not None) == is_said
 
 
 def test_scenarios_are_examined_where_they_have_depth():

@@ -33,6 +33,13 @@ class ByState(Youngest):
         return state.cameras[: 1 + int(state.poses[:, 0].sum())]
 
 
+class OnlyOpen(LastFirst):
+    """Values nothing that is captured."""
+
+    def values(self, state):
+        return np.where(np.isin(np.arange(len(state.open)), state.order), np.nan, 1.0)
+
+
 def painted(level):
     """A render of this level: a function of the field."""
 
@@ -128,7 +135,9 @@ ROWS = [(kind, name, *row) for kind, rows in BROKEN.items() for name, row in row
 globals().update({name: type(BASES[kind])(name, (BASES[kind],), dict(has)) for kind, name, has, _ in ROWS})
 
 
-@pytest.mark.parametrize(("kind", "name"), [*BUILT_IN, *OWN_CLASSES, ("policy", f"{__file__}:ByState")])
+@pytest.mark.parametrize(
+    ("kind", "name"), [*BUILT_IN, *OWN_CLASSES, ("policy", f"{__file__}:ByState"), ("selector", f"{__file__}:OnlyOpen")]
+)
 def test_what_keeps_its_contract_passes(kind, name, capsys):
     words = FAULTS[name].split() if name in FAULTS else []
     assert main(["check-plugin", kind, name, *words]) == 0, capsys.readouterr().out
