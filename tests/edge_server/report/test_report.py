@@ -13,7 +13,7 @@ import pytest
 from edge_server.cli import main as edge_server
 from edge_server.live.state import Publication
 from edge_server.report.build_report import METRICS, SERIES, assemble, build_report, fidelity, updates
-from edge_server.report.figures import draw_fidelity, draw_frontier
+from edge_server.report.figures import draw_ages, draw_fidelity, draw_frontier
 from edge_server.report.report_page import counts, number
 from edge_server.report.run_files import continuous, read_run_files
 from edge_server.run_records import EdgeStatus, UpdateCounts, UpdateRow
@@ -251,6 +251,14 @@ def test_a_held_out_camera_that_moves_is_drawn_and_tabled_at_refined_poses(tmp_p
         "shown, last fifth of the run, at given poses 24.00 17.00",
     ):
         assert words in text, words
+
+
+def test_the_band_of_ages_reaches_from_the_youngest_camera_to_the_oldest(run, tmp_path, monkeypatch) -> None:
+    files, bands = read_run_files(run[0]), []
+    monkeypatch.setattr("matplotlib.axes.Axes.fill_between", lambda axes, t, low, high, **_: bands.append((low, high)))
+    assert draw_ages(run[1], files, tmp_path / "ages.png")
+    known = np.array([[row.age_ms[camera] for camera in CAMERAS[1:]] for row in files.ages])
+    np.testing.assert_array_equal(bands, [(known.min(axis=1), known.max(axis=1))])
 
 
 @pytest.mark.stability
