@@ -106,8 +106,10 @@ def test_a_streams_ages_and_losses_are_the_channels(channel, greeter, client, tm
     report = link.settle()
     assert report.offered == 100 and int(answer) == len(greeter.collected) == report.delivered
     link.close()
+    records = trace.read(tmp_path / "1.jsonl").records
+    assert {r.session for r in records} == {"call1"}, "calls are counted from 1"
     # A busy machine paces them unevenly: when each one came says which pass.
-    offered_ms = [r.offered_ns / 1e6 for r in trace.read(tmp_path / "1.jsonl").records]
+    offered_ms = [r.offered_ns / 1e6 for r in records]
     free_ms, passed = float("-inf"), 0
     for at_ms in sorted(offered_ms):
         if at_ms >= free_ms:
