@@ -10,6 +10,7 @@ import pytest
 
 from camera_node.sources.datasets.formats import open_dataset
 from camera_node.sources.datasets.records import DatasetError
+from camera_node.sources.datasets.rgbd import foxglove
 from camera_node.sources.datasets.rgbd.recording import _nearest
 from freshfield.geometry import Pose, look_at
 
@@ -82,6 +83,13 @@ def test_images_depth_and_poses_of_a_recording(tmp_path, encoding):
         assert measured.after_image_ns == 8_000_000 and measured.intrinsics is None
     small = open_dataset(file, scale=2.0)[1][0]
     assert small.read().shape == (12, 16, 3) and small.depth().counts.shape == (12, 16)
+
+
+def test_of_a_folder_the_first_recording_is_read(tmp_path):
+    write(tmp_path / "b.mcap", camera="second")
+    file = write(tmp_path / "a.mcap")
+    for path in (tmp_path, file):
+        assert foxglove.load_dataset(path).cameras == ("front",)
 
 
 def test_an_image_gets_the_depth_nearest_in_time():
