@@ -1,4 +1,4 @@
-"""Every scene looks as it did: four small views of each beside the images in ``golden``, so that figures measured on
+"""Every scene looks as it did: five small views of each beside the images in ``golden``, so that figures measured on
 a scene stay figures of that scene. After a wanted change:
 
     python -m tests.camera_node.synthetic.test_golden
@@ -23,7 +23,7 @@ SCENES = {
     "tile": ("tile", {}),
     "bench": ("tile", {"bench": True}),
 }
-VIEWS = (("cam00", 0.0), ("cam04", 1.3), ("cam08", 2.9), ("cam12", 5.0))
+VIEWS = (("cam00", 0.0), ("cam04", 1.3), ("cam08", 2.9), ("cam12", 5.0), ("cam05", 3.7))
 
 
 # A ray that just hits or misses a moving part does the other a nanosecond earlier or later, as on another kind of
@@ -32,7 +32,7 @@ INSTANTS_S = (0.0, 1e-9, -1e-9)
 
 
 def views(name: str, later_s: float = 0.0) -> Image:
-    """Four views of a scene, side by side."""
+    """Five views of a scene, side by side."""
     kind, params = SCENES[name]
     scene = make_scene(kind, {**params, "width": 96, "height": 72})
     return np.hstack([scene.render(camera, t_s + later_s) for camera, t_s in VIEWS])

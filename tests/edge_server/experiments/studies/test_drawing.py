@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from edge_server.experiments.common.seed_table import SeedTable
-from edge_server.experiments.studies import drawing
+from edge_server.experiments.studies import drawing, metric_distortions
 from tests.edge_server.experiments.studies.invented import request
 
 
@@ -18,3 +19,11 @@ def test_the_lowest_panel_alone_names_the_axis(tmp_path: Path, monkeypatch: pyte
     table = SeedTable([{**row, "gamma_ms": gamma, "seed": seed} for gamma in (30.0, 60.0) for seed in (0, 1)])
     drawing.curves("mat", "gamma_ms", "maximum age (ms)", metrics, "channel")(request(tmp_path), table)
     assert named == [None, None, "maximum age (ms)"] and (tmp_path / "mat-room-0.png").is_file()
+
+
+def test_distortions_are_drawn_as_bright_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[tuple[str, np.ndarray]] = []
+    monkeypatch.setattr(metric_distortions, "draw_images", lambda path, rows: drawn.extend(rows[0][1]))
+    metric_distortions._draw(request(tmp_path), SeedTable([]))
+    assert [label for label, _ in drawn] == ["reference", *metric_distortions.THESIS]
+    np.testing.assert_allclose(drawn[0][1], 255 * metric_distortions._reference(0), atol=1.0)
