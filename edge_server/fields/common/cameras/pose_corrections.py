@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,24 @@ class PoseCorrection:
         return _corrected(self.given, self.rotation, self.shift_m)
 
 
+class Leap(NamedTuple):
+    """From one view on all poses that a camera reports are off by the same motion: its tracker has found itself anew.
+
+    before_ns, from_ns: when the last view before it and the first one after it were taken. back: (4, 4), leads a pose
+    reported since to where it would have been reported. shift_m: by how much it shifted that first view.
+    """
+
+    before_ns: int
+    from_ns: int
+    back: Array
+    shift_m: float
+
+    @property
+    def words(self) -> str:
+        turned_deg = np.rad2deg(np.linalg.norm(so3_log(self.back[:3, :3])))
+        return f"{self.shift_m:.1f} m and {turned_deg:.0f} degrees"
+
+
 class PoseCorrections:
     """Bounded corrections of camera poses.
 
@@ -61,6 +79,7 @@ class PoseCorrections:
     def __init__(self, most_m: float, most_deg: float, full_steps: float = np.inf) -> None:
         self.most_m, self.most_rad, self.full_steps = most_m, np.deg2rad(most_deg), full_steps
         self.known: dict[str, PoseCorrection] = {}
+        self.leaps: dict[str, tuple[Leap, ...]] = {}  # of each track, in the order of time
         self._sorted: dict[str, list[str]] = {}  # names by track, in the order of time; empty: not known
         self._ranks: dict[str, int] = {}
 
@@ -68,7 +87,24 @@ class PoseCorrections:
         """A copy that later steps do not change."""
         other = PoseCorrections(self.most_m, 0.0)
         other.most_rad, other.known = self.most_rad, {name: replace(c) for name, c in self.known.items()}
+        other.leaps = dict(self.leaps)
         return other
+
+    def taken_back(self, view: View, track: str) -> View:
+        """A view at the pose that its camera would have reported without leaps. One taken between the views by which a
+        leap was found may be from before or after it: it lies where it is nearer to its neighbors in time."""
+        leaps = self.leaps.get(track, ())
+        if not leaps or view.generated_ns <= leaps[0].before_ns:
+            return view
+        backs, before = [np.eye(4), *(leap.back for leap in leaps)], 0
+        while before < len(leaps) and leaps[before].from_ns <= view.generated_ns:
+            before += 1
+        poses = [backs[before] @ view.camera_to_world]
+        if before < len(leaps) and leaps[before].before_ns < view.generated_ns:
+            poses.append(backs[before + 1] @ view.camera_to_world)
+        near = [self.known[name].given for name in self.neighbors_in_time(view, track)]
+        apart = [sum(np.abs(pose - each).sum() for each in near) for pose in poses]
+        return replace(view, camera_to_world=poses[int(np.argmin(apart))])
 
     def begin(self, view: View, track: str) -> None:
         """Assign a view to a track, with the correction of the one before it there, if any."""

@@ -24,7 +24,7 @@ from edge_server.fields.splat.kernels.rasterize import EXPOSURE, Targets
 from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.discs import usable_depth
 from edge_server.fields.splat.scan.own_motion import OwnMotion, search
-from edge_server.fields.splat.scan.plausibility import moved_in, troubles, unturned
+from edge_server.fields.splat.scan.plausibility import agreeing, flat, moved_in, troubles, unturned
 from edge_server.fields.splat.scan.scan_field import ScanField, Shown, aim_of
 from edge_server.fields.splat.scan.sweep import sweep_depth
 from edge_server.fields.splat.scan.tracking import Alignment, Rendered, align, gray
@@ -118,10 +118,9 @@ class CarriedField(ScanField):
         self._aims: list[tuple[NDArray[np.float64], float]] = []
         self._index: dict[str, int] = {}
 
-    def _take(self, given: View) -> None:
+    def _take(self, reported: View) -> None:
         """Make a view a keyframe."""
-        box = self.view_store.box
-        assert box is not None
+        given = self._poses.taken_back(reported, reported.camera)
         view = replace(given, camera=f"{given.camera}{SEPARATOR}{self._taken}", depth=usable_depth(given.depth))
         last = self._seen.get(given.camera)
         if last is not None and not self._measured:
@@ -129,13 +128,16 @@ class CarriedField(ScanField):
         self._seen[given.camera] = given
         self._follow(view)
         shown = self._look(view)
-        doubted = self._doubted(view, shown)
-        if self._rigid is not None and len(self.cloud) and (doubted or self._agreeing(view, shown) < tuned.SURE):
-            placed = self._placed(view, shown, doubted)
+        unseen = self._leaps_out_of_sight(reported, shown)
+        doubted = unseen or self._own.doubted(reported.camera)
+        agrees = agreeing(view, shown, *self._exposures.of(view.camera))
+        if self._rigid is not None and len(self.cloud) and (doubted or agrees < tuned.SURE):
+            placed = self._placed(view, shown, unseen)
             if placed is None and self._founded:
                 self._leave_out(view)
                 return
             view = placed or view
+            self._seen[given.camera] = replace(given, camera_to_world=view.camera_to_world)
             shown = self._look(view)
         else:
             self._own.trust(given.camera)
@@ -186,54 +188,64 @@ class CarriedField(ScanField):
         if before:
             self._exposures.known[view.camera] = self._exposures.between(before)
 
-    def _track(self, view: View) -> Alignment:
-        """Correct the pose of a view by what it shows."""
+    def _track(self, view: View, prior: float | None = None) -> Alignment:
+        """Correct the pose of a view by what it shows. prior: see ``align``."""
         frame = gray(view.image)
         for _ in range(tuned.ALIGNMENTS):
-            found = align(self._rendered(view, self._pose_of(view)), frame, view.camera_to_world)
+            found = align(self._rendered(view, self._pose_of(view)), frame, view.camera_to_world, prior=prior)
             self._poses.set_pose(view, found.pose)
         return found
 
-    def _doubted(self, view: View, shown: Shown) -> bool:
-        """Whether to look for a view elsewhere first: reports of its camera do not fit, or leap out of sight."""
-        camera, seen = _carrier(view), (shown.opacity >= tuned.ALIGNED_OPACITY).mean()
-        if self._own.leaps(view, camera) and seen < tuned.LEAST_OVERLAP and self._measured:
-            self._own.doubt(camera)
-            return True
-        return self._measured and self._own.astray(camera)
+    def _leaps_out_of_sight(self, view: View, shown: Shown) -> bool:
+        """Whether a view is reported far from the one before, where hardly anything is shown."""
+        seen = (shown.opacity >= tuned.ALIGNED_OPACITY).mean()
+        leaps = self._own.leaps(view, view.camera) and seen < tuned.LEAST_OVERLAP and self._founded
+        if leaps and self._measured:
+            self._own.doubt(view.camera)
+        return leaps
 
-    def _placed(self, view: View, shown: Shown, doubted: bool) -> View | None:
+    def _placed(self, view: View, shown: Shown, unseen: bool) -> View | None:
         """A view where its picture was taken: near its reported pose, else near the view before. None: it shows
-        something else than is to be seen from there."""
+        something else than is to be seen from there. unseen: see ``_leaps_out_of_sight``."""
         camera = _carrier(view)
-        if doubted:
-            if not self._own.astray(camera):
-                return None
-            if self._own.fits_again(camera, self._fits_as_reported(view, shown)):
+        if self._own.astray(camera):
+            if self._own.fits_again(camera, not flat(view, shown) and self._track(view).fits):
                 return view
             found = self._search(view)
             if found is not None:
                 return self._own.located(view, camera, *found)
             return self._own.lost(view, camera, self._has_depth_of(view) is not None)
-        if self._flat(view, shown):
+        if flat(view, shown):
             return None
+        begun = self._pose_of(view)
         tracked = self._track(view)
-        if self._measured and tracked.overlap >= tuned.LEAST_OVERLAP and tracked.agreeing < tuned.DOUBTFUL:
+        after_leap = self._own.after_leap(view, camera)
+        if after_leap is not None:
+            known = self._poses.known[view.camera]
+            self._poses.begin(after_leap, camera)
+            fits = not tracked.fits and self._track(after_leap, tuned.GUESSED_ERROR).fits
+            if self._own.try_leap(camera, fits):
+                return after_leap
+            if fits:
+                return None
+            self._poses.known[view.camera] = known
+        leapt, least = False, tuned.DOUBTFUL if self._measured else tuned.LOCATED
+        doubtful = tracked.overlap >= tuned.LEAST_OVERLAP and tracked.agreeing < least
+        if unseen or (doubtful and self._founded):
             found = self._search(view)
             if found is not None and found[1] != 1.0:
-                if tracked.agreeing >= tuned.LEAST_AGREEING:
+                if self._measured and tracked.agreeing >= tuned.LEAST_AGREEING and not unseen:
                     self._own.doubt(camera)
                 if self._own.astray(camera):
                     return self._own.located(view, camera, *found)
-            elif found is not None:
+                if not tracked.fits:
+                    again = self._search(view, tuned.FOLLOWED) or found
+                    leapt = self._own.suggest_leap(view, camera, begun, again[0])
+            elif found is not None and not unseen:
                 self._own.trust(camera)
-        return view if self._plausible(view, tracked) else None
-
-    def _fits_as_reported(self, view: View, shown: Shown) -> bool:
-        if self._flat(view, shown):
-            return False
-        tracked = self._track(view)
-        return tracked.overlap >= tuned.LEAST_OVERLAP and tracked.agreeing >= tuned.LOCATED
+        if unseen and self._measured:
+            return None
+        return view if self._plausible(view, tracked, leapt) else None
 
     def _has_depth_of(self, view: View) -> View | None:
         """The newest keyframe with depth of a view's camera, if it was taken not long before."""
@@ -241,40 +253,27 @@ class CarriedField(ScanField):
         recent = last is not None and bool(before) and last.generated_ns >= before[0].at_ns
         return last if recent else None
 
-    def _search(self, view: View) -> tuple[NDArray[np.float64], float] | None:
+    def _search(self, view: View, goes_on: float = 0.0) -> tuple[NDArray[np.float64], float] | None:
         """See ``own_motion.search``."""
         last, before = self._has_depth_of(view), self._own.before(view, _carrier(view))
-        if last is None or last.depth is None:
+        if last is not None and (z := last.depth) is not None:
+            kept = Rendered(self._pose_of(last), last.intrinsics, gray(last.image), z, np.ones_like(z))
+        elif before and (newest := [each for each in self._views if _carrier(each) == _carrier(view)]):
+            kept = self._rendered(newest[-1], self._pose_of(newest[-1]))._replace(gray=gray(newest[-1].image))
+        else:
             return None
-        kept = Rendered(self._pose_of(last), last.intrinsics, gray(last.image), last.depth, np.ones_like(last.depth))
-        return search(view, kept, before, self._poses, lambda pose: self._rendered(view, pose))
+        return search(view, kept, before, self._poses, lambda pose: self._rendered(view, pose), goes_on)
 
     def _rendered(self, view: View, pose: NDArray[np.float64]) -> Rendered:
         shown, lens = self._look(view, tuned.RENDERED_HALVINGS, pose), view.intrinsics.halved(tuned.RENDERED_HALVINGS)
         return Rendered(pose, lens, gray(shown.color), shown.depth, shown.opacity)
 
-    def _agreeing(self, view: View, shown: Shown) -> float:
-        """The share of a view's pixels, of those where the field shows a surface, that look as expected."""
-        gain, bias = self._exposures.of(view.camera)
-        expected = shown.color * gain.astype(np.float32) + bias.astype(np.float32)
-        surface = shown.opacity[::2, ::2] >= tuned.ALIGNED_OPACITY
-        error = np.abs(gray(expected[::2, ::2]) - gray(view.image[::2, ::2]))[surface]
-        return float((error < tuned.SOFT).mean()) if error.size else 1.0
-
-    def _flat(self, view: View, shown: Shown) -> bool:
-        """Whether a view shows hardly anything where the field shows something: its lens is covered, or it is dark. An
-        exposure could be found by which it agrees."""
-        surface = shown.opacity >= tuned.ALIGNED_OPACITY
-        if surface.mean() < tuned.LEAST_OVERLAP:
-            return False
-        contrast, expected = (float(gray(each)[surface].std()) for each in (view.image, shown.color))
-        return contrast < tuned.FLAT * expected
-
-    def _plausible(self, view: View, found: Alignment) -> bool:
+    def _plausible(self, view: View, found: Alignment, leapt: bool) -> bool:
         """Whether a view shows what the field does, or so many in a row did not that this one is taken."""
         camera = _carrier(view)
         row = self._in_a_row.get(camera, 0)
-        taken = found.overlap < tuned.LEAST_OVERLAP or found.agreeing >= tuned.LEAST_AGREEING or row >= tuned.PATIENCE
+        fits = found.overlap < tuned.LEAST_OVERLAP or found.agreeing >= tuned.LEAST_AGREEING
+        taken = (fits and not leapt) or row >= tuned.PATIENCE
         self._in_a_row[camera] = 0 if taken else row + 1
         return taken
 
@@ -326,9 +325,10 @@ class CarriedField(ScanField):
         that take the scene for farther than it is overshoot. Where none is found, the box stays."""
         swept = {view.camera: view for view in self._swept()}
         views, kept = [swept.get(v.camera, v) for v in self._views], {name: getattr(self, name) for name in _OF_CAMERAS}
-        due, turns = self._due_before + self.step // tuned.STEPS_A_KEYFRAME, self._own.unturned
+        due = self._due_before + self.step // tuned.STEPS_A_KEYFRAME
+        turns, leaps = self._own.unturned, self._poses.leaps
         self._begin(views)
-        self._own.unturned = turns
+        self._own.unturned, self._poses.leaps = turns, leaps
         for name, value in kept.items():
             setattr(self, name, value)
         self._due_before = due

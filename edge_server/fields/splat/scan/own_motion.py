@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common.cameras.pose_corrections import PoseCorrection, PoseCorrections
+from edge_server.fields.common.cameras.pose_corrections import Leap, PoseCorrection, PoseCorrections
 from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.tracking import Gray, Rendered, align, align_from, gray
 from freshfield.geometry import se3, se3_inverse, so3_exp, so3_log
@@ -36,11 +36,16 @@ class OwnMotion:
         self.missed: dict[str, int] = {}  # frames in a row of a camera astray that were not found
         self.replaced: dict[str, int] = {}
         self.unturned: dict[str, int] = {}  # see ``compare_turns``
+        self._suggested: dict[str, tuple[Leap, int]] = {}  # a leap that may be, and how many views fit to it
         self._reported_m: dict[str, Array] = {}  # position of a camera's newest view, (3,)
 
     def astray(self, camera: str) -> bool:
         """Whether reported poses of a camera are not believed."""
         return self.doubts.get(camera, 0) >= tuned.DOUBTS
+
+    def doubted(self, camera: str) -> bool:
+        """Whether the next view of a camera has to be looked for."""
+        return self.astray(camera) or camera in self._suggested
 
     def doubt(self, camera: str) -> None:
         """Note that a view fits better elsewhere than where reported motion leads."""
@@ -81,6 +86,50 @@ class OwnMotion:
         self._reported_m[camera] = here
         return bool(np.linalg.norm(here - before) > tuned.FARTHEST * self._poses.most_m)
 
+    def suggest_leap(self, view: View, camera: str, begun: Array, found: Array) -> bool:
+        """Note that poses of a camera may have leapt before a view: it was found elsewhere, soon after the one before,
+        and farther away than a correction goes. Returns whether so.
+
+        begun: (4, 4), the view's pose with the correction of the one before it, which goes on. found: (4, 4), where its
+        picture was taken.
+        """
+        before = self.before(view, camera)[-1:]
+        recent = before and view.generated_ns - before[0].at_ns < 1e9 * tuned.LONGEST_GAP_S
+        if not recent or self._poses.within(begun, found, 1.0):
+            return False
+        reported, back = self._as_reported(view, camera), found @ se3_inverse(begun) @ self._back(camera)
+        back = se3(so3_exp(so3_log(back[:3, :3])), back[:3, 3])  # else errors of rounding grow from leap to leap
+        if self._poses.within(reported, found, 1.0):
+            back = np.eye(4)  # an earlier leap has ended
+        shift_m = float(np.linalg.norm((back @ reported - reported)[:3, 3]))
+        self._suggested[camera] = Leap(before[0].at_ns, view.generated_ns, back, shift_m), 0
+        return True
+
+    def after_leap(self, view: View, camera: str) -> View | None:
+        """A view where it is if poses of its camera have leapt as is suggested; None: nothing is."""
+        if camera not in self._suggested:
+            return None
+        return replace(view, camera_to_world=self._suggested[camera][0].back @ self._as_reported(view, camera))
+
+    def try_leap(self, camera: str, fits: bool) -> bool:
+        """Note whether a view fits to the leap that is suggested. Returns whether so many did that it is believed."""
+        leap, count = self._suggested.pop(camera)
+        if not fits:
+            return False
+        if count + 1 < tuned.LEAPT:
+            self._suggested[camera] = leap, count + 1
+            return False
+        self._poses.leaps[camera] = (*self._poses.leaps.get(camera, ()), leap)[-tuned.KEPT_CORRECTIONS :]
+        self.trust(camera)
+        return True
+
+    def _back(self, camera: str) -> Array:
+        leaps = self._poses.leaps.get(camera)
+        return leaps[-1].back if leaps else np.eye(4)
+
+    def _as_reported(self, view: View, camera: str) -> Array:
+        return se3_inverse(self._back(camera)) @ view.camera_to_world
+
     def located(self, view: View, camera: str, pose: Array, scale: float) -> View:
         """The view at a pose (4, 4) that its picture was found at, and no longer at the reported one."""
         self.missed[camera] = 0
@@ -106,26 +155,40 @@ class OwnMotion:
 
     def troubles(self) -> list[str]:
         """What is wrong with the cameras' reported poses, for people."""
-        return [
+        replaced = [
             f"{camera}: {count} reported poses do not fit its pictures and were replaced by what the pictures show"
             + misfit(self._poses.newest(camera, tuned.JUDGED))
             for camera, count in self.replaced.items()
-        ] + [
+        ]
+        leapt = [
+            f"{camera}: its poses leapt by {leaps[-1].words}: they are taken back by as much"
+            for camera, leaps in self._poses.leaps.items()
+            if not np.array_equal(leaps[-1].back, np.eye(4))
+        ]
+        unturned = [
             f"{camera}: reported poses have no rotation, but its pictures turn: look at how they are exported and read"
             for camera in self.unturned
             if self.has_no_rotation(camera)
         ]
+        return [*replaced, *leapt, *unturned]
 
     def meta(self) -> dict[str, Any]:
         """What a state keeps, ready for JSON."""
         places = {camera: place.tolist() for camera, place in self._reported_m.items()}
-        return {**{name: getattr(self, name) for name in _COUNTS}, "reported_m": places}
+        leaps = {camera: [_as_list(leap) for leap in leaps] for camera, leaps in self._poses.leaps.items()}
+        suggested = {camera: (_as_list(leap), count) for camera, (leap, count) in self._suggested.items()}
+        counts = {name: getattr(self, name) for name in _COUNTS}
+        return {**counts, "reported_m": places, "leaps": leaps, "suggested": suggested}
 
     def load(self, meta: dict[str, Any]) -> None:
         """Restore what ``meta`` returned."""
         for name in _COUNTS:
             setattr(self, name, {str(camera): int(count) for camera, count in meta[name].items()})
         self._reported_m = {str(camera): np.array(place) for camera, place in meta["reported_m"].items()}
+        self._poses.leaps = {str(camera): tuple(map(_leap, leaps)) for camera, leaps in meta["leaps"].items()}
+        self._suggested = {
+            str(camera): (_leap(leap), int(count)) for camera, (leap, count) in meta["suggested"].items()
+        }
 
 
 def search(
@@ -134,16 +197,17 @@ def search(
     before: Sequence[PoseCorrection],
     poses: PoseCorrections,
     rendered: Callable[[Array], Rendered],
+    goes_on: float = 0.0,
 ) -> tuple[Array, float] | None:
     """Where a view was taken, (4, 4), by an earlier view and then the field, and ``followed_scale``; None: not found.
 
     kept: the earlier view, with its depth. before: see ``guessed_poses``. poses: says how far apart poses may be.
-    rendered: renders the field from a pose.
+    rendered: renders the field from a pose. goes_on: see ``align_from``.
     """
     frame = gray(view.image)
     if frame.std() < tuned.FLAT * kept.gray.std():
         return None  # an exposure could be found by which it agrees
-    found = align_from(kept, frame, guessed_poses(view, before))
+    found = align_from(kept, frame, guessed_poses(view, before), goes_on)
     least = tuned.LEAST_OVERLAP * float((kept.depth > 0).mean())
     if found.overlap < least or found.agreeing < tuned.LOCATED:
         return None
@@ -151,13 +215,12 @@ def search(
         return None
     scale = followed_scale(kept, frame, view.camera_to_world, before, found.agreeing)
     refined = align(rendered(found.pose), frame, found.pose, prior=tuned.GUESSED_ERROR)
-    fits = refined.overlap >= tuned.LEAST_OVERLAP and refined.agreeing >= tuned.LOCATED
-    return (refined.pose if fits and poses.within(found.pose, refined.pose, 1.0) else found.pose), scale
+    return (refined.pose if refined.fits and poses.within(found.pose, refined.pose, 1.0) else found.pose), scale
 
 
 def guessed_poses(view: View, before: Sequence[PoseCorrection]) -> list[Array]:
-    """Poses (4, 4) where a view may have been taken: as the one before it, moved on as before, moved or turned as its
-    reported pose says.
+    """Poses (4, 4) where a view may have been taken: moved or turned as its reported pose says, as the one before it,
+    moved on as before; this one comes last.
 
     before: corrections of earlier views of its camera, at least one, in the order of time.
     """
@@ -221,3 +284,11 @@ def misfit(known: Sequence[PoseCorrection]) -> str:
 
 def _reported(known: PoseCorrection) -> Array:
     return known.given if known.reported is None else known.reported
+
+
+def _as_list(leap: Leap) -> list[Any]:
+    return [*leap[:2], leap.back.tolist(), leap.shift_m]
+
+
+def _leap(told: Sequence[Any]) -> Leap:
+    return Leap(int(told[0]), int(told[1]), np.array(told[2], dtype=np.float64), float(told[3]))

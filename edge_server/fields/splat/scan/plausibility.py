@@ -12,6 +12,8 @@ from edge_server.fields import View
 from edge_server.fields.common.cameras.constant_correction import constant_correction
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
 from edge_server.fields.splat.scan import settings as tuned
+from edge_server.fields.splat.scan.scan_field import Shown
+from edge_server.fields.splat.scan.tracking import gray
 from freshfield.geometry import se3_inverse, so3_log
 
 Array = NDArray[np.float64]
@@ -41,6 +43,24 @@ def moved_in(now: View, pose: Array, before: View, before_pose: Array) -> NDArra
     found = cv2.dilate(cv2.morphologyEx(through.astype(np.uint8), cv2.MORPH_OPEN, kernel), kernel)
     size = (now.image.shape[1], now.image.shape[0])
     return cv2.resize(found, size, interpolation=cv2.INTER_NEAREST).astype(bool)
+
+
+def agreeing(view: View, shown: Shown, gain: Array, bias: Array) -> float:
+    """The share of a view's pixels, of those where the field shows a surface, that look as expected."""
+    expected = shown.color * gain.astype(np.float32) + bias.astype(np.float32)
+    surface = shown.opacity[::2, ::2] >= tuned.ALIGNED_OPACITY
+    error = np.abs(gray(expected[::2, ::2]) - gray(view.image[::2, ::2]))[surface]
+    return float((error < tuned.SOFT).mean()) if error.size else 1.0
+
+
+def flat(view: View, shown: Shown) -> bool:
+    """Whether a view shows hardly anything where the field shows something: its lens is covered, or it is dark. An
+    exposure could be found by which it agrees."""
+    surface = shown.opacity >= tuned.ALIGNED_OPACITY
+    if surface.mean() < tuned.LEAST_OVERLAP:
+        return False
+    contrast, expected = (float(gray(each)[surface].std()) for each in (view.image, shown.color))
+    return contrast < tuned.FLAT * expected
 
 
 def unturned(before: View, now: View) -> bool:

@@ -31,7 +31,9 @@ class RefinedCameras:
         learned = self.poses.learned_pose(view)
         if learned is not None:
             return Correction(learned, *self.exposures.of(view.camera))
-        neighbors = self.poses.neighbors_in_time(view, self._track_of(view))
+        track = self._track_of(view)
+        view = self.poses.taken_back(view, track)
+        neighbors = self.poses.neighbors_in_time(view, track)
         return Correction(self.poses.pose_between(view, neighbors), *self.exposures.between(neighbors))
 
     def _track_of(self, view: View) -> str:
@@ -43,9 +45,8 @@ class RefinedCameras:
 
         def apart_m(track: str) -> float:
             near = [self.poses.known[name].given for name in self.poses.neighbors_in_time(view, track)]
-            return min(
-                (float(np.linalg.norm(pose[:3, 3] - view.camera_to_world[:3, 3])) for pose in near), default=np.inf
-            )
+            here = self.poses.taken_back(view, track).camera_to_world[:3, 3]
+            return min((float(np.linalg.norm(pose[:3, 3] - here)) for pose in near), default=np.inf)
 
         return min(tracks, key=apart_m)
 

@@ -96,6 +96,7 @@ LOCATED = 0.7  # least share of pixels for another place to be believed
 FARTHEST = 6.0  # largest corrections, that a camera may move between two keyframes: more is a wrong match, or a leap
 LOST = 1  # frames in a row that are not found, after which one is taken where the one before was
 DOUBTS = 2  # keyframes in a row for which another place fits better, from which on reports are not believed
+LEAPT = 2  # further keyframes that fit where a leap of reported poses leads, from which on it is believed
 ASTRAY_FOR = 4  # keyframes from which on it is said why reported poses do not fit
 SAME_TURN, TURNED = 1e-6, 0.05  # of matrices' numbers: a tracker's noise is more; a camera that turns
 CORNERS, LEAST_CORNERS, CORNERS_APART_PX = 200, 8, 3  # of a picture, followed to the next keyframe
@@ -119,7 +120,7 @@ JUDGED = 24  # newest keyframes of a camera by which its poses are judged
 MOUNT_POSES = 256  # newest ones by which an error of the mount is told: 15 ms
 DRIFT_SHARE = 0.6  # of the largest correction, above which poses drift
 LATE_S, LATE_EXPLAINS = 0.03, 0.4  # least delay of poses that is said, and share of the corrections that it explains
-LONGEST_GAP_S = 1.5  # between two keyframes, for a velocity
+LONGEST_GAP_S = 1.5  # between two keyframes, for a velocity or a leap: a covered camera may be carried elsewhere
 
 
 def scan_options(pixels: int, tracked: bool) -> dict[str, Any]:

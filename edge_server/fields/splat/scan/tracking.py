@@ -43,6 +43,11 @@ class Alignment(NamedTuple):
     overlap: float
     agreeing: float
 
+    @property
+    def fits(self) -> bool:
+        """Whether enough is seen, and looks as expected, for the pose to be believed whatever is reported."""
+        return self.overlap >= tuned.LEAST_OVERLAP and self.agreeing >= tuned.LOCATED
+
 
 def gray(image: NDArray) -> Gray:
     """(H, W) in [0, 1] of an image (H, W, 3 or 4), bytes or float."""
@@ -90,12 +95,13 @@ def align(
     return Alignment(shown.pose @ se3_inverse(motion), overlap, agreeing)
 
 
-def align_from(shown: Rendered, frame: Gray, candidates: Sequence[Array]) -> Alignment:
+def align_from(shown: Rendered, frame: Gray, candidates: Sequence[Array], last: float = 0.0) -> Alignment:
     """Find the pose of a frame from several guesses, (4, 4) each: the one that fits best at the coarse sizes is
-    followed to the finest."""
+    followed to the finest. last: the last one is taken if it fits worse than the best by less than this share."""
     coarse, finest = tuned.LEVELS[:-1], tuned.LEVELS[-1:]
     found = [align(shown, frame, pose, pose, coarse, tuned.GUESSED_ERROR) for pose in candidates]
-    best = max(found, key=lambda each: min(each.overlap, tuned.ENOUGH_OVERLAP) * each.agreeing)
+    fit = [min(each.overlap, tuned.ENOUGH_OVERLAP) * each.agreeing for each in found]
+    best = found[-1 if fit[-1] > (1.0 - last) * max(fit) else fit.index(max(fit))]
     return align(shown, frame, best.pose, best.pose, finest, tuned.GUESSED_ERROR)
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from edge_server.fields import View
-from edge_server.fields.common.cameras.pose_corrections import PoseCorrections, normal_matrix
-from freshfield.geometry import Pinhole, look_at, so3_exp, world_rays
+from edge_server.fields.common.cameras.pose_corrections import Leap, PoseCorrections, normal_matrix
+from freshfield.geometry import Pinhole, look_at, se3, se3_inverse, so3_exp, world_rays
 
 LENS = Pinhole.from_fov(48, 40, 60.0)
 WALL_M = 2.0  # ahead of the cameras
@@ -117,6 +117,26 @@ def test_views_in_between_take_their_neighbors_corrections_in_camera_axes() -> N
     np.testing.assert_allclose(pose[:3, 3], asked.camera_to_world[:3, 3] + axes @ (2.0 * local), atol=1e-12)
     assert poses.neighbors_in_time(replace(asked, generated_ns=500)) == {"last": 1.0}
     np.testing.assert_array_equal(poses.pose_between(asked, {}), asked.camera_to_world)
+
+
+def test_poses_reported_after_a_leap_are_taken_back_and_earlier_ones_are_not() -> None:
+    """A view taken between the keyframes by which the leap was found lies where its neighbors are."""
+    poses, true = PoseCorrections(1.0, 20.0), [_view(f"v{k}", 10 * k, x=0.1 * k) for k in range(6)]
+    leap = se3(so3_exp([0.1, -0.2, 0.3]), (0.5, 0.0, -0.8))
+    poses.leaps["a"] = (Leap(20, 30, se3_inverse(leap), 0.9),)
+    for view in true:
+        poses.begin(view, "a")
+    frozen = poses.copied()
+    poses.leaps["a"] = (*poses.leaps["a"], Leap(40, 50, np.eye(4), 0.0))
+    for at_ns, leapt in ((5, False), (20, False), (22, False), (28, True), (30, True), (35, True)):
+        expected = _view("asked", at_ns, x=0.01 * at_ns)
+        reported = leap @ expected.camera_to_world if leapt else expected.camera_to_world
+        for known in (poses, frozen):
+            found = known.taken_back(replace(expected, camera_to_world=reported), "a")
+            np.testing.assert_allclose(found.camera_to_world, expected.camera_to_world, atol=1e-12)
+    back = _view("asked", 52, x=0.52)
+    np.testing.assert_array_equal(poses.taken_back(back, "a").camera_to_world, back.camera_to_world)
+    assert poses.taken_back(back, "b") is back and "asked" not in poses.known
 
 
 def test_a_step_moves_the_views_taken_around_it_but_not_those_without_times() -> None:

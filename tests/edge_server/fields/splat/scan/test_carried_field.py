@@ -16,7 +16,7 @@ from edge_server.fields.splat.densification import GaussianCloud
 from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.carried_field import CarriedField
 from edge_server.fields.splat.settings import SplatSettings
-from freshfield.geometry import look_at, so3_exp
+from freshfield.geometry import look_at, se3, so3_exp
 from tests.edge_server.fields.scenes import seen
 from tests.edge_server.fields.small import same_state
 from tests.edge_server.fields.splat.scan.walk import LENS, WALK, at, spoiled, walk
@@ -429,6 +429,39 @@ def test_reported_poses_are_believed_again_after_a_leap_of_a_second() -> None:
     late = field._poses.newest("hand", 20)
     assert max(np.linalg.norm(each.shift_m) for each in late) < 0.2
     assert all(each.reported is None for each in late)
+
+
+def _relocalized(k: int, view: View) -> View:
+    """From the fourth second on poses are off by a meter and 20 degrees: the tracker has found itself anew."""
+    at_m, turn = WALK[BAD_FROM].camera_to_world[:3, 3], so3_exp(np.deg2rad([0.0, 0.0, 20.0]))
+    leap = se3(turn, at_m - turn @ at_m + WALK[BAD_FROM].camera_to_world[:3, 2])
+    return view if k < BAD_FROM else replace(view, camera_to_world=leap @ view.camera_to_world)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("depth", [True, False])
+def test_poses_that_leap_and_stay_so_are_taken_back(depth: bool) -> None:
+    """Taken as they are after ten frames, they cost 4 dB of all held-out frames so far for as long as was looked."""
+    views = [_relocalized(k, view) for k, view in enumerate(walk(depth=depth))]
+    field, found_db = _by_seconds(views, views)
+    lost = (np.array(_undisturbed(depth)) - found_db)[1:]
+    assert lost.mean() < 1.0 and lost.max() < 2.0
+    (said,) = (line for line in field.troubles if line.startswith("hand: its poses leapt by 1."))
+    assert 17 <= int(said.split(" degrees")[0].split()[-1]) <= 23, said
+
+
+@pytest.mark.parametrize("until", [42, 46])  # two frames suggest the leap; it is believed
+def test_a_camera_whose_poses_leapt_resumes_bit_for_bit(until: int) -> None:
+    views = [replace(_relocalized(k, view), camera="hand") for k, view in enumerate(WALK[:50])]
+    field, resumed = _field(), _field()
+    for k, view in enumerate(views):
+        field.fit([view], Budget(steps=tuned.STEPS_A_KEYFRAME))
+        if k == until:
+            resumed.load_state(field.state())
+        if k > until:
+            resumed.fit([view], Budget(steps=tuned.STEPS_A_KEYFRAME))
+    assert "poses leapt" in str(field.troubles) and resumed.troubles == field.troubles
+    same_state(field, resumed)
 
 
 def test_a_camera_that_is_located_by_its_pictures_resumes_bit_for_bit() -> None:
