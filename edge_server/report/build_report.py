@@ -30,8 +30,8 @@ from freshfield.machine_load import outside_load
 
 METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "psnr_refined_db", "ssim_refined")
 SERIES = ("t_s", *METRICS, "aaoi_ms", "selected", "update_ms", "truth_gap_ms")
-# ``final`` is the mean of this last share of the run.
 FINAL_SHARE = 0.2
+"""Of a run, its last: ``final`` and ``shown`` are means over it."""
 
 
 def build_report(out_dir: str | Path) -> dict[str, Any]:
@@ -63,6 +63,8 @@ def assemble(files: RunFiles) -> dict[str, Any]:
     notes += edge.troubles
     accounting = account_frames(files.out)
     seconds = max(edge.seconds or edge.uptime_s or 0.0, series[-1].t_s if series else 0.0)
+    counted = updates(series, edge.updates or UpdateCounts())
+    late_s = last_share_s(counted["first_ms"] if edge.kind == "live" else None, seconds)
     report = {
         "kind": edge.kind,
         "scenario": edge.scenario,
@@ -76,9 +78,9 @@ def assemble(files: RunFiles) -> dict[str, Any]:
         "outside_load": outside_load(files.processes),
         "frames": {**accounting.as_dict(), "ledgers": accounting.ledgers},
         "age_ms": ages(files.ages),
-        "updates": updates(series, edge.updates or UpdateCounts()),
+        "updates": counted,
         "foreground": edge.foreground,
-        "fidelity": {**fidelity(series, seconds, edge), "shown": shown(files.shown, series, seconds)},
+        "fidelity": {**fidelity(series, late_s, edge), "shown": shown(files.shown, series, late_s, seconds)},
         "channel": msgspec.to_builtins(files.channel),
         "notes": notes + accounting.notes,
     }
@@ -144,11 +146,17 @@ def updates(series: Sequence[UpdateRow], edge: UpdateCounts) -> dict[str, Any]:
     }
 
 
-def fidelity(series: Sequence[UpdateRow], seconds: float, edge: EdgeStatus) -> dict[str, Any]:
+def last_share_s(first_ms: float | None, seconds: float) -> float:
+    """When the last fifth of a run of ``seconds`` begins, counted from its first publication: before it, kernels may
+    have been compiled for longer than a short run lasts."""
+    return seconds - FINAL_SHARE * (seconds - (first_ms or 0.0) / 1e3)
+
+
+def fidelity(series: Sequence[UpdateRow], late_s: float, edge: EdgeStatus) -> dict[str, Any]:
     """Scores against the held-out views at publication: {final, mean, baseline, lpips_missing, lpips_network,
-    so_far: see ``SoFarScores``, scored_on, scored, series}. ``final``: mean over the last fifth of ``seconds``."""
+    so_far: see ``SoFarScores``, scored_on, scored, late_s, series}. ``final``: mean from ``late_s`` on."""
     return {
-        "final": _means(_last_fifth(series, seconds), METRICS),
+        "final": _means(_since(late_s, series), METRICS),
         "mean": _means(series, METRICS),
         "baseline": msgspec.to_builtins(edge.baseline or Baseline()),
         "lpips_missing": edge.lpips_missing,
@@ -156,24 +164,25 @@ def fidelity(series: Sequence[UpdateRow], seconds: float, edge: EdgeStatus) -> d
         "so_far": msgspec.to_builtins(edge.so_far),
         "scored_on": sorted({row.scored_on for row in series if row.scored_on}),
         "scored": sum(row.psnr_db is not None for row in series),
+        "late_s": late_s,
         "series": [{name: getattr(row, name) for name in SERIES} for row in series],
     }
 
 
-def shown(rows: Sequence[ShownRow], series: Sequence[UpdateRow], seconds: float) -> dict[str, Any]:
-    """What was shown at random instants of the last fifth of the run's ``seconds``: mean of each score, count
+def shown(rows: Sequence[ShownRow], series: Sequence[UpdateRow], late_s: float, seconds: float) -> dict[str, Any]:
+    """What was shown at random instants from ``late_s`` to the run's end at ``seconds``: mean of each score, count
     of the instants, and age_ms {network, waiting, computing, display}: the parts of the mean age of the views
     behind what was shown. Where nothing is held out, no instant is scored: the age follows from the updates."""
-    late = _last_fifth(rows, seconds)
+    late = _since(late_s, rows)
     parts = ("network", "waiting", "computing", "display")
     ages = _means([row.age_ms for row in late], parts)
     if not late:
-        ages |= age_parts_ms([row for row in _last_fifth(series, seconds) if row.number is not None], seconds)
+        ages |= age_parts_ms([row for row in _since(late_s, series) if row.number is not None], seconds)
     return {**_means(late, SHOWN), "count": len(late), "age_ms": ages}
 
 
-def _last_fifth(rows: Sequence[Any], seconds: float) -> list[Any]:
-    return [row for row in rows if row.t_s >= (1.0 - FINAL_SHARE) * seconds]
+def _since(late_s: float, rows: Sequence[Any]) -> list[Any]:
+    return [row for row in rows if row.t_s >= late_s]
 
 
 def _means(rows: Iterable[Any], names: Sequence[str]) -> dict[str, float | None]:

@@ -223,9 +223,8 @@ def draw_frontier(report: Report, files: RunFiles, path: Path) -> bool:
     """What accuracy costs in time, as measured (OUT/frontier.json), and the run's own point: PSNR of what it
     showed in its last fifth, against the time from one update to the next."""
     measured, shown = files.frontier, report["fidelity"]["shown"]
-    late = [
-        (row.t_s, row.number) for row in files.series if row.t_s >= 0.8 * report["seconds"] and row.number is not None
-    ]
+    late_s = report["fidelity"]["late_s"]
+    late = [(row.t_s, row.number) for row in files.series if row.t_s >= late_s and row.number is not None]
     updates = late[-1][1] - late[0][1] if late else 0  # not all have a row
     if measured is None or not measured.points or shown["psnr_db"] is None or not updates > 0:
         return False
