@@ -63,7 +63,7 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
         network = found.get("lpips_network") or "network unknown"
         _plot(bottom, series, "lpips", ORANGE, f"LPIPS-{network} (lower is better)")
         bottom.set_ylim(0.0, 1.02)
-        label_lines(bottom, "score", seconds)
+        label_lines(bottom, "score" if len(bottom.lines) > 1 else bottom.lines[0].get_label(), seconds)
     return True
 
 
@@ -109,7 +109,7 @@ def draw_ages(report: Report, files: RunFiles, path: Path) -> bool:
         over_time.fill_between(t, low, high, color=SKY, alpha=0.35, linewidth=0, label="all cameras")
         over_time.plot(t, mid, color=BLUE, label="median camera")
         if len(aaoi[0]):
-            over_time.plot(*aaoi, color=VERMILION, linewidth=1.2, label="selected views,\nat publication")
+            over_time.plot(*aaoi, color=VERMILION, linewidth=1.2, label="selected views, at publication")
         over_time.set_ylim(0, _robust_top([*high, *aaoi[1]]))
         label_lines(over_time, "age (ms)", "seconds since the edge started", "Age of information")
         _mark(axes[:1], report)
@@ -277,9 +277,8 @@ def _mark(axes: np.ndarray, report: Report) -> None:
         for ax in axes.flat:
             ax.axvline(event["t_s"], color=PURPLE, linestyle=":", linewidth=1.0)
         top = axes.flat[0]
-        top.annotate(
-            str(number), (event["t_s"], 1.0), xycoords=("data", "axes fraction"), color=PURPLE, fontsize=8, ha="center"
-        )
+        at = {"xycoords": ("data", "axes fraction"), "xytext": (2, -1), "textcoords": "offset points", "va": "top"}
+        top.annotate(str(number), (event["t_s"], 1.0), **at, color=PURPLE, fontsize=8)
 
 
 def _robust_top(values: list[float]) -> float:

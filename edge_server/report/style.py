@@ -26,6 +26,8 @@ WIDTH_INCH = 8.4
 _COLORS = 64  # in a file: a quarter of the bytes, without a visible difference in curves
 _OF_PICTURES, _MEANS = 256, 3  # the same of pictures, and rounds of k-means that keep their rare colors: a third
 
+_IN_A_ROW, _ROW_PT = 4, 20.0  # of a legend: entries, and height of the row
+
 _RC: Any = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
@@ -82,11 +84,16 @@ def figure(
 
 
 def label_lines(axes: Axes, y: str, x: str | None = None, title: str | None = None) -> None:
-    """Axis labels, a title and, for more than one line, a legend beside the plot."""
+    """Axis labels, a title and, for more than one line, a legend: above the plot, where a phone that shows a part of
+    the figure shows it first; of many lines beside it."""
     axes.set_ylabel(y)
     if x:
         axes.set_xlabel(x)
+    count = len(axes.get_legend_handles_labels()[0])
+    above = 1 < count <= _IN_A_ROW
     if title:
-        axes.set_title(title)
-    if len(axes.get_legend_handles_labels()[0]) > 1:
+        axes.set_title(title, pad=_ROW_PT if above else None)
+    if above:
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=count, columnspacing=1.2)
+    elif count > 1:
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2)

@@ -16,6 +16,7 @@ from edge_server.report.build_report import METRICS, SERIES, assemble, build_rep
 from edge_server.report.figures import draw_ages, draw_fidelity, draw_frontier
 from edge_server.report.report_page import counts, number
 from edge_server.report.run_files import continuous, read_run_files
+from edge_server.report.style import figure, label_lines
 from edge_server.run_records import EdgeStatus, UpdateCounts, UpdateRow
 from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, EDGE, SECONDS, page_of, publication, write_run
 
@@ -83,6 +84,16 @@ def test_final_is_the_mean_of_the_last_fifth_of_the_run(run):
     series = [UpdateRow(t_s=t, psnr_db=20.0) for t in (1.0, 2.0)]
     found = fidelity(series, 48.0, EdgeStatus())
     assert found["final"]["psnr_db"] is None and found["mean"]["psnr_db"] == 20.0
+
+
+def test_a_phone_that_shows_the_left_of_a_figure_shows_its_legend(tmp_path):
+    with figure(tmp_path / "curves.png") as (fig, axes):
+        for name in ("whole image", "moving pixels"):
+            axes[0, 0].plot([1.0, 2.0], label=name)
+        label_lines(axes[0, 0], "PSNR (dB)", title="Fidelity")
+        fig.canvas.draw()
+        shown_px = 0.5 * fig.bbox.width
+        assert axes[0, 0].get_legend().get_window_extent().x1 < shown_px < axes[0, 0].get_window_extent().x1
 
 
 def test_the_last_fifth_is_counted_from_the_first_publication(tmp_path):
@@ -175,7 +186,7 @@ def test_the_page_says_what_the_report_holds(run):
         "dropped busy 80 discarded: the link was busy",
         "rejected 4 crc 4",
         "cam01 50 10 40 0 20 0 0 0 19 0 0 1",
-        "drawn delay (ms) 60.20 41.00 180.00 – –",
+        "drawn delay (ms) delay error (ms) mean 60.20 – 50 % 41.00 0.10 95 % 180.00 – 99 % – 1.20 largest – 4.00",
     ):
         assert words in text, words
 
