@@ -14,8 +14,9 @@ from edge_server.fields.compiling import USUAL
 from edge_server.fields.registry import FIELD, field_names, make_field
 
 DESCRIPTION = f"""\
-Compile the kernels of a field for this processor ({USUAL}), so that
-the first run starts at once. Later starts load them. Run it again on another kind of processor, or after an update.
+Compile the kernels of a field for this processor ({USUAL}),
+so that the first run starts at once. Later starts load them. Run it again on another kind of processor, or after an
+update.
 
   freshfield warm-up             the default field, for cameras that stand still and for carried ones
   freshfield warm-up quad        only what this scenario uses
