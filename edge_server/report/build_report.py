@@ -64,7 +64,11 @@ def assemble(files: RunFiles) -> dict[str, Any]:
     accounting = account_frames(files.out)
     seconds = max(edge.seconds or edge.uptime_s or 0.0, series[-1].t_s if series else 0.0)
     counted = updates(series, edge.updates or UpdateCounts())
-    late_s = last_share_s(counted["first_ms"] if edge.kind == "live" else None, seconds)
+    first_ms, ended_s = None, seconds
+    if edge.kind == "live":
+        first_ms = counted["first_ms"]
+        ended_s = max((rows[-1].t_s for rows in (files.ages, series) if rows), default=seconds)
+    late_s = last_share_s(first_ms, ended_s)
     report = {
         "kind": edge.kind,
         "scenario": edge.scenario,
@@ -80,7 +84,7 @@ def assemble(files: RunFiles) -> dict[str, Any]:
         "age_ms": ages(files.ages),
         "updates": counted,
         "foreground": edge.foreground,
-        "fidelity": {**fidelity(series, late_s, edge), "shown": shown(files.shown, series, late_s, seconds)},
+        "fidelity": {**fidelity(series, late_s, edge), "shown": shown(files.shown, series, late_s, ended_s)},
         "channel": msgspec.to_builtins(files.channel),
         "notes": notes + accounting.notes,
     }
@@ -146,10 +150,11 @@ def updates(series: Sequence[UpdateRow], edge: UpdateCounts) -> dict[str, Any]:
     }
 
 
-def last_share_s(first_ms: float | None, seconds: float) -> float:
-    """When the last fifth of a run of ``seconds`` begins, counted from its first publication: before it, kernels may
-    have been compiled for longer than a short run lasts."""
-    return seconds - FINAL_SHARE * (seconds - (first_ms or 0.0) / 1e3)
+def last_share_s(first_ms: float | None, ended_s: float) -> float:
+    """When the last fifth of a run begins, counted from its first publication to the last sample of ages: before,
+    kernels may have been compiled for longer than a short run lasts; afterwards files are written and nothing is shown
+    any more."""
+    return ended_s - FINAL_SHARE * (ended_s - (first_ms or 0.0) / 1e3)
 
 
 def fidelity(series: Sequence[UpdateRow], late_s: float, edge: EdgeStatus) -> dict[str, Any]:
@@ -169,15 +174,15 @@ def fidelity(series: Sequence[UpdateRow], late_s: float, edge: EdgeStatus) -> di
     }
 
 
-def shown(rows: Sequence[ShownRow], series: Sequence[UpdateRow], late_s: float, seconds: float) -> dict[str, Any]:
-    """What was shown at random instants from ``late_s`` to the run's end at ``seconds``: mean of each score, count
+def shown(rows: Sequence[ShownRow], series: Sequence[UpdateRow], late_s: float, ended_s: float) -> dict[str, Any]:
+    """What was shown at random instants from ``late_s`` to the run's end at ``ended_s``: mean of each score, count
     of the instants, and age_ms {network, waiting, computing, display}: the parts of the mean age of the views
     behind what was shown. Where nothing is held out, no instant is scored: the age follows from the updates."""
     late = _since(late_s, rows)
     parts = ("network", "waiting", "computing", "display")
     ages = _means([row.age_ms for row in late], parts)
     if not late:
-        ages |= age_parts_ms([row for row in _since(late_s, series) if row.number is not None], seconds)
+        ages |= age_parts_ms([row for row in _since(late_s, series) if row.number is not None], ended_s)
     return {**_means(late, SHOWN), "count": len(late), "age_ms": ages}
 
 

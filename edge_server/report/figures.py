@@ -14,7 +14,6 @@ from matplotlib.axes import Axes
 from edge_server.fidelity.scorer import SELECTED, fidelity_title
 from edge_server.report.run_files import RunFiles
 from edge_server.report.style import BLUE, GRAY, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, label_lines
-from freshfield.scenario import NOTHING_HELD_OUT
 
 Report = dict[str, Any]
 # Factor by which errors are brightened to be visible.
@@ -185,7 +184,7 @@ def draw_comparison(report: Report, files: RunFiles, path: Path) -> bool:
     with figure(path, 1, 3, height_inch=height) as (_, axes):
         truth_is = "held-out truth" if report["kind"] == "fit" else "truth at the present"
         if SELECTED in report["fidelity"]["scored_on"]:
-            truth_is = NOTHING_HELD_OUT
+            truth_is = "a training view"
         titles = (truth_is, "the field's rendering", f"error, {_ERROR_GAIN:g} times")
         for ax, image, title in zip(axes[0], (truth, rendered, error), titles):
             ax.imshow(image, interpolation="nearest")
