@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 # Longest sleep before the loop looks at the controls again.
 _MAX_SLEEP_S = 0.2
 _TOO_SHORT = 3  # updates in a row without a step, after which a warning is due
-_SHED_EVERY_S = 30.0  # between two warnings that frames are left out
+_WARN_EVERY_S = 30.0  # between two warnings of one kind
 STOP_S = 20.0
 """How long the server waits at its end for the update in progress, without which there is no checkpoint. On a machine
 with five times as much to do as it has cores, updates of ``ngp`` at 640 x 480 take 6 s, the longest 18. The launcher
@@ -64,6 +64,7 @@ class UpdateLoop:
         self._stop = threading.Event()
         self._paused = False
         self.without_step, self._in_a_row = 0, 0  # updates without time for a step: all, and the newest
+        self._warned_short_s = -_WARN_EVERY_S + clock.now_ns() / 1e9
         self._warned_of = (0, 0, clock.now_ns() / 1e9)  # frames shed and arrived, and when
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._main, name="loop", daemon=True)
@@ -158,10 +159,12 @@ class UpdateLoop:
         self._write_checkpoints()
 
     def _warn_without_steps(self, report: FitReport) -> None:
-        """Log once, and again if it recurs, that updates are too short to learn anything."""
+        """Log once, and now and then if it recurs, that updates are too short to learn anything."""
         self.without_step += report.short
         self._in_a_row = self._in_a_row + 1 if report.short else 0
-        if self._in_a_row == _TOO_SHORT:
+        now_s = self._clock.now_ns() / 1e9
+        if self._in_a_row == _TOO_SHORT and now_s - self._warned_short_s >= _WARN_EVERY_S:
+            self._warned_short_s = now_s
             log.warning(
                 "an update of %.0f ms made no step: all its time went into taking in new pictures. Send smaller ones "
                 "(source.scale, or width and height), or give updates more time (edge.update_ms)",
@@ -172,7 +175,7 @@ class UpdateLoop:
         """Log now and then what share of the frames was left out for lack of time."""
         buffer, now_s = self._updater.buffer, self._clock.now_ns() / 1e9
         shed, arrived, since_s = self._warned_of
-        if now_s - since_s < _SHED_EVERY_S:
+        if now_s - since_s < _WARN_EVERY_S:
             return
         if buffer.shed > shed:
             log.warning(

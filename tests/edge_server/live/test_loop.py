@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget
+from edge_server.live import loop
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.loop import UpdateLoop
@@ -197,9 +198,12 @@ def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(running, tm
     assert run.published[-1][0].omega_ms == 0.0 and not run.controls.reset_requested
 
 
-@pytest.mark.parametrize(("short", "warnings"), [(True, 2), (False, 0)])
-def test_an_update_without_time_to_learn_is_warned_of_once_and_again_if_it_comes_back(short, warnings, running, caplog):
+@pytest.mark.parametrize(("short", "every_s", "warnings"), [(True, 0.0, 2), (True, 30.0, 1), (False, 0.0, 0)])
+def test_an_update_without_time_to_learn_is_warned_of_once_and_later_if_it_comes_back(
+    short, every_s, warnings, running, caplog, monkeypatch
+):
     """But not one that had nothing to learn."""
+    monkeypatch.setattr(loop, "_WARN_EVERY_S", every_s)
     u = updates()
     fit = u.fit  # no time at all, then some, then none again
 
