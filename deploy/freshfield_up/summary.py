@@ -63,10 +63,9 @@ def _fidelity(fidelity: dict[str, Any]) -> list[str]:
 
 
 def _baselines(baseline: dict[str, Any]) -> list[str]:
-    mean, nearest = (baseline.get(name) for name in ("mean_color_db", "nearest_view_db"))
-    if mean is None and nearest is None:
-        return []
-    return [f"baselines  mean color {fmt(mean, '.1f')} dB, nearest view {fmt(nearest, '.1f')} dB"]
+    names = {"mean_color_db": "mean color", "nearest_view_db": "nearest view"}
+    known = [f"{what} {db:.1f} dB" for name, what in names.items() if (db := baseline.get(name)) is not None]
+    return [f"baselines  {', '.join(known)}"] if known else []
 
 
 def _accounted(frames: dict[str, Any]) -> str:

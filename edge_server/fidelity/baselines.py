@@ -23,10 +23,12 @@ class BaselineMean:
         self._count = 0
 
     def add(self, found: Baseline) -> None:
-        """Take the baselines of one image; both are known."""
+        """Take the baselines of one image, always the same of them known."""
         self._count += 1
         pairs = zip(msgspec.structs.astuple(self.mean), msgspec.structs.astuple(found))
-        self.mean = Baseline(*((mean or 0.0) + (db - (mean or 0.0)) / self._count for mean, db in pairs))
+        self.mean = Baseline(
+            *(None if db is None else (mean or 0.0) + (db - (mean or 0.0)) / self._count for mean, db in pairs)
+        )
 
 
 def baseline(views: Sequence[View], truth: NDArray, camera_to_world: ArrayLike, background: Color = BLACK) -> Baseline:

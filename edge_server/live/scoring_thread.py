@@ -21,14 +21,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from edge_server.fidelity.baselines import BaselineMean, baseline
+from edge_server.fidelity.baselines import BaselineMean, baseline, mean_color_db
 from edge_server.fidelity.images import to_bytes
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fidelity.so_far import FrameScore, so_far
 from edge_server.fields import Snapshot, View
 from edge_server.live.held_out import HeldOutCamera, Scored, Truth
 from edge_server.live.state import Comparison, Publication
-from edge_server.run_records import SoFarScores
+from edge_server.run_records import Baseline, SoFarScores
 from freshfield.frame import Frame
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import seed_sequence
@@ -267,6 +267,8 @@ class ScoringThread:
         score = self._scorer.score_selected(renderings, publication.published_ns)
         if score is None:
             return
+        one_of_them = whole[publication.number % len(whole)]  # in turn: the mean is that of all
+        self.baselines.add(Baseline(mean_color_db([v.image for v in whole], one_of_them.image)))
         camera, image, truth = renderings[0]
         comparison = Comparison(camera, truth[..., :3], to_bytes(image), publication.number)
         self._on_scored(publication.scored(score), comparison, True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fidelity.so_far import MOST
-from edge_server.fields import Rendering
+from edge_server.fields import Rendering, View
 from edge_server.live import scoring_thread
 from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import Publication
@@ -197,6 +197,16 @@ def test_baselines_are_of_every_fifth_publication(monkeypatch: Any) -> None:
     for number in range(3, 12):
         thread._score_later(_publication(number, 10 * MS), Brightness(0), ["view"])  # type: ignore[list-item]
     assert found == [1, 1] and thread.baselines.mean == Baseline(1.0, 2.0), "of 5 and 10"
+
+
+def test_where_nothing_is_held_out_the_mean_color_is_that_of_the_views() -> None:
+    told: list[Publication] = []
+    thread = ScoringThread([], Scorer(), lambda of, *_: told.append(of), lambda *_: None)
+    images = [np.full((32, 32, 3), level, np.uint8) for level in (102, 153)]  # 0.4 and 0.6: 0.1 from their mean
+    views = [View(f"cam{k}", image, np.eye(4), LENS) for k, image in enumerate(images)]
+    thread._score_selected(_publication(3, 500 * MS), Brightness(500 * MS), views)
+    assert len(told) == 1 and thread.baselines.mean.nearest_view_db is None
+    np.testing.assert_allclose([told[0].psnr_db, thread.baselines.mean.mean_color_db], 20.0, atol=1e-3)
 
 
 def test_of_a_held_out_camera_that_moves_the_newest_frame_and_all_so_far_are_told_apart() -> None:

@@ -61,6 +61,16 @@ def test_three_sentences_say_what_was_shown_its_age_and_its_limit(tmp_path: Path
         ({"fidelity.shown.psnr_still_db": 15.0}, 2, "too few cameras"),
         (
             {
+                "fidelity.scored_on": ["selected"],
+                "fidelity.final.psnr_db": 17.4,
+                "fidelity.shown.psnr_db": None,
+                "fidelity.shown.psnr_still_db": None,
+            },
+            2,
+            "What is shown is little better than one mean color: too few cameras",
+        ),
+        (
+            {
                 "fidelity.shown.psnr_still_db": 15.0,
                 "fidelity.so_far": {"now_psnr_db": 20.0, "all_psnr_db": 23.0, "frames": 9},
             },
