@@ -90,7 +90,7 @@ def _edge_line(edge: Status) -> str:
         f"{updates:.0f} updates",
         f"{fmt(number(edge, 'updates', 'ms_p50'), '.0f')} ms each",
         *scores,
-        f"aAoI {fmt(number(edge, 'last', 'aaoi_ms'), '.0f')} ms",
+        f"views used {fmt(number(edge, 'last', 'aaoi_ms'), '.0f')} ms old",
         f"policy {edge.get('policy', '-')}",
     ]
     return ", ".join(parts) + (" (paused)" if edge.get("paused") else "")
