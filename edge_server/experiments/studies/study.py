@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ from edge_server.experiments.common.statistics import Interval, all_of, discover
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.engine import Engine
 from edge_server.machine import commit
+from edge_server.progress import ProgressLine
 from edge_server.scheduler.learned.settings import W_S
 from freshfield.files import write_csv, write_json, write_text
 
@@ -220,7 +222,8 @@ def run_study(study: Study, request: StudyRequest) -> list[Verdict]:
     write_csv(request.out / f"{study.name}.csv", rows)
     table = SeedTable(rows)
     if study.draw is not None:
-        study.draw(request, table)
+        with ProgressLine(sys.stderr).running("figures"):
+            study.draw(request, table)
     verdicts = judge(study, table)
     write_text(request.out / f"{study.name}.md", markdown(study, request, table, verdicts))
     found = {
@@ -282,10 +285,11 @@ def markdown(study: Study, request: StudyRequest, table: SeedTable, verdicts: Se
     each = [[v.claim, v.about, v.verdict, v.found] for of in of_claim.values() for v in of]
     figures = sorted(p.name for p in request.out.glob(f"{study.name}*.png"))
     seeds = len({row["seed"] for row in table.rows})
+    at = f", commit {found}" if (found := commit()) else ""
     parts = [
         f"# {study.title}",
-        f"`{request.command(study.name)}`: {'quick pass' if request.quick else 'full run'}, {seeds} seeds a point, "
-        f"commit {commit()}. [Rows]({study.name}.csv), [verdicts]({study.name}.json).",
+        f"`{request.command(study.name)}`: {'quick pass' if request.quick else 'full run'}, {seeds} seeds a point{at}. "
+        f"[Rows]({study.name}.csv), [verdicts]({study.name}.json).",
         f"Intervals are 95 %. Of the {len(verdicts)} verdicts, those that are decided are corrected for their number "
         f"(Benjamini-Hochberg, false discovery rate {100 * FALSE_DISCOVERY_RATE:g} %).",
         markdown_table(["claim", HOLDS, DOES_NOT_HOLD, UNDECIDED], counted),
