@@ -450,6 +450,19 @@ def test_poses_that_leap_and_stay_so_are_taken_back(depth: bool) -> None:
     assert 17 <= int(said.split(" degrees")[0].split()[-1]) <= 23, said
 
 
+@pytest.mark.stability
+@pytest.mark.parametrize("depth", [True, False])
+def test_a_camera_that_is_carried_elsewhere_under_a_hand_has_not_leapt(depth: bool) -> None:
+    clean = walk(depth=depth)
+    views = [*clean[:BAD_FROM], *map(_covered, clean[BAD_FROM : BAD_FROM + 20]), *clean[BAD_FROM + 20 :]]
+    views = [*views[: BAD_FROM + 20], *views[BAD_FROM + 25 :]]  # meanwhile it goes as far as in 2.5 seconds
+    views = [replace(view, generated_ns=100_000_000 * k) for k, view in enumerate(views)]
+    field = _played(views)
+    assert not any("leapt" in line for line in field.troubles)
+    late = field._poses.newest("hand", 10)
+    assert max(np.linalg.norm(each.shift_m) for each in late) < 0.2 and all(each.reported is None for each in late)
+
+
 @pytest.mark.parametrize("until", [42, 46])  # two frames suggest the leap; it is believed
 def test_a_camera_whose_poses_leapt_resumes_bit_for_bit(until: int) -> None:
     views = [replace(_relocalized(k, view), camera="hand") for k, view in enumerate(WALK[:50])]
