@@ -163,7 +163,7 @@ class UpdateLoop:
         self.without_step += report.short
         self._in_a_row = self._in_a_row + 1 if report.short else 0
         now_s = self._clock.now_ns() / 1e9
-        if self._in_a_row == _TOO_SHORT and now_s - self._warned_short_s >= _WARN_EVERY_S:
+        if self._in_a_row >= _TOO_SHORT and now_s - self._warned_short_s >= _WARN_EVERY_S:
             self._warned_short_s = now_s
             log.warning(
                 "an update of %.0f ms made no step: all its time went into taking in new pictures. Send smaller ones "

@@ -9,14 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.fields import Budget
-from edge_server.live import loop
+from edge_server.fields import Budget, FitReport
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.loop import UpdateLoop
 from edge_server.live.state import Controls
 from edge_server.scheduler import make_policy
-from freshfield.clock import WallClock
+from freshfield.clock import Clock, VirtualClock, WallClock
 from tests.edge_server.fields_for_tests import tiny_field
 from tests.edge_server.frames import frame
 
@@ -132,9 +131,11 @@ def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
 class Running:
     """A loop on the wall clock, with what it published and its status lines."""
 
-    def __init__(self, u: FieldUpdater, grace_ms: float = 0.0, update_ms: float = 100.0) -> None:
+    def __init__(
+        self, u: FieldUpdater, grace_ms: float = 0.0, update_ms: float = 100.0, clock: Clock | None = None
+    ) -> None:
         self.published, self.lines, self.saved, self.events = [], [], [], []
-        self.clock = WallClock()
+        self.clock = clock or WallClock()
         self.controls = Controls(u.policy.name, u.policy.value)
         self.loop = UpdateLoop(
             u,
@@ -198,12 +199,9 @@ def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(running, tm
     assert run.published[-1][0].omega_ms == 0.0 and not run.controls.reset_requested
 
 
-@pytest.mark.parametrize(("short", "every_s", "warnings"), [(True, 0.0, 2), (True, 30.0, 1), (False, 0.0, 0)])
-def test_an_update_without_time_to_learn_is_warned_of_once_and_later_if_it_comes_back(
-    short, every_s, warnings, running, caplog, monkeypatch
-):
-    """But not one that had nothing to learn."""
-    monkeypatch.setattr(loop, "_WARN_EVERY_S", every_s)
+@pytest.mark.parametrize(("short", "warnings"), [(True, 1), (False, 0)])
+def test_updates_without_time_to_learn_are_warned_of_once(short, warnings, running, caplog):
+    """But not those that had nothing to learn."""
     u = updates()
     fit = u.fit  # no time at all, then some, then none again
 
@@ -221,6 +219,18 @@ def test_an_update_without_time_to_learn_is_warned_of_once_and_later_if_it_comes
     assert run.loop.without_step >= 7 * short
     told = [record.message for record in caplog.records if "made no step" in record.message]
     assert len(told) == warnings and all("source.scale" in each and "edge.update_ms" in each for each in told)
+
+
+def test_updates_without_time_to_learn_are_warned_of_again_every_half_minute(caplog):
+    """Also where the third in a row comes sooner than that after the last warning, and none recovers."""
+    clock = VirtualClock()
+    starved = Running(updates(), clock=clock).loop
+    told = []
+    for second in range(70):  # one update a second; that of 20 learns something
+        clock.advance_to(second * 1000 * MS)
+        starved._warn_without_steps(FitReport(0, 0.1, 0.0, 0, 0, short=second != 20))
+        told += [second] * (len(caplog.records) - len(told))
+    assert told == [2, 32, 62]
 
 
 def test_a_camera_that_never_reports_does_not_hold_the_others_up(running):
