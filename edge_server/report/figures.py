@@ -62,7 +62,8 @@ def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
         network = found.get("lpips_network") or "network unknown"
         _plot(bottom, series, "lpips", ORANGE, f"LPIPS-{network} (lower is better)")
         bottom.set_ylim(0.0, 1.02)
-        label_lines(bottom, "score" if len(bottom.lines) > 1 else bottom.lines[0].get_label(), seconds)
+        drawn = bottom.get_legend_handles_labels()[1]  # without the marks of events, which are lines, too
+        label_lines(bottom, "score" if len(drawn) > 1 else drawn[0], seconds)
     return True
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.state import CameraView
 from edge_server.page.diagnosis import poor_picture
 from edge_server.page.settings import FLAT_SCORES
@@ -29,6 +30,13 @@ def scored(*psnr_db):
 def test_the_likely_cause_is_named(cause):
     said = poor_picture(12.0, scored(*[30.0] * 9, *[12.3, None] * FLAT_SCORES), CASES[cause])
     assert "no better than one mean color (12.3 dB; that color 12.0 dB)" in said and cause in said
+
+
+@pytest.mark.parametrize(("scored_on", "said"), [("cam00", True), (SELECTED, False)])
+def test_views_that_were_learned_from_are_not_blurred_by_cameras_that_share_little(scored_on, said):
+    publications = [replace(each, scored_on=scored_on) for each in scored(*[12.3] * FLAT_SCORES)]
+    text = poor_picture(12.0, publications, [GOOD, replace(GOOD, camera="cam02")])
+    assert ("different places" in text) == said and ("too short a run" in text) != said
 
 
 @pytest.mark.stability

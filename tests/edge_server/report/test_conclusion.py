@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from edge_server.report import figures
 from edge_server.report.build_report import assemble
 from edge_server.report.conclusion import conclusion
 from edge_server.report.events import MOST, silences
@@ -67,7 +68,7 @@ def test_three_sentences_say_what_was_shown_its_age_and_its_limit(tmp_path: Path
                 "fidelity.shown.psnr_still_db": None,
             },
             2,
-            "What is shown is little better than one mean color: too few cameras",
+            "What is shown is little better than one mean color: poses that do not fit, or too short a run",
         ),
         (
             {
@@ -113,6 +114,18 @@ def test_events_of_operators_network_and_cameras_are_listed_in_order(tmp_path: P
             assert draw(marked, files, tmp_path / "figure.png")
             drawn.append((tmp_path / "figure.png").read_bytes())
     assert drawn[0] != drawn[2] and drawn[1] != drawn[3], "they are marked on both"
+
+
+def test_a_lone_score_gives_its_axis_its_name_beside_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_run(tmp_path)
+    files, said = read_run_files(tmp_path), []
+    report = {**assemble(files), "events": [{"t_s": 1.0, "what": "reset"}, {"t_s": 2.0, "what": "reset"}]}
+    monkeypatch.setattr(figures, "label_lines", lambda _, y, *__, **___: said.append(y))
+    assert draw_fidelity(report, files, tmp_path / "both.png")
+    for row in report["fidelity"]["series"]:
+        row["lpips"] = None
+    assert draw_fidelity(report, files, tmp_path / "one.png")
+    assert said[1::2] == ["score", "SSIM (higher is better)"]
 
 
 def test_cameras_that_fall_silent_together_are_one_event() -> None:
