@@ -40,7 +40,7 @@ _NICE = 5
 _WAITING_FRAMES = 256  # held-out frames that wait while one publication is scored; older ones are not needed
 _WAITING_PUBLICATIONS = 2
 _OPEN_PUBLICATIONS = 16
-_BASELINE_EVERY = 5
+_BASELINE_EVERY = 5  # publications; where nothing is held out, scored ones
 _MOST_SNAPSHOTS = 16  # kept for held-out frames that arrive late
 _SILENT_NS = 2_000_000_000  # behind the others: such a camera's captures are not waited for
 _SHOWN_EVERY_S = 0.4  # largest mean time between two scores of what a held-out camera is shown
@@ -90,6 +90,7 @@ class ScoringThread:
         self._ending = False
         self._open: dict[int, list[Score]] = {}  # publications of which some cameras are still to be scored
         self._views: list[View] = []
+        self._selected_scored = 0  # publications scored on the views learned from
         self.baselines = BaselineMean()
         self.so_far: SoFarScores | None = None
         """Of held-out cameras that move: now, and all frames so far. At the end of a run each of these is rendered from
@@ -267,8 +268,11 @@ class ScoringThread:
         score = self._scorer.score_selected(renderings, publication.published_ns)
         if score is None:
             return
-        one_of_them = whole[publication.number % len(whole)]  # in turn: the mean is that of all
-        self.baselines.add(Baseline(mean_color_db([v.image for v in whole], one_of_them.image)))
+        turn, left = divmod(self._selected_scored, _BASELINE_EVERY)
+        self._selected_scored += 1
+        if left == 0:
+            one_of_them = whole[turn % len(whole)]  # in turn: the mean is that of all
+            self.baselines.add(Baseline(mean_color_db([v.image for v in whole], one_of_them.image)))
         camera, image, truth = renderings[0]
         comparison = Comparison(camera, truth[..., :3], to_bytes(image), publication.number)
         self._on_scored(publication.scored(score), comparison, True)

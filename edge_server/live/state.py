@@ -135,7 +135,8 @@ class EdgeState:
     frontier: what accuracy costs in time, as measured.
     chosen: how the edge works and why, in one line (``config.described``).
     troubles: what the field finds wrong with poses and measured depth, for people.
-    flat_db: PSNR of the mean color of the training images, against the held-out views; None: not known.
+    flat_db: PSNR of the mean color of the training images, against what is scored: the held-out views, or where
+    nothing is held out the views learned from; None: not known.
     so_far: scores of held-out cameras that move.
     warnings: what other machines can do here that they should not, in words (--insecure).
     events: (seconds since the run began, what happened), for the report; ``note`` adds one.

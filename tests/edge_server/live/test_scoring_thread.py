@@ -209,6 +209,18 @@ def test_where_nothing_is_held_out_the_mean_color_is_that_of_the_views() -> None
     np.testing.assert_allclose([told[0].psnr_db, thread.baselines.mean.mean_color_db], 20.0, atol=1e-3)
 
 
+def test_where_nothing_is_held_out_each_view_is_compared_in_turn_every_fifth_time(monkeypatch: Any) -> None:
+    """Whatever the numbers of the publications that are scored: here each third."""
+    found: list[int] = []
+    monkeypatch.setattr(scoring_thread, "mean_color_db", lambda _, image: found.append(int(image[0, 0, 0])) or 20.0)
+    thread = ScoringThread([], Scorer(), lambda *_: None, lambda *_: None)
+    images = [np.full((32, 32, 3), level, np.uint8) for level in (10, 20, 30)]
+    views = [View(f"cam{k}", image, np.eye(4), LENS) for k, image in enumerate(images)]
+    for number in range(0, 60, 3):
+        thread._score_selected(_publication(number, 500 * MS), Brightness(500 * MS), views)
+    assert found == [10, 20, 30, 10]
+
+
 def test_of_a_held_out_camera_that_moves_the_newest_frame_and_all_so_far_are_told_apart() -> None:
     """The field knows how bright it is at half a second, and shows that everywhere."""
     thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
