@@ -29,7 +29,7 @@ def median_curve(runs: Sequence[Path]) -> dict[str, Any]:
     ``psnr_db`` and ``psnr_moving_db``, None where nothing that moves was shown.
 
     runs: folders of ``edge-server fit`` or ``edge-server simulate``. Raises OSError and ValueError for a folder that is
-    none, or for fits whose instants differ in number from the others'.
+    none, for fits whose instants differ in number from the others', or that did not measure one of them.
     """
     if (runs[0] / "simulation.json").exists():
         return _shown_curve(runs)
@@ -47,8 +47,12 @@ def median_curve(runs: Sequence[Path]) -> dict[str, Any]:
         values: list[list[Any]] = [
             [next((row[k] for k in keys if row.get(k) is not None), None) for row in of_run] for of_run in rows
         ]
-        if not any(None in of_run for of_run in values):  # LPIPS needs its network: a run without it has no such column
-            curve[name] = np.round(np.median(values, axis=0), 3).tolist()
+        if name == "lpips" and any(None in of_run for of_run in values):
+            continue  # it needs its network: a run without it has no such column
+        for run, of_run, found in zip(runs, rows, values):
+            if None in found:
+                raise ValueError(f"{run}: no {name} at {of_run[found.index(None)].get('t_s')} s")
+        curve[name] = np.round(np.median(values, axis=0), 3).tolist()
     return curve
 
 

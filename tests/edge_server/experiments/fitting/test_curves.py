@@ -54,3 +54,11 @@ def test_fits_of_other_instants_are_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main([f"two={fits[0]},{fits[1]}", "--out", str(tmp_path / "two")])
     assert "different instants" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("missing", [{"psnr_db": None}, {"ssim": None}])
+def test_fits_without_a_score_are_refused_by_name_and_instant(missing, tmp_path, capsys):
+    fit = write_fit(tmp_path / "gap", [row(1.0, 3.0), row(2.5, 4.0) | missing])
+    with pytest.raises(SystemExit):
+        main([f"one={fit}", "--out", str(tmp_path / "one")])
+    assert f"{fit}: no {next(iter(missing))} at 2.5 s" in capsys.readouterr().err
