@@ -75,7 +75,9 @@ class ProgressLine:
                 print(f"  {self._stage}: some {left_s:.0f} s", file=self._stream, flush=True)
             return
         told = f", {max(left_s, 0.0):.0f} s left" if done > 0.0 else f", {now - began_s:.0f} s"
-        line = f"\r  {self._stage:10} {100 * self._share:3.0f} %{told:16}"
+        # A stage without parts, or whose first takes long, has no share to show.
+        rest = f"{100 * self._share:3.0f} %{told}" if self._share > 0.0 else f"{now - began_s:3.0f} s"
+        line = f"\r  {self._stage:10} {rest:21}"
         if self._share >= 1.0:  # results follow
             line = "\r" + " " * len(line) + "\r"
         print(line, end="", file=self._stream, flush=True)
