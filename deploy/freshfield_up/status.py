@@ -86,11 +86,12 @@ def _edge_line(edge: Status) -> str:
         scores = [f"PSNR {fmt(number(edge, 'scores', 'psnr_db'), '.2f')} dB{views}"]
         if not views:
             scores += [f"moving {fmt(number(edge, 'scores', 'psnr_moving_db'), '.2f')} dB"]
+    age_ms = number(edge, "last", "aaoi_ms")
     parts = [
         f"{updates:.0f} updates",
         f"{fmt(number(edge, 'updates', 'ms_p50'), '.0f')} ms each",
         *scores,
-        f"views used {fmt(number(edge, 'last', 'aaoi_ms'), '.0f')} ms old",
+        *([] if age_ms is None else [f"views used {age_ms:.0f} ms old"]),
         f"policy {edge.get('policy', '-')}",
     ]
     return ", ".join(parts) + (" (paused)" if edge.get("paused") else "")

@@ -39,7 +39,10 @@ def test_the_line_says_what_the_processes_wrote(tmp_path: Path) -> None:
     write_status(tmp_path)
     text = status_line(tmp_path, 13)
     assert text.startswith("13/13 cameras, age 1880 ms (median); 9 updates, 812 ms each, PSNR 25.12 dB, moving - dB")
-    assert "views used 512 ms old, policy all; ch6-slow, state high (75% of the time), forwarded 481" in text
+    assert (
+        "views used 512 ms old, policy all; ch6-slow, state high (75% of the time), forwarded 481, superseded 17"
+        in text
+    )
     assert text.endswith("delay error p99 0.12 ms")
 
 
@@ -93,4 +96,4 @@ def test_a_moving_held_out_camera_reads_its_frames_at_refined_poses(tmp_path: Pa
     text = summarize(tmp_path)
     assert f"held out   {said}; 14.00 dB at given ones\nshown      age of 20 ms network" in text
     (tmp_path / "edge.json").write_text(json.dumps({"updates": {"count": 2}, "so_far": so_far, "scores": {}}))
-    assert f"held out {said}, views used" in status_line(tmp_path, 2)
+    assert f"held out {said}, policy" in status_line(tmp_path, 2)
