@@ -283,16 +283,17 @@ def _walk_after(begin: Callable[[int, View], View] | None, depth: bool, seed: in
         (_looks_about, True, 1.0),
         (_looks_about, False, 1.0),
         (_at_a_wall, True, 1.2),
-        (_at_a_wall, False, 1.4),
-        (_under_a_hand, True, 1.0),
-        (_under_a_hand, False, 3.0),
+        (_at_a_wall, False, 1.0),
+        (_under_a_hand, True, 1.2),
+        (_under_a_hand, False, 2.6),
     ],
 )
 def test_a_bad_beginning_is_forgotten_within_two_seconds(begin, depth: bool, lost_db: float) -> None:
-    """lost_db: at most, against a walk without that beginning, on average over four instants of three trainings. What a
-    camera that only turns, or sees nothing, guesses of the scene cost up to 11 dB for as long as it was kept."""
+    """lost_db: at most, against a walk without that beginning, at each of four instants, on average over three
+    trainings. What a camera that only turns, or sees nothing, guesses of the scene cost up to 11 dB for as long as it
+    was kept."""
     lost = [np.array(_walk_after(None, depth, seed)) - _walk_after(begin, depth, seed) for seed in SEEDS]
-    assert np.mean(lost) < lost_db
+    assert np.mean(lost, axis=0).max() < lost_db
 
 
 @pytest.mark.stability
@@ -356,13 +357,13 @@ def _without_rotation(k: int, view: View) -> View:
 @pytest.mark.parametrize(
     ("spoil", "words", "lost_db"),
     [
-        (_in_unit(1000.0), "times as far apart as meters are", 1.8),
-        (_in_unit(0.001), "times as far apart as meters are", 4.2),
-        (_without_rotation, "no rotation", 3.2),
+        (_in_unit(1000.0), "times as far apart as meters are", 2.3),
+        (_in_unit(0.001), "times as far apart as meters are", 4.0),
+        (_without_rotation, "no rotation", 3.6),
     ],
 )
 def test_poses_that_never_fit_give_way_to_pictures_where_depth_is_measured(spoil, words: str, lost_db: float) -> None:
-    """lost_db: at most, against right poses, from the fourth second on, on average over five instants of three
+    """lost_db: at most, against right poses, at each of five instants from the fourth second on, on average over three
     trainings; as they are, such poses cost up to 11 dB for as long as was looked. The walk takes a keyframe each 4
     degrees and 15 cm, which 48 x 40 pixels show coarsely."""
     views, lost = [spoil(k, view) for k, view in enumerate(WALK)], []
@@ -371,7 +372,7 @@ def test_poses_that_never_fit_give_way_to_pictures_where_depth_is_measured(spoil
         assert np.isfinite(field.cloud.params).all() and len(field.views) > 60
         assert any("reported poses do not fit" in line and words in line for line in field.troubles)
         lost.append(np.array(_undisturbed(True, seed)) - found_db)
-    assert np.mean(lost) < lost_db
+    assert np.mean(lost, axis=0).max() < lost_db
 
 
 @pytest.mark.stability
