@@ -43,7 +43,7 @@ Computing is charged as edge.compute says. The first policy is the one that the 
   edge-server compare room19 all threshold:120 wait:60 --seeds 8
   edge-server compare card all bandit:runs/card/policy.npz --seeds 14 --json scores.json
   edge-server compare room19 all freshest-k:6 --channel my-channel.yaml
-  edge-server compare card all mine.py:Mine --results runs.jsonl       after Ctrl-C the same command goes on
+  edge-server compare card all mine.py:Mine --results runs.jsonl   after Ctrl-C run the same command again to resume
 
 Intervals are 95 % (Student's t, over seeds; differences paired by seed). A star marks the differences that are
 decided at a false discovery rate of 5 % over all of them (Benjamini-Hochberg).
@@ -65,8 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
     errors = (ScenarioError, DatasetError, EngineError, ValueError)
-    kept = f"finished runs are in {args.results}: the same command goes on"
-    stopped = kept if args.results else "nothing was kept: with --results FILE the same command would go on"
+    kept = f"finished runs are in {args.results}: run the same command again to resume"
+    stopped = kept if args.results else "nothing was kept: with --results FILE the same command would resume"
     return run_command("compare", lambda: _run(args), errors, stopped)
 
 

@@ -84,7 +84,7 @@ def reached(cameras: int, depth: bool) -> str:
     whole_db, moving_db = reached[known[-1]]
     sensors = "with depth sensors" if depth else "without depth sensors"
     return (
-        f"The shipped room before {known[-1]} cameras {sensors} was shown at {whole_db:g} dB, {moving_db:g} where it "
+        f"The shipped room with {known[-1]} cameras {sensors} was shown at {whole_db:g} dB, {moving_db:g} where it "
         "moves; above some 25 dB a picture looks right, one mean color reaches some 15"
     )
 

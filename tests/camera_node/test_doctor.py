@@ -216,7 +216,7 @@ def test_what_fixed_cameras_see_is_reckoned_and_drawn(capsys, tmp_path):
     _, parts = examined(capsys, "quad", "--plan", str(drawn))
     assert parts["coverage"][0] and "50 % by two or more, 54 degrees apart. One more camera" in parts["coverage"][1]
     assert drawn.read_text().count("<polygon") == 4 + 1
-    assert "before 4 cameras with depth sensors was shown at 26.2 dB, 22.3 where it moves" in parts["coverage"][1]
+    assert "with 4 cameras with depth sensors was shown at 26.2 dB, 22.3 where it moves" in parts["coverage"][1]
 
 
 def test_what_doctor_promises_was_measured():

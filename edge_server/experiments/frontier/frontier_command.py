@@ -109,7 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (DatasetError, EngineError, ScenarioError, ValueError) as error:
         print(f"edge-server frontier: {error}", file=sys.stderr)
         return 2
-    stopped = f"what was measured is in {args.out}: the same command goes on"
+    stopped = f"what was measured is in {args.out}: run the same command again to resume"
     return run_command("frontier", frontier.run, (EngineError,), stopped)
 
 

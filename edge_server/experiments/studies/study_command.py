@@ -71,7 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"  {time.monotonic() - began:.0f} s; {request.out / name}.md, .csv, .json and figures", flush=True)
 
     errors = (ScenarioError, DatasetError, StudyError, EngineError, TrainingError, ViewpointError, EmbeddingError)
-    return run_command("study", work, errors, f"what is finished is in {args.out}: the same command goes on")
+    stopped = f"what is finished is in {args.out}: run the same command again to resume"
+    return run_command("study", work, errors, stopped)
 
 
 def checked(names: list[str], request: StudyRequest) -> list[str]:

@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         args.out.mkdir(parents=True, exist_ok=True)  # first, so that an error does not waste the work
         _train(args, setting, config, folders)
 
-    stopped = f"what is finished is in {args.out}: the same command goes on"
+    stopped = f"what is finished is in {args.out}: run the same command again to resume"
     return run_command("train-scheduler", work, (ScenarioError, DatasetError, EngineError, TrainingError), stopped)
 
 
