@@ -285,7 +285,7 @@ def _walk_after(begin: Callable[[int, View], View] | None, depth: bool, seed: in
         (_at_a_wall, True, 1.2),
         (_at_a_wall, False, 1.0),
         (_under_a_hand, True, 1.2),
-        (_under_a_hand, False, 2.6),
+        (_under_a_hand, False, 3.0),
     ],
 )
 def test_a_bad_beginning_is_forgotten_within_two_seconds(begin, depth: bool, lost_db: float) -> None:
