@@ -128,6 +128,12 @@ class PoseCorrections:
         shifted = np.linalg.norm(pose[:3, 3] - given[:3, 3])
         return bool(turned <= share * self.most_rad and shifted <= share * self.most_m)
 
+    def apart(self, one: Array, other: Array) -> float:
+        """How far apart two poses (4, 4) are, in largest corrections: of a shift and of a turn, the larger one."""
+        turned = np.linalg.norm(so3_log(other[:3, :3] @ one[:3, :3].T))
+        shifted = np.linalg.norm(other[:3, 3] - one[:3, 3])
+        return float(max(turned / self.most_rad, shifted / self.most_m))
+
     def place(self, view: View, pose: Array, scale: float) -> View:
         """The view at another pose (4, 4) than the reported one. scale: see ``PoseCorrection``."""
         known = self._of(view)

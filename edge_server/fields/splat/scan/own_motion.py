@@ -90,19 +90,25 @@ class OwnMotion:
         """Note that poses of a camera may have leapt before a view: it was found elsewhere, soon after the one before,
         and farther away than a correction goes. Returns whether so.
 
+        Where pictures fit both here and there, a gap's own motion looks like a leap: ``begun`` is believed where it is
+        nearer than ``found`` to where the last motion leads.
+
         begun: (4, 4), the view's pose with the correction of the one before it, which goes on. found: (4, 4), where its
         picture was taken.
         """
-        before = self.before(view, camera)[-1:]
-        recent = before and view.generated_ns - before[0].at_ns < 1e9 * tuned.LONGEST_GAP_S
+        before = self.before(view, camera)
+        recent = before and view.generated_ns - before[-1].at_ns < 1e9 * tuned.LONGEST_LEAP_S
         if not recent or self._poses.within(begun, found, 1.0):
+            return False
+        led = moved_on(view, before)
+        if led is not None and self._poses.apart(led, begun) < self._poses.apart(led, found):
             return False
         reported, back = self._as_reported(view, camera), found @ se3_inverse(begun) @ self._back(camera)
         back = se3(so3_exp(so3_log(back[:3, :3])), back[:3, 3])  # else errors of rounding grow from leap to leap
         if self._poses.within(reported, found, 1.0):
             back = np.eye(4)  # an earlier leap has ended
         shift_m = float(np.linalg.norm((back @ reported - reported)[:3, 3]))
-        self._suggested[camera] = Leap(before[0].at_ns, view.generated_ns, back, shift_m), 0
+        self._suggested[camera] = Leap(before[-1].at_ns, view.generated_ns, back, shift_m), 0
         return True
 
     def after_leap(self, view: View, camera: str) -> View | None:
@@ -227,11 +233,19 @@ def guessed_poses(view: View, before: Sequence[PoseCorrection]) -> list[Array]:
     last = before[-1]
     scales = (1.0, shift_scale(before), 0.0)
     poses = [*(replace(last, scale=scale).moved(view.camera_to_world) for scale in scales), last.pose]
-    if len(before) > 1 and last.at_ns > before[-2].at_ns:
-        share = min((view.generated_ns - last.at_ns) / (last.at_ns - before[-2].at_ns), tuned.FASTEST)
-        own = se3_inverse(before[-2].pose) @ last.pose
-        poses.append(last.pose @ se3(so3_exp(share * so3_log(own[:3, :3])), share * own[:3, 3]))
-    return poses
+    led = moved_on(view, before, tuned.FASTEST)
+    return poses if led is None else [*poses, led]
+
+
+def moved_on(view: View, before: Sequence[PoseCorrection], most: float = np.inf) -> Array | None:
+    """Where a view was taken, (4, 4), if its camera moved on as before, at most so many times as far; None: its motion
+    is not known. before: see ``guessed_poses``."""
+    if len(before) < 2 or before[-1].at_ns <= before[-2].at_ns:
+        return None
+    last, one = before[-1], before[-2]
+    share = min((view.generated_ns - last.at_ns) / (last.at_ns - one.at_ns), most)
+    own = se3_inverse(one.pose) @ last.pose
+    return last.pose @ se3(so3_exp(share * so3_log(own[:3, :3])), share * own[:3, 3])
 
 
 def shift_scale(known: Sequence[PoseCorrection]) -> float:

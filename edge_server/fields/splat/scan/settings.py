@@ -107,6 +107,8 @@ UNTURNED = 6  # by so many pairs of keyframes contradict reported poses more tha
 OTHER_UNIT = 2.5  # ratio of distances that is no error of single poses: feet in meters are 3.3
 UNIT_LOG = 0.45  # deviation of its logarithm, up to which it is that of two units
 FOLLOWED = 0.1  # share of pixels by which fewer may look as expected where reported motion leads than at best
+# Between two keyframes, for a leap: later the camera may be anywhere, and what fits where it was tells no leap.
+LONGEST_LEAP_S = 1.5
 FASTEST = 3.0  # times that the last motion may have gone on since
 
 # --- frames and poses that cannot be right ---
@@ -120,7 +122,7 @@ JUDGED = 24  # newest keyframes of a camera by which its poses are judged
 MOUNT_POSES = 256  # newest ones by which an error of the mount is told: 15 ms
 DRIFT_SHARE = 0.6  # of the largest correction, above which poses drift
 LATE_S, LATE_EXPLAINS = 0.03, 0.4  # least delay of poses that is said, and share of the corrections that it explains
-LONGEST_GAP_S = 1.5  # between two keyframes, for a velocity or a leap: a covered camera may be carried elsewhere
+LONGEST_GAP_S = 1.5  # between two keyframes, for a velocity
 
 
 def scan_options(pixels: int, tracked: bool) -> dict[str, Any]:

@@ -443,25 +443,35 @@ def _relocalized(k: int, view: View) -> View:
 @pytest.mark.parametrize("depth", [True, False])
 def test_poses_that_leap_and_stay_so_are_taken_back(depth: bool) -> None:
     """Taken as they are after ten frames, they cost 4 dB of all held-out frames so far for as long as was looked."""
-    views = [_relocalized(k, view) for k, view in enumerate(walk(depth=depth))]
-    field, found_db = _by_seconds(views, views)
-    lost = (np.array(_undisturbed(depth)) - found_db)[1:]
-    assert lost.mean() < 1.0 and lost.max() < 2.0
-    (said,) = (line for line in field.troubles if line.startswith("hand: its poses leapt by 1."))
-    assert 17 <= int(said.split(" degrees")[0].split()[-1]) <= 23, said
+    views, lost = [_relocalized(k, view) for k, view in enumerate(walk(depth=depth))], []
+    for seed in SEEDS:
+        field, found_db = _by_seconds(views, views, seed)
+        lost.append((np.array(_undisturbed(depth, seed)) - found_db)[1:])
+        (said,) = (line for line in field.troubles if line.startswith("hand: its poses leapt by 1."))
+        assert 17 <= int(said.split(" degrees")[0].split()[-1]) <= 23, said
+    assert np.mean(lost) < 0.6  # measured: .1 each, single trainings -.2 to .3
 
 
 @pytest.mark.stability
-@pytest.mark.parametrize("depth", [True, False])
-def test_a_camera_that_is_carried_elsewhere_under_a_hand_has_not_leapt(depth: bool) -> None:
-    clean = walk(depth=depth)
-    views = [*clean[:BAD_FROM], *map(_covered, clean[BAD_FROM : BAD_FROM + 20]), *clean[BAD_FROM + 20 :]]
-    views = [*views[: BAD_FROM + 20], *views[BAD_FROM + 25 :]]  # meanwhile it goes as far as in 2.5 seconds
-    views = [replace(view, generated_ns=100_000_000 * k) for k, view in enumerate(views)]
-    field = _played(views)
+@pytest.mark.parametrize("covered", [True, False])
+@pytest.mark.parametrize(("frames", "depth"), [(6, False), (9, False), (11, False), (14, False), (9, True), (11, True)])
+def test_a_camera_that_is_carried_elsewhere_meanwhile_has_not_leapt(frames: int, depth: bool, covered: bool) -> None:
+    """It sees a hand or nothing comes of it, and it goes a quarter faster. Its right poses were taken back by the way
+    that it had gone: 2 m."""
+    clean, begin = walk(depth=depth), BAD_FROM + round(1.25 * frames)
+    bad = [_covered(view) for view in clean[BAD_FROM : BAD_FROM + frames]] if covered else []
+    after = [
+        replace(view, generated_ns=100_000_000 * k)
+        for k, view in enumerate(clean[begin : begin + 14], BAD_FROM + frames)
+    ]
+    field = _field()
+    for view in [*clean[:BAD_FROM], *bad, *after]:
+        field.fit([replace(view, camera="hand")], Budget(steps=tuned.STEPS_A_KEYFRAME))
     assert not any("leapt" in line for line in field.troubles)
-    late = field._poses.newest("hand", 10)
-    assert max(np.linalg.norm(each.shift_m) for each in late) < 0.2 and all(each.reported is None for each in late)
+    for view in after[4:]:
+        found = field.correction(replace(view, camera="hand", generated_ns=view.generated_ns + 1))
+        assert found is not None
+        assert np.linalg.norm((found.camera_to_world - view.camera_to_world)[:3, 3]) < 0.25  # measured: .13
 
 
 @pytest.mark.parametrize("until", [42, 46])  # two frames suggest the leap; it is believed
