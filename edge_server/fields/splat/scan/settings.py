@@ -108,7 +108,7 @@ OTHER_UNIT = 2.5  # ratio of distances that is no error of single poses: feet in
 UNIT_LOG = 0.45  # deviation of its logarithm, up to which it is that of two units
 FOLLOWED = 0.1  # share of pixels by which fewer may look as expected where reported motion leads than at best
 # Between two keyframes, for a leap: later the camera may be anywhere, and what fits where it was tells no leap.
-LONGEST_LEAP_S = 1.5
+LONGEST_LEAP_S = 1.0
 FASTEST = 3.0  # times that the last motion may have gone on since
 
 # --- frames and poses that cannot be right ---
