@@ -124,9 +124,7 @@ class PoseCorrections:
 
     def within(self, given: Array, pose: Array, share: float) -> bool:
         """Whether a correction from ``given`` to ``pose``, (4, 4), takes at most a share of what is allowed."""
-        turned = np.linalg.norm(so3_log(pose[:3, :3] @ given[:3, :3].T))
-        shifted = np.linalg.norm(pose[:3, 3] - given[:3, 3])
-        return bool(turned <= share * self.most_rad and shifted <= share * self.most_m)
+        return self.apart(given, pose) <= share
 
     def apart(self, one: Array, other: Array) -> float:
         """How far apart two poses (4, 4) are, in largest corrections: of a shift and of a turn, the larger one."""
