@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import asdict
 
 from camera_node.capture import build_cameras
 from camera_node.settings import source_config
@@ -24,6 +25,7 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none, number
 from edge_server.experiments.engine import processor
 from edge_server.experiments.virtual.from_scenario import build_deployment
+from edge_server.experiments.virtual.now_and_all import NowAndAll
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
@@ -89,8 +91,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
         watched = None
         if scenario.held_out_every:
-            from edge_server.experiments.virtual.now_and_all import NowAndAll
-
             kept = build_cameras(scenario, source_config(scenario), scenario.held_out, folders.data)
             watched = NowAndAll(deployment, kept, args.seconds)
         _run(deployment, args.seconds, quiet=args.json)
@@ -103,9 +103,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if watched is not None:
         found["now_and_all"] = watched.means()
     if args.out is not None:
-        write_output(args.out, found, deployment, scenario.channel.get("preset"))
-        if watched is not None:
-            watched.write(args.out)
+        write_output(args.out, found, deployment, scenario.channel.get("preset"), watched)
     print(json.dumps(found) if args.json else "\n  ".join([show(found), *deployment.updates.troubles]))
     return 0
 
@@ -216,9 +214,16 @@ def digest(deployment: VirtualDeployment) -> str:
     return found.hexdigest()
 
 
-def write_output(out: Path, found: dict[str, Any], deployment: VirtualDeployment, channel: str | None = None) -> None:
+def write_output(
+    out: Path,
+    found: dict[str, Any],
+    deployment: VirtualDeployment,
+    channel: str | None = None,
+    watched: NowAndAll | None = None,
+) -> None:
     """Write OUT/simulation.json, and what a live run writes for its report: edge.json, channel.json, and lines for each
-    publication and each scored instant (series.jsonl, shown.jsonl). channel: its preset. Raises OSError."""
+    publication and each scored instant (series.jsonl, shown.jsonl). channel: its preset. watched: of held-out cameras
+    that move. Raises OSError."""
     publications = deployment.publications
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / "simulation.json", found)
@@ -230,6 +235,7 @@ def write_output(out: Path, found: dict[str, Any], deployment: VirtualDeployment
             "run": run_facts(),
             "field": found["field"],
             "troubles": deployment.updates.troubles,
+            "so_far": asdict(watched.rows[-1][1]) if watched is not None and watched.rows else None,
             **{name: found[name] for name in names if name in found},
         },
     )
@@ -241,7 +247,7 @@ def write_output(out: Path, found: dict[str, Any], deployment: VirtualDeployment
     for score in deployment.shown:
         behind = publications[bisect_right(instants, score.published_ns) - 1]
         t_s = behind.t_s + (score.published_ns - behind.published_ns) / 1e9
-        lines.append(shown_line(t_s, score, behind))
+        lines.append(shown_line(t_s, score, behind, None if watched is None else watched.at(t_s)))
     write_text(out / "shown.jsonl", "".join(line + "\n" for line in lines))
 
 
@@ -251,8 +257,7 @@ def show(found: dict[str, Any]) -> str:
     cost = found["compute"]
     charged = f"{cost['ms_per_step']:g} ms a step, {cost['ms_per_update']:g} ms an update"
     cost_text = charged if any(cost.values()) else "free of charge"
-    now_and_all = dict(found.get("now_and_all") or {})
-    revisited = now_and_all.pop("revisited", None)
+    now_and_all = found.get("now_and_all") or {}
     lines = [
         f"{found['scenario']}, seed {found['seed']}, {found['seconds']:g} s of virtual time, "
         f"{short_name(found['policy'])}{value}",
@@ -261,7 +266,6 @@ def show(found: dict[str, Any]) -> str:
         "  last fifth  " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["last_fifth"].items()),
         "  shown       " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["shown"].items()),
         *(["  since 4 s   " + ", ".join(f"{k} {number(v, 3)}" for k, v in now_and_all.items())] if now_and_all else []),
-        *(["  revisited   " + ", ".join(f"{k} {number(v, 2)}" for k, v in revisited.items())] if revisited else []),
         f"  seconds until within 1 dB of that: {number(found['seconds_to_1_db'], 1)}",
         "  frames      " + ", ".join(f"{k} {v}" for k, v in found["frames"].items() if v),
         f"  digest      {found['digest'][:32]} on {found['processor']}",
