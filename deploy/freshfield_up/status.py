@@ -65,15 +65,6 @@ def _channel_line(channel: Status) -> str:
     return ", ".join(parts)
 
 
-def held_out(scores: dict[str, Any]) -> str:
-    """What is shown of held-out cameras that move (``SoFarScores``)."""
-    poses = ", at refined poses" if scores.get("refined") else ""
-    return (
-        f"now {fmt(scores.get('now_psnr_db'), '.2f')} dB, all {fmt(scores.get('frames'), 'd')} frames so far "
-        f"{fmt(scores.get('all_psnr_db'), '.2f')} dB{poses}"
-    )
-
-
 def _edge_line(edge: Status) -> str:
     updates = number(edge, "updates", "count")
     if not updates:
@@ -81,7 +72,10 @@ def _edge_line(edge: Status) -> str:
     views = f" on {NOTHING_HELD_OUT}" if (edge.get("scores") or {}).get("on") == "selected" else ""
     so_far = edge.get("so_far")
     if isinstance(so_far, dict):
-        scores = [f"held out {held_out(so_far)}"]
+        poses = ", at refined poses" if so_far.get("refined") else ""
+        now, whole = (fmt(number(so_far, name), ".2f") for name in ("now_psnr_db", "all_psnr_db"))
+        frames = fmt(number(so_far, "frames"), ".0f")
+        scores = [f"held out now {now} dB, all {frames} frames so far {whole} dB{poses}"]
     else:
         scores = [f"PSNR {fmt(number(edge, 'scores', 'psnr_db'), '.2f')} dB{views}"]
         if not views:

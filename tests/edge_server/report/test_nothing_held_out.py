@@ -119,5 +119,5 @@ def test_the_age_of_what_was_shown_is_told_without_a_held_out_camera(tmp_path):
     # Updates of some 745 ms follow each other: an image is shown for 750, and counts as old as it is in the middle.
     assert age["network"] == 50.0 and age["computing"] == pytest.approx(757, abs=20)
     assert age["display"] == pytest.approx(375, abs=40)
-    assert "shown      age of 50 ms network" in summarize(folder)
+    assert "(50 ms network, " in summarize(folder)
     assert "ms network" in page
