@@ -101,7 +101,7 @@ def check(view: DepthView, others: Sequence[DepthView]) -> str:
         raise DepthWrong(f"{said}: nearly all of it is the same, {middle:.3g} m: does the sensor measure at all?")
     if not USUAL_M[0] <= middle <= USUAL_M[1]:
         raise DepthWrong(f"{said}: is the unit wrong?")
-    shares = {other.camera: Overlap.of(view, other).share for other in others}
+    shares = {other.camera: _agreement(view, other)[0] for other in others}
     known = {camera: share for camera, share in shares.items() if share is not None}
     if known:
         best, share = max(known.items(), key=lambda pair: pair[1])
@@ -122,35 +122,20 @@ def _explained(view: DepthView, others: Sequence[DepthView]) -> str:
     for factor in _FACTORS:
         for own, theirs in ((factor, 1.0), (1.0, factor), (factor, factor)):
             for other in others:
-                found = Overlap.of(view.scaled(own), other.scaled(theirs))
-                if (found.share or 0.0) >= _AGREES and found.least_same >= _OVERLAPS:
+                share, least_same = _agreement(view.scaled(own), other.scaled(theirs))
+                if (share or 0.0) >= _AGREES and least_same >= _OVERLAPS:
                     whose = other.camera if own == 1.0 else view.camera if theirs == 1.0 else "both cameras"
                     return f"that of {whose} seems to be {1.0 / factor:.3g} times what it should be: is the unit wrong?"
     return "is the pose, a lens, the scale or the instant of one of them wrong, or are near and far exchanged?"
 
 
-@dataclass(frozen=True)
-class Overlap:
-    """Points of two cameras in each other's depth: on its surfaces, in front of them, behind them. Two numbers each."""
-
-    same: NDArray[np.int64]
-    through: NDArray[np.int64]
-    hidden: NDArray[np.int64]
-
-    @staticmethod
-    def of(a: DepthView, b: DepthView) -> Overlap:
-        return Overlap(*np.array([_compared(a, b), _compared(b, a)]).T)
-
-    @property
-    def share(self) -> float | None:
-        """Share of the points that are not hidden on which both agree; None for too few of them."""
-        count = int((self.same + self.through).sum())
-        return None if count < _FEWEST_POINTS else float(self.same.sum()) / count
-
-    @property
-    def least_same(self) -> float:
-        """Share of all points, of the camera with fewer of them on the other's surfaces."""
-        return float((self.same / np.maximum(1, self.same + self.through + self.hidden)).min())
+def _agreement(a: DepthView, b: DepthView) -> tuple[float | None, float]:
+    """Share of the points of both that the other's surfaces do not hide on which both agree, None for too few of them;
+    and the share of all points, of the camera with fewer of them on the other's surfaces."""
+    same, through, hidden = np.array([_compared(a, b), _compared(b, a)]).T
+    count = int((same + through).sum())
+    share = None if count < _FEWEST_POINTS else float(same.sum()) / count
+    return share, float((same / np.maximum(1, same + through + hidden)).min())
 
 
 def _compared(a: DepthView, b: DepthView) -> tuple[int, int, int]:

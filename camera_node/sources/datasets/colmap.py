@@ -13,13 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from camera_node.sources.datasets.lens import Lens
-from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageFiles, ImageOptions
 from camera_node.sources.datasets.records import (
     Dataset,
     DatasetError,
-    PosedImage,
     camera_to_world,
-    dataset_of_files,
     errors_at,
     file_within,
     find_files,
@@ -67,23 +65,17 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
     lenses, entries = (_binary if file.suffix == ".bin" else _text)(file)
     root = path if path.is_dir() else path.parent
     folder = _images(root, file, images)
-    found: list[PosedImage] = []
-    missing: list[str] = []
+    found = ImageFiles(folder, options, str(file.with_stem("images")))
     for image in sorted(entries, key=lambda i: i.name):
         where = f"{file.with_stem('images')}: {image.name}"
         if image.camera not in lenses:
             raise DatasetError(f"{where}: its camera {image.camera} is not in {file.name}")
         with errors_at(where):
-            picture = file_within(folder, image.name)
             mask = _mask(folder, root, image.name)
-        if picture is None:
-            missing.append(image.name)
-            continue
-        photo = Photo(picture, lenses[image.camera], options, ignored=(mask, True) if mask else None)
-        with errors_at(where):
             pose = camera_to_world(quaternion_to_matrix(image.pose[:4]), image.pose[4:])
-        found.append(posed_photo(photo, image.name, pose, where))
-    return dataset_of_files(found, missing, folder, str(file.with_stem("images")))
+        ignored = (mask, True) if mask else None
+        found.add(image.name, image.name, lenses[image.camera], pose, where, ignored=ignored)
+    return found.dataset()
 
 
 def _mask(folder: Path, root: Path, name: str) -> Path | None:

@@ -20,18 +20,8 @@ from typing import Any
 import numpy as np
 
 from camera_node.sources.datasets.lens import Lens
-from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
-from camera_node.sources.datasets.records import (
-    Dataset,
-    DatasetError,
-    PosedImage,
-    dataset_of_files,
-    errors_at,
-    file_within,
-    path_within,
-    read_array,
-    read_json,
-)
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageFiles, ImageOptions
+from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, path_within, read_array, read_json
 from freshfield.geometry import Pose, se3_inverse
 
 FILES = ("cameras.json",)
@@ -55,20 +45,12 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
     file = path if path.is_file() else folder / FILES[0]
     entries = _entries(file)
     held_out = _held_out(folder / "splits.json")
-    pictures = _images(folder, images)
-    found: list[PosedImage] = []
-    missing: list[str] = []
+    found = ImageFiles(_images(folder, images), options, str(file))
     for name, lens, camera_to_world in entries:
-        where = f"{file}: {name}"
-        with errors_at(where):
-            image = file_within(pictures, name, (".jpg", ".jpeg", ".png"))
-        if image is None:
-            missing.append(f"{name}.jpg")
-            continue
-        photo = Photo(image, lens, options)
-        found.append(posed_photo(photo, name, _UPRIGHT @ camera_to_world, where, name.split("/")[0]))
-    dataset = dataset_of_files(found, missing, pictures, str(file))
-    return replace(dataset, held_out=held_out & {image.name for image in found}, per_camera=True)
+        pose, camera = _UPRIGHT @ camera_to_world, name.split("/")[0]
+        found.add(name, name, lens, pose, f"{file}: {name}", endings=(".jpg", ".jpeg", ".png"), camera=camera)
+    dataset = found.dataset()
+    return replace(dataset, held_out=held_out & {image.name for image in dataset}, per_camera=True)
 
 
 def _images(folder: Path, images: str | None) -> Path:

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.sources.datasets.imaging import composite, image_size, read_image, resize, shrink
 from camera_node.sources.datasets.lens import Lens, exact, pinhole, undistort
-from camera_node.sources.datasets.records import DatasetError, Image, PosedImage, errors_at
+from camera_node.sources.datasets.records import (
+    Dataset,
+    DatasetError,
+    Image,
+    PosedImage,
+    dataset_of_files,
+    errors_at,
+    file_within,
+)
 from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pose
@@ -132,3 +141,42 @@ def posed_photo(
         weight=photo.weight if photo.ignored is not None else None,
         depth=None if photo.depth is None else partial(photo.depth, photo),
     )
+
+
+class ImageFiles:
+    """The images that a data set lists: those that have a file, and the names of the others.
+
+    folder: of the files. options: how they are read. where: what lists them, for error messages.
+    """
+
+    def __init__(self, folder: Path, options: ImageOptions, where: str) -> None:
+        self._folder, self._options, self._where = folder, options, where
+        self._found: list[PosedImage] = []
+        self._missing: list[str] = []
+
+    def add(
+        self,
+        name: str,
+        file: str,
+        lens: Lens,
+        camera_to_world: np.ndarray,
+        where: str,
+        *,
+        endings: Sequence[str] = ("",),
+        camera: str = "",
+        time_s: float | None = None,
+        **more: Any,
+    ) -> None:
+        """Add an entry. file: path below the folder, with the first of ``endings`` that exists. more: further keys of
+        ``Photo``. Others: see ``posed_photo``, which raises."""
+        with errors_at(where):
+            path = file_within(self._folder, file, endings)
+        if path is None:
+            self._missing.append(file + endings[0])
+            return
+        photo = Photo(path, lens, self._options, **more)
+        self._found.append(posed_photo(photo, name, camera_to_world, where, camera, time_s))
+
+    def dataset(self) -> Dataset:
+        """Raises DatasetError as ``dataset_of_files``."""
+        return dataset_of_files(self._found, self._missing, self._folder, self._where)

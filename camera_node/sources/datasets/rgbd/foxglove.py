@@ -18,7 +18,15 @@ from typing import Any
 
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError
-from camera_node.sources.datasets.rgbd.recording import COMPRESSED, Calibration, Picture, Record, Transform, load
+from camera_node.sources.datasets.rgbd.recording import (
+    COMPRESSED,
+    Calibration,
+    Messages,
+    Picture,
+    Record,
+    Transform,
+    load,
+)
 from freshfield.session import INSTALL
 
 FILES = ("*.mcap",)
@@ -38,12 +46,10 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
 
 
 @dataclass(frozen=True)
-class FoxgloveMessages:
-    """See ``recording.Messages``."""
-
+class FoxgloveMessages(Messages):
     where: Path
-    name: str = "Foxglove's messages"
-    needs: tuple[str, str] = (_CALIBRATION, _TRANSFORM)
+    name = "Foxglove's messages"
+    needs = (_CALIBRATION, _TRANSFORM)
 
     def read(self, topic: str | None = None, log_ns: int = 0) -> Iterator[tuple[str, int, Record]]:
         chosen = {} if topic is None else {"topics": [topic], "starting_at": log_ns, "ending_at": log_ns}

@@ -15,17 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.sources.datasets.lens import Lens
-from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
-from camera_node.sources.datasets.records import (
-    Dataset,
-    DatasetError,
-    PosedImage,
-    dataset_of_files,
-    errors_at,
-    file_within,
-    read_array,
-    read_json,
-)
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageFiles, ImageOptions
+from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, file_within, read_array, read_json
 from camera_node.sources.datasets.rgbd.depth_file import DepthFile
 from freshfield.geometry import OPENGL_TO_OPENCV
 
@@ -39,8 +30,7 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
     """The keyframes of a capture: its folder, or one of its folders of cameras. Raises DatasetError."""
     cameras = next((path / name for name in FILES if (path / name).is_dir()), path)
     folder, which = cameras.parent, cameras.name.removesuffix("cameras")
-    images: list[PosedImage] = []
-    missing: list[str] = []
+    found = ImageFiles(folder, options, str(cameras))
     files = sorted(cameras.glob("*.json"), key=lambda file: (len(file.stem), file.stem))  # of numbers: by time
     tracked = not which and all(file.stem.isdecimal() for file in files)
     for file in files:
@@ -50,14 +40,10 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
         width, height, fx, fy, cx, cy = (float(read_array(entry, key, (), where)) for key in _LENS)
         pose = np.array([float(read_array(entry, key, (), where)) for key in _MATRIX]).reshape(3, 4)
         with errors_at(where):
-            image = file_within(folder, f"{which}images/{file.stem}", (".jpg", ".png"))
+            lens = Lens(int(width), int(height), fx, fy, cx, cy)
             depth = file_within(folder, f"depth/{file.stem}.png")
-            if image is None:
-                missing.append(f"{which}images/{file.stem}.jpg")
-                continue
-            reader = DepthFile(depth).read if depth else None
-            photo = Photo(image, Lens(int(width), int(height), fx, fy, cx, cy), options, depth=reader)
         turned = _Y_UP_TO_Z_UP @ pose @ OPENGL_TO_OPENCV
         time_s = (int(file.stem) - int(files[0].stem)) / 1e6 if tracked else None
-        images.append(posed_photo(photo, file.stem, turned, where, time_s=time_s))
-    return dataset_of_files(images, missing, folder, str(cameras))
+        image, reader = f"{which}images/{file.stem}", DepthFile(depth).read if depth else None
+        found.add(file.stem, image, lens, turned, where, endings=(".jpg", ".png"), time_s=time_s, depth=reader)
+    return found.dataset()

@@ -15,17 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.sources.datasets.lens import Lens
-from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
-from camera_node.sources.datasets.records import (
-    Dataset,
-    DatasetError,
-    PosedImage,
-    dataset_of_files,
-    errors_at,
-    file_within,
-    read_array,
-    read_json,
-)
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageFiles, ImageOptions
+from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, file_within, read_array, read_json
 from camera_node.sources.datasets.rgbd.depth_file import DepthFile
 from freshfield.geometry import OPENGL_TO_OPENCV, quaternion_to_matrix, se3
 
@@ -48,19 +39,14 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
     times = np.arange(count) / max(fps, 1e-3)
     if data.get("frameTimestamps"):
         times = read_array(data, "frameTimestamps", (count,), where)
-    images: list[PosedImage] = []
-    missing: list[str] = []
+    found = ImageFiles(file.parent, options, where)
     for n in range(count):
-        with errors_at(f"{where}: frame {n}"):
-            image = file_within(file.parent, f"rgb/{n}", (".jpg", ".png"))
-            depth = file_within(file.parent, f"depth/{n}", (".exr",))
-            if image is None:
-                missing.append(f"rgb/{n}.jpg")
-                continue
+        name, here = f"rgb/{n}", f"{where}: frame {n}"
+        with errors_at(here):
+            depth = file_within(file.parent, f"depth/{n}.exr")
             x, y, z, w = poses[n, :4]
             pose = se3(quaternion_to_matrix([w, x, y, z]), poses[n, 4:]) @ OPENGL_TO_OPENCV
-            reader = DepthFile(depth, 1.0).read if depth else None
-            fx, fy, cx, cy = lenses[n].tolist()
-            photo = Photo(image, Lens(int(width), int(height), fx, fy, cx, cy), options, depth=reader)
-        images.append(posed_photo(photo, f"rgb/{n}", pose, f"{where}: frame {n}", time_s=float(times[n] - times[0])))
-    return dataset_of_files(images, missing, file.parent, where)
+            lens = Lens(int(width), int(height), *lenses[n].tolist())
+        time_s, reader = float(times[n] - times[0]), DepthFile(depth, 1.0).read if depth else None
+        found.add(name, name, lens, pose, here, endings=(".jpg", ".png"), time_s=time_s, depth=reader)
+    return found.dataset()

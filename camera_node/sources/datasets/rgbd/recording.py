@@ -8,13 +8,14 @@ Of images of a frame with the same stamp one is taken: uncompressed before compr
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial, reduce
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -105,17 +106,15 @@ class Transform:
 Record = Picture | Calibration | Transform
 
 
-class Messages(Protocol):
+class Messages(ABC):
     """What decodes a format. where: its file; name: of its messages; needs: what it calls a lens and a pose; all for
     error messages."""
 
-    @property
-    def where(self) -> Path: ...
-    @property
-    def name(self) -> str: ...
-    @property
-    def needs(self) -> tuple[str, str]: ...
+    where: Path
+    name: ClassVar[str]
+    needs: ClassVar[tuple[str, str]]
 
+    @abstractmethod
     def read(self, topic: str | None = None, log_ns: int = 0) -> Iterator[tuple[str, int, Record]]:
         """Topic, log time and record of every message, or of those at a topic and log time. Raises DatasetError."""
 

@@ -23,6 +23,7 @@ from camera_node.sources.datasets.rgbd.recording import (
     COMPRESSED,
     COMPRESSED_DEPTH,
     Calibration,
+    Messages,
     Picture,
     Record,
     Transform,
@@ -40,8 +41,8 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
     return load(BagMessages(path.parent if path.name == FILES[0] else path), options)
 
 
-class BagMessages:
-    """See ``recording.Messages``. The bag stays open: images are read when they are needed, by any thread."""
+class BagMessages(Messages):
+    """The bag stays open: images are read when they are needed, by any thread."""
 
     name = "ROS messages"
     needs = ("CameraInfo", "tf")

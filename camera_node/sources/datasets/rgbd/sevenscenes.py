@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.sources.datasets.lens import Lens
-from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
-from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage, dataset_of_files, file_within
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageFiles, ImageOptions
+from camera_node.sources.datasets.records import Dataset, DatasetError, file_within
 from camera_node.sources.datasets.rgbd.depth_file import DepthFile
 from freshfield.geometry import Pinhole, Pose, se3_inverse
 from freshfield.untrusted import read_text
@@ -35,22 +35,18 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
     """The frames of a sequence's folder that have an image and a pose. Raises DatasetError."""
     folder = path if path.is_dir() else path.parent
     to_depth = se3_inverse(_DEPTH_TO_CAMERA.matrix())
-    images: list[PosedImage] = []
-    missing: list[str] = []
+    found = ImageFiles(folder, options, str(folder))
     for file in sorted(folder.glob("frame-*.pose.txt")):
         name = file.name.removesuffix(".pose.txt")
-        color = file_within(folder, f"{name}.color", (".png", ".jpg"))  # redistributions have JPEGs
         depth = file_within(folder, f"{name}.depth.png")
-        if color is None:
-            missing.append(f"{name}.color.png")
-            continue
         reader = DepthFile(depth, nothing=NOTHING, lens=DEPTH_LENS, to_camera=_DEPTH_TO_CAMERA).read if depth else None
         number = name.removeprefix("frame-")
         if not number.isdecimal():
             raise DatasetError(f"{file}: expected frame-NUMBER.pose.txt")
-        photo = Photo(color, _LENS, options, depth=reader)
-        images.append(posed_photo(photo, name, _pose(file) @ to_depth, str(file), time_s=int(number) / FPS))
-    return dataset_of_files(images, missing, folder, str(folder))
+        pose, time_s = _pose(file) @ to_depth, int(number) / FPS
+        endings = (".png", ".jpg")  # redistributions have JPEGs
+        found.add(name, f"{name}.color", _LENS, pose, str(file), endings=endings, time_s=time_s, depth=reader)
+    return found.dataset()
 
 
 def _pose(file: Path) -> np.ndarray:

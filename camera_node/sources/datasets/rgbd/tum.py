@@ -17,15 +17,8 @@ import numpy as np
 
 from camera_node.pose.providers import PoseGapError, TrajectoryError, read_tum
 from camera_node.sources.datasets.lens import Lens
-from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
-from camera_node.sources.datasets.records import (
-    Dataset,
-    DatasetError,
-    PosedImage,
-    dataset_of_files,
-    errors_at,
-    file_within,
-)
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageFiles, ImageOptions
+from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, file_within
 from camera_node.sources.datasets.rgbd.depth_file import DepthFile
 from freshfield.untrusted import read_text
 
@@ -48,16 +41,9 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
     depth = dict(_listed(folder / "depth.txt"))
     times = np.array(sorted(depth), dtype=np.int64)
     lens = _FREIBURG3 if "freiburg3" in folder.resolve().name else _LENS
-    images: list[PosedImage] = []
-    missing: list[str] = []
+    found = ImageFiles(folder, options, str(folder / "rgb.txt"))
     unposed = 0
     for t_ns, name in listed:
-        where = f"{folder / 'rgb.txt'}: {name}"
-        with errors_at(where):
-            file = file_within(folder, name)
-        if file is None:
-            missing.append(name)
-            continue
         try:
             pose, _ = poses.at(t_ns)
         except PoseGapError:
@@ -66,13 +52,14 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
         nearest = int(times[np.abs(times - t_ns).argmin()]) if times.size else t_ns + 2 * _NEAR_NS
         with errors_at(f"{folder / 'depth.txt'}"):
             measured = file_within(folder, depth[nearest]) if abs(nearest - t_ns) <= _NEAR_NS else None
-        photo = Photo(file, lens, options, depth=DepthFile(measured, METERS_PER_COUNT).read if measured else None)
-        images.append(posed_photo(photo, name, pose.matrix(), where, time_s=(t_ns - listed[0][0]) / 1e9))
+        reader = DepthFile(measured, METERS_PER_COUNT).read if measured else None
+        where, time_s = f"{folder / 'rgb.txt'}: {name}", (t_ns - listed[0][0]) / 1e9
+        found.add(name, name, lens, pose.matrix(), where, time_s=time_s, depth=reader)
     left_out = f"{unposed} of {len(listed)} images have no pose within 20 ms: left out"
-    if unposed and not images:
+    if listed and unposed == len(listed):
         raise DatasetError(f"{folder}: {left_out}")
-    found = dataset_of_files(images, missing, folder, str(folder / "rgb.txt"))
-    return replace(found, notes=(*found.notes, left_out)) if unposed else found
+    dataset = found.dataset()
+    return replace(dataset, notes=(*dataset.notes, left_out)) if unposed else dataset
 
 
 def _listed(file: Path) -> list[tuple[int, str]]:

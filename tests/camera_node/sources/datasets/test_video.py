@@ -295,38 +295,6 @@ def test_reported_videos():
     assert [len(rig.of(c)) for c in rig.cameras] == [40, 20, 20] and rig.of("cam01")[30].time_s == pytest.approx(0.5)
 
 
-def test_what_does_not_fit_is_named(tmp_path):
-    file = write_rig(tmp_path / "a")
-    rig = json.loads(file.read_text())
-    rig["cam01"]["width"] = 65
-    file.write_text(json.dumps(rig))
-    with pytest.raises(DatasetError, match="64 x 48, calibrated for 65 x 48"):
-        opened(video_scenario(file))
-    rig["cam01"].update(width=64, R_world_to_cam=np.diag([1.0, 1, -1]).tolist())
-    file.write_text(json.dumps(rig))
-    with pytest.raises(DatasetError, match=r"cam01\.R_world_to_cam"):
-        opened(video_scenario(file))
-    rig["cam01"]["dist_coeffs"] = [0.1]
-    file.write_text(json.dumps(rig))
-    with pytest.raises(DatasetError, match=r"json: cam01: dist_coeffs is not understood and may change the camera"):
-        opened(video_scenario(file))
-    rig["cam01"].pop("dist_coeffs")
-    (tmp_path / "a/videos/cam00.mp4").rename(tmp_path / "private.mp4")
-    (tmp_path / "a/videos/cam00.mp4").symlink_to(tmp_path / "private.mp4")
-    rig["cam01"].pop("R_world_to_cam")
-    file.write_text(json.dumps(rig))
-    with pytest.raises(DatasetError, match=r"'videos/cam00\.mp4' is a symbolic link that leads out of the data set"):
-        opened(video_scenario(file))
-    (tmp_path / "a/videos/cam00.mp4").unlink()
-    (tmp_path / "b/videos").mkdir(parents=True)
-    with pytest.raises(DatasetError, match=r"expected one calib\*.json or rig\*.json, found none"):
-        opened(video_scenario(tmp_path / "b"))
-    (tmp_path / "a/videos/cam00.mp4").write_bytes(b"no video at all")
-    file.write_text(json.dumps(rig))
-    with pytest.raises(DatasetError, match=r"cam00.mp4: OpenCV cannot open"):
-        opened(video_scenario(file))
-
-
 UNKNOWN = {
     "camera_model": "OPENCV_FISHEYE",
     "coeffs": [0, 0.1],
@@ -370,5 +338,3 @@ def test_a_camera_without_a_pose_is_missed_only_where_it_is_used(tmp_path):
     assert opened(video_scenario(file), ["cam00"])["cam00"].read(0).pose.translation_m == pytest.approx((3, 0, 1))
     with pytest.raises(ScenarioError, match=r"trajectory.files.cam01: missing, and the calibration has no pose"):
         opened(video_scenario(file))
-    with pytest.raises(DatasetError, match="cam01: R_world_to_cam is missing"):
-        load_dataset(file)

@@ -11,7 +11,6 @@ import pytest
 from camera_node.sources.datasets.formats import open_dataset
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.datasets.rgbd import foxglove
-from camera_node.sources.datasets.rgbd.recording import _nearest
 from freshfield.geometry import Pose, look_at
 
 mcap = pytest.importorskip("mcap_protobuf.writer", reason="needs the extra mcap")
@@ -90,17 +89,6 @@ def test_of_a_folder_the_first_recording_is_read(tmp_path):
     file = write(tmp_path / "a.mcap")
     for path in (tmp_path, file):
         assert foxglove.load_dataset(path).cameras == ("front",)
-
-
-def test_an_image_gets_the_depth_nearest_in_time():
-    rng = np.random.default_rng(2)
-    for count in (0, 1, 2, 40):
-        messages = sorted((int(t_ns), "/depth", n) for n, t_ns in enumerate(rng.integers(0, 100, count)))
-        for t_ns in range(-3, 103):
-            found = _nearest(messages, t_ns)
-            distances = [abs(message[0] - t_ns) for message in messages]
-            assert (found is None) == (not messages)
-            assert found is None or abs(found[0] - t_ns) == min(distances)
 
 
 @pytest.mark.stability
