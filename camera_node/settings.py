@@ -364,6 +364,11 @@ def own_class(kind: str) -> tuple[type[Source], type[SourceConfig]]:
     return found, keys
 
 
+def beside(scenario: Scenario, name: str) -> Path:
+    """A file that the scenario names, relative to it."""
+    return scenario.path.parent / Path(name).expanduser()
+
+
 def find_data(name: str, scenario: Scenario, base: Path | None, key: str = "data") -> Path:
     """Locate the file or folder ``name`` that the scenario gives as ``source.key``.
 
@@ -373,8 +378,8 @@ def find_data(name: str, scenario: Scenario, base: Path | None, key: str = "data
     """
     where = f"{scenario.path}: source.{key}"
     path = Path(name).expanduser()
-    if (beside := scenario.path.parent / path).exists():
-        return beside
+    if (near := beside(scenario, name)).exists():
+        return near
     if not path.is_absolute():
         folder = base or (Path(os.environ["FRESHFIELD_DATA"]) if os.environ.get("FRESHFIELD_DATA") else None)
         if (

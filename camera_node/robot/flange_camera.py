@@ -7,7 +7,6 @@ kinematics and hand-eye calibration. The difference of both is the pose error.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import socket
 import threading
@@ -37,7 +36,7 @@ class TruthClient:
 
     def __init__(self, host: str) -> None:
         self.host = host
-        self._socket: socket.socket | None = None
+        self._link: socket.SocketIO | None = None
         self._lock = threading.Lock()
 
     def joints(self, t_ns: int) -> Array:
@@ -47,17 +46,15 @@ class TruthClient:
 
     def _ask(self, t_ns: int) -> Array:
         try:
-            if self._socket is None:
-                self._socket = socket.create_connection((self.host, TRUTH_PORT), _TIMEOUT_S)
-            self._socket.sendall(b"%d\n" % t_ns)
-            answer = b""
-            while not answer.endswith(b"\n"):
-                part = self._socket.recv(4096)
-                if not part:
-                    raise OSError("it closed the connection")
-                answer += part
+            if self._link is None:
+                with socket.create_connection((self.host, TRUTH_PORT), _TIMEOUT_S) as connected:
+                    self._link = connected.makefile("rwb", buffering=0)
+            self._link.write(b"%d\n" % t_ns)
+            answer = self._link.readline()
+            if not answer.endswith(b"\n"):
+                raise OSError("it closed the connection")
         except OSError as error:
-            self.close()
+            self._link = None
             raise PoseGapError(
                 f"simulated arm at {self.host}: {error}: is camera-node simulate-arm running there?"
             ) from None
@@ -69,12 +66,6 @@ class TruthClient:
                 "this machine too busy to simulate it?"
             )
         return np.array(known["q"])
-
-    def close(self) -> None:
-        if self._socket is not None:
-            with contextlib.suppress(OSError):
-                self._socket.close()
-        self._socket = None
 
 
 @dataclass(frozen=True)

@@ -35,10 +35,3 @@ def test_mistakes_are_one_line_and_exit_code_2(capsys, tmp_path, monkeypatch):
     assert "--out: " in capsys.readouterr().err
     (tmp_path / "bad.yaml").write_text("cameras: {count: 20}\nsource: {kind: world, scene: room}\n")
     assert "bad.yaml: source: " in fails(capsys, "run", str(tmp_path / "bad.yaml"), "--all", *to)
-
-
-def test_help_teaches_with_examples(capsys):
-    with pytest.raises(SystemExit) as end:
-        main(["run", "--help"])
-    assert end.value.code == 0
-    assert "camera-node run room --all --to 127.0.0.1:7001" in capsys.readouterr().out

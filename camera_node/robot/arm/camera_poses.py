@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from camera_node.pose.providers import FixedPose, PoseProvider
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND, HandEye, read_hand_eye
 from camera_node.robot.arm.kinematics import MODELS, ArmModel, apply_calibration
-from camera_node.settings import ArmConfig, errors_of, source_config
+from camera_node.settings import ArmConfig, beside, errors_of, source_config
 from freshfield.clock import WallClock
 from freshfield.geometry import Pose, se3, so3_exp
 from freshfield.scenario import Scenario, ScenarioError
@@ -34,7 +33,7 @@ def arm_model(scenario: Scenario, config: ArmConfig) -> ArmModel:
     if config.calibration is None:
         return model
     with errors_of(f"{scenario.path}: source.arm.calibration"):
-        return apply_calibration(model, _resolve_path(scenario, config.calibration))
+        return apply_calibration(model, beside(scenario, config.calibration))
 
 
 def base_matrix(config: ArmConfig) -> NDArray[np.float64]:
@@ -58,7 +57,7 @@ def load_hand_eyes(scenario: Scenario, config: ArmConfig, cameras: Iterable[str]
             found[camera] = HandEye(EYE_IN_HAND, np.eye(4))
             continue
         with errors_of(f"{where}.{camera}"):
-            found[camera] = read_hand_eye(_resolve_path(scenario, file))
+            found[camera] = read_hand_eye(beside(scenario, file))
     return found
 
 
@@ -94,9 +93,3 @@ def camera_poses(scenario: Scenario, config: ArmConfig | None, cameras: Iterable
         flange = FlangePoses(stream, model, base)
         poses.update({camera: mounts[camera].camera_poses(flange) for camera in moving})
     return poses
-
-
-def _resolve_path(scenario: Scenario, name: str) -> Path:
-    """A file named in a scenario, relative to it."""
-    path = Path(name).expanduser()
-    return path if path.is_absolute() else scenario.path.parent / path

@@ -18,7 +18,6 @@ import subprocess
 import sys
 import threading
 import time
-from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +41,6 @@ STALE_S = 0.5
 """Default age at which a state counts as stale."""
 READER = (sys.executable, "-m", "camera_node.robot.arm.rtde_process")
 """The process that reads joint states; host and frequency follow."""
-_LAST_WORDS_BYTES = 4096
 BACKOFF_S = (0.25, 0.5, 1.0, 2.0, 5.0)
 _ROBOT_MODES = {
     -1: "no controller",
@@ -87,19 +85,12 @@ def probe(host: str) -> None:
                 if not part:
                     raise ArmError(f"{where}: port {RTDE_PORT} closed at once: is another program's?")
                 answer += part
-    except ConnectionRefusedError:
-        raise ArmError(
-            f"{where}: nothing listens on port {RTDE_PORT}: switch the controller on and enable RTDE in its "
-            "settings (Security, Services), or start one with: camera-node simulate-arm"
-        ) from None
-    except socket.gaierror:
-        raise ArmError(f"{where}: no such host: give the IP address from the teach pendant") from None
-    except TimeoutError:
-        raise ArmError(
-            f"{where}: no answer on port {RTDE_PORT} within {PROBE_S:g} s: check address, cable and subnet"
-        ) from None
     except OSError as error:
-        raise ArmError(f"{where}: {error.strerror or error}: check address, cable and subnet") from None
+        raise ArmError(
+            f"{where}: no answer on port {RTDE_PORT} ({error.strerror or error}): check address, cable and subnet, "
+            "switch the controller on and enable RTDE in its settings (Security, Services), or start one with: "
+            "camera-node simulate-arm"
+        ) from None
     if answer != b"\x00\x04V\x01":
         raise ArmError(f"{where}: port {RTDE_PORT} does not speak RTDE version 2: too old, or no controller")
 
@@ -208,8 +199,6 @@ class ArmStream:
         assert child.stdout is not None and child.stderr is not None
         received, patience_s = False, CONNECT_S
         clock, last_s, pending = ArrivalClock(), -1.0, b""
-        # What the library says is read as it comes: a pipe that is full would stop the process.
-        said = _LastWords(child.stderr)
         try:
             while not self._stop.is_set():
                 if not select.select([child.stdout], [], [], patience_s)[0]:
@@ -218,7 +207,8 @@ class ArmStream:
                 data = os.read(child.stdout.fileno(), 65536)
                 arrived_ns = self._clock.now_ns()
                 if not data:
-                    self._set_trouble(said.last_line() or f"arm at {self.host}: the connection was lost")
+                    said = child.stderr.read().decode(errors="replace").strip().split("\n")[-1]
+                    self._set_trouble(said or f"arm at {self.host}: the connection was lost")
                     return received
                 pending += data
                 whole = len(pending) - len(pending) % SAMPLE.size
@@ -237,7 +227,6 @@ class ArmStream:
         finally:
             self._end_child()
             child.stdout.close()
-            said.last_line()
             child.stderr.close()
 
     def _check_modes(self, mode: int, safety: int) -> None:
@@ -263,24 +252,6 @@ class ArmStream:
             with contextlib.suppress(ProcessLookupError):
                 child.kill()
             child.wait()
-
-
-class _LastWords:
-    """Reads a stream to its end in a thread, and keeps the end of it."""
-
-    def __init__(self, stream: IO[bytes]) -> None:
-        self._stream, self._end = stream, b""
-        self._thread = threading.Thread(target=self._read, name="arm's messages", daemon=True)
-        self._thread.start()
-
-    def _read(self) -> None:
-        while part := os.read(self._stream.fileno(), 65536):
-            self._end = (self._end + part)[-_LAST_WORDS_BYTES:]
-
-    def last_line(self) -> str:
-        """The last line, once the stream has ended."""
-        self._thread.join(1.0)
-        return self._end.decode(errors="replace").strip().split("\n")[-1]
 
 
 class FlangePoses:

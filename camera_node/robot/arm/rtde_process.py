@@ -4,7 +4,8 @@
 
 The client library (ur_rtde) holds Python's lock while it connects, and waits forever for a controller that
 accepts the connection and then does not answer. It therefore runs in its own process, which the node can end.
-This process writes one ``SAMPLE`` for each new stamp.
+This process writes one ``SAMPLE`` for each new stamp, and at most one line of its own to standard error. What the
+library prints is dropped, since a full pipe would stop it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ SAMPLE = struct.Struct("<d6d2i")
 VARIABLES = ["timestamp", "actual_q", "robot_mode", "safety_mode"]
 CONNECT_S = 2.5
 _LIBRARY_MISSING = 3
+_LONGEST_MESSAGE = 1000  # characters: a pipe holds more
 
 
 def main(host: str, frequency_hz: float) -> int:
@@ -31,13 +33,14 @@ def main(host: str, frequency_hz: float) -> int:
         from rtde_receive import RTDEReceiveInterface
     except ImportError:
         return _LIBRARY_MISSING
-    # The library prints to standard output, which must carry samples only.
-    pipe = os.dup(1)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    # The library prints to both of its outputs, which must carry samples and one message only.
+    pipe, messages = os.dup(1), os.dup(2)
+    for output in (1, 2):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), output)
     try:
         arm = RTDEReceiveInterface(host, frequency_hz, VARIABLES)
     except RuntimeError as error:
-        print(f"{host}: {error}", file=sys.stderr)
+        os.write(messages, f"{host}: {error}"[:_LONGEST_MESSAGE].encode())
         return 1
     signal.setitimer(signal.ITIMER_REAL, 0)
     parent, last = os.getppid(), -1.0

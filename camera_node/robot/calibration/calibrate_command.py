@@ -15,7 +15,7 @@ from camera_node.robot.calibration.rig import rig_command
 EXAMPLES = """examples:
   camera-node calibrate target charuco:7x5:30mm:22mm --out board.png        print it, measure it, fix it flat
   camera-node calibrate intrinsics pictures/ --board charuco:7x5:30mm:22mm --out lens.json
-  camera-node calibrate rig pictures/ --board charuco:7x5:30mm:22mm --out rig.json --plot rig.png
+  camera-node calibrate rig pictures/ --board charuco:7x5:30mm:22mm --out rig.json
   camera-node calibrate hand-eye handeye/ --board chessboard:9x6:23.6mm     ViSP's layout: pictures and poses
   camera-node calibrate hand-eye --pairs samples.yaml --json                saved by MoveIt's panel
   camera-node calibrate hand-eye --live cell.yaml --camera cam00 --board charuco:7x5:30mm:22mm --out hand.yaml
@@ -39,14 +39,6 @@ every corner: ten are enough if the target has been everywhere and tilted by 30 
 """
 
 BOARD = "target: charuco:7x5:30mm:22mm[:4X4_50], chessboard:9x6:23.6mm (inner corners)"
-
-# Option -> the inputs that use it. With any other input it is an error.
-_GOES_WITH = {
-    "board": ("folder", "live"),
-    "lens": ("folder", "live"),
-    **dict.fromkeys(("camera", "data", "seconds"), ("live",)),
-}
-_INPUT_NAMES = {"folder": "FOLDER", "live": "--live SCENARIO"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -119,19 +111,9 @@ def run(args: argparse.Namespace) -> int:
         raise CalibrationError(str(error)) from None
 
 
-def _require_one_input(args: argparse.Namespace) -> None:
-    """Raise CalibrationError unless one input is given, with options that go with it."""
-    given = [name for name in ("folder", "pairs", "live") if getattr(args, name) is not None]
-    if len(given) != 1:
-        raise CalibrationError("expected one of FOLDER, --pairs FILE, --live SCENARIO")
-    for option, goes_with in _GOES_WITH.items():
-        if getattr(args, option, None) is not None and given[0] not in goes_with:
-            places = " or ".join(_INPUT_NAMES[each] for each in goes_with)
-            raise CalibrationError(f"--{option}: goes with {places}")
-
-
 def _hand_eye(args: argparse.Namespace) -> int:
-    _require_one_input(args)
+    if sum(given is not None for given in (args.folder, args.pairs, args.live)) != 1:
+        raise CalibrationError("expected one of FOLDER, --pairs FILE, --live SCENARIO")
     from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, calibrate
     from camera_node.robot.calibration.targets import parse_target
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from camera_node.robot.arm.capsules import PAIRS, PARTS, CapsuleModel
+from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.settings import TeleopConfig
@@ -30,6 +30,12 @@ Array = NDArray[np.float64]
 # Limits are this much tighter than configured, because sums over a stop round differently at each tick.
 _ROUNDING = 1e-9
 _STEP_FRACTIONS = (1.0, 0.5, 0.2)
+# Where an arm stands that breaks a limit at rest.
+_WHERE = {
+    "box": "outside workspace_low_m to workspace_high_m",
+    "floor": "with a part below floor_m",
+    "near": "with two parts nearer to each other than margin_m",
+}
 
 
 class JointLimits:
@@ -145,7 +151,7 @@ class Limiter:
 
     def _check_start(self) -> None:
         """Raise TeleopError if the arm breaks a limit at the start."""
-        c, q = self.config, self.q
+        q = self.q
         if q.shape != (6,) or not np.isfinite(q).all():
             raise TeleopError("the arm gives no joint angles")
         limits = self.joint_limits
@@ -155,19 +161,10 @@ class Limiter:
                 f"joint {joint + 1} stands at {np.degrees(q[joint]):.1f} degrees, within joint_margin_rad of "
                 "its limit: turn it back with the pendant"
             )
-        at = self.shape.arm.forward(q)[:3, 3]
-        if np.any(at < self._low_m) or np.any(at > self._high_m):
+        violated = self._violated_limit(q, self.v)
+        if violated is not None:
+            at = np.round(self.shape.arm.forward(q)[:3, 3], 3).tolist()
             raise TeleopError(
-                f"the flange stands at {np.round(at, 3).tolist()} m, outside the workspace "
-                f"{c.workspace_low_m} to {c.workspace_high_m}: move it inside, or change workspace_low_m and "
-                "workspace_high_m"
-            )
-        apart, lowest = self.shape.clearance(self.shape.arm.nominal_model.link_frames(q[None]))
-        if lowest[0] < c.floor_m + _ROUNDING:
-            raise TeleopError(f"a part of the arm stands {lowest[0]:.3f} m high, below floor_m {c.floor_m:g}")
-        if apart.min() < c.margin_m + _ROUNDING:
-            a, b = PAIRS[int(apart[0].argmin())]
-            raise TeleopError(
-                f"{PARTS[a]} and {PARTS[b]} are {1e3 * apart.min():.0f} mm apart, nearer than margin_m "
-                f"{c.margin_m:g}: spread the arm, or lower the margin"
+                f"the arm, its flange at {at} m, stands {_WHERE[violated]}: move it with the pendant, or change "
+                "source.arm.teleop"
             )

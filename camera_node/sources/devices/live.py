@@ -14,10 +14,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from functools import partial
-from pathlib import Path
 
 from camera_node.pose.providers import Closable, FixedPose, PoseProvider
-from camera_node.settings import LiveConfig
+from camera_node.settings import LiveConfig, beside
 from camera_node.sources.base import Shot, Source, rate
 from camera_node.sources.devices.feed import CameraError, Feed, Image, as_camera_error
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
@@ -210,8 +209,7 @@ def calibrations(scenario: Scenario, config: LiveConfig) -> dict[str, Calibrated
     DatasetError."""
     if config.calibration is None:
         return {}
-    path = Path(config.calibration).expanduser()
-    return load_calibration(path if path.is_absolute() else scenario.path.parent / path)
+    return load_calibration(beside(scenario, config.calibration))
 
 
 def _poses(

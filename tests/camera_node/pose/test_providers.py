@@ -1,19 +1,12 @@
-"""Poses that stay, and those of a trajectory file."""
+"""Poses of a trajectory file."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from camera_node.pose.providers import FixedPose, TrajectoryError, read_tum
-from freshfield.geometry import Pose, so3_exp
-
-MS = 1_000_000
-
-
-def test_a_fixed_pose_has_no_gap():
-    pose = Pose.from_matrix(np.eye(4))
-    assert FixedPose(pose).at(123) == (pose, 0)
+from camera_node.pose.providers import TrajectoryError, read_tum
+from freshfield.geometry import so3_exp
 
 
 def test_tum_files_keep_nanoseconds_and_put_w_first(tmp_path):
@@ -25,11 +18,8 @@ def test_tum_files_keep_nanoseconds_and_put_w_first(tmp_path):
     between, _ = track.at(1305031102_187652000)
     for pose, angle in ((exact, np.pi / 3), (between, np.pi / 6)):
         np.testing.assert_allclose(pose.matrix()[:3, :3], so3_exp([0, 0, angle]), atol=1e-6)
-
-
-def test_a_trajectory_may_have_one_sample(tmp_path):
-    (tmp_path / "track.txt").write_text("2 1 2 3 0 0 0 1")
-    assert read_tum(tmp_path / "track.txt").at(2_050 * MS)[0].translation_m == (1.0, 2.0, 3.0)
+    file.write_text("2 1 2 3 0 0 0 1")
+    assert read_tum(file).at(2_050_000_000)[0].translation_m == (1.0, 2.0, 3.0), "one sample is enough"
 
 
 @pytest.mark.parametrize(

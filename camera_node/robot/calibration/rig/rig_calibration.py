@@ -29,7 +29,7 @@ class RigCalibration:
         left corner, x to its right, y up along it, z out of it towards the viewer.
     lenses: by camera. error_px: root mean square reprojection error by camera.
     std_mm, std_deg: standard deviation of a camera's place and rotation relative to the first one, on each axis.
-    boards: moment -> target to world (4, 4), its axes turned like the world's.
+    moments: number of moments at which the target was seen.
     shared: moments that a pair of cameras saw the target at.
     unused: reason for each image that was left out.
     """
@@ -39,7 +39,7 @@ class RigCalibration:
     error_px: Mapping[str, float]
     std_mm: Mapping[str, float]
     std_deg: Mapping[str, float]
-    boards: Mapping[str, Array]
+    moments: int
     shared: Mapping[tuple[str, str], int]
     origin: str
     unused: Mapping[str, str]
@@ -54,7 +54,7 @@ class RigCalibration:
     def show(self) -> str:
         """The result for people."""
         first = next(iter(self.poses))
-        lines = [f"{len(self.boards)} moments; world: the target as it lay at {self.origin}, z out of it, meters"]
+        lines = [f"{self.moments} moments; world: the target as it lay at {self.origin}, z out of it, meters"]
         for camera, pose in self.poses.items():
             at, sure = pose[:3, 3], f"+- {self.std_mm[camera]:.1f} mm, {self.std_deg[camera]:.2f} degrees"
             lines.append(
@@ -133,7 +133,7 @@ def _result(
         {c: float(np.sqrt(np.mean(squares[c]))) for c in names},
         {c: float(np.sqrt(np.mean(bundle.std[c][3:] ** 2)) * 1e3) for c in names},
         {c: float(np.degrees(np.sqrt(np.mean(bundle.std[c][:3] ** 2)))) for c in names},
-        {m: to_world @ board @ _UP for m, board in bundle.boards.items()},
+        len(bundle.boards),
         _shared({(s.camera, s.moment): None for s in sightings}),
         origin,
         unused,

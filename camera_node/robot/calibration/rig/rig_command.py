@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from camera_node.robot.calibration import CalibrationError
@@ -36,7 +37,6 @@ def add_arguments(parser: argparse.ArgumentParser, board: str) -> None:
     add("--length", nargs=3, metavar=("CAM", "CAM", "METERS"), help="with --colmap: distance of two cameras")
     add("--seconds", type=float, metavar="S", help="with --live: end after S seconds")
     add("--out", type=Path, metavar="FILE.json", help="file to write, for source.calibration of a scenario")
-    add("--plot", type=Path, metavar="FILE.png", help="picture of the rig to write, seen from above and from the side")
     add("--json", action="store_true", help="print the calibration as JSON, as --out writes it")
 
 
@@ -46,21 +46,50 @@ def run(args: argparse.Namespace) -> int:
     if len(given) != 1:
         raise CalibrationError("expected one of FOLDER, --live SCENARIO, --colmap MODEL")
     if args.colmap is not None:
-        from camera_node.robot.calibration.rig.scaled_model import read_scaled_model
-
         if args.length is None:
             raise CalibrationError("--length CAM CAM METERS: a COLMAP model has no scale; measure between two lenses")
-        found: Any = read_scaled_model(args.colmap, *args.length)
-    else:
-        if args.board is None:
-            raise CalibrationError("--board SPEC: say what the target is")
-        found = _from_target(args)
+        show(args, *scaled_model(args.colmap, *args.length))
+        return 0
+    if args.board is None:
+        raise CalibrationError("--board SPEC: say what the target is")
+    found = _from_target(args)
     show(args, found.show(), found.to_json())
-    if args.plot is not None:
-        from camera_node.robot.calibration.rig.rig_picture import draw_rig
-
-        draw_rig(args.plot, found.poses, getattr(found, "boards", {}))
     return 0
+
+
+def scaled_model(folder: Path, first: str, second: str, meters: str) -> tuple[str, dict[str, Any]]:
+    """Cameras of a COLMAP model in meters, in the model's axes: for people, and as a calibration file.
+
+    first, second: cameras whose distance is ``meters``.
+    An image belongs to the camera that its folder, else its file, is named after; the first one of a camera counts.
+    Raises CalibrationError, and DatasetError where the model cannot be read.
+    """
+    from camera_node.sources.datasets.colmap import load_dataset
+    from camera_node.sources.datasets.records import PosedImage
+    from camera_node.sources.rig_calibration import calibration_entry
+
+    try:
+        length = float(meters)
+    except ValueError:
+        length = math.nan
+    if not 1e-3 <= length <= 1e4:
+        raise CalibrationError(f"--length: expected meters, 0.001 to 10000, got {meters!r}")
+    images: dict[str, PosedImage] = {}
+    for image in load_dataset(folder):
+        path = PurePosixPath(image.name)
+        images.setdefault(path.parts[-2] if len(path.parts) > 1 else path.stem, image)
+    for name in (first, second):
+        if name not in images:
+            raise CalibrationError(f"--length: the model has no camera {name}; it has {', '.join(list(images)[:8])}")
+    apart = math.dist(*(images[name].camera_to_world[:3, 3] for name in (first, second)))
+    if not apart > 1e-9:
+        raise CalibrationError(f"--length: {first} and {second} stand at one place in the model")
+    poses = {name: image.camera_to_world.copy() for name, image in images.items()}
+    for pose in poses.values():
+        pose[:3, 3] *= length / apart
+    lines = [f"{len(poses)} cameras; a unit of the model is {length / apart:.6g} m; world: the model's axes"]
+    lines += ["{}: at {:.3f} {:.3f} {:.3f}".format(name, *pose[:3, 3]) for name, pose in poses.items()]
+    return "\n".join(lines), {name: calibration_entry(images[name].intrinsics, poses[name]) for name in poses}
 
 
 def show(args: argparse.Namespace, text: str, data: dict[str, Any]) -> None:

@@ -55,25 +55,21 @@ def test_a_camera_that_stands_does_not_follow_the_flange(tmp_path):
     ("change", "message"),
     [
         ({"setup": "eye-on-foot"}, "setup: expected eye-in-hand or eye-to-hand"),
-        ({"transform": [[1, 2], [3, 4]]}, "transform: expected 4 x 4"),
         ({"transform": (2 * np.eye(4)).tolist()}, "transform: expected 4 x 4 numbers with the last row"),
         ({"transform": np.diag([1.0, 1, -1, 1]).tolist()}, "transform: the pose's rotation"),
-        ({"transform": "none"}, "transform"),
-        ({"time_offset_s": float("nan")}, "time_offset_s"),
         ({"transform": [[10**400] * 4] * 4}, "transform: .* too large"),
-        ({"time_offset_s": "soon"}, "time_offset_s"),
+        ({"time_offset_s": float("nan")}, "time_offset_s"),
         ({"time_offset_s": 10**400}, "time_offset_s"),
+        ("[1, 2]", "expected setup and transform"),
+        (None, "cannot be read"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_named(tmp_path, change, message):
+    file = written(tmp_path, **(change if isinstance(change, dict) else {}))
+    if isinstance(change, str):
+        file.write_text(change)
+    elif change is None:
+        file.unlink()
     with pytest.raises(HandEyeError, match=message) as error:
-        read_hand_eye(written(tmp_path, **change))
+        read_hand_eye(file)
     assert "hand.yaml" in str(error.value)
-
-
-def test_a_file_of_something_else(tmp_path):
-    (tmp_path / "x.yaml").write_text("[1, 2]")
-    with pytest.raises(HandEyeError, match="expected setup and transform"):
-        read_hand_eye(tmp_path / "x.yaml")
-    with pytest.raises(HandEyeError, match="cannot be read"):
-        read_hand_eye(tmp_path / "none.yaml")

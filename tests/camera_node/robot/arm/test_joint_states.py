@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import socket
 import sys
@@ -14,7 +15,6 @@ import pytest
 
 from camera_node.clocks import ArrivalClock
 from camera_node.pose.providers import PoseGapError
-from camera_node.robot.arm import joint_states
 from camera_node.robot.arm.joint_states import ArmError, ArmStream, FlangePoses
 from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.flange_camera import TruthClient
@@ -83,7 +83,7 @@ def test_joints_come_with_their_times():
 
 def test_no_controller_is_one_clear_line():
     begin = time.monotonic()
-    with pytest.raises(ArmError, match=r"nothing listens on port 30004.*simulate-arm"):
+    with pytest.raises(ArmError, match=r"no answer on port 30004 \(Connection refused\).*simulate-arm"):
         ArmStream(own_address(), WallClock()).start()
     assert time.monotonic() - begin < 3.0
 
@@ -159,18 +159,35 @@ def test_an_arm_that_cannot_move_says_why(mode, safety, says):
     assert says in stream.trouble and bool(stream.trouble) == bool(says)
 
 
-def test_a_library_that_talks_much_does_not_stop_the_joints(monkeypatch):
-    """More than a pipe holds before every sample, and its last line is the trouble."""
-    talk = f"""
-import os, sys
-sys.path[:0] = {sys.path!r}
-from camera_node.robot.arm.rtde_process import SAMPLE
-for k in range(20):
-    os.write(2, b"x" * 100_000 + b"\\n")
-    os.write(1, SAMPLE.pack(float(k), *range(6), 7, 1))
-os.write(2, b"gone for good\\n")
+TALKATIVE = """
+import os
+class RTDEReceiveInterface:
+    def __init__(self, host, frequency_hz, variables):
+        self.stamp = 0
+        if host == "nowhere":
+            raise RuntimeError("no robot")
+    def isConnected(self):
+        for output in (1, 2):
+            os.write(output, b"x" * 100_000)
+        self.stamp += 1
+        return self.stamp <= 20
+    def getTimestamp(self):
+        return float(self.stamp)
+    def getActualQ(self):
+        return list(range(6))
+    def getRobotMode(self):
+        return 7
+    getSafetyMode = lambda self: 1
 """
-    monkeypatch.setattr(joint_states, "READER", (sys.executable, "-c", talk))
-    stream = ArmStream("127.0.0.1", WallClock())
-    assert stream._read() and stream.received == 20
-    assert stream.trouble == "gone for good"
+
+
+@pytest.mark.parametrize(
+    ("host", "received", "says"), [("127.0.0.1", 20, "the connection was lost"), ("nowhere", 0, "nowhere: no robot")]
+)
+def test_a_library_that_talks_much_does_not_stop_the_joints(monkeypatch, tmp_path, host, received, says):
+    """More than a pipe holds before every sample."""
+    (tmp_path / "rtde_receive.py").write_text(TALKATIVE)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    stream = ArmStream(host, WallClock())
+    assert stream._read() == bool(received) and stream.received == received
+    assert says in stream.trouble

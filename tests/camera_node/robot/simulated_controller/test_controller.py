@@ -132,19 +132,3 @@ def test_rubbish_ends_its_connection_and_no_other(arm, rubbish):
         assert link.recv(100) == b""
     with socket.create_connection((arm, 30004), 5.0) as link:
         assert _exchange(link, rtde.REQUEST_VERSION, b"\0\2") == b"\1"
-
-
-def test_a_recipe_is_packed_as_the_protocol_says():
-    recipe = rtde.Recipe.of(3, ["timestamp", "actual_q", "robot_mode", "runtime_state", "input_int_register_47"])
-    values = {
-        "timestamp": 1.25,
-        "actual_q": tuple(map(float, range(6))),
-        "robot_mode": -1,
-        "runtime_state": 2**32 - 1,
-        "input_int_register_47": -5,
-    }
-    packed = recipe.pack(values)
-    assert packed == struct.pack(">B7diIi", 3, 1.25, 0, 1, 2, 3, 4, 5, -1, 2**32 - 1, -5)
-    assert recipe.unpack(packed[1:]) == values
-    assert recipe.unpack(recipe.pack({})[1:])["actual_q"] == (0.0,) * 6
-    assert rtde.type_of("output_double_register_48") == "NOT_FOUND"

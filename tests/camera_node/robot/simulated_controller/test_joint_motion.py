@@ -45,16 +45,6 @@ def test_a_move_lasts_as_long_as_its_ramps():
     assert len(run(motion)[0]) * STEP_S == pytest.approx(3.5, abs=0.02)
 
 
-def test_a_move_that_interrupts_another_ends_at_its_own_target():
-    motion = JointMotion(UR3E, HOME_RAD)
-    motion.move(np.array(HOME_RAD) + 1.0, 1.0, 2.0)
-    run(motion, 200)
-    goal = np.array(HOME_RAD) - 0.5
-    assert motion.move(goal, 1.0, 2.0)
-    assert np.abs(np.diff(run(motion)[1], axis=0)).max() <= 2.0 * STEP_S + 1e-9
-    assert np.array_equal(motion.q, goal)
-
-
 @settings(max_examples=25)
 @given(st.lists(st.tuples(six, st.integers(1, 60)), min_size=1, max_size=6))
 def test_targets_that_jump_make_no_arm_that_jumps(targets):

@@ -68,9 +68,9 @@ def test_what_is_no_speed_is_a_stop_and_counted(wanted):
 @pytest.mark.parametrize(
     "changes, part",
     [
-        ({"workspace_low_m": (0.0, 0.0, 0.4)}, "outside the workspace"),
+        ({"workspace_low_m": (0.0, 0.0, 0.4)}, "outside workspace_low_m"),
         ({"floor_m": 0.5}, "below floor_m"),
-        ({"margin_m": 0.1}, "nearer than margin_m"),
+        ({"margin_m": 0.1}, "than margin_m"),
     ],
 )
 def test_an_arm_that_breaks_a_limit_standing_still_is_refused(changes, part):

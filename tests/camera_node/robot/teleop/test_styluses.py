@@ -8,9 +8,10 @@ import time
 
 import numpy as np
 import pytest
+from msgspec.json import encode
 
 from camera_node.robot.teleop import TeleopError
-from camera_node.robot.teleop.stylus import KeyboardStylus, NetworkStylus, encode, open_stylus, parse
+from camera_node.robot.teleop.stylus import KeyboardStylus, NetworkStylus, open_stylus, parse
 from tests.camera_node.robot.teleop.checks import sample
 
 GOOD = {"t_ns": 5, "p": [0.1, 0.2, 0.3], "q": [1, 0, 0, 0], "clutch": True}
@@ -56,12 +57,12 @@ def test_messages_of_one_sender_arrive_as_they_were_sent():
         json.dumps({**GOOD, "t_ns": 1.5}).encode(),
         json.dumps({**GOOD, "t_ns": True}).encode(),
         json.dumps({"t_ns": 1}).encode(),
+        json.dumps({**GOOD, "p": [float("nan"), 0, 0]}).encode(),
         json.dumps({**GOOD, "more": "x" * 2048}).encode(),
     ],
 )
 def test_what_is_no_message_is_none(data):
     assert parse(data) is None
-    assert not parse(json.dumps({**GOOD, "p": [float("nan"), 0, 0]}).encode()).is_valid(), "left to the mapping"
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "[::]", "example.com"])

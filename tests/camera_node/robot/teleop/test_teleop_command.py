@@ -10,6 +10,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from msgspec.json import encode
 
 from camera_node.cli import main
 from camera_node.robot.arm.joint_states import ArmError
@@ -17,7 +18,6 @@ from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.flange_camera import TruthClient
 from camera_node.robot.teleop import sinks, teleop_command
 from camera_node.robot.teleop.settings import TeleopConfig
-from camera_node.robot.teleop.stylus import encode
 from camera_node.robot.teleop.teleoperator import Command, Teleoperator
 from freshfield.clock import WallClock
 from tests.camera_node.robot.arm.simulated import simulated_arm, start_cli, wait_until_moving, write_cell
@@ -146,7 +146,7 @@ def test_the_operator_ends_it_and_the_arm_comes_to_rest(capsys):
 def test_an_arm_that_is_not_there_and_wrong_settings_are_one_line(tmp_path, capsys, host):
     scenario = write_cell(tmp_path, host)
     assert main(["teleop", str(scenario), "--stylus", f"network:{free_port()}"]) == 2
-    assert "nothing listens on port 30004" in capsys.readouterr().err
+    assert "no answer on port 30004" in capsys.readouterr().err
     for section, part in (
         ({"speed_rad_s": 99}, "source.arm.teleop.speed_rad_s"),
         ({"scale": [1, 0, 1]}, "source.arm.teleop: scale"),
