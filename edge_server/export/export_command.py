@@ -27,7 +27,7 @@ Write the results of a run or fit as files for other programs. RUN is its folder
   edge-server export runs/demo --colmap out/colmap --transforms out/nerf
   edge-server export room.ffsplats --splats room.ply    a saved splat stream: room-0000.ply and so on
 
---mesh         triangles with colors: .ply or .glb (scikit-image: pip install 'freshfield[surface]')
+--mesh         triangles with colors: .ply or .glb (pip install 'freshfield[surface]')
 --splats       the Gaussians of a splat field, in the layout that splat viewers open (.ply), or a quarter as
                large (.spz: pip install 'freshfield[spz]'); of a stream that the page /splats/ saved,
                a sequence of 30 files a second

@@ -7,15 +7,25 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from edge_server.export import ExportError, PosedImage
 from edge_server.export.settings import PIXELS_A_POINT, POINTS
 from edge_server.fields import Field, View
 from edge_server.surface.settings import MeshSettings
+from freshfield.files import write_bytes
+
+if TYPE_CHECKING:  # of the extra surface
+    from trimesh import Trimesh
 
 ENDINGS = {"mesh": (".ply", ".glb"), "splats": (".ply", ".spz"), "points": (".ply",)}
 KINDS = ("splats", "transforms", "colmap", "points", "mesh")  # in the order of writing
+
+
+# glTF's y points up, our z does.
+_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
 def check(files: Mapping[str, Path], count: int = POINTS) -> None:
@@ -100,11 +110,7 @@ class Exporter:
         from edge_server.surface.reconstruct import mesh_from_depth_maps
 
         mesh = mesh_from_depth_maps(self.maps, self._settings, self._progress)
-        if path.suffix.lower() == ".glb":
-            from edge_server.export.glb import write_mesh
-        else:
-            from edge_server.export.ply import write_mesh
-        write_mesh(path, mesh.vertices, mesh.faces, mesh.color)
+        write_mesh(path, mesh)
         self._say(f"{path}: {len(mesh.faces)} triangles, {len(mesh.vertices)} vertices")
 
     def _points(self, path: Path) -> None:
@@ -137,3 +143,12 @@ class Exporter:
         self._points(folder / "points.ply")
         path = write_transforms(folder, self._shots, "points.ply")
         self._say(f"{path}: {len(self._shots)} frames")
+
+
+def write_mesh(path: Path, mesh: Trimesh) -> None:
+    """Write a mesh in world meters as its file's ending says, .ply (binary) or .glb, where y points up."""
+    kind = path.suffix.lower().removeprefix(".")
+    turned = mesh.copy().apply_transform(_UP) if kind == "glb" else mesh
+    data = turned.export(file_type=kind)
+    assert isinstance(data, bytes)  # of these two kinds
+    write_bytes(path, data)

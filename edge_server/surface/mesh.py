@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,38 +12,27 @@ from edge_server.surface import SurfaceError
 from edge_server.surface.kernels.fuse import CELLS, SIDE
 from edge_server.surface.volume import Volume, unblock
 
+if TYPE_CHECKING:  # of the extra surface
+    from trimesh import Trimesh
+
 Floats = NDArray[np.float32]
 
 MOST_VOXELS = 1 << 27  # of the box around the blocks: 512 MB of distances, and about as much for each step
 LEAST = 1e-3  # voxels; a distance of exactly 0 puts a vertex on a voxel and makes degenerate triangles
 KEEP_SHARE = 0.002  # share of the largest component's area; smaller components are removed
-INSTALL = "marching cubes needs scikit-image: pip install 'freshfield[surface]'"
+INSTALL = "a mesh needs scikit-image and trimesh: pip install 'freshfield[surface]'"
 
 
-@dataclass(frozen=True)
-class Mesh:
-    """vertices: float32 (V, 3), world meters. faces: int32 (F, 3), counter-clockwise seen from outside.
-    color: uint8 (V, 3)."""
-
-    vertices: Floats
-    faces: NDArray[np.int32]
-    color: NDArray[np.uint8]
-
-    def areas_m2(self) -> NDArray[np.float64]:
-        """Area of every face (F,), square meters."""
-        corners = self.vertices[self.faces].astype(np.float64)
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        areas: NDArray[np.float64] = 0.5 * np.linalg.norm(cross, axis=1)
-        return areas
-
-
-def extract_mesh(volume: Volume, min_weight: float = 0.0) -> Mesh:
-    """Extract the zero level set (Lorensen and Cline 1987, in Lewiner's topologically sound variant).
+def extract_mesh(volume: Volume, min_weight: float = 0.0) -> Trimesh:
+    """Extract the zero level set (Lorensen and Cline 1987, in Lewiner's topologically sound variant): in world meters,
+    faces counter-clockwise seen from outside, with colors of vertices.
 
     min_weight: voxels need more fused weight than this to be known; faces connect only known voxels.
-    SurfaceError: scikit-image is missing, there is no surface, or the box has more than ``MOST_VOXELS``.
+    SurfaceError: scikit-image or trimesh is missing, there is no surface, or the box has more than ``MOST_VOXELS``.
     """
     marching_cubes = import_marching_cubes()
+    from trimesh import Trimesh
+
     dense = _Dense(volume, min_weight)
     distance, known = dense.distances()
     # scikit-image reads a cell's mask at its upper corner.
@@ -54,13 +42,14 @@ def extract_mesh(volume: Volume, min_weight: float = 0.0) -> Mesh:
         raise SurfaceError("the depth maps hold no surface within the bounds")
     points, faces, *_ = marching_cubes(distance, 0.0, mask=cells)
     index = points.astype(np.float64)
-    mesh = Mesh(dense.meters(index).astype(np.float32), faces.astype(np.int32), dense.colors(index))
-    return remove_degenerate(mesh)
+    vertices = dense.meters(index).astype(np.float32)  # as files have them: what they merge has no area
+    return remove_degenerate(Trimesh(vertices, faces, vertex_colors=dense.colors(index), process=False))
 
 
 def import_marching_cubes() -> Callable[..., Any]:
-    """scikit-image's marching cubes. SurfaceError where it is not installed."""
+    """scikit-image's marching cubes. SurfaceError where it, or trimesh, is not installed."""
     try:
+        import trimesh  # noqa: F401
         from skimage.measure import marching_cubes
     except ImportError:
         raise SurfaceError(INSTALL) from None
@@ -145,32 +134,24 @@ class _Dense:
         return np.where(number[:, None] >= 0, sums, 0.0)
 
 
-def remove_degenerate(mesh: Mesh) -> Mesh:
-    """Remove faces of zero area and unused vertices."""
-    corners = mesh.faces
-    apart = (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
-    return _select_faces(mesh, apart & (mesh.areas_m2() > 0.0))
+def remove_degenerate(mesh: Trimesh) -> Trimesh:
+    """The mesh without faces of zero area."""
+    return _with_faces(mesh, mesh.area_faces > 0.0)
 
 
-def remove_small_components(mesh: Mesh, keep_share: float = KEEP_SHARE) -> Mesh:
-    """Keep components with at least ``keep_share`` of the largest area."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+def remove_small_components(mesh: Trimesh, keep_share: float = KEEP_SHARE) -> Trimesh:
+    """The components with at least ``keep_share`` of the largest area."""
+    from trimesh.graph import connected_component_labels
 
     if not len(mesh.faces):
         return mesh
-    a, b = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
-    count = len(mesh.vertices)
-    graph = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(count, count))
-    _, label = connected_components(graph, directed=False)
-    of_face = label[mesh.faces[:, 0]]
-    area = np.bincount(of_face, weights=mesh.areas_m2())
-    return _select_faces(mesh, (area >= keep_share * area.max())[of_face])
+    label = connected_component_labels(mesh.edges, node_count=len(mesh.vertices))[mesh.faces[:, 0]]
+    area = np.bincount(label, weights=mesh.area_faces)
+    return _with_faces(mesh, (area >= keep_share * area.max())[label])
 
 
-def _select_faces(mesh: Mesh, which: NDArray[np.bool_]) -> Mesh:
-    faces = mesh.faces[which]
-    used = np.zeros(len(mesh.vertices), np.bool_)
-    used[faces] = True
-    number = np.cumsum(used) - 1
-    return Mesh(mesh.vertices[used], number[faces].astype(np.int32), mesh.color[used])
+def _with_faces(mesh: Trimesh, which: NDArray[np.bool_]) -> Trimesh:
+    found = mesh.copy()
+    found.update_faces(which)
+    found.remove_unreferenced_vertices()
+    return found

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from edge_server.fields import Renderer, View
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import SOLID, DepthMap, render_depth_maps
-from edge_server.surface.mesh import Mesh, extract_mesh, remove_small_components
+from edge_server.surface.mesh import extract_mesh, remove_small_components
 from edge_server.surface.refine_depth import GAIN_WITHIN, on_surface, refine_depth
 from edge_server.surface.settings import COVERING_POINTS, MIN_WEIGHT, SHARPENED_PIXELS, MeshSettings
 from edge_server.surface.volume import TRUNCATION, Grid, bounding_box, fuse_maps
+
+if TYPE_CHECKING:  # of the extra surface
+    from trimesh import Trimesh
 
 GUESS = 0.5  # minimum opacity of a surface as initial depth for refinement
 FINEST = 512  # maximum voxels along the longest side without a given voxel size
@@ -71,7 +75,7 @@ def covering_maps(maps: Sequence[DepthMap], most_pixels: int) -> list[int]:
     return sorted(chosen)
 
 
-def mesh_from_depth_maps(maps: Sequence[DepthMap], settings: MeshSettings, say: Say = silent) -> Mesh:
+def mesh_from_depth_maps(maps: Sequence[DepthMap], settings: MeshSettings, say: Say = silent) -> Trimesh:
     """Extract the surface of ``maps``. say: called with each stage and its completed share. SurfaceError:
     there is no surface, or the settings do not allow it."""
     grid = grid_for(maps, settings)

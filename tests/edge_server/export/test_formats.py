@@ -11,8 +11,9 @@ import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.scenes.recorded import load_recorded
-from edge_server.export import PosedImage, file_names, glb, ply
+from edge_server.export import PosedImage, file_names, ply
 from edge_server.export.colmap import Cloud, write_model
+from edge_server.export.exporter import write_mesh
 from edge_server.export.images import write_images
 from edge_server.export.point_cloud import sparse_points
 from edge_server.export.splats import Y0, splat_table, write_splats
@@ -224,12 +225,13 @@ def test_meshes_open_in_trimesh(tmp_path):
     vertices = RNG.normal(size=(20, 3)).astype(np.float32)
     faces = RNG.permutation(20)[:18].reshape(6, 3).astype(np.int32)
     color = RNG.integers(0, 255, (20, 3), dtype=np.uint8)
-    ply.write_mesh(tmp_path / "m.ply", vertices, faces, color)
+    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=color, process=False)
+    write_mesh(tmp_path / "m.ply", mesh)
     read = trimesh.load(tmp_path / "m.ply", process=False)
     np.testing.assert_array_equal(read.vertices, vertices)
     np.testing.assert_array_equal(read.faces, faces)
     np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], color)
-    glb.write_mesh(tmp_path / "m.glb", vertices, faces, color)
+    write_mesh(tmp_path / "m.glb", mesh)
     scene = trimesh.load(tmp_path / "m.glb", process=False)
     read = scene.to_geometry()  # y up
     np.testing.assert_allclose(read.vertices, vertices[:, [0, 2, 1]] * (1, 1, -1), atol=1e-6)

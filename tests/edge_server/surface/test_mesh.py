@@ -7,11 +7,12 @@ import pytest
 
 from edge_server.surface import SurfaceError
 from edge_server.surface import mesh as mesh_module
-from edge_server.surface.mesh import Mesh, extract_mesh, remove_degenerate, remove_small_components
+from edge_server.surface.mesh import extract_mesh, remove_degenerate, remove_small_components
 from edge_server.surface.volume import Grid, fuse_maps
 from tests.edge_server.surface.ball import RADIUS_M, ball_maps
 
 pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
+trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed (extra surface)")
 
 GRID = Grid((-0.13,) * 3, (0.13,) * 3, 0.005, 0.02)
 
@@ -21,18 +22,15 @@ def ball():
     return fuse_maps(GRID, ball_maps(24))
 
 
-def volume_m3(mesh: Mesh) -> float:
-    corner = mesh.vertices[mesh.faces].astype(float)
-    return float(np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])).sum() / 6)
-
-
 def test_a_ball_comes_out_as_a_ball(ball):
     mesh = remove_small_components(extract_mesh(ball))
     radius = np.linalg.norm(mesh.vertices, axis=1)
     assert abs(radius.mean() - RADIUS_M) < 3e-4 and np.abs(radius - RADIUS_M).max() < 0.003
     # Faces look outwards, so the volume is positive.
-    assert volume_m3(mesh) == pytest.approx(4 / 3 * np.pi * RADIUS_M**3, rel=0.02)
-    top, bottom = (mesh.color[side] for side in (mesh.vertices[:, 2] > 0.01, mesh.vertices[:, 2] < -0.01))
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS_M**3, rel=0.02)
+    top, bottom = (
+        mesh.visual.vertex_colors[side, :3] for side in (mesh.vertices[:, 2] > 0.01, mesh.vertices[:, 2] < -0.01)
+    )
     assert np.abs(top.astype(int) - (200, 20, 20)).mean() < 6 and np.abs(bottom.astype(int) - 90).mean() < 6
 
 
@@ -50,11 +48,7 @@ def test_what_nobody_saw_stays_open():
 
 def test_dirt_goes_and_pieces_stay(ball):
     mesh = remove_small_components(extract_mesh(ball))
-    dirt = Mesh(
-        np.concatenate([mesh.vertices, [[0.2, 0, 0], [0.21, 0, 0], [0.2, 0.01, 0]]]).astype(np.float32),
-        np.concatenate([mesh.faces, len(mesh.vertices) + np.array([[0, 1, 2]])]).astype(np.int32),
-        np.concatenate([mesh.color, np.zeros((3, 3), np.uint8)]),
-    )
+    dirt = mesh + trimesh.Trimesh([[0.2, 0, 0], [0.21, 0, 0], [0.2, 0.01, 0]], [[0, 1, 2]])
     assert len(remove_small_components(dirt).faces) == len(mesh.faces)
     assert len(remove_small_components(dirt, keep_share=0.0).faces) == len(mesh.faces) + 1
 
@@ -62,7 +56,7 @@ def test_dirt_goes_and_pieces_stay(ball):
 def test_faces_without_area_go():
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0]], np.float32)
     faces = np.array([[0, 1, 2], [0, 1, 1], [0, 1, 3]], np.int32)
-    found = remove_degenerate(Mesh(vertices, faces, np.zeros((4, 3), np.uint8)))
+    found = remove_degenerate(trimesh.Trimesh(vertices, faces, process=False))
     assert found.faces.tolist() == [[0, 1, 2]] and len(found.vertices) == 3
 
 
