@@ -7,10 +7,9 @@ vector, axis times tan(angle / 2), exceeds sqrt(2) - 1. Three bytes then hold a 
 
 from __future__ import annotations
 
-from itertools import permutations, product
-
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSITION, QUATERNION, SCALE
 from edge_server.fields.splat.planar import unit_quaternions
@@ -99,34 +98,9 @@ def _bytes(values: NDArray) -> NDArray[np.uint8]:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def _cubic_group() -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """The 24 rotations of a cube as quaternions (24, 4), w first, and the order (24, 3) that each brings axes into."""
-    quaternions, orders = [], []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            matrix = np.zeros((3, 3))
-            matrix[list(order), range(3)] = signs
-            if np.linalg.det(matrix) > 0:
-                quaternions.append(_quaternion(matrix))
-                orders.append(order)
-    return np.array(quaternions), np.array(orders)
-
-
-def _quaternion(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of a rotation (3, 3), as the eigenvector of a symmetric matrix, which half turns do not trouble."""
-    m = matrix
-    k = np.array(
-        [
-            [m.trace(), m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [0.0, m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
-            [0.0, 0.0, m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
-            [0.0, 0.0, 0.0, m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
-    )
-    return np.linalg.eigh(k, UPLO="U")[1][:, -1]
-
-
-_GROUP, _ORDERS = _cubic_group()
+_CUBIC = Rotation.create_group("O")
+_GROUP = np.roll(_CUBIC.as_quat(), 1, axis=1)  # the 24 rotations of a cube, w first
+_ORDERS = np.abs(_CUBIC.as_matrix()).argmax(axis=1)  # (24, 3): the order that each brings axes into
 
 
 def _rodrigues(quaternions: NDArray) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
