@@ -13,14 +13,8 @@ from typing import Any
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.arguments import (
-    add_folders,
-    add_workers,
-    at_least,
-    command_parser,
-    folders_of,
-    run_command,
-)
+from edge_server.command import command_parser, run_command
+from edge_server.experiments.common.arguments import add_folders, add_workers, at_least, folders_of
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
@@ -67,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     errors = (ScenarioError, DatasetError, EngineError, ValueError)
     kept = f"finished runs are in {args.results}: run the same command again to resume"
     stopped = kept if args.results else "nothing was kept: with --results FILE the same command would resume"
-    return run_command("compare", lambda: _run(args), errors, stopped)
+    return run_command("edge-server compare", lambda: _run(args), errors, stopped)
 
 
 def _run(args: argparse.Namespace) -> None:
@@ -165,7 +159,7 @@ def _labels(policies: Sequence[str]) -> dict[str, str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = command_parser("compare", DESCRIPTION)
+    parser = command_parser("edge-server compare", DESCRIPTION)
     add = parser.add_argument
     add("scenario", help="scenario file, or the name of a shipped one; needs a held-out camera")
     add(

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from edge_server.command import command_parser, run_command
 from edge_server.export import ExportError
 from edge_server.export.exporter import KINDS, Exporter, check, check_installed
 from edge_server.export.run_source import open_source
@@ -48,17 +49,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     files = {kind: path for kind in KINDS if (path := getattr(args, kind)) is not None}
     if not files:
         parser.error(f"say what to write: {', '.join(f'--{kind}' for kind in KINDS)}")
-    try:
-        _export(args, files)
-    except (ExportError, SurfaceError) as error:
-        print(f"edge-server export: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(parser.prog, lambda: _export(args, files), (ExportError, SurfaceError))
 
 
 def _parser() -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("edge-server export", description=DESCRIPTION, formatter_class=raw)
+    parser = command_parser("edge-server export", DESCRIPTION)
     add = parser.add_argument
     add("run", type=Path, metavar="RUN", help="folder of a run or fit (its --out), a checkpoint, or .ffsplats")
     add("--mesh", type=out_file, metavar="FILE", help="mesh: .ply or .glb")

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from edge_server.command import command_parser, run_command
 from edge_server.export import ExportError
 from edge_server.export.camera_paths import Step, lens, looking, orbit, read_nerfstudio, vertical_fov_deg
 from edge_server.export.images import IMAGE_ENDINGS, Image, checked_file, write_video
@@ -38,18 +39,11 @@ Files end in .png or .jpg (the first image of a path), or in .mp4.
 def main(argv: Sequence[str] | None = None, prog: str = "edge-server render") -> int:
     """Run the command; returns its exit status. prog: its name in usage and errors."""
     args = _parser(prog).parse_args(argv)
-    try:
-        _render(args)
-    except ExportError as error:
-        print(f"{prog}: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(prog, lambda: _render(args), ExportError)
 
 
 def _parser(prog: str) -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    description = DESCRIPTION.replace("edge-server render", prog)
-    parser = argparse.ArgumentParser(prog, description=description, formatter_class=raw)
+    parser = command_parser(prog, DESCRIPTION.replace("edge-server render", prog))
     add = parser.add_argument
     add("run", type=Path, metavar="RUN", help="folder of a run or fit (its --out), or a checkpoint")
     which = parser.add_mutually_exclusive_group(required=True).add_argument

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from edge_server.command import command_parser, run_command
 from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, open_lpips
 from freshfield.files import out_folder
 
@@ -31,17 +30,10 @@ class FetchError(ValueError):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("edge-server fetch-lpips", description=DESCRIPTION, formatter_class=raw)
+    parser = command_parser("edge-server fetch-lpips", DESCRIPTION)
     parser.add_argument("--out", type=out_folder, required=True, metavar="DIR", help="folder to write")
     args = parser.parse_args(argv)
-    try:
-        for path in convert(*_fetch(), args.out):
-            print(path)
-    except FetchError as error:
-        print(f"edge-server fetch-lpips: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(parser.prog, lambda: print(*convert(*_fetch(), args.out), sep="\n"), FetchError)
 
 
 def _fetch() -> tuple[dict[str, Any], dict[str, Any]]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.command import command_parser, run_command
 from edge_server.report.style import BLUE, GRAY, VERMILION, figure
 from edge_server.scheduler.learned.decision_record import RecordedDecision, read_decision
 from edge_server.scheduler.learned.explain import EmbedImages, Explanation, explain, occlusion_map
@@ -34,28 +35,26 @@ MAX_BARS = 20
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("edge-server explain", description=DESCRIPTION, formatter_class=raw)
+    parser = command_parser("edge-server explain", DESCRIPTION)
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run or simulation (its --out)")
     parser.add_argument("--decision", type=int, metavar="N", help="decision of update N [the newest kept]")
     parser.add_argument(
         "--camera", metavar="NAME", help="camera whose image regions to explain [that with the largest share]"
     )
     args = parser.parse_args(argv)
-    try:
-        found = read_decision(args.run, args.decision)
-        decision = found.decision
-        explanation = explain(decision.actor, decision.state, decision.action)
-        camera = _camera(args.camera, found, explanation)
-        regions = None if camera is None else _regions(found, camera, asked=args.camera is not None)
-        picture = args.run / f"decision-{decision.number:06d}.png"
-        draw(explanation, picture, camera, found.images.get(camera or ""), regions)
-    except ValueError as error:
-        print(f"edge-server explain: {error}", file=sys.stderr)
-        return 2
+    return run_command(parser.prog, lambda: _explain(args), ValueError)
+
+
+def _explain(args: argparse.Namespace) -> None:
+    found = read_decision(args.run, args.decision)
+    decision = found.decision
+    explanation = explain(decision.actor, decision.state, decision.action)
+    camera = _camera(args.camera, found, explanation)
+    regions = None if camera is None else _regions(found, camera, asked=args.camera is not None)
+    picture = args.run / f"decision-{decision.number:06d}.png"
+    draw(explanation, picture, camera, found.images.get(camera or ""), regions)
     print(as_text(found, explanation, camera, regions))
     print(picture)
-    return 0
 
 
 def _camera(asked: str | None, found: RecordedDecision, explanation: Explanation) -> str | None:

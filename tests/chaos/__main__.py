@@ -13,7 +13,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from edge_server.experiments.common.arguments import add_workers, run_command
+from edge_server.command import run_command
+from edge_server.experiments.common.arguments import add_workers
 from edge_server.experiments.engine import Engine, EngineError
 from tests.chaos.seeds import failure, read_seeds, run_seed
 
@@ -31,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with Engine(args.out, args.jobs, args.ray) as engine:
             failed.extend(found for found in engine.run(run_seed, args.seeds, "seeds") if found["problems"])
 
-    status = run_command("chaos", work, (EngineError,), f"what is finished is in {args.out}")
+    status = run_command("tests.chaos", work, (EngineError,), f"what is finished is in {args.out}")
     for found in failed:
         print(failure(found))
     return status or int(bool(failed))

@@ -1,9 +1,8 @@
-"""Parts that the commands share: parsers, common arguments, and error handling."""
+"""Arguments that the commands of experiments share."""
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,12 +14,6 @@ from freshfield.untrusted import UntrustedError, read_yaml
 
 class OptionError(ValueError):
     """An option that cannot work; the message says what to change."""
-
-
-def command_parser(name: str, description: str) -> argparse.ArgumentParser:
-    """The parser of ``edge-server NAME``, which prints ``description`` as it stands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    return argparse.ArgumentParser(f"edge-server {name}", description=description, formatter_class=raw)
 
 
 def add_folders(parser: argparse.ArgumentParser) -> None:
@@ -76,20 +69,3 @@ def parse_options(words: Sequence[str]) -> dict[str, Any]:
         except UntrustedError:
             raise OptionError(f"--option {word}: {value!r} is not a value") from None
     return options
-
-
-def run_command(name: str, work: Callable[[], object], errors: tuple[type[Exception], ...], stopped: str) -> int:
-    """Call ``work`` and return the exit status of ``edge-server NAME``.
-
-    errors: exceptions that are printed in one line; the status is then 2.
-    stopped: text that is printed after Ctrl-C; the status is then 130.
-    """
-    try:
-        work()
-    except errors as error:
-        print(f"edge-server {name}: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"\nstopped; {stopped}", flush=True)
-        return 130
-    return 0

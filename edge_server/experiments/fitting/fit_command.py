@@ -10,14 +10,8 @@ from typing import Any
 
 from camera_node.sources.datasets.formats import FORMATS
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.arguments import (
-    OptionError,
-    add_lpips,
-    at_least,
-    command_parser,
-    parse_options,
-    run_command,
-)
+from edge_server.command import command_parser, run_command
+from edge_server.experiments.common.arguments import OptionError, add_lpips, at_least, parse_options
 from edge_server.experiments.fitting.evaluate import Scored
 from edge_server.experiments.fitting.fit import Fit, check_seconds
 from edge_server.experiments.scenes.multiview_still import data_name, open_still
@@ -48,7 +42,7 @@ fitting. Ctrl-C ends the fit early; report, pictures and checkpoint are still wr
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
-    parser = command_parser("fit", DESCRIPTION)
+    parser = command_parser("edge-server fit", DESCRIPTION)
     add = parser.add_argument
     add(
         "data",
@@ -87,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.data is None:
         parser.error("name a data set: a folder, or the file that describes it")
     args.out = args.out or Path("runs") / f"fit-{data_name(args.data)}"
-    return run_command("fit", lambda: run(args), (DatasetError, OptionError), "nothing was written")
+    return run_command("edge-server fit", lambda: run(args), (DatasetError, OptionError), "nothing was written")
 
 
 def run(request: argparse.Namespace) -> dict[str, Any]:

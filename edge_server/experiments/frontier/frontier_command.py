@@ -14,7 +14,8 @@ from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic.scene import SCENES
-from edge_server.experiments.common.arguments import add_lpips, add_workers, command_parser, parse_options, run_command
+from edge_server.command import command_parser, run_command
+from edge_server.experiments.common.arguments import add_lpips, add_workers, parse_options
 from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.frontier import from_scratch, update_time
 from edge_server.experiments.frontier.from_scratch import Fit, Still
@@ -110,11 +111,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"edge-server frontier: {error}", file=sys.stderr)
         return 2
     stopped = f"what was measured is in {args.out}: run the same command again to resume"
-    return run_command("frontier", frontier.run, (EngineError,), stopped)
+    return run_command("edge-server frontier", frontier.run, (EngineError,), stopped)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = command_parser("frontier", DESCRIPTION)
+    parser = command_parser("edge-server frontier", DESCRIPTION)
     add = parser.add_argument
     size = parser.add_mutually_exclusive_group().add_argument
     size("--quick", action="store_true", help="a smaller sweep: four minutes on two cores, not one to two hours")

@@ -7,8 +7,9 @@ import time
 from collections.abc import Sequence
 
 from camera_node.sources.datasets.records import DatasetError
+from edge_server.command import command_parser, run_command
 from edge_server.embed import EmbeddingError
-from edge_server.experiments.common.arguments import add_folders, add_workers, command_parser, folders_of, run_command
+from edge_server.experiments.common.arguments import add_folders, add_workers, folders_of
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.engine import EngineError
 from edge_server.experiments.rollouts.setting import SEEDS_A_PURPOSE
@@ -72,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     errors = (ScenarioError, DatasetError, StudyError, EngineError, TrainingError, ViewpointError, EmbeddingError)
     stopped = f"what is finished is in {args.out}: run the same command again to resume"
-    return run_command("study", work, errors, stopped)
+    return run_command("edge-server study", work, errors, stopped)
 
 
 def checked(names: list[str], request: StudyRequest) -> list[str]:
@@ -105,7 +106,7 @@ def checked(names: list[str], request: StudyRequest) -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = command_parser("study", DESCRIPTION)
+    parser = command_parser("edge-server study", DESCRIPTION)
     add = parser.add_argument
     add(
         "study",

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from functools import partial
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.arguments import add_folders, add_workers, command_parser, folders_of, run_command
+from edge_server.command import command_parser, run_command
+from edge_server.experiments.common.arguments import add_folders, add_workers, folders_of
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.engine import EngineError
 from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
@@ -73,7 +74,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         _train(args, setting, config, folders)
 
     stopped = f"what is finished is in {args.out}: run the same command again to resume"
-    return run_command("train-scheduler", work, (ScenarioError, DatasetError, EngineError, TrainingError), stopped)
+    return run_command(
+        "edge-server train-scheduler", work, (ScenarioError, DatasetError, EngineError, TrainingError), stopped
+    )
 
 
 def _train(args: argparse.Namespace, setting: Setting, config: TrainingConfig, folders: Folders) -> None:
@@ -154,7 +157,7 @@ def _parts(text: str) -> tuple[str, ...]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = command_parser("train-scheduler", DESCRIPTION)
+    parser = command_parser("edge-server train-scheduler", DESCRIPTION)
     add = parser.add_argument
     add("scenario", help="scenario file, or the name of a shipped one; needs a held-out camera")
     add("--kind", choices=ACTIONS, default="select", help="what the policy decides [%(default)s]")

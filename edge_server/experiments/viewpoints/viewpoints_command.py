@@ -6,14 +6,8 @@ import argparse
 from collections.abc import Sequence
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.arguments import (
-    OptionError,
-    add_folders,
-    at_least,
-    command_parser,
-    folders_of,
-    run_command,
-)
+from edge_server.command import command_parser, run_command
+from edge_server.experiments.common.arguments import OptionError, add_folders, at_least, folders_of
 from edge_server.experiments.viewpoints.asking import ANSWERS, VIEWS, Comparison, compare, learn
 from edge_server.experiments.viewpoints.drawing import draw_plan
 from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
@@ -58,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     errors = (ScenarioError, DatasetError, ViewpointError, OptionError, TransportError)
     stopped = f"answers are kept in {args.out / ANSWERS}" if args.ask else "nothing was written"
-    return run_command("viewpoints", lambda: _run(args), errors, stopped)
+    return run_command("edge-server viewpoints", lambda: _run(args), errors, stopped)
 
 
 def _run(args: argparse.Namespace) -> None:
@@ -132,7 +126,7 @@ def read_budget(text: str) -> Budget:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = command_parser("viewpoints", DESCRIPTION)
+    parser = command_parser("edge-server viewpoints", DESCRIPTION)
     add = parser.add_argument
     add("scenario", help="scenario file, or the name of a shipped one")
     add(

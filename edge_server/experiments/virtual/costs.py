@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of, run_command
+from edge_server.command import command_parser, run_command
+from edge_server.experiments.common.arguments import add_folders, folders_of
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.machine import machine, versions
@@ -45,7 +46,7 @@ _BESIDE = ("static field", "static renders")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
-    parser = command_parser("costs", DESCRIPTION)
+    parser = command_parser("edge-server costs", DESCRIPTION)
     parser.add_argument("scenario", help="scenario file, or the name of a shipped one")
     parser.add_argument(
         "--seconds",
@@ -64,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         write_json(args.out, found, indent=1)
         print(", ".join(f"{name} {ms:g}" for name, ms in found["compute"].items() if ms), f"-> {args.out}")
 
-    return run_command("costs", work, (ScenarioError, DatasetError, ValueError), "nothing was written")
+    return run_command("edge-server costs", work, (ScenarioError, DatasetError, ValueError), "nothing was written")
 
 
 def measure(scenario: Scenario, seconds: float, data: Path | None = None) -> dict[str, Any]:

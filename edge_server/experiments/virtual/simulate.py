@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import itertools
 import json
-import sys
 import time
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
@@ -19,8 +18,8 @@ from msgspec.structs import asdict
 
 from camera_node.capture import build_cameras
 from camera_node.settings import source_config
-from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.arguments import add_folders, command_parser, folders_of
+from edge_server.command import command_parser, run_command
+from edge_server.experiments.common.arguments import add_folders, folders_of
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none, number
 from edge_server.experiments.engine import processor
@@ -70,6 +69,10 @@ _PROGRESS_EVERY_S = 1.0
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
+    return run_command("edge-server simulate", lambda: _simulate(args), ValueError)
+
+
+def _simulate(args: argparse.Namespace) -> None:
     folders = folders_of(args)
     decisions: DecisionLog | None = None
     chosen: list[str] = []
@@ -83,20 +86,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not args.json:
             print(line, flush=True)
 
-    try:
-        scenario = _scenario(args)
-        config = read_config(scenario)
-        deployment, missing = open_simulation(scenario, folders, lambda new: _settings(new, args), say, published)
-        if args.out is not None:
-            decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
-        watched = None
-        if scenario.held_out_every:
-            kept = build_cameras(scenario, source_config(scenario), scenario.held_out, folders.data)
-            watched = NowAndAll(deployment, kept, args.seconds)
-        _run(deployment, args.seconds, quiet=args.json)
-    except (ScenarioError, DatasetError, ValueError) as error:
-        print(f"edge-server simulate: {error}", file=sys.stderr)
-        return 2
+    scenario = _scenario(args)
+    config = read_config(scenario)
+    deployment, missing = open_simulation(scenario, folders, lambda new: _settings(new, args), say, published)
+    if args.out is not None:
+        decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
+    watched = None
+    if scenario.held_out_every:
+        kept = build_cameras(scenario, source_config(scenario), scenario.held_out, folders.data)
+        watched = NowAndAll(deployment, kept, args.seconds)
+    _run(deployment, args.seconds, quiet=args.json)
     found = {**summary(scenario, deployment, args.seconds), "field": config.field, "chosen": chosen[-1]}
     if missing:
         found["lpips_missing"] = missing
@@ -105,7 +104,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.out is not None:
         write_output(args.out, found, deployment, scenario.channel.get("preset"), watched)
     print(json.dumps(found) if args.json else "\n  ".join([show(found), *deployment.updates.troubles]))
-    return 0
 
 
 def open_simulation(
@@ -340,7 +338,7 @@ def _compute(text: str) -> ComputeConfig:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = command_parser("simulate", DESCRIPTION)
+    parser = command_parser("edge-server simulate", DESCRIPTION)
     add = parser.add_argument
     add("scenario", help="scenario file, or the name of a shipped one")
     add("--seconds", type=float, default=10.0, metavar="S", help="seconds of virtual time [%(default)g]")
