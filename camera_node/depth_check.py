@@ -37,10 +37,6 @@ _BESIDE = 0.06  # distance from edges to where the image is compared with them, 
 _LEAST_CONTRAST = 1.05
 
 
-class DepthWrong(ValueError):
-    """Depth that cannot be right; the message says why, and what to look for."""
-
-
 @dataclass(frozen=True)
 class DepthView:
     """One camera's depth with its image: uint8 (H, W, 3), the image's lens, and its pose."""
@@ -89,28 +85,28 @@ def first_views(scenario: Scenario, config: SourceConfig, data: Path | None) -> 
 
 def check(view: DepthView, others: Sequence[DepthView]) -> str:
     """One line on a camera's depth. others: depth of the same instant, or of a scene that stands still. Raises
-    DepthWrong."""
+    ValueError."""
     counts, meters = view.depth.counts, view.depth.meters()
     measured = counts > 0
     said = f"{counts.shape[1]} x {counts.shape[0]}, {1.0 - measured.mean():.0%} without depth"
     if measured.mean() < _LEAST_MEASURED:
-        raise DepthWrong(f"{said}: is the scene within the sensor's range and lit, is the lens free?")
+        raise ValueError(f"{said}: is the scene within the sensor's range and lit, is the lens free?")
     near, middle, far = np.quantile(meters[measured], (0.05, 0.5, 0.95))
     said += f", {near:.2g} to {far:.2g} m"
     if np.bincount(counts[measured]).max() > _CONSTANT * measured.sum():
-        raise DepthWrong(f"{said}: nearly all of it is the same, {middle:.3g} m: does the sensor measure at all?")
+        raise ValueError(f"{said}: nearly all of it is the same, {middle:.3g} m: does the sensor measure at all?")
     if not USUAL_M[0] <= middle <= USUAL_M[1]:
-        raise DepthWrong(f"{said}: is the unit wrong?")
+        raise ValueError(f"{said}: is the unit wrong?")
     shares = {other.camera: _agreement(view, other)[0] for other in others}
     known = {camera: share for camera, share in shares.items() if share is not None}
     if known:
         best, share = max(known.items(), key=lambda pair: pair[1])
         if share < _AGREES:
-            raise DepthWrong(f"{said}: {share:.0%} of it agrees with {best}'s: {_explained(view, others)}")
+            raise ValueError(f"{said}: {share:.0%} of it agrees with {best}'s: {_explained(view, others)}")
         return f"{said}, {share:.0%} of it agrees with {best}'s"
     contrast = edge_contrast(view)
     if contrast is not None and contrast < _LEAST_CONTRAST:
-        raise DepthWrong(
+        raise ValueError(
             f"{said}: its edges are not those of the image (contrast {contrast:.2f} of that beside them): is it "
             "registered to this image, of this instant, not mirrored?"
         )

@@ -1,6 +1,7 @@
 """``camera-node doctor``: checks what a scenario needs on this machine, part by part. It moves no arm.
 
-All parts are checked, whatever the earlier results, so one call reports everything that is wrong.
+All parts are checked, whatever the earlier results, so one call reports everything that is wrong. A check that fails
+raises ValueError, which says what is wrong and what to do.
 """
 
 from __future__ import annotations
@@ -56,10 +57,6 @@ _UNSYNCHRONISED = 0x40  # STA_UNSYNC of adjtimex(2)
 _TIMEX_BYTES = 512
 
 
-class CheckFailed(ValueError):
-    """A failed check; the message says what is wrong and what to do."""
-
-
 @dataclass(frozen=True)
 class CheckResult:
     """The result for one part. ok: None if nothing was checked. said: the finding, for people."""
@@ -72,7 +69,7 @@ class CheckResult:
 def run(args: argparse.Namespace) -> int:
     """Run all checks and print the results. Returns the exit code: 1 if something is wrong, else 0."""
     results = []
-    for result in run_checks(args.scenario, args.to, args.data, args.out, transport.from_arguments(args), args.plan):
+    for result in _checks(args):
         results.append(result)
         if not args.json:
             mark = {True: "ok", False: "WRONG", None: "-"}[result.ok]
@@ -85,37 +82,21 @@ def run(args: argparse.Namespace) -> int:
     return 1 if wrong else 0
 
 
-def run_checks(
-    name: str | None,
-    to: str | None,
-    data: Path | None,
-    out: Path,
-    security: transport.Transport,
-    plan: Path | None = None,
-) -> Iterator[CheckResult]:
-    """Yield the results as they come.
-
-    name: scenario file, or the name of a shipped one; None checks only what every scenario needs.
-    to: HOST:PORT of the next hop; None skips the network.
-    data: folder of the data sets; None: $FRESHFIELD_DATA.
-    out: folder where runs will be written.
-    security: TLS and tokens of the connection to ``to``.
-    plan: SVG file to draw what the cameras see in; None: none.
-    """
+def _checks(args: argparse.Namespace) -> Iterator[CheckResult]:
     yield _check("python", _python)
     yield _check("clock", _clock)
-    yield _check("disk", lambda: _disk(out))
-    if to is None:
+    yield _check("disk", lambda: _disk(args.out))
+    if args.to is None:
         yield CheckResult("network", None, "not examined: give --to HOST:PORT of the emulator or the edge")
     else:
-        yield _check("network", lambda: _network(to, security))
-    if name is None:
+        yield _check("network", lambda: _network(args.to, transport.from_arguments(args)))
+    if args.scenario is None:
         yield CheckResult("scenario", None, "none given: cameras, arm and files are not examined")
         return
     opened: list[tuple[Scenario, SourceConfig]] = []
-    yield _check("scenario", lambda: _scenario(name, opened))
+    yield _check("scenario", lambda: _scenario(args.scenario, opened))
     for scenario, config in opened:
-        yield from _source(scenario, config, data, plan)
+        yield from _source(scenario, config, args.data, args.plan)
 
 
 def _source(scenario: Scenario, config: SourceConfig, data: Path | None, plan: Path | None) -> Iterator[CheckResult]:
@@ -209,7 +190,7 @@ def _python() -> str:
 def _package(extra: str) -> str:
     for module, distribution in _PACKAGES[extra]:
         if importlib.util.find_spec(module) is None:
-            raise CheckFailed(f"{distribution} is not installed: pip install 'freshfield[{extra}]'")
+            raise ValueError(f"{distribution} is not installed: pip install 'freshfield[{extra}]'")
     _, distribution = _PACKAGES[extra][0]
     return f"{distribution} {version(distribution)}"
 
@@ -217,16 +198,16 @@ def _package(extra: str) -> str:
 def _clock() -> str:
     """Whether the kernel reports the clock as synchronized (adjtimex)."""
     if sys.platform != "linux":
-        raise CheckFailed("whether the clock is synchronized can only be asked on Linux")
+        raise ValueError("whether the clock is synchronized can only be asked on Linux")
     buffer = ctypes.create_string_buffer(_TIMEX_BYTES)
     if ctypes.CDLL(None, use_errno=True).adjtimex(buffer) < 0:
-        raise CheckFailed("the kernel does not say whether the clock is synchronized (adjtimex)")
+        raise ValueError("the kernel does not say whether the clock is synchronized (adjtimex)")
     # struct timex: unsigned modes; long offset, freq, maxerror, esterror; int status.
     word = ctypes.sizeof(ctypes.c_long)
     longs = [ctypes.c_long.from_buffer(buffer, word * k).value for k in range(1, 5)]
     status = ctypes.c_int.from_buffer(buffer, word * 5).value
     if status & _UNSYNCHRONISED:
-        raise CheckFailed(
+        raise ValueError(
             "the clock is not synchronized: install chrony, or timedatectl set-ntp true (not needed where one machine "
             "runs everything)"
         )
@@ -239,7 +220,7 @@ def _disk(out: Path) -> str:
         file.write(b"\0")
     free_gb = shutil.disk_usage(place).free / 1e9
     if free_gb < LEAST_FREE_GB:
-        raise CheckFailed(f"{place}: {free_gb:.1f} GB free: make room for {LEAST_FREE_GB:g} GB, or choose --out")
+        raise ValueError(f"{place}: {free_gb:.1f} GB free: make room for {LEAST_FREE_GB:g} GB, or choose --out")
     return f"{place}: {free_gb:.0f} GB free, can be written to"
 
 
@@ -250,7 +231,7 @@ def _network(to: str, security: transport.Transport) -> str:
         socket.create_connection((host, port), _ANSWER_S).close()
         connect_ms = 1e3 * (time.perf_counter() - begin)
     except OSError as error:
-        raise CheckFailed(
+        raise ValueError(
             f"nobody takes connections at {host}:{port} ({error.strerror or error}): is the process "
             "started, does it listen on this network's address (--listen 0.0.0.0:PORT), does a firewall "
             "stand between?"
@@ -275,13 +256,13 @@ async def _exchange(target: str, security: transport.Transport) -> tuple[float, 
             for _ in range(_EXCHANGES):
                 await exchange(channel, security.metadata(), clock, estimator, _ANSWER_S)
         except grpc.RpcError as error:
-            raise CheckFailed(
+            raise ValueError(
                 f"{target} takes connections but does not speak with us ({error.code().name.lower()}): "  # type: ignore[attr-defined]
                 "is it an emulator or an edge server, and does it ask for --tls-* or --token-file?"
             ) from None
     found = estimator.estimate(clock.now_ns())
     if found is None:
-        raise CheckFailed(f"{target} does not tell its time: is it an emulator or an edge server?")
+        raise ValueError(f"{target} does not tell its time: is it an emulator or an edge server?")
     return found.offset_ns / 1e6, found.uncertainty_ns / 1e6
 
 
@@ -298,7 +279,7 @@ def _calibration(scenario: Scenario, config: LiveConfig) -> str:
     known = calibrations(scenario, config)
     missing = [camera for camera in scenario.cameras if camera not in known]
     if missing:
-        raise CheckFailed(f"{config.calibration}: it lacks {', '.join(missing)}")
+        raise ValueError(f"{config.calibration}: it lacks {', '.join(missing)}")
     return f"{config.calibration}: {len(known)} cameras"
 
 
@@ -314,7 +295,7 @@ def _tracker(scenario: Scenario, config: TrajectoryConfig) -> str:
             _, gap_ns = tracked.at(clock.now_ns())
             said.append(f"{camera}: a pose {gap_ns / 1e6:.0f} ms from now")
     except PoseGapError as error:
-        raise CheckFailed(f"{error}: is the tracker running, and does it write each pose at once?") from None
+        raise ValueError(f"{error}: is the tracker running, and does it write each pose at once?") from None
     finally:
         for tracked in poses.values():
             if isinstance(tracked, Closable):
@@ -334,7 +315,7 @@ def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
     try:
         first = feed.grab(config.first_frame_s)
         if first is None:
-            raise CheckFailed(f"it opened, but sent no frame for {config.first_frame_s:g} s")
+            raise ValueError(f"it opened, but sent no frame for {config.first_frame_s:g} s")
         ages_ms, begin_s = [], time.monotonic()
         while (spent_s := time.monotonic() - begin_s) < listen_s:
             taken = feed.grab(_LISTEN_S)
@@ -349,12 +330,12 @@ def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
     if camera in calibrations(scenario, config):
         known = "its lens as calibrated"
     elif lens is None:
-        raise CheckFailed(no_intrinsics.removeprefix(f"{camera}: "))
+        raise ValueError(no_intrinsics.removeprefix(f"{camera}: "))
     else:
         known = f"f = {lens.fx:.0f} px"
     rate_hz = len(ages_ms) / spent_s
     if rate_hz < _LEAST_RATE * asked_hz and asked_hz * spent_s >= _JUDGED_FRAMES:
-        raise CheckFailed(
+        raise ValueError(
             f"{width} x {height}, but {rate_hz:.3g} frames a second of the {asked_hz:g} asked: is it too "
             "dark (more light, or a shorter exposure_us), is it on USB 2 (another port or cable), can it do "
             "this size so fast (smaller width and height, or fps)?"

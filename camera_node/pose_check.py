@@ -24,13 +24,9 @@ from freshfield.scenario import Scenario
 Array = NDArray[np.float64]
 
 
-class PosesWrong(ValueError):
-    """Poses that contradict their images; the message says what is wrong and what to do."""
-
-
 def check(scenario: Scenario, config: RecordedConfig, data: Path | None) -> str:
-    """What the poses of each training camera that moves are worth, in words; "" if none moves. Raises PosesWrong,
-    ScenarioError, DatasetError or OSError."""
+    """What the poses of each training camera that moves are worth, in words; "" if none moves. Raises ValueError
+    or OSError."""
     if scenario.held_out_every:  # whole paths, of which held-out captures are a part
         scenario = replace(scenario, cameras=scenario.training, held_out=())
     said = []
@@ -45,7 +41,7 @@ def compare(images: list[NDArray[np.float32]], poses: Array, focal_px: float, pe
     """One line on the poses of consecutive captures.
 
     images: gray (H, W). poses: (N, 4, 4), camera-to-world. focal_px: of the images. period_ms: between two captures.
-    Raises PosesWrong.
+    Raises ValueError.
     """
     window = cv2.createHanningWindow(images[0].shape[::-1], cv2.CV_32F)
     shifts = np.array([cv2.phaseCorrelate(a, b, window)[0] for a, b in pairwise(images)])
@@ -55,23 +51,23 @@ def compare(images: list[NDArray[np.float32]], poses: Array, focal_px: float, pe
     speed, rate = 1e3 * float(np.median(steps_m)) / period_ms, np.rad2deg(np.linalg.norm(turns, axis=1).mean())
     said = f"moves at {speed:.2g} m/s, turns at {1e3 * rate / period_ms:.2g} degrees/s"
     if speed > tuned.POSES_FAST_M_PER_S:
-        raise PosesWrong(f"{said}: are its poses in meters?")
+        raise ValueError(f"{said}: are its poses in meters?")
     if shifts.std(axis=0).max() < tuned.POSES_MOVE_PX:
         return f"{said}; its images hardly move"
     if not turns.any():
-        raise PosesWrong(f"{said}, while its images shift: do its poses lack the rotation?")
+        raise ValueError(f"{said}, while its images shift: do its poses lack the rotation?")
     lags = np.arange(-tuned.POSES_LARGEST_LAG, tuned.POSES_LARGEST_LAG + tuned.POSES_LAG_STEP, tuned.POSES_LAG_STEP)
     found = np.array([_correlation(shifts, expected, lag) for lag in lags])
     now, best = float(found[len(lags) // 2]), int(found.argmax())
     late_ms = float(lags[best]) * period_ms
     for axis, direction in enumerate(("sideways", "up and down")):
         if _correlation(shifts[:, [axis]], expected[:, [axis]], 0.0) < -tuned.POSES_AGREE:
-            raise PosesWrong(f"{said}, but its images move the other way {direction}: are its axes OpenCV's?")
+            raise ValueError(f"{said}, but its images move the other way {direction}: are its axes OpenCV's?")
     if found[best] < tuned.POSES_AGREE:
         return f"{said}; its images tell nothing of its turns (correlation {found[best]:.2f})"
     if abs(late_ms) > tuned.POSES_LATE_MS and found[best] > now + tuned.POSES_GAIN:
         early = "late" if late_ms > 0 else "early"
-        raise PosesWrong(
+        raise ValueError(
             f"{said}; its poses are some {abs(late_ms):.0f} ms {early}: its images move as they do, at another time "
             f"(correlation {found[best]:.2f} instead of {now:.2f}); shift their times (source.trajectory.start_s)"
         )

@@ -15,15 +15,12 @@ import numpy as np
 
 from camera_node.pose.pairing import PoseGapError as PoseGapError
 from camera_node.pose.pairing import SampleBuffer
+from camera_node.sources.datasets.records import DatasetError
 from freshfield.geometry import GeometryError, Pose, quaternion_normalize
 from freshfield.limits import MAX_STAMP_S
 from freshfield.untrusted import read_text
 
 _COLUMN_NAMES = ("t", "time", "timestamp")
-
-
-class TrajectoryError(ValueError):
-    """A trajectory file that cannot be used; the message names file and line."""
 
 
 class PoseProvider(Protocol):
@@ -59,11 +56,11 @@ def read_tum(
         instant; False takes the nearest sample (thesis 4.3.3).
     max_gap_ns: an instant farther than this from every sample has no pose.
     start_ns: time in the file that becomes 0.
-    Raises TrajectoryError.
+    Raises DatasetError.
     """
     times, poses = read_samples(path)
     if not times or any(b <= a for a, b in itertools.pairwise(times)):
-        raise TrajectoryError(f"{path}: expected at least one sample, and times that increase")
+        raise DatasetError(f"{path}: expected at least one sample, and times that increase")
     # As long as the recording: nothing is dropped.
     track = SampleBuffer(Pose.interpolate if interpolate else None, max_gap_ns, times[-1] - times[0] + 1)
     for t_ns, pose in zip(times, poses):
@@ -75,19 +72,19 @@ def read_samples(path: Path) -> tuple[list[int], list[Pose]]:
     """Times (ns) and poses of a trajectory file, in the file's order.
 
     Fields are separated by spaces or commas. Lines that are empty, start with # or name the columns
-    (``t,x,...``) are skipped. Raises TrajectoryError naming file and line.
+    (``t,x,...``) are skipped. Raises DatasetError naming file and line.
     """
     try:
         lines = read_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise TrajectoryError(f"{path}: cannot be read: {error}") from None
+        raise DatasetError(f"{path}: cannot be read: {error}") from None
     found = (read_sample(line, f"{path}:{number}") for number, line in enumerate(lines, 1))
     samples = [sample for sample in found if sample is not None]
     return [t_ns for t_ns, _ in samples], [pose for _, pose in samples]
 
 
 def read_sample(line: str, where: str) -> tuple[int, Pose] | None:
-    """Time (ns) and pose of a line of a trajectory; None: it holds none. Raises TrajectoryError, which begins with
+    """Time (ns) and pose of a line of a trajectory; None: it holds none. Raises DatasetError, which begins with
     ``where``."""
     fields = line.replace(",", " ").split()
     if not fields or fields[0].startswith("#") or fields[0] in _COLUMN_NAMES:
@@ -98,11 +95,11 @@ def read_sample(line: str, where: str) -> tuple[int, Pose] | None:
             raise ValueError
         q = quaternion_normalize((qw, qx, qy, qz))
     except GeometryError as error:
-        raise TrajectoryError(f"{where}: {error}") from None
+        raise DatasetError(f"{where}: {error}") from None
     except ValueError:
-        raise TrajectoryError(f"{where}: expected t tx ty tz qx qy qz qw") from None
+        raise DatasetError(f"{where}: expected t tx ty tz qx qy qz qw") from None
     if abs(t) > MAX_STAMP_S:
-        raise TrajectoryError(f"{where}: the time {t:g} cannot be in seconds: is it in milliseconds or nanoseconds?")
+        raise DatasetError(f"{where}: the time {t:g} cannot be in seconds: is it in milliseconds or nanoseconds?")
     return _nanoseconds(fields[0]), Pose(tuple(map(float, q)), (x, y, z))  # type: ignore[arg-type]
 
 

@@ -15,8 +15,9 @@ import time
 from pathlib import Path
 
 from camera_node.pose.pairing import PoseGapError, SampleBuffer
-from camera_node.pose.providers import TrajectoryError, read_sample
+from camera_node.pose.providers import read_sample
 from camera_node.settings import TRACKER_LATE_S, TRACKER_LINE_BYTES, TRACKER_LOOKS_S
+from camera_node.sources.datasets.records import DatasetError
 from freshfield.geometry import Pose
 
 log = logging.getLogger("camera-node")
@@ -83,7 +84,7 @@ class TrackerPoses:
     def _add(self, line: bytes) -> None:
         try:
             sample = read_sample(line.decode(errors="replace"), str(self.path))
-        except TrajectoryError as error:
+        except DatasetError as error:
             self.refused += 1
             if self.refused == 1:
                 log.warning("%s; lines that are no pose are left out", error)

@@ -171,13 +171,13 @@ async def test_a_peer_tells_its_time():
 
 def test_a_missing_package_says_what_to_install(monkeypatch):
     monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(doctor.CheckFailed, match=r"ur-rtde is not installed: pip install 'freshfield\[ur\]'"):
+    with pytest.raises(ValueError, match=r"ur-rtde is not installed: pip install 'freshfield\[ur\]'"):
         doctor._package("ur")
 
 
 def test_a_full_disk_is_wrong(monkeypatch, tmp_path):
     monkeypatch.setattr(doctor, "LEAST_FREE_GB", 1e9)
-    with pytest.raises(doctor.CheckFailed, match="make room"):
+    with pytest.raises(ValueError, match="make room"):
         doctor._disk(tmp_path)
 
 

@@ -46,7 +46,7 @@ def test_right_poses_move_with_their_images():
 @pytest.mark.stability
 @pytest.mark.parametrize(("late_s", "message"), [(0.1, "some 1[0-9]{2} ms late"), (-0.2, "some 2[0-9]{2} ms early")])
 def test_poses_of_another_instant_are_said_with_their_delay(late_s, message):
-    with pytest.raises(pose_check.PosesWrong, match=message):
+    with pytest.raises(ValueError, match=message):
         said(poses(late_s))
 
 
@@ -61,7 +61,7 @@ def test_other_units_other_axes_and_poses_without_rotation_are_said():
         (still, "lack the rotation"),
         (right @ OPENGL_TO_OPENCV, "axes"),
     ):
-        with pytest.raises(pose_check.PosesWrong, match=message):
+        with pytest.raises(ValueError, match=message):
             said(wrong)
 
 
@@ -90,5 +90,5 @@ def test_a_recording_is_read_as_it_is_streamed(tmp_path, still, damaged):
     found = parse({"cameras": cameras, "source": {"kind": "transforms", "data": str(tmp_path)}}, tmp_path / "s.yaml")
     config = source_config(found)
     assert isinstance(config, RecordedConfig)
-    with pytest.raises(pose_check.PosesWrong, match="ms late"):
+    with pytest.raises(ValueError, match="ms late"):
         pose_check.check(found, config, None)

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.robot.arm.joint_states import STALE_S, ArmError, ArmStream, probe
+from camera_node.robot.arm import ArmError
+from camera_node.robot.arm.joint_states import STALE_S, ArmStream, probe
 from camera_node.settings import ArmConfig
 from freshfield.clock import WallClock
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, mount_on_flange, require_arm
 from camera_node.robot.arm.control import (
     STOP_RAD_S2,
@@ -28,7 +29,7 @@ from camera_node.robot.arm.control import (
     stop_event,
     stop_within_timeout,
 )
-from camera_node.robot.arm.joint_states import ArmError, ArmStream
+from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.viewpoint_tour import FARTHEST_RAD, Tour, plan_tour
 from camera_node.settings import PathConfig, errors_of
 from freshfield.scenario import ScenarioError, load

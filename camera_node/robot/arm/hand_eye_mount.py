@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.pose.providers import Closable, FixedPose, PoseProvider
+from camera_node.robot.arm import ArmError
 from freshfield.geometry import GeometryError, Pose
 from freshfield.untrusted import UntrustedError, read_text, read_yaml
 
@@ -25,10 +26,6 @@ MAX_OFFSET_S = 1e6
 """Bound of the time offset: a larger one is the difference between two clocks' epochs."""
 EYE_IN_HAND, EYE_TO_HAND = "eye-in-hand", "eye-to-hand"
 SETUPS = (EYE_IN_HAND, EYE_TO_HAND)
-
-
-class HandEyeError(ValueError):
-    """A hand-eye file that cannot be used. The message names the file and the mistake."""
 
 
 @dataclass(frozen=True)
@@ -78,26 +75,26 @@ class MountedCameraPoses:
 
 
 def read_hand_eye(path: Path) -> HandEye:
-    """Read a hand-eye calibration. Raises HandEyeError."""
+    """Read a hand-eye calibration. Raises ArmError."""
     try:
         data = read_yaml(read_text(path))
     except (OSError, UnicodeDecodeError, UntrustedError) as error:
-        raise HandEyeError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from None
+        raise ArmError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from None
     if not isinstance(data, dict) or "transform" not in data:
-        raise HandEyeError(f"{path}: expected setup and transform, as camera-node calibrate hand-eye --out writes")
+        raise ArmError(f"{path}: expected setup and transform, as camera-node calibrate hand-eye --out writes")
     setup = data.pop("setup", EYE_IN_HAND)
     if setup not in SETUPS:
-        raise HandEyeError(f"{path}: setup: expected {' or '.join(SETUPS)}, got {setup!r}")
+        raise ArmError(f"{path}: setup: expected {' or '.join(SETUPS)}, got {setup!r}")
     try:
         transform = rigid_transform(data.pop("transform"))
     except (ValueError, TypeError, OverflowError) as error:
-        raise HandEyeError(f"{path}: transform: {error}") from None
+        raise ArmError(f"{path}: transform: {error}") from None
     try:
         offset_s = float(data.pop("time_offset_s", 0.0))
         if not abs(offset_s) < MAX_OFFSET_S:
             raise ValueError
     except (ValueError, TypeError, OverflowError):
-        raise HandEyeError(f"{path}: time_offset_s: expected seconds, less than {MAX_OFFSET_S:g} either way") from None
+        raise ArmError(f"{path}: time_offset_s: expected seconds, less than {MAX_OFFSET_S:g} either way") from None
     return HandEye(setup, transform, offset_s, data)
 
 

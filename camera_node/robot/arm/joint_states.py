@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from camera_node.clocks import ArrivalClock
 from camera_node.pose.pairing import SampleBuffer, interpolate_joints
 from camera_node.pose.providers import PoseGapError
+from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.arm.rtde_process import CONNECT_S, SAMPLE
 from freshfield.clock import Clock
@@ -64,10 +65,6 @@ _SAFETY_MODES = {
     8: "safety violation",
     9: "safety fault",
 }
-
-
-class ArmError(ValueError):
-    """An arm that cannot be used. The message is one line: what, where, what to do."""
 
 
 def probe(host: str) -> None:

@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from camera_node.robot.arm import ArmError
 from freshfield.geometry import se3_inverse, so3_log
 from freshfield.untrusted import read_text
 
@@ -40,10 +41,6 @@ _REACHED_M = 1e-7
 _REACHED_RAD = 1e-7
 _SINGULAR_SIN = math.sin(math.radians(5.0))
 _SINGULAR_M = 0.02
-
-
-class KinematicsError(ValueError):
-    """Invalid calibration or joint vector; the message says which part and why."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +74,7 @@ class ArmModel:
     def link_frames(self, joints: ArrayLike) -> Array:
         """Base-from-link transforms (..., 7, 4, 4) for joint angles (..., 6) in radians: the base itself, then
         each link; the last one is the flange. For the positions of the arm's parts use ``nominal_model``. Raises
-        KinematicsError for angles that are not finite."""
+        ArmError for angles that are not finite."""
         q = _check_joints(joints)
         out = np.empty((*q.shape[:-1], 7, 4, 4))
         out[..., 0, :, :] = np.eye(4)
@@ -122,7 +119,7 @@ class ArmModel:
         """
         wanted = np.asarray(target, dtype=np.float64)
         if wanted.shape != (4, 4) or not np.all(np.isfinite(wanted)):
-            raise KinematicsError("the target must be a finite 4 x 4 matrix")
+            raise ArmError("the target must be a finite 4 x 4 matrix")
         start = np.zeros(6) if near is None else _check_joints(near)
         base = self.nominal_model
         found: list[Array] = []
@@ -186,13 +183,13 @@ def apply_calibration(model: ArmModel, file: Path) -> ArmModel:
     The controller stores the file in ``/root/.urcontrol/``. It is an INI file whose section ``mounting`` has
     ``delta_theta``, ``delta_a``, ``delta_d`` and ``delta_alpha``, each a list of six numbers (radians and
     meters) to add to the data sheet's Denavit-Hartenberg parameters. A missing list is zero. Raises
-    KinematicsError, also for a file without any of them.
+    ArmError, also for a file without any of them.
     """
     parser = configparser.ConfigParser(inline_comment_prefixes=("#", ";"), interpolation=None, strict=False)
     try:
         parser.read_string(read_text(file))
     except (OSError, UnicodeDecodeError, configparser.Error) as error:
-        raise KinematicsError(f"{file}: cannot be read: {' '.join(str(error).split())}") from None
+        raise ArmError(f"{file}: cannot be read: {' '.join(str(error).split())}") from None
     deltas: dict[str, Six] = {}
     for section in parser.sections():
         for key in ("theta", "a", "d", "alpha"):
@@ -200,7 +197,7 @@ def apply_calibration(model: ArmModel, file: Path) -> ArmModel:
                 where = f"{file}: [{section}] delta_{key}"
                 deltas[key] = _parse_six(parser[section][f"delta_{key}"], where)
     if not deltas:
-        raise KinematicsError(f"{file}: has no delta_theta, delta_a, delta_d or delta_alpha")
+        raise ArmError(f"{file}: has no delta_theta, delta_a, delta_d or delta_alpha")
 
     def add_deltas(values: Sequence[float], key: str) -> Six:
         return tuple(v + x for v, x in zip(values, deltas.get(key, _ZEROS)))  # type: ignore[return-value]
@@ -282,7 +279,7 @@ def _wrapped(q: Array) -> Array:
 def _check_joints(values: ArrayLike) -> Array:
     q = np.asarray(values, dtype=np.float64)
     if q.shape[-1:] != (6,) or not np.all(np.isfinite(q)):
-        raise KinematicsError(f"expected six finite joint angles, got {values!r}")
+        raise ArmError(f"expected six finite joint angles, got {values!r}")
     return q
 
 
@@ -292,5 +289,5 @@ def _parse_six(text: str, where: str) -> Six:
     except (ValueError, TypeError):
         values = []
     if len(values) != 6 or not all(map(math.isfinite, values)):
-        raise KinematicsError(f"{where}: expected a list of six numbers, got {text!r}")
+        raise ArmError(f"{where}: expected a list of six numbers, got {text!r}")
     return tuple(values)  # type: ignore[return-value]

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.settings import PathConfig
@@ -27,10 +28,6 @@ FARTHEST_RAD = 2.0
 _CHECKED_POSTURES = 24  # tested along a path
 _TOOL_M, _TOOL_RADIUS_M = 0.08, 0.04  # as in TeleopConfig: the camera and its mount
 _MARGIN_M = 0.01  # between parts of the arm, whose capsules are rounded up
-
-
-class PathError(ValueError):
-    """The arm cannot make the tour. The message says what to change."""
 
 
 def viewpoints(path: PathConfig) -> list[Array]:
@@ -69,7 +66,7 @@ def plan_tour(arm: ArmModel, base: Array, mount: Array, path: PathConfig, start:
     base: world-from-base (4, 4).
     mount: flange-from-camera (4, 4).
     start: current joint angles (6,); the tour begins near them, with a viewpoint to which the path is free.
-    Raises PathError if the arm can visit fewer than three viewpoints.
+    Raises ArmError if the arm can visit fewer than three viewpoints.
     """
     poses = viewpoints(path)
     begin = None if start is None else np.asarray(start, dtype=np.float64)
@@ -85,7 +82,7 @@ def plan_tour(arm: ArmModel, base: Array, mount: Array, path: PathConfig, start:
             visited |= used
             best = max(best, tour, key=lambda each: each.reached)
     if best.reached < 3:
-        raise PathError(
+        raise ArmError(
             f"the arm reaches {best.reached} of {len(poses)} viewpoints: change radius_m, elevations_deg, "
             "azimuths_deg, where the base stands, or the arm's posture before"
         )

@@ -5,9 +5,3 @@ stylus -> filter -> scaled map with clutch -> joint speeds -> limits -> arm
 No input is trusted: ``limits`` allows only joint speeds from which the arm can still stop within all of its
 limits.
 """
-
-from __future__ import annotations
-
-
-class TeleopError(ValueError):
-    """A stylus, setting or start posture that cannot be used. The message is one line with what to do."""

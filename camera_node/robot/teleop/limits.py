@@ -20,9 +20,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.settings import TeleopConfig
 
 Array = NDArray[np.float64]
@@ -89,7 +89,7 @@ class JointLimits:
 
 class Limiter:
     """Joints ``q`` (6,) and speeds ``v`` (6,) that keep every limit of a TeleopConfig. The arm starts at rest
-    at ``joints`` (6,). Raises TeleopError if these break a limit.
+    at ``joints`` (6,). Raises ArmError if these break a limit.
 
     refused: numbers of ticks in which a limit reduced the speeds, or the wanted speeds were invalid
         (unsound).
@@ -150,21 +150,21 @@ class Limiter:
         return "near" if apart.min() < self.config.margin_m + _ROUNDING else None
 
     def _check_start(self) -> None:
-        """Raise TeleopError if the arm breaks a limit at the start."""
+        """Raise ArmError if the arm breaks a limit at the start."""
         q = self.q
         if q.shape != (6,) or not np.isfinite(q).all():
-            raise TeleopError("the arm gives no joint angles")
+            raise ArmError("the arm gives no joint angles")
         limits = self.joint_limits
         if np.any(q < limits.low) or np.any(q > limits.high):
             joint = int(np.argmax(np.maximum(limits.low - q, q - limits.high)))
-            raise TeleopError(
+            raise ArmError(
                 f"joint {joint + 1} stands at {np.degrees(q[joint]):.1f} degrees, within joint_margin_rad of "
                 "its limit: turn it back with the pendant"
             )
         violated = self._violated_limit(q, self.v)
         if violated is not None:
             at = np.round(self.shape.arm.forward(q)[:3, 3], 3).tolist()
-            raise TeleopError(
+            raise ArmError(
                 f"the arm, its flange at {at} m, stands {_WHERE[violated]}: move it with the pendant, or change "
                 "source.arm.teleop"
             )

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.control import STOP_RAD_S2, connect_control, joints_in_motion, stop_within_timeout
-from camera_node.robot.arm.joint_states import ArmError, ArmStream
+from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.teleop.teleoperator import Command
 

@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.robot.teleop import TeleopError
+from camera_node.robot.arm import ArmError
 from freshfield.geometry import matrix_to_quaternion, quaternion_multiply, quaternion_normalize, so3_exp
 
 log = logging.getLogger("camera-node.teleop")
@@ -103,7 +103,7 @@ class Stylus(Protocol):
 
 
 class KeyboardStylus:
-    """Reads the terminal ``fd`` without blocking; its line mode is off until ``close``. Raises TeleopError if
+    """Reads the terminal ``fd`` without blocking; its line mode is off until ``close``. Raises ArmError if
     it is not a terminal.
 
     A terminal reports presses, not whether a key is held. Every press, and every repetition of a held key, is one
@@ -119,7 +119,7 @@ class KeyboardStylus:
             self._before = termios.tcgetattr(self._fd)
             tty.setcbreak(self._fd)
         except termios.error:
-            raise TeleopError("--stylus keyboard needs a terminal: run it in one, or use network:PORT") from None
+            raise ArmError("--stylus keyboard needs a terminal: run it in one, or use network:PORT") from None
 
     def poll(self, now_ns: int) -> list[StylusSample]:
         """See ``Stylus``. Returns one sample, also if no key was pressed."""
@@ -159,7 +159,7 @@ class KeyboardStylus:
 
 
 class NetworkStylus:
-    """Listens at ``host``:``port``; port 0 takes a free one, which ``port`` then tells. Raises TeleopError, also for an
+    """Listens at ``host``:``port``; port 0 takes a free one, which ``port`` then tells. Raises ArmError, also for an
     address that other machines reach: whoever sends a datagram moves the arm.
 
     Only the first sender counts, until it has been silent for a second.
@@ -169,7 +169,7 @@ class NetworkStylus:
 
     def __init__(self, host: str, port: int) -> None:
         if not _is_loopback(host):
-            raise TeleopError(
+            raise ArmError(
                 f"--stylus network: other machines reach {host}, and a message moves the arm: run the stylus's driver "
                 "on this machine, and name network:PORT"
             )
@@ -180,7 +180,7 @@ class NetworkStylus:
             self._socket = socket.socket(kind, socket.SOCK_DGRAM)
             self._socket.bind((host, port))
         except OSError as error:
-            raise TeleopError(
+            raise ArmError(
                 f"--stylus network: cannot listen at {host}:{port}: {error.strerror}; name another port"
             ) from None
         self._socket.setblocking(False)
@@ -226,7 +226,7 @@ def parse(data: bytes) -> StylusSample | None:
 
 def open_stylus(text: str) -> Stylus:
     """Open a stylus by its name on the command line: ``keyboard``, ``network:PORT`` or ``network:HOST:PORT``. Raises
-    TeleopError."""
+    ArmError."""
     kind, _, rest = text.partition(":")
     if kind == "keyboard" and not rest:
         keyboard = KeyboardStylus()
@@ -235,8 +235,8 @@ def open_stylus(text: str) -> Stylus:
     if kind == "network":
         host, _, port = rest.rpartition(":")
         if not port.isdigit() or not 0 < int(port) < 65536:
-            raise TeleopError(f"--stylus: expected network:PORT or network:HOST:PORT, got {text!r}")
+            raise ArmError(f"--stylus: expected network:PORT or network:HOST:PORT, got {text!r}")
         stylus = NetworkStylus(host.strip("[]") or "127.0.0.1", int(port))
         log.info("waiting for a stylus at UDP port %d", stylus.port)
         return stylus
-    raise TeleopError(f"--stylus: expected keyboard or network:PORT, got {text!r}")
+    raise ArmError(f"--stylus: expected keyboard or network:PORT, got {text!r}")

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.camera_poses import arm_model, require_arm
 from camera_node.robot.arm.control import confirm_motion, open_stream, stop_event
-from camera_node.robot.arm.joint_states import ArmError, ArmStream
+from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.simulated_controller.controller import HOME_RAD
-from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.sinks import ServoSink, Sink, TrajectoryFile
 from camera_node.robot.teleop.stylus import Stylus, open_stylus
@@ -32,13 +32,13 @@ _LONGEST_STOP_S = 3.0
 
 def run(args: argparse.Namespace) -> int:
     """Teleoperate until the operator ends it, Ctrl-C or ``--seconds``. Returns 1 after an error of the arm or
-    the file. Raises ScenarioError, TeleopError and ArmError before the arm moves."""
+    the file. Raises ScenarioError and ArmError before the arm moves."""
     scenario = load(args.scenario)
     arm_config = require_arm(scenario)
     config = teleop_config(scenario, arm_config)
     model = arm_model(scenario, arm_config)
     if args.seconds is not None and not args.seconds > 0:
-        raise TeleopError("--seconds: expected a positive number")
+        raise ArmError("--seconds: expected a positive number")
     stream: ArmStream | None = None
     stylus: Stylus | None = None
     try:
@@ -78,7 +78,7 @@ def _sink(file: Path | None, stream: ArmStream | None, model: ArmModel, config: 
     try:
         return TrajectoryFile(file, model)
     except OSError as error:
-        raise TeleopError(f"--dry-run: {file}: {error.strerror}") from None
+        raise ArmError(f"--dry-run: {file}: {error.strerror}") from None
 
 
 def _run_loop(operator: Teleoperator, stylus: Stylus, sink: Sink, seconds: float | None) -> int:

@@ -42,7 +42,7 @@ class Command:
 
 
 class Teleoperator:
-    """Moves an arm by stylus messages. The arm starts at rest at ``joints`` (6,). Raises TeleopError if these
+    """Moves an arm by stylus messages. The arm starts at rest at ``joints`` (6,). Raises ArmError if these
     are outside its limits."""
 
     def __init__(self, arm: ArmModel, config: TeleopConfig, joints: ArrayLike) -> None:

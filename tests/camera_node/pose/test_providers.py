@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.pose.providers import TrajectoryError, read_tum
+from camera_node.pose.providers import read_tum
+from camera_node.sources.datasets.records import DatasetError
 from freshfield.geometry import so3_exp
 
 
@@ -38,6 +39,6 @@ def test_tum_files_keep_nanoseconds_and_put_w_first(tmp_path):
 def test_bad_lines_are_named(tmp_path, text, message):
     file = tmp_path / "track.txt"
     file.write_text(text)
-    with pytest.raises(TrajectoryError, match=message) as error:
+    with pytest.raises(DatasetError, match=message) as error:
         read_tum(file)
     assert str(file) in str(error.value)

@@ -11,8 +11,8 @@ import pytest
 
 from camera_node.capture import build_cameras
 from camera_node.pose.providers import PoseGapError
+from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.camera_poses import base_matrix, load_hand_eyes
-from camera_node.robot.arm.joint_states import ArmError
 from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.flange_camera import TruthClient
 from camera_node.settings import source_config

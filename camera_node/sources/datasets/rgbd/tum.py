@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node.pose.providers import PoseGapError, TrajectoryError, read_tum
+from camera_node.pose.providers import PoseGapError, read_tum
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageFiles, ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, file_within
@@ -33,10 +33,7 @@ _FREIBURG3 = Lens(640, 480, 535.4, 539.2, 320.6, 248.1)
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
     """The images of a sequence's folder, or of its ``rgb.txt``. Raises DatasetError."""
     folder = path if path.is_dir() else path.parent
-    try:
-        poses = read_tum(folder / "groundtruth.txt", interpolate=False, max_gap_ns=_NEAR_NS)
-    except TrajectoryError as error:
-        raise DatasetError(str(error)) from None
+    poses = read_tum(folder / "groundtruth.txt", interpolate=False, max_gap_ns=_NEAR_NS)
     listed = _listed(folder / "rgb.txt")
     depth = dict(_listed(folder / "depth.txt"))
     times = np.array(sorted(depth), dtype=np.int64)

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import PAIRS, CapsuleModel, segment_distance
 from camera_node.robot.arm.kinematics import UR3E, apply_calibration
-from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.limits import Limiter
 from camera_node.robot.teleop.settings import TeleopConfig
 from tests.camera_node.robot.arm.test_kinematics import CALIBRATION
@@ -58,6 +58,6 @@ def test_parts_of_a_calibrated_arm_stay_where_they_are(tmp_path):
             Limiter(arm, OPEN, q)
         elif apart_m < OPEN.margin_m - 0.01:
             met += 1
-            with pytest.raises(TeleopError, match="nearer to each other than margin_m"):
+            with pytest.raises(ArmError, match="nearer to each other than margin_m"):
                 Limiter(arm, OPEN, q)
     assert met > 10

@@ -7,7 +7,8 @@ import pytest
 import yaml
 
 from camera_node.pose.pairing import SampleBuffer
-from camera_node.robot.arm.hand_eye_mount import HandEyeError, read_hand_eye
+from camera_node.robot.arm import ArmError
+from camera_node.robot.arm.hand_eye_mount import read_hand_eye
 from freshfield.geometry import Pose, so3_exp
 
 MS = 1_000_000
@@ -70,6 +71,6 @@ def test_a_file_that_cannot_be_used_is_named(tmp_path, change, message):
         file.write_text(change)
     elif change is None:
         file.unlink()
-    with pytest.raises(HandEyeError, match=message) as error:
+    with pytest.raises(ArmError, match=message) as error:
         read_hand_eye(file)
     assert "hand.yaml" in str(error.value)

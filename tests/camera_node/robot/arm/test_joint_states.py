@@ -15,7 +15,8 @@ import pytest
 
 from camera_node.clocks import ArrivalClock
 from camera_node.pose.providers import PoseGapError
-from camera_node.robot.arm.joint_states import ArmError, ArmStream, FlangePoses
+from camera_node.robot.arm import ArmError
+from camera_node.robot.arm.joint_states import ArmStream, FlangePoses
 from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.flange_camera import TruthClient
 from camera_node.robot.simulated_controller.controller import HOME_RAD

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_node.robot.arm.kinematics import UR3E, KinematicsError, apply_calibration
+from camera_node.robot.arm import ArmError
+from camera_node.robot.arm.kinematics import UR3E, apply_calibration
 from freshfield.geometry import se3, so3_exp
 
 POSTURES = np.random.default_rng(3).uniform(-math.pi, math.pi, (40, 6))
@@ -123,13 +124,13 @@ def test_a_calibration_moves_the_flange_and_the_inverse_follows_it(factory):
 )
 def test_a_wrong_calibration_is_refused_by_name(factory, text, says):
     factory.write_text(text)
-    with pytest.raises(KinematicsError, match=says):
+    with pytest.raises(ArmError, match=says):
         apply_calibration(UR3E, factory)
 
 
 @pytest.mark.parametrize("joints", [[0] * 5, [0] * 7, [0, 0, 0, 0, 0, math.nan], [math.inf] + [0] * 5])
 def test_joints_that_no_arm_has_are_refused(joints):
-    with pytest.raises(KinematicsError, match="six finite"):
+    with pytest.raises(ArmError, match="six finite"):
         UR3E.forward(joints)
 
 

@@ -2,18 +2,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import UR3E, apply_calibration
-from camera_node.robot.arm.viewpoint_tour import (
-    FARTHEST_RAD,
-    PathError,
-    _extend_tour,
-    is_free,
-    plan_tour,
-    reachable,
-    viewpoints,
-)
+from camera_node.robot.arm.viewpoint_tour import FARTHEST_RAD, _extend_tour, is_free, plan_tour, reachable, viewpoints
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from camera_node.settings import PathConfig, source_config
 from freshfield.scenario import ScenarioError, load, parse
@@ -102,7 +95,7 @@ def test_from_where_no_path_leads_on_the_tour_goes_back():
 
 def test_a_tour_out_of_reach_says_what_to_change():
     far = msgspec.structs.replace(ARM.path, radius_m=2.0)
-    with pytest.raises(PathError, match=r"reaches 0 of .* viewpoints: change radius_m"):
+    with pytest.raises(ArmError, match=r"reaches 0 of .* viewpoints: change radius_m"):
         plan_tour(UR3E, BASE, MOUNT, far)
     assert not reachable(UR3E, BASE, MOUNT, far, viewpoints(far)).any()
 

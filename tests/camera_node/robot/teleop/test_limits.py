@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.kinematics import UR3E
-from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.limits import JointLimits, Limiter
 from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.stylus import StylusSample
@@ -74,12 +74,12 @@ def test_what_is_no_speed_is_a_stop_and_counted(wanted):
     ],
 )
 def test_an_arm_that_breaks_a_limit_standing_still_is_refused(changes, part):
-    with pytest.raises(TeleopError, match=part):
+    with pytest.raises(ArmError, match=part):
         Limiter(UR3E, TeleopConfig(**changes), HOME)
     for none in (HOME[:5], [np.nan, *HOME[1:]]):
-        with pytest.raises(TeleopError, match="the arm gives no joint angles"):
+        with pytest.raises(ArmError, match="the arm gives no joint angles"):
             Limiter(UR3E, TeleopConfig(**changes), none)
-    with pytest.raises(TeleopError, match=r"joint 6 stands at 359\.4 degrees"):
+    with pytest.raises(ArmError, match=r"joint 6 stands at 359\.4 degrees"):
         Limiter(UR3E, TeleopConfig(), [*HOME[:5], 2 * math.pi - 0.01])
 
 

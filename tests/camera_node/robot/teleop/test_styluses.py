@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from msgspec.json import encode
 
-from camera_node.robot.teleop import TeleopError
+from camera_node.robot.arm import ArmError
 from camera_node.robot.teleop.stylus import KeyboardStylus, NetworkStylus, open_stylus, parse
 from tests.camera_node.robot.teleop.checks import sample
 
@@ -36,7 +36,7 @@ def test_messages_of_one_sender_arrive_as_they_were_sent():
     assert stylus.poll(0) == []
     assert received(stylus, 10, (second, encode(sent[2])), (first, encode(sent[3]))) == [sent[3]]
     assert received(stylus, 1_000_000_010, (second, encode(sent[4]))) == [sent[4]], "the first has been silent"
-    with pytest.raises(TeleopError, match=r"cannot listen at .*name another port"):
+    with pytest.raises(ArmError, match=r"cannot listen at .*name another port"):
         NetworkStylus("127.0.0.1", stylus.port)
     for each in (first, second, stylus):
         each.close()
@@ -67,13 +67,13 @@ def test_what_is_no_message_is_none(data):
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "[::]", "example.com"])
 def test_nobody_on_another_machine_moves_the_arm(host):
-    with pytest.raises(TeleopError, match=r"other machines reach .*driver on this machine"):
+    with pytest.raises(ArmError, match=r"other machines reach .*driver on this machine"):
         open_stylus(f"network:{host}:7010")
 
 
 @pytest.mark.parametrize("text", ["mouse", "network", "network:x", "network:0", "network:99999", "keyboard:2"])
 def test_unknown_styluses_are_refused(text):
-    with pytest.raises(TeleopError, match="--stylus: expected"):
+    with pytest.raises(ArmError, match="--stylus: expected"):
         open_stylus(text)
 
 
@@ -117,7 +117,7 @@ def test_the_keyboard_of_a_real_terminal():
     assert gone.ended, "its terminal is gone"
     os.close(terminal)
     read, write = os.pipe()
-    with pytest.raises(TeleopError, match="needs a terminal"):
+    with pytest.raises(ArmError, match="needs a terminal"):
         KeyboardStylus(read)
     os.close(read)
     os.close(write)

@@ -13,7 +13,7 @@ import pytest
 from msgspec.json import encode
 
 from camera_node.cli import main
-from camera_node.robot.arm.joint_states import ArmError
+from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.flange_camera import TruthClient
 from camera_node.robot.teleop import sinks, teleop_command
