@@ -18,10 +18,8 @@ from camera_node import settings as tuned
 from camera_node.settings import RecordedConfig
 from camera_node.sources.base import Source, pixels
 from camera_node.sources.registry import open_sources
-from freshfield.geometry import so3_log
+from freshfield.geometry import Array, so3_log
 from freshfield.scenario import Scenario
-
-Array = NDArray[np.float64]
 
 
 def check(scenario: Scenario, config: RecordedConfig, data: Path | None) -> str:

@@ -12,19 +12,17 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+from freshfield.geometry import Array
 
 T = TypeVar("T")
 Interpolate = Callable[[T, T, float], T]
-Joints = NDArray[np.float64]
 
 
 class PoseGapError(ValueError):
     """No pose sample is near enough to the requested instant."""
 
 
-def interpolate_joints(a: Joints, b: Joints, fraction: float) -> Joints:
+def interpolate_joints(a: Array, b: Array, fraction: float) -> Array:
     """Interpolate joint angles (J,), radians, linearly: a controller reports them unwrapped."""
     return (1.0 - fraction) * a + fraction * b
 

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.pose.providers import PoseGapError, PoseProvider
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, camera_poses, load_hand_eyes
@@ -22,10 +21,8 @@ from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.simulated_controller import TRUTH_PORT
 from camera_node.robot.simulated_controller.joint_motion import STEP_S
 from camera_node.settings import ArmConfig
-from freshfield.geometry import Pose
+from freshfield.geometry import Array, Pose
 from freshfield.scenario import Scenario
-
-Array = NDArray[np.float64]
 
 _TIMEOUT_S = 1.0
 _MAX_OFFSET_NS = 2 * round(STEP_S * 1e9)  # between the requested instant and the arm's answer

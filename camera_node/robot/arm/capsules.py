@@ -11,11 +11,9 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.robot.arm.kinematics import ArmModel
-
-Array = NDArray[np.float64]
+from freshfield.geometry import Array
 
 PARTS = ("base", "shoulder", "upper arm", "forearm", "wrist 1", "wrist 2", "wrist 3", "tool")
 # Pairs of parts that share a joint, or whose distance no joint changes.

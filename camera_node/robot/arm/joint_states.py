@@ -29,11 +29,9 @@ from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.arm.rtde_process import CONNECT_S, SAMPLE
 from freshfield.clock import Clock
-from freshfield.geometry import Pose
+from freshfield.geometry import Array, Pose
 
 log = logging.getLogger("camera-node.arm")
-
-Joints = NDArray[np.float64]
 
 RTDE_PORT = 30004
 PROBE_S = 2.0
@@ -119,7 +117,7 @@ class ArmStream:
         self.connections = 0
         self._clock = clock
         self._frequency_hz, self._interpolate = frequency_hz, interpolate
-        self._samples = SampleBuffer[Joints](interpolate_joints if interpolate else None, round(max_gap_ms * 1e6))
+        self._samples = SampleBuffer[Array](interpolate_joints if interpolate else None, round(max_gap_ms * 1e6))
         self._first_sample = threading.Event()
         self._stop = threading.Event()
         self._child: subprocess.Popen[bytes] | None = None
@@ -146,7 +144,7 @@ class ArmStream:
         if self._thread.is_alive():
             self._thread.join(2.0)
 
-    def at(self, t_ns: int, wait_s: float = 0.0) -> tuple[Joints, int]:
+    def at(self, t_ns: int, wait_s: float = 0.0) -> tuple[Array, int]:
         """Joint angles (6,) at an instant, and its distance (ns) from the nearest sample. Raises
         PoseGapError.
 
@@ -161,7 +159,7 @@ class ArmStream:
         except PoseGapError as error:
             raise PoseGapError(self.trouble or f"arm at {self.host}: {error}") from None
 
-    def now(self) -> Joints:
+    def now(self) -> Array:
         """Current joint angles (6,). Raises ArmError if there is no state that is new enough."""
         try:
             return self.at(self._clock.now_ns())[0]

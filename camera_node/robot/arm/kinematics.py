@@ -22,13 +22,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from camera_node.robot.arm import ArmError
-from freshfield.geometry import se3_inverse, so3_log
+from freshfield.geometry import Array, se3_inverse, so3_log
 from freshfield.untrusted import read_text
 
-Array = NDArray[np.float64]
 Six = tuple[float, float, float, float, float, float]
 
 _ZEROS: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

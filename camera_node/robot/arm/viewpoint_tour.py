@@ -19,9 +19,7 @@ from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.settings import PathConfig
-from freshfield.geometry import on_sphere, se3, se3_inverse, so3_exp
-
-Array = NDArray[np.float64]
+from freshfield.geometry import Array, on_sphere, se3, se3_inverse, so3_exp
 
 FARTHEST_RAD = 2.0
 """Largest turn of a joint in one move."""

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.robot.calibration.settings import MIN_CORNERS, MIN_MARKERS
+from freshfield.geometry import Array
 
 GrayImage = NDArray[np.uint8]
-Array = NDArray[np.float64]
 
 # The largest dictionaries: each holds the smaller ones of its kind.
 _DICTIONARIES = (

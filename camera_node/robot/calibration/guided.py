@@ -15,7 +15,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.robot.arm.camera_poses import base_matrix
 from camera_node.robot.calibration import CalibrationError
@@ -41,12 +40,11 @@ from camera_node.robot.calibration.settings import (
 from camera_node.robot.calibration.targets import WHICH_PRINT, Target, estimate_pose, to_gray
 from camera_node.settings import ArmConfig, source_config
 from camera_node.sources.base import Source, pixels
+from camera_node.sources.devices.feed import Image
 from camera_node.sources.registry import open_sources
 from freshfield import scenario
 from freshfield.clock import WallClock
 from freshfield.geometry import Pinhole, se3_inverse
-
-Image = NDArray[np.uint8]
 
 KEPT = "kept"
 

@@ -18,12 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.charuco import CharucoPrint, explain_charuco, find_charuco
+from camera_node.robot.calibration.charuco import CharucoPrint, GrayImage, explain_charuco, find_charuco
 from camera_node.robot.calibration.settings import AMBIGUOUS, MIN_CORNERS
-from freshfield.geometry import Pinhole, se3
-
-Array = NDArray[np.float64]
-GrayImage = NDArray[np.uint8]
+from freshfield.geometry import Array, Pinhole, se3
 
 NOTATIONS = "charuco:7x5:30mm:22mm or chessboard:9x6:23.6mm"
 WHICH_PRINT = "parts of the board fit two prints, a square apart: show all of it once"

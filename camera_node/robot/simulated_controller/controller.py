@@ -13,14 +13,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.simulated_controller.joint_motion import STEP_S, JointMotion
+from freshfield.geometry import Array
 
 log = logging.getLogger("camera-node.arm")
-
-Array = NDArray[np.float64]
 
 HOME_RAD = (0.0, -np.pi / 2, -np.pi / 2, -np.pi / 2, np.pi / 2, 0.0)
 STEP_NS = round(STEP_S * 1e9)

@@ -9,11 +9,10 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from camera_node.robot.arm.kinematics import ArmModel
-
-Array = NDArray[np.float64]
+from freshfield.geometry import Array
 
 STEP_S = 0.002
 MAX_ACCELERATION_RAD_S2 = 40.0

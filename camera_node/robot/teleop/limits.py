@@ -18,14 +18,13 @@ smaller steps are tried, and finally the stop that was checked with the tick bef
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.teleop.settings import TeleopConfig
-
-Array = NDArray[np.float64]
+from freshfield.geometry import Array
 
 # Limits are this much tighter than configured, because sums over a stop round differently at each tick.
 _ROUNDING = 1e-9
@@ -70,7 +69,7 @@ class JointLimits:
         return np.sign(v) * np.maximum(np.abs(v) - self._change, 0.0)
 
     def stop(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Joints and speeds (T, n) of a stop from (q, v), beginning with that state."""
+        """Array and speeds (T, n) of a stop from (q, v), beginning with that state."""
         ticks = int(np.ceil(np.abs(v).max() / self._change)) if v.any() else 0
         left = np.abs(v) - self._change * np.arange(ticks + 1)[:, None]
         speeds = np.sign(v) * np.maximum(left, 0.0)
@@ -88,7 +87,7 @@ class JointLimits:
 
 
 class Limiter:
-    """Joints ``q`` (6,) and speeds ``v`` (6,) that keep every limit of a TeleopConfig. The arm starts at rest
+    """Array ``q`` (6,) and speeds ``v`` (6,) that keep every limit of a TeleopConfig. The arm starts at rest
     at ``joints`` (6,). Raises ArmError if these break a limit.
 
     refused: numbers of ticks in which a limit reduced the speeds, or the wanted speeds were invalid

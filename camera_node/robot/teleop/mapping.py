@@ -11,13 +11,10 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.stylus import StylusSample
-from freshfield.geometry import matrix_to_quaternion, quaternion_multiply, quaternion_to_matrix, slerp, so3_log
-
-Array = NDArray[np.float64]
+from freshfield.geometry import Array, matrix_to_quaternion, quaternion_multiply, quaternion_to_matrix, slerp, so3_log
 
 _SPEED_HZ = 2.0  # cutoff of the filter of the speed itself
 _MIN_S, _MAX_S = 1e-4, 0.5  # bounds of the time between two samples: others come from a faulty clock

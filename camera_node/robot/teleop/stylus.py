@@ -21,14 +21,11 @@ from typing import Protocol
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.robot.arm import ArmError
-from freshfield.geometry import matrix_to_quaternion, quaternion_multiply, quaternion_normalize, so3_exp
+from freshfield.geometry import Array, matrix_to_quaternion, quaternion_multiply, quaternion_normalize, so3_exp
 
 log = logging.getLogger("camera-node.teleop")
-
-Array = NDArray[np.float64]
 
 FARTHEST_M = 10.0
 """Positions farther from the origin are invalid."""

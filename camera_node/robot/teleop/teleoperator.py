@@ -10,15 +10,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from camera_node.robot.arm.kinematics import ArmModel, pose_difference
 from camera_node.robot.teleop.limits import Limiter
 from camera_node.robot.teleop.mapping import Mapping
 from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.stylus import StylusSample
-
-Array = NDArray[np.float64]
+from freshfield.geometry import Array
 
 # Damping distorts the flange's direction, so it is applied only near a singularity, where the Jacobian's least
 # singular value falls below _DAMPING_THRESHOLD (Maciejewski and Klein 1988).

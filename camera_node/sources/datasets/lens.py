@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from camera_node.sources.datasets.records import DatasetError
 from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
-from freshfield.geometry import Pinhole, invertible
+from freshfield.geometry import Array, Pinhole, invertible
 
 import cv2  # isort: skip
 
-Array = NDArray[np.float64]
 Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.uint16])
 
 # Widest angle from the axis of an undistorted image; beyond it the corners are mostly stretched.

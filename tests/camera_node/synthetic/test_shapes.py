@@ -6,11 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere, capsule, nearest_hit
-
-Array = NDArray[np.float64]
+from freshfield.geometry import Array
 
 SHAPES = [
     Sphere(0.7),

@@ -14,15 +14,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.inputs import find_corners, list_images
 from camera_node.robot.calibration.settings import LIVE_WAIT_S, MOMENT_S, NEW_SHARE, STILL_PX, UNKNOWN_FOV_DEG
-from camera_node.robot.calibration.targets import Corners, Target, to_gray
+from camera_node.robot.calibration.targets import Corners, GrayImage, Target, to_gray
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
-GrayImage = NDArray[np.uint8]
 
 
 @dataclass
