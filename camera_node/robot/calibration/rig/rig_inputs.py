@@ -12,13 +12,13 @@ from fractions import Fraction
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.inputs import find_corners, list_images
 from camera_node.robot.calibration.settings import LIVE_WAIT_S, MOMENT_S, NEW_SHARE, STILL_PX, UNKNOWN_FOV_DEG
 from camera_node.robot.calibration.targets import Corners, GrayImage, Target, to_gray
+from camera_node.sources.datasets.video import Clip
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 
@@ -64,37 +64,16 @@ def read_folder(folder: Path, target: Target, progress: Callable[[int], None]) -
 
 def _of_video(file: Path, target: Target, progress: Callable[[], None]) -> tuple[dict[str, Corners], tuple[int, int]]:
     """Corners by moment, each MOMENT_S, at which the target stood still between two frames; and the images' size."""
-    capture = cv2.VideoCapture(str(file))
-    try:
-        fps = capture.get(cv2.CAP_PROP_FPS)
-        if not capture.isOpened() or not 0 < fps < 1000:
-            raise CalibrationError(f"{file}: cannot be read as a video")
-        found: dict[str, Corners] = {}
-        size, before = (0, 0), None
-        starts = itertools.count()
-        moment, start = next(starts), 0  # of the frame nearest to each MOMENT_S, whatever the video's rate
-        for index in itertools.count():
-            if not capture.grab():
-                break
-            if index > start + 1:
-                moment = next(starts)
-                start = max(round(moment * MOMENT_S * fps), index)
-            if index < start:
-                continue
-            ok, image = capture.retrieve()
-            if not ok:
-                raise CalibrationError(f"{file}: frame {index} cannot be decoded")
-            size = (image.shape[1], image.shape[0])
-            corners = target.find(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
-            if index == start:
-                before = corners
-                progress()
-            elif corners is not None and before is not None and moved_px(before, corners) < STILL_PX:
-                found[f"{moment * MOMENT_S:.1f}s"] = corners
-    finally:
-        capture.release()
-    if not size[0]:
-        raise CalibrationError(f"{file}: has no frame")
+    clip = Clip(file)
+    size, times_s = (clip.width, clip.height), clip.times_s - clip.times_s[0]
+    found: dict[str, Corners] = {}
+    for moment_s in np.arange(0.0, times_s[-1], MOMENT_S):
+        first = int(np.abs(times_s[:-1] - moment_s).argmin())
+        before, now = (target.find(to_gray(clip.frame(index, *size))) for index in (first, first + 1))
+        progress()
+        if before is not None and now is not None and moved_px(before, now) < STILL_PX:
+            found[f"{moment_s:.1f}s"] = now
+    clip.close()
     return found, size
 
 
