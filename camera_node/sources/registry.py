@@ -61,7 +61,7 @@ def open_sources(
     elif isinstance(config, LiveConfig):
         from camera_node.sources.devices.live import open_live
 
-        sources = open_live(scenario, config, cameras)
+        sources = {**open_live(scenario, config, cameras)}
     else:
         from camera_node.sources.mcap import open_replay
 

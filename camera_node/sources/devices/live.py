@@ -22,7 +22,7 @@ from camera_node.sources.devices.feed import CameraError, Feed, Image, as_camera
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
 from freshfield.clock import Clock, WallClock
 from freshfield.depth import DepthImage
-from freshfield.geometry import Pinhole
+from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import Scenario, ScenarioError
 
 log = logging.getLogger("camera-node")
@@ -60,7 +60,8 @@ class LiveSource(Source):
 
     opener: opens the camera, or raises; called again after a failure.
     poses: of the camera.
-    calibrated: intrinsics that replace the device's own, scaled to the images' size; None: the device's own.
+    calibrated: intrinsics that replace the device's own, scaled to the images' size; None: the device's own. A number:
+        no lens is known yet, one of this horizontal angle of view is taken, degrees.
     first_frame_s: how long the first frame may take, and how long an open camera may be silent before it is reopened.
     """
 
@@ -70,7 +71,7 @@ class LiveSource(Source):
         fps: Fraction,
         opener: Callable[[], Feed],
         poses: PoseProvider,
-        calibrated: Pinhole | None = None,
+        calibrated: Pinhole | float | None = None,
         first_frame_s: float = 3.0,
     ) -> None:
         self.camera, self.fps = camera, fps
@@ -87,6 +88,8 @@ class LiveSource(Source):
             first = feed.grab(first_frame_s)
             if first is None:
                 raise CameraError(f"{camera}: the camera opened, but sent no frame for {first_frame_s:g} s")
+            if isinstance(calibrated, float):
+                calibrated = Pinhole.from_fov(first[1].shape[1], first[1].shape[0], calibrated)
             lens = calibrated or feed.intrinsics
             if lens is None:
                 raise CameraError(feed.no_intrinsics)
@@ -176,16 +179,22 @@ class LiveSource(Source):
         return True
 
 
-def open_live(scenario: Scenario, config: LiveConfig, cameras: Sequence[str]) -> dict[str, Source]:
-    """See ``camera_node.sources.registry.open_sources``. Raises ScenarioError, CameraError or ArmError."""
+def open_live(
+    scenario: Scenario, config: LiveConfig, cameras: Sequence[str], any_fov_deg: float | None = None
+) -> dict[str, LiveSource]:
+    """See ``camera_node.sources.registry.open_sources``. Raises ScenarioError, CameraError or ArmError.
+
+    any_fov_deg: horizontal angle of view of cameras that have no calibration yet; None: lenses and poses are known.
+    """
     if len(cameras) > 1:
         for camera in cameras:
             if camera not in config.devices:
                 raise ScenarioError(f"{scenario.path}: source.devices.{camera}: missing: which camera is it?")
     fps, clock = rate(config.fps or DEFAULT_FPS), WallClock()
-    known = calibrations(scenario, config)
-    poses = _poses(scenario, config, cameras, known)
-    sources: dict[str, Source] = {}
+    known = calibrations(scenario, config) if any_fov_deg is None else {}
+    standing = FixedPose(Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    poses = _poses(scenario, config, cameras, known) if any_fov_deg is None else dict.fromkeys(cameras, standing)
+    sources: dict[str, LiveSource] = {}
     try:
         for camera in cameras:
             sources[camera] = LiveSource(
@@ -193,7 +202,7 @@ def open_live(scenario: Scenario, config: LiveConfig, cameras: Sequence[str]) ->
                 fps,
                 partial(open_feed, camera, config, fps, clock),
                 poses[camera],
-                known[camera].intrinsics if camera in known else None,
+                known[camera].intrinsics if camera in known else any_fov_deg,
                 config.first_frame_s,
             )
     except BaseException:

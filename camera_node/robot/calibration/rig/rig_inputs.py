@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from fractions import Fraction
 from functools import partial
 from pathlib import Path
 
@@ -128,31 +127,16 @@ def watch(cameras: Mapping[str, Grab], target: Target, seconds: float | None, te
 def open_cameras(scenario_file: str) -> tuple[dict[str, Grab], Callable[[], None]]:
     """The live cameras of a scenario, before they have a calibration: functions for ``watch``, and one that closes
     them. Raises ScenarioError, CameraError."""
-    from camera_node.pose.providers import FixedPose
     from camera_node.settings import LiveConfig, source_config
-    from camera_node.sources.devices.feed import CameraError, Feed
-    from camera_node.sources.devices.live import DEFAULT_FPS, LiveSource, open_feed
-    from freshfield.clock import WallClock
-    from freshfield.geometry import Pinhole, Pose
+    from camera_node.sources.devices.feed import CameraError
+    from camera_node.sources.devices.live import LiveSource, open_live
     from freshfield.scenario import load
 
     loaded = load(scenario_file)
     config = source_config(loaded)
     if not isinstance(config, LiveConfig):
         raise CalibrationError(f"{loaded.path}: source.kind {config.kind}: expected camera, oak or realsense")
-    fps = Fraction(config.fps or DEFAULT_FPS)
-    sources: dict[str, LiveSource] = {}
-
-    def opened(camera: str) -> Feed:
-        feed = open_feed(camera, config, fps, WallClock())
-        first = feed.grab(config.first_frame_s)
-        if first is not None:  # a source wants a lens; any will do, it is estimated here
-            feed.intrinsics = Pinhole.from_fov(first[1].shape[1], first[1].shape[0], UNKNOWN_FOV_DEG)
-        return feed
-
-    def close() -> None:
-        for source in sources.values():
-            source.close()
+    sources = open_live(loaded, config, loaded.cameras, UNKNOWN_FOV_DEG)
 
     def newest(source: LiveSource) -> GrayImage | None:
         until_s = time.monotonic() + LIVE_WAIT_S
@@ -161,11 +145,8 @@ def open_cameras(scenario_file: str) -> tuple[dict[str, Grab], Callable[[], None
                 return to_gray(np.asarray(source.read(0).image))
         return None
 
-    try:
-        for camera in loaded.cameras:
-            standing = FixedPose(Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-            sources[camera] = LiveSource(camera, fps, partial(opened, camera), standing, None, config.first_frame_s)
-    except BaseException:
-        close()
-        raise
+    def close() -> None:
+        for source in sources.values():
+            source.close()
+
     return {camera: partial(newest, source) for camera, source in sources.items()}, close
