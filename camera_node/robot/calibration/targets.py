@@ -10,22 +10,35 @@ x to the right, y down, z away from the viewer, meters.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.charuco import CharucoPrint, GrayImage, explain_charuco, find_charuco
-from camera_node.robot.calibration.settings import AMBIGUOUS, MIN_CORNERS
+from camera_node.robot.calibration.settings import AMBIGUOUS, MIN_CORNERS, MIN_MARKERS
 from freshfield.geometry import Array, Pinhole, se3
+
+GrayImage = NDArray[np.uint8]
 
 NOTATIONS = "charuco:7x5:30mm:22mm or chessboard:9x6:23.6mm"
 WHICH_PRINT = "parts of the board fit two prints, a square apart: show all of it once"
+# The largest dictionaries: each holds the smaller ones of its kind.
+_DICTIONARIES = (
+    *(f"{n}X{n}_1000" for n in (4, 5, 6, 7)),
+    *(f"APRILTAG_{name}" for name in ("16H5", "25H9", "36H10", "36H11")),
+    "ARUCO_ORIGINAL",
+    "ARUCO_MIP_36H12",
+)
+_SIZES = (50, 100, 250, 1000)
+_MOST_SQUARES = 16  # across and down, of ChArUco boards that are tried
 # Corners of a chessboard that was described by its squares, or miscounted by one or two.
 _OTHER_SIZES = ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1), (-2, -2), (2, 2))
+_CHESSBOARD = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 _SUBPIX = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
 
 
@@ -38,40 +51,44 @@ class Corners:
     points: Array
 
 
-@dataclass(frozen=True)
-class Target:
+class Target(ABC):
     """A calibration target.
 
-    name: its SPEC.
-    size_m: width and height of the drawing.
-    find: returns the corners in a gray image, or None.
-    explain: says why they are not found in a gray image, as far as it tells; "" if it does not.
-    draw: returns a drawing of a given width in pixels, exact at multiples of ``modules`` (its width in
-        modules).
-    pattern_m: width and height without the white border.
-    square_m: side of a square.
-    decided: whether it is known which of two prints the target is (see ``charuco.find_charuco``).
+    name: its SPEC. square_m: side of a square.
+    size_m: width and height of the drawing, whose width has so many ``modules``. pattern_m: without its white border.
     """
 
     name: str
+    square_m: float
     size_m: tuple[float, float]
-    find: Callable[[GrayImage], Corners | None]
-    explain: Callable[[GrayImage], str]
-    draw: Callable[[int], GrayImage]
     modules: int
     pattern_m: tuple[float, float]
-    square_m: float
-    decided: Callable[[], bool] = lambda: True
+
+    @abstractmethod
+    def find(self, image: GrayImage) -> Corners | None:
+        """The corners in an image."""
+
+    @abstractmethod
+    def explain(self, image: GrayImage) -> str:
+        """Why they are not found in an image, as far as it tells; "" if it does not."""
+
+    @abstractmethod
+    def draw(self, width: int) -> GrayImage:
+        """A drawing of a width in pixels, exact at multiples of ``modules``."""
+
+    def decided(self) -> bool:
+        """Whether it is known which of two prints it is, see ``Charuco``."""
+        return True
 
 
 def parse_target(spec: str) -> Target:
     """The target of a SPEC (see above). Raises CalibrationError."""
     kind, *rest = spec.split(":")
     try:
-        if kind not in _MAKERS:
+        if kind not in _KINDS:
             raise ValueError(f"no kind {kind!r}")
-        return _MAKERS[kind](spec, *rest)
-    except (TypeError, ValueError, AttributeError) as error:
+        return _KINDS[kind](spec, *rest)
+    except (TypeError, ValueError) as error:
         why = f" ({error})" if isinstance(error, ValueError) else ""
         raise CalibrationError(f"target {spec!r}: expected for example {NOTATIONS}{why}") from None
 
@@ -102,54 +119,127 @@ def to_gray(image: NDArray[np.uint8]) -> GrayImage:
     return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
 
 
-def _charuco(name: str, squares: str, square: str, marker: str, dictionary: str = "4X4_50", *extra: str) -> Target:
-    across, down = _counts(squares)
-    side, inner = _meters(square), _meters(marker)
-    if not inner < side or extra:
-        raise ValueError("the markers must be smaller than the squares")
-    board = cv2.aruco.CharucoBoard((across, down), side, inner, _dictionary(f"DICT_{dictionary.upper()}"))
-    places = np.asarray(board.getChessboardCorners(), dtype=np.float64)
-    printed = CharucoPrint(across, down, inner / side, dictionary.upper())
+class Charuco(Target):
+    """A ChArUco board, in OpenCV's print or in the one before 4.6, which differs where the number of rows is even.
 
-    # Corners so far by print, of pictures that tell the prints apart: a part of a board can fit both, a square apart,
-    # and then the other pictures decide.
-    total = [0, 0]
+    A part of a board can fit both prints, a square apart: which one it is, the pictures in which only one of them finds
+    corners tell.
+    """
 
-    def find(image: GrayImage) -> Corners | None:
-        prints = find_charuco(image, printed)
+    def __init__(self, name: str, squares: str, square: str, marker: str, dictionary: str = "4X4_50") -> None:
+        across, down = self._counts = _counts(squares)
+        self.name, self.modules, self.square_m = name, across, _meters(square)
+        self.size_m = self.pattern_m = (across * self.square_m, down * self.square_m)
+        self._marker, self._dictionary = _meters(marker) / self.square_m, dictionary.upper()
+        if not self._marker < 1.0:
+            raise ValueError("the markers must be smaller than the squares")
+        self._detectors = _charuco_detectors(across, down, self._marker, self._dictionary)
+        self._board = self._detectors[0].getBoard()
+        self._places = self.square_m * np.asarray(self._board.getChessboardCorners(), dtype=np.float64)
+        self._total = [0] * len(self._detectors)  # corners by print, of pictures that tell the prints apart
+
+    def find(self, image: GrayImage) -> Corners | None:
+        prints = _detect(self._detectors, image)
         counts = [len(numbers) for _, numbers in prints]
         if max(counts) - min(counts) >= MIN_CORNERS:
-            total[:] = [count + before for count, before in zip(counts, total)]
-        pixels, numbers = prints[int(np.argmax(total if any(total) else counts))]
+            self._total = [count + before for count, before in zip(counts, self._total)]
+        pixels, numbers = prints[int(np.argmax(self._total if any(self._total) else counts))]
         if len(numbers) < MIN_CORNERS:
             return None
-        points = places[numbers]
-        if min(len(np.unique(points[:, 0].round(6))), len(np.unique(points[:, 1].round(6)))) < 2:
+        points = self._places[numbers]
+        if min(len(np.unique(points[:, axis].round(6))) for axis in (0, 1)) < 2:
             return None  # all on one line
         return Corners(pixels + 0.5, points)
 
-    def draw(width: int) -> GrayImage:
-        return np.asarray(board.generateImage((width, round(width * down / across))), dtype=np.uint8)
+    def decided(self) -> bool:
+        return any(self._total) or len(self._detectors) == 1
 
-    size = across * side, down * side
+    def draw(self, width: int) -> GrayImage:
+        across, down = self._counts
+        return np.asarray(self._board.generateImage((width, round(width * down / across))), dtype=np.uint8)
 
-    def explain(image: GrayImage) -> str:
-        return explain_charuco(image, printed)
+    def explain(self, image: GrayImage) -> str:
+        numbers = _markers(image, self._dictionary)
+        if len(numbers) < MIN_MARKERS:
+            return self._other_markers(image)
+        across, down = self._counts
+        for other in _other_boards(across, down, int(numbers.max())):
+            found = _detect(_charuco_detectors(*other, self._marker, self._dictionary), image)
+            if max(len(corners) for _, corners in found) >= MIN_CORNERS:
+                what = "its sizes are swapped" if other == (down, across) else "it is a board of another size"
+                return f"{what}: {other[0]}x{other[1]} squares, not {across}x{down}"
+        return f"{len(numbers)} markers are seen, but not arranged like this board's"
 
-    return Target(name, size, find, explain, draw, across, size, side, lambda: any(total) or down % 2 == 1)
+    def _other_markers(self, image: GrayImage) -> str:
+        """What is seen instead of this board's markers."""
+        if len(_markers(np.ascontiguousarray(image[:, ::-1]), self._dictionary)) >= MIN_MARKERS:
+            return "the picture is mirrored: switch that off in the camera's settings"
+        seen = {name: _markers(image, name) for name in _DICTIONARIES}
+        name = max(seen, key=lambda each: len(seen[each]))
+        if len(seen[name]) < MIN_MARKERS:
+            return "no markers are seen: is the board small, blurred, dark, or another one?"
+        kind, _, largest = name.rpartition("_")
+        if largest.isdigit():
+            name = f"{kind}_{next(size for size in _SIZES if seen[name].max() < size)}"
+        return f"its markers are of dictionary {name}, not {self._dictionary}"
 
 
-def _chessboard(name: str, corners: str, square: str) -> Target:
-    across, down = _counts(corners)
-    side = _meters(square)
-    if (across + down) % 2 == 0:
-        raise ValueError("one of the numbers of corners must be odd and the other even, or up looks as down")
-    y, x = np.mgrid[0:down, 0:across].reshape(2, -1) * side
-    points = np.stack([x, y, np.zeros_like(x)], axis=1)
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+@lru_cache(maxsize=8)
+def _charuco_detectors(across: int, down: int, marker: float, dictionary: str) -> tuple[cv2.aruco.CharucoDetector, ...]:
+    """Of both prints that a board has, or of its one, with squares of side 1."""
+    found = []
+    for legacy in (False, True)[: 1 + (down % 2 == 0)]:
+        board = cv2.aruco.CharucoBoard((across, down), 1.0, marker, _dictionary(dictionary))
+        board.setLegacyPattern(legacy)
+        found.append(cv2.aruco.CharucoDetector(board))
+    return tuple(found)
 
-    def find(image: GrayImage) -> Corners | None:
-        found, pixels = cv2.findChessboardCorners(image, (across, down), flags=flags)
+
+def _detect(detectors: Sequence[cv2.aruco.CharucoDetector], image: GrayImage) -> list[tuple[Array, NDArray[np.intp]]]:
+    """Corners (N, 2), pixel centers at whole numbers, and their numbers (N,) on the board, by print."""
+    found = []
+    for detector in detectors:
+        pixels, numbers, _, _ = detector.detectBoard(image)
+        seen = numbers is not None and len(numbers) > 0
+        at = np.asarray(pixels if seen else [], np.float64).reshape(-1, 2)
+        found.append((at, np.asarray(numbers if seen else [], np.intp).ravel()))
+    return found
+
+
+def _markers(image: GrayImage, dictionary: str) -> NDArray[np.intp]:
+    """Numbers (N,) of the markers that are seen."""
+    _, numbers, _ = cv2.aruco.ArucoDetector(_dictionary(dictionary)).detectMarkers(image)
+    return np.zeros(0, np.intp) if numbers is None else numbers.ravel().astype(np.intp)
+
+
+def _dictionary(name: str) -> cv2.aruco.Dictionary:
+    if not hasattr(cv2.aruco, f"DICT_{name}"):
+        raise ValueError(f"no dictionary {name}")
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
+
+
+def _other_boards(across: int, down: int, highest: int) -> list[tuple[int, int]]:
+    """Boards that have a marker of number ``highest`` and few beyond it: the one with swapped sizes first."""
+    sides = range(3, _MOST_SQUARES + 1)
+    fitting = [(a, d) for a in sides for d in sides if highest < a * d // 2 <= highest + 3 and (a, d) != (across, down)]
+    return list(dict.fromkeys([(down, across), *fitting]))
+
+
+class Chessboard(Target):
+    """A chessboard, by its inner corners."""
+
+    def __init__(self, name: str, corners: str, square: str) -> None:
+        across, down = self._counts = _counts(corners)
+        self.name, self.modules, self.square_m = name, across + 3, _meters(square)
+        if (across + down) % 2 == 0:
+            raise ValueError("one of the numbers of corners must be odd and the other even, or up looks as down")
+        self.size_m, self.pattern_m = (((across + n) * self.square_m, (down + n) * self.square_m) for n in (3, 1))
+        y, x = np.mgrid[0:down, 0:across].reshape(2, -1) * self.square_m
+        self._places = np.stack([x, y, np.zeros_like(x)], axis=1)
+
+    def find(self, image: GrayImage) -> Corners | None:
+        across, down = self._counts
+        found, pixels = cv2.findChessboardCorners(image, (across, down), flags=_CHESSBOARD)
         if not found:
             return None
         pixels = pixels.reshape(down, across, 2)
@@ -163,37 +253,30 @@ def _chessboard(name: str, corners: str, square: str) -> Target:
         last = pixels[-2:, -2:].mean(axis=(0, 1))
         if _mean_level(image, first) > _mean_level(image, last):
             pixels = pixels[::-1, ::-1]
-        return Corners(np.asarray(pixels.reshape(-1, 2) + 0.5, dtype=np.float64), points)
+        return Corners(np.asarray(pixels.reshape(-1, 2) + 0.5, dtype=np.float64), self._places)
 
-    def draw(width: int) -> GrayImage:
+    def draw(self, width: int) -> GrayImage:
+        across, down = self._counts
         # The detector needs white around the outer squares.
-        cell = max(1, width // (across + 3))
+        cell = max(1, width // self.modules)
         board = (np.indices((down + 1, across + 1)).sum(axis=0) % 2 * 255).astype(np.uint8)
         return np.pad(np.kron(board, np.ones((cell, cell), np.uint8)), cell, constant_values=255)
 
-    def explain(image: GrayImage) -> str:
+    def explain(self, image: GrayImage) -> str:
+        across, down = self._counts
         for wider, taller in _OTHER_SIZES:
             size = across + wider, down + taller
-            if min(size) >= 3 and cv2.findChessboardCorners(image, size, flags=flags)[0]:
+            if min(size) >= 3 and cv2.findChessboardCorners(image, size, flags=_CHESSBOARD)[0]:
                 return f"a board of {size[0]}x{size[1]} inner corners is seen, not of {across}x{down}"
         return ""
 
-    size, pattern = (((across + n) * side, (down + n) * side) for n in (3, 1))
-    return Target(name, size, find, explain, draw, across + 3, pattern, side)
 
-
-_MAKERS: dict[str, Callable[..., Target]] = {"charuco": _charuco, "chessboard": _chessboard}
+_KINDS = {"charuco": Charuco, "chessboard": Chessboard}
 
 
 def _mean_level(image: GrayImage, at: Array) -> float:
     x, y = np.rint(at).astype(int)
     return float(image[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2].mean())
-
-
-def _dictionary(name: str) -> cv2.aruco.Dictionary:
-    if not hasattr(cv2.aruco, name):
-        raise ValueError(f"no dictionary {name.removeprefix('DICT_')}")
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
 def _counts(text: str) -> tuple[int, int]:

@@ -155,6 +155,7 @@ def test_a_camera_that_was_gone_is_opened_again(tmp_path, clock):
         ("http://127.0.0.1:9/none", "eye: no camera at http://127.0.0.1:9/none: is the address right"),
         ("77", "eye: no camera at 77: is it plugged in"),
         ("/dev/v4l/by-id/none", "eye: no camera at /dev/v4l/by-id/none: is it plugged in"),
+        (__file__, "it is a file, not a device: a recorded .* --like videos"),
     ],
 )
 def test_no_camera_is_one_clear_line_within_three_seconds(tmp_path, device, says):
@@ -364,9 +365,3 @@ def test_the_camera_that_is_meant_is_the_one_named_or_the_only_one():
             chosen(device)
     with pytest.raises(CameraError, match=r"^eye: RuntimeError: busy now$"):
         select_device("eye", "OAK", None, being_plugged_in, "")
-
-
-def test_a_video_file_is_no_device(tmp_path):
-    (tmp_path / "left.mp4").write_bytes(b"any")
-    with pytest.raises(CameraError, match=r"left\.mp4: it is a file, not a device: a recorded .* --like videos"):
-        opencv_camera._open("left", str(tmp_path / "left.mp4"))

@@ -17,7 +17,6 @@ from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.registry import open_sources
 from edge_server.experiments.scenes.recorded import load_recorded
 from freshfield.geometry import Pose, look_at
-from freshfield.scenario import parse
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="needs the extra ros")
 
@@ -248,18 +247,6 @@ def test_a_damaged_bag_is_named_and_one_without_poses_says_so(tmp_path):
             transform(START_NS + 2 * 10**10, "map", "base", MOUNT),
         )
         open_dataset(write(tmp_path / "late", [*late, ("/tf", 0, transforms(*gone)), *pictures()]))
-
-
-def test_every_eighth_capture_of_a_bag_is_held_out_by_a_scenario(tmp_path):
-    bag = write(tmp_path / "run", robot(17) + pictures(17))
-    cameras = {"ids": ["hand", "kept"], "held_out": ["kept"], "held_out_every": 8}
-    source = {"kind": "rosbag", "data": str(bag), "assignment": {"hand": EYE}}
-    scenario = parse({"cameras": cameras, "source": source}, tmp_path / "mine.yaml")
-    sources = open_sources(scenario, source_config(scenario), scenario.cameras)
-    for camera, captures in (("kept", [0, 8]), ("hand", [*range(1, 8), *range(9, 16)])):
-        shots = [sources[camera].read(sources[camera].content(tick)) for tick in range(len(captures))]
-        at_m = [shot.pose.translation_m[0] for shot in shots]
-        assert at_m == pytest.approx([10.1 + 0.05 * n for n in captures])
 
 
 def test_a_bag_is_played_without_a_scenario(tmp_path, capsys):
