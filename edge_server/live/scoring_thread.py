@@ -46,8 +46,10 @@ _SILENT_NS = 2_000_000_000  # behind the others: such a camera's captures are no
 _SHOWN_EVERY_S = 0.4  # largest mean time between two scores of what a held-out camera is shown
 _FULL_EVERY = 4  # one in this many scores of what is shown has all metrics, the others only PSNR
 # This thread may use a share of the cores' time, refilling an allowance of CPU seconds. What is shown may use
-# its part of that share; publications are scored only while the reserve, CPU seconds, is left for it.
+# its part of that share; publications are scored only while the reserve, CPU seconds, is left for it. The first
+# allowance is small: in its first seconds the field needs the cores.
 _SHARE, _SHOWN_SHARE, _ALLOWANCE_S, _RESERVE_S = 0.03, 0.02, 1.0, 0.1
+_FIRST_ALLOWANCE_S = 0.2
 # Of held-out cameras that move, all frames so far are scored again and again, 30 ms each at 320 x 240, with this share
 # more. One publication, whose metrics cost some ten times that, is scored for so many of them.
 _LOOK_BACK_SHARE, _LOOKS_A_SCORE = 0.03, 12
@@ -83,7 +85,8 @@ class ScoringThread:
         self._left_out_ns = 0  # instant of the newest publication that went by unseen
         self._next_shown_ns = dict.fromkeys(self._held_out, 0)
         self._shown_count, self._shown_cost_s = 0, np.inf  # cost of the last score of what is shown, CPU s
-        self._allowance_s, self._asked_s, self._used_s = _ALLOWANCE_S, time.monotonic(), 0.0
+        self._allowance_s = min(_FIRST_ALLOWANCE_S, _ALLOWANCE_S)
+        self._asked_s, self._used_s = time.monotonic(), 0.0
         self._new_frames: deque[Frame] = deque(maxlen=_WAITING_FRAMES)
         self._new_publications: deque[tuple[Publication, Snapshot, list[View]]] = deque()
         self._wake = threading.Condition()
@@ -99,6 +102,13 @@ class ScoringThread:
         self._looked_at = 0  # frames of ``so_far`` scored so far
         self._ends_s = np.inf  # when ``stop`` waits no longer
         self._thread = threading.Thread(target=self._main, name="scoring", daemon=True)
+
+    def load(self) -> None:
+        """Load what the metrics need: for LPIPS two seconds, in which Python runs little else."""
+        try:
+            self._scorer.warm_up()
+        except Exception:  # it costs scores, not the server
+            log.exception("a metric could not be loaded")
 
     def start(self) -> None:
         self._thread.start()
@@ -136,11 +146,6 @@ class ScoringThread:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         except (OSError, AttributeError):
             log.debug("thread priority cannot be lowered here")
-        try:
-            self._scorer.warm_up()
-        except Exception:  # it costs scores, not the thread
-            log.exception("a metric could not be loaded")
-        # Loading is not charged: the allowance would be gone for half a minute.
         self._asked_s, self._used_s = time.monotonic(), time.thread_time()
         while True:
             with self._wake:

@@ -201,6 +201,7 @@ class EdgeServer:
         """Serve until stopped, then write everything down. Raises what ended the update loop, if it
         failed; TransportError if a port would be open to others."""
         self.state.warnings = self._warnings()
+        self.scoring.load()  # before frames come: they would wait for it
         grpc = GrpcThread(
             self.options.transport, self.options.listen, self.ingest, self.clock, self.state, self._stopping
         )

@@ -97,6 +97,16 @@ class StillField(SteppedField[SplatSnapshot]):
             self.dropped += lost
         return loss, pixels, pairs
 
+    def error(self) -> float:
+        """Mean squared error of the views that were taken in, as ``train_step`` has it."""
+        with self._lock:
+            square, pixels, gaussians = 0.0, 0, self.cloud.gaussians()
+            for view in self._asked:
+                self._raster.project_and_bin(self._cams[[view]], gaussians)
+                losses = self._compare(view)
+                square, pixels = square + float(losses[:, 0].sum()), pixels + TILE * TILE * len(losses)
+        return square / (3 * max(pixels, 1))
+
     def set_params(self, params: NDArray[np.float32]) -> None:
         """Replace the parameters, float32 (N, P), of all Gaussians."""
         with self._lock:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fidelity.so_far import MOST
@@ -250,3 +251,15 @@ def test_a_held_out_camera_that_stands_still_has_no_earlier_places() -> None:
     thread._recent.append((_publication(0, 0), Brightness(0)))
     thread._look_back(whole=True)
     assert thread.so_far is None
+
+
+def test_a_metric_that_cannot_be_loaded_costs_its_scores_alone(caplog: pytest.LogCaptureFixture) -> None:
+    class Broken(Scorer):
+        def warm_up(self) -> None:
+            raise OSError("no such weights")
+
+    thread = ScoringThread(["cam00"], Broken(), lambda *_: None, lambda *_: None)
+    thread.load()
+    assert "a metric could not be loaded" in caplog.text
+    thread.start()
+    thread.stop()

@@ -94,7 +94,11 @@ class Pool:
     def run(self, kernel: Callable[..., Any], *args: Any) -> None:
         """Run ``kernel`` on all workers and wait for them; raises what a worker raised. RuntimeError: the
         pool is closed."""
-        job = _Job(kernel, args, self._engaged)
+        engaged = self._engaged
+        if engaged == 1 < self.threads and not self._closed:
+            kernel(np.zeros(COUNTER, np.int64), 0, *args)
+            return
+        job = _Job(kernel, args, engaged)
         with self._turn:
             if self._closed:
                 raise RuntimeError("the pool is closed")
@@ -112,7 +116,9 @@ class Pool:
 
     def spare(self, count: int) -> None:
         """Leave so many workers idle in the jobs to come, but for one: others compute beside them, and two threads that
-        share a core wait for each other."""
+        share a core wait for each other. Where one is left, callers compute themselves, at their own priority and
+        without waiting for each other: to wake a worker takes as long as a small kernel, longer beside busy threads.
+        """
         self._engaged = max(self.threads - count, 1)
 
     def close(self) -> None:
@@ -136,7 +142,7 @@ class Pool:
             job.wait()
 
     def _serve(self, worker: int) -> None:
-        _lower_priority(self.nice)
+        lower_priority(self.nice)
         while (job := self._inboxes[worker].get()) is not None:
             if not job.finished[worker]:
                 self._work(job, worker)
@@ -188,8 +194,9 @@ def shared_pool(threads: int | None = None, nice: int = 0) -> Pool:
         return _shared[threads, nice]
 
 
-def _lower_priority(nice: int) -> None:
-    """On Linux a thread's priority is its own; elsewhere this would slow the whole process."""
+def lower_priority(nice: int) -> None:
+    """Lower the calling thread's priority to ``nice``. On Linux a thread's priority is its own; elsewhere this would
+    slow the whole process, and nothing is done."""
     if nice <= 0 or os.uname().sysname != "Linux":
         return
     try:

@@ -161,6 +161,8 @@ class LayeredField:
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
         pace = StepBudget(budget, self.now)
+        beside = budget.seconds is not None
+        self.pool.spare(1 if beside and self.layered else 0)  # this thread computes, too
         for view in views:
             if not self._has_seen(view):
                 check_view(view)
@@ -187,13 +189,11 @@ class LayeredField:
                 return FitReport(0, pace.elapsed_s(), 0.0, 0, 0, note="the cameras' exposures are equalized")
             log.info("layers begin: the plates of %d cameras are known", len(self.cameras))
         tracker = self.tracker or self._begin_layers()
-        beside = budget.seconds is not None
         self.supervision.compare(self.cameras, self.observations, beside)
         self._find_rows()
         parameters = self.still.adam_parameters(tuned.STEP_PROGRESS)
         steps = rays = samples = 0
         follows = budget.seconds is None or self.supervision.layers_shown
-        self.pool.spare(1 if beside and follows and self.static.at_work else 0)  # this thread computes, too
         if budget.seconds is not None and not follows:
             self.static.wait(budget.seconds - pace.elapsed_s())  # it has the processor: nobody sees yet what moves
         else:
@@ -304,6 +304,7 @@ class LayeredField:
         if self.supervision.with_depth:  # virtual ones
             self.still.view_store.forget_views()
         self.layered = False
+        self.pool.spare(0)
         self._published, self.tracker, self.observations = None, None, Observations()
         self.cameras, self.supervision = {}, StaticSupervision(self.static, self.part_s, self.depth_network)
 
@@ -338,7 +339,7 @@ class LayeredField:
             camera = self._move_camera(view)
         refused = self.refused | {view.camera}
         may_refuse = self.tracker is not None and 4 * len(refused) <= len(self.cameras)
-        foreground = camera.plate.take(view.image, may_refuse)
+        foreground = camera.plate.take(view.image, may_refuse, by_itself=self.supervision.is_unsure)
         if camera.shows_turned(view, foreground, self.observations.usual_share):
             foreground = None
             if camera.was_turned:

@@ -27,7 +27,7 @@ from freshfield.geometry import Pinhole
 Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
-VERSION = 10
+VERSION = 11
 COUNTERS = ("layered", "origin_ns")  # of the field
 # Of its supervision.
 SUPERVISED = ("plates_s", "fine_s", "fine", "exposure_rounds", "anew", "with_depth", "early", "plain", "layers_shown")

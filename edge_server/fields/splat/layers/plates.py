@@ -94,10 +94,14 @@ class Plate:
         """Multiply this camera's assumed exposure by ``ratio``, float32 (3,), one factor a channel."""
         self.gain = self.gain * ratio
 
-    def take(self, image: NDArray[np.uint8], may_refuse: bool = False) -> NDArray[np.bool_] | None:
+    def take(
+        self, image: NDArray[np.uint8], may_refuse: bool = False, by_itself: bool = False
+    ) -> NDArray[np.bool_] | None:
         """Take in a frame, uint8 (H, W, 3). Returns its foreground, bool (H, W).
 
         may_refuse: a frame that is nearly all foreground changes nothing; None is returned for it.
+        by_itself: what the fields show does not say what is background. Fields that were learned from plates that are
+            not certain yet would confirm what is wrong with these.
         """
         before = dict(vars(self))
         self._follow_exposure(image)
@@ -123,7 +127,9 @@ class Plate:
                 vars(self).update(before)  # what ``_scale`` has replaced
                 return None
             changing = clean_mask(self._flags & np.uint8(CHANGING)) if self.count > 1 else foreground
-            votes = (changing == 0) | ((self._flags & LIKE_STATIC > 0) & (foreground == 0))
+            votes = changing == 0
+            if not by_itself:
+                votes |= (self._flags & LIKE_STATIC > 0) & (foreground == 0)
         self.pool.run(
             vote,
             image,
@@ -131,7 +137,7 @@ class Plate:
             self._difference,
             foreground,
             votes.astype(np.uint8),
-            self._held,
+            np.zeros_like(self._held) if by_itself else self._held,
             self.arrays,
             self._static,
             self._has_static,

@@ -14,7 +14,10 @@ EVIDENCE_S = 0.8  # largest age of a frame from which motion is estimated
 RENDERINGS_A_FIT = 2  # renderings of the still field that plates take over in a fit
 # Steps after which the still field is shown that began early: what it replaces has learned what moves as background.
 EARLY_SHOWN_AFTER = 200
-SHOWN_AFTER = 400  # steps, after which a still field that began anew is better than what was shown before
+SHOWN_AFTER = 400  # steps, after which a still field is shown that began anew without anything to compare it with
+# Else it is shown once it fits the plates as well as what it replaces, or has had so many steps; weight of a step in
+# the running mean of its error.
+SHOWN_AT_LATEST, ERROR_RATE = 1200, 0.06
 MOST_PIXELS = 400_000  # of one image of every camera together, if 15 frames a second of each are taken in
 LEAST_SHARE = 0.01  # of a picture that counts as moving: which of calmer cameras is taken in, a frame's age decides
 FRAMES_KNOWN = 256  # instants of earlier frames that are remembered for each camera

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Budget, Rendering, View
 from edge_server.fields.common.field_state import give_attributes, take_attributes
+from edge_server.fields.common.threads.thread_pool import lower_priority
 from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import Gaussians
@@ -25,7 +26,10 @@ from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.snapshot import SplatSnapshot
 
 Arrays = dict[str, NDArray]
-_KEPT = ("rounds", "_rounds_wanted", "_rate", "_round_step", "grows_until", "shown_after")  # of a state
+_KEPT = (  # of a state
+    *("rounds", "_rounds_wanted", "_rate", "_round_step", "grows_until"),
+    *("shown_after", "_better_than", "_error"),
+)
 
 
 class PlateImage(NamedTuple):
@@ -57,11 +61,12 @@ class StaticLayer:
     def forget(self) -> None:
         """Forget the plates and the schedule; the field stays as it is."""
         self.stop()
-        self.field.pool.spare(0)  # see ``LayeredField.fit``
         self.shown: SplatSnapshot | None = None
         self.rendered: dict[str, tuple[int, Rendering]] = {}
         self.grows_until = tuned.SCHEDULE  # step
         self.shown_after = tuned.SHOWN_AFTER  # steps
+        self._better_than = 1.0  # mean squared error of what is shown meanwhile, of full scale
+        self._error = 1.0  # that of the latest steps
         self._learned: dict[str, tuple[NDArray, NDArray]] = {}  # camera -> plate, known: as learned
         self._begin_rounds(tuned.ROUNDS_FIRST, tuned.RATE_FIRST)
 
@@ -84,14 +89,20 @@ class StaticLayer:
     @property
     def ready(self) -> bool:
         """Whether the field is good enough to be shown, and to say what lies where plates are unknown."""
-        return self.shown is not None and self.shown.step >= self.shown_after
+        if self.shown is None or self.shown.step < self.shown_after:
+            return False
+        return self._error <= self._better_than or self.shown.step >= tuned.SHOWN_AT_LATEST
 
     # --- plates -------------------------------------------------------------------------------
 
-    def begin(self, plates: Sequence[PlateImage], shown_after: int | None = None) -> None:
-        """``learn`` the first plates, in a schedule that begins now. shown_after: steps after which the field is better
-        than what was shown before; None: SHOWN_AFTER."""
+    def begin(self, plates: Sequence[PlateImage], shown_after: int | None = None, better_than: float = 1.0) -> None:
+        """``learn`` the first plates, in a schedule that begins now.
+
+        shown_after: steps after which the field may be shown; None: SHOWN_AFTER.
+        better_than: mean squared error that it must have reached then, or have had SHOWN_AT_LATEST steps.
+        """
         self.learn(plates)
+        self._better_than, self._error = better_than, 1.0
         self.shown_after = tuned.SHOWN_AFTER if shown_after is None else shown_after
         self.grows_until = self.field.step + tuned.SCHEDULE
         self._begin_rounds(tuned.ROUNDS_FIRST, tuned.RATE_FIRST)
@@ -143,6 +154,7 @@ class StaticLayer:
             left = self.grows_until - self.field.step
             progress = 1.0 - left / tuned.SCHEDULE if left > 0 else self._round_step / tuned.ROUND
             loss, seen, pairs = self.field.train_step(progress, grow=left > 0)
+            self._error += (loss - self._error) * tuned.ERROR_RATE
             if left <= 0:
                 self._finish_round_step()
             losses.append(loss)
@@ -207,6 +219,7 @@ class StaticLayer:
             raise failure
 
     def _main(self, begin: Callable[[], None], views: Sequence[View]) -> None:
+        lower_priority(self.field.pool.nice)  # on few cores this thread computes itself
         try:
             begin()
             rendered_step = self.field.step

@@ -62,6 +62,11 @@ class StaticSupervision:
         self.earlier: SplatSnapshot | None = None
         self.layers_shown = False
 
+    @property
+    def is_unsure(self) -> bool:
+        """Whether the static field has learned from plates that were not certain, and no depth."""
+        return self.early and not self.with_depth
+
     def begin_again(self) -> None:
         """Forget how the static field has begun; plates stay."""
         self.exposure_rounds = 0
@@ -239,7 +244,7 @@ class StaticSupervision:
                 self.static.refine(self._plates(cameras))
             self.plates_s = now_s
         due = now_s - self.plates_s >= tuned.PLATES_EVERY_S
-        if due and self.early and not (self.anew or self.with_depth):  # more of the plates is known
+        if due and self.is_unsure and not self.anew:  # more of the plates is known
             self.plates_s = now_s
             self.static.learn(self._plates(cameras))
         if beside and self.static.training:
@@ -271,6 +276,7 @@ class StaticSupervision:
         """Begin with the plates, and their depth where it is known, from nothing: a field that has begun early knows
         people as background, and going on with it keeps them."""
         static, self.anew = self.static, False
+        self._keep_showing()  # again: with a thread, ``to_show`` has seen a field that is ready meanwhile
         static.forget()
         shown_after = self._shown_after()
         if self.with_depth:
@@ -286,8 +292,10 @@ class StaticSupervision:
             images = self._plates(cameras)
 
             def begin() -> None:
+                static.learn(images)
+                better_than = static.field.error()
                 static.field.begin_anew(None)
-                static.begin(images, shown_after)
+                static.begin(images, shown_after, better_than)
 
         if beside:
             static.train_beside(begin, [camera.view for camera in cameras.values()])
@@ -295,13 +303,13 @@ class StaticSupervision:
             begin()
 
     def _shown_after(self) -> int:
-        """Steps after which a field that begins anew is better than what is shown: at most as many as that has had,
-        which on a busy machine are few."""
-        least, most = tuned.EARLY_SHOWN_AFTER, tuned.SHOWN_AFTER
-        if self.with_depth:
-            from edge_server.fields.splat.layers.depth.settings import SHOWN_AFTER
+        """Steps after which a field that begins anew may be shown. With depth it is better then than what is shown: at
+        most as many as that has had, which on a busy machine are few."""
+        if not self.with_depth:
+            return tuned.EARLY_SHOWN_AFTER
+        from edge_server.fields.splat.layers.depth.settings import SHOWN_AFTER
 
-            least, most = SHOWN_AFTER
+        least, most = SHOWN_AFTER
         if self.early or self.earlier is None:
             return least
         return min(max(self.earlier.step, least), most)

@@ -71,6 +71,25 @@ def test_workers_that_are_spared_stay_idle(nice: int) -> None:
 
 
 @either_priority
+def test_where_one_worker_is_left_callers_compute_themselves_side_by_side(nice: int) -> None:
+    pool, together, seen = Pool(2, nice), threading.Barrier(2), list[tuple[int, int]]()
+    pool.spare(1)
+
+    def meet(counter, worker):
+        together.wait(10)
+        seen.append((worker, threading.get_ident()))
+
+    caller = threading.Thread(target=pool.run, args=(meet,))
+    caller.start()
+    pool.run(meet)
+    caller.join(10)
+    assert sorted(seen) == sorted([(0, caller.ident), (0, threading.get_ident())])
+    pool.close()
+    with pytest.raises(RuntimeError, match="closed"):
+        pool.run(meet)
+
+
+@either_priority
 def test_an_error_reaches_the_caller_after_all_are_done_and_the_pool_lives_on(nice: int) -> None:
     pool, done = Pool(2, nice), []
 

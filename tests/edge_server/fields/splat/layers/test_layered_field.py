@@ -17,11 +17,13 @@ import pytest
 from msgspec import structs
 
 from edge_server.fields import Budget, View
+from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.registry import make_field
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.layers import settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.layers.layered_state import VERSION
+from edge_server.fields.splat.layers.plates import Plate
 from edge_server.fields.splat.layers.static_layer import StaticLayer
 from edge_server.fields.splat.settings import SplatSettings
 from tests.edge_server.fields.scenes import picture, psnr, ring
@@ -377,23 +379,18 @@ def test_in_seconds_what_moves_is_followed_once_anything_is_shown_of_it() -> Non
     field.static.stop()
 
 
-def test_the_pool_has_all_its_workers_but_while_motion_is_followed_beside_training(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    field, spared = LayeredField(SMALL), []
+def test_one_worker_is_left_to_the_calling_thread_where_budgets_are_in_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    field, spared = LayeredField(SMALL), list[int]()
     spare = field.pool.spare
     monkeypatch.setattr(field.pool, "spare", lambda count: (spared.append(count), spare(count)))
-    _run(field, range(17), steps=5)
-    spared.clear()
-    for frame in range(17, 400):
-        field.fit([_frame(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
-        if 1 in spared:
-            break
-    assert spared[0] == 0 and spared[-1] == 1, "waiting, and following"
-    field.static.stop()
-    monkeypatch.setattr(field.supervision, "compare", lambda *_: None)  # nothing trains any more
-    field.fit([_frame(k, frame + 1, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
-    assert spared[-1] == 0
+    frames = [_frame(k, 0, True) for k in range(len(CAMERAS))]
+    for budget in (Budget(steps=1), Budget(seconds=0.02), Budget(steps=1)):
+        field.fit(frames, budget)
+    assert spared == [0, 1, 0]
+    field.fit(frames, Budget(seconds=0.02))
+    for turned in _turning():
+        field.fit([turned], Budget(seconds=0.02))
+    assert not field.layered and spared[-1] == 0
 
 
 @pytest.mark.parametrize(("shown_after", "anew_s"), [(20, 1.2), (10_000, 2.0)])
@@ -409,7 +406,47 @@ def test_in_seconds_the_still_field_begins_anew_after_it_was_shown_or_late(
         field.fit([_frame(k, frame, False) for k in range(len(CAMERAS))], Budget(seconds=0.02))
         frame += 1
     assert field.observations.newest_s == pytest.approx(anew_s, abs=FRAME_S)
+    while field.supervision.anew:  # the thread is at work on what it knows
+        field.fit([_frame(k, frame, False) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+        frame += 1
+    assert field.supervision.earlier is not None, "what is shown stays"
     field.static.stop()
+
+
+def test_a_still_field_that_began_anew_is_shown_once_it_fits_as_well_as_what_it_replaces(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    field = LayeredField(SMALL)
+    _run(field, range(24), moves=False, steps=35)
+    static, plates = field.static, [camera.plate_image(fine=False) for camera in field.cameras.values()]
+    error, step = field.still.error(), field.still.step
+    assert 0.0 < error < 0.01 and field.still.step == step
+    monkeypatch.setattr(settings, "SHOWN_AT_LATEST", 90)
+    ready = {}
+    for better_than in (1.0, error, 1e-9):
+        static.forget()
+        field.still.begin_anew(None)
+        static.begin(plates, 20, better_than)
+        while not static.ready:
+            static.train(StepBudget(Budget(steps=10)))
+            static.publish()
+        ready[better_than] = static.shown.step
+    assert ready[1.0] == 20 and ready[error] > 20 and ready[1e-9] == 90
+
+
+def test_plates_ask_no_field_before_they_are_certain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(settings, "EARLY_S", 0.6)
+    field, asked = LayeredField(SMALL), dict[int, bool]()
+    take = Plate.take
+
+    def told(self: Plate, image: Any, may_refuse: bool = False, by_itself: bool = False) -> Any:
+        asked[self.count] = by_itself
+        return take(self, image, may_refuse, by_itself)
+
+    monkeypatch.setattr(Plate, "take", told)
+    _run(field, range(20), steps=1)
+    first, last = round(0.6 / FRAME_S) + 1, round(1.0 / FRAME_S)
+    assert [frame for frame, by_itself in asked.items() if by_itself] == list(range(first, last + 1))
 
 
 def test_a_camera_that_shows_something_else_is_refused_and_changes_nothing() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.splat.layers.plates import FinePlate, Plate, clean_mask, plain_share
@@ -29,6 +30,13 @@ def _seen(frames: int = 12) -> Plate:
     for _ in range(frames):
         assert not plate.take(_frame()).any()
     return plate
+
+
+def _opaque_at(left: int, right: int) -> NDArray[np.float32]:
+    """The opacity of a moving set that shows the body between two columns."""
+    opacity = np.zeros((SIZE, SIZE), np.float32)
+    opacity[BODY, left:right] = 1.0
+    return opacity
 
 
 def test_a_body_that_passes_is_foreground_and_leaves_no_trace() -> None:
@@ -62,12 +70,25 @@ def test_a_body_that_stays_becomes_the_plate_unless_it_is_held() -> None:
             image = _frame(20)
             foreground = plate.take(image)
             if held:
-                opacity = np.zeros((SIZE, SIZE), np.float32)
-                opacity[BODY, 20:30] = 1.0
-                plate.exclude_explained(image, image / np.float32(255.0), opacity)
+                plate.exclude_explained(image, image / np.float32(255.0), _opaque_at(20, 30))
         assert foreground[BODY, 20:30].all() == held
         expected = WALL[20:28, 22:28] if held else np.full((8, 6, 3), (250, 30, 30))
         np.testing.assert_allclose(plate.picture[20:28, 22:28], expected, atol=1.0)
+
+
+@pytest.mark.parametrize("by_itself", [False, True])
+def test_a_plate_by_itself_asks_no_field_what_is_background(by_itself: bool) -> None:
+    """Fields learned from plates that are not certain would confirm what is wrong with these."""
+    plate = _seen()
+    for k in range(20):
+        image = _frame(20)  # a body that stays
+        image[:, 40:] = (40, 220)[k % 2]  # a curtain that never holds still
+        plate.fill_unknown(image / np.float32(255.0))
+        plate.exclude_explained(image, image / np.float32(255.0), _opaque_at(20, 30))
+        plate.take(image, by_itself=by_itself)
+    body, curtain = plate.picture[20:28, 22:28], plate.arrays.means[:2, 20:28, 45:, 0]
+    np.testing.assert_allclose(body, np.full((8, 6, 3), (250, 30, 30)) if by_itself else WALL[20:28, 22:28], atol=1.0)
+    assert (np.isclose(curtain, 40, atol=1) | np.isclose(curtain, 220, atol=1)).any() != by_itself
 
 
 def test_a_change_of_exposure_is_no_foreground() -> None:
