@@ -221,9 +221,8 @@ def test_hard_footage_leaves_a_finite_field_that_shows_what_it_learned(spoil: Sp
         assert np.linalg.norm(known.shift_m) <= field._poses.most_m + 1e-9
     refined_db = score_views(field, footage[::9], Scorer())[0].psnr_refined_db
     assert refined_db is not None and refined_db > least_db
-    field.reset()  # what comes afterwards is learned as ever
-    field.fit(WALK[::2], Budget(steps=100))
-    assert score_views(field, WALK[::9], Scorer())[0].psnr_db > 17.0
+    field.reset()
+    same_state(field, ScanField(replace_settings(2)))  # what comes afterwards is learned as ever
 
 
 @pytest.mark.stability

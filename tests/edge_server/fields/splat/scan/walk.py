@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from tests.edge_server.fields.scenes import seen
 LENS = Pinhole.from_fov(48, 40, 55.0)
 
 
+@cache
 def walk(count: int = 80, depth: bool = True) -> list[View]:
     """Frames of an arc around the scene, 10 a second."""
     views, blank = [], np.zeros((LENS.height, LENS.width), np.float32)
