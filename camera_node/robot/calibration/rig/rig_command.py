@@ -131,7 +131,9 @@ def _from_target(args: argparse.Namespace) -> Any:
         lenses = {}
         for camera, seen in views.corners.items():
             try:
-                lenses[camera] = calibrate_lens(seen, views.sizes.get(camera, (0, 0)), {}).pinhole
+                lenses[camera] = calibrate_lens(
+                    seen, views.sizes.get(camera, (0, 0)), views.unused.get(camera, {})
+                ).pinhole
             except CalibrationError as error:
                 raise CalibrationError(f"{camera}: {error}; or give its intrinsics: --lens FILE") from None
     else:

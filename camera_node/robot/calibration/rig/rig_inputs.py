@@ -25,11 +25,11 @@ VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 @dataclass
 class RigViews:
     """What was seen. corners: camera -> moment -> corners. sizes: width and height of each camera's images. unused:
-    reason for each image without corners."""
+    camera -> reason for each image without corners."""
 
     corners: dict[str, dict[str, Corners]] = field(default_factory=dict)
     sizes: dict[str, tuple[int, int]] = field(default_factory=dict)
-    unused: dict[str, str] = field(default_factory=dict)
+    unused: dict[str, dict[str, str]] = field(default_factory=dict)
 
 
 def read_folder(folder: Path, target: Target, progress: Callable[[int], None]) -> RigViews:
@@ -51,13 +51,13 @@ def read_folder(folder: Path, target: Target, progress: Callable[[int], None]) -
         if entry.is_file():
             views.corners[name], views.sizes[name] = _of_video(entry, target, lambda: progress(next(done)))
             continue
-        found, unused, size = find_corners(list_images(entry), target, None, lambda _: progress(next(done)))
+        found, views.unused[name], size = find_corners(list_images(entry), target, None, lambda _: progress(next(done)))
         views.corners[name] = {Path(file).stem: corners for file, corners in found.items()}
         views.sizes[name] = size
-        views.unused |= {f"{name}/{file}": why for file, why in unused.items()}
     for name, seen in views.corners.items():
         if not seen:
-            raise CalibrationError(f"{folder}: {name} never sees the target {target.name}")
+            why = next(iter(views.unused.get(name, {}).values()), f"{target.name} not found")
+            raise CalibrationError(f"{folder}: {name} never sees the target: {why}")
     return views
 
 
