@@ -55,7 +55,13 @@ _ALONE = (
     "edge_server/live/test_scoring_thread.py",
     "edge_server/live/test_server.py",
     "edge_server/live/test_server_learned.py",
-    "edge_server/page",
+    "edge_server/page/splats/test_stream.py",
+    "edge_server/page/test_access_guard.py",
+    "edge_server/page/test_browser.py",
+    "edge_server/page/test_foxglove_live.py",
+    "edge_server/page/test_network_control.py",
+    "edge_server/page/test_page.py",
+    "edge_server/page/test_preferences.py",
 )
 
 
@@ -82,8 +88,21 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--faults", metavar="K,...", help="only these faults of the seeds of -m chaos, or none [all]")
 
 
+def _is_alone(file: Path) -> bool:
+    return any(file.is_relative_to(ROOT / "tests" / place) for place in _ALONE)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Both passes of ``make test`` import their own files alone: all of them take ten seconds."""
+    asked = config.getoption("markexpr")
+    if not asked.endswith("side_by_side") or not collection_path.name.startswith("test_"):
+        return None
+    if asked.endswith("not side_by_side"):
+        return None if _is_alone(collection_path) or "mark.alone" in collection_path.read_text() else True
+    return _is_alone(collection_path) or None
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    tests = ROOT / "tests"
     part, parts = map(int, config.getoption("--slow-part").split("/"))
     slow = sorted(item.nodeid for item in items if item.get_closest_marker("slow") is not None)
     left_out = set(slow) - set(slow[part - 1 :: parts])
@@ -91,8 +110,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=[item for item in items if item.nodeid in left_out])
         items[:] = [item for item in items if item.nodeid not in left_out]
     for item in items:
-        alone = any(item.path.is_relative_to(tests / place) for place in _ALONE)
-        if not alone and item.get_closest_marker("alone") is None:
+        if not _is_alone(item.path) and item.get_closest_marker("alone") is None:
             item.add_marker("side_by_side")
 
 

@@ -58,8 +58,9 @@ def test_ages_are_plotted(tmp_path: Path) -> None:
 
 
 def test_a_policy_of_ones_own_is_tried(tmp_path: Path) -> None:
-    (tmp_path / "small.yaml").write_text(SMALL)
-    lines = start("own_policy.py", tmp_path / "small.yaml", 4).splitlines()
+    quick = "field: splat, field_options: {gaussians: 128, start: 96, seed_cells: 8}"
+    (tmp_path / "small.yaml").write_text(SMALL.replace("field: ngp", quick))
+    lines = start("own_policy.py", tmp_path / "small.yaml", 2).splitlines()
     assert [line.split(":")[0] for line in lines] == ["all", "youngest-half"]
 
 

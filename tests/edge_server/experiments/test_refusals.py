@@ -55,7 +55,7 @@ REFUSED = {
         ("mat --channel nowhere.yaml", "nowhere.yaml"),
         ("mat --channel sms", "expected one of ideal, ch5"),
         ("metrics --channel ch5", "--channel is for mat"),
-        ("preferences --scene tower", "its cameras look outward"),
+        ("preferences --scene tower --jobs 1", "its cameras look outward"),
         ("ppo-wait --scene tower", "scenes of its own"),
         ("mat --case room", "--case is for ppo-select"),
         ("mat --episodes 3", "--episodes is for ppo-select"),

@@ -123,8 +123,8 @@ def _unharmed(name: str, updates: int, warm: bool = True) -> float:
 
 # Also in the very first update: before anything is known, and where the scene's box is found. Networks take ten times
 # as long as splat, and share what survives: ngp alone meets one of each kind.
-CASES = [("splat", poison, warm) for poison in PICTURES + POSES for warm in (True, False)]
-CASES += [("ngp", _noise, True), ("ngp", _in_millimeters, False)]
+CASES: list[Any] = [("splat", poison, warm) for poison in PICTURES + POSES for warm in (True, False)]
+CASES += [pytest.param("ngp", *case, marks=pytest.mark.slow) for case in ((_noise, True), (_in_millimeters, False))]
 
 
 @pytest.mark.parametrize(("name", "poison", "warm"), CASES)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -11,11 +13,15 @@ from edge_server.surface.kernels.fuse import SIDE
 from edge_server.surface.mesh import extract_mesh, remove_small_components
 from edge_server.surface.sdf import fit_sdf, gradient_norm, sample_grid
 from edge_server.surface.settings import SdfSettings
-from edge_server.surface.volume import Grid
+from edge_server.surface.volume import Grid, Volume
 from tests.edge_server.surface.ball import RADIUS_M, ball_maps, voxel_points
 
 GRID = Grid((-0.13,) * 3, (0.13,) * 3, 0.008, 0.032)
-SHORT = SdfSettings(levels=2, steps=60, points=4000)
+
+
+@cache
+def fitted(eikonal: float) -> Volume:
+    return fit_sdf(GRID, ball_maps(16), settings=SdfSettings(levels=2, steps=60, points=4000, eikonal=eikonal))
 
 
 def exact(volume) -> np.ndarray:
@@ -24,7 +30,7 @@ def exact(volume) -> np.ndarray:
 
 def test_the_distances_are_those_of_the_ball():
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
-    volume = fit_sdf(GRID, ball_maps(16), settings=SHORT)
+    volume = fitted(0.3)
     truth = exact(volume)
     near = np.abs(truth) < 0.01
     assert np.abs(volume.blocks.distance - truth)[near].mean() < 0.0015
@@ -34,10 +40,9 @@ def test_the_distances_are_those_of_the_ball():
 
 
 def test_the_eikonal_term_makes_it_a_distance():
-    maps = ball_maps(12)
     steep = []
     for weight in (0.0, 0.3):
-        volume = fit_sdf(GRID, maps, settings=SdfSettings(levels=2, steps=60, points=4000, eikonal=weight))
+        volume = fitted(weight)
         distance = volume.blocks.distance.reshape(-1, SIDE, SIDE, SIDE)
         known = (np.abs(exact(volume)) < 0.02).reshape(distance.shape)[:, 1:-1, 1:-1, 1:-1]
         parts = [np.gradient(distance, GRID.voxel_m, axis=k)[:, 1:-1, 1:-1, 1:-1] for k in (1, 2, 3)]
