@@ -125,6 +125,7 @@ def test_losses_of_a_busy_link_need_outcomes(tmp_path: Path) -> None:
     assert "outcome" in inferred.warnings[0] and inferred.parameters["loss_2"].value > 0.5
 
 
+@pytest.mark.slow  # 9 s; the tests above ask that the intervals of single recordings hold it
 def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
     """20 recordings of four parameters: 95 % of 80 is 76, and fewer than 69 has a chance of 1 in 500."""
     inside = 0

@@ -54,6 +54,27 @@ def _run(field: Any, frames: range, moves: bool = True, steps: int = 30) -> None
         field.fit([_frame(k, frame, moves) for k in range(len(CAMERAS))], Budget(steps=steps))
 
 
+@cache
+def _moving() -> LayeredField:
+    field = LayeredField(SMALL)
+    _run(field, range(42))
+    return field
+
+
+@cache
+def _plates_known(steps: int) -> dict[str, np.ndarray]:
+    """The state of a field that has just begun its layers."""
+    field = LayeredField(SMALL)
+    _run(field, range(17), steps=steps)
+    return field.state()
+
+
+def _resumed(state: dict[str, np.ndarray] | None = None) -> LayeredField:
+    field = LayeredField(SMALL)
+    field.load_state(_moving().state() if state is None else state)
+    return field
+
+
 def _score(shown: Any, instant_s: float, moves: bool = True) -> float:
     truth = picture(HELD.intrinsics, HELD.camera_to_world, _ball_m(instant_s, moves))
     return psnr(shown.render(HELD.camera_to_world, HELD.intrinsics).color, truth / 255.0)
@@ -153,8 +174,7 @@ def test_layers_begin_before_plates_are_certain_and_the_still_field_anew_when_th
     assert field.learning == "learning the background: 0.9 of 2 s"
     _run(field, range(14, 30), steps=10)
     assert len(known) > 2 and known[-1] >= known[0] and field.static.ready
-    resumed, score = LayeredField(SMALL), _score(field.snapshot(), 29 * FRAME_S)
-    resumed.load_state(field.state())
+    resumed, score = _resumed(field.state()), _score(field.snapshot(), 29 * FRAME_S)
     for each in (field, resumed):
         _run(each, range(30, 34), steps=10)
     same_state(field, resumed)
@@ -202,13 +222,6 @@ def test_nothing_moves_where_nothing_moves() -> None:
     assert _score(field.snapshot(), 2.0, moves=False) > 22.0
 
 
-@cache
-def _moving() -> LayeredField:
-    field = LayeredField(SMALL)
-    _run(field, range(42))
-    return field
-
-
 def test_what_moves_is_shown_at_any_instant() -> None:
     field = _moving()
     assert field.moving is not None and field.moving.alive
@@ -224,8 +237,7 @@ def test_what_moves_is_shown_at_any_instant() -> None:
 
 
 def test_a_snapshot_stays_as_it_is() -> None:
-    field = LayeredField(SMALL)
-    field.load_state(_moving().state())
+    field = _resumed()
     shown = field.snapshot()
     before = shown.render(HELD.camera_to_world, HELD.intrinsics).color
     _run(field, range(42, 45))
@@ -234,11 +246,10 @@ def test_a_snapshot_stays_as_it_is() -> None:
 
 
 def test_a_state_continues_bit_for_bit() -> None:
-    field, other = LayeredField(SMALL), LayeredField(SMALL)
-    field.load_state(_moving().state())
+    field = _resumed()
     same_state(field, _moving())
     _run(field, range(42, 44))
-    other.load_state(field.state())
+    other = _resumed(field.state())
     for one in (field, other):
         _run(one, range(44, 50))
     same_state(field, other)
@@ -248,10 +259,10 @@ def test_a_state_continues_bit_for_bit() -> None:
 
 def test_a_state_of_a_field_that_is_not_shown_yet_continues_bit_for_bit() -> None:
     """What it shows meanwhile, too."""
-    field, other = LayeredField(SMALL), LayeredField(SMALL)
+    field = LayeredField(SMALL)
     _run(field, range(17), steps=5)
     assert field.supervision.earlier is not None and not field.supervision.layers_shown
-    other.load_state(field.state())
+    other = _resumed(_plates_known(5))
     for frame in range(17, 45):
         for one in (field, other):
             _run(one, range(frame, frame + 1), steps=5)
@@ -259,15 +270,12 @@ def test_a_state_of_a_field_that_is_not_shown_yet_continues_bit_for_bit() -> Non
         np.testing.assert_array_equal(one, two)
     assert field.supervision.layers_shown
     same_state(field, other)
-    damaged = LayeredField(SMALL)
-    _run(damaged, range(17), steps=5)
     with pytest.raises(ValueError, match="what was shown before layers are"):
-        damaged.load_state({**damaged.state(), "earlier": np.zeros((5, 3), np.float32)})
+        field.load_state({**_plates_known(5), "earlier": np.zeros((5, 3), np.float32)})
 
 
 def test_it_tells_how_much_moves_before_each_camera_in_its_newest_frame() -> None:
-    field = LayeredField(SMALL)
-    field.load_state(_moving().state())
+    field = _resumed()
     newest = {o.camera: o.share for o in sorted(field.observations, key=lambda o: o.instant_s)}
     assert max(newest.values()) > 0.02 and len({*newest.values()}) > 3
     assert field.moving_shares == {name: max(share, 0.01) for name, share in newest.items()}
@@ -307,8 +315,7 @@ def test_a_refused_state_changes_nothing() -> None:
 
 
 def test_reset_forgets() -> None:
-    field = LayeredField(SMALL)
-    field.load_state(_moving().state())
+    field = _resumed()
     field.reset()
     same_state(field, LayeredField(SMALL))
 
@@ -342,8 +349,7 @@ assert compiled() == before, (before, compiled())
 
 
 def test_in_seconds_the_static_field_learns_beside_what_moves() -> None:
-    field = LayeredField(SMALL)
-    _run(field, range(17))
+    field = _resumed(_plates_known(30))
     assert field.tracker is not None and not field.static.finished
     frame = 17
     while frame < 50 or (frame < 300 and not (field.static.finished and field.moving.steps > 0)):  # a busy machine
@@ -358,8 +364,7 @@ def test_in_seconds_the_static_field_learns_beside_what_moves() -> None:
 
 def test_in_seconds_what_moves_is_followed_once_anything_is_shown_of_it() -> None:
     """Until then the still field has the processor."""
-    field = LayeredField(SMALL)
-    _run(field, range(17), steps=5)
+    field = _resumed(_plates_known(5))
     assert field.tracker is not None and not field.supervision.layers_shown
     followed = field.tracker.fits
     for frame in range(17, 300):
@@ -450,10 +455,7 @@ def test_plates_ask_no_field_before_they_are_certain(monkeypatch: pytest.MonkeyP
 
 
 def test_a_camera_that_shows_something_else_is_refused_and_changes_nothing() -> None:
-    without, field = LayeredField(SMALL), LayeredField(SMALL)
-    rng = np.random.default_rng(0)
-    for f in (without, field):
-        f.load_state(_moving().state())
+    without, field, rng = _resumed(), _resumed(), np.random.default_rng(0)
     for frame in range(42, 46):
         views = [_frame(k, frame, True) for k in range(len(CAMERAS))]
         image = views[0].image
@@ -464,16 +466,14 @@ def test_a_camera_that_shows_something_else_is_refused_and_changes_nothing() -> 
     one, two = without.snapshot(), field.snapshot()
     for a, b in zip((one.static, one.moving.params), (two.static, two.moving.params), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3)
-    resumed = LayeredField(SMALL)
-    resumed.load_state(field.state())
+    resumed = _resumed(field.state())
     assert resumed.refused == {CAMERAS[0].camera}
     views = [_frame(k, 46, True) for k in range(len(CAMERAS))]
     assert resumed.fit(views, Budget(steps=5)).refused == ()
 
 
 def test_layers_begin_again_when_the_box_of_the_scene_changes() -> None:
-    field = LayeredField(SMALL)
-    field.load_state(_moving().state())
+    field = _resumed()
     store, plates = field.still.view_store, {n: c.plate for n, c in field.cameras.items()}
     store.box = replace(store.box, radius_m=2.0 * store.box.radius_m)  # as a late camera may have it
     _run(field, range(42, 43), steps=5)
@@ -516,8 +516,7 @@ def test_it_wants_every_frame_and_tells_how_long_one_takes_until_a_camera_moves(
 
 
 def test_a_thread_that_trains_ends_with_the_scene_and_tells_why_it_failed(monkeypatch: pytest.MonkeyPatch) -> None:
-    field = LayeredField(SMALL)
-    _run(field, range(17))
+    field = _resumed(_plates_known(30))
     field.fit([_frame(k, 17, True) for k in range(len(CAMERAS))], Budget(seconds=0.01))
     assert field.static.training
     state = field.state()  # a checkpoint ends it first

@@ -177,7 +177,9 @@ def _recovered_s(curve: NDArray[np.float64], over: int) -> float:
     return max(int(below[-1]) + 1 - over if len(below) else 0, 0) * FRAME_S
 
 
-@pytest.mark.parametrize("name", CASES)
+# Of the others each rule is held by itself: what contradicts in ``test_surfaces``, poses and scales in
+# ``test_registration``.
+@pytest.mark.parametrize("name", [pytest.param(c, marks=[pytest.mark.slow] * (c != "mirror")) for c in CASES])
 def test_depth_is_worth_something_where_sensors_are_deceived(name: str) -> None:
     case = CASES[name]
     curves = _curves(case)
