@@ -72,13 +72,14 @@ def test_frames_become_keyframes_and_held_out_ones_take_their_neighbors_correcti
     np.testing.assert_array_equal(before.camera_to_world, after.camera_to_world)  # a snapshot never changes
 
 
-def test_without_depth_it_begins_anew_until_it_has_seen_enough() -> None:
-    views = walk(depth=False)
-    field = _field()
-    taken = []
+def test_without_depth_it_begins_anew_until_it_has_seen_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    views, field, anew = walk(depth=False), _field(), list[int]()
+    begin, taken = field._begin_anew, list[int]()
+    monkeypatch.setattr(field, "_begin_anew", lambda: anew.append(field._taken) or begin())
     for view in views[:30]:
         field.fit([replace(view, camera="hand")], Budget(steps=tuned.STEPS_A_KEYFRAME))
         taken.append(field._taken)
+    assert anew == [2, 4, 8]
     # Beginning anew counts steps from 0 again, not the turns of frames.
     assert taken == list(range(taken[0], taken[0] + 30))
     # The depth that was found serves the box, and each keyframe's own the steps of its pose.
@@ -285,6 +286,18 @@ def _under_a_hand(k: int, view: View) -> View:
     return _covered(view)
 
 
+@pytest.mark.stability
+@pytest.mark.parametrize("begin", [_looks_about, _under_a_hand])
+def test_depth_that_nothing_tells_is_guessed_and_said_until_frames_tell_it(begin) -> None:
+    """The scene is 2.1 m away: half a second of walking tells it, whatever was guessed before."""
+    clean, field = walk(depth=False), _field()
+    bad = [begin(k, clean[0]) for k in range(20)]
+    for k, view in enumerate([*bad, *clean[:6]]):
+        assert k != 20 or "tell no depth" in str(field.troubles)
+        field.fit([replace(view, camera="hand", generated_ns=100_000_000 * k)], Budget(steps=tuned.STEPS_A_KEYFRAME))
+    assert field._seen_m == pytest.approx(2.07, abs=0.05) and field.troubles == ()
+
+
 def _walk_after(begin: Callable[[int, View], View], depth: bool, seed: int) -> list[float]:
     """Mean PSNR of the held-out frames so far, two to five seconds after two seconds of a bad beginning."""
     clean, field = walk(depth=depth)[:50], _field(seed=seed)
@@ -297,24 +310,24 @@ def _walk_after(begin: Callable[[int, View], View], depth: bool, seed: int) -> l
     return found_db
 
 
+@pytest.mark.slow  # 20 s each
 @pytest.mark.stability
 @pytest.mark.parametrize(
-    ("begin", "depth", "seeds", "lost_db"),
+    ("begin", "depth", "lost_db"),
     [
-        (_looks_about, False, (0,), 3.0),  # what it costs that nothing is forgotten, one training tells
-        slow(_looks_about, True, SEEDS, 1.0),
-        slow(_looks_about, False, SEEDS, 1.0),
-        slow(_at_a_wall, True, SEEDS, 1.2),
-        slow(_at_a_wall, False, SEEDS, 1.0),
-        slow(_under_a_hand, True, SEEDS, 1.2),
-        slow(_under_a_hand, False, SEEDS, 3.0),
+        (_looks_about, True, 1.0),
+        (_looks_about, False, 1.0),
+        (_at_a_wall, True, 1.2),
+        (_at_a_wall, False, 1.0),
+        (_under_a_hand, True, 1.2),
+        (_under_a_hand, False, 3.0),
     ],
 )
-def test_a_bad_beginning_is_forgotten_within_two_seconds(begin, depth: bool, seeds, lost_db: float) -> None:
-    """lost_db: at most, against a walk without that beginning, at each of four instants, on average over
+def test_a_bad_beginning_is_forgotten_within_two_seconds(begin, depth: bool, lost_db: float) -> None:
+    """lost_db: at most, against a walk without that beginning, at each of four instants, on average over three
     trainings. What a camera that only turns, or sees nothing, guesses of the scene cost up to 11 dB for as long as it
     was kept."""
-    lost = [np.array(_undisturbed(depth, seed))[:4] - _walk_after(begin, depth, seed) for seed in seeds]
+    lost = [np.array(_undisturbed(depth, seed))[:4] - _walk_after(begin, depth, seed) for seed in SEEDS]
     assert np.mean(lost, axis=0).max() < lost_db
 
 
