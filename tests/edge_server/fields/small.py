@@ -60,7 +60,7 @@ def healthy(field: Any, views: Sequence[View]) -> None:
         out = field.render(view.camera_to_world, view.intrinsics)
         assert all(np.isfinite(part).all() for part in (out.color, out.depth, out.opacity))
         assert out.color.min() >= 0.0 and out.color.max() <= 1.0 and out.depth.min() >= 0.0
-        assert out.opacity.min() >= -1e-6 and out.opacity.max() <= 1.0 + 1e-5
+        assert out.opacity.min() >= 0.0 and out.opacity.max() <= 1.0
         if name == "splat":
             splat.check_bounds(field, out)
         else:

@@ -43,7 +43,7 @@ def render_tiles(counter, worker, camera, pixels, space, model, sh_degree, backg
     model: encoding, number of its levels in use, network.
     pixels: float64 (N, 2), image points. background: float32 (3,).
     scratch: float32 (W, units, BATCH), (W, 3, BATCH) and (W, 3, BATCH), activations, points and lines.
-    out: color, float32 (N, 3), depth (scene units) and opacity: float32 (N,); all written.
+    out: color, float32 (N, 3) in [0, 1], depth (scene units) and opacity in [0, 1]: float32 (N,); all written.
     """
     (lens, rotation, origin), (encoding, levels, net), (color, depth, opacity) = camera, model, out
     acts, x, line = scratch[0][worker], scratch[1][worker], scratch[2][worker]
@@ -116,3 +116,5 @@ def render_tiles(counter, worker, camera, pixels, space, model, sh_degree, backg
                 color[pixel, c] = min(max(value, _F0), _F1) if is_finite(value) else background[c]
             if not is_finite(depth[pixel]) or not is_finite(opacity[pixel]):
                 depth[pixel] = opacity[pixel] = _F0
+            # Only now: above, the sum itself is what colors and depth were weighted with. Rounding takes it past 1.
+            opacity[pixel] = min(max(opacity[pixel], _F0), _F1)
