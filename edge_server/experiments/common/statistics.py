@@ -19,6 +19,8 @@ _Curve = Mapping[float, Mapping[int, float | None]]
 _RESAMPLES = 2000
 # Least number of seeds for resampling; fewer say too little about how seeds differ.
 FEWEST = 5
+# Expected share of wrong verdicts among those that are decided.
+FALSE_DISCOVERY_RATE = 0.05
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class Interval:
         return float(2.0 * stats.t.sf(deviations, degrees))
 
 
-def discoveries(p_values: Sequence[float], rate: float = 0.05) -> list[bool]:
+def discoveries(p_values: Sequence[float], rate: float = FALSE_DISCOVERY_RATE) -> list[bool]:
     """Which of several hypotheses are rejected at a false discovery rate (Benjamini-Hochberg).
 
     p_values: of all hypotheses that are tested together.

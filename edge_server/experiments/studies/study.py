@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row, SeedTable
-from edge_server.experiments.common.statistics import Interval, all_of, discoveries
+from edge_server.experiments.common.statistics import FALSE_DISCOVERY_RATE, Interval, all_of, discoveries
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.engine import Engine
 from edge_server.machine import commit
@@ -19,8 +19,6 @@ from edge_server.scheduler.learned.settings import W_S
 from freshfield.files import write_csv, write_json, write_text
 
 HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"
-# Expected share of wrong verdicts among those that a study decides.
-FALSE_DISCOVERY_RATE = 0.05
 LEAST_DB = 0.1
 
 
@@ -261,7 +259,7 @@ def judge(study: Study, table: SeedTable) -> list[Verdict]:
                     found.append((about, claim, finding, claim.bound_of(metric)))
     p_values = [finding.p_value(bound) for _, _, finding, bound in found]
     tested = [p for p in p_values if p > 0.0]  # the others are without noise, and not a matter of chance
-    decided = iter(discoveries(tested, FALSE_DISCOVERY_RATE))
+    decided = iter(discoveries(tested))
     kept = [p == 0.0 or next(decided) for p in p_values]
     return [
         Verdict(

@@ -7,7 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from edge_server.experiments.common.statistics import Interval, at_its_best, crossed, interval, optimum, paired
+from edge_server.experiments.common.statistics import (
+    FALSE_DISCOVERY_RATE,
+    Interval,
+    at_its_best,
+    crossed,
+    discoveries,
+    interval,
+    optimum,
+    paired,
+)
 
 
 def test_an_interval_covers_the_mean_in_95_of_100():
@@ -27,6 +36,19 @@ def test_too_few_values_have_no_interval():
     assert Interval(1.0, 0.5, 1.5, 9).above(1.0) is None
     assert Interval(1.0, 0.5, 1.5, 9).above(1.5) is None  # its end is part of it
     assert Interval(1.0, 1.0, 1.0, 9).above(1.0) is False  # all values alike
+
+
+def test_the_false_discovery_rate_is_the_share_of_wrong_verdicts_among_the_decided():
+    rng = np.random.default_rng(3)
+    wrong = []
+    for _ in range(500):  # 20 hypotheses that hold, then 20 that do not
+        p_values = [*rng.uniform(size=20).tolist(), *(1e-2 * rng.uniform(size=20)).tolist()]
+        found = discoveries(p_values)
+        wrong.append(sum(found[:20]) / max(sum(found), 1))
+        assert found == discoveries(p_values, FALSE_DISCOVERY_RATE)
+    # Of all hypotheses half hold, so that Benjamini and Hochberg's procedure keeps half of the rate.
+    assert np.mean(wrong) == pytest.approx(0.5 * FALSE_DISCOVERY_RATE, abs=0.005)
+    assert discoveries([]) == []
 
 
 def test_pairing_takes_out_what_seeds_have_in_common():
