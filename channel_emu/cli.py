@@ -36,6 +36,9 @@ In the help of a command, [x] after an option is its default.
   channel-emu fit trace.jsonl --plot fit.png --out fitted.yaml
 """
 
+# Counts of delivered frames, with the fault that makes them: shown, 0 too, where it is asked for.
+_OF_DELIVERED = {"duplicated": "duplication", "corrupted": "corruption"}
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line. argv: arguments without the program's name; None: those of the process.
@@ -220,8 +223,9 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
 def _simulate(args: argparse.Namespace) -> int:
     from channel_emu.virtual.simulate import OUTCOMES, simulate
 
+    config = _config_of(args)
     simulation = simulate(
-        _config_of(args),
+        config,
         args.cameras,
         args.seconds,
         args.seed,
@@ -239,6 +243,7 @@ def _simulate(args: argparse.Namespace) -> int:
         "peak age (ms)": result["peak_age_ms"],
         **{f"drawn delay, {name} (ms)": value for name, value in result["delay_ms"].items()},
         **{key: result[key] for key in ("offered", "delivered", *OUTCOMES[1:], "in_flight") if result[key]},
+        **{key: result[key] for key, fault in _OF_DELIVERED.items() if result[key] or fault in config.faults},
         **{f"share of state {name}": share for name, share in result["state_share"].items() if share < 1},
         **{key: result[key] for key in ("cameras", "seconds", "seed")},
     }

@@ -51,6 +51,10 @@ class LinkRun:
         """The age over time."""
         return RunningAge((arrived, captured) for captured, arrived in self.deliveries_ns().tolist())
 
+    def corrupted(self) -> int:
+        """How many of the delivered frames a fault has damaged."""
+        return sum(t.outcome is EventKind.DELIVERED and bool(t.flips) for t in self.transits)
+
     def delays_ms(self) -> list[float]:
         """The drawn delay of every frame that started and was due within the run."""
         due = [t for t in self.transits if t.due_ns is not None and t.due_ns <= self.end_ns]
@@ -97,6 +101,7 @@ class Simulation:
             "in_flight": sum(run.link.in_flight for run in self.runs),
             "dropped": sum(counts[kind] for kind in OUTCOMES if kind is not EventKind.DELIVERED),
             **{str(kind): counts[kind] for kind in (*OUTCOMES, EventKind.DUPLICATED)},
+            "corrupted": sum(run.corrupted() for run in self.runs),
             "state_share": dict(zip(self.config.state_names, (round(float(s), 6) for s in share))),
             "delay_ms": {
                 "mean": float(delays.mean()) if len(delays) else None,

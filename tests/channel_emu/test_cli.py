@@ -58,6 +58,23 @@ def test_simulate_from_a_scenario_and_for_people(capsys, scenario: Path) -> None
     assert "mean age" in text and "dropped_busy" in text and "drawn delay" in text
 
 
+def test_what_duplication_and_corruption_did_is_shown_where_they_are_asked_for(capsys) -> None:
+    line = "--preset ch5 --seconds 60 --fault duplication:0.5 --fault corruption:0.25"
+    found = simulate(capsys, line)
+    assert found["duplicated"] == pytest.approx(0.5 * found["delivered"], rel=0.2)
+    assert found["corrupted"] == pytest.approx(0.25 * found["delivered"], rel=0.2)
+
+    def rows(line: str) -> dict[str, str]:
+        assert main(["simulate", *line.split()]) == 0
+        return dict(row.rsplit(maxsplit=1) for row in capsys.readouterr().out.splitlines())
+
+    shown = rows(line)
+    assert [int(shown[key]) for key in ("duplicated", "corrupted")] == [found["duplicated"], found["corrupted"]]
+    assert rows("--preset ch5 --seconds 1 --fault corruption:0")["corrupted"] == "0"
+    plain = rows("--preset ch5 --seconds 1")
+    assert "delivered" in plain and not {"duplicated", "corrupted"} & plain.keys()
+
+
 def test_presets_are_listed_with_their_mean_delays(capsys) -> None:
     assert main(["presets"]) == 0
     text = capsys.readouterr().out
