@@ -11,12 +11,14 @@ import asyncio
 import ctypes
 import importlib.util
 import json
+import logging
 import shutil
 import socket
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -96,7 +98,27 @@ def _checks(args: argparse.Namespace) -> Iterator[CheckResult]:
     opened: list[tuple[Scenario, SourceConfig]] = []
     yield _check("scenario", lambda: _scenario(args.scenario, opened))
     for scenario, config in opened:
-        yield from _source(scenario, config, args.data, args.plan)
+        with _notes_said_once(config):
+            yield from _source(scenario, config, args.data, args.plan)
+
+
+@contextmanager
+def _notes_said_once(config: SourceConfig) -> Iterator[None]:
+    """Without the log's warnings where data are recorded: they are the notes of the data set, written by each check
+    that opens it, and the part ``data`` says them."""
+    if not isinstance(config, RecordedConfig):
+        yield
+        return
+    log = logging.getLogger("camera-node")
+
+    def is_error(record: logging.LogRecord) -> bool:
+        return record.levelno > logging.WARNING
+
+    log.addFilter(is_error)
+    try:
+        yield
+    finally:
+        log.removeFilter(is_error)
 
 
 def _source(scenario: Scenario, config: SourceConfig, data: Path | None, plan: Path | None) -> Iterator[CheckResult]:

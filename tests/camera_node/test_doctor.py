@@ -205,6 +205,23 @@ def test_a_data_set_is_opened_and_its_images_are_read(capsys, tmp_path):
     assert said()[1].startswith(f"{folder}: 23 images of 1 cameras; 1 of 24 images are missing, first images/003.png")
 
 
+def test_a_note_on_a_data_set_is_said_once(capsys, caplog, tmp_path):
+    """Several checks open the set, and each time its notes go to the log."""
+    file = write_photos(tmp_path / "set", 8)
+    data = json.loads(file.read_text())
+    for k, frame in enumerate(data["frames"]):
+        frame["time"] = 10.0 + k
+    file.write_text(json.dumps(data))
+    scenario = {"cameras": {"count": 1}, "source": {"kind": "transforms", "data": str(file.parent)}}
+    (tmp_path / "s.yaml").write_text(yaml.safe_dump(scenario))
+    note = "8 images of one moving camera, each with its own time: taken for a scene that stands still"
+    main(["doctor", str(tmp_path / "s.yaml")])
+    assert capsys.readouterr().out.count(note) == 1 and note not in caplog.text
+    scenario = load(str(tmp_path / "s.yaml"))
+    open_sources(scenario, source_config(scenario), scenario.cameras)
+    assert caplog.text.count(note) == 1, "a node still says it"
+
+
 def test_data_that_are_missing_are_said_once(capsys, tmp_path):
     _, parts = examined(capsys, "fox", "--data", str(tmp_path))
     wrong = [part for part, (ok, text) in parts.items() if "does not exist" in text]
