@@ -340,7 +340,7 @@ field = LayeredField(SMALL)
 field.warm_up()
 before = compiled()
 assert sum(before.values()) > 10
-_run(field, range(60))
+_run(field, range(60), steps=10)
 assert field.moving is not None and field.moving.alive and field.part_s["solving"] > 0.0
 assert compiled() == before, (before, compiled())
 """
