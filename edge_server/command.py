@@ -22,16 +22,17 @@ def run_command(
     """Call ``work`` and return the command's exit status.
 
     errors: exceptions that are printed in one line; the status is then 2.
-    stopped: text that is printed after Ctrl-C; the status is then 130. None: KeyboardInterrupt is raised on.
+    stopped: text that is printed after Ctrl-C, unless the KeyboardInterrupt has one of its own; the status is then
+        130. None: KeyboardInterrupt is raised on.
     """
     try:
         work()
     except errors as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         if stopped is None:
             raise
-        print(f"\nstopped; {stopped}", flush=True)
+        print(f"\nstopped; {str(interrupt) or stopped}", flush=True)
         return 130
     return 0

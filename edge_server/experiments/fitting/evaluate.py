@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from types import FrameType
 
 import numpy as np
 
+from edge_server.experiments.fitting import ctrl_c
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Budget, Field, FitReport, View
 
@@ -63,7 +61,7 @@ def fit_in_slices(
         began = time.perf_counter()
         report: FitReport | None = None
         # After an interruption the parameters are those of the last step and can be scored and saved.
-        with _ctrl_c() as pressed, suppress(KeyboardInterrupt):
+        with ctrl_c.noted() as pressed, suppress(KeyboardInterrupt):
             report = field.fit(training, Budget(seconds=mark - seconds))
         slice_s = time.perf_counter() - began
         seconds += slice_s
@@ -72,23 +70,3 @@ def fit_in_slices(
         if report is None or pressed.is_set():
             return False
     return True
-
-
-@contextmanager
-def _ctrl_c() -> Iterator[threading.Event]:
-    """Record whether Ctrl-C was pressed within the block, also if Python cannot raise it: in a callback of
-    the garbage collector the exception is printed and lost."""
-    pressed, before = threading.Event(), signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
-        yield pressed
-        return
-
-    def note(number: int, frame: FrameType | None) -> None:
-        pressed.set()
-        before(number, frame)
-
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield pressed
-    finally:
-        signal.signal(signal.SIGINT, before)

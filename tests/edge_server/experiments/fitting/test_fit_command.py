@@ -17,6 +17,7 @@ from edge_server.experiments.fitting.evaluate import fit_in_slices, marks_s
 from edge_server.experiments.scenes.multiview_still import WHITE, mean_baselines, open_still
 from edge_server.fidelity.images import BLACK
 from edge_server.fields import FitReport, checkpoint
+from edge_server.report.build_report import build_report
 from tests.edge_server.experiments.sets import SMALL_WORDS, write_photos, write_recording
 
 
@@ -137,6 +138,31 @@ def test_ctrl_c_ends_early_with_the_report_written(tmp_path, capsys):
     assert "stopped early" in capsys.readouterr().out
     assert 0.5 < report_of(out)["seconds"] < 30.0
     assert fit(tmp_path / "set", out, "--seconds", "0.5", "--resume") == 2, "it has been fitted for longer"
+
+
+@pytest.mark.parametrize("presses", [1, 2])
+def test_the_first_ctrl_c_while_it_saves_lets_it_finish(tmp_path, capsys, monkeypatch, presses):
+    def pressed(folder):
+        for _ in range(presses):
+            os.kill(os.getpid(), signal.SIGINT)
+        return build_report(folder)
+
+    write_photos(tmp_path / "set", 5)
+    out, before = tmp_path / "out", signal.getsignal(signal.SIGINT)
+    with monkeypatch.context() as patch:
+        patch.setattr("edge_server.report.build_report.build_report", pressed)
+        status = fit(tmp_path / "set", out, "--seconds", "0.5")
+    said = capsys.readouterr()
+    assert signal.getsignal(signal.SIGINT) is before
+    assert f"writing {out}; Ctrl-C again stops that" in said.err
+    if presses == 1:
+        assert status == 0 and said.out.rstrip().endswith("report.html") and "stopped" not in said.out
+    else:
+        assert status == 130 and f"stopped; {out}: written: field, series.jsonl, " in said.out
+        assert "not written: report.json, report.html (edge-server report" in said.out
+        assert not (out / "report.json").exists()
+        assert edge_server(["report", str(out)]) == 0
+    assert report_of(out)["seconds"] > 0.0 and (out / "report.html").exists()
 
 
 def test_transparent_images_are_scored_over_white(tmp_path):
