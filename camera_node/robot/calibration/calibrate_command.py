@@ -40,6 +40,16 @@ every corner: ten are enough if the target has been everywhere and tilted by 30 
 
 BOARD = "target: charuco:7x5:30mm:22mm[:4X4_50], chessboard:9x6:23.6mm (inner corners)"
 
+# Of hand-eye: each input as its help names it, and option -> inputs that use it. With another input it is an error.
+_INPUTS = {"folder": "FOLDER", "pairs": "--pairs FILE", "live": "--live SCENARIO"}
+_GOES_WITH = {
+    "board": ("folder", "live"),
+    "lens": ("folder", "live"),
+    "camera": ("live",),
+    "data": ("live",),
+    "seconds": ("live",),
+}
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Fill in ``camera-node calibrate``."""
@@ -111,9 +121,19 @@ def run(args: argparse.Namespace) -> int:
         raise CalibrationError(str(error)) from None
 
 
+def _require_one_input(args: argparse.Namespace) -> None:
+    """Raise CalibrationError unless one input is given, and only options that it uses."""
+    given = [name for name in _INPUTS if getattr(args, name) is not None]
+    if len(given) != 1:
+        raise CalibrationError(f"expected one of {', '.join(_INPUTS.values())}")
+    for option, inputs in _GOES_WITH.items():
+        if getattr(args, option) is not None and given[0] not in inputs:
+            names = " or ".join(_INPUTS[name] for name in inputs)
+            raise CalibrationError(f"--{option}: goes with {names}, not with {_INPUTS[given[0]]}")
+
+
 def _hand_eye(args: argparse.Namespace) -> int:
-    if sum(given is not None for given in (args.folder, args.pairs, args.live)) != 1:
-        raise CalibrationError("expected one of FOLDER, --pairs FILE, --live SCENARIO")
+    _require_one_input(args)
     from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, calibrate
     from camera_node.robot.calibration.targets import parse_target
 

@@ -98,6 +98,11 @@ def test_mistakes_are_one_line(tmp_path, capsys, pairs):
 
     for inputs in ((), ("--pairs", pairs, "--live", "room")):
         assert "expected one of FOLDER" in fails(*inputs)
+    for option in ("--board", "--lens"):
+        assert f"{option}: goes with FOLDER or --live SCENARIO, not with" in fails("--pairs", pairs, option, "x")
+    for option in ("--camera", "--data", "--seconds"):
+        for words in (("--pairs", pairs), (tmp_path, "--board", "chessboard:9x6:10mm")):
+            assert f"{option}: goes with --live SCENARIO, not with" in fails(*words, option, "1")
     assert "--method: expected one of tsai" in fails("--pairs", pairs, "--method", "magic")
     assert "--board SPEC" in fails(tmp_path)
     assert "has 0 camera XML files" in fails(tmp_path, "--board", "chessboard:9x6:10mm")
