@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera_node.robot.arm import ArmError
-from camera_node.robot.arm.capsules import CapsuleModel
+from camera_node.robot.arm.capsules import PAIRS, PARTS, CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.teleop.settings import TeleopConfig
 from freshfield.geometry import Array
@@ -29,12 +29,6 @@ from freshfield.geometry import Array
 # Limits are this much tighter than configured, because sums over a stop round differently at each tick.
 _ROUNDING = 1e-9
 _STEP_FRACTIONS = (1.0, 0.5, 0.2)
-# Where an arm stands that breaks a limit at rest.
-_WHERE = {
-    "box": "outside workspace_low_m to workspace_high_m",
-    "floor": "with a part below floor_m",
-    "near": "with two parts nearer to each other than margin_m",
-}
 
 
 class JointLimits:
@@ -69,7 +63,7 @@ class JointLimits:
         return np.sign(v) * np.maximum(np.abs(v) - self._change, 0.0)
 
     def stop(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Array and speeds (T, n) of a stop from (q, v), beginning with that state."""
+        """Joints and speeds (T, n) of a stop from (q, v), beginning with that state."""
         ticks = int(np.ceil(np.abs(v).max() / self._change)) if v.any() else 0
         left = np.abs(v) - self._change * np.arange(ticks + 1)[:, None]
         speeds = np.sign(v) * np.maximum(left, 0.0)
@@ -87,7 +81,7 @@ class JointLimits:
 
 
 class Limiter:
-    """Array ``q`` (6,) and speeds ``v`` (6,) that keep every limit of a TeleopConfig. The arm starts at rest
+    """Joints ``q`` (6,) and speeds ``v`` (6,) that keep every limit of a TeleopConfig. The arm starts at rest
     at ``joints`` (6,). Raises ArmError if these break a limit.
 
     refused: numbers of ticks in which a limit reduced the speeds, or the wanted speeds were invalid
@@ -162,8 +156,22 @@ class Limiter:
             )
         violated = self._violated_limit(q, self.v)
         if violated is not None:
-            at = np.round(self.shape.arm.forward(q)[:3, 3], 3).tolist()
             raise ArmError(
-                f"the arm, its flange at {at} m, stands {_WHERE[violated]}: move it with the pendant, or change "
-                "source.arm.teleop"
+                f"{self._show_violation(violated)}: move the arm with the pendant, or change source.arm.teleop"
             )
+
+    def _show_violation(self, limit: str) -> str:
+        """How the arm, at rest, breaks ``limit`` (box, floor or near): for people."""
+        config, arm = self.config, self.shape.arm
+        if limit == "box":
+            at = np.round(arm.forward(self.q)[:3, 3], 3).tolist()
+            low, high = list(config.workspace_low_m), list(config.workspace_high_m)
+            return f"the flange stands at {at} m, outside workspace_low_m {low} to workspace_high_m {high}"
+        apart, lowest = self.shape.clearance(arm.nominal_model.link_frames(self.q[None]))
+        if limit == "floor":
+            return f"a part of the arm is {1e3 * lowest[0]:.1f} mm high, below floor_m, {1e3 * config.floor_m:g} mm"
+        first, second = PAIRS[int(apart[0].argmin())]
+        return (
+            f"{PARTS[first]} and {PARTS[second]} are {1e3 * apart.min():.1f} mm apart, nearer than margin_m, "
+            f"{1e3 * config.margin_m:g} mm"
+        )

@@ -58,6 +58,6 @@ def test_parts_of_a_calibrated_arm_stay_where_they_are(tmp_path):
             Limiter(arm, OPEN, q)
         elif apart_m < OPEN.margin_m - 0.01:
             met += 1
-            with pytest.raises(ArmError, match="nearer to each other than margin_m"):
+            with pytest.raises(ArmError, match="mm apart, nearer than margin_m"):
                 Limiter(arm, OPEN, q)
     assert met > 10
