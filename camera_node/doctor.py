@@ -69,9 +69,13 @@ class CheckResult:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run all checks and print the results. Returns the exit code: 1 if something is wrong, else 0."""
+    """Run all checks and print the results. Returns the exit code: 1 if something is wrong, else 0.
+
+    Raises TransportError for unusable security options, which are read without --to, too.
+    """
+    security = transport.from_arguments(args)
     results = []
-    for result in _checks(args):
+    for result in _checks(args, security):
         results.append(result)
         if not args.json:
             mark = {True: "ok", False: "WRONG", None: "-"}[result.ok]
@@ -84,14 +88,14 @@ def run(args: argparse.Namespace) -> int:
     return 1 if wrong else 0
 
 
-def _checks(args: argparse.Namespace) -> Iterator[CheckResult]:
+def _checks(args: argparse.Namespace, security: transport.Transport) -> Iterator[CheckResult]:
     yield _check("python", _python)
     yield _check("clock", _clock)
     yield _check("disk", lambda: _disk(args.out))
     if args.to is None:
         yield CheckResult("network", None, "not examined: give --to HOST:PORT of the emulator or the edge")
     else:
-        yield _check("network", lambda: _network(args.to, transport.from_arguments(args)))
+        yield _check("network", lambda: _network(args.to, security))
     if args.scenario is None:
         yield CheckResult("scenario", None, "none given: cameras, arm and files are not examined")
         return

@@ -50,6 +50,14 @@ def test_without_a_scenario_the_machine_is_examined(capsys, tmp_path):
     assert parts["network"][0] is None and parts["scenario"][0] is None
 
 
+@pytest.mark.parametrize("option", ["--token-file", "--tls-ca"])
+@pytest.mark.parametrize("to", [[], ["--to", "127.0.0.1:9"]])
+def test_security_files_that_do_not_exist_are_refused_before_any_check(capsys, tmp_path, option, to):
+    assert main(["doctor", *to, option, str(tmp_path / "none")]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and f"cannot read {tmp_path / 'none'}" in said.err
+
+
 @pytest.mark.slow  # 7 s
 def test_an_arm_that_is_well(capsys, tmp_path, host):
     with simulated_arm(host):
