@@ -8,6 +8,7 @@ import time
 
 import numpy as np
 import pytest
+import yaml
 
 from camera_node.cli import main
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
@@ -153,8 +154,13 @@ def test_a_real_arm_is_asked_about_first(cell):
         assert f"the first move turns a joint by {first_deg:.0f}" in said[0] and 0 < first_deg <= 30
 
 
-def test_a_scenario_without_an_arm_is_refused(cell, capsys):
+def test_a_scenario_without_an_arm_or_a_path_is_refused(cell, capsys):
     file, _ = cell
     for words, says in ((["tile"], "source.arm: missing"), ([str(file), "--rounds", "-1"], "--rounds: expected 0")):
         assert main(["drive-arm", *words]) == 2
         assert says in capsys.readouterr().err
+    data = yaml.safe_load(file.read_text())
+    del data["source"]["arm"]["path"]
+    file.write_text(yaml.safe_dump(data))
+    assert main(["drive-arm", str(file)]) == 2
+    assert "source.arm.path: missing" in capsys.readouterr().err

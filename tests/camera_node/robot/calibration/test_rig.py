@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 import time
@@ -94,6 +95,10 @@ def test_a_rig_is_exact_from_exact_corners_and_stands_where_the_target_lay():
     for name, pose in found.poses.items():
         np.testing.assert_allclose(pose, shift @ POSES[name], atol=1e-4)
         np.testing.assert_allclose(found.lenses[name].distortion, LENSES[name].distortion, atol=1e-3)
+    assert "note" not in found.show()
+    shared = {("cam0", "cam1"): 9, ("cam1", "cam2"): 6, ("cam2", "cam3"): 2}
+    notes = [line for line in dataclasses.replace(found, shared=shared).show().splitlines() if "note" in line]
+    assert len(notes) == 1 and notes[0].startswith("note: cam3: shares few moments with any other camera")
 
 
 @pytest.mark.parametrize(("noise_px", "count"), [(0.1, 20), (0.2, 40)])
