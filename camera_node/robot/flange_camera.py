@@ -7,6 +7,7 @@ kinematics and hand-eye calibration. The difference of both is the pose error.
 
 from __future__ import annotations
 
+import io
 import json
 import socket
 import threading
@@ -33,7 +34,8 @@ class TruthClient:
 
     def __init__(self, host: str) -> None:
         self.host = host
-        self._link: socket.SocketIO | None = None
+        # One connection: the file for requests, and the buffer for answers, as an unbuffered file reads byte by byte.
+        self._link: tuple[socket.SocketIO, io.BufferedReader] | None = None
         self._lock = threading.Lock()
 
     def joints(self, t_ns: int) -> Array:
@@ -45,9 +47,11 @@ class TruthClient:
         try:
             if self._link is None:
                 with socket.create_connection((self.host, TRUTH_PORT), _TIMEOUT_S) as connected:
-                    self._link = connected.makefile("rwb", buffering=0)
-            self._link.write(b"%d\n" % t_ns)
-            answer = self._link.readline()
+                    file = connected.makefile("rwb", buffering=0)
+                self._link = file, io.BufferedReader(file)
+            requests, answers = self._link
+            requests.write(b"%d\n" % t_ns)
+            answer = answers.readline()
             if not answer.endswith(b"\n"):
                 raise OSError("it closed the connection")
         except OSError as error:

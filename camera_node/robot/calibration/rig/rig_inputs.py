@@ -6,7 +6,7 @@ import itertools
 import sys
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -63,16 +63,15 @@ def read_folder(folder: Path, target: Target, progress: Callable[[int], None]) -
 
 def _of_video(file: Path, target: Target, progress: Callable[[], None]) -> tuple[dict[str, Corners], tuple[int, int]]:
     """Corners by moment, each MOMENT_S, at which the target stood still between two frames; and the images' size."""
-    clip = Clip(file)
-    size, times_s = (clip.width, clip.height), clip.times_s - clip.times_s[0]
     found: dict[str, Corners] = {}
-    for moment_s in np.arange(0.0, times_s[-1], MOMENT_S):
-        first = int(np.abs(times_s[:-1] - moment_s).argmin())
-        before, now = (target.find(to_gray(clip.frame(index, *size))) for index in (first, first + 1))
-        progress()
-        if before is not None and now is not None and moved_px(before, now) < STILL_PX:
-            found[f"{moment_s:.1f}s"] = now
-    clip.close()
+    with closing(Clip(file)) as clip:
+        size, times_s = (clip.width, clip.height), clip.times_s - clip.times_s[0]
+        for moment_s in np.arange(0.0, times_s[-1], MOMENT_S):
+            first = int(np.abs(times_s[:-1] - moment_s).argmin())
+            before, now = (target.find(to_gray(clip.frame(index, *size))) for index in (first, first + 1))
+            progress()
+            if before is not None and now is not None and moved_px(before, now) < STILL_PX:
+                found[f"{moment_s:.1f}s"] = now
     return found, size
 
 
