@@ -256,6 +256,7 @@ class FieldUpdater:
         """
 
         def if_moving(camera: str) -> None:
+            self.field.reset()  # gives back what the next one shares with it
             self.field = make(config)
             self.field.warm_up()
             self.keyframes = _keyframes(config)

@@ -85,7 +85,7 @@ class ScoringThread:
         self._left_out_ns = 0  # instant of the newest publication that went by unseen
         self._next_shown_ns = dict.fromkeys(self._held_out, 0)
         self._shown_count, self._shown_cost_s = 0, np.inf  # cost of the last score of what is shown, CPU s
-        self._allowance_s = min(_FIRST_ALLOWANCE_S, _ALLOWANCE_S)
+        self._allowance_s = _FIRST_ALLOWANCE_S
         self._asked_s, self._used_s = time.monotonic(), 0.0
         self._new_frames: deque[Frame] = deque(maxlen=_WAITING_FRAMES)
         self._new_publications: deque[tuple[Publication, Snapshot, list[View]]] = deque()

@@ -26,7 +26,7 @@ PLAN = 41  # cells a side of the plan
 # What `room` reached with so many cameras, dB of the whole image and where it moves: with depth sensors
 # (docs/results/few-cameras.json), and without (docs/fields.md).
 REACHED_WITH_DEPTH = {2: (22.4, 18.6), 3: (24.7, 21.0), 4: (26.2, 22.3)}
-REACHED = {2: (14.9, 15.4), 3: (19.8, 19.1), 4: (22.6, 22.1), 6: (25.4, 22.8), 8: (27.3, 23.8), 12: (29.2, 25.3)}
+REACHED = {2: (14.8, 15.7), 3: (19.2, 19.2), 4: (22.6, 22.1), 6: (26.0, 22.9), 8: (27.5, 24.2), 12: (28.9, 25.4)}
 
 Camera = tuple[Pinhole, Array]
 """Lens, and camera-to-world pose (4, 4), meters."""

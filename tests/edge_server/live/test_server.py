@@ -20,7 +20,9 @@ from edge_server.cli import main as edge_server
 from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
 from edge_server.fields.splat.scan.carried_field import CarriedField
+from edge_server.live.grpc_services import GrpcThread
 from edge_server.live.loop import STOP_S, UpdateLoop
+from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.settings import SCAN, read_config
 from freshfield import frame as wire
@@ -240,6 +242,9 @@ def test_a_camera_that_moves_begins_the_field_anew_as_a_scan_and_a_resumed_run_k
     assert server.updater.keyframes is None and not server.updater.on_arrivals
     assert isinstance(server.updater.field, CarriedField)
     assert not server.updater.field.frame_s and server.loop.update_ms == 100.0
+    pool, workers = server.updater.field.pool, set[int]()
+    pool.run(lambda counter, worker: workers.add(worker))
+    assert workers == set(range(pool.threads)), "layers have given theirs back"
     feed.stop()
     server.stop()
     thread.join(20)
@@ -357,6 +362,16 @@ def test_a_time_that_no_timer_takes_is_refused(tmp_path, capsys, option, value):
     assert edge_server(["run", "room", f"{option}={value}", "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
     assert f"{option} " in said and "expected 0 to 1e+09" in said and said.count("\n") == 1
+
+
+def test_what_metrics_need_is_loaded_before_frames_may_come(serve, monkeypatch):
+    order = []
+    load, start = ScoringThread.load, GrpcThread.start
+    monkeypatch.setattr(ScoringThread, "load", lambda thread: (order.append("load"), load(thread)))
+    monkeypatch.setattr(GrpcThread, "start", lambda thread: (order.append("listen"), start(thread)))
+    serve()
+    until(lambda: len(order) == 2)
+    assert order == ["load", "listen"]
 
 
 def test_files_are_written_before_anything_that_may_take_long(fed, tmp_path, monkeypatch):

@@ -6,7 +6,9 @@ kernels, and here a page renders while the field trains.
 Linux puts a waking thread on a core that is idle at that moment and seldom moves it afterwards. A caller that
 woke one worker a core would itself keep a core busy until it slept, and two workers would share one. So each
 thread that computes wakes at most two others first, and the caller computes itself, unless its priority is
-higher than the workers'.
+higher than the workers'. Of a pool that is to leave all workers but one idle (``Pool.spare``) each caller computes
+itself, whatever its priority. Callers may then compute at once, each as worker 0: what kernels index by their worker
+belongs to one caller.
 """
 
 from __future__ import annotations
@@ -73,7 +75,8 @@ class Pool:
     """``run(kernel, *args)`` calls ``kernel(counter, worker, *args)`` on each worker; the kernel draws task
     numbers from ``counter`` until none are left (see ``simd``).
 
-    Any number of Python threads may call ``run``: one job is done after the other.
+    Any number of Python threads may call ``run``: one job is done after the other, but for callers that compute
+    themselves while ``spare`` leaves one worker.
 
     threads: number of workers; results do not depend on it. Default: ``default_threads``.
     nice: the workers' priority where the system allows it (Linux has one per thread), so that threads that

@@ -91,6 +91,7 @@ class LayeredField:
     def reset(self) -> None:
         """Forget the scene, its cameras and their plates; keep settings and compiled kernels."""
         self.static.forget()
+        self.pool.spare(0)
         self.still.reset()
         self.cameras: dict[str, FixedCamera] = {}
         self.observations = Observations()
@@ -139,7 +140,8 @@ class LayeredField:
         static, earlier = self.supervision.static, self.supervision.earlier
         if not static.ready and (earlier is None or earlier.step < tuned.EARLY_SHOWN_AFTER):
             step = 0 if static.shown is None else static.shown.step
-            return f"learning the background: {step} of {static.shown_after} steps"
+            most = static.shown_after if step < static.shown_after else tuned.SHOWN_AT_LATEST
+            return f"learning the background: {step} of {most} steps"
         return ""
 
     @property
@@ -162,7 +164,7 @@ class LayeredField:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
         pace = StepBudget(budget, self.now)
         beside = budget.seconds is not None
-        self.pool.spare(1 if beside and self.layered else 0)  # this thread computes, too
+        self._share_cores(beside, computes=False)
         for view in views:
             if not self._has_seen(view):
                 check_view(view)
@@ -194,6 +196,7 @@ class LayeredField:
         parameters = self.still.adam_parameters(tuned.STEP_PROGRESS)
         steps = rays = samples = 0
         follows = budget.seconds is None or self.supervision.layers_shown
+        self._share_cores(beside, computes=follows and self.static.at_work)
         if budget.seconds is not None and not follows:
             self.static.wait(budget.seconds - pace.elapsed_s())  # it has the processor: nobody sees yet what moves
         else:
@@ -219,6 +222,11 @@ class LayeredField:
             short=follows and steps == 0 and pace.steps == 0 and tracker.moving.alive > 0,
             refused=tuple(camera for camera in cameras_of(views) if camera in self.refused),
         )
+
+    def _share_cores(self, beside: bool, computes: bool) -> None:
+        """Have the pool leave a worker idle while this thread computes beside it (``computes``); and wherever a pool of
+        two runs beside a server's threads: each kernel would wait for whichever worker the others hold up."""
+        self.pool.spare(int(self.layered and beside and (computes or self.pool.threads == 2)))
 
     def _fit_still(self, views: Sequence[View], budget: Budget, pace: StepBudget) -> FitReport:
         """Spend what is left of a budget on the still field, on the newest view of each camera."""

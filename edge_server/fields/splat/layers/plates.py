@@ -100,8 +100,8 @@ class Plate:
         """Take in a frame, uint8 (H, W, 3). Returns its foreground, bool (H, W).
 
         may_refuse: a frame that is nearly all foreground changes nothing; None is returned for it.
-        by_itself: what the fields show does not say what is background. Fields that were learned from plates that are
-            not certain yet would confirm what is wrong with these.
+        by_itself: what the fields show does not say what is background. While plates are not certain, fields that were
+            learned from them would confirm what is wrong with them.
         """
         before = dict(vars(self))
         self._follow_exposure(image)

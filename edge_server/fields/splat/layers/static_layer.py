@@ -26,10 +26,8 @@ from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.snapshot import SplatSnapshot
 
 Arrays = dict[str, NDArray]
-_KEPT = (  # of a state
-    *("rounds", "_rounds_wanted", "_rate", "_round_step", "grows_until"),
-    *("shown_after", "_better_than", "_error"),
-)
+_SCHEDULE = ("rounds", "_rounds_wanted", "_rate", "_round_step", "grows_until")
+_KEPT = (*_SCHEDULE, "ready", "shown_after", "_better_than", "_error")  # of a state
 
 
 class PlateImage(NamedTuple):
@@ -47,7 +45,8 @@ class PlateImage(NamedTuple):
 class StaticLayer:
     """What stands still. ``learn`` says from which plates; ``train`` spends steps on them.
 
-    shown: the field as it was last published. rendered: camera -> step and rendering, for the caller to take.
+    shown: the field as it was last published. ready: whether it is good enough to be shown, and to say what lies where
+    plates are unknown; until it begins anew. rendered: camera -> step and rendering, for the caller to take.
     Nothing waits for the thread of ``train_beside`` but ``stop`` and, for a time, ``wait``.
     """
 
@@ -62,6 +61,7 @@ class StaticLayer:
         """Forget the plates and the schedule; the field stays as it is."""
         self.stop()
         self.shown: SplatSnapshot | None = None
+        self.ready = False
         self.rendered: dict[str, tuple[int, Rendering]] = {}
         self.grows_until = tuned.SCHEDULE  # step
         self.shown_after = tuned.SHOWN_AFTER  # steps
@@ -86,13 +86,6 @@ class StaticLayer:
         """Whether there is nothing more to learn from these plates."""
         return self.rounds >= self._rounds_wanted
 
-    @property
-    def ready(self) -> bool:
-        """Whether the field is good enough to be shown, and to say what lies where plates are unknown."""
-        if self.shown is None or self.shown.step < self.shown_after:
-            return False
-        return self._error <= self._better_than or self.shown.step >= tuned.SHOWN_AT_LATEST
-
     # --- plates -------------------------------------------------------------------------------
 
     def begin(self, plates: Sequence[PlateImage], shown_after: int | None = None, better_than: float = 1.0) -> None:
@@ -102,7 +95,7 @@ class StaticLayer:
         better_than: mean squared error that it must have reached then, or have had SHOWN_AT_LATEST steps.
         """
         self.learn(plates)
-        self._better_than, self._error = better_than, 1.0
+        self.ready, self._better_than, self._error = False, better_than, 1.0
         self.shown_after = tuned.SHOWN_AFTER if shown_after is None else shown_after
         self.grows_until = self.field.step + tuned.SCHEDULE
         self._begin_rounds(tuned.ROUNDS_FIRST, tuned.RATE_FIRST)
@@ -243,6 +236,8 @@ class StaticLayer:
             if self._mean is not None:
                 snapshot = replace(snapshot, gaussians=Gaussians(self._mean.copy(), self.field.settings.sh_degree))
             self.shown = snapshot
+        fits = self._error <= self._better_than or self.shown.step >= tuned.SHOWN_AT_LATEST
+        self.ready = self.ready or (fits and self.shown.step >= self.shown_after)
 
     def render(self, views: Iterable[View]) -> None:
         """Render what is shown from the cameras of ``views``."""

@@ -384,18 +384,33 @@ def test_in_seconds_what_moves_is_followed_once_anything_is_shown_of_it() -> Non
     field.static.stop()
 
 
-def test_one_worker_is_left_to_the_calling_thread_where_budgets_are_in_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    field, spared = LayeredField(SMALL), list[int]()
+@pytest.mark.parametrize(("threads", "seconds", "follows"), [(2, 1, 1), (3, 0, 1)])
+def test_the_pool_leaves_a_worker_to_a_thread_that_computes_beside_it(
+    monkeypatch: pytest.MonkeyPatch, threads: int, seconds: int, follows: int
+) -> None:
+    """And of two always, where budgets are in seconds: a kernel of both would wait for the one that others hold up."""
+    field, spared = LayeredField(structs.replace(SMALL, threads=threads)), list[int]()
     spare = field.pool.spare
     monkeypatch.setattr(field.pool, "spare", lambda count: (spared.append(count), spare(count)))
     frames = [_frame(k, 0, True) for k in range(len(CAMERAS))]
     for budget in (Budget(steps=1), Budget(seconds=0.02), Budget(steps=1)):
         field.fit(frames, budget)
-    assert spared == [0, 1, 0]
-    field.fit(frames, Budget(seconds=0.02))
+    assert spared == [0, seconds, 0]
+    _run(field, range(1, 17), steps=5)
+    for frame in range(17, 400):
+        spared.clear()
+        field.fit([_frame(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+        if spared == [seconds, follows]:
+            break
+    else:
+        pytest.fail("it never followed beside the training")
     for turned in _turning():
+        turned = replace(turned, generated_ns=turned.generated_ns + 60_000_000_000)
         field.fit([turned], Budget(seconds=0.02))
     assert not field.layered and spared[-1] == 0
+    field.pool.spare(1)
+    field.reset()
+    assert spared[-1] == 0
 
 
 @pytest.mark.parametrize(("shown_after", "anew_s"), [(20, 1.2), (10_000, 2.0)])
@@ -435,8 +450,14 @@ def test_a_still_field_that_began_anew_is_shown_once_it_fits_as_well_as_what_it_
         while not static.ready:
             static.train(StepBudget(Budget(steps=10)))
             static.publish()
+        assert static.shown is not None
         ready[better_than] = static.shown.step
     assert ready[1.0] == 20 and ready[error] > 20 and ready[1e-9] == 90
+    static._error, static.shown = 1.0, None
+    static.publish()
+    assert static.ready, "a step that errs takes nothing back"
+    static.begin(plates, 20)
+    assert not static.ready
 
 
 def test_plates_ask_no_field_before_they_are_certain(monkeypatch: pytest.MonkeyPatch) -> None:
