@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.synthetic import make_scene
-from camera_node.synthetic.effects import load_effects
 from camera_node.synthetic.effects.depth_sensor import DepthSensor, StereoDepth
-from camera_node.synthetic.source import WorldSource
 from freshfield.geometry import Pinhole
 
 EXACT = {
@@ -81,14 +78,10 @@ def test_steps_of_disparity():
     assert len(found) == pytest.approx(32.0 * (K / 3.0 - K / 8.0), abs=2)
 
 
-def test_scale_is_one_factor_a_camera():
+def test_scale_is_one_factor_a_camera_and_nothing_is_measured_out_of_range():
     cameras = [sensor(k, scale_spread_percent=0.5) for k in range(400)]
     assert np.std([c.scale for c in cameras]) == pytest.approx(0.005, rel=0.12)
-    for camera in cameras[:5]:
-        assert (np.abs(counts(camera, WALL) - 2000.0 * camera.scale) <= 0.5).all()
-
-
-def test_the_range():
+    assert (np.abs(counts(cameras[3], WALL) - 2000.0 * cameras[3].scale) <= 0.5).all()
     depth = np.linspace(0.1, 12.0, WALL.size, dtype=np.float32).reshape(WALL.shape)
     seen = counts(sensor(nearest_m=0.3, farthest_m=8.0), depth) > 0
     assert np.array_equal(seen, (depth >= 0.3) & (depth <= 8.0))
@@ -139,32 +132,6 @@ def test_dark_and_overexposed_pixels_stay_unmeasured():
     assert first[:40].mean() == pytest.approx(0.7, abs=0.02)
     assert first[40:80].mean() == pytest.approx(0.5, abs=0.02)
     assert not first[80:].any()
-
-
-def test_a_measurement_depends_on_the_stream_and_the_frame_s_number_alone():
-    def shown(seed: int, numbers: tuple[int, ...]) -> list[bytes]:
-        made = DepthSensor().start(np.random.default_rng(seed))
-        return [counts(made, box(), k).tobytes() for k in numbers]
-
-    first = shown(0, (0, 1, 2**40))
-    assert len(set(first)) == 3 and shown(0, (2**40, 1, 0)) == first[::-1]
-    assert shown(1, (0,)) != first[:1]
-
-
-def test_in_the_room_it_leaves_little_unmeasured_and_errs_by_centimeters():
-    scene = make_scene("room", {"supersample": 1})
-    effects = load_effects({"depth_sensor": {}}, lambda _: np.random.default_rng(3))
-    camera = WorldSource("eye", scene, "cam01", 15, effects=effects)
-    exact = WorldSource(
-        "eye", scene, "cam01", 15, effects=load_effects({"depth_sensor": EXACT}, lambda _: np.random.default_rng(3))
-    )
-    measured, true = (c.depth(20, c.read(20)).meters() for c in (camera, exact))
-    assert (true > 0).all()
-    assert 0.005 < (measured == 0).mean() < 0.03
-    seen = measured > 0
-    error_px = np.abs(K / measured[seen] - K / true[seen])
-    assert np.median(error_px) < 0.12
-    assert 0.002 < (error_px > 0.6).mean() < 0.02
 
 
 @pytest.mark.stability
