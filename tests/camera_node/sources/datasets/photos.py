@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
+from camera_node.sources.datasets.records import DatasetError
 from freshfield.geometry import OPENGL_TO_OPENCV, look_at
 from freshfield.scenario import Scenario, parse
 
@@ -47,6 +50,22 @@ def write_photos(folder: Path, count: int, cameras: int = 0, suffix: str = ".png
     file = folder / "transforms.json"
     file.write_text(json.dumps(data))
     return file
+
+
+def edited(file: Path, change: Callable[[Any], Any] | None = None, **top: Any) -> Path:
+    """The transforms JSON after a change of its contents. top: keys at its top; None takes one away."""
+    data = {key: value for key, value in (json.loads(file.read_text()) | top).items() if value is not None}
+    if change is not None:
+        change(data)
+    file.write_text(json.dumps(data))
+    return file
+
+
+def fails(message: str, load: Callable[..., Any], *args: Any) -> None:
+    """Expect ``load`` to be refused in one line."""
+    with pytest.raises(DatasetError, match=message) as error:
+        load(*args)
+    assert "\n" not in str(error.value)
 
 
 def photo_scenario(data: Path, cameras: int = 3, file: Path = Path("test.yaml"), **source: Any) -> Scenario:

@@ -41,18 +41,11 @@ class Taken:
         lens = self.lens
         return np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
 
-    def pixels(self, points: np.ndarray = POINTS, *more: float) -> np.ndarray:
-        """Where OpenCV sees points, corner origin. more: k1 k2 p1 p2 [k3], else the lens's own."""
-        m = self.world_to_camera
-        bend = np.array(more or self.lens.distortion)
-        found, _ = cv2.projectPoints(points, cv2.Rodrigues(m[:3, :3])[0], m[:3, 3], self.k, bend)
+    def pixels(self) -> np.ndarray:
+        """Where OpenCV sees POINTS, corner origin."""
+        m, bend = self.world_to_camera, np.array(self.lens.distortion)
+        found, _ = cv2.projectPoints(POINTS, cv2.Rodrigues(m[:3, :3])[0], m[:3, 3], self.k, bend)
         return found[:, 0] + 0.5
-
-    def fisheye(self, points: np.ndarray, k: list[float]) -> np.ndarray:
-        """Where OpenCV's fisheye model with k1..k4 sees them, corner origin."""
-        m = self.world_to_camera
-        found, _ = cv2.fisheye.projectPoints(points[None], cv2.Rodrigues(m[:3, :3])[0], m[:3, 3], self.k, np.array(k))
-        return found[0] + 0.5
 
 
 def rig(count: int = 3, lens: Pinhole | None = None) -> list[Taken]:
