@@ -20,15 +20,11 @@ def test_mistakes_are_one_line_and_exit_code_2(capsys, tmp_path, monkeypatch):
     assert "shipped scenarios: " in fails(capsys, "run", "nope", "--all", *to)
     assert "--camera-index 13: expected 0 to 12" in fails(capsys, "run", "room", "--camera-index", "13", *to)
     assert "has no camera cam77; it has cam00, " in fails(capsys, "run", "room", "--camera", "cam01,cam77", *to)
-    assert "FRESHFIELD_DATA" in fails(capsys, "run", "fox", "--all", *to)
-    assert "does not exist" in fails(capsys, "run", "fox", "--all", "--data", str(tmp_path), *to)
-    assert "--to: expected HOST:PORT" in fails(capsys, "run", "room", "--all", "--to", "host")
-    for wrong in ("host:0", "host:99999", "::1", "http://host:80"):
+    for wrong in ("host", "host:0", "::1", "http://host:80"):
         assert "--to: expected HOST:PORT" in fails(capsys, "run", "room", "--all", "--to", wrong)
     for wrong in ("-1", "nan"):
         assert "--seconds: expected" in fails(capsys, "run", "room", "--all", "--seconds", wrong, *to)
     assert "cannot read" in fails(capsys, "run", "room", "--all", "--token-file", str(tmp_path / "no"), *to)
-    assert "seed" in fails(capsys, "run", "room", "--all", "--seed", "-4", *to)
     (tmp_path / "file").write_text("")
     with pytest.raises(SystemExit, match="2"):
         main(["run", "tile", "--all", "--out", str(tmp_path / "file/x"), *to])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +16,7 @@ from camera_node.synthetic.depth import DepthRenderer
 from camera_node.synthetic.effects.depth_sensor import DepthSensor
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose, se3_inverse, so3_exp
-from freshfield.scenario import load, parse
-from tests.conftest import data_dir
+from freshfield.scenario import load
 
 APART = np.eye(4)
 APART[:3, :3], APART[:3, 3] = so3_exp([0.0, 0.05, 0.0]), (-0.03, 0.0, 0.01)
@@ -75,29 +73,15 @@ def test_right_depth_is_described():
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (lambda v: v.scaled(10.0), "that of cam01 seems to be 10 times what it should be: is the unit wrong"),
-        (lambda v: v.scaled(0.1), "that of cam01 seems to be 0.1 times"),
+        (lambda v: v.scaled(0.1), "that of cam01 seems to be 0.1 times what it should be: is the unit wrong"),
         (lambda v: v.scaled(0.3048), "that of cam01 seems to be 0.305 times"),
-        (lambda v: v.scaled(1000.0), "is the unit wrong"),
         (lambda v: recounted(v, lambda c: np.where(c > 0, 3000, 0)), "nearly all of it is the same, 3 m"),
         (lambda v: recounted(v, np.zeros_like), "100% without depth: is the scene within the sensor's range"),
         (lambda v: recounted(v, lambda c: np.where(c > 0, 8000 - c, 0)), "are near and far exchanged"),
         (lambda v: recounted(v, lambda c: c[:, ::-1]), "is the pose, a lens"),
-        (lambda v: moved(v, np.diag([-1.0, -1.0, 1.0, 1.0])), "is the pose, a lens"),
         (lambda v: moved(v, se3_inverse(v.pose.matrix())), "is the pose, a lens"),
     ],
-    ids=[
-        "tenfold",
-        "a tenth",
-        "feet",
-        "mm as m",
-        "constant",
-        "holes",
-        "inverted",
-        "mirrored",
-        "upside down",
-        "nowhere",
-    ],
+    ids=["a tenth", "feet", "constant", "holes", "inverted", "mirrored", "nowhere"],
 )
 def test_wrong_depth_is_told_of_the_camera_that_has_it(change, told):
     first, *others = rig()
@@ -107,13 +91,9 @@ def test_wrong_depth_is_told_of_the_camera_that_has_it(change, told):
 
 
 @pytest.mark.stability
-def test_of_two_cameras_the_one_with_another_unit_is_named_by_both():
+def test_of_two_cameras_the_one_with_another_unit_is_named_by_both_and_one_alone_by_its_edges():
     lines = said([rig()[0].scaled(0.1), rig()[1]])
     assert all("that of cam01 seems to be 0.1 times what it should be" in line for line in lines), lines
-
-
-@pytest.mark.stability
-def test_alone_depth_of_another_image_is_told_by_its_edges():
     mirrored = [recounted(view, lambda c: c[:, ::-1]) for view in rig()[:3]]
     lines = [line for view in mirrored for line in said([view])]
     assert sum("its edges are not those of the image" in line for line in lines) >= 2, lines
@@ -140,14 +120,7 @@ def test_edges_of_fewer_than_200_pixels_say_nothing(count, is_said):
     assert (found is not None) == is_said
 
 
-def test_scenarios_are_examined_where_they_have_depth():
-    def found(scenario):
-        return first_views(scenario, source_config(scenario), None)
-
-    assert [view.camera for view in found(load("duo"))] == ["cam01", "cam02"]
-    assert found(load("room")) == []
-    kitchen = data_dir("blender_kitchen") / "transforms_two_sensor.json"
-    cameras = {"ids": ["cam00", "cam08", "cam11"], "held_out": ["cam00"]}
-    scenario = parse({"cameras": cameras, "source": {"kind": "transforms", "data": str(kitchen)}}, Path("k.yaml"))
-    lines = said(found(scenario))
-    assert len(lines) == 2 and all("agrees with cam" in line and "WRONG" not in line for line in lines)
+@pytest.mark.parametrize(("name", "cameras"), [("duo", ["cam01", "cam02"]), ("room", [])])
+def test_scenarios_are_examined_where_they_have_depth(name, cameras):
+    scenario = load(name)
+    assert [view.camera for view in first_views(scenario, source_config(scenario), None)] == cameras

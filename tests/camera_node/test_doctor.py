@@ -19,7 +19,7 @@ from freshfield.coverage import REACHED, REACHED_WITH_DEPTH
 from freshfield.scenario import load
 from freshfield.transport import Transport
 from tests.camera_node.robot.arm.simulated import simulated_arm
-from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
+from tests.camera_node.sources.datasets.photos import edited, photo_scenario, write_photos
 from tests.camera_node.sources.devices.mjpeg import NetworkCamera
 from tests.camera_node.sources.devices.test_live import CALIBRATION
 from tests.conftest import ROOT
@@ -45,15 +45,15 @@ def cell_at(folder: Path, host: str, **arm) -> str:
 
 def test_without_a_scenario_the_machine_is_examined(capsys, tmp_path):
     _, parts = examined(capsys, "--out", str(tmp_path / "not" / "there" / "yet"))
-    assert parts["python"][0] and parts["disk"][0] and "GB free" in parts["disk"][1]
-    assert parts["clock"][0] is not None and "synchronized" in parts["clock"][1]
+    assert parts["python"][0] and parts["disk"][0] and "synchronized" in parts["clock"][1]
     assert parts["network"][0] is None and parts["scenario"][0] is None
+    main(["doctor"])
+    said = capsys.readouterr().out
+    assert "ok     python" in said and "-      scenario" in said
 
 
-@pytest.mark.parametrize("option", ["--token-file", "--tls-ca"])
-@pytest.mark.parametrize("to", [[], ["--to", "127.0.0.1:9"]])
-def test_security_files_that_do_not_exist_are_refused_before_any_check(capsys, tmp_path, option, to):
-    assert main(["doctor", *to, option, str(tmp_path / "none")]) == 2
+def test_security_files_that_do_not_exist_are_refused_before_any_check(capsys, tmp_path):
+    assert main(["doctor", "--token-file", str(tmp_path / "none")]) == 2
     said = capsys.readouterr()
     assert said.out == "" and f"cannot read {tmp_path / 'none'}" in said.err
 
@@ -67,36 +67,34 @@ def test_an_arm_that_is_well(capsys, tmp_path, host):
     assert parts["arm's path"][0] and "of 51 viewpoints" in parts["arm's path"][1]
 
 
-def test_a_tour_that_leaves_a_side_out_is_wrong(capsys, tmp_path, host):
+def test_a_tour_that_leaves_a_side_out_and_the_examples_calibration_are_wrong(capsys, tmp_path, host):
     path = {**load("cell").source["arm"]["path"], "radius_m": 0.55}
-    code, parts = examined(capsys, cell_at(tmp_path, host, path=path))
+    code, parts = examined(capsys, cell_at(tmp_path, host, path=path, simulated=False))
     ok, said = parts["arm's path"]
     assert code == 1 and ok is False
     assert 3 <= int(re.search(r"reaches (\d+) of 51 viewpoints: change radius_m", said)[1]) < 0.6 * 51
-
-
-@pytest.mark.slow  # 6 s
-def test_the_examples_calibration_is_not_a_benchs(capsys, tmp_path, host):
-    _, parts = examined(capsys, cell_at(tmp_path, host, simulated=False))
     assert parts["hand-eye"][0] is False and "still the example's" in parts["hand-eye"][1]
 
 
-def test_a_part_that_fails_in_its_own_way_does_not_end_the_examination():
+def test_every_fault_is_named_in_one_call(capsys, monkeypatch, tmp_path, host):
     def broken():
-        raise RuntimeError("xioctl failed\nlast error 5")
+        raise RuntimeError("adjtimex failed\nlast error 5")
 
-    finding = doctor._check("camera eye", broken)
-    assert (finding.ok, finding.said) == (False, "RuntimeError: xioctl failed last error 5")
-
-
-def test_every_fault_is_named_in_one_call(capsys, tmp_path, host):
+    monkeypatch.setattr(doctor, "_clock", broken)
+    monkeypatch.setattr(doctor, "LEAST_FREE_GB", 1e9)
+    monkeypatch.setattr(doctor, "_PACKAGES", {"ur": (("nowhere", "ur-rtde"),)})
     scenario = cell_at(tmp_path, host, cameras={"hand": "none.yaml"})
     code, parts = examined(capsys, scenario, "--to", "127.0.0.1:9")
-    assert code == 1
-    assert parts["network"][0] is False and "does a firewall stand between" in parts["network"][1]
-    assert parts["hand-eye"][0] is False and "none.yaml" in parts["hand-eye"][1]
-    assert parts["arm"][0] is False and "simulate-arm" in parts["arm"][1]
-    assert parts["arm's path"][0] is False
+    assert code == 1 and parts["clock"] == (False, "RuntimeError: adjtimex failed last error 5")
+    for part, said in {
+        "disk": "make room",
+        "network": "does a firewall stand between",
+        "package ur": "ur-rtde is not installed: pip install 'freshfield[ur]'",
+        "hand-eye": "none.yaml",
+        "arm": "simulate-arm",
+        "arm's path": "none.yaml",
+    }.items():
+        assert parts[part][0] is False and said in parts[part][1], part
 
 
 def test_a_scenario_that_is_wrong_is_said_like_everything_else(capsys, tmp_path):
@@ -129,14 +127,10 @@ def test_a_camera_is_opened_and_watched(capsys, tmp_path):
     assert parts["camera eye"][0] and parts["camera eye"][1].startswith("64 x 48, ")
     assert parts["camera eye"][1].endswith("stamped by their arrival, less latency_ms; its lens as calibrated")
     assert parts["calibration"] == (True, "calibration.json: 1 cameras")
-    assert "network" in parts
     (tmp_path / "calibration.json").write_text(json.dumps({"other": CALIBRATION["eye"]}))
     _, parts = examined(capsys, file)
     assert parts["calibration"] == (False, "calibration.json: it lacks eye")
     assert parts["camera eye"][0] is False and "no camera at http" in parts["camera eye"][1]
-    (tmp_path / "calibration.json").unlink()
-    _, parts = examined(capsys, file)
-    assert parts["calibration"][0] is False and "camera-node calibrate rig" in parts["calibration"][1]
 
 
 def test_a_tracker_beside_a_camera_is_asked_for_the_pose_of_now(capsys, tmp_path):
@@ -150,24 +144,14 @@ def test_a_tracker_beside_a_camera_is_asked_for_the_pose_of_now(capsys, tmp_path
     assert parts["tracker"][0] and re.fullmatch(r"eye: a pose \d+ ms from now", parts["tracker"][1])
 
 
-def test_a_camera_whose_lens_nobody_knows_is_wrong(capsys, tmp_path):
-    camera = NetworkCamera(WallClock())
-    _, parts = examined(capsys, bench_with(tmp_path, camera, calibration=None))
-    camera.close()
-    assert parts["camera eye"][0] is False and "intrinsics" in parts["camera eye"][1]
-
-
-@pytest.mark.parametrize("asked, ok", [(40, False), (10, True), (4, True)])
+@pytest.mark.parametrize("asked, ok", [(40, False), (4, True)])
 def test_a_camera_at_a_fraction_of_the_rate_that_was_asked_for_is_wrong(capsys, tmp_path, asked, ok):
     camera = NetworkCamera(WallClock(), fps=12.0)
     _, parts = examined(capsys, bench_with(tmp_path, camera, fps=asked))
     camera.close()
     found, said = parts["camera eye"]
-    assert found is ok
-    rate_hz = float(re.search(r"([\d.]+) frames a second", said)[1])
-    assert 2.0 < rate_hz < 16.0
-    if not ok:
-        assert f"of the {asked} asked: is it too dark" in said and "USB 2" in said
+    assert found is ok and 2.0 < float(re.search(r"([\d.]+) frames a second", said)[1]) < 16.0
+    assert ok or f"of the {asked} asked: is it too dark" in said
 
 
 async def test_a_peer_tells_its_time():
@@ -177,57 +161,29 @@ async def test_a_peer_tells_its_time():
     assert abs(found - 3000.0) <= bound + 1.0
 
 
-def test_a_missing_package_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"ur-rtde is not installed: pip install 'freshfield\[ur\]'"):
-        doctor._package("ur")
-
-
-def test_a_full_disk_is_wrong(monkeypatch, tmp_path):
-    monkeypatch.setattr(doctor, "LEAST_FREE_GB", 1e9)
-    with pytest.raises(ValueError, match="make room"):
-        doctor._disk(tmp_path)
-
-
-def test_people_read_lines_with_marks(capsys):
-    main(["doctor"])
-    said = capsys.readouterr().out
-    assert "ok     python" in said and "-      scenario" in said
-
-
 def test_a_data_set_is_opened_and_its_images_are_read(capsys, tmp_path):
     folder = write_photos(tmp_path / "set", 24).parent
     scenario = {"cameras": {"count": 2}, "source": {"kind": "transforms", "data": str(folder)}}
     (tmp_path / "s.yaml").write_text(yaml.safe_dump(scenario))
-
-    def said():
-        return examined(capsys, str(tmp_path / "s.yaml"))[1]["data"]
-
-    assert said() == (True, f"{folder}: 24 images of 1 cameras")
     (folder / "images/003.png").unlink()
+    _, parts = examined(capsys, str(tmp_path / "s.yaml"))
+    said = f"{folder}: 23 images of 1 cameras; 1 of 24 images are missing, first images/003.png"
+    assert parts["data"][0] and parts["data"][1].startswith(said)
     whole = (folder / "images/004.png").read_bytes()
     (folder / "images/004.png").write_bytes(whole[:300])
-    ok, text = said()
+    ok, text = examined(capsys, str(tmp_path / "s.yaml"))[1]["data"]
     assert not ok and "images/004.png: damaged or cut short" in text
-    (folder / "images/004.png").write_bytes(whole)
-    assert said()[1].startswith(f"{folder}: 23 images of 1 cameras; 1 of 24 images are missing, first images/003.png")
 
 
 def test_a_note_on_a_data_set_is_said_once(capsys, caplog, tmp_path):
     """Several checks open the set, and each time its notes go to the log."""
     file = write_photos(tmp_path / "set", 8)
-    data = json.loads(file.read_text())
-    for k, frame in enumerate(data["frames"]):
-        frame["time"] = 10.0 + k
-    file.write_text(json.dumps(data))
+    edited(file, lambda data: [frame.update(time=10.0 + k) for k, frame in enumerate(data["frames"])])
     scenario = {"cameras": {"count": 1}, "source": {"kind": "transforms", "data": str(file.parent)}}
     (tmp_path / "s.yaml").write_text(yaml.safe_dump(scenario))
     note = "8 images of one moving camera, each with its own time: taken for a scene that stands still"
     main(["doctor", str(tmp_path / "s.yaml")])
     assert capsys.readouterr().out.count(note) == 1 and note not in caplog.text
-    scenario = load(str(tmp_path / "s.yaml"))
-    open_sources(scenario, source_config(scenario), scenario.cameras)
-    assert caplog.text.count(note) == 1, "a node still says it"
 
 
 def test_data_that_are_missing_are_said_once(capsys, tmp_path):
@@ -264,8 +220,6 @@ def test_a_camera_that_is_carried_is_not_taken_for_a_fixed_one(tmp_path, count, 
 
     for loop in ("back-and-forth", "restart"):
         assert said(loop).startswith("not reckoned: the cameras move, ")
-    data = json.loads(file.read_text())
-    for frame in data["frames"]:
-        frame["transform_matrix"] = data["frames"][0]["transform_matrix"]
-    file.write_text(json.dumps(data))
+    first = json.loads(file.read_text())["frames"][0]["transform_matrix"]
+    edited(file, lambda data: [frame.update(transform_matrix=first) for frame in data["frames"]])
     assert not said("restart").startswith("not reckoned")

@@ -39,13 +39,14 @@ def said(found: np.ndarray) -> str:
     return pose_check.compare(images, found, focal_px, 1e3 * PERIOD_S)
 
 
-def test_right_poses_move_with_their_images():
-    assert "images and poses move together" in said(poses()) and "moves at 0.4" in said(poses())
-
-
 @pytest.mark.stability
-@pytest.mark.parametrize(("late_s", "message"), [(0.1, "some 1[0-9]{2} ms late"), (-0.2, "some 2[0-9]{2} ms early")])
+@pytest.mark.parametrize(
+    ("late_s", "message"), [(0.0, "together"), (0.1, "some 1[0-9]{2} ms late"), (-0.2, "some 2[0-9]{2} ms early")]
+)
 def test_poses_of_another_instant_are_said_with_their_delay(late_s, message):
+    if not late_s:
+        assert "images and poses move together" in said(poses()) and "moves at 0.4" in said(poses())
+        return
     with pytest.raises(ValueError, match=message):
         said(poses(late_s))
 
@@ -73,9 +74,7 @@ def test_images_that_tell_nothing_are_not_held_against_the_poses():
     assert "hardly move" in pose_check.compare(flat, poses(), 60.0, 100.0)
 
 
-@pytest.mark.parametrize(
-    ("still", "damaged"), [(0, ()), (3, ()), (0, (1,)), (3, (0, 5))], ids=["whole", "stands", "damaged", "both"]
-)
+@pytest.mark.parametrize(("still", "damaged"), [(0, ()), (3, (0, 5))], ids=["whole", "stands, damaged"])
 def test_a_recording_is_read_as_it_is_streamed(tmp_path, still, damaged):
     images, focal_px = filmed()
     frames = []

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
 import pytest
 
-from camera_node.settings import PathConfig, WorldConfig, find_data, source_config
+from camera_node.settings import WorldConfig, find_data, source_config
 from freshfield.scenario import ScenarioError, parse
 
 VIDEO = {"kind": "video", "data": "x"}
@@ -17,11 +16,12 @@ def config(**source):
     return source_config(parse({"cameras": {"count": 2}, "source": source}, Path("s.yaml")))
 
 
-def test_what_is_given_reaches_the_scene():
+def test_what_is_given_reaches_the_source():
     world = config(kind="world", scene="tile", width=64, params={"supersample": 1}, effects={"sensor_noise": None})
-    assert isinstance(world, WorldConfig) and world.codec == "jpeg" and world.fps is None
+    assert isinstance(world, WorldConfig) and world.codec == "jpeg" and world.fps is None and world.depth_every == 5
     assert world.scene_parameters() == {"width": 64, "supersample": 1}
     assert world.effects == {"sensor_noise": None}
+    assert config(kind="camera", devices={"a": 0, "b": "/dev/video2"}).devices == {"a": 0, "b": "/dev/video2"}
 
 
 @pytest.mark.parametrize(
@@ -30,15 +30,10 @@ def test_what_is_given_reaches_the_scene():
         ({}, "source.kind: expected one of world, transforms, video"),
         ({"kind": "wrold"}, "source.kind: .*'wrold'"),
         ({"kind": "world", "fbs": 3}, "source.fbs: unknown key; did you mean 'fps'"),
-        ({"kind": "world", "fps": 0}, "source.fps: expected a number, 0.01 to 1000, got 0"),
-        ({"kind": "world", "quality": 101}, "source.quality: expected .*1 to 100"),
         ({"kind": "world", "effects": {"sensor_noise": 3}}, "source.effects.sensor_noise"),
         ({"kind": "transforms"}, "data: missing"),
-        ({"kind": "transforms", "data": "x", "scale": 0.5}, "source.scale: expected .*at least 1"),
         ({"kind": "transforms", "data": "x", "background": "keep"}, "use png"),
-        ({**VIDEO, "trajectory": {"files": {}, "max_gap_ms": 1e308}}, "trajectory.max_gap_ms: expected"),
         ({**VIDEO, "trajectory": {"files": {}, "start_s": 1e300}}, "trajectory.start_s: expected"),
-        ({"kind": "camera", "latency_ms": 1e308}, "source.latency_ms: expected"),
         ({"kind": "world", "quality": 10**400}, "source.quality: expected .*1 to 100, got 10{99}"),
     ],
 )
@@ -46,15 +41,6 @@ def test_errors_name_file_and_key(source, message):
     with pytest.raises(ScenarioError, match=message) as error:
         config(**source)
     assert str(error.value).startswith("s.yaml: source") and "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("elevation_deg", [-89.1, -89.0, 89.0, 89.1])
-def test_rings_of_a_tour_lie_off_the_poles(elevation_deg):
-    if abs(elevation_deg) == 89.0:
-        assert msgspec.convert({"elevations_deg": [elevation_deg]}, PathConfig).elevations_deg == (elevation_deg,)
-    else:
-        with pytest.raises(msgspec.ValidationError):
-            msgspec.convert({"elevations_deg": [elevation_deg]}, PathConfig)
 
 
 def test_data_is_found_below_the_folder_that_was_given(tmp_path, monkeypatch):
@@ -69,13 +55,7 @@ def test_data_is_found_below_the_folder_that_was_given(tmp_path, monkeypatch):
     assert find_data("set", scenario, None) == tmp_path / "set"
     with pytest.raises(ScenarioError, match="does not exist"):
         find_data("other", scenario, None)
-    with pytest.raises(ScenarioError, match=r"rig\.json: neither beside s\.yaml nor .*; camera-node calibrate rig"):
-        find_data("rig.json", parse({"cameras": {"count": 2}, "source": {"kind": "video"}}, Path("s.yaml")), None)
     # What lies beside the scenario comes first.
     (tmp_path / "mine/set").mkdir(parents=True)
     mine = parse({"cameras": {"count": 2}}, tmp_path / "mine/s.yaml")
     assert find_data("set", mine, tmp_path) == tmp_path / "mine/set"
-
-
-def test_devices_may_be_numbers_as_people_write_them():
-    assert config(kind="camera", devices={"a": 0, "b": "/dev/video2"}).devices == {"a": 0, "b": "/dev/video2"}

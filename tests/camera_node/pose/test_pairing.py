@@ -59,11 +59,10 @@ def test_the_order_and_the_number_of_arrivals_do_not_matter(random, stamps_ms):
     """Duplicated and shuffled, a stream pairs as its sorted self does."""
     sent = stamps_ms + random.sample(stamps_ms, len(stamps_ms) // 2)
     random.shuffle(sent)
-    buffer = SampleBuffer(Pose.interpolate, max_gap_ns=30 * MS)
+    buffer, track = (SampleBuffer(Pose.interpolate, max_gap_ns=30 * MS) for _ in range(2))
     added = [buffer.add(t_ms * MS, at(t_ms)) for t_ms in sent]
     distinct = sorted(set(stamps_ms))
     assert sum(added) == len(distinct) and buffer.received == len(sent)
-    track = SampleBuffer(Pose.interpolate, max_gap_ns=30 * MS)
     for t_ms in distinct:
         track.add(t_ms * MS, at(t_ms))
     for t_ms in range(0, 400, 13):
@@ -77,19 +76,9 @@ def test_the_order_and_the_number_of_arrivals_do_not_matter(random, stamps_ms):
 
 
 @pytest.mark.stability
-@pytest.mark.parametrize("jump_ms", [-3_600_000, 3_600_000, -(10**12), 10**12])
-def test_a_clock_that_is_set_is_followed(jump_ms):
+@pytest.mark.parametrize("jump_ms", [-3_600_000, 10**12])
+def test_a_clock_that_is_set_is_followed_and_one_wild_stamp_costs_a_few_samples(jump_ms):
     """A controller that restarts counts from its start again; one that is synchronised leaps."""
-    buffer = SampleBuffer(Pose.interpolate, max_gap_ns=20 * MS)
-    for t_ms in range(0, 1000, 8):
-        buffer.add(t_ms * MS, at(t_ms))
-    for k, t_ms in enumerate(range(1000, 2000, 8)):
-        buffer.add((t_ms + jump_ms) * MS, at(t_ms))
-        assert k < 8 or buffer.at((t_ms + jump_ms) * MS)[0] == at(t_ms)
-
-
-@pytest.mark.stability
-def test_one_wild_stamp_costs_a_few_samples_and_no_more():
     buffer, lost = SampleBuffer(Pose.interpolate, max_gap_ns=20 * MS), 0
     for t_ms in range(0, 4000, 8):
         buffer.add((10**15 if t_ms == 2000 else t_ms) * MS, at(t_ms))
@@ -98,6 +87,9 @@ def test_one_wild_stamp_costs_a_few_samples_and_no_more():
         except PoseGapError:
             lost += 1
     assert lost == 8
+    for k, t_ms in enumerate(range(4000, 5000, 8)):
+        buffer.add((t_ms + jump_ms) * MS, at(t_ms))
+        assert k < 8 or buffer.at((t_ms + jump_ms) * MS)[0] == at(t_ms)
 
 
 @pytest.mark.stability

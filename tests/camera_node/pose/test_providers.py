@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from camera_node.pose.providers import read_tum
-from camera_node.sources.datasets.records import DatasetError
 from freshfield.geometry import so3_exp
+from tests.camera_node.sources.datasets.photos import fails
 
 
 def test_tum_files_keep_nanoseconds_and_put_w_first(tmp_path):
@@ -27,18 +27,14 @@ def test_tum_files_keep_nanoseconds_and_put_w_first(tmp_path):
     ("text", "message"),
     [
         ("", "at least one sample"),
-        ("1 2 3\n", ":1: expected t tx ty tz"),
-        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 zero\n", ":2: expected"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 zero\n", ":2: expected t tx ty tz"),
         ("0 0 0 0 0 0 0 0\n", ":1: quaternion"),
         ("0 nan 0 0 0 0 0 1\n", ":1: expected"),
-        ("1732600000000 0 0 0 0 0 0 1\n", ":1: the time 1.7.* milliseconds or nanoseconds"),
-        ("0 0 0 0 0 0 0 1\n-1e300 0 0 0 0 0 0 1\n", ":2: the time -1e"),
+        ("0 0 0 0 0 0 0 1\n-1e300 0 0 0 0 0 0 1\n", ":2: the time -1e.* milliseconds or nanoseconds"),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "times that increase"),
     ],
 )
 def test_bad_lines_are_named(tmp_path, text, message):
     file = tmp_path / "track.txt"
     file.write_text(text)
-    with pytest.raises(DatasetError, match=message) as error:
-        read_tum(file)
-    assert str(file) in str(error.value)
+    fails(f"{file}.*{message}", read_tum, file)
