@@ -50,25 +50,16 @@ def test_the_person_and_the_cart_move_at_the_speed_asked_for(speed):
         assert np.allclose(centers[0], centers[-1], atol=1e-9), "it joins up at the end of the loop"
 
 
-def test_what_does_not_move_is_the_same_at_every_instant():
-    for scene in (make_scene("room", {**SMALL, "speed_m_per_s": 0.0}), make_scene("tile", SMALL)):
-        first = scene.render("cam00", 0.0)
-        assert not scene.moving and all(np.array_equal(scene.render("cam00", t), first) for t in (3.21, 1e9, -5.0))
-
-
 @pytest.mark.parametrize(
     ("name", "params", "message"),
     [
         ("rooom", {}, "valid scenes: drawn_room, room, tile, tower"),
         ("room", {"people": 5}, "people: expected .*0 to 4"),
-        ("room", {"motion_seed": -1}, "motion_seed: expected .*0"),
-        ("room", SMALL, "no camera 'cam13'; it has cam00, cam01"),
     ],
 )
-def test_an_invalid_scene_or_camera_is_refused_in_one_line(name, params, message):
-    with pytest.raises(ScenarioError, match=message) as error:
-        make_scene(name, params).render("cam13", 0.0)
-    assert "\n" not in str(error.value)
+def test_an_invalid_scene_is_refused(name, params, message):
+    with pytest.raises(ScenarioError, match=message):
+        make_scene(name, params)
 
 
 @pytest.mark.parametrize("name", ["room", "tower"])
@@ -77,11 +68,9 @@ def test_a_motion_that_is_drawn_follows_from_its_seed_alone(name):
         scene = make_scene(name, {"count": 3, **SMALL, **params})
         return np.concatenate([m.matrices(0.3).ravel() for m in scene.world.moving_bodies])
 
-    own, drawn = seen(), [seen(motion_seed=seed) for seed in range(6)]
+    own, *drawn = seen(), *(seen(motion_seed=seed) for seed in range(6))
     assert np.array_equal(seen(motion_seed=2), drawn[2])
-    for k, one in enumerate(drawn):
-        assert not np.allclose(one, own) and not any(np.allclose(one, other) for other in drawn[:k])
-    assert np.array_equal(seen(speed_m_per_s=0.0), seen(speed_m_per_s=0.0, motion_seed=4)), "what stands still"
+    assert not any(np.allclose(one, other) for k, one in enumerate(drawn) for other in (own, *drawn[:k]))
 
 
 def test_motions_that_are_drawn_differ_in_speed_direction_start_and_path_and_face_forward():
@@ -94,16 +83,6 @@ def test_motions_that_are_drawn_differ_in_speed_direction_start_and_path_and_fac
     for walk in walks[:9]:
         step = np.subtract(walk.at(0.3 + 1e-6), walk.at(0.3 - 1e-6))
         assert np.allclose(step / np.linalg.norm(step), walk.heading(0.3), atol=1e-5)
-
-
-def test_renderers_of_drawn_motions_share_what_stands_still_and_nothing_else():
-    scenes = [make_scene("room", {"count": 2, **SMALL, "motion_seed": seed}) for seed in (1, 2)]
-    images = [scene.render("cam01", 0.4) for scene in scenes]
-    for scene, image in zip(scenes, images):
-        assert np.array_equal(scene.view(*scene.cameras["cam01"]).image(0.4), image)
-    assert not np.array_equal(*images)
-    assert scenes[0].renderer("cam01")._static_colors is scenes[1].renderer("cam01")._static_colors
-    assert make_scene("room", SMALL).static_key is None  # nothing is kept where no motion is drawn
 
 
 @pytest.mark.parametrize(("name", "speed"), [("room", 8.0), ("tower", 8.0), ("drawn_room", 1.0)])
@@ -156,7 +135,6 @@ def test_extreme_lenses_and_sizes(fov, shape):
         ([0.0, 0.5, 2.99], [0.0, 0.5, 0.0]),  # straight down, along the up vector
         ([0.0, 0.5, 0.0], [0.0, 0.5, 3.0]),  # in the floor's plane, straight up
         ([3.0, 3.0, 3.0], [-3.0, -3.0, 0.0]),  # in the corner where three planes meet
-        ([0.0, -40.0, 2.0], [0.0, 0.0, 1.0]),  # outside
     ],
 )
 @pytest.mark.filterwarnings("error")

@@ -6,18 +6,13 @@ import os
 from fractions import Fraction
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from camera_node.settings import WorldConfig, source_config
 from camera_node.synthetic import frame_cache, make_scene
 from camera_node.synthetic import source as source_module
-from camera_node.synthetic.effects import load_effects
 from camera_node.synthetic.frame_cache import prune
-from camera_node.synthetic.source import WorldSource, open_sources
+from camera_node.synthetic.source import WorldSource
 from freshfield import payload
-from freshfield.scenario import ScenarioError, parse
-from tests.support import small_world
 
 SMALL = {"width": 32, "height": 32, "supersample": 1, "speed_m_per_s": 8.0}  # 0.6 s: few frames
 
@@ -32,25 +27,6 @@ def source(scene=None, fps=15, camera="cam01", **options) -> WorldSource:
 
 def files(folder: Path) -> list[Path]:
     return sorted(p for p in folder.rglob("*") if p.is_file())
-
-
-@pytest.mark.parametrize(
-    ("ids", "taken"),
-    [
-        (["cam02", "cam01"], ["cam02", "cam01"]),
-        (["cam01", "eye"], ["cam00", "cam01"]),
-        ([f"c{k}" for k in "0123"], None),
-    ],
-)
-def test_cameras_are_those_of_the_scene_by_name_if_it_has_all_of_them_or_else_in_order(monkeypatch, ids, taken):
-    scenario, three = parse({"cameras": {"ids": ids}}, Path("own.yaml")), room(count=3)
-    monkeypatch.setattr(source_module, "make_scene", lambda *_: three)
-    config = WorldConfig(kind="world")
-    if taken is None:
-        with pytest.raises(ScenarioError, match=r"own\.yaml: cameras: the scene has 3: cam00, cam01, cam02"):
-            open_sources(scenario, config, ids, None, {})
-    else:
-        assert [made.camera_id for made in open_sources(scenario, config, ids, None, {}).values()] == taken
 
 
 @pytest.mark.parametrize(("fps", "frames"), [(15, 9), (Fraction(100, 3), 20), (24, 72), (29.97, None)])
@@ -80,7 +56,6 @@ def test_prepared_once_nothing_is_rendered_again(tmp_path, codec, monkeypatch):
     first.prepare(lambda: len(files(tmp_path)) >= 3)
     assert len(files(tmp_path)) == 3
     first.prepare(lambda: False)
-    assert len(files(tmp_path)) == 9
     again = source(codec=codec, folder=tmp_path)
     monkeypatch.setattr(again, "_render", None)
     again.prepare(lambda: False)
@@ -117,18 +92,6 @@ def test_the_key_follows_all_that_decides_the_bytes(monkeypatch):
     assert source().key() != base
 
 
-def test_noise_is_added_to_lossless_frames_and_never_repeats(tmp_path):
-    scene = room()
-    made = source(
-        scene, effects=load_effects({"sensor_noise": {}}, lambda _: np.random.default_rng(5)), folder=tmp_path
-    )
-    assert made.contents is None and made.content(1234) == 1234
-    exact = scene.render("cam01", 2 / 15)
-    a, b = made.read(2).image, made.read(2 + 9).image
-    assert np.array_equal(made.image(2), exact) and len(files(tmp_path)) == 1
-    assert not np.array_equal(a, b) and np.abs(a.astype(int) - exact).mean() < 6
-
-
 def test_the_first_frame_a_process_writes_makes_room_and_the_longest_unused_goes_first(tmp_path, monkeypatch):
     for k in range(4):
         folder = tmp_path / f"{k:032x}"
@@ -143,14 +106,3 @@ def test_the_first_frame_a_process_writes_makes_room_and_the_longest_unused_goes
     monkeypatch.setattr(frame_cache, "MAX_DISK_BYTES", 1000)
     source(folder=tmp_path).prepare(lambda: False)
     assert not (tmp_path / f"{0:032x}").exists() and len(files(tmp_path)) == 9 + 2
-
-
-@pytest.mark.parametrize("variable", ["XDG_CACHE_HOME", "HOME"])
-def test_frames_of_a_scenario_are_kept_in_the_users_cache(monkeypatch, tmp_path, variable):
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setenv(variable, str(tmp_path))
-    scenario = parse({"cameras": {"count": 1}, "source": small_world(scene="tile")}, Path("s.yaml"))
-    (made,) = open_sources(scenario, source_config(scenario), ["cam00"], None, {}).values()
-    made.read(0)
-    cache = tmp_path if variable == "XDG_CACHE_HOME" else tmp_path / ".cache"
-    assert len(files(cache / "freshfield/frames")) == 1

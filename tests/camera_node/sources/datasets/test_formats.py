@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 
 from camera_node.settings import source_config
-from camera_node.sources.datasets import colmap, dynerf, eyeful, zju
+from camera_node.sources.datasets import dynerf, eyeful, zju
 from camera_node.sources.datasets.formats import FORMATS, open_dataset
 from camera_node.sources.datasets.lens import Lens, exact, pinhole, undistort
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
-from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.registry import open_sources
 from camera_node.synthetic import make_scene
 from freshfield.geometry import Pinhole, se3_inverse
@@ -162,31 +161,25 @@ def test_a_pickle_runs_nothing_and_one_that_refers_to_itself_is_no_bomb(tmp_path
     fails("references stand for more", zju.load_dataset, tmp_path)
 
 
-def test_eyeful_sees_points_where_they_are(tmp_path):
+def test_eyeful_sees_points_where_they_are_and_straightens_lenses_that_are_none_of_ours(tmp_path):
     cameras = sets.rig(3, BENT)
     dataset = eyeful.load_dataset(sets.write_eyeful(tmp_path, cameras))
     assert dataset.cameras == ("10", "11", "12") and not dataset.moving
     agree([dataset.of(name)[0] for name in dataset.cameras], cameras)
     assert dataset.held_out == {"10/10_DSC0000", "10/10_DSC0001"}
     shows_the_world(dataset.of("12")[0])
-
-
-@pytest.mark.parametrize(
-    ("model", "distortion", "bends"),
-    [
+    for number, (model, distortion, bends) in enumerate(
         (
-            "RadialAndTangential",
-            [-0.08, 0.02, 0.002, -0.003, 0.015],
-            {"radial": (-0.08, 0.02, 0.015), "tangential": (0.002, -0.003)},
-        ),
-        ("Fisheye", [-0.02, 0.004, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], {"radial": (-0.02, 0.004, 0.0), "fisheye": True}),
-    ],
-)
-def test_eyeful_lenses_that_are_none_of_ours_are_straightened(tmp_path, model, distortion, bends):
-    cameras = sets.rig(2)
-    record = eyeful.load_dataset(sets.write_eyeful(tmp_path, cameras, 1, model, distortion))[1]
-    lens = Lens(64, 48, *cameras[1].k[[0, 1], [0, 1]], *(cameras[1].k[:2, 2] + 0.5), **bends)
-    assert record.intrinsics == pinhole(lens) and not record.intrinsics.distorted and record.path is None
+            (
+                "RadialAndTangential",
+                [0.1, 0.2, 3e-3, 4e-3, 0.5],
+                {"radial": (0.1, 0.2, 0.5), "tangential": (3e-3, 4e-3)},
+            ),
+            ("Fisheye", [-0.02, 4e-3, 0, 0, 0, 0, 0, 0], {"radial": (-0.02, 4e-3, 0.0), "fisheye": True}),
+        )
+    ):
+        record = eyeful.load_dataset(sets.write_eyeful(tmp_path / str(number), cameras, 1, model, distortion))[1]
+        assert record.intrinsics == pinhole(Lens(64, 48, 60.0, 61.0, 31.2, 24.9, **bends)) and record.path is None
 
 
 @pytest.mark.parametrize(
@@ -209,18 +202,6 @@ def test_colmap_sees_points_where_they_are(tmp_path, model, binary):
         np.testing.assert_allclose(dataset[1].camera_to_world, cameras[1].camera_to_world, atol=1e-9)
 
 
-def test_colmap_pictures_may_be_smaller_than_the_model(tmp_path):
-    cameras = sets.rig(2)
-    folder = sets.write_colmap(tmp_path, cameras, "PINHOLE", True)
-    for camera in cameras:
-        small = cv2.resize(camera.shows(0), (32, 24), interpolation=cv2.INTER_AREA)
-        sets.write_image(folder / f"images_2/{camera.name} x.jpg", small)
-    dataset = colmap.load_dataset(folder, images="images_2")
-    for record, camera in zip(dataset, cameras):
-        assert np.abs(2.0 * seen(record) - camera.pixels()).max() < NEAR_PX
-    assert dataset[0].read().shape == (24, 32, 3)
-
-
 WRITERS = {
     "dynerf": sets.write_dynerf,
     "zju": sets.write_zju,
@@ -234,7 +215,6 @@ def test_formats_are_recognized_and_streamed_at_their_pace(tmp_path, name):
     cameras = sets.rig(3)
     folder = WRITERS[name](tmp_path / "set", cameras)
     _, dataset = open_dataset(folder)
-    assert [r.name for r in dataset] == [r.name for r in open_dataset(folder, name=name)[1]]
     for other in set(FORMATS) - {name}:
         fails("holds no data set of the format", open_dataset, folder, 1.0, other)
     ids = list(dataset.cameras) if name != "colmap" else ["a", "b", "c"]
@@ -244,8 +224,7 @@ def test_formats_are_recognized_and_streamed_at_their_pace(tmp_path, name):
     for camera, truth in zip(ids, cameras):
         shot = sources[camera].read(sources[camera].content(0))
         np.testing.assert_allclose(shot.pose.matrix(), truth.camera_to_world, atol=1e-9)
-        # What is a JPEG already is sent as it is.
-        assert isinstance(shot.image, bytes) == (name != "dynerf")
+        assert isinstance(shot.image, bytes) == (name != "dynerf"), "what is a JPEG already is sent as it is"
 
 
 @pytest.mark.parametrize(
@@ -277,10 +256,3 @@ def test_straightened_pictures_show_each_ray_where_it_belongs(lens):
     assert np.abs(found - truth)[inner].max() < 1 / 32
     # Nothing comes from beyond the picture, and it is as wide as that allows: some border touches the edge.
     assert (truth >= -1e-9).all() and (truth <= (96, 64)).all()
-
-
-def test_lenses_that_nobody_made_are_refused():
-    with pytest.raises(DatasetError, match="belong to no lens"):
-        pinhole(Lens(64, 48, 10.0, 10.0, 32.0, 24.0, (-50.0, 900.0, -4000.0)))
-    with pytest.raises(DatasetError, match="not finite"):
-        Lens(64, 48, float("nan"), 1.0, 0.0, 0.0)

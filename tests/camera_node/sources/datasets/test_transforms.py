@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import cv2
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ from camera_node.sources.datasets.photo import ImageOptions, Photo
 from camera_node.sources.datasets.transforms import load_dataset
 from freshfield.geometry import Pinhole
 from tests.camera_node.sources.datasets.photos import BOMB, edited, fails, opencv_pose, picture, write_photos
-from tests.conftest import data_dir
 
 
 def test_poses_become_opencv_and_images_rgb_at_the_scale_asked_for(tmp_path):
@@ -85,30 +82,6 @@ def test_an_image_of_another_size_or_damaged_is_refused_when_read(tmp_path):
     fails(r"bomb\.png: .* larger than its limit", bomb.read)
     cv2.imwrite(str(tmp_path / "images/000.png"), np.zeros((24, 30, 3), np.uint8))
     fails("30 x 24", dataset[0].read)
-
-
-def test_a_folder_uses_the_first_file_whose_images_exist():
-    dataset = load_dataset(data_dir("fox"), ImageOptions(4))
-    # transforms.json names full-size images that are not there; transforms_2.json those that are.
-    assert len(dataset) == 50 and dataset.missing == 0
-    assert dataset[0].read().shape == (240, 135, 3)
-
-
-def test_kitchen_points_project_onto_their_balls():
-    folder = data_dir("blender_kitchen")
-    dataset = load_dataset(folder / "transforms.json")
-    assert dataset.moving and len(dataset.cameras) == 19 and dataset.fps == 30
-    magenta = json.loads((folder / "points.json").read_text())["points"]["table_magenta"]
-    world = np.append(np.array(magenta["xyz"][0]), 1.0)
-    hits = 0
-    for camera in ("cam00", "cam05", "cam11", "cam17"):
-        record = dataset.of(camera)[0]
-        u, v = record.intrinsics.project((np.linalg.inv(record.camera_to_world) @ world)[:3])
-        if 2 < u < 190 and 2 < v < 142:
-            r, g, b = (float(c) for c in record.read()[int(v), int(u)])
-            assert r > 1.3 * g and b > 1.2 * g, (camera, r, g, b)
-            hits += 1
-    assert hits >= 3
 
 
 @pytest.mark.parametrize("leads", ["../outside", "{outside}", "images/../../outside", "/etc/hostname", "", "a/" * 5000])

@@ -8,19 +8,8 @@ import pytest
 from camera_node.synthetic.effects.depth_sensor import DepthSensor, StereoDepth
 from freshfield.geometry import Pinhole
 
-EXACT = {
-    "noise_px": 0.0,
-    "fixed_noise_px": 0.0,
-    "step_px": 0.0,
-    "scale_spread_percent": 0.0,
-    "nearest_m": 0.0,
-    "farthest_m": 65.535,
-    "shadow": False,
-    "silhouette_holes": 0.0,
-    "flying": 0.0,
-    "dark_holes": 0.0,
-    "bright_holes": 0.0,
-}
+ERRORS = ("noise_px", "fixed_noise_px", "step_px", "scale_spread_percent", "nearest_m", "silhouette_holes", "flying")
+EXACT = dict.fromkeys((*ERRORS, "dark_holes", "bright_holes"), 0.0) | {"farthest_m": 65.535, "shadow": False}
 LENS = Pinhole.from_fov(160, 120, 60.0)
 GRAY = np.full((120, 160, 3), 128, np.uint8)
 K = 425.0 * 0.05  # disparity = K / depth
@@ -44,28 +33,29 @@ def disparity_error(made: StereoDepth, frames: int, depth_m: float = 2.0) -> np.
     return K / (shown * 1e-3) - K / depth_m
 
 
-def test_without_errors_it_is_exact_depth_in_millimeters():
+def test_without_errors_it_is_exact_depth_in_millimeters_within_its_range_and_scale():
     depth = np.random.default_rng(1).uniform(0.001, 65.0, WALL.shape).astype(np.float32)
     depth[5] = 0.0
     assert np.abs(counts(sensor(), depth) - depth * 1e3).max() < 0.51
+    seen = counts(sensor(nearest_m=0.3, farthest_m=8.0), depth) > 0
+    assert np.array_equal(seen, (depth >= 0.3) & (depth <= 8.0))
+    cameras = [sensor(k, scale_spread_percent=0.5) for k in range(400)]
+    assert np.std([c.scale for c in cameras]) == pytest.approx(0.005, rel=0.12)
+    assert (np.abs(counts(cameras[3], WALL) - 2000.0 * cameras[3].scale) <= 0.5).all()
 
 
-@pytest.mark.parametrize("depth_m", [1.0, 2.0])
-def test_noise_has_the_stated_deviation_and_reach(depth_m):
-    new = disparity_error(sensor(noise_px=0.08), 40, depth_m)
+def test_noise_has_the_stated_deviation_and_reach():
+    new = disparity_error(sensor(noise_px=0.08), 40)
     assert new.std() == pytest.approx(0.08, rel=0.04)
     assert abs(np.corrcoef(new[:-1].ravel(), new[1:].ravel())[0, 1]) < 0.05, "new in each frame"
-    fixed = disparity_error(sensor(fixed_noise_px=0.06), 2, depth_m)
-    assert np.array_equal(fixed[0], fixed[1])
-    assert fixed[0].std() == pytest.approx(0.06, rel=0.1)
+    fixed = disparity_error(sensor(fixed_noise_px=0.06), 2, 1.0)
+    assert np.array_equal(fixed[0], fixed[1]) and fixed[0].std() == pytest.approx(0.06, rel=0.1)
     # White noise smoothed by sigma has the autocorrelation exp(-x^2 / (4 sigma^2)).
     sigma = 2.3 * LENS.fx / 425.0
     for x in (1, 2):
         near = np.corrcoef(new[:, :, x:].ravel(), new[:, :, :-x].ravel())[0, 1]
         assert near == pytest.approx(np.exp(-(x**2) / (4.0 * sigma**2)), abs=0.05)
-    rough = disparity_error(sensor(noise_px=0.08, smoothing_px=0.0), 10, depth_m)
-    assert rough.std() == pytest.approx(0.08, rel=0.04)
-    assert abs(np.corrcoef(rough[:, :, 1:].ravel(), rough[:, :, :-1].ravel())[0, 1]) < 0.05
+    assert disparity_error(sensor(noise_px=0.08, smoothing_px=0.0), 10).std() == pytest.approx(0.08, rel=0.04)
 
 
 def test_steps_of_disparity():
@@ -76,15 +66,6 @@ def test_steps_of_disparity():
     assert np.abs(steps - np.rint(steps))[far].max() < 0.05
     found = np.unique(np.rint(steps[far]))
     assert len(found) == pytest.approx(32.0 * (K / 3.0 - K / 8.0), abs=2)
-
-
-def test_scale_is_one_factor_a_camera_and_nothing_is_measured_out_of_range():
-    cameras = [sensor(k, scale_spread_percent=0.5) for k in range(400)]
-    assert np.std([c.scale for c in cameras]) == pytest.approx(0.005, rel=0.12)
-    assert (np.abs(counts(cameras[3], WALL) - 2000.0 * cameras[3].scale) <= 0.5).all()
-    depth = np.linspace(0.1, 12.0, WALL.size, dtype=np.float32).reshape(WALL.shape)
-    seen = counts(sensor(nearest_m=0.3, farthest_m=8.0), depth) > 0
-    assert np.array_equal(seen, (depth >= 0.3) & (depth <= 8.0))
 
 
 def box(near_m: float = 1.0, far_m: float = 4.0) -> np.ndarray:

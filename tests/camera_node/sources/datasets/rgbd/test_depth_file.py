@@ -38,21 +38,15 @@ def written(path: Path, values: np.ndarray) -> Path:
 
 @pytest.mark.parametrize("name", ["mm.png", "mm.tiff", "mm.npy", "m.npy", "m.exr"])
 def test_every_kind_of_file_gives_the_same_millimeters(tmp_path, name):
-    values = MM if name.startswith("mm") else (MM / 1000.0).astype(np.float32)
+    values = MM.copy() if name.startswith("mm") else (MM / 1000.0).astype(np.float32)
     found = DepthFile(written(tmp_path / name, values)).read(photo())
     assert np.array_equal(found.counts, MM) and found.meters_per_count == 0.001
-    assert np.allclose(found.meters(), MM / 1000.0, atol=1e-6)
     assert found.intrinsics is None and found.to_camera is None
-
-
-def test_the_unit_and_what_stands_for_nothing_are_the_format_s(tmp_path):
-    values = MM.copy()
-    values[0] = 65535
-    found = DepthFile(written(tmp_path / "d.png", values), 1 / 5000, 65535).read(photo())
-    assert np.array_equal(found.counts[1:], MM[1:]) and not found.counts[0].any()
-    assert found.meters()[10, 10] == pytest.approx(MM[10, 10] / 5000)
-    floats = DepthFile(written(tmp_path / "d.npy", MM.astype(np.float64)), 0.001).read(photo())
-    assert np.array_equal(floats.counts, MM)
+    if name.startswith("mm"):  # the unit, and what stands for nothing, may be the format's
+        values[0] = 65535
+        found = DepthFile(written(tmp_path / name, values), 1 / 5000, 65535).read(photo())
+        assert np.array_equal(found.counts[1:], MM[1:]) and not found.counts[0].any()
+        assert found.meters()[10, 10] == pytest.approx(MM[10, 10] / 5000)
 
 
 def test_depth_is_straightened_with_its_image_and_is_no_larger(tmp_path):
@@ -65,16 +59,13 @@ def test_depth_is_straightened_with_its_image_and_is_no_larger(tmp_path):
     assert bent.shape == (24, 32) and set(bent.ravel()) <= set(MM.ravel()) and not np.array_equal(bent, MM)
 
 
-FLOATS = (MM / 1000.0).astype(np.float32)
 BAD_FILES = {
     "missing": ("d.png", None, "missing, damaged"),
-    "cut": ("d.png", b"\x89PNG\r\n\x1a\n123", "missing, damaged"),
     "npy cut": ("d.npy", b"\x93NUMPY", "cannot be read as numbers"),
     "8 bits": ("d.png", (MM // 256).astype(np.uint8), "expected one number a pixel, of 16 bits"),
-    "colors": ("d.png", np.dstack([MM, MM // 2, MM]), "expected one number a pixel"),
     "another shape": ("d.png", MM[:, :20], "depth is 20 x 24, its image 32 x 24"),
     "meters in a PNG": ("d.png", np.maximum(MM // 1000, 1), "the median of its depth is 0.00"),
-    "millimeters as floats": ("d.npy", FLOATS * 1e2, "the median of its depth is 3.. m"),
+    "millimeters as floats": ("d.npy", (MM / 10.0).astype(np.float32), "the median of its depth is 3.. m"),
     "signed": ("d.npy", MM.astype(np.int32), "expected one number a pixel"),
     "wide": ("d.npy", MM.astype(np.uint32) * 1000, "exceed 16 bits"),
 }
@@ -131,11 +122,3 @@ def test_transforms_bring_depth_with_the_frames_that_have_it(tmp_path):
     assert np.array_equal(shown[2].counts, measured.counts)
     for unit in (-1, "mm", 1e9, True):
         fails("depth_unit_scale_factor", transforms.load_dataset, edited(file, depth_unit_scale_factor=unit))
-
-
-def test_the_depth_sensor_s_errors_can_be_added_to_recorded_depth(tmp_path):
-    effects = {"depth_sensor": {"silhouette_holes": 1.0}}
-    scenario = photo_scenario(with_depth(tmp_path), cameras=2, effects=effects)
-    (camera,) = build_cameras(scenario, source_config(scenario), ["cam01"])
-    first, again = (camera.source.depth(3, camera.source.read(3)).counts for _ in range(2))
-    assert np.array_equal(first, again) and (first == 0).mean() > 0.5, "random depth is all silhouettes"

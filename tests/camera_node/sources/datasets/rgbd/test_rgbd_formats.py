@@ -67,16 +67,12 @@ def write_tum(folder: Path) -> None:
         (folder / f"{name}.txt").write_text("# a comment\n" + "\n".join(lines) + "\n")
 
 
-# The nominal place of a Kinect's depth sensor to its camera.
-APART = np.eye(4)
-APART[0, 3] = -0.0256
-
-
 def write_sevenscenes(folder: Path) -> None:
-    lens = Pinhole(64, 48, 52.5, 52.5, 32.0, 24.0)  # a tenth of the data set's size
-    sensor = Pinhole(64, 48, 58.5, 58.5, 32.0, 24.0)
+    lens, sensor = (Pinhole(64, 48, f, f, 32.0, 24.0) for f in (52.5, 58.5))  # a tenth of the data set's size
+    apart = np.eye(4)
+    apart[0, 3] = -0.0256  # the nominal place of a Kinect's depth sensor to its camera
     for n in range(COUNT):
-        of_depth = pose(n) @ APART
+        of_depth = pose(n) @ apart
         save(folder / f"frame-{n:06d}.color.png", image(n, lens))
         counts = np.rint(1000 * depth(n, sensor, of_depth)).astype(np.uint16)
         counts[:1] = 65535

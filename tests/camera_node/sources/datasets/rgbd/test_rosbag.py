@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
-from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -125,17 +123,6 @@ def test_images_depth_and_the_chain_of_transforms_of_a_bag(tmp_path, storage, as
         assert np.array_equal(depth.counts, MM) and depth.after_image_ns == 8_000_000
 
 
-def test_types_named_without_msg_are_known(tmp_path):
-    """As in the MCAP of amber's soccer goal: sensor_msgs/Image, without a definition."""
-    bag = write(tmp_path / "run", robot() + pictures(), "SQLITE3")
-    with closing(sqlite3.connect(next(bag.glob("*.db3")))) as tables:
-        tables.execute("UPDATE topics SET type = replace(type, '/msg/', '/')")
-        tables.execute("DELETE FROM message_definitions")
-        tables.commit()
-    (bag / "metadata.yaml").unlink()
-    assert np.array_equal(open_dataset(next(bag.iterdir()))[1][2].read(), PICTURE)
-
-
 def png(values: np.ndarray) -> bytes:
     return cv2.imencode(".png", values)[1].tobytes()
 
@@ -197,29 +184,25 @@ def test_of_several_topics_of_a_frame_one_is_taken_and_named(tmp_path):
 @pytest.mark.parametrize(
     ("said", "message"),
     [
-        ([("/info", START_NS, info(START_NS, k=[0.0] * 9))], "the focal lengths are 0, 0"),
-        ([("/info", START_NS, info(START_NS, k=[np.nan] * 9))], "not finite"),
-        ([("/info", START_NS, info(START_NS, "rational_polynomial", (0.1,) * 8))], "undistort the images"),
-        ([("/tf", 0, transforms(transform(START_NS, "base", "map", MOUNT)))], "form a circle"),
-        ([("/tf", 0, transforms(transform(START_NS, "map", EYE, MOUNT)))], "hangs on map and on base: keep one"),
-        ([("/tf", 0, transforms(transform(START_NS, "base", EYE, Pose((0, 0, 0, 0), (0, 0, 0)))))], "quaternion"),
-        ([("/tf", 0, transforms(transform(START_NS, "base", EYE, Pose((1, 0, 0, 0), (np.inf, 0, 0)))))], "not finite"),
+        (info(START_NS, k=[np.nan] * 9), "not finite"),
+        (info(START_NS, "rational_polynomial", (0.1,) * 8), "undistort the images"),
+        (transforms(transform(START_NS, "base", "map", MOUNT)), "form a circle"),
+        (transforms(transform(START_NS, "map", EYE, MOUNT)), "hangs on map and on base: keep one"),
+        (transforms(transform(START_NS, "base", EYE, Pose((0, 0, 0, 0), (0, 0, 0)))), "quaternion"),
     ],
 )
 def test_what_a_bag_gets_wrong_is_one_line(tmp_path, said, message):
-    fails(message, open_dataset, write(tmp_path / "run", said + robot() + pictures(1)))
+    topic = "/tf" if "TF" in said.__msgtype__ else "/info"
+    fails(message, open_dataset, write(tmp_path / "run", [(topic, START_NS, said), *robot(), *pictures(1)]))
 
 
 @pytest.mark.stability
 def test_a_damaged_bag_is_named_and_one_without_poses_says_so(tmp_path):
     bag = write(tmp_path / "run", robot() + pictures())
-    file = bag / "run.mcap"
-    whole = file.read_bytes()
+    whole = (bag / "run.mcap").read_bytes()
     for data in (b"", whole[:20], b"RIFF" + whole):
-        file.write_bytes(data)
+        (bag / "run.mcap").write_bytes(data)
         fails("run: cannot be read as a ROS bag", open_dataset, bag)
-    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: []\n")
-    fails("cannot be read as a ROS bag", open_dataset, bag)
     bare = write(tmp_path / "bare", pictures())
     fails(f"no image in ROS messages .*: {EYE} has no CameraInfo", open_dataset, bare)
     gone = [transform(START_NS + n * 10**10, "map", "base", MOUNT) for n in (1, 2)]
@@ -237,11 +220,6 @@ def test_a_bag_is_played_without_a_scenario(tmp_path, capsys):
     assert set(sources) == {"hand", "left"} and scenario.seed == 3
     shot = sources["hand"].read(1)
     assert np.array_equal(shot.image, PICTURE) and shot.pose.translation_m == pytest.approx((10.15, 0.0, 0.3))
-    assert np.array_equal(sources["hand"].depth(1, shot).counts, MM)
-    for path, names, expected in (
-        (bag, "hand=nowhere", "the data has no camera 'nowhere'"),
-        (bag, "a b", "--as a b: "),
-        (tmp_path, "hand", "no data set or recording"),
-    ):
-        assert main(["run", str(path), "--as", names, "--to", "127.0.0.1:1"]) == 2
+    for names, expected in (("hand=nowhere", "the data has no camera 'nowhere'"), ("a b", "--as a b: ")):
+        assert main(["run", str(bag), "--as", names, "--to", "127.0.0.1:1"]) == 2
         assert expected in capsys.readouterr().err
