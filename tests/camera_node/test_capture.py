@@ -1,15 +1,19 @@
-"""The cache and the outbox: bounded, and honest about every frame."""
+"""When captures are due; the cache and the outbox: bounded, and honest about every frame."""
 
 from __future__ import annotations
 
 import asyncio
+from fractions import Fraction
+from itertools import pairwise
 
-import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from camera_node.capture import Camera, ShotCache, build_cameras, prepare
+from camera_node.capture_schedule import OnceSchedule, PartialSchedule, RateSchedule
 from camera_node.outbox import Outbox
-from camera_node.settings import DEPTH_STEP, WorldConfig, source_config
+from camera_node.settings import WorldConfig, source_config
 from camera_node.sources.base import Shot
 from freshfield import ledger
 from freshfield.clock import VirtualClock
@@ -63,16 +67,6 @@ def test_one_in_so_many_shots_brings_depth(every, contents, ticks):
         depths = {tick: camera.capture(tick).encoded_depth for tick in range(12)}
         assert [tick for tick, depth in depths.items() if depth is not None] == ticks
         assert all((depths[tick].decode().counts == tick + 1).all() for tick in ticks)
-
-
-def test_a_link_that_takes_each_so_many_th_frame_still_gets_depth():
-    """A line of finite rate that drops what finds it busy takes exactly each second, third, ... frame."""
-    for every in (2, 5, 10):
-        wanted = np.arange(60_000) * DEPTH_STEP % 2**32 * every < 2**32
-        for stride in range(1, 13):
-            (taken,) = np.nonzero(wanted[::stride])
-            assert len(taken) == pytest.approx(len(wanted[::stride]) / every, rel=0.1)
-            assert np.diff(taken).max() <= 8 * every
 
 
 def test_depth_is_cached_encoded_and_its_bytes_count():
@@ -138,3 +132,49 @@ async def test_the_outbox_keeps_the_newest_and_books_each_frame(tmp_path):
     for end in range(len(written) + 1):
         seen = [name for name, _ in written[:end]]
         assert 0 <= seen.count("captured") - seen.count("replaced") - seen.count("sent") <= 1
+
+
+NOW_NS = 1_763_000_000_123_456_789
+TIMES = [0, 33_000_000, 66_000_001, 250_000_000]
+
+
+def walk(schedule, now_ns, steps, late_ns=0):
+    """RateSchedule and due times as a node makes them: each capture ends ``late_ns`` after it was due."""
+    tick, out = schedule.first(now_ns), []
+    missed = 0
+    while tick is not None and len(out) < steps:
+        due_ns = schedule.due_ns(tick)
+        out.append((tick, due_ns))
+        tick, m = schedule.next(tick, due_ns + late_ns)
+        missed += m
+    return out, missed
+
+
+@given(st.fractions(Fraction(1, 10), 200, max_denominator=1001), st.integers(0, 2**62), st.integers(0, 10**10))
+def test_ticks_are_due_after_now_and_follow_each_other(fps, now_ns, phase_ns):
+    schedule = RateSchedule(fps, phase_ns)
+    found, missed = walk(schedule, now_ns, 5)
+    assert found[0][1] > now_ns >= schedule.due_ns(found[0][0] - 1) and missed == 0 and schedule.due_ns(0) == phase_ns
+    assert [tick for tick, _ in found] == list(range(found[0][0], found[0][0] + 5))
+
+
+def test_a_late_node_skips_to_the_newest_tick_but_plays_a_recording_once_whole():
+    found, missed = walk(RateSchedule(Fraction(10)), NOW_NS, 3, late_ns=350_000_000)
+    assert [b[0] - a[0] for a, b in pairwise(found)] == [3, 3] and missed == 6
+    for late_ns in (0, 10**10):
+        found, missed = walk(OnceSchedule(TIMES, NOW_NS), NOW_NS + 5, 10, late_ns)
+        assert found == [(k, NOW_NS + t) for k, t in enumerate(TIMES)] and missed == 0
+
+
+@given(st.integers(2, 9), st.integers(0, 2**60), st.integers(0, 10**9))
+def test_captures_that_are_held_out_are_left_out_and_the_others_counted_without_a_gap(every, now_ns, late_ns):
+    whole, part = RateSchedule(Fraction(10), 70_000_000), PartialSchedule(Fraction(10), 70_000_000, every)
+    tick = part.first(now_ns)
+    at = part.whole(tick)
+    own = [whole.due_ns(k) for k in range(at - every, at + 2 * every + 12) if k % every]
+    assert part.due_ns(tick) == min(due_ns for due_ns in own if due_ns > now_ns)
+    later_ns = part.due_ns(tick) + late_ns
+    after, missed = part.next(tick, later_ns)
+    between = [due_ns for due_ns in own if part.due_ns(tick) < due_ns <= later_ns]
+    assert after is not None and missed == max(0, len(between) - 1)
+    assert part.due_ns(after) == (between[-1] if between else min(due_ns for due_ns in own if due_ns > later_ns))

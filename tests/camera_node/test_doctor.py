@@ -1,28 +1,38 @@
-"""The doctor finds what is wrong, names what to do, and moves nothing."""
+"""The doctor finds what is wrong, of depth and of poses too, names what to do, and moves nothing."""
 
 from __future__ import annotations
 
 import json
 import re
 import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import yaml
 
-from camera_node import coverage_check, doctor
+from camera_node import coverage_check, doctor, pose_check
 from camera_node.cli import main
+from camera_node.depth_check import DepthView, check, edge_contrast, first_views
 from camera_node.settings import source_config
-from camera_node.sources.registry import open_sources
+from camera_node.synthetic import make_scene
+from camera_node.synthetic.depth import DepthRenderer
+from camera_node.synthetic.effects.depth_sensor import DepthSensor
+from camera_node.synthetic.walk import walks_through
 from freshfield.clock import WallClock
-from freshfield.coverage import REACHED, REACHED_WITH_DEPTH
-from freshfield.scenario import load
+from freshfield.depth import DepthImage
+from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole, Pose, so3_exp
+from freshfield.scenario import load, parse
 from freshfield.transport import Transport
 from tests.camera_node.robot.arm.simulated import simulated_arm
-from tests.camera_node.sources.datasets.photos import edited, photo_scenario, write_photos
+from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 from tests.camera_node.sources.devices.mjpeg import NetworkCamera
 from tests.camera_node.sources.devices.test_live import CALIBRATION
-from tests.conftest import ROOT
 from tests.integration.peer import Peer
 
 
@@ -50,12 +60,6 @@ def test_without_a_scenario_the_machine_is_examined(capsys, tmp_path):
     main(["doctor"])
     said = capsys.readouterr().out
     assert "ok     python" in said and "-      scenario" in said
-
-
-def test_security_files_that_do_not_exist_are_refused_before_any_check(capsys, tmp_path):
-    assert main(["doctor", "--token-file", str(tmp_path / "none")]) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and f"cannot read {tmp_path / 'none'}" in said.err
 
 
 @pytest.mark.slow  # 7 s
@@ -97,26 +101,13 @@ def test_every_fault_is_named_in_one_call(capsys, monkeypatch, tmp_path, host):
         assert parts[part][0] is False and said in parts[part][1], part
 
 
-def test_a_scenario_that_is_wrong_is_said_like_everything_else(capsys, tmp_path):
-    file = tmp_path / "bad.yaml"
-    file.write_text("cameras: {count: 2}\nsource: {kind: oak, sockets: CAM_A}\n")
-    code, parts = examined(capsys, str(file))
-    assert code == 1 and parts["scenario"][0] is False and "did you mean 'socket'" in parts["scenario"][1]
-
-
 def bench_with(folder: Path, camera: NetworkCamera, **source) -> str:
     """A scenario with one calibrated network camera, eye."""
     (folder / "calibration.json").write_text(json.dumps(CALIBRATION))
-    source = {
-        "kind": "camera",
-        "devices": {"eye": camera.address},
-        "calibration": "calibration.json",
-        "first_frame_s": 10,
-        **source,
-    }
-    file = folder / "bench.yaml"
-    file.write_text(yaml.safe_dump({"cameras": {"ids": ["eye"]}, "source": source}))
-    return str(file)
+    given = {"kind": "camera", "devices": {"eye": camera.address}, "calibration": "calibration.json"}
+    given |= {"first_frame_s": 10, **source}
+    (folder / "bench.yaml").write_text(yaml.safe_dump({"cameras": {"ids": ["eye"]}, "source": given}))
+    return str(folder / "bench.yaml")
 
 
 def test_a_camera_is_opened_and_watched(capsys, tmp_path):
@@ -175,51 +166,183 @@ def test_a_data_set_is_opened_and_its_images_are_read(capsys, tmp_path):
     assert not ok and "images/004.png: damaged or cut short" in text
 
 
-def test_a_note_on_a_data_set_is_said_once(capsys, caplog, tmp_path):
-    """Several checks open the set, and each time its notes go to the log."""
-    file = write_photos(tmp_path / "set", 8)
-    edited(file, lambda data: [frame.update(time=10.0 + k) for k, frame in enumerate(data["frames"])])
-    scenario = {"cameras": {"count": 1}, "source": {"kind": "transforms", "data": str(file.parent)}}
-    (tmp_path / "s.yaml").write_text(yaml.safe_dump(scenario))
-    note = "8 images of one moving camera, each with its own time: taken for a scene that stands still"
-    main(["doctor", str(tmp_path / "s.yaml")])
-    assert capsys.readouterr().out.count(note) == 1 and note not in caplog.text
-
-
-def test_data_that_are_missing_are_said_once(capsys, tmp_path):
-    _, parts = examined(capsys, "fox", "--data", str(tmp_path))
-    wrong = [part for part, (ok, text) in parts.items() if "does not exist" in text]
-    assert wrong == ["data"] and parts["poses and coverage"] == (None, "not examined: they need the data")
-
-
 def test_what_fixed_cameras_see_is_reckoned_and_drawn(capsys, tmp_path):
     drawn = tmp_path / "plan.svg"
     _, parts = examined(capsys, "quad", "--plan", str(drawn))
     assert parts["coverage"][0] and "50 % by two or more, 54 degrees apart. One more camera" in parts["coverage"][1]
     assert drawn.read_text().count("<polygon") == 4 + 1
-    assert "with 4 cameras with depth sensors was shown at 26.2 dB, 22.3 where it moves" in parts["coverage"][1]
+    scenario = photo_scenario(write_photos(tmp_path / "set", 7), 2)
+    said = coverage_check.check(scenario, source_config(scenario), None, None)
+    assert said.startswith("not reckoned: the cameras move, ")
 
 
-def test_what_doctor_promises_was_measured():
-    rigs = json.loads((ROOT / "docs/results/few-cameras.json").read_text())["rigs"]
-    measured = {n: (rigs[k]["mean_db"], rigs[k]["mean_moving_db"]) for n, k in ((2, "duo"), (3, "room3"), (4, "quad"))}
-    assert measured == REACHED_WITH_DEPTH
-    assert REACHED[4] == (rigs["room4plain"]["mean_db"], rigs["room4plain"]["mean_moving_db"])
+NOWHERE = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+APART = np.eye(4)
+APART[:3, :3], APART[:3, 3] = so3_exp([0.0, 0.05, 0.0]), (-0.03, 0.0, 0.01)
 
 
-@pytest.mark.parametrize(("count", "carried"), [(3, 2), (7, 6), (35, 30)])
-def test_a_camera_that_is_carried_is_not_taken_for_a_fixed_one(tmp_path, count, carried):
-    """Its photos loop: shot 30 of 2, 6 or 30 of them is shot 0 again. Each eighth is a held-out camera's."""
-    file = write_photos(tmp_path / "set", count)
+@cache
+def rig() -> tuple[DepthView, ...]:
+    """Four cameras of the room with depth sensors; that of the last stands beside its camera."""
+    scene = make_scene("room", {"supersample": 1})
+    views = []
+    for n in range(1, 5):
+        lens, pose = scene.cameras[f"cam{n:02d}"]
+        image = scene.render(f"cam{n:02d}", 1.0)
+        sensor = DepthSensor().start(np.random.default_rng(n))
+        if n < 4:
+            measured = sensor.measure(DepthRenderer(scene.world, lens, pose).depth(1.0), image, lens, 0)
+        else:
+            small = Pinhole.from_fov(96, 80, 66.0)
+            exact = DepthRenderer(scene.world, small, pose @ APART).depth(1.0)
+            counts = np.rint(exact * 1e4).astype(np.uint16)
+            measured = DepthImage(counts, 1e-4, small, Pose.from_matrix(APART))
+        views.append(DepthView(f"cam{n:02d}", image, lens, Pose.from_matrix(pose), measured))
+    return tuple(views)
 
-    def said(loop):
-        scenario = photo_scenario(file, 2, loop=loop)
-        config = source_config(scenario)
-        assert open_sources(scenario, config, ["cam01"], None)["cam01"].contents == carried
-        return coverage_check.check(scenario, config, None, None)
 
-    for loop in ("back-and-forth", "restart"):
-        assert said(loop).startswith("not reckoned: the cameras move, ")
-    first = json.loads(file.read_text())["frames"][0]["transform_matrix"]
-    edited(file, lambda data: [frame.update(transform_matrix=first) for frame in data["frames"]])
-    assert not said("restart").startswith("not reckoned")
+def said(views: list[DepthView]) -> list[str]:
+    lines = []
+    for view in views:
+        try:
+            lines.append(check(view, [other for other in views if other is not view]))
+        except ValueError as error:
+            assert "\n" not in str(error)
+            lines.append(f"WRONG {error}")
+    return lines
+
+
+def recounted(view: DepthView, change: Callable[[np.ndarray], np.ndarray]) -> DepthView:
+    return replace(view, depth=replace(view.depth, counts=change(view.depth.counts).astype(np.uint16)))
+
+
+def test_right_depth_is_described():
+    lines = said(list(rig()))
+    assert all("of it agrees with cam0" in line and "WRONG" not in line for line in lines), lines
+    assert lines[0].startswith("128 x 128, ") and " without depth, 1.3 to 6.3 m" in lines[0]
+    for view in rig()[:3]:
+        assert "its edges are those of the image" in check(view, [])
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda v: v.scaled(0.3048), "that of cam01 seems to be 0.305 times what it should be: is the unit wrong"),
+        (lambda v: recounted(v, lambda c: np.where(c > 0, 3000, 0)), "nearly all of it is the same, 3 m"),
+        (lambda v: recounted(v, np.zeros_like), "100% without depth: is the scene within the sensor's range"),
+        (lambda v: recounted(v, lambda c: np.where(c > 0, 8000 - c, 0)), "are near and far exchanged"),
+        (lambda v: recounted(v, lambda c: c[:, ::-1]), "is the pose, a lens"),
+        (lambda v: replace(v, pose=NOWHERE), "is the pose, a lens"),
+    ],
+    ids=["feet", "constant", "holes", "inverted", "mirrored", "nowhere"],
+)
+def test_wrong_depth_is_told_of_the_camera_that_has_it(change, told):
+    first, *others = rig()
+    lines = said([change(first), *others])
+    assert lines[0].startswith("WRONG") and told in lines[0], lines[0]
+    assert not any(line.startswith("WRONG") for line in lines[1:]), lines
+
+
+@pytest.mark.stability
+def test_of_two_cameras_the_one_with_another_unit_is_named_by_both_and_one_alone_by_its_edges():
+    lines = said([rig()[0].scaled(0.1), rig()[1]])
+    assert all("that of cam01 seems to be 0.1 times what it should be" in line for line in lines), lines
+    mirrored = [recounted(view, lambda c: c[:, ::-1]) for view in rig()[:3]]
+    lines = [line for view in mirrored for line in said([view])]
+    assert sum("its edges are not those of the image" in line for line in lines) >= 2, lines
+
+
+@pytest.mark.stability
+@pytest.mark.filterwarnings("error")
+def test_cameras_that_see_nothing_in_common_and_blank_images_are_described():
+    away = replace(rig()[1], pose=Pose((1.0, 0.0, 0.0, 0.0), (500.0, 0.0, 0.0)))
+    line = check(replace(rig()[0], image=np.zeros_like(rig()[0].image)), [away])
+    assert line.startswith("128 x 128, ") and "agrees" not in line and "edges" not in line
+
+
+@pytest.mark.parametrize(("count", "is_said"), [(199, False), (200, True)])
+def test_edges_of_fewer_than_200_pixels_say_nothing(count, is_said):
+    halves, lens = np.indices((count, 64))[1] // 32, Pinhole.from_fov(64, count, 60.0)
+    image = np.repeat(200 * halves[..., None], 3, axis=-1).astype(np.uint8)
+    depth = DepthImage((1000 + 1000 * halves).astype(np.uint16), 0.001)
+    found = edge_contrast(DepthView("cam01", image, lens, Pose.from_matrix(np.eye(4)), depth))
+    assert (found is not None) == is_said
+
+
+@pytest.mark.parametrize(("name", "cameras"), [("duo", ["cam01", "cam02"]), ("room", [])])
+def test_scenarios_are_examined_where_they_have_depth(name, cameras):
+    scenario = load(name)
+    assert [view.camera for view in first_views(scenario, source_config(scenario), None)] == cameras
+
+
+COUNT, PERIOD_S = 40, 0.1
+
+
+@cache
+def filmed() -> tuple[list[np.ndarray], float]:
+    """Small gray images of a walk through the room, and their focal length."""
+    scene = make_scene("room", {"people": 0, "width": 160, "height": 120, "supersample": 1})
+    walk, lens = walks_through(scene, ["hand"])["hand"], scene.cameras["cam00"][0]
+    images = [scene.view(lens, walk.pose(k * PERIOD_S)).image(0.0) for k in range(COUNT)]
+    small = [cv2.resize(image, (80, 60), interpolation=cv2.INTER_AREA) for image in images]
+    return [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in small], lens.fx / 2
+
+
+def poses(late_s: float = 0.0) -> np.ndarray:
+    walk = walks_through(make_scene("room"), ["hand"])["hand"]
+    return np.array([walk.pose(k * PERIOD_S - late_s) for k in range(COUNT)])
+
+
+def compared(found: np.ndarray) -> str:
+    images, focal_px = filmed()
+    return pose_check.compare(images, found, focal_px, 1e3 * PERIOD_S)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    ("late_s", "message"), [(0.0, "move together"), (0.1, "some 1[0-9]{2} ms late"), (-0.2, "some 2[0-9]{2} ms early")]
+)
+def test_poses_of_another_instant_are_said_with_their_delay(late_s, message):
+    with pytest.raises(ValueError, match=message) if late_s else nullcontext():
+        assert message in compared(poses(late_s))
+
+
+@pytest.mark.stability
+def test_other_units_other_axes_and_poses_without_rotation_are_said():
+    right = poses()
+    millimeters, still = right.copy(), right.copy()
+    millimeters[:, :3, 3] *= 1e3
+    still[:, :3, :3] = np.eye(3)
+    for wrong, message in (
+        (millimeters, "in meters"),
+        (still, "lack the rotation"),
+        (right @ OPENGL_TO_OPENCV, "axes"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            compared(wrong)
+
+
+@pytest.mark.stability
+def test_images_that_tell_nothing_are_not_held_against_the_poses():
+    noise = np.random.default_rng(0).uniform(0, 255, (40, 60, 80)).astype(np.float32)
+    assert "tell nothing" in pose_check.compare(list(noise), poses(), 60.0, 100.0)
+    flat = [np.full((60, 80), 90.0, np.float32)] * 40
+    assert "hardly move" in pose_check.compare(flat, poses(), 60.0, 100.0)
+
+
+def test_a_recording_is_read_as_it_is_streamed(tmp_path):
+    """Its camera stands at first, and some of its images are damaged."""
+    images, focal_px = filmed()
+    frames = []
+    for k, image in enumerate([images[0]] * 3 + images):
+        data = cv2.imencode(".png", image.astype(np.uint8))[1].tobytes()
+        (tmp_path / f"{k:03d}.png").write_bytes(data[: len(data) // 2] if k in (0, 5) else data)
+        matrix = (poses(0.1)[max(k - 3, 0)] @ OPENGL_TO_OPENCV).tolist()
+        frames.append({"file_path": f"{k:03d}.png", "transform_matrix": matrix, "time": 2 + k * PERIOD_S})
+    data = {"fl_x": focal_px, "w": 80, "h": 60, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    cameras = {"ids": ["hand", "kept"], "held_out": ["kept"], "held_out_every": 8}
+    found = parse({"cameras": cameras, "source": {"kind": "transforms", "data": str(tmp_path)}}, tmp_path / "s.yaml")
+    with pytest.raises(ValueError, match="ms late"):
+        pose_check.check(found, source_config(found), None)

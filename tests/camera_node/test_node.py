@@ -15,7 +15,7 @@ from camera_node.capture import Camera, ShotCache
 from camera_node.cli import main
 from camera_node.node import Node, NodeOptions
 from camera_node.outbox import Outbox
-from camera_node.sender import ProtocolError, Sender
+from camera_node.sender import Sender
 from camera_node.settings import CameraConfig
 from camera_node.sources.base import Shot, Source
 from freshfield.clock import VirtualClock
@@ -119,25 +119,6 @@ def test_reasons_of_refusals_are_logged_once_and_not_without_end(caplog):
                 sender._count(frame, pb.PushResponse(outcome=pb.OUTCOME_REJECTED, reason=f"reason_{k}"))
     assert len(caplog.records) == MAX_REASONS + 1
     assert outbox.counts["rejected:other"] == 4 * MAX_REASONS and outbox.counts["rejected:reason_0"] == 2
-
-
-def test_what_ends_the_streams_of_all_cameras_of_a_node_is_said_once(caplog):
-    troubles: dict[str, str] = {}
-    outboxes = [Outbox(f"cam0{k}", "s", None, VirtualClock(0)) for k in range(5)]
-    senders = [Sender(o, MagicMock(), (), lambda: None, np.random.default_rng(0), troubles) for o in outboxes]
-    with caplog.at_level(logging.INFO, "camera-node"):
-        for sender in senders:
-            sender._report(ProtocolError("stream ended: UNAVAILABLE"))
-        senders[2]._report(ProtocolError("stream ended: PERMISSION_DENIED"))
-        assert [sender.trouble[-11:] for sender in senders[1:4]] == ["UNAVAILABLE", "SION_DENIED", "UNAVAILABLE"]
-        for sender in (senders[0], senders[1], senders[3], senders[4]):
-            sender._answered()
-    assert [record.getMessage() for record in caplog.records] == [
-        "cam00: stream ended: UNAVAILABLE; trying again",
-        "cam02: stream ended: PERMISSION_DENIED; trying again",
-        "cam04: connected again",
-    ]
-    assert not senders[0].trouble and senders[2].trouble
 
 
 def test_a_node_that_reached_nobody_ends_with_1(capsys):

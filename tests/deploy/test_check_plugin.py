@@ -17,7 +17,7 @@ from freshfield_up.cli import main
 from tests.integration.own_classes import Darker, Flat, LastFirst, Late, Turning, Youngest
 
 OWN = Path(__file__).parent.parent / "integration/own_classes.py"
-# Effects: tests/camera_node/synthetic/effects/test_registry.py.
+# Effects: tests/camera_node/synthetic/effects/test_effects.py.
 BUILT_IN = [("policy", name) for name in POLICIES] + [("fault", name) for name in faults.NAMES]
 BUILT_IN += [("selector", name) for name in ("random", "coverage", "fisher")]
 FAULTS = {"loss": "probability=0.5", "duplication": "probability=0.5", "corruption": "probability=0.5 count=3"}

@@ -1,19 +1,30 @@
-"""Sources as the node uses them: opened from a scenario, asked for ticks."""
+"""Sources as the node uses them: which frame a tick shows, and frames held out of a carried camera's path."""
 
 from __future__ import annotations
 
+from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from camera_node.capture import build_cameras, prepare
+from camera_node.capture import Camera, build_cameras
 from camera_node.settings import source_config
-from camera_node.sources.datasets.records import DatasetError
+from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
+from camera_node.sources.datasets.streamer import Playback, Timeline, split_photos
 from camera_node.sources.registry import open_sources
-from freshfield.scenario import ScenarioError, parse
-from tests.camera_node.sources.datasets.photos import edited, opencv_pose, photo_scenario, picture, write_photos
-from tests.support import small_world
+from camera_node.synthetic import make_scene
+from camera_node.synthetic.walk import walks_through
+from edge_server.experiments.virtual.from_scenario import build_truth
+from edge_server.experiments.virtual.truth import CapturedTruth
+from edge_server.fidelity.scorer import Scorer
+from edge_server.settings import read_config
+from freshfield.geometry import Pinhole
+from freshfield.scenario import Scenario, ScenarioError, parse
+from tests.camera_node.sources.datasets.photos import edited, fails, opencv_pose, photo_scenario, picture, write_photos
 
 
 def opened(scenario, cameras=None, data: Path | None = None):
@@ -67,15 +78,136 @@ def test_a_jpeg_of_the_right_size_is_sent_as_it_lies(tmp_path):
     assert not isinstance(shrunk.read(4).image, bytes) and shrunk.intrinsics.width == 16
 
 
-def test_noise_makes_every_tick_its_own_and_spares_the_truth(tmp_path, monkeypatch):
+def test_back_and_forth_and_restart_at_a_recordings_own_pace():
+    there_and_back = Playback(4, Fraction(10), Fraction(10))
+    assert [there_and_back.frame(k) for k in range(9)] == [0, 1, 2, 3, 2, 1, 0, 1, 2]
+    restart = Playback(4, Fraction(10), Fraction(10), back_and_forth=False)
+    assert [restart.frame(k) for k in range(6)] == [0, 1, 2, 3, 0, 1]
+    assert [Playback(1, Fraction(10), Fraction(30)).frame(k) for k in range(3)] == [0, 0, 0]
+    assert [Playback(1000, Fraction(15), Fraction(60)).frame(k) for k in range(4)] == [0, 4, 8, 12]
+    fast = Playback(1000, Fraction(60), Fraction(20))
+    assert [fast.frame(k) for k in range(7)] == [0, 0, 1, 1, 1, 2, 2]  # the nearest, halves upwards
+
+
+@given(count=st.integers(1, 300), training=st.integers(1, 20), held_out=st.integers(0, 3))
+def test_photos_are_dealt_once_and_every_eighth_is_held_out(count, training, held_out):
+    names = [f"t{k}" for k in range(training)], [f"h{k}" for k in range(held_out)]
+    try:
+        shares = split_photos(count, *names)
+    except DatasetError as error:
+        assert "too few" in str(error)
+        assert count < 8 * max(training, held_out) + 8
+        return
+    assert sorted(i for share in shares.values() for i in share) == list(range(count))
+    for name, share in shares.items():
+        if held_out:
+            assert all((i % 8 == 0) == name.startswith("h") for i in share)
+    of_training = [len(shares[n]) for n in names[0]]
+    assert max(of_training) - min(of_training) <= 1
+
+
+def test_own_test_images_go_to_held_out_cameras_and_to_nobody_else():
+    assert split_photos(6, ["a", "b"], ["d"], [1, 4]) == {"d": [1, 4], "a": [0, 3], "b": [2, 5]}
+    assert split_photos(6, ["a", "b"], [], [1, 4]) == {"a": [0, 3], "b": [2, 5]}
+
+
+def recorded(**times: list[float]) -> Dataset:
+    images = (
+        PosedImage(f"{camera}{k}", camera, time_s, np.eye(4), Pinhole(8, 8, 8, 8, 4, 4), lambda: None)
+        for camera, stamps in times.items()
+        for k, time_s in enumerate(stamps)
+    )
+    return Dataset(tuple(images))
+
+
+def test_a_timeline_holds_what_all_cameras_have_at_the_fastest_ones_rate():
+    found = recorded(fast=[0.2, 0.3, 0.4, 0.6, 0.7, 0.8], slow=[0.0, 0.2, 0.4, 0.6], once=[5.0])
+    timeline = Timeline.of(found, Path("set"))
+    assert timeline == Timeline(0.2, 5, Fraction(10))
+    assert list(timeline.nearest(found.of("fast"))) == [0, 1, 2, 2, 3]  # 0.5 s was dropped: the earlier of two
+    assert list(timeline.nearest(found.of("slow"))) == [1, 1, 2, 2, 3]
+    assert list(timeline.nearest(found.of("once"))) == [0] * 5
+    assert list(Timeline(0.0, 0, Fraction(10)).nearest(found.of("slow"))) == [0, 1, 2, 3]
+
+
+WORLD = {"kind": "world", "width": 16, "height": 12, "fps": 10, "carried": ["hand"], "params": {"people": 0}}
+
+
+def scenario(source: dict[str, Any], every: int = 8, ids: tuple[str, ...] = ("hand", "kept")) -> Scenario:
+    cameras = {"ids": list(ids), "held_out": list(ids[len(ids) // 2 :]), "held_out_every": every}
+    return parse({"seed": 5, "cameras": cameras, "source": source}, Path("carried.yaml"))
+
+
+def cameras_of(found: Scenario, only: str = "") -> dict[str, Camera]:
+    return {c.name: c for c in build_cameras(found, source_config(found), [only] if only else found.cameras)}
+
+
+def path_of_one(folder: Path, count: int) -> Path:
+    """A recording of one moving camera at 10 frames a second."""
+    file = write_photos(folder, count)
+    return edited(file, lambda data: [frame.update(time=3.0 + k / 10) for k, frame in enumerate(data["frames"])])
+
+
+@pytest.mark.parametrize("loop", ["back-and-forth", "restart"])
+@pytest.mark.parametrize(("fps", "count"), [(None, 33), (5, 60)])
+def test_no_frame_of_a_recording_is_both_held_out_and_trained_on_in_any_round(tmp_path, loop, fps, count):
+    data = path_of_one(tmp_path, count)
+    source = {"kind": "transforms", "data": str(data), "loop": loop, "codec": "png"}
+    hand, kept = cameras_of(scenario({**source, "fps": fps} if fps else source)).values()
+    rate = fps or 10
+    assert float(hand.fps) == rate and float(kept.fps) == rate / 8
+    trained = {hand.source.content(tick) for tick in range(500)}
+    held_out = {kept.source.content(tick) for tick in range(100)}
+    assert held_out and trained.isdisjoint(held_out)
+    assert [kept.source.content(tick) for tick in range(2)] == [0, 8 * 10 // rate]
+    instants = [hand.rate_schedule.due_ns(k) for k in range(14)] + [kept.rate_schedule.due_ns(k) for k in range(2)]
+    assert sorted(instants) == [k * 10**9 // rate for k in range(16)]
+    assert kept.capture(1).pose != kept.capture(0).pose
+
+
+def test_a_held_out_frame_of_the_world_has_the_errors_of_the_camera_that_is_carried(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    noise = {"sensor_noise": {"read_noise_counts": 4.0}}
-    recorded = photo_scenario(write_photos(tmp_path / "data", 24), 3, effects=noise)
-    world = small_world(codec="png", effects=noise)
-    cameras = {"count": 3, "held_out": ["cam00"]}
-    for scenario in (recorded, parse({"cameras": cameras, "source": world}, Path("world.yaml"))):
-        truth, noisy = build_cameras(scenario, source_config(scenario), ["cam00", "cam01"])
-        prepare([truth, noisy], lambda: False)
-        assert truth.cached(3) is not None and noisy.cached(3) is None
-        one, again, later = noisy.capture(3), noisy.capture(3), noisy.capture(3 + 10**6 * 7920)
-        assert one.payload == again.payload != later.payload, "the noise belongs to the tick"
+
+    def whole(effects):
+        source = {**WORLD, "effects": effects}
+        return cameras_of(parse({"seed": 5, "cameras": {"ids": ["hand"]}, "source": source}, Path("w")))["hand"]
+
+    effects = {"pose_noise": {"correlation_s": 0.5}, "exposure_drift": {}, "pose_delay": {"delay_ms": 40}}
+    found, alone = scenario({**WORLD, "effects": effects}), whole(effects)
+    cameras = cameras_of(found)
+    assert cameras["kept"].capture(2) == alone.capture(16)
+    assert cameras["kept"].capture(2) == cameras_of(found, "kept")["kept"].capture(2), "also in a process of its own"
+    assert [cameras["hand"].capture(k) for k in (0, 7)] == [alone.capture(k) for k in (1, 9)]
+    truth = build_truth(found, source_config(found), read_config(found), Scorer())
+    assert isinstance(truth, CapturedTruth), "scored on captures, since only those are neighbors of trained ones"
+    walk = walks_through(make_scene("room"), ["hand"])["hand"]
+    for listed, t_s in (({}, 0.4), ({"pose_delay": {"delay_ms": 40}}, 0.36)):
+        assert whole(listed).capture(4).pose.matrix() == pytest.approx(walk.pose(t_s), abs=1e-9)
+
+
+def test_a_walk_repeats_after_a_lap_and_neither_jumps_nor_leaves_the_room():
+    for scene in (make_scene("room"), *(make_scene("drawn_room", {"layout_seed": seed}) for seed in range(3))):
+        first, second = walks_through(scene, ["a", "b"]).values()
+        poses = np.array([first.pose(k / 100) for k in range(1920)])
+        assert poses[0] == pytest.approx(first.pose(first.lap_s), abs=1e-9)
+        assert second.pose(0.0) == pytest.approx(first.pose(first.lap_s / 2), abs=1e-9)
+        step_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        turned = np.einsum("nij,nij->n", poses[1:, :3, :3], poses[:-1, :3, :3])
+        assert step_m.min() > 0.001 and step_m.max() < 0.012, "walking pace"
+        assert np.rad2deg(np.arccos(np.clip((turned.min() - 1) / 2, -1, 1))) < 0.8, "degrees in 10 ms"
+        low, high = scene.bounds
+        assert (poses[:, :3, 3] > low + 1.0).all() and (poses[:, :3, 3] < high - 0.4).all()
+
+
+@pytest.mark.parametrize(
+    ("source", "every", "ids", "message"),
+    [
+        (WORLD, 1, ("hand", "kept"), r"cameras.held_out_every: expected 2 or more, .* got 1, 1 of 2 held out"),
+        (WORLD, 8, ("hand", "other", "kept"), r"as many held-out cameras as training cameras"),
+        (WORLD, 7, ("hand", "kept"), r"hand's path repeats after 192 captures, expected a multiple of 7"),
+        ({**WORLD, "carried": ["foot"]}, 8, ("hand", "kept"), r"source.carried: expected cameras .* got foot"),
+        ({"kind": "camera"}, 8, ("hand", "kept"), r"needs a recorded data set or a synthetic world"),
+    ],
+)
+def test_what_cannot_be_divided_is_said_in_one_line(source, every, ids, message):
+    fails(message, lambda: cameras_of(scenario(source, every, ids)), error=ScenarioError)

@@ -1,14 +1,20 @@
-"""Ray intersection against signed distances, and the cases that divide by zero."""
+"""Shapes, images and depth against geometry that the renderer does not use. How scenes look is in golden."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
+from camera_node.synthetic.depth import DepthRenderer
+from camera_node.synthetic.lighting import Light
+from camera_node.synthetic.placement import MovingBody, Part, at, facing, place_static
+from camera_node.synthetic.render import CameraRenderer, World, cast_rays
 from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere, capsule, nearest_hit
-from freshfield.geometry import Array
+from camera_node.synthetic.textures import Checker, Plain
+from freshfield.geometry import Array, Pinhole, look_at, se3_inverse
 
 # Their surfaces, edges, corners and axes lie on the grid of origins below.
 SOLIDS = [
@@ -86,3 +92,76 @@ def test_rays_along_the_axes_from_everywhere_are_finite_or_miss(shape):
         if hit.any():
             normal, uv = shape.surface(origin[:, None] + t[hit] * axes[:, hit])
             assert np.isfinite(normal).all() and np.isfinite(uv).all()
+
+
+# Ambient only: every surface shows its albedo.
+FLAT = Light(np.array([[0.0, 0.0, 50.0]]), 0.0, 1.0, (1.0, 1.0, 1.0), (1.0, 1.0, 1.0))
+WHITE = Plain((1.0, 1.0, 1.0))
+DISTORTION = (-0.25, 0.06, 0.004, -0.003)
+
+
+def test_a_small_ball_appears_where_the_camera_model_projects_it():
+    camera = dataclasses.replace(Pinhole.from_fov(256, 192, 70.0), distortion=DISTORTION)
+    pose = look_at([1.5, -3.0, 1.2], [0.0, 0.0, 0.3])
+    for point in ([0.0, 0.0, 0.3], [0.9, 0.4, -0.4], [-1.1, 0.2, 0.9]):
+        world = World((Part(Sphere(0.05), WHITE, at(*point)),), (), FLAT)
+        image = CameraRenderer(world, camera, pose, supersample=3).image(0.0)[..., 0].astype(float)
+        v, u = np.mgrid[0:192, 0:256] + 0.5
+        centroid = np.array([(u * image).sum(), (v * image).sum()]) / image.sum()
+        in_camera = se3_inverse(pose) @ [*point, 1.0]
+        assert np.allclose(centroid, camera.project(in_camera[:3]), atol=0.15)
+
+
+def test_culling_leaves_out_no_ray_that_hits():
+    """The culled cast equals every ray tried on every part."""
+    rng = np.random.default_rng(0)
+    parts = [Part(Sphere(0.3), WHITE, at(*rng.uniform(-1, 1, 3))) for _ in range(6)]
+    parts += [Part(Box(tuple(rng.uniform(0.1, 0.5, 3))), WHITE, at(*rng.uniform(-1, 1, 3))) for _ in range(6)]
+    d = rng.standard_normal((3, 4000))
+    d /= np.linalg.norm(d, axis=0)
+    for origin in (np.array([2.0, 1.0, 0.5]), np.array([0.1, 0.0, 0.0]), parts[0].matrix[:3, 3]):
+        t, which = cast_rays(origin, d, place_static(parts), np.full(4000, np.inf))
+        every = np.stack([nearest_hit(p.shape, (origin - p.matrix[:3, 3])[:, None], d) for p in parts])
+        assert np.allclose(t, every.min(axis=0))
+        hit = np.isfinite(t)
+        assert np.array_equal(which[hit], every.argmin(axis=0)[hit]) and (which[~hit] == -1).all()
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("shape", SOLIDS, ids=repr)
+@pytest.mark.filterwarnings("error")
+def test_a_camera_inside_a_shape_sees_its_inside(shape):
+    light = Light(np.array([[0.0, 0.0, 5.0]]), 0.5, 3.0, (0.4,) * 3, (0.6,) * 3)
+    world = World((Part(shape, Checker((0.2,) * 3, (0.9,) * 3, 0.1)),), (), light)
+    pose = look_at([0.01, 0.02, 0.05], [0.3, 0.2, 0.1])
+    renderer = CameraRenderer(world, Pinhole.from_fov(32, 32, 90.0), pose)
+    assert np.isfinite(renderer.distance()).all()
+    assert renderer.image(0.0).min() > 0
+
+
+@pytest.mark.stability
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("z", [0.0, 0.5, 0.499])
+def test_a_light_inside_or_on_a_surface_does_no_harm(z):
+    light = Light(np.array([[0.0, 0.0, z]]), 0.8, 3.0, (0.1,) * 3, (0.2,) * 3)
+    world = World((Part(Sphere(0.5), Checker((0.2,) * 3, (0.9,) * 3, 0.1)),), (), light)
+    pose = look_at([0.0, -2.0, 1.0], [0.0, 0.0, 0.0])
+    assert CameraRenderer(world, Pinhole.from_fov(32, 32, 40.0), pose).image(0.0).max() > 0
+
+
+def test_depth_is_z_at_pixel_centers_of_parts_that_stand_and_move_and_0_where_nothing_is():
+    lens = dataclasses.replace(Pinhole.from_fov(64, 48, 60.0), distortion=DISTORTION)
+    pose = look_at([0.0, -3.0, 1.0], [0.0, 0.0, 1.0])  # looks along +y
+    wall = Part(Quad((50.0, 50.0)), WHITE, facing((1, 0, 0), (0, 0, 1), (0, 1, 0)))
+    ball = Part(Sphere(0.3), WHITE)
+    moving = MovingBody((ball,), lambda t_s: at(t_s, 0.0, 1.0)[None])
+    behind = MovingBody((ball,), lambda t_s: at(t_s, 3.0, 1.0)[None])  # never seen: behind the wall
+    renderer = DepthRenderer(World((wall,), (behind, moving), FLAT), lens, pose)
+    for t_s in (0.0, 0.8, -0.8, 0.0):
+        depth = renderer.depth(t_s)
+        u, v = lens.project(np.array([t_s, 0.0, 3.0])).astype(int)
+        assert depth.dtype == np.float32 and depth[v, u] == pytest.approx(2.7, abs=0.03)
+        # A ball of .3 m at 3 m: pi (.3 f / 3)^2 pixels.
+        assert (depth < 3.9).sum() == pytest.approx(np.pi * (0.1 * lens.fx) ** 2, rel=0.15)
+        assert np.allclose(depth[depth > 3.1], 4.0, atol=1e-5)
+    assert not DepthRenderer(World((), (), FLAT), lens, pose).depth(0.0).any()

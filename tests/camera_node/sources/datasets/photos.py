@@ -61,11 +61,11 @@ def edited(file: Path, change: Callable[[Any], Any] | None = None, **top: Any) -
     return file
 
 
-def fails(message: str, load: Callable[..., Any], *args: Any) -> None:
+def fails(message: str, load: Callable[..., Any], *args: Any, error: type[Exception] = DatasetError) -> None:
     """Expect ``load`` to be refused in one line."""
-    with pytest.raises(DatasetError, match=message) as error:
+    with pytest.raises(error, match=message) as raised:
         load(*args)
-    assert "\n" not in str(error.value)
+    assert "\n" not in str(raised.value)
 
 
 def photo_scenario(data: Path, cameras: int = 3, file: Path = Path("test.yaml"), **source: Any) -> Scenario:

@@ -116,7 +116,6 @@ DAMAGE: dict[str, list[tuple[Change, str]]] = {
     "transforms": [
         (in_frame(lambda f: f.update(transform_matrix=[[1, 2], [3, 4]])), r"frames\[0\].*transform_matrix"),
         (in_frame(lambda f: f["transform_matrix"][0].__setitem__(0, 7.0)), "orthonormal"),
-        (in_frame(lambda f: f["transform_matrix"][0].__setitem__(3, float("nan"))), "finite"),
         (in_frame(lambda f: f["transform_matrix"][0].__setitem__(3, 10**400)), "transform_matrix"),
         (in_frame(lambda f: f.update(transform_matrix=[*zip(*f["transform_matrix"])])), "is it transposed"),
         (in_top(lambda d: d["frames"].append(d["frames"][1])), "2 of its .* the image images/001.png"),
@@ -124,7 +123,6 @@ DAMAGE: dict[str, list[tuple[Change, str]]] = {
         (in_top(lambda d: d.update(h=1e300)), "too many"),
         (in_top(lambda d: [f.update(is_bad=True) for f in d["frames"]]), "marked is_bad, and none"),
         (written("transforms.json", "[" * 10**5), "cannot be read as JSON"),
-        (written("transforms.json", '{"frames": ' + "9" * 5000 + "}"), "cannot be read as JSON"),
         (written("transforms.json", '{"w": 64, "frames": [], "w": 32}'), "cannot be read as JSON"),
         (leads_out("images/001.png"), "001.png' is a symbolic link that leads out of the data set"),
     ],
@@ -137,7 +135,6 @@ DAMAGE: dict[str, list[tuple[Change, str]]] = {
     ],
     "dynerf": [
         (replaced(POSES, b"'shape': (3", b"'shape': (9" + b"9" * 10), r"poses_bounds\.npy: cannot be read"),
-        (in_numpy(POSES, lambda rows: rows[:, :15]), r"expected numbers of shape \(cameras, 17\), got \(3, 15\)"),
         (in_numpy(POSES, lambda rows: np.where(np.arange(3)[:, None] == 1, np.nan, rows)), "row 1 is not finite"),
         (in_numpy(POSES, lambda r: r * np.where(np.arange(17) == 9, 1.5, 1)), r"96 x 48, cam00\.mp4 has 64 x 48"),
     ],
@@ -146,8 +143,6 @@ DAMAGE: dict[str, list[tuple[Change, str]]] = {
         (in_numpy(ANNOTS, lambda a: a["cams"].update(K=[[[10**400] * 3] * 3] * 3) or a), "'cams' with K, .* too large"),
     ],
     "eyeful": [
-        (in_krt(lambda e: e.update(K=[[10**400] * 3] * 3)), "K: expected numbers"),
-        (in_krt(lambda e: e.update(T=[*zip(*e["T"])])), "last row is not 0 0 0 1: is it transposed"),
         (in_krt(lambda e: e.update(distortion=[10**400] * 5)), "width, height or distortion is wrong"),
         (in_krt(lambda e: e.update(cameraId="10/10_DSC0000")), "json: 2 of its entries are of the image 10/10"),
         (in_krt(lambda e: e.update(distortion=[0.1])), "RadialAndTangential' with 1 coefficients"),
@@ -161,7 +156,6 @@ DAMAGE: dict[str, list[tuple[Change, str]]] = {
     "colmap text": [
         (replaced("sparse/0/cameras.txt", b"PINHOLE", b"OPENCV"), "OPENCV has 8 parameters, not 4"),
         (changed("sparse/0/images.txt", lambda d: d[:-1].rpartition(b"\n")[0]), "points is missing: cut"),
-        (replaced("sparse/0/images.txt", b"cam02", b"cam00"), r"images\.txt: 2 .* of the image cam00 x\.jpg"),
     ],
     "colmap": [
         (changed("sparse/0/images.bin", lambda d: d + b"more"), "4 bytes follow its last"),

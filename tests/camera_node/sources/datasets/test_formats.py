@@ -5,7 +5,6 @@ from __future__ import annotations
 import pickle
 import subprocess
 import sys
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -17,7 +16,6 @@ from camera_node.sources.datasets.formats import FORMATS, open_dataset
 from camera_node.sources.datasets.lens import Lens, exact, pinhole, undistort
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.registry import open_sources
-from camera_node.synthetic import make_scene
 from freshfield.geometry import Pinhole, se3_inverse
 from freshfield.scenario import parse
 from tests.camera_node.sources.datasets import sets
@@ -33,26 +31,14 @@ def seen(record, points=sets.POINTS):
     return record.intrinsics.project(points @ inverse[:3, :3].T + inverse[:3, 3])
 
 
-def agree(records, cameras):
-    """Every record sees every point where OpenCV sees it."""
+def agree(records, cameras, instant=0):
+    """Every record sees every point where OpenCV sees it, and shows what its camera showed then."""
     assert len(records) == len(cameras)
     for record, camera in zip(records, cameras):
         assert np.abs(seen(record) - camera.pixels()).max() < NEAR_PX
-
-
-def shows_the_world(record, t_s=0.0):
-    """The record's picture is what our world looks like from where the record says it was taken, and from
-    nowhere near: not a step to the side or upside down."""
-    lens, pose = record.intrinsics, record.camera_to_world
-    aside, turned = pose.copy(), pose.copy()
-    aside[:3, 3] += 0.1 * pose[:3, 0]
-    turned[:3, :2] *= -1
-    scene = make_scene("room", {"count": 3, "width": 64, "height": 48})
-    scene = replace(scene, cameras={"here": (lens, pose), "aside": (lens, aside), "turned": (lens, turned)})
-    picture = record.read().astype(float)
-    off = {name: np.abs(picture - scene.render(name, t_s)).mean() for name in scene.cameras}
-    # What is left is compression, of videos at a quarter of the colors.
-    assert off["here"] < 15 and 1.5 * off["here"] < min(off["aside"], off["turned"]), off
+        off = [np.abs(record.read().astype(float) - each.shows(instant)).mean() for each in cameras]
+        # What is left is compression, of videos at a quarter of the colors.
+        assert off[cameras.index(camera)] == min(off) < 15, off
 
 
 @pytest.mark.parametrize("written_at", [1.0, 2.0], ids=["same size", "videos halved"])
@@ -60,8 +46,7 @@ def test_dynerf_sees_points_where_they_are(tmp_path, written_at):
     cameras = sets.rig(3)
     dataset = dynerf.load_dataset(sets.write_dynerf(tmp_path, cameras, 6, written_at))
     assert dataset.moving and dataset.fps == 10 and len(dataset) == 18
-    agree([dataset.of(camera.name)[0] for camera in cameras], cameras)
-    shows_the_world(dataset.of("cam01")[4], 0.4)
+    agree([dataset.of(camera.name)[4] for camera in cameras], cameras, 4)
 
 
 def test_zju_sees_points_where_they_are_and_counts_instants(tmp_path):
@@ -72,10 +57,9 @@ def test_zju_sees_points_where_they_are_and_counts_instants(tmp_path):
     dataset = zju.load_dataset(folder)
     assert dataset.moving and dataset.cameras == ("Camera_B1", "Camera_B2", "Camera_B3")
     assert dataset.missing == 1 and len(dataset) == 11
-    first = [dataset.of(name)[0] for name in dataset.cameras]
-    agree(first, cameras)
-    assert first[0].intrinsics.distorted and first[0].path is not None
-    shows_the_world(dataset.of("Camera_B2")[2], 0.3)
+    last = [dataset.of(name)[-1] for name in dataset.cameras]
+    agree(last, cameras, 3)
+    assert last[0].intrinsics.distorted and last[0].path is not None
     assert [r.time_s for r in dataset.of("Camera_B2")] == [0.0, 2 / 50, 3 / 50]
     straightened = zju.load_dataset(sets.write_zju(tmp_path / "k3", cameras, k3=0.01))
     assert not any(r.intrinsics.distorted or r.path for r in straightened)
@@ -167,7 +151,6 @@ def test_eyeful_sees_points_where_they_are_and_straightens_lenses_that_are_none_
     assert dataset.cameras == ("10", "11", "12") and not dataset.moving
     agree([dataset.of(name)[0] for name in dataset.cameras], cameras)
     assert dataset.held_out == {"10/10_DSC0000", "10/10_DSC0001"}
-    shows_the_world(dataset.of("12")[0])
     for number, (model, distortion, bends) in enumerate(
         (
             (

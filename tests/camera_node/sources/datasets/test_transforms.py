@@ -1,16 +1,31 @@
-"""transforms.json data sets: written ones for every corner, real ones for conventions."""
+"""transforms.json data sets: every corner of the format, and files as other tools and people leave them."""
 
 from __future__ import annotations
+
+import json
+import re
+import struct
 
 import cv2
 import numpy as np
 import pytest
 
-from camera_node.sources.datasets.lens import Lens
+from camera_node.settings import source_config
+from camera_node.sources.datasets.lens import Lens, pinhole
 from camera_node.sources.datasets.photo import ImageOptions, Photo
 from camera_node.sources.datasets.transforms import load_dataset
+from camera_node.sources.datasets.transforms_keys import REFUSED
+from camera_node.sources.registry import open_sources
 from freshfield.geometry import Pinhole
-from tests.camera_node.sources.datasets.photos import BOMB, edited, fails, opencv_pose, picture, write_photos
+from tests.camera_node.sources.datasets.photos import (
+    BOMB,
+    edited,
+    fails,
+    opencv_pose,
+    photo_scenario,
+    picture,
+    write_photos,
+)
 
 
 def test_poses_become_opencv_and_images_rgb_at_the_scale_asked_for(tmp_path):
@@ -91,3 +106,161 @@ def test_images_outside_the_data_set_are_not_read(tmp_path, leads):
     path = leads.format(outside=outside.with_suffix(""))
     file = edited(write_photos(tmp_path / "set", 2), lambda d: d["frames"][0].update(file_path=path))
     fails(r"frames\[0\].*(does not lie within|is missing|is not the name)", load_dataset, file)
+
+
+def load_edited(file, change=None, **top):
+    """The data set of a transforms JSON after a change, see ``edited``."""
+    return load_dataset(edited(file, change, **top))
+
+
+BENDS = {"k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": 0.0001}
+
+
+def lens_of(fx=40.0, fy=41.0, radial=(), tangential=(0.0, 0.0), fisheye=False):
+    return Lens(32, 24, fx, fy, 16.0, 12.0, radial, tangential, fisheye)
+
+
+@pytest.mark.parametrize(
+    ("keys", "lens"),
+    [
+        ({"is_fisheye": True, "k1": 0.03, "k2": -0.005}, lens_of(radial=(0.03, -0.005), fisheye=True)),
+        ({"camera_model": "OPENCV_FISHEYE", **BENDS}, lens_of(radial=tuple(BENDS.values()), fisheye=True)),
+        ({"k3": 0.59, "p1": 0.01}, lens_of(radial=(0.0, 0.0, 0.59), tangential=(0.01, 0.0))),
+        ({"distortion_params": [0.1, 0.2, 0, 0, 0.01, 0.02]}, lens_of(radial=(0.1, 0.2), tangential=(0.01, 0.02))),
+        ({"fl_y": None, "camera_angle_y": 2 * np.arctan(12 / 44)}, lens_of(fy=44)),
+        ({"fl_x": None, "x_fov": np.degrees(2 * np.arctan(16 / 30))}, lens_of(fx=30)),
+        ({"fl_x": None, "fl_y": None, "camera_angle_y": 2 * np.arctan(12 / 30)}, lens_of(30, 30)),
+        # What the tools write beside, and what is zero, changes nothing.
+        ({"k5": 0, "rolling_shutter": [0, 0, 0, 0], "is_fisheye": False, "aabb_scale": 4}, lens_of()),
+        # Numbers that belong to a larger original.
+        ({"w": 64, "h": 48, "fl_x": 80, "fl_y": 82, "cx": 32, "cy": 24}, lens_of()),
+    ],
+)
+def test_keys_of_the_camera_are_honored(tmp_path, keys, lens):
+    found, expected = load_edited(write_photos(tmp_path, 2), **keys)[0].intrinsics, pinhole(lens)
+    assert (found.width, found.height) == (expected.width, expected.height)
+    numbers = [(c.fx, c.fy, c.cx, c.cy, *c.distortion) for c in (found, expected)]
+    assert numbers[0] == pytest.approx(numbers[1])
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        *(({key: [0.1]}, rf"json: {key}: .*(undistort|convert|give|cut|correct|store)") for key in sorted(REFUSED)),
+        ({"lens_shift_x": 0.1}, "lens_shift_x is not understood and may change the camera"),
+        ({"is_fisheye": "false"}, "is_fisheye is 'false', expected true or false"),
+        ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye and camera_model OPENCV contradict"),
+        ({"is_fisheye": True, "p1": 0.1}, "p1 and p2 belong to no fisheye lens"),
+        ({"train_filenames": ["images/009.png"]}, r"train_filenames: images/009\.png is no file_path"),
+        ({"mask_path": "masks/none.png"}, r"mask_path: 'masks/none\.png' is missing"),
+    ],
+)
+def test_keys_that_change_the_meaning_are_refused_by_name(tmp_path, keys, message):
+    fails(message, load_dataset, edited(write_photos(tmp_path, 2), **keys))
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        (np.arange(6) / 5, "6 different times and no camera, so that there is one view of each instant"),
+        ([0.0, 3.0, 5.0], "3 different times and no camera, so that it is not known which"),
+        ([float(k) for k in range(6)], ""),  # seconds of a walk through a room, not D-NeRF's 0 to 1
+    ],
+)
+def test_times_without_cameras_are_refused_unless_they_tell_of_one_walk(tmp_path, times, message):
+    file = write_photos(tmp_path, 6)
+    edited(file, lambda d: [f.update(time=float(times[k % len(times)])) for k, f in enumerate(d["frames"])])
+    if message:
+        fails(message, load_dataset, file)
+    else:
+        still = load_dataset(file)
+        assert not still.moving and "taken for a scene that stands still" in still.notes[0]
+        fails("1 of 6 frames have no time", load_edited, file, lambda d: d["frames"][3].pop("time"))
+
+
+def test_a_split_of_the_datas_own(tmp_path):
+    names = [f"images/{k:03d}.png" for k in range(5)]
+    split = {"train_filenames": ["./images/000.png", names[1]], "val_filenames": [names[2]]}
+    found = load_edited(write_photos(tmp_path / "a", 5), **split, test_filenames=[names[3]])
+    assert [r.name for r in found] == [names[0], names[1], names[3]] and found.held_out == {names[3]}
+    assert load_edited(write_photos(tmp_path / "b", 5), val_filenames=[names[2]]).held_out == {names[2]}
+    file = write_photos(tmp_path / "c", 5)
+    data = json.loads(file.read_text())
+    for part, frames in (("train", data["frames"][:3]), ("test", data["frames"][3:])):
+        (file.parent / f"transforms_{part}.json").write_text(json.dumps({**data, "frames": frames}))
+    file.unlink()
+    found = load_dataset(file.parent)
+    assert len(found) == 5 and found.held_out == set(names[3:])
+    sources = open_sources(*(s := photo_scenario(file.parent), source_config(s)), s.cameras)
+    truth = {sources["cam00"].read(k).image.tobytes() for k in range(sources["cam00"].contents)}
+    assert truth == {r.read().tobytes() for r in found if r.name in found.held_out}
+
+
+def exif(orientation: int) -> bytes:
+    tag = b"II*\0\x08\0\0\0\x01\0" + struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0) + b"\0\0\0\0"
+    return b"\xff\xe1" + struct.pack(">H", len(tag) + 8) + b"Exif\0\0" + tag
+
+
+def test_orientation_and_size_are_what_the_camera_says(tmp_path):
+    file = write_photos(tmp_path, 2, suffix=".jpg")
+    image = tmp_path / "images/000.jpg"
+    as_stored = load_dataset(file)[0].read()
+    data = image.read_bytes()
+    for orientation in (3, 6, 8):
+        image.write_bytes(data[:2] + exif(orientation) + data[2:])
+        np.testing.assert_array_equal(load_dataset(file)[0].read(), as_stored)  # its size is the camera's
+    turned = load_edited(file, lambda d: d["frames"].pop(), w=24, h=32, cx=12, cy=16)
+    np.testing.assert_array_equal(turned[0].read(), np.rot90(as_stored))
+    assert turned[0].path is None, "the stored file is not what the camera saw"
+    image.write_bytes(data)
+    fails("24 x 32 pixels, 000.jpg 32 x 24: another shape", load_dataset, file)
+    file = write_photos(tmp_path, 2, suffix=".jpg", w=None, h=None)
+    cv2.imwrite(str(tmp_path / "images/001.jpg"), np.zeros((40, 32, 3), np.uint8))
+    fails("image of 32 x 40, others have 32 x 24: give w and h", load_dataset, file)
+
+
+def test_masks_are_weights_and_cannot_be_streamed(tmp_path):
+    mask = np.repeat(np.uint8([255, 0]), (16, 8))[:, None].repeat(32, axis=1)
+    file = write_photos(tmp_path, 2)
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    found = load_edited(file, lambda d: d["frames"][0].update(mask_path="mask.png"))
+    np.testing.assert_array_equal(found[0].weight(), mask / np.float32(255))
+    assert found[1].weight is None and found[0].read().shape == (24, 32, 3)
+    scenario = photo_scenario(tmp_path)
+    fails("masks .* a stream cannot carry", open_sources, scenario, source_config(scenario), scenario.cameras)
+    write_photos(tmp_path / "ngp", 1)
+    cv2.imwrite(str(tmp_path / "ngp/images/dynamic_mask_000.png"), mask)
+    np.testing.assert_array_equal(load_dataset(tmp_path / "ngp")[0].weight(), 1 - mask / np.float32(255))
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    ("suffix", "damage"),
+    [*((s, "cut") for s in (".jpg", ".png", ".webp", ".bmp", ".tiff", ".ppm")), (".png", "empty"), (".jpg", "text")],
+)
+def test_a_damaged_picture_is_refused_by_name(tmp_path, suffix, damage):
+    file = write_photos(tmp_path, 2, suffix=suffix)
+    image = tmp_path / f"images/001{suffix}"
+    whole = image.read_bytes()
+    image.write_bytes({"cut": whole[: len(whole) * 2 // 3], "empty": b"", "text": b"version https://git-lfs"}[damage])
+    fails(rf"001{re.escape(suffix)}: .*damaged or cut short", lambda: [r.read() for r in load_dataset(file)])
+
+
+def test_a_cut_jpeg_is_not_sent_as_it_is(tmp_path):
+    write_photos(tmp_path, 8, suffix=".jpg")
+    whole = (tmp_path / "images/003.jpg").read_bytes()
+    (tmp_path / "images/003.jpg").write_bytes(whole[: len(whole) * 2 // 3])
+    scenario = photo_scenario(tmp_path, cameras=2, codec="jpeg")
+    source = open_sources(scenario, source_config(scenario), ["cam01"])["cam01"]
+    assert isinstance(source.read(0).image, bytes)
+    fails(r"003\.jpg: damaged or cut short", lambda: [source.read(k) for k in range(source.contents)])
+
+
+def test_backslashes_are_slashes_and_links_within_the_folder_are_files(tmp_path):
+    file = write_photos(tmp_path, 2)
+    (tmp_path / "images/001.png").unlink()
+    (tmp_path / "images/001.png").symlink_to("000.png")
+    found = load_edited(file, lambda d: d["frames"][1].update(file_path="images\\001.png"))
+    assert [r.name for r in found] == ["images/000.png", "images/001.png"]
+    for name in ("..\\x.png", "C:\\x.png", "C:/x.png"):
+        fails("does not lie within the folder", load_edited, file, lambda d, n=name: d["frames"][1].update(file_path=n))

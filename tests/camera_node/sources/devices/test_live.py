@@ -1,4 +1,4 @@
-"""Real cameras as sources, with a camera that streams over the network."""
+"""Real cameras as sources: the list of those that are plugged in, and one that streams over the network."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from camera_node.pose.providers import FixedPose
 from camera_node.settings import CameraConfig, source_config
 from camera_node.sources.devices import live
 from camera_node.sources.devices import opencv as opencv_camera
+from camera_node.sources.devices.connected import Connected, connected
 from camera_node.sources.devices.feed import CameraError, Plugged, select_device
 from camera_node.sources.devices.live import LiveSource
 from freshfield.clock import WallClock
@@ -237,3 +238,21 @@ def test_the_camera_that_is_meant_is_the_one_named_or_the_only_one():
     ):
         with pytest.raises(CameraError, match=message):
             chosen(device, *serials)
+
+
+def test_video_devices_are_listed_with_the_name_that_lasts(tmp_path: Path) -> None:
+    for number, index, name in ((0, 0, "HD Webcam"), (1, 1, "HD Webcam"), (10, 0, "Other")):
+        entry = tmp_path / f"sys/class/video4linux/video{number}"
+        entry.mkdir(parents=True)
+        (entry / "index").write_text(f"{index}\n")
+        (entry / "name").write_text(f"{name}\n")
+        (tmp_path / "dev").mkdir(exist_ok=True)
+        (tmp_path / f"dev/video{number}").touch()
+    links = tmp_path / "dev/v4l/by-id"
+    links.mkdir(parents=True)
+    (links / "usb-HD_Webcam-video-index0").symlink_to("../../video0")
+    found = [camera for camera in connected(tmp_path) if camera.kind == "camera"]
+    assert found == [
+        Connected("camera", "0", "HD Webcam; the same at every start: /dev/v4l/by-id/usb-HD_Webcam-video-index0"),
+        Connected("camera", "10", "Other"),
+    ]

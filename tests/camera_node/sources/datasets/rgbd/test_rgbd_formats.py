@@ -1,28 +1,30 @@
-"""TUM RGB-D, 7-Scenes, Record3D and Polycam: sets as their tools write them, of a world that is known.
-
-The writers share nothing with the readers: conventions are spelt out here a second time.
-"""
+"""TUM RGB-D, 7-Scenes, Record3D and Polycam as their tools write them, of a known world; depth files of each kind."""
 
 from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from camera_node.capture import build_cameras
+from camera_node.settings import source_config
+from camera_node.sources.datasets import transforms
 from camera_node.sources.datasets.formats import open_dataset
+from camera_node.sources.datasets.lens import Lens
+from camera_node.sources.datasets.photo import ImageOptions, Photo
+from camera_node.sources.datasets.rgbd.depth_file import DepthFile
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.depth import DepthRenderer
 from freshfield.geometry import Pinhole, look_at
+from tests.camera_node.sources.datasets.photos import edited, fails, photo_scenario, write_photos
 
 os.environ["OPENCV_IO_ENABLE_OPENEXR"] = "1"
-import cv2
-
 SCENE = make_scene("room", {"width": 64, "height": 48, "supersample": 1})
 COUNT = 3
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's axes to OpenGL's
@@ -94,10 +96,10 @@ def write_record3d(folder: Path) -> None:
     (folder / "metadata.json").write_text(json.dumps(data))
 
 
-def write_polycam(folder: Path, from_us: int = 7_000_000) -> None:
+def write_polycam(folder: Path) -> None:
     lens, small = Pinhole(64, 48, 60.0, 61.0, 31.0, 25.0), Pinhole(32, 24, 30.0, 30.5, 15.5, 12.5)
     for n in range(COUNT):
-        name = f"{from_us + 100_000 * n}"
+        name = f"{7_000_000 + 100_000 * n}"
         save(folder / f"keyframes/images/{name}.png", image(n, lens))
         save(folder / f"keyframes/depth/{name}.png", np.rint(1000 * depth(n, small)).astype(np.uint16))
         matrix = TO_ARKIT @ pose(n) @ FLIP
@@ -137,15 +139,106 @@ def test_image_pose_and_depth_are_of_one_world(tmp_path, name):
         assert (np.abs(measured.meters()[seen] - exact[seen]) < 0.02).mean() > 0.98
 
 
-def test_corrected_poses_of_polycam_are_preferred(tmp_path):
-    """They were computed from the photos, the others are a tracker's, at the times that files are named by."""
-    write_polycam(tmp_path, 950_000)  # names that are sorted by time are not as texts
-    assert [image.time_s for image in open_dataset(tmp_path)[1]] == pytest.approx(0.1 * np.arange(COUNT))
-    frames = tmp_path / "keyframes"
-    shutil.copytree(frames / "images", frames / "corrected_images")
-    (frames / "corrected_cameras").mkdir()
-    entry = json.loads((frames / "cameras/1050000.json").read_text())
-    (frames / "corrected_cameras/1050000.json").write_text(json.dumps(entry | {"t_03": entry["t_03"] + 0.5}))
-    (found,) = open_dataset(tmp_path)[1]
-    assert found.name == "1050000" and found.depth is not None and found.time_s is None
-    assert np.abs(found.camera_to_world[:3, 3] - pose(1)[:3, 3]).max() == pytest.approx(0.5)
+MM = np.random.default_rng(0).integers(300, 6000, (24, 32)).astype(np.uint16)
+MM[3:5, 7:9] = 0
+LENS = Lens(32, 24, 40.0, 41.0, 16.0, 12.0)
+
+
+def photo(lens: Lens = LENS, scale: float = 1.0) -> Photo:
+    return Photo(Path("image.png"), lens, ImageOptions(scale))
+
+
+def written(path: Path, values: np.ndarray) -> Path:
+    if path.suffix == ".npy":
+        np.save(path, values)
+    else:
+        assert cv2.imwrite(str(path), values)
+    return path
+
+
+@pytest.mark.parametrize("name", ["mm.png", "mm.tiff", "mm.npy", "m.npy", "m.exr"])
+def test_every_kind_of_file_gives_the_same_millimeters(tmp_path, name):
+    values = MM.copy() if name.startswith("mm") else (MM / 1000.0).astype(np.float32)
+    found = DepthFile(written(tmp_path / name, values)).read(photo())
+    assert np.array_equal(found.counts, MM) and found.meters_per_count == 0.001
+    assert found.intrinsics is None and found.to_camera is None
+    if name.startswith("mm"):  # the unit, and what stands for nothing, may be the format's
+        values[0] = 65535
+        found = DepthFile(written(tmp_path / name, values), 1 / 5000, 65535).read(photo())
+        assert np.array_equal(found.counts[1:], MM[1:]) and not found.counts[0].any()
+        assert found.meters()[10, 10] == pytest.approx(MM[10, 10] / 5000)
+
+
+def test_depth_is_straightened_with_its_image_and_is_no_larger(tmp_path):
+    file = DepthFile(written(tmp_path / "d.png", np.kron(MM, np.ones((2, 2), np.uint16))))
+    assert file.read(photo(scale=1.0)).counts.shape == (24, 32)
+    assert file.read(photo(scale=4.0)).counts.shape == (6, 8)
+    assert set(file.read(photo(scale=4.0)).counts.ravel()) <= set(MM.ravel()), "no means across edges"
+    fisheye = Lens(32, 24, 40.0, 41.0, 16.0, 12.0, (0.05, 0.0, 0.0, 0.0), fisheye=True)
+    bent = file.read(photo(fisheye)).counts
+    assert bent.shape == (24, 32) and set(bent.ravel()) <= set(MM.ravel()) and not np.array_equal(bent, MM)
+
+
+BAD_FILES = {
+    "missing": ("d.png", None, "missing, damaged"),
+    "npy cut": ("d.npy", b"\x93NUMPY", "cannot be read as numbers"),
+    "8 bits": ("d.png", (MM // 256).astype(np.uint8), "expected one number a pixel, of 16 bits"),
+    "another shape": ("d.png", MM[:, :20], "depth is 20 x 24, its image 32 x 24"),
+    "meters in a PNG": ("d.png", np.maximum(MM // 1000, 1), "the median of its depth is 0.00"),
+    "millimeters as floats": ("d.npy", (MM / 10.0).astype(np.float32), "the median of its depth is 3.. m"),
+    "signed": ("d.npy", MM.astype(np.int32), "expected one number a pixel"),
+    "wide": ("d.npy", MM.astype(np.uint32) * 1000, "exceed 16 bits"),
+}
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(("name", "content", "message"), BAD_FILES.values(), ids=BAD_FILES)
+def test_what_cannot_be_depth_is_refused_by_name(tmp_path, name, content, message):
+    path = tmp_path / name
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        written(path, content)
+    fails(f"{path}: .*{message}", DepthFile(path).read, photo())
+
+
+@pytest.mark.stability
+@pytest.mark.filterwarnings("error")
+def test_what_is_no_number_or_too_far_is_not_measured(tmp_path):
+    values = (MM / 1000.0).astype(np.float32)
+    values[1, :6] = np.nan, np.inf, -np.inf, -1.0, 1e30, 65.6
+    found = DepthFile(written(tmp_path / "d.npy", values)).read(photo())
+    assert not found.counts[1, :6].any() and np.array_equal(found.counts[2:], MM[2:])
+    for empty in (np.zeros((24, 32), np.float32), np.full((24, 32), np.nan, np.float32)):
+        assert not DepthFile(written(tmp_path / "e.npy", empty)).read(photo()).counts.any()
+
+
+def with_depth(folder: Path, **keys) -> Path:
+    """Photos of which every frame but the second has depth; that of the third is missing."""
+
+    def add(data) -> None:
+        for index, frame in enumerate(data["frames"]):
+            if index != 1:
+                frame["depth_file_path"] = f"depth/{index:03d}.png"
+            if index != 2:
+                written(folder / f"depth/{index:03d}.png", np.where(MM > 0, MM + index, 0).astype(np.uint16))
+
+    (folder / "depth").mkdir()
+    return edited(write_photos(folder, 16), add, **keys)
+
+
+def test_transforms_bring_depth_with_the_frames_that_have_it(tmp_path):
+    file = with_depth(tmp_path, depth_unit_scale_factor=0.0005)
+    found = transforms.load_dataset(file)
+    assert [image.depth is not None for image in found][:4] == [True, False, False, True]
+    assert "1 of its depth files are missing, first" in found.notes[-1]
+    measured = found[3].depth()
+    assert measured.meters_per_count == 0.0005 and measured.counts[10, 10] == MM[10, 10] + 3
+    scenario = photo_scenario(file, cameras=2)
+    (camera,) = build_cameras(scenario, source_config(scenario), ["cam01"])
+    source = camera.source
+    shown = [source.depth(content, source.read(content)) for content in range(source.contents)]
+    assert [depth is not None for depth in shown][:3] == [False, False, True], "images 1, 2, 3"
+    assert np.array_equal(shown[2].counts, measured.counts)
+    for unit in (-1, "mm", 1e9, True):
+        fails("depth_unit_scale_factor", transforms.load_dataset, edited(file, depth_unit_scale_factor=unit))
