@@ -44,14 +44,6 @@ def test_preparing_fills_what_fits_until_it_is_told_to_stop(tmp_path, cache, cac
     assert len(cameras[1].capture(5).payload) > 0  # with or without
 
 
-def test_a_frame_too_large_to_send_is_an_error_of_that_frame(tmp_path, monkeypatch):
-    monkeypatch.setattr("freshfield.payload.MAX_PAYLOAD_BYTES", 100)
-    scenario = photo_scenario(write_photos(tmp_path, 24), 3)
-    camera = build_cameras(scenario, source_config(scenario), scenario.cameras)[1]
-    with pytest.raises(ValueError, match="exceeds 100"):
-        camera.capture(0)
-
-
 def depth_camera(every: int, contents: int | None = None, cache: ShotCache | None = None, **depth) -> Camera:
     source = DepthSource("cam01", contents, **depth)
     return Camera(source, WorldConfig(kind="world"), cache or ShotCache(10**6), depth_every=every)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import threading
 from fractions import Fraction
 from unittest.mock import MagicMock
@@ -14,14 +13,9 @@ import pytest
 from camera_node.capture import Camera, ShotCache
 from camera_node.cli import main
 from camera_node.node import Node, NodeOptions
-from camera_node.outbox import Outbox
-from camera_node.sender import Sender
 from camera_node.settings import CameraConfig
 from camera_node.sources.base import Shot, Source
-from freshfield.clock import VirtualClock
-from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose
-from freshfield.limits import MAX_REASONS
 from freshfield.scenario import load
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
@@ -107,18 +101,6 @@ async def test_a_fault_of_the_program_ends_the_node_and_is_told(monkeypatch):
     monkeypatch.setattr(node, "_frame", MagicMock(side_effect=ZeroDivisionError))
     with pytest.raises(ZeroDivisionError):
         await node.run()
-
-
-def test_reasons_of_refusals_are_logged_once_and_not_without_end(caplog):
-    outbox = Outbox("cam01", "s", None, VirtualClock(0))
-    sender = Sender(outbox, MagicMock(), (), lambda: None, np.random.default_rng(0), {})
-    frame = Frame("cam01", "s", 0, 0, POSE, LENS, "jpeg", b"")
-    with caplog.at_level(logging.WARNING, "camera-node"):
-        for k in range(3 * MAX_REASONS):
-            for _ in range(2):
-                sender._count(frame, pb.PushResponse(outcome=pb.OUTCOME_REJECTED, reason=f"reason_{k}"))
-    assert len(caplog.records) == MAX_REASONS + 1
-    assert outbox.counts["rejected:other"] == 4 * MAX_REASONS and outbox.counts["rejected:reason_0"] == 2
 
 
 def test_a_node_that_reached_nobody_ends_with_1(capsys):

@@ -42,8 +42,12 @@ def views(name: str, later_s: float = 0.0) -> Image:
 def test_a_scene_looks_as_it_did(name):
     """Of the instants the nearest counts at each pixel, to a level of gray."""
     golden = cv2.imread(str(GOLDEN / f"{name}.png"))[..., ::-1].astype(np.int16)
-    off = np.min([np.abs(views(name, s).astype(np.int16) - golden).max(axis=2) for s in INSTANTS_S], axis=0)
-    assert (off > 1).sum() <= 3
+    off = np.full(golden.shape[:2], 255)
+    for later_s in INSTANTS_S:
+        off = np.minimum(off, np.abs(views(name, later_s).astype(np.int16) - golden).max(axis=2))
+        if (off > 1).sum() <= 3:
+            return
+    pytest.fail(f"{(off > 1).sum()} pixels differ")
 
 
 if __name__ == "__main__":
