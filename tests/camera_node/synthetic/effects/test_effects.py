@@ -34,22 +34,6 @@ def test_every_file_is_registered_and_keeps_its_contract_and_others_are_refused(
             fx.load_effects(listed, lambda name: np.random.default_rng(0))
 
 
-def test_the_held_out_camera_shows_the_truth_unless_in_truth():
-    listed = {"sensor_noise": {}, "exposure_drift": {"in_truth": True}, "clock_drift": None}
-    asked: list[str] = []
-
-    def rng_for(name: str) -> np.random.Generator:
-        asked.append(name)
-        return np.random.default_rng(0)
-
-    held_out = fx.load_effects(listed, rng_for, held_out=True)
-    assert asked == ["exposure_drift"]
-    assert len(held_out.image) == 1 and not held_out.clock
-    assert fx.load_effects({"clock_drift": {"cameras": ["cam02"]}}, rng_for, camera="cam01") is fx.NO_EFFECTS
-    training = fx.load_effects(listed, rng_for)
-    assert len(training.image) == 2 and len(training.clock) == 1
-
-
 @pytest.mark.parametrize("name", ["depth_sensor", "exposure_drift", "pose_noise", "sensor_noise"])
 def test_frames_repeat_in_any_order(name):
     """A frame depends on the camera's random stream and the frame's number alone."""
