@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from fractions import Fraction
-from unittest.mock import MagicMock
+from unittest.mock import AsyncMock, MagicMock
 
 import numpy as np
 import pytest
@@ -13,8 +13,12 @@ import pytest
 from camera_node.capture import Camera, ShotCache
 from camera_node.cli import main
 from camera_node.node import Node, NodeOptions
+from camera_node.outbox import Outbox
+from camera_node.sender import Sender
 from camera_node.settings import CameraConfig
 from camera_node.sources.base import Shot, Source
+from freshfield.clock import VirtualClock
+from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import load
 from freshfield.transport import Transport
@@ -101,6 +105,19 @@ async def test_a_fault_of_the_program_ends_the_node_and_is_told(monkeypatch):
     monkeypatch.setattr(node, "_frame", MagicMock(side_effect=ZeroDivisionError))
     with pytest.raises(ZeroDivisionError):
         await node.run()
+
+
+async def test_the_time_allowed_for_an_answer_doubles_after_each_timeout_up_to_its_bound():
+    outbox = Outbox("cam01", "s", None, VirtualClock(0))
+    sender = Sender(outbox, MagicMock(), (), lambda: None, np.random.default_rng(0), {}, response_timeout_s=0.05)
+    sender._patience_s = 0.01
+    call, allowed_s = MagicMock(write=AsyncMock(), read=asyncio.Event().wait), []
+    for _ in range(4):
+        with pytest.raises(TimeoutError):
+            await sender._exchange(call, Frame("cam01", "s", 0, 0, POSE, LENS, "jpeg", b""))
+        allowed_s.append(sender._patience_s)
+    assert allowed_s == [0.02, 0.04, 0.05, 0.05] and outbox.counts["broken"] == 4
+    assert not sender.connected, "it never was"
 
 
 def test_a_node_that_reached_nobody_ends_with_1(capsys):
