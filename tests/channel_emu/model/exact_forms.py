@@ -7,7 +7,6 @@ shared and modulated forms are derived where they stand, by renewal arguments.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -24,12 +23,6 @@ def mm1_newest_waits(lam: float, mu: float) -> float:
     return 1 / lam + 2 / mu + lam / (lam + mu) ** 2 + 1 / (lam + mu) - 2 * (lam + mu) / both
 
 
-def mg1_blocking(lam: float, mean: float, second_moment: float) -> float:
-    """E[S] + E[(S + X)²] / (2 (E[S] + 1/lambda)), X exponential of rate lambda."""
-    square = second_moment + 2 * mean / lam + 2 / lam**2
-    return mean + square / (2 * (mean + 1 / lam))
-
-
 def mg1_preemptive(lam: float, shape: float, mean: float) -> float:
     """1 / (lambda E[e^(-lambda S)]) for gamma service."""
     return (1 + lam * mean / shape) ** shape / lam
@@ -42,32 +35,8 @@ def dg1_drop_new(period: float, mean: float, survival: Callable[[np.ndarray], np
     return mean + period * second / (2 * first), mean + period * first
 
 
-def dm1_drop_new(period: float, mu: float) -> tuple[float, float]:
-    """The same of exponential service, in closed form."""
-    return 1 / mu + period / 2 / math.tanh(mu * period / 2), 1 / mu + period / (1 - math.exp(-mu * period))
-
-
-def shared_mm1_fcfs(lam: float, other: float, mu: float) -> float:
-    """Of the source of rate lam where others of rate ``other`` in all use the same server, exact.
-
-    age = lam (E[X²]/2 + E[X T]): T is the workload V that the previous update left after X, and its own
-    service. V starts exponential of rate mu - lam - other and gets the others' work meanwhile, so that
-    E[V(x)] = E[V(0)] - (1 - other/mu) x + time spent empty, whose Laplace transform is
-    E[e^(-eta V(0))] / (eta s²) with eta (1 - other/(mu + eta)) = s; X weighs it with lam x e^(-lam x).
-    """
-    start = mu - lam - other
-    half = (lam + other - mu) / 2
-    eta = half + math.sqrt(half**2 + lam * mu)
-    slope = 1 / (1 - other * mu / (mu + eta) ** 2)  # of eta by s, at s = lam
-    empty = start / ((start + eta) * eta)
-    empty_slope = -start * (start + 2 * eta) / ((start + eta) * eta) ** 2 * slope
-    idle = empty / lam - empty_slope  # -lam d/ds [empty / s]
-    workload = 1 / (start * lam) - 2 * (1 - other / mu) / lam**2 + idle
-    return lam * (1 / lam**2 + workload + 1 / (lam * mu))
-
-
-def shared_mm1_preemptive(lam: float, other: float, mu: float) -> float:
-    return (1 + (lam + other) / mu) / lam
+def shared_mm1_preemptive(lam: float, other: float, mean: float, _second_moment: float) -> float:
+    return (1 + (lam + other) * mean) / lam
 
 
 def shared_mg1_blocking(lam: float, other: float, mean: float, second_moment: float) -> float:
