@@ -111,9 +111,9 @@ async def test_no_service_and_no_port():
     proxy = TcpProxy(channel_from_mapping({}), 0, ProxyOptions("127.0.0.1:0", f"127.0.0.1:{free_port()}"))
     await proxy.start()
     assert await through(proxy, b"anybody?") == b""
-    for listen, why in ((f"127.0.0.1:{proxy.port}", "cannot listen"), ("0.0.0.0:0", "TLS|insecure")):
+    for listen in (f"127.0.0.1:{proxy.port}", "0.0.0.0:0"):
         other = TcpProxy(channel_from_mapping({}), 0, ProxyOptions(listen, "127.0.0.1:1"))
-        with pytest.raises(TransportError, match=why):
+        with pytest.raises(TransportError, match="cannot listen"):
             await other.start()
         await other.stop()
     await proxy.stop()

@@ -3,16 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import PAIRS, CapsuleModel, segment_distance
-from camera_node.robot.arm.kinematics import UR3E, apply_calibration
-from camera_node.robot.teleop.limits import Limiter
-from camera_node.robot.teleop.settings import TeleopConfig
-from tests.camera_node.robot.arm.test_kinematics import CALIBRATION
-from tests.camera_node.robot.teleop.checks import HOME
+from camera_node.robot.arm.kinematics import UR3E
 
 SHAPE = CapsuleModel(UR3E, 0.12, 0.04)
-OPEN = TeleopConfig(workspace_low_m=(-1, -1, -1), workspace_high_m=(1, 1, 1), floor_m=-1.0)
 
 
 def test_distance_of_segments_is_the_least_of_all_their_points():
@@ -43,21 +37,3 @@ def test_parts_of_the_stretched_arm_lie_where_the_manufacturer_describes_them():
     # Base (radius 64 mm) and forearm (40 mm): from the top of the column to the elbow's end.
     assert apart[0][PAIRS.index((0, 3))] == pytest.approx(np.hypot(0.24355, 0.0273) - 0.064 - 0.04)
     assert lowest[0] == pytest.approx(height - 0.08535 - 0.04)
-
-
-def test_parts_of_a_calibrated_arm_stay_where_they_are(tmp_path):
-    """Its link frames lie meters beside it: the limits may not take them for the arm."""
-    file = tmp_path / "calibration.conf"
-    file.write_text(CALIBRATION)
-    arm = apply_calibration(UR3E, file)
-    assert np.abs(arm.link_frames(HOME) - UR3E.link_frames(HOME)).max() > 2.0
-    shape, met = CapsuleModel(UR3E, OPEN.tool_m, OPEN.tool_radius_m), 0
-    for q in np.random.default_rng(4).uniform(-3, 3, (60, 6)):
-        apart_m = shape.clearance(UR3E.link_frames(q[None]))[0].min()
-        if apart_m > OPEN.margin_m + 0.01:
-            Limiter(arm, OPEN, q)
-        elif apart_m < OPEN.margin_m - 0.01:
-            met += 1
-            with pytest.raises(ArmError, match="mm apart, nearer than margin_m"):
-                Limiter(arm, OPEN, q)
-    assert met > 10

@@ -93,13 +93,6 @@ def test_from_where_no_path_leads_on_the_tour_goes_back():
     assert tour.places == [0, 1, 2] and used.all()
 
 
-def test_a_tour_out_of_reach_says_what_to_change():
-    far = msgspec.structs.replace(ARM.path, radius_m=2.0)
-    with pytest.raises(ArmError, match=r"reaches 0 of .* viewpoints: change radius_m"):
-        plan_tour(UR3E, BASE, MOUNT, far)
-    assert not reachable(UR3E, BASE, MOUNT, far, viewpoints(far)).any()
-
-
 def test_reachable_viewpoints_are_those_above_the_floor_with_a_free_posture():
     path = msgspec.structs.replace(ARM.path, step_deg=80.0)
     poses = viewpoints(path)
@@ -108,6 +101,8 @@ def test_reachable_viewpoints_are_those_above_the_floor_with_a_free_posture():
     for pose, z_m in zip(low, (2.0, -0.2, 0.02)):
         pose[2, 3] = z_m
     assert not reachable(UR3E, BASE, MOUNT, path, low).any()
+    with pytest.raises(ArmError, match=r"reaches 0 of .* viewpoints: change radius_m"):
+        plan_tour(UR3E, BASE, MOUNT, msgspec.structs.replace(path, radius_m=2.0))
 
 
 def cell(**changed):
@@ -116,32 +111,25 @@ def cell(**changed):
     return parse(data, CELL.path)
 
 
-def test_a_camera_that_is_not_calibrated_yet_has_the_hands_poses():
-    scenario = cell()
-    mounts = load_hand_eyes(scenario, source_config(scenario).arm, scenario.cameras)
+def test_a_camera_that_is_not_calibrated_yet_has_the_hands_poses_wherever_the_base_stands():
+    scenario = cell(base_m=[1.0, 2.0, 3.0], base_yaw_deg=90.0)
+    arm = source_config(scenario).arm
+    mounts = load_hand_eyes(scenario, arm, scenario.cameras)
     assert list(mounts) == ["hand"] and np.array_equal(mounts["hand"].transform, np.eye(4))
-
-
-def test_where_the_base_stands():
-    base = base_matrix(source_config(cell(base_m=[1.0, 2.0, 3.0], base_yaw_deg=90.0)).arm)
-    assert np.allclose(base @ [1, 0, 0, 1], [1, 3, 3, 1])
-
-
-def test_a_real_arm_does_not_pass_for_a_simulated_one():
-    """A simulated one is driven without a question."""
-    with pytest.raises(ScenarioError, match=r"simulated: host is 192\.168"):
-        source_config(cell(host="192.168.56.101", simulated=True))
+    assert np.allclose(base_matrix(arm) @ [1, 0, 0, 1], [1, 3, 3, 1])
 
 
 @pytest.mark.parametrize(
     "changed, says",
     [
+        # A simulated one is driven without a question.
+        ({"host": "192.168.56.101", "simulated": True}, r"simulated: host is 192\.168"),
         ({"cameras": {"nobody": None}}, "arm.cameras: 'nobody' is not one of the scenario's cameras"),
         ({"cameras": {"hand": "no-such.yaml"}}, r"arm.cameras.hand: .*no-such.yaml: cannot be read"),
         ({"calibration": "no-such.conf"}, r"source.arm.calibration: .*no-such.conf: cannot be read"),
     ],
 )
-def test_a_wrong_file_is_refused_by_name(changed, says):
+def test_a_wrong_file_or_host_is_refused_by_name(changed, says):
     scenario = cell(**changed)
     with pytest.raises(ScenarioError, match=says):
         load_hand_eyes(scenario, source_config(scenario).arm, scenario.cameras)

@@ -48,6 +48,11 @@ def test_it_waits_for_stillness_keeps_what_is_new_and_says_when_there_is_enough(
     assert angle_deg(found.transform, X) < 0.1
     step = session.offer(np.ascontiguousarray(images[-1][:, ::-1]), LENS, flanges[-1])
     assert step.outcome == "target not found" and "the picture is mirrored" in step.advice
+    # The axis that is missing.
+    turns = [[0, 0, 0], [0.4, 0, 0], [0, 0.3, 0], [0.3, 0.3, -0.1]]
+    poses = np.array([se3(so3_exp(turn), np.zeros(3)) for turn in turns])
+    assert "about its +z" in missing_turn(poses) and "about its +y" in missing_turn(poses[:2])
+    assert "bring the target" in missing_turn(poses[:0])
 
 
 def test_it_asks_for_all_of_a_board_whose_part_fits_two_prints():
@@ -59,13 +64,6 @@ def test_it_asks_for_all_of_a_board_whose_part_fits_two_prints():
     steps = [session.offer(image, lens, np.eye(4)) for image in (part, part, whole, part)]
     assert [step.outcome for step in steps] == ["arm moving", "target unclear", "kept", "like pose 1"]
     assert steps[1].advice == WHICH_PRINT and len(session.samples) == 1
-
-
-def test_it_asks_for_turns_about_the_axis_that_is_missing():
-    turns = [[0, 0, 0], [0.4, 0, 0], [0, 0.3, 0], [0.3, 0.3, -0.1]]
-    poses = np.array([se3(so3_exp(turn), np.zeros(3)) for turn in turns])
-    assert "about its +z" in missing_turn(poses) and "about its +y" in missing_turn(poses[:2])
-    assert "bring the target" in missing_turn(poses[:0])
 
 
 class Recording:

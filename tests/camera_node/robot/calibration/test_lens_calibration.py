@@ -20,7 +20,6 @@ from tests.camera_node.robot.calibration.rendered import BOARD
 from tests.conftest import data_dir
 
 TRUE = Pinhole(640, 480, 520.0, 523.0, 331.0, 236.0, (-0.12, 0.05, 0.002, -0.001))
-LENS = Pinhole.from_fov(640, 480, 65.0)
 
 
 def views(noise_px: float, tilt_deg: float = 45.0, count: int = 14) -> dict[str, Corners]:
@@ -68,7 +67,6 @@ def test_an_image_that_does_not_fit_is_left_out_and_named():
     ("seen", "message"),
     [
         (views(0.1, count=3), "too few pictures show the target: 3 of 4"),
-        (views(0.0, 0.0), "do not determine"),
         (views(0.1, 0.0), "do not determine"),
         (views(0.0, 2.0), "held the same way"),
     ],
@@ -99,7 +97,6 @@ def test_real_images():
     board = parse_target("chessboard:9x6:23.6mm")
     corners, unused, size = find_corners(list_images(folder), board, None, lambda done: None)
     found = calibrate_lens(corners, size, unused)
-    published = read_lens(folder / "franka_camera.xml")
     assert len(found.views) == 8 and found.error_px == pytest.approx(0.260, abs=0.002)
     # The published lens has no distortion; ours, which has, differs by a hundredth.
-    assert abs(found.pinhole.fx / published.fx - 1) < 0.02
+    assert abs(found.pinhole.fx / read_lens(folder / "franka_camera.xml").fx - 1) < 0.02

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import json
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -101,15 +102,11 @@ def test_a_rig_is_exact_from_exact_corners_and_stands_where_the_target_lay():
     assert len(notes) == 1 and notes[0].startswith("note: cam3: shares few moments with any other camera")
 
 
-@pytest.mark.parametrize(("noise_px", "count"), [(0.1, 20), (0.2, 40)])
-def test_errors_are_within_their_own_deviations_and_within_3_mm_and_a_fifth_of_a_degree(noise_px, count):
-    found = calibrate_rig(sightings(noise_px, count), start(), True)
+def test_errors_are_within_their_own_deviations_and_within_3_mm_and_a_fifth_of_a_degree():
+    found = calibrate_rig(sightings(0.2, 40), start(), True)
     mm, deg = errors(dict(found.poses))
     assert mm < 3.0 and deg < 0.2
     assert mm < 6 * max(found.std_mm.values()) and deg < 6 * max(found.std_deg.values())
-
-
-def test_an_origin_that_nobody_saw_is_refused():
     with pytest.raises(CalibrationError, match="--origin 99: no camera saw the target then; there are 00, 01, 02"):
         calibrate_rig(sightings(0.1), start(), True, "99")
 
@@ -154,14 +151,10 @@ def test_a_live_camera_shows_its_newest_frame_however_slowly_it_is_asked(tmp_pat
 
 
 @pytest.mark.stability
-@pytest.mark.parametrize("wrong", ["apart", "once"])
-def test_a_camera_that_shares_nothing_is_named(wrong):
+@pytest.mark.parametrize("together", [[], ["00"]])
+def test_a_camera_that_shares_nothing_or_one_moment_is_named(together):
     views = sightings(0.1)
-    if wrong == "apart":
-        views["cam3"] = {f"x{moment}": corners for moment, corners in views["cam3"].items()}
-    else:
-        alone = {f"x{moment}": corners for moment, corners in views["cam3"].items()}
-        views["cam3"] = {"00": views["cam3"]["00"], **alone}
+    views["cam3"] = {m if m in together else f"x{m}": corners for m, corners in views["cam3"].items()}
     with pytest.raises(CalibrationError, match="cam3: never saw the target at the same moment as cam0, cam1, cam2"):
         calibrate_rig(views, start(), True)
 
@@ -237,18 +230,16 @@ def test_videos_give_the_moments_at_which_the_target_stood_still(tmp_path):
 
 
 def test_a_live_session_keeps_each_new_place_once_the_target_rests():
-    target = parse_target(BOARD)
     places = boards(3)
     frames = {n: iter([photo(n, b, 2.0, k) for b in places for k in range(3)]) for n in ("cam1", "cam2")}
     said: list[str] = []
 
     def grab(name):
-        try:
-            return next(frames[name])
-        except StopIteration:
-            raise KeyboardInterrupt from None
+        if (image := next(frames[name], None)) is None:
+            raise KeyboardInterrupt
+        return image
 
-    views = rig_inputs.watch({n: lambda n=n: grab(n) for n in frames}, target, None, said.append)
+    views = rig_inputs.watch({n: partial(grab, n) for n in frames}, parse_target(BOARD), None, said.append)
     assert len(said) == len(places) and views.sizes["cam1"] == (640, 480)
     assert said[-1] == f"cam1 {len(views.corners['cam1'])}, cam2 {len(views.corners['cam2'])}"
 
@@ -275,11 +266,9 @@ def test_a_live_camera_that_is_unplugged_is_named_and_the_others_go_on():
     [
         ([], "expected one of FOLDER"),
         (["{folder}"], "--board SPEC"),
-        (["{folder}/none", "--board", BOARD], "no such folder"),
         (["{folder}/cam0", "--board", BOARD], "for each of at least two cameras, found 0"),
         (["{folder}", "--board", BOARD], "cam0 never sees the target: charuco:8x5:60mm:45mm not found: no markers"),
         (["--colmap", "{folder}"], "--length CAM CAM METERS"),
-        (["--colmap", "{folder}", "--length", "a", "b", "long"], "--length: expected meters"),
         (["--live", "room", "--board", BOARD], "expected camera, oak or realsense"),
     ],
 )
