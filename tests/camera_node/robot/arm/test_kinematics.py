@@ -110,19 +110,15 @@ def test_a_calibration_moves_the_flange_and_the_inverse_follows_it(factory):
     assert np.array_equal(apply_calibration(UR3E, factory).forward(POSTURES), UR3E.forward(POSTURES))
 
 
-@pytest.mark.parametrize(
-    "text, says",
-    [
-        ("[mounting]\ndelta_a = [1, 2]\n", "delta_a: expected a list of six numbers"),
+def test_a_wrong_calibration_is_refused_by_name(factory):
+    for text, says in (
         ("[mounting]\ndelta_a = [1, 2, 3, 4, 5, nan]\n", "delta_a: expected a list of six numbers"),
         ("[mounting]\nother = 1\n", "has no delta_theta"),
         ("delta_a = [0, 0, 0, 0, 0, 0]\n", "cannot be read"),
-    ],
-)
-def test_a_wrong_calibration_is_refused_by_name(factory, text, says):
-    factory.write_text(text)
-    with pytest.raises(ArmError, match=says):
-        apply_calibration(UR3E, factory)
+    ):
+        factory.write_text(text)
+        with pytest.raises(ArmError, match=says):
+            apply_calibration(UR3E, factory)
 
 
 def test_joints_that_no_arm_has_are_refused():

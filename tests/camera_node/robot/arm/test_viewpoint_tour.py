@@ -74,11 +74,8 @@ def test_a_calibrated_arm_is_kept_above_the_floor_too(tmp_path):
 
 def test_an_arm_is_not_driven_through_itself():
     """Between two postures that are free the straight way in joint space need not be."""
-    folded = np.array(HOME_RAD)
-    folded[2] = -np.pi + 0.05
-    other = np.array(HOME_RAD)
-    other[2] = -2 * np.pi + np.pi / 2
     home = np.array(HOME_RAD)
+    folded, other = (np.where(np.arange(6) == 2, elbow, home) for elbow in (-np.pi + 0.05, -1.5 * np.pi))
     assert is_free(UR3E, BASE, home, home, -1.0) and is_free(UR3E, BASE, other, other, -1.0)
     assert not is_free(UR3E, BASE, folded, folded, -1.0)
     assert not is_free(UR3E, BASE, home, other, -1.0)

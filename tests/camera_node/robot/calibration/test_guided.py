@@ -13,7 +13,7 @@ import yaml
 
 from camera_node.cli import main
 from camera_node.robot.arm.camera_poses import base_matrix, camera_poses
-from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration import guided
 from camera_node.robot.calibration.guided import HandEyeSession, missing_turn
 from camera_node.robot.calibration.hand_eye.calibrate import calibrate
@@ -96,26 +96,23 @@ def bench(folder, camera=None):
     return file
 
 
-@pytest.mark.parametrize("setup", [EYE_IN_HAND, EYE_TO_HAND])
-def test_what_it_saves_is_what_the_node_takes_it_for(setup, tmp_path, monkeypatch, capsys):
-    """In the axes of the arm's base, wherever that stands in the world."""
+def test_what_it_saves_is_what_the_node_takes_it_for(tmp_path, monkeypatch, capsys):
+    """Of a camera that stands, in the axes of the arm's base, wherever that stands in the world."""
     file, out = bench(tmp_path), tmp_path / "eye.yaml"
     plan = load(str(file))
     config = source_config(plan).arm
     base = base_matrix(config)
-    flanges = taken()[1] if setup == EYE_IN_HAND else se3_inverse(taken()[1])
-    monkeypatch.setattr(guided, "open_sources", lambda *_: {"eye": Recording(base @ flanges)})
-    held = ["--eye-to-hand"] if setup == EYE_TO_HAND else []
-    arguments = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--out", str(out)]
-    assert main(["calibrate", "hand-eye", *arguments, *held, "--json"]) == 0
+    recording = Recording(base @ se3_inverse(taken()[1]))
+    monkeypatch.setattr(guided, "open_sources", lambda *_: {"eye": recording})
+    words = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--out", str(out), "--eye-to-hand", "--json"]
+    assert main(["calibrate", "hand-eye", *words]) == 0
     said = capsys.readouterr()
     assert "no pose near enough" in said.err and said.err.splitlines()[-1].endswith("kept: enough")
     found = np.array(json.loads(said.out)["transform"])
     assert distance_mm(found, X) < 0.6 and angle_deg(found, X) < 0.1
-    if setup == EYE_TO_HAND:
-        used = msgspec.structs.replace(config, cameras={"eye": str(out)})
-        place = camera_poses(plan, used, ["eye"])["eye"].at(0)[0].matrix()
-        assert distance_mm(place, base @ X) < 0.6
+    used = msgspec.structs.replace(config, cameras={"eye": str(out)})
+    place = camera_poses(plan, used, ["eye"])["eye"].at(0)[0].matrix()
+    assert distance_mm(place, base @ X) < 0.6
 
 
 @pytest.mark.parametrize(

@@ -38,21 +38,17 @@ def views(noise_px: float, tilt_deg: float = 45.0, count: int = 14) -> dict[str,
     return out
 
 
-def test_a_lens_is_exact_from_exact_corners():
+def test_a_lens_is_exact_from_exact_corners_and_within_its_own_deviations_from_others():
     """In this project's convention: the principal point counts from the corner of the first pixel."""
     p = calibrate_lens(views(0.0), (640, 480), {}).pinhole
     np.testing.assert_allclose([p.fx, p.fy, p.cx, p.cy], [520.0, 523.0, 331.0, 236.0], atol=0.02)
     np.testing.assert_allclose(p.distortion, TRUE.distortion, atol=2e-4)
     assert len(calibrate_lens(views(0.0, count=4), (640, 480), {}).views) == 4
-
-
-def test_a_lens_is_found_within_its_own_deviations():
     found = calibrate_lens(views(0.1), (640, 480), {})
     p = found.pinhole
     off = np.array([p.fx, p.fy, p.cx, p.cy, *p.distortion]) - [520, 523, 331, 236, *TRUE.distortion]
     assert np.all(np.abs(off) < 4 * np.array(found.std)) and found.std[0] < 2.0
-    # 0.1 px a coordinate.
-    assert found.error_px == pytest.approx(0.1 * np.sqrt(2), rel=0.15)
+    assert found.error_px == pytest.approx(0.1 * np.sqrt(2), rel=0.15)  # 0.1 px a coordinate
 
 
 def test_an_image_that_does_not_fit_is_left_out_and_named():

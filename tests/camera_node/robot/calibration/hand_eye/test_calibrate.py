@@ -87,36 +87,28 @@ def test_the_flanges_residual_is_the_motion_from_the_reported_to_the_predicted_p
     np.testing.assert_allclose(found, [[0.01, -0.02, 0.03, 0.001, 0.002, -0.003]] * 4, atol=1e-9)
 
 
-@pytest.mark.parametrize(("trials", "excess"), [(24, 1.25), pytest.param(300, 1.10, marks=pytest.mark.slow)])
-def test_with_noise_on_the_arm_the_refinement_is_as_exact_as_can_be_and_says_so(trials, excess):
+def test_with_noise_on_the_arm_the_refinement_is_as_exact_as_can_be_and_says_so():
     """15 poses, arm noise .5 mm and .002 rad an axis. The Cramer-Rao bound is .0768 degrees, .410 mm."""
-    found, said, noise, tsai = [], [], [], []
-    for trial in range(trials):
-        samples = noisy_samples(15, np.random.default_rng([7, trial]))
-        refined = refine(samples)
-        found.append((angle_deg(refined.x, X), distance_mm(refined.x, X)))
-        said.append((refined.std_deg, refined.std_mm))
-        noise.append((refined.arm_noise_rad, refined.arm_noise_m))
-        by_tsai = solve(samples, "tsai")
-        tsai.append((angle_deg(by_tsai, X), distance_mm(by_tsai, X)))
-    rms, rms_said, rms_tsai = (np.sqrt(np.mean(np.square(v), axis=0)) for v in (found, said, tsai))
-    assert np.all(rms < excess * np.array([0.0768, 0.410])) and np.all(rms > 0.75 * np.array([0.0768, 0.410]))
-    np.testing.assert_allclose(rms, rms_said, rtol=0.35 if trials < 300 else 0.2)
+    refined = [refine(noisy_samples(15, np.random.default_rng([7, trial]))) for trial in range(24)]
+    off = [(angle_deg(each.x, X), distance_mm(each.x, X)) for each in refined]
+    said = [(each.std_deg, each.std_mm) for each in refined]
+    rms, rms_said = (np.sqrt(np.mean(np.square(v), axis=0)) for v in (off, said))
+    bound = np.array([0.0768, 0.410])
+    assert np.all(rms < 1.25 * bound) and np.all(rms > 0.75 * bound)
+    np.testing.assert_allclose(rms, rms_said, rtol=0.35)
+    noise = [(each.arm_noise_rad, each.arm_noise_m) for each in refined]
     np.testing.assert_allclose(np.mean(noise, axis=0), [0.002, 0.0005], rtol=0.1)
-    assert trials < 300 or np.all(rms < rms_tsai)
 
 
-@pytest.mark.parametrize("setup", SETUPS)
-def test_a_few_wrong_samples_are_found_and_hardly_count(setup):
-    good = noisy_samples(20, np.random.default_rng(5), setup=setup)
+def test_a_few_wrong_samples_are_found_and_hardly_count():
+    good = noisy_samples(20, np.random.default_rng(5))
     bad = good.target.copy()
     bad[[3, 11, 17]] = known_truth.add_noise(bad[[3, 11, 17]], np.random.default_rng(6), 0.3, 0.08)
-    found = calibrate(Samples(good.flange, bad, setup))
+    found = calibrate(Samples(good.flange, bad))
     assert found.refined.outliers == [3, 11, 17]
     assert distance_mm(found.transform, X) < 1.0 < distance_mm(found.results["park"], X)
     assert sum("does not fit the others" in w for w in found.warnings) == 3
-    np.testing.assert_array_equal(calibrate(Samples(good.flange, bad, setup)).transform, found.transform)
-    noisy = noisy_samples(12, np.random.default_rng(5), 0.1, 0.02, setup)
+    noisy = noisy_samples(12, np.random.default_rng(5), 0.1, 0.02)
     assert any("residuals are large" in warning for warning in calibrate(noisy).warnings)
 
 
@@ -136,11 +128,10 @@ def test_a_board_of_another_size_than_said_is_told_and_its_size_found(setup, fac
     assert calibrate(right, fit_size=True).warnings == calibrate(right).warnings == ()
 
 
-@pytest.mark.parametrize(("file", "percent"), [("pairs-5.json", 5), ("pairs-20.json", 20)])
-def test_real_pairs_with_a_board_of_another_size(file, percent):
-    said = read_pairs(data_dir("../cases/17-board-size-wrong") / file, EYE_IN_HAND)
+def test_real_pairs_with_a_board_of_another_size():
+    said = read_pairs(data_dir("../cases/17-board-size-wrong") / "pairs-5.json", EYE_IN_HAND)
     found = calibrate(said, fit_size=True)
-    assert refine(said, with_scale=True).scale == pytest.approx(1 + percent / 100, abs=0.005)
+    assert refine(said, with_scale=True).scale == pytest.approx(1.05, abs=0.005)
     assert "too large" in found.warnings[0] and np.linalg.norm(found.transform[:3, 3] - [0.03, -0.06, 0.09]) < 0.0035
 
 
@@ -209,16 +200,8 @@ def test_the_least_that_determines_something_does(setup):
 
 @pytest.mark.stability
 def test_motions_that_turn_by_nearly_half_a_turn_among_others_do_no_harm():
-    turns = [
-        [0, 0, 0],
-        [np.pi - 0.01, 0, 0],
-        [0, np.pi, 0],
-        [0.6, 0, 0.2],
-        [0, 0.7, 0],
-        [0.3, -0.4, 0.5],
-        [-0.5, 0.2, 0],
-    ]
-    found = calibrate(of_turns([*turns, [0.1, 0.2, -0.8]]))
+    turns = [[0, 0, 0], [np.pi - 0.01, 0, 0], [0, np.pi, 0], [0.6, 0, 0.2], [0, 0.7, 0]]
+    found = calibrate(of_turns([*turns, [0.3, -0.4, 0.5], [-0.5, 0.2, 0], [0.1, 0.2, -0.8]]))
     assert distance_mm(found.transform, X) < 4 * found.refined.std_mm + 0.5
     assert any("nearly 180 degrees" in w for w in found.warnings)
 
