@@ -49,14 +49,6 @@ def test_simulate_takes_the_short_notation(capsys) -> None:
     assert again["mean_age_ms"] == found["mean_age_ms"]  # the same channel in other words
 
 
-def test_a_chain_of_any_number_of_states(capsys) -> None:
-    chain = "{generator_per_ms: [[-0.3, 0.2, 0.1], [0.05, -0.05, 0], [0.4, 0.4, -0.8]], initial: s2}"
-    found = simulate(capsys, "--service exp:5ms,exp:20ms,exp:80ms --seconds 300 --chain", chain)
-    shares = [0.05 * 0.8, 0.3 * 0.8 - 0.1 * 0.4, 0.1 * 0.05]  # of the balance equations, by hand
-    expected = [share / sum(shares) for share in shares]
-    assert list(found["state_share"].values()) == pytest.approx(expected, abs=0.01)
-
-
 def test_people_are_shown_what_there_is_to_say(capsys, scenario: Path) -> None:
     line = "--preset ch6 --seconds 60 --fault duplication:0.5 --fault corruption:0.25"
     found, shown = simulate(capsys, line), rows(capsys, line)
@@ -90,12 +82,6 @@ def test_the_frames_of_a_simulation_can_be_fitted(capsys, tmp_path: Path) -> Non
     fitted = json.loads(capsys.readouterr().out)
     assert fitted["delays"] == found["delivered"]
     assert fitted["parameters"]["mean_ms"]["low"] < 60 < fitted["parameters"]["mean_ms"]["high"]
-
-
-def test_delays_from_a_file(capsys, tmp_path: Path) -> None:
-    (tmp_path / "delays.txt").write_text("# ms\n10\n20\n\n60\n")
-    line = f"--service trace:{tmp_path / 'delays.txt'} --seconds 30 --discipline parallel --arrivals periodic:100ms"
-    assert simulate(capsys, line)["delay_ms"]["mean"] == pytest.approx(30)
 
 
 def test_spans_and_rates() -> None:

@@ -117,16 +117,6 @@ def test_rows_behind_a_waiting_place(tmp_path: Path) -> None:
     check(fit(path, discipline="newest-waits"), SLOW_TRUE)
 
 
-@pytest.mark.slow  # 9 s; the tests above ask that the intervals of single recordings hold it
-def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
-    """20 recordings of four parameters: 95 % of 80 is 76, and fewer than 69 has a chance of 1 in 500."""
-    inside = 0
-    for seed in range(20):
-        found = fit(write_trace(tmp_path / "t.jsonl", SLOW, 100 + seed, cameras=1, seconds=90))
-        inside += sum(holds(found.parameters[name], value) for name, value in SLOW_TRUE.items())
-    assert inside >= 69
-
-
 def test_what_is_still_on_its_way_is_not_lost(tmp_path: Path) -> None:
     """A parallel link recorded until 10 s: late frames that had not come by then are no losses, and one that is
     missing long before is."""

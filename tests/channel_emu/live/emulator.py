@@ -23,7 +23,6 @@ from edge_server.live.buffer import FrameBuffer
 from edge_server.live.grpc_services import ClockService
 from edge_server.live.ingest import Ingest
 from freshfield.clock import WallClock
-from freshfield.depth import EncodedDepth
 from freshfield.frame import Frame, to_request
 from freshfield.geometry import Pinhole, Pose
 from freshfield.ledger import Ledger
@@ -38,12 +37,10 @@ _LENS = Pinhole(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)
 _sessions = itertools.count()
 
 
-def frame_of(
-    camera: str, session: str, sequence: int, at_ns: int, held_out: bool = False, depth: EncodedDepth | None = None
-) -> Frame:
+def frame_of(camera: str, session: str, sequence: int, at_ns: int, held_out: bool = False) -> Frame:
     """A real frame: encoded, posed, with a lens."""
     pose = Pose((1, 0, 0, 0), (0, 0, 0))
-    return Frame(camera, session, sequence, at_ns, pose, _LENS, "jpeg", _IMAGE, held_out, depth=depth)
+    return Frame(camera, session, sequence, at_ns, pose, _LENS, "jpeg", _IMAGE, held_out)
 
 
 def make(
@@ -90,10 +87,7 @@ class Edge:
 
 
 class Camera:
-    """One stream of frames to the emulator, one unanswered at a time; keeps every answer and a ledger.
-
-    depth: goes with each frame.
-    """
+    """One stream of frames to the emulator, one unanswered at a time; keeps every answer and a ledger."""
 
     def __init__(self, name: str, port: int, transport: Transport, held_out: bool, ledger: Ledger) -> None:
         self.name, self.held_out = name, held_out
@@ -101,7 +95,6 @@ class Camera:
         self.answers: Counter[str] = Counter()
         self.reasons: Counter[str] = Counter()
         self.sequence = 0
-        self.depth: EncodedDepth | None = None
         self.call: Any = None
         self._clock = WallClock()
         self._channel = transport.aio_channel(f"127.0.0.1:{port}")
@@ -117,7 +110,7 @@ class Camera:
         """Send one frame and wait for its answer."""
         if self.call is None:
             await self.connect()
-        frame = frame_of(self.name, self.session, self.sequence, self._clock.now_ns(), self.held_out, self.depth)
+        frame = frame_of(self.name, self.session, self.sequence, self._clock.now_ns(), self.held_out)
         self._write(frame.sequence, "captured")
         self._write(frame.sequence, "sent")
         self.sequence += 1

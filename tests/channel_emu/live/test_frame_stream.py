@@ -9,7 +9,6 @@ from pathlib import Path
 
 import grpc
 import grpc.aio
-import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
@@ -18,7 +17,6 @@ from channel_emu.live.camera_stream import PUSH
 from channel_emu.live.status import SET_BY_HAND
 from channel_emu.model import trace
 from edge_server.report.frame_accounting import account_frames
-from freshfield.depth import DepthImage
 from freshfield.frame import to_request
 from freshfield.ledger import read_all
 from freshfield.transport import Transport
@@ -90,20 +88,6 @@ async def test_a_trace_replayed_at_another_pace_is_decided_and_delivered_alike(t
             if then.outcome == "delivered":
                 assert then.ended_ns - then.offered_ns == now.ended_ns - now.offered_ns
                 assert now.actual_ns is None or now.actual_ns >= now.ended_ns
-
-
-async def test_depth_passes_untouched_and_takes_its_time_on_the_line(tmp_path: Path) -> None:
-    """At 1 Mbit/s a byte takes 8 microseconds, whatever it belongs to."""
-    counts = np.random.default_rng(0).integers(0, 2**16, (48, 64), np.uint16)
-    depth = DepthImage(counts, 0.001, after_image_ns=-7).encode()
-    async with emulate(tmp_path, {"faults": {"bandwidth": 1.0}}, trace=tmp_path / "t.jsonl") as r:
-        r.cameras["cam01"].depth = depth
-        await r.stream(1, 0.0)
-        await r.settled()
-        newest = r.edge.ingest.buffer.newest()
-        assert (newest["cam00"].depth, newest["cam01"].depth) == (None, depth)
-    took_ns = {r.camera: r.due_ns - r.offered_ns for r in trace.read(tmp_path / "t.jsonl").records}
-    assert took_ns["cam01"] - took_ns["cam00"] == pytest.approx(8000 * len(depth.payload), rel=0.02)
 
 
 async def test_the_account_closes_with_every_fault(tmp_path: Path) -> None:

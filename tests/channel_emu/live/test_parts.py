@@ -80,17 +80,6 @@ def test_without_real_time_the_priority_is_raised(monkeypatch: pytest.MonkeyPatc
     assert priority.raise_priority() == ("short-slice" if short_slice else "normal")
 
 
-@pytest.mark.parametrize(("machine", "numbers"), [("x86_64", [314]), ("aarch64", [274]), ("riscv64", [])])
-def test_short_slices_are_asked_for_where_the_call_is_known(monkeypatch, machine: str, numbers: list[int]) -> None:
-    library = mock.Mock()
-    library.syscall.return_value = 0
-    monkeypatch.setattr(priority.platform, "machine", lambda: machine)
-    monkeypatch.setattr(priority.platform, "system", lambda: "Linux")
-    monkeypatch.setattr(priority.ctypes, "CDLL", lambda _: library)
-    assert priority._shorten_slice() is bool(numbers)
-    assert [call.args[0] for call in library.syscall.call_args_list] == numbers
-
-
 async def test_behind_a_message_in_the_link_no_more_are_read_than_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(call_flow, "_MOST_BEHIND", 100)
     link, read, written = mock.Mock(calls=set()), [], []

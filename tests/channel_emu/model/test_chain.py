@@ -1,10 +1,14 @@
+"""Random numbers that are looked up by number, and the Markov chain that is drawn from them."""
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from channel_emu.model.chain import Chain, ChainError, stationary, two_state_generator
-from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.counter_rng import CounterRng, philox4x32, stream_key
 from channel_emu.model.nanoseconds import NEVER_NS
 
 THREE = np.array([[-0.3, 0.2, 0.1], [0.05, -0.05, 0.0], [0.4, 0.4, -0.8]])
@@ -80,3 +84,29 @@ def test_one_state_and_an_absorbing_one() -> None:
     absorbed = path([[-1.0, 1.0], [0.0, 0.0]], initial=0)
     left = absorbed.segment(0)[1]
     assert left < 100 * 10**6 and absorbed.segment(left) == (1, NEVER_NS)
+
+
+@pytest.mark.parametrize(
+    ("counter", "key", "words"),
+    [
+        ((0, 0, 0, 0), (0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
+        ((0xFFFFFFFF,) * 4, (0xFFFFFFFF,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
+    ],
+)
+def test_philox_gives_its_authors_known_answers(counter, key, words) -> None:
+    assert philox4x32(counter, key) == words
+
+
+def test_streams_differ_by_seed_camera_and_purpose_and_by_nothing_else() -> None:
+    words = [(seed, "cam03", "channel.service") for seed in (7, 8, 7 + 2**32)]
+    words += [(7, "cam04", "channel.service"), (7, "cam03", "channel.loss")]
+    assert len({stream_key(*each) for each in words * 2}) == 5
+    for seed in (-1, 2**63):
+        with pytest.raises(ValueError, match="seed"):
+            stream_key(seed, "a", "b")
+
+
+@given(st.integers(0, 2**62), st.integers(0, 2**31), st.integers(0, 2**63 - 1))
+def test_never_zero_and_never_one(number: int, again: int, seed: int) -> None:
+    u, v = CounterRng(seed, "c", "p").pair(number, again)
+    assert 0.0 < u < 1.0 and 0.0 < v < 1.0

@@ -10,7 +10,6 @@ from channel_emu.model.channel import Channel
 from channel_emu.model.link import DISCIPLINES, EventKind, Link
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.settings import channel_from_mapping
-from channel_emu.virtual.simulate import simulate
 
 MS = 10**6
 
@@ -73,15 +72,6 @@ def test_what_a_busy_link_does_with_a_new_frame(discipline: str, delays_ms: list
     assert play(subject, [(word[0], float(word[1:])) for word in offers.split()]) == story
 
 
-@pytest.mark.parametrize("discipline", DISCIPLINES)
-def test_a_shared_line_for_one_camera_is_a_line_of_its_own(discipline: str) -> None:
-    own, alone = (
-        simulate(channel_from_mapping({"preset": "ch6", "discipline": discipline, **more}), 1, 20, 3).runs[0]
-        for more in ({}, {"server": {"shared": True}})
-    )
-    assert [(t.outcome, t.due_ns) for t in own.transits] == [(t.outcome, t.due_ns) for t in alone.transits]
-
-
 def test_what_others_cause_is_told_at_once() -> None:
     """b waits behind a. Whoever asks for time first, b learns of its start with its own next question."""
     subject = links("newest-waits", [10, 7], "cab", server={"shared": True})
@@ -104,15 +94,6 @@ def test_a_reset_breaks_one_camera_and_frees_the_line() -> None:
     told = play(subject, [("a", 0), ("b", 1), ("a", 2)])
     assert told == "sa0@0 brokena0@20 brokena1@20 sb0@20 db0@70"
     assert subject["a"].resets == 1 and subject["b"].resets == 0
-
-
-def test_a_late_caller_gets_the_punctual_decisions() -> None:
-    """Told of 30 ms at once, newest-waits starts the waiting frame when the first was due, not when told."""
-    subject = links("newest-waits", [10, 5])["a"]
-    assert subject.offer(0)[0].drawn_ns == 10 * MS
-    assert subject.offer(2 * MS)[0].drawn_ns is None
-    events = subject.advance(30 * MS)
-    assert [(e.kind, e.at_ns / MS) for e in events] == [("delivered", 10), ("started", 10), ("delivered", 15)]
 
 
 def test_sampling_takes_the_newest_offered_frame() -> None:

@@ -8,9 +8,7 @@ import time
 
 import numpy as np
 import pytest
-import yaml
 
-from camera_node.cli import main
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
 from camera_node.robot.arm.control import stop_event
 from camera_node.robot.arm.viewpoint_tour import plan_tour
@@ -149,13 +147,3 @@ def test_a_real_arm_is_asked_about_first_and_not_driven_through_half_the_bench(c
         process = start_cli("drive-arm", real(cell), "--yes")
         said = process.communicate(timeout=20)[1]
         assert process.returncode == 2 and "the first move would turn a joint by" in said
-
-
-def test_a_scenario_without_an_arm_or_a_path_is_refused(cell, capsys):
-    file, _ = cell
-    data = yaml.safe_load(file.read_text())
-    del data["source"]["arm"]["path"]
-    file.write_text(yaml.safe_dump(data))
-    for name, says in (("tile", "source.arm: missing"), (str(file), "source.arm.path: missing")):
-        assert main(["drive-arm", name]) == 2
-        assert says in capsys.readouterr().err

@@ -12,11 +12,10 @@ import pytest
 from camera_node.cli import main
 from camera_node.robot.arm.hand_eye_mount import read_hand_eye
 from camera_node.robot.calibration.hand_eye.samples import Samples, distance_mm
-from camera_node.robot.calibration.inputs import read_visp_pose
 from camera_node.robot.calibration.targets import parse_target
 from freshfield.geometry import se3_inverse
 from tests.camera_node.robot.calibration import known_truth
-from tests.camera_node.robot.calibration.rendered import noisy_samples
+from tests.camera_node.robot.calibration.known_truth import noisy_samples
 from tests.camera_node.sources.datasets.photos import BOMB
 from tests.conftest import data_dir
 
@@ -146,12 +145,3 @@ def test_without_scipy_it_says_what_to_install(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "scipy", None)
     assert hand_eye("--pairs", "x") == 2
     assert "pip install 'freshfield[calibrate]'" in capsys.readouterr().err
-
-
-def test_visps_poses_are_rotation_vectors(tmp_path):
-    file = tmp_path / "pose_rPe_1.yaml"
-    values = map(float, (0.1, 0.2, 0.3, 0, 0, np.pi / 2))
-    file.write_text("rows: 6\ncols: 1\ndata: \n" + "".join(f"  - [{v!r}]\n" for v in values))
-    found = read_visp_pose(file)
-    np.testing.assert_allclose(found[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
-    assert found[:3, 3].tolist() == [0.1, 0.2, 0.3]

@@ -24,7 +24,7 @@ from camera_node.sources.base import Shot
 from freshfield.geometry import Pinhole, Pose, se3, se3_inverse, so3_exp
 from freshfield.scenario import load
 from tests.camera_node.robot.calibration import known_truth
-from tests.camera_node.robot.calibration.rendered import BOARD, LENS, taken
+from tests.camera_node.robot.calibration.known_truth import BOARD, LENS, taken
 from tests.camera_node.robot.calibration.test_targets import printed
 
 X = known_truth.CAMERA_IN_FLANGE

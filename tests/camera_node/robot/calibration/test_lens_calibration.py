@@ -15,8 +15,8 @@ from camera_node.robot.calibration.lens_calibration import calibrate_lens
 from camera_node.robot.calibration.targets import Corners, parse_target
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import Pinhole, so3_exp
-from tests.camera_node.robot.calibration import rendered
-from tests.camera_node.robot.calibration.rendered import BOARD
+from tests.camera_node.robot.calibration import known_truth
+from tests.camera_node.robot.calibration.known_truth import BOARD
 from tests.conftest import data_dir
 
 TRUE = Pinhole(640, 480, 520.0, 523.0, 331.0, 236.0, (-0.12, 0.05, 0.002, -0.001))
@@ -73,7 +73,7 @@ def test_images_that_tell_no_focal_length_are_refused(seen, message):
 
 
 def test_from_images_to_a_file_that_the_node_reads(tmp_path, capsys):
-    taken, _ = rendered.taken()
+    taken, _ = known_truth.taken()
     for k, image in enumerate(taken):
         cv2.imwrite(str(tmp_path / f"view-{k}.png"), image)
     cv2.imwrite(str(tmp_path / "view-99.png"), np.zeros_like(taken[0]))
@@ -84,7 +84,7 @@ def test_from_images_to_a_file_that_the_node_reads(tmp_path, capsys):
     assert "12 pictures of 320 x 240" in said and "view-99.png: charuco" in said
     lens = load_calibration(out)["eye"].intrinsics
     assert read_lens(out) == lens
-    assert abs(lens.fx / rendered.LENS.fx - 1) < 0.005 and abs(lens.cx - 160) < 1.5 and abs(lens.cy - 120) < 1.5
+    assert abs(lens.fx / known_truth.LENS.fx - 1) < 0.005 and abs(lens.cx - 160) < 1.5 and abs(lens.cy - 120) < 1.5
     assert json.loads(out.read_text())["eye"]["error_px"] < 0.15
 
 

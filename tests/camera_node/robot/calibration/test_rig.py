@@ -19,6 +19,7 @@ from camera_node.robot.calibration.targets import Corners, parse_target
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.clock import WallClock
 from freshfield.geometry import Pinhole, look_at, matrix_to_quaternion, se3, se3_inverse, so3_exp, so3_log
+from tests.camera_node.robot.calibration import known_truth
 from tests.camera_node.sources.devices.mjpeg import NetworkCamera, number_of
 
 BOARD = "charuco:8x5:60mm:45mm"
@@ -140,19 +141,7 @@ def test_a_camera_that_shares_nothing_or_one_moment_is_named(together):
 
 
 def photo(name: str, board: np.ndarray, noise: float, seed: int) -> np.ndarray:
-    """Gray picture (480, 640) of a camera without distortion, blurred and noisy."""
-    drawn = cv2.copyMakeBorder(TARGET.draw(960), 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
-    px = TARGET.size_m[0] / 960
-    # From pixels of the drawing to meters on the target.
-    to_target = np.array([[px, 0, (0.5 - 60) * px], [0, px, (0.5 - 60) * px], [0, 0, 1.0]])
-    pose = se3_inverse(POSES[name]) @ board
-    if pose[2, 2] < 0.2:  # from behind, or along it
-        return np.full((480, 640), 110, np.uint8)
-    finer = np.array([[4, 0, 1.5], [0, 4, 1.5], [0, 0, 1]])
-    homography = finer @ LENSES[name].opencv()[0] @ pose[:3, [0, 1, 3]] @ to_target
-    image = cv2.warpPerspective(drawn, homography, (2560, 1920), flags=cv2.INTER_LINEAR, borderValue=110)
-    image = cv2.resize(image, (640, 480), interpolation=cv2.INTER_AREA).astype(np.float64)
-    return np.clip(image + np.random.default_rng(seed).normal(0, noise, image.shape), 0, 255).astype(np.uint8)
+    return known_truth.photo(TARGET, LENSES[name], se3_inverse(board) @ POSES[name], noise, seed)
 
 
 def test_pictures_of_noisy_webcams_give_a_file_that_a_scenario_reads(tmp_path, capsys):

@@ -1,5 +1,4 @@
-"""The real detectors on pictures that the project's own ray caster made, so that the true pose is known; boards of both
-prints, and what is said of a board that is not found."""
+"""The real detectors on pictures whose true pose is known; boards of both prints; a board that is not found."""
 
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ from camera_node.robot.calibration.inputs import find_corners, list_images
 from camera_node.robot.calibration.lens_calibration import calibrate_lens
 from camera_node.robot.calibration.targets import WHICH_PRINT, Corners, estimate_pose, parse_target
 from freshfield.geometry import Pinhole, look_at, se3_inverse, so3_exp
-from tests.camera_node.robot.calibration.rendered import render
+from tests.camera_node.robot.calibration.known_truth import photo
 from tests.conftest import data_dir
 
 LENS = Pinhole(400, 300, 330.0, 332.0, 203.0, 148.0, (-0.05, 0.02, 0.001, -0.001))
@@ -34,7 +33,7 @@ def test_a_rendered_target_is_found_where_it_is_and_only_where_it_is(spec, origi
     for x, y, z, roll in ((0.05, 0.08, -0.22, 0.4), (-0.07, 0.03, -0.20, 3.3)):
         camera = look_at(middle + np.array([x, y, z]), middle, up=(0.0, -1.0, 0.0))
         camera[:3, :3] = camera[:3, :3] @ so3_exp([0, 0, roll])
-        found = estimate_pose(target.find(render(target, LENS, camera, 2)), LENS)
+        found = estimate_pose(target.find(photo(target, LENS, camera)), LENS)
         truth = se3_inverse(camera)
         truth[:3, 3] += truth[:3, :3] @ [origin_m, origin_m, 0.0]
         assert angle_deg(found, truth) < 0.1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import struct
 import time
 
 import numpy as np
@@ -112,15 +111,6 @@ def _exchange(link, kind, payload):
     size, answered = rtde.HEADER.unpack(link.recv(3))
     assert answered == kind
     return link.recv(size - 3)
-
-
-def test_an_unknown_variable_is_refused_by_name(arm):
-    with socket.create_connection((arm, 30004), 5.0) as link:
-        assert _exchange(link, rtde.REQUEST_VERSION, b"\0\2") == b"\1"
-        assert _exchange(link, rtde.REQUEST_VERSION, b"\0\3") == b"\0"
-        answer = _exchange(link, rtde.SETUP_OUTPUTS, struct.pack(">d", 125.0) + b"actual_q,moon_phase")
-        assert answer == b"\0VECTOR6D,NOT_FOUND"
-        assert _exchange(link, rtde.START, b"") == b"\0"  # nothing was agreed on
 
 
 @pytest.mark.parametrize("rubbish", [b"\0\0\0", b"\xff\xff\x55", b"\0\4U\1"])
