@@ -64,3 +64,14 @@ def test_a_step_gives_the_expected_jumps_over_the_expected_time() -> None:
     time_in = (ahead * back)[:-1].sum(0) * h
     jumps = [(ahead[:-1, k] * small[k, 1 - k] * back[1:, 1 - k]).sum() for k in (0, 1)]
     assert after.leave_per_ms[0] == pytest.approx(np.array(jumps) / time_in, rel=2e-3)
+
+
+def test_the_maximum_is_higher_than_all_around_it() -> None:
+    base = two_states.segments((np.arange(1500) * 30.0, np.ones(1500), np.zeros(1500)), False)
+    data = two_states.draw(MODEL, base, 1, np.random.default_rng(1))
+    found, best = two_states.maximize(MODEL, data, "gamma")
+    for k, parameter in itertools.product((0, 1), ("leave_per_ms", "mean_ms", "loss")):
+        for by in (0.97, 1.03):
+            values = {name: getattr(found, name).copy() for name in ("leave_per_ms", "mean_ms", "loss", "shape")}
+            values[parameter][0, k] *= by
+            assert two_states.step(TwoStates(**values), data, "gamma")[1] < best + 0.01

@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
-from scipy.linalg import expm
 
 from channel_emu.model.ages import RunningAge
 from channel_emu.model.settings import channel_from_mapping
@@ -62,44 +61,20 @@ def dg1_drop_new(period: float, mean: float, survival: Callable[[np.ndarray], np
     return mean + period * second / (2 * first), mean + period * first
 
 
-def gilbert_elliott(a: float, b: float, loss: tuple[float, float], period: float, delay: float) -> tuple[float, float]:
-    """Mean and peak age of periodic frames that each take ``delay``, lost with the probability of the state.
-
-    N frames from one delivery to the next: with P the chain's change over a period, F = P diag(loss) and
-    G = P diag(1 - loss), alpha = alpha (I - F)^-1 G is the state at a delivery; E[N] = alpha (I - F)^-1 1,
-    E[N²] = alpha (I + F) (I - F)^-2 1. Age: delay + C E[N²] / (2 E[N]); peak: delay + C E[N].
-    """
-    p = expm(np.array([[-a, a], [b, -b]]) * period)
-    f, g = p * np.array(loss), p * (1 - np.array(loss))
-    r = np.linalg.inv(np.eye(2) - f)
-    alpha = _stationary(r @ g)
-    first, second = alpha @ r @ np.ones(2), alpha @ (np.eye(2) + f) @ r @ r @ np.ones(2)
-    return delay + period * second / (2 * first), delay + period * first
-
-
-def _stationary(transition: np.ndarray) -> np.ndarray:
-    values, vectors = np.linalg.eig(transition.T)
-    alpha = np.real(vectors[:, np.argmin(abs(values - 1))])
-    return alpha / alpha.sum()
-
-
 LOGNORMAL = dg1_drop_new(1.0, 1.5, stats.lognorm(0.8, scale=1.5 * np.exp(-0.32)).sf)
 THESIS = dg1_drop_new(30.0, 60.0, stats.expon(scale=60.0).sf)
-BURSTS = gilbert_elliott(1 / 200, 1 / 70, (0.05, 0.7), 30.0, 20.0)
 # Arrivals, service, discipline, seconds, exact mean age, exact peak age where known.
 CASES = {
     "M/M/1 newest waits": ("poisson:1", "exp:1ms", "newest-waits", 40, mm1_newest_waits(1.0, 1.0), None),
     "D/G/1/0": ("periodic:1ms", "lognormal:1.5ms:0.8", "drop-new", 80, *LOGNORMAL),
     "D/M/1/0, thesis": ("periodic:30ms", "exp:60ms", "drop-new", 1200, *THESIS),
-    "losses by state": ("periodic:30ms", "det:20ms", "parallel", 1800, *BURSTS),
 }
-MORE = {"losses by state": {"chain": "mu1=1/200,mu2=1/70", "faults": {"loss": [0.05, 0.7]}}}
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_mean_age_and_peak_age(case: str) -> None:
     arrivals, service, discipline, seconds, age, peak = CASES[case]
-    section = {"arrivals": arrivals, "service": service, "discipline": discipline, **MORE.get(case, {})}
+    section = {"arrivals": arrivals, "service": service, "discipline": discipline}
     found = simulate(channel_from_mapping(section), 1, seconds, seed=5).summary()
     assert found["mean_age_ms"] == pytest.approx(age, rel=TOLERANCE)
     assert peak is None or found["peak_age_ms"] == pytest.approx(peak, rel=TOLERANCE)
