@@ -169,6 +169,8 @@ def test_silence_brings_the_arm_to_rest_within_its_limits():
     assert_within_limits(CONFIG, commands + silent)
     # 200 ms of the watchdog, and at most speed / acceleration to stop.
     assert [c.state for c in silent].index(SILENT) == 20
+    states = drive(Teleoperator(UR3E, CONFIG, HOME), [(0, [sample(1)]), (200_000_000, []), (200_000_001, [])])
+    assert states[1].state != SILENT == states[2].state
     assert not np.any([c.speeds for c in silent[20 + 41 :]])
     # The stylus comes back, far away and with its clutch held: nothing moves.
     back = drive(operator, [((150 + k) * TICK_NS, [sample(k + 1, (0.3, 0.2, 0.1))]) for k in range(40)])
