@@ -108,6 +108,12 @@ def test_mistakes_get_one_line(capsys, words: list[str], why: str) -> None:
     assert why in error and error.count("\n") == 1 and error.startswith("channel-emu: ")
 
 
+def test_a_command_is_asked_for(capsys) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main([])
+    assert "COMMAND" in capsys.readouterr().err
+
+
 @contextmanager
 def command(*words: object) -> Iterator[subprocess.Popen[str]]:
     """A command in a process of its own."""
