@@ -66,7 +66,7 @@ def test_a_step_gives_the_expected_jumps_over_the_expected_time() -> None:
     assert after.leave_per_ms[0] == pytest.approx(np.array(jumps) / time_in, rel=2e-3)
 
 
-def test_the_maximum_is_higher_than_all_around_it() -> None:
+def test_the_maximum_is_higher_than_all_around_it_and_reached_in_a_dozen_steps() -> None:
     base = two_states.segments((np.arange(1500) * 30.0, np.ones(1500), np.zeros(1500)), False)
     data = two_states.draw(MODEL, base, 1, np.random.default_rng(1))
     found, best = two_states.maximize(MODEL, data, "gamma")
@@ -75,3 +75,5 @@ def test_the_maximum_is_higher_than_all_around_it() -> None:
             values = {name: getattr(found, name).copy() for name in ("leave_per_ms", "mean_ms", "loss", "shape")}
             values[parameter][0, k] *= by
             assert two_states.step(TwoStates(**values), data, "gamma")[1] < best + 0.01
+    far = TwoStates(MODEL.leave_per_ms * [[3.0, 0.3]], MODEL.mean_ms * [[2.0, 0.7]], np.full((1, 2), 0.2), MODEL.shape)
+    assert two_states.maximize(far, data, "gamma", 12)[1] > best - 0.05
