@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent import futures
-from functools import partial
 
 import grpc
 import pytest
@@ -17,10 +16,10 @@ from channel_emu.model import trace
 from channel_emu.testing import EmulatedLink, channel
 
 assert channel  # the fixture; where a conftest.py lists the plugin, no import is needed
+pytest_plugins = ["pytester"]
 
 HELLO, COUNT, COLLECT, ECHO, FAIL = (f"/greet.Greeter/{name}" for name in ("Hello", "Count", "Collect", "Echo", "Fail"))
 LOSSY = {"faults": {"loss": {"probability": 0.5}}}
-WAIT = {"service": {"law": "deterministic", "mean_ms": 40.0}}
 
 
 class Greeter:
@@ -35,7 +34,7 @@ class Greeter:
             "Hello": grpc.unary_unary_rpc_method_handler(self.hello),
             "Count": grpc.unary_stream_rpc_method_handler(self.count),
             "Collect": grpc.stream_unary_rpc_method_handler(self.collect),
-            "Echo": grpc.stream_stream_rpc_method_handler(self.echo),
+            "Echo": grpc.stream_stream_rpc_method_handler(lambda requests, _: requests),
             "Fail": grpc.unary_unary_rpc_method_handler(self.fail),
         }
         self._server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("greet.Greeter", handlers),))
@@ -58,9 +57,6 @@ class Greeter:
     def collect(self, requests: Iterator[bytes], context: grpc.ServicerContext) -> bytes:
         self.collected = list(requests)
         return str(len(self.collected)).encode()
-
-    def echo(self, requests: Iterator[bytes], context: grpc.ServicerContext) -> Iterator[bytes]:
-        yield from requests
 
     def fail(self, request: bytes, context: grpc.ServicerContext) -> bytes:
         context.set_trailing_metadata((("why", "because"),))
@@ -97,9 +93,18 @@ def paced(count: int, every_s: float) -> Iterator[bytes]:
         yield str(n).encode()
 
 
+def code_of(call, *words, **options) -> str:
+    """How a unary call ends."""
+    try:
+        call(*words, **{"timeout": 10, **options})
+        return "OK"
+    except grpc.RpcError as error:
+        return error.code().name
+
+
 def test_a_streams_ages_and_losses_are_the_channels(channel, greeter, client, tmp_path) -> None:
     """The example: 100 messages, one each 10 ms, over a link that takes 15 ms and drops what finds it busy:
-    every second one gets through, and the newest is 15 to 35 ms old."""
+    every second one gets through."""
     section = {"service": {"law": "deterministic", "mean_ms": 15.0}, "discipline": "drop-new"}
     link = channel(section, to=greeter.address, seed=1, trace=tmp_path / "1.jsonl")
     answer = client(link).stream_unary(COLLECT)(paced(100, 0.010))
@@ -109,53 +114,31 @@ def test_a_streams_ages_and_losses_are_the_channels(channel, greeter, client, tm
     records = trace.read(tmp_path / "1.jsonl").records
     assert {r.session for r in records} == {"call1"}, "calls are counted from 1"
     # A busy machine paces them unevenly: when each one came says which pass.
-    offered_ms = [r.offered_ns / 1e6 for r in records]
     free_ms, passed = float("-inf"), 0
-    for at_ms in sorted(offered_ms):
+    for at_ms in sorted(r.offered_ns / 1e6 for r in records):
         if at_ms >= free_ms:
             free_ms, passed = at_ms + 15, passed + 1
     assert report.delivered == passed < 100 and report.dropped == report.outcomes["dropped_busy"]
-    gap_ms = max(b - a for a, b in itertools.pairwise(sorted(offered_ms)))
+    assert 20 < report.mean_age_ms < report.peak_age_ms
     # It also hands messages on late, by an error that it reports.
-    late_ms = report.error_ms["max"]
-    assert 20 < report.mean_age_ms < 25 + gap_ms / 2 + late_ms
-    assert report.mean_age_ms < report.peak_age_ms < 30 + gap_ms + late_ms
-    assert report.delay_ms["mean"] == 15.0 <= report.latency_ms["mean"] <= 15 + late_ms
+    assert report.delay_ms["mean"] == 15.0 <= report.latency_ms["mean"] <= 15 + report.error_ms["max"]
     # What came is in order, and is what was sent.
     numbers = [int(word) for word in greeter.collected]
     assert numbers == sorted(set(numbers)) and report.by_method[f"up {COLLECT}"].offered == 100
 
 
-def test_a_dropped_unary_call_is_unavailable(channel, greeter, client) -> None:
-    link = channel(LOSSY, to=greeter.address, seed=3)
-    hello = client(link).unary_unary(HELLO)
-    codes = []
-    for _ in range(40):
-        try:
-            assert hello(b"you", timeout=10).startswith(b"hello you")
-            codes.append("OK")
-        except grpc.RpcError as error:
-            codes.append(error.code().name)
-            assert "dropped the request" in error.details() and "seed 3" in error.details()
-    report = link.settle()
-    assert set(codes) == {"OK", "UNAVAILABLE"} and codes.count("UNAVAILABLE") == report.outcomes["lost"]
-    assert 8 < report.dropped < 32
-    # Draws are looked up by the message's number: the same seed loses the same calls, whatever the timing.
-    again = channel(LOSSY, to=greeter.address, seed=3)
-    hello = client(again).unary_unary(HELLO)
-    repeated = [_code(lambda: hello(b"you", timeout=10)) for _ in range(40)]
-    assert repeated == codes
-    other = channel(LOSSY, to=greeter.address, seed=4)
-    hello = client(other).unary_unary(HELLO)
-    assert [_code(lambda: hello(b"you", timeout=10)) for _ in range(40)] != codes
+def test_a_dropped_unary_call_is_unavailable_and_the_same_ones_are_dropped_again(channel, greeter, client) -> None:
+    """Draws are looked up by the message's number: whatever the timing."""
 
+    def codes(seed: int) -> list[str]:
+        link = channel(LOSSY, to=greeter.address, seed=seed)
+        found = [code_of(client(link).unary_unary(HELLO), b"you") for _ in range(40)]
+        assert found.count("UNAVAILABLE") == link.settle().outcomes["lost"]
+        return found
 
-def _code(call) -> str:
-    try:
-        call()
-        return "OK"
-    except grpc.RpcError as error:
-        return error.code().name
+    first = codes(3)
+    assert set(first) == {"OK", "UNAVAILABLE"} and 8 < first.count("OK") < 32
+    assert codes(3) == first != codes(4)
 
 
 def test_dropped_stream_messages_are_left_out_in_both_directions(channel, greeter, client) -> None:
@@ -170,8 +153,7 @@ def test_dropped_stream_messages_are_left_out_in_both_directions(channel, greete
 
 
 def test_metadata_status_trailers_and_deadline_pass(channel, greeter, client) -> None:
-    link = channel(WAIT, to=greeter.address, direction="both")
-    stub = client(link)
+    stub = client(channel({"service": "det:40ms"}, to=greeter.address, direction="both"))
     begun = time.monotonic()
     answer, call = stub.unary_unary(HELLO).with_call(b"you", timeout=5, metadata=(("name", "a test"),))
     took_ms = (time.monotonic() - begun) * 1e3
@@ -183,19 +165,14 @@ def test_metadata_status_trailers_and_deadline_pass(channel, greeter, client) ->
     assert 4.0 < greeter.deadline_s < 5.0
     with pytest.raises(grpc.RpcError) as failed:
         stub.unary_unary(FAIL)(b"", timeout=5)
-    assert failed.value.code() is grpc.StatusCode.FAILED_PRECONDITION
-    assert failed.value.details() == "not today"
+    assert failed.value.code() is grpc.StatusCode.FAILED_PRECONDITION and failed.value.details() == "not today"
     assert dict(failed.value.trailing_metadata())["why"] == "because"
-    assert _code(lambda: stub.unary_unary("/greet.Greeter/Missing")(b"", timeout=5)) == "UNIMPLEMENTED"
-    assert _code(lambda: stub.unary_unary(HELLO)(b"you", timeout=0.02)) == "DEADLINE_EXCEEDED"
+    assert code_of(stub.unary_unary("/greet.Greeter/Missing"), b"") == "UNIMPLEMENTED"
+    assert code_of(stub.unary_unary(HELLO), b"you", timeout=0.02) == "DEADLINE_EXCEEDED"
 
 
 def test_cancellation_reaches_the_service_and_frees_the_link(channel, greeter, client) -> None:
-    link = channel(
-        {"service": {"law": "deterministic", "mean_ms": 5.0}, "discipline": "fcfs"},
-        to=greeter.address,
-        direction="down",
-    )
+    link = channel({"service": "det:5ms", "discipline": "fcfs"}, to=greeter.address, direction="down")
     call = client(link).unary_stream(COUNT)(b"1000", timeout=30)
     assert [int(word) for word in itertools.islice(call, 3)] == [0, 1, 2]
     call.cancel()
@@ -205,39 +182,22 @@ def test_cancellation_reaches_the_service_and_frees_the_link(channel, greeter, c
     assert report.delivered == report.outcomes["forwarded"] + report.outcomes.get("cancelled", 0)
 
 
-def test_a_service_that_is_not_there_says_so(channel, client) -> None:
+def test_no_service_and_a_link_that_failed_say_so_and_it_still_closes(channel, client) -> None:
     link = channel("ideal", to="127.0.0.1:1")
-    assert _code(lambda: client(link).unary_unary(HELLO)(b"", timeout=5)) == "UNAVAILABLE"
-
-
-def test_a_link_that_failed_says_so_and_still_closes(channel) -> None:
-    link = channel("ideal", to="127.0.0.1:1")
+    assert code_of(client(link).unary_unary(HELLO), b"") == "UNAVAILABLE"
     link._loop.call_soon_threadsafe(link._proxy.fail, OSError(28, "No space left on device"))
     with pytest.raises(proxy.EmulatorFailed, match="room on the disk"):
         link.settle()
     link.close()
-    assert link.describe().endswith("no call was made")
-
-
-def test_a_reset_cuts_the_streams_on_it(channel, greeter, client) -> None:
-    link = channel({"faults": {"reset": {"at_ms": [700.0]}}}, to=greeter.address)
-    call = client(link).stream_stream(ECHO)(paced(10_000, 0.01), timeout=20)
-    with pytest.raises(grpc.RpcError) as cut:
-        list(call)
-    assert cut.value.code() is grpc.StatusCode.UNAVAILABLE and "reset this stream" in cut.value.details()
-    assert 10 < link.report().offered < 200
-    assert list(client(link).stream_stream(ECHO)(paced(3, 0), timeout=5)) == [b"0", b"1", b"2"]
 
 
 def test_damage_and_doubles(channel, greeter, client) -> None:
-    chance = {"probability": 1.0}
-    link = channel({"faults": {"duplication": chance}}, to=greeter.address)
-    stub = client(link)
+    stub = client(channel({"faults": {"duplication": 1.0}}, to=greeter.address))
     doubled = list(stub.stream_stream(ECHO)(iter([b"a", b"b", b"c"]), timeout=5))
     assert doubled[1:] == [b"b", b"b", b"c", b"c"] or doubled == [b"a", b"a", b"b", b"b", b"c", b"c"]
     assert stub.unary_unary(HELLO)(b"you", timeout=5).startswith(b"hello you")
-    link = channel({"faults": {"corruption": chance}}, to=greeter.address)
-    (answer,) = client(link).stream_stream(ECHO)(iter([b"payload"]), timeout=5)
+    damaging = client(channel({"faults": {"corruption": 1.0}}, to=greeter.address))
+    (answer,) = damaging.stream_stream(ECHO)(iter([b"payload"]), timeout=5)
     assert len(answer) == 7 and sum(a != b for a, b in zip(answer, b"payload")) == 1
 
 
@@ -245,13 +205,10 @@ def test_methods_that_a_client_invents_share_one_link(channel, greeter, client, 
     monkeypatch.setattr(proxy, "_MOST_METHODS", 2)
     link = channel("ideal", to=greeter.address)
     for n in range(5):
-        _code(partial(client(link).unary_unary(f"/a.B/C{n}"), b"", timeout=5))  # the service has none of them
+        code_of(client(link).unary_unary(f"/a.B/C{n}"), b"")  # the service has none of them
     by_method = link.settle().by_method
     assert set(by_method) == {"up /a.B/C0", "up /a.B/C1", "up (other methods)"}
     assert by_method["up (other methods)"].offered == 3
-
-
-pytest_plugins = ["pytester"]
 
 
 def test_a_failing_test_shows_the_seed_and_the_figures(pytester: pytest.Pytester) -> None:

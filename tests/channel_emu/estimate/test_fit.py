@@ -16,8 +16,9 @@ from channel_emu.estimate.fit import Fit, IntervalEstimate, fit
 from channel_emu.estimate.report import format_fit
 from channel_emu.model.link import FITTED_DISCIPLINES
 from channel_emu.model.settings import channel_from_mapping
+from channel_emu.model.trace import TraceWriter
+from channel_emu.virtual.simulate import simulate
 from freshfield import scenario
-from tests.channel_emu.estimate.recordings import write_rows, write_trace
 
 # A slow channel: periodic frames, delays of 20 and 120 ms.
 SLOW = {
@@ -27,14 +28,26 @@ SLOW = {
     "discipline": "drop-new",
 }
 HEAD = "offered_ms,delivered_ms\n"
-SLOW_TRUE = {"mu1_per_ms": 1 / 1000, "mu2_per_ms": 1 / 500, "mean_1_ms": 20.0, "mean_2_ms": 120.0}
-BURSTS = {
-    **SLOW,
-    "service": {"law": "deterministic", "mean_ms": 20.0},
-    "discipline": "parallel",
-    "faults": {"loss": [0.02, 0.5]},
-}
-BURSTS_TRUE = {"mu1_per_ms": 1 / 1000, "mu2_per_ms": 1 / 500, "loss_1": 0.02, "loss_2": 0.5, "mean_ms": 20.0}
+RATES = {"mu1_per_ms": 1 / 1000, "mu2_per_ms": 1 / 500}
+SLOW_TRUE = {**RATES, "mean_1_ms": 20.0, "mean_2_ms": 120.0}
+
+
+def write_trace(path: Path, section: dict, seed: int, cameras: int, seconds: float, **more) -> Path:
+    """A trace as the live emulator would leave it."""
+    config = channel_from_mapping(section)
+    writer = TraceWriter(path, config, seed)
+    for run in simulate(config, cameras, seconds, seed, **more).runs:
+        for transit in run.transits:
+            writer.write(run.camera, "s", transit.number, transit)
+    writer.close()
+    return path
+
+
+def write_rows(path: Path, section: dict, seed: int = 1, seconds: float = 120.0) -> Path:
+    """offered_ms, delivered_ms of one camera; what did not come is blank, without a word why."""
+    simulate(channel_from_mapping(section), 1, seconds, seed).write_frames(path)
+    path.write_text("".join(line.rpartition(",")[0] + "\n" for line in path.read_text().splitlines()))
+    return path
 
 
 def holds(found: IntervalEstimate, true: float, widened: float = 1.0) -> bool:
@@ -47,7 +60,7 @@ def holds(found: IntervalEstimate, true: float, widened: float = 1.0) -> bool:
 def check(found: Fit, true: dict[str, float]) -> None:
     """Each parameter within one and a half times the reach of its interval (three standard deviations), and
     no interval so wide that it says nothing."""
-    assert found.states == 2 and set(found.parameters) == set(true)
+    assert found.states == (2 if "mu1_per_ms" in true else 1) and set(found.parameters) == set(true)
     for name, value in true.items():
         assert holds(found.parameters[name], value, 1.5), (name, found.parameters[name], value)
         interval = found.parameters[name].interval
@@ -68,29 +81,22 @@ def test_a_slow_chain_from_delays_alone(tmp_path: Path) -> None:
     assert visits + shares in format_fit(found).splitlines()
 
 
-@pytest.mark.parametrize("kind", ["trace", "rows"])
-def test_losses_in_bursts(tmp_path: Path, kind: str) -> None:
-    """Gilbert and Elliott's channel, whose states differ by nothing but their losses."""
-    if kind == "trace":
-        found = fit(write_trace(tmp_path / "t", BURSTS, 1, cameras=1, seconds=240))
-    else:
-        found = fit(write_rows(tmp_path / "t", BURSTS, 1, seconds=240), discipline="parallel")
-    check(found, BURSTS_TRUE)
+def test_states_that_differ_by_nothing_but_their_losses(tmp_path: Path) -> None:
+    """Gilbert and Elliott's channel."""
+    service = {"law": "deterministic", "mean_ms": 20.0}
+    bursts = {**SLOW, "service": service, "discipline": "parallel", "faults": {"loss": [0.02, 0.5]}}
+    found = fit(write_rows(tmp_path / "t", bursts, seconds=240), discipline="parallel")
+    check(found, {**RATES, "loss_1": 0.02, "loss_2": 0.5, "mean_ms": 20.0})
     p, q = found.channel["faults"]["loss"]["probability"]
     assert p == pytest.approx(0.02, abs=0.01) and q == pytest.approx(0.5, abs=0.06)
-    assert found.channel["service"] == {"law": "deterministic", "mean_ms": 20.0}
+    assert found.channel["service"] == service
 
 
 def test_delays_and_losses_together_and_a_shape(tmp_path: Path) -> None:
-    section = {
-        **SLOW,
-        "service": {"law": "gamma", "mean_ms": [20.0, 60.0], "shape": 4.0},
-        "faults": {"loss": [0.01, 0.3]},
-        "discipline": "parallel",
-    }
-    found = fit(write_rows(tmp_path / "rows.csv", section, 1), discipline="parallel")
-    true = {"mu1_per_ms": 1 / 1000, "mu2_per_ms": 1 / 500, "mean_1_ms": 20.0, "mean_2_ms": 60.0}
-    check(found, {**true, "loss_1": 0.01, "loss_2": 0.3, "shape": 4.0})
+    service = {"law": "gamma", "mean_ms": [20.0, 60.0], "shape": 4.0}
+    section = {**SLOW, "service": service, "faults": {"loss": [0.01, 0.3]}, "discipline": "parallel"}
+    found = fit(write_rows(tmp_path / "rows.csv", section), discipline="parallel")
+    check(found, {**RATES, "mean_1_ms": 20.0, "mean_2_ms": 60.0, "loss_1": 0.01, "loss_2": 0.3, "shape": 4.0})
     assert found.channel["service"]["law"] == "gamma" and not found.warnings
 
 
@@ -98,10 +104,8 @@ def test_one_state_and_arrivals_that_sample_frames(tmp_path: Path) -> None:
     """The thesis's traffic in its low state: arrivals of one rate, delays of one mean, independent losses."""
     section = {"preset": "ch6-low", "faults": {"loss": 0.2}}
     found = fit(write_trace(tmp_path / "t.jsonl", section, 4, cameras=4, seconds=120, frame_period_ms=33.3))
-    assert found.states == 1 and found.arrivals == "poisson" and found.recording.sampled
-    assert set(found.parameters) == {"mean_ms", "loss", "rate_per_ms"}
-    for name, value in {"mean_ms": 30.0, "loss": 0.2, "rate_per_ms": 1 / 120}.items():
-        assert holds(found.parameters[name], value, 1.5), name
+    assert found.arrivals == "poisson" and found.recording.sampled
+    check(found, {"mean_ms": 30.0, "loss": 0.2, "rate_per_ms": 1 / 120})
     assert found.channel["discipline"] == "newest-waits"
 
 
@@ -113,26 +117,17 @@ def test_rows_behind_a_waiting_place(tmp_path: Path) -> None:
     check(fit(path, discipline="newest-waits"), SLOW_TRUE)
 
 
-@pytest.mark.slow  # 20 s
-def test_losses_of_a_busy_link_need_outcomes(tmp_path: Path) -> None:
-    """Frames behind a lost one are dropped unseen: rows that say so give the truth, others a note."""
-    section = {**SLOW, "faults": {"loss": [0.02, 0.4]}}
-    true = {**SLOW_TRUE, "loss_1": 0.02, "loss_2": 0.4}
-    told = fit(write_rows(tmp_path / "told.csv", section, 3, 300.0, outcomes=True))
-    assert not told.warnings
-    check(told, true)
-    inferred = fit(write_rows(tmp_path / "inferred.csv", section, 3, 300.0), samples=4)
-    assert "outcome" in inferred.warnings[0] and inferred.parameters["loss_2"].value > 0.5
-
-
-@pytest.mark.slow  # 9 s; the tests above ask that the intervals of single recordings hold it
-def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
-    """20 recordings of four parameters: 95 % of 80 is 76, and fewer than 69 has a chance of 1 in 500."""
-    inside = 0
-    for seed in range(20):
-        found = fit(write_trace(tmp_path / "t.jsonl", SLOW, 100 + seed, cameras=1, seconds=90))
-        inside += sum(holds(found.parameters[name], value) for name, value in SLOW_TRUE.items())
-    assert inside >= 69
+def test_what_is_still_on_its_way_is_not_lost(tmp_path: Path) -> None:
+    """A parallel link recorded until 10 s: late frames that had not come by then are no losses, and one that is
+    missing long before is."""
+    offered = np.arange(0.0, 10_000.0, 10.0)
+    came = offered + np.random.default_rng(5).exponential(60.0, len(offered))
+    came[300] = np.inf
+    path = tmp_path / "rows.csv"
+    path.write_text(HEAD + "".join(f"{o},{c if c <= 10_000 else ''}\n" for o, c in zip(offered, came)))
+    (camera,) = recordings.read_recording(path, "parallel").cameras
+    assert np.flatnonzero(camera.outcome == "lost").tolist() == [300]
+    assert (camera.outcome == "").sum() == (came > 10_000).sum() - 1 > 2
 
 
 @pytest.mark.parametrize(
@@ -143,22 +138,17 @@ def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
         (HEAD + "0,5\n30,40\n", "2 delays .2 frames, 2 came.; at least 20 are needed"),
         (HEAD + "".join(f"{30 * n},\n" for n in range(100)), "none of its 100 frames came through"),
         (HEAD + "0,5\n30,20\n", "line 3: delivered_ms is not earlier than offered_ms, or blank: 30, 20"),
+        (HEAD + ",5\n30,40\n", "line 2: delivered_ms is not earlier than offered_ms, or blank"),
         (HEAD + "0,5\n1e12,\n1.1e12,\n", "line 4: offered_ms is decades away from the first: 1.1e12, "),
-        (HEAD + "0,5\nrain\n", "line 3: offered_ms is 'rain', expected a number"),
         (HEAD + '"' + 140_000 * "0", "cannot be read as a table: field larger than"),
         ("0,5\n30,40\n", "expected a header with the columns offered_ms, .* it has no header"),
-        ("offered_ms;delivered_ms\n0.5;7,5\n", "with decimal points and with commas: use one of them"),
-        ("offered;delivered\n0;7\n", "the column 'offered' has no unit that is known: call it offered_ms"),
     ],
 )
-def test_nothing_to_fit_is_said_in_one_line(tmp_path: Path, capsys, rows: str, why: str) -> None:
-    path = tmp_path / "rows.csv"
-    path.write_text(rows)
-    assert main(["fit", str(path)]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    with pytest.raises(ValueError, match=why):
-        fit(path)
+def test_nothing_to_fit_is_said_in_one_line(tmp_path: Path, rows: str, why: str) -> None:
+    (tmp_path / "rows.csv").write_text(rows)
+    with pytest.raises(ValueError, match=why) as error:
+        fit(tmp_path / "rows.csv")
+    assert "\n" not in str(error.value)
 
 
 def test_constant_delays_are_one_state_of_constant_delays(tmp_path: Path) -> None:
@@ -187,7 +177,7 @@ def test_a_few_huge_delays_are_no_state(tmp_path: Path) -> None:
 
 
 def test_the_command_writes_a_scenario_and_a_picture(tmp_path: Path, capsys) -> None:
-    path = write_trace(tmp_path / "t.jsonl", SLOW, 1, seconds=60)
+    path = write_trace(tmp_path / "t.jsonl", SLOW, 1, 2, seconds=60)
     words = ["fit", str(path), "--out", str(tmp_path / "f.yaml"), "--plot", str(tmp_path / "f.png")]
     assert main(words) == 0
     text = capsys.readouterr().out
@@ -195,14 +185,9 @@ def test_the_command_writes_a_scenario_and_a_picture(tmp_path: Path, capsys) -> 
     shown = yaml.safe_load(text[text.index("channel:") :])["channel"]
     assert channel_from_mapping(shown) == channel_from_mapping(scenario.load(tmp_path / "f.yaml").channel)
     assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
-    assert main(["simulate", "--scenario", str(tmp_path / "f.yaml"), "--seconds", "60"]) == 0
-    capsys.readouterr()
     assert main(["fit", str(path), "--json", "--states", "1"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["states"] == 1 and found["chosen_by"] == "asked"
-    with pytest.raises(SystemExit):
-        main(["fit", str(path), "--plot", str(path / "no" / "f.png")])
-    assert "argument --plot: " in capsys.readouterr().err
 
 
 @pytest.mark.stability
@@ -238,21 +223,3 @@ def test_odd_recordings_give_finite_figures_or_one_line(tmp_path: Path, seed: in
             for value in found.parameters.values():
                 assert all(math.isfinite(v) for v in (value.value, *(value.interval or ())))
                 assert value.interval is None or value.interval[0] <= value.value <= value.interval[1]
-
-
-def test_what_is_still_on_its_way_is_not_lost(tmp_path: Path) -> None:
-    """A parallel link recorded until 10 s: late frames that had not come by then are no losses."""
-    rng = np.random.default_rng(5)
-    offered = np.arange(0.0, 10_000.0, 10.0)
-    came = offered + rng.exponential(60.0, len(offered))
-    path = tmp_path / "rows.csv"
-    path.write_text(HEAD + "".join(f"{o},{c if c <= 10_000 else ''}\n" for o, c in zip(offered, came)))
-    assert (came > 10_000).sum() > 2
-    (camera,) = recordings.read_recording(path, "parallel").cameras
-    assert not (camera.outcome == "lost").any() and (camera.outcome == "").sum() == (came > 10_000).sum()
-    # One that is missing long before the end is lost.
-    lines = path.read_text().splitlines()
-    lines[301] = f"{offered[300]},"
-    path.write_text("\n".join(lines))
-    (camera,) = recordings.read_recording(path, "parallel").cameras
-    assert np.flatnonzero(camera.outcome == "lost").tolist() == [300]

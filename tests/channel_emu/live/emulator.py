@@ -7,6 +7,7 @@ import contextlib
 import itertools
 from collections import Counter
 from collections.abc import AsyncIterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ from edge_server.live.buffer import FrameBuffer
 from edge_server.live.grpc_services import ClockService
 from edge_server.live.ingest import Ingest
 from freshfield.clock import WallClock
-from freshfield.depth import EncodedDepth
 from freshfield.frame import Frame, to_request
 from freshfield.geometry import Pinhole, Pose
 from freshfield.ledger import Ledger
@@ -37,20 +37,18 @@ _LENS = Pinhole(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)
 _sessions = itertools.count()
 
 
-def frame_of(
-    camera: str, session: str, sequence: int, at_ns: int, held_out: bool = False, depth: EncodedDepth | None = None
-) -> Frame:
+def frame_of(camera: str, session: str, sequence: int, at_ns: int, held_out: bool = False) -> Frame:
     """A real frame: encoded, posed, with a lens."""
     pose = Pose((1, 0, 0, 0), (0, 0, 0))
-    return Frame(camera, session, sequence, at_ns, pose, _LENS, "jpeg", _IMAGE, held_out, depth=depth)
+    return Frame(camera, session, sequence, at_ns, pose, _LENS, "jpeg", _IMAGE, held_out)
 
 
 def make(
     out: Path, address: str, section: dict, cameras: tuple[str, ...] = ("cam00",), **options
 ) -> tuple[FrameProxy, list[CameraStream]]:
     """A proxy for the frame stream, not started, and its cameras' flows."""
-    chosen = ProxyOptions("127.0.0.1:0", address, Transport(), **options)
-    proxy = FrameProxy(channel_from_mapping(section), 0, chosen, cameras, out)
+    chosen = ProxyOptions("127.0.0.1:0", address, options.pop("transport", Transport()), **options)
+    proxy = FrameProxy(channel_from_mapping(section), 5, chosen, cameras, out)
     return proxy, list(proxy.flows.values())
 
 
@@ -67,8 +65,6 @@ class Edge:
         self._out, self._cameras, self._held_out, self._transport = out, cameras, held_out, transport
         self.port = 0
         self.truth: list[tuple[Frame, int]] = []
-        self.delivered: Counter[str] = Counter()
-        self.rejected: Counter[str] = Counter()
 
     async def start(self) -> None:
         clock = WallClock()
@@ -88,15 +84,10 @@ class Edge:
         """As if killed: no stream is ended politely."""
         await self._server.stop(None)
         self._ledger.close(self._clock.now_ns())
-        self.delivered.update(self.ingest.delivered)
-        self.rejected.update(self.ingest.rejected)
 
 
 class Camera:
-    """One stream of frames to the emulator, one unanswered at a time; keeps every answer and a ledger.
-
-    depth: goes with each frame.
-    """
+    """One stream of frames to the emulator, one unanswered at a time; keeps every answer and a ledger."""
 
     def __init__(self, name: str, port: int, transport: Transport, held_out: bool, ledger: Ledger) -> None:
         self.name, self.held_out = name, held_out
@@ -104,44 +95,38 @@ class Camera:
         self.answers: Counter[str] = Counter()
         self.reasons: Counter[str] = Counter()
         self.sequence = 0
-        self.depth: EncodedDepth | None = None
+        self.call: Any = None
         self._clock = WallClock()
         self._channel = transport.aio_channel(f"127.0.0.1:{port}")
         self._metadata = transport.metadata()
-        self._call: Any = None
         self._ledger = ledger
 
     async def connect(self) -> None:
         await self._channel.channel_ready()
-        self._call = frames_pb2_grpc.FrameStreamServiceStub(self._channel).Push(metadata=self._metadata)
-        await self._call.wait_for_connection()
+        self.call = frames_pb2_grpc.FrameStreamServiceStub(self._channel).Push(metadata=self._metadata)
+        await self.call.wait_for_connection()
 
     async def push(self) -> pb.PushResponse:
         """Send one frame and wait for its answer."""
-        if self._call is None:
+        if self.call is None:
             await self.connect()
-        frame = frame_of(self.name, self.session, self.sequence, self._clock.now_ns(), self.held_out, self.depth)
+        frame = frame_of(self.name, self.session, self.sequence, self._clock.now_ns(), self.held_out)
         self._write(frame.sequence, "captured")
         self._write(frame.sequence, "sent")
         self.sequence += 1
-        await self._call.write(to_request(frame))
-        response = await self._call.read()
+        await self.call.write(to_request(frame))
+        response = await self.call.read()
         assert response.sequence == frame.sequence
         name = pb.Outcome.Name(response.outcome).removeprefix("OUTCOME_").lower()
-        detail = f"{name}:{response.reason}" if response.reason else name
-        self._write(frame.sequence, "answered", detail)
+        self._write(frame.sequence, "answered", f"{name}:{response.reason}" if response.reason else name)
         self.answers[name] += 1
         self.reasons[response.reason] += 1
         return response
 
-    async def stream(self, frames: int, period_s: float) -> None:
+    async def stream(self, frames: int, period_s: float = 0.0) -> None:
         for _ in range(frames):
             await self.push()
             await asyncio.sleep(period_s)
-
-    async def code(self) -> grpc.StatusCode:
-        """How the stream ended."""
-        return await self._call.code()
 
     async def close(self) -> None:
         await self._channel.close()
@@ -150,11 +135,17 @@ class Camera:
         self._ledger.write(self._clock.now_ns(), self.name, self.session, sequence, event, detail)
 
 
+@dataclass
 class Emulation:
     """Edge, emulator and cameras in one folder."""
 
-    def __init__(self, edge: Edge, proxy: FrameProxy, cameras: dict[str, Camera]) -> None:
-        self.edge, self.proxy, self.cameras = edge, proxy, cameras
+    edge: Edge
+    proxy: FrameProxy
+    cameras: dict[str, Camera]
+
+    async def stream(self, frames: int, period_s: float) -> None:
+        """All cameras together."""
+        await asyncio.gather(*(c.stream(frames, period_s) for c in self.cameras.values()))
 
     async def connected(self) -> None:
         """Wait until every stream to the edge is open."""
@@ -167,6 +158,16 @@ class Emulation:
         async with asyncio.timeout(30):
             await self.proxy.settled()
 
+    def stranger(self, transport: Transport | None = None) -> grpc.aio.Channel:
+        """A channel to the emulator."""
+        return (transport or Transport()).aio_channel(f"127.0.0.1:{self.proxy.port}")
+
+
+async def answer_to(call: grpc.aio.StreamStreamCall, raw: bytes) -> pb.PushResponse:
+    """Send bytes on a stream of PUSH, which a stranger opened."""
+    await call.write(raw)
+    return pb.PushResponse.FromString(await call.read())
+
 
 @contextlib.asynccontextmanager
 async def emulate(
@@ -175,15 +176,13 @@ async def emulate(
     *,
     cameras: tuple[str, ...] = CAMERAS,
     held_out: tuple[str, ...] = (),
-    seed: int = 5,
     transport: Transport | None = None,
     **options: Any,
 ) -> AsyncIterator[Emulation]:
     transport = transport or Transport()
     edge = Edge(out, cameras, held_out, transport)
     await edge.start()
-    chosen = ProxyOptions("127.0.0.1:0", f"127.0.0.1:{edge.port}", transport, **options)
-    proxy = FrameProxy(channel_from_mapping(section), seed, chosen, cameras, out)
+    proxy, _ = make(out, f"127.0.0.1:{edge.port}", section, cameras, transport=transport, **options)
     await proxy.start()
     ledger = Ledger(out, "node", "all", WallClock().now_ns())
     nodes = {c: Camera(c, proxy.port, transport, c in held_out, ledger) for c in cameras}

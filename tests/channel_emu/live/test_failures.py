@@ -1,4 +1,5 @@
-"""What breaks inside the live emulator ends it, or its stream, in plain sight."""
+"""What breaks inside or behind the live emulator ends it, or its stream, in plain sight; an edge that is slow or away
+costs frames and nothing else."""
 
 from __future__ import annotations
 
@@ -9,22 +10,23 @@ from pathlib import Path
 import grpc
 import grpc.aio
 import pytest
-from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from channel_emu.live import frame_proxy
+from channel_emu.live.camera_stream import CREDITS
+from channel_emu.live.live_link import Message
 from channel_emu.live.proxy import EmulatorFailed, Proxy
 from channel_emu.model.chain import ChainError
 from freshfield.ledger import read_all
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
 from tests.channel_emu.live.emulator import make, offer
-from tests.integration.peer import Peer
+from tests.integration.peer import Peer, silence
 from tests.support import free_port
 
-SLOW = {"service": {"law": "deterministic", "mean_ms": 1e9}}
-SHORT = {"service": {"law": "deterministic", "mean_ms": 300.0}}
+SHORT = {"service": "det:300ms"}
 FULL = Path("/dev/full")
 SERVICE = "freshfield.v1.FrameStreamService"
+STRANGE = pb.PushResponse(sequence=77).SerializeToString()
 
 
 def fill_the_disk(proxy: Proxy) -> None:
@@ -59,29 +61,31 @@ async def test_a_full_disk_ends_the_emulator_and_its_other_books_are_closed(
     assert ledger.closed
 
 
-async def test_a_part_that_breaks_ends_the_emulator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A background task and the timer's callback, each with an error that is no OSError."""
+def raising(*_: object) -> None:
+    raise ChainError("no such state")
+
+
+def break_background(proxy: frame_proxy.FrameProxy) -> None:
+    proxy.channel.forget = raising
+
+
+def break_timer(proxy: frame_proxy.FrameProxy) -> None:
+    proxy.flows["cam00"].link.advance = raising
+
+
+@pytest.mark.parametrize("break_it", [break_background, break_timer])
+async def test_a_part_that_breaks_ends_the_emulator(tmp_path: Path, monkeypatch, break_it) -> None:
+    """With an error that is no OSError."""
     monkeypatch.setattr(frame_proxy, "_FIRST_WAIT_S", 0.1)
-
-    async def live(break_it) -> None:
-        proxy, (flow,) = make(tmp_path, f"127.0.0.1:{free_port()}", SHORT)
-        break_it(proxy, flow)
-        running = asyncio.create_task(proxy.run(asyncio.Event()))
-        await asyncio.sleep(0.3)
-        if not running.done():
-            offer(flow, 0)
-        with pytest.raises(EmulatorFailed, match="ChainError: no such state"):
-            async with asyncio.timeout(15):
-                await running
-
-    def raising(*_: object) -> None:
-        raise ChainError("no such state")
-
-    await live(lambda proxy, _: setattr(proxy.channel, "forget", raising))
-    await live(lambda _, flow: setattr(flow.link, "advance", raising))
-
-
-STRANGE = pb.PushResponse(sequence=77).SerializeToString()
+    proxy, (flow,) = make(tmp_path, f"127.0.0.1:{free_port()}", SHORT)
+    break_it(proxy)
+    running = asyncio.create_task(proxy.run(asyncio.Event()))
+    await asyncio.sleep(0.3)
+    if not running.done():
+        offer(flow, 0)
+    with pytest.raises(EmulatorFailed, match="ChainError: no such state"):
+        async with asyncio.timeout(15):
+            await running
 
 
 @pytest.mark.parametrize("answers", [[b"\xff\xff\xff"], [STRANGE] * 1000], ids=["no answer", "to no frame"])
@@ -110,26 +114,25 @@ async def test_answers_that_are_none_end_the_stream_and_not_the_emulator(tmp_pat
     await server.stop(None)
 
 
-async def test_cameras_are_let_in_once_the_streams_to_the_edge_stand(tmp_path: Path) -> None:
-    edge = await Peer().start()
-    proxy, flows = make(tmp_path, edge.address, {}, ("cam00", "cam01", "cam02"))
+async def test_an_edge_that_never_answers_costs_frames_and_no_memory(tmp_path: Path) -> None:
+    """The credits hold for frames and for bytes."""
+    edge = await Peer(respond=silence).start()
+    proxy, flows = make(tmp_path, edge.address, {}, ("cam00", "cam01"))
     await proxy.start()
-    assert all(flow.connected for flow in flows)
-    offer(flows[0], 0)
-    assert flows[0].broken == 0
+    assert all(flow.connected for flow in flows), "cameras are let in once the streams to the edge stand"
+    for n in range(200):
+        offer(flows[0], n)
+        await asyncio.sleep(0)
+    await edge.until(CREDITS)
+    assert (flows[0].pending, flows[0].broken) == (CREDITS + 1, 200 - CREDITS - 1)
+    large = Message(bytes(5 * 2**20), "s", 0, flows[1])
+    for _ in range(6):
+        flows[1].send(large)
+    assert (flows[1].pending, flows[1].broken) == (2, 4)  # one on its way, the newest held
+    assert proxy._snapshot()["counts"]["in_flight"] == CREDITS + 3
     await proxy.stop()
+    assert flows[0].broken == 200
     await edge.stop()
-
-
-async def test_without_an_edge_they_are_let_in_a_moment_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_proxy, "_FIRST_WAIT_S", 0.2)
-    proxy, _ = make(tmp_path, f"127.0.0.1:{free_port()}", {})
-    await proxy.start()
-    channel = Transport().aio_channel(f"127.0.0.1:{proxy.port}")
-    check = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=5)
-    assert (await check).status == health_pb2.HealthCheckResponse.SERVING
-    await channel.close()
-    await proxy.stop()
 
 
 async def test_a_status_that_a_thread_still_holds_does_not_replace_the_last(tmp_path: Path) -> None:

@@ -21,24 +21,13 @@ def run(section: dict, seconds: float = 10, **more):
 
 
 @pytest.mark.parametrize("discipline", DISCIPLINES)
-def test_zero_delays_deliver_everything_with_the_age_of_the_period(discipline: str) -> None:
+def test_zero_delays_deliver_everything_and_huge_ones_saturate(discipline: str) -> None:
     found = run({"preset": "ch5", "service": {"mean_ms": 0.0}, "discipline": discipline})
     assert found["delivered"] == found["offered"] and found["dropped"] == 0
     assert found["mean_age_ms"] == pytest.approx(15.0, abs=0.05)
     assert found["delay_ms"]["mean"] == 0.0
-
-
-@pytest.mark.parametrize("discipline", DISCIPLINES)
-@pytest.mark.parametrize("mean_ms", [1e12, 1e300])
-def test_huge_delays_saturate(discipline: str, mean_ms: float) -> None:
-    found = run(
-        {
-            "preset": "ch5",
-            "service": {"law": "deterministic", "mean_ms": mean_ms},
-            "queue_limit": 8,
-            "discipline": discipline,
-        }
-    )
+    service = {"law": "deterministic", "mean_ms": 1e300}
+    found = run({"preset": "ch5", "service": service, "queue_limit": 8, "discipline": discipline})
     assert found["delivered"] == 0 and found["mean_age_ms"] is None
     assert found["in_flight"] <= 2 * 9
     assert found["offered"] == found["in_flight"] + found["dropped_busy"] + found["superseded"]
@@ -60,13 +49,10 @@ def test_a_chain_that_always_switches() -> None:
 
 
 def test_chains_too_fast_to_follow_are_refused_with_a_reason() -> None:
-    with pytest.raises(ChainError, match="at most 1000 are"):
-        run({"preset": "ch6", "chain": {"mu1_per_ms": 1e6, "mu2_per_ms": 1e6}})
-    with pytest.raises(ChainError, match="at most 1000 are"):
-        run({"preset": "ch6", "chain": {"mu1_per_ms": 1e9, "mu2_per_ms": 3e9}})
     fast = np.array([[-1e9, 1e9, 0.0], [0.0, -1e9, 1e9], [1e9, 0.0, -1e9]])
-    with pytest.raises(ChainError, match="at most 1000 are"):
-        Chain(fast, CounterRng(0, "", "c"))
+    for generator in (two_state_generator(1e6, 1e6), fast):
+        with pytest.raises(ChainError, match="at most 1000 are"):
+            Chain(generator, CounterRng(0, "", "c"))
     # Named start, closed class only reached later: found out while running, not by hanging.
     late = np.array([[-1.0, 1.0, 0, 0], [0, -1e9, 1e9, 0], [0, 1e9, -1e9, 0], [0, 0, 0, 0]])
     with pytest.raises(ChainError, match="more than 10000 times"):

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import msgspec
@@ -10,19 +9,18 @@ from channel_emu.live.replay_link import ReplayLink
 from channel_emu.model import trace
 from channel_emu.model.channel import Channel
 from channel_emu.model.link import Event, EventKind
-from channel_emu.model.settings import ChannelConfig, channel_from_mapping
+from channel_emu.model.settings import channel_from_mapping
 from channel_emu.model.trace import TraceError, TraceWriter
-from tests.channel_emu.decided_again import compare
 
 MS = 10**6
 CHANCE = {"probability": 0.15}
 FAULTS = {"loss": CHANCE, "corruption": CHANCE, "duplication": CHANCE, "reset": {"mean_interval_ms": 2000.0}}
 
 
-def record(path: Path, config: ChannelConfig, seed: int = 3, frames: int = 400) -> dict[str, list[Event]]:
+def record(path: Path, section: dict, frames: int) -> tuple[trace.Trace, dict[str, list[Event]]]:
     """Two cameras' frames through fresh links, written as the live emulator does; the events by camera."""
-    writer = TraceWriter(path, config, seed)
-    channel = Channel(config, seed)
+    config = channel_from_mapping(section)
+    writer, channel = TraceWriter(path, config, 3), Channel(config, 3)
     told: dict[str, list[Event]] = {}
     for camera, phase in (("a", 0), ("b", 7)):
         link = channel.link(camera)
@@ -38,29 +36,15 @@ def record(path: Path, config: ChannelConfig, seed: int = 3, frames: int = 400) 
             writer.write(camera, "s1", transit.item, transit)
         told[camera] = events
     writer.close()
-    return told
+    found = trace.read(path)
+    assert found.seed == 3 and msgspec.structs.replace(found.config, preset=config.preset) == config
+    return found, told
 
 
 @pytest.mark.parametrize("preset", ["ch5", "ch6"])
-def test_a_recorded_trace_is_decided_again_exactly(tmp_path: Path, preset: str) -> None:
-    config = channel_from_mapping({"preset": preset, "faults": FAULTS})
-    told = record(tmp_path / "t.jsonl", config)
-    found = trace.read(tmp_path / "t.jsonl")
-    assert found.seed == 3 and msgspec.structs.replace(found.config, preset=preset) == config
-    assert {c: len(r) for c, r in found.by_camera().items()} == {"a": 400, "b": 400}
-    assert sum(r.outcome == "delivered" for r in found.by_camera()["a"]) == sum(
-        e.kind is EventKind.DELIVERED for e in told["a"]
-    )
-    assert compare(found) == {"frames": 800, "equal": 800, "different": []}
-    # It would notice: another seed decides otherwise.
-    assert compare(dataclasses.replace(found, seed=4))["equal"] < 700
-
-
-@pytest.mark.parametrize("preset", ["ch5", "ch6"])
-def test_replaying_the_recorded_offers_repeats_every_event(tmp_path: Path, preset: str) -> None:
-    config = channel_from_mapping({"preset": preset, "faults": FAULTS})
-    told = record(tmp_path / "t.jsonl", config)
-    found = trace.read(tmp_path / "t.jsonl")
+def test_a_recorded_trace_is_replayed_event_by_event(tmp_path: Path, preset: str) -> None:
+    found, told = record(tmp_path / "t.jsonl", {"preset": preset, "faults": FAULTS}, 400)
+    assert len(found.records) == 800
     for camera, records in found.by_camera().items():
         link = ReplayLink(camera, records)
         events: list[Event] = []
@@ -69,19 +53,16 @@ def test_replaying_the_recorded_offers_repeats_every_event(tmp_path: Path, prese
             events += happened
             assert transit.flips == r.flips
         events += link.advance(33 * 400 * MS)
-
-        def plain(events: list[Event]) -> list[tuple]:
-            return sorted((e.at_ns, e.transit.number, str(e.kind)) for e in events)
-
         settled = {r.number for r in records if r.outcome is not None}
-        assert plain([e for e in events if e.transit.number in settled]) == plain(
-            [e for e in told[camera] if e.transit.number in settled]
+        replayed, recorded = (
+            sorted((e.at_ns, e.transit.number, str(e.kind)) for e in each if e.transit.number in settled)
+            for each in (events, told[camera])
         )
+        assert replayed == recorded
 
 
 def test_replay_of_shifted_offers_keeps_decisions_and_latencies_and_starts_over(tmp_path: Path) -> None:
-    record(tmp_path / "t.jsonl", channel_from_mapping({"preset": "ch5"}), frames=50)
-    records = trace.read(tmp_path / "t.jsonl").by_camera()["a"]
+    records = record(tmp_path / "t.jsonl", {"preset": "ch5"}, 50)[0].by_camera()["a"]
     link = ReplayLink("a", records)
     transits = [link.offer((1000 + 40 * n) * MS)[0] for n in range(100)]
     link.advance(10**12)
@@ -90,6 +71,8 @@ def test_replay_of_shifted_offers_keeps_decisions_and_latencies_and_starts_over(
         if r.outcome is not None and r.ended_ns is not None:
             assert (t.outcome, t.ended_ns - t.offered_ns) == (r.outcome, r.ended_ns - r.offered_ns)
     assert link.in_flight == 0 and link.next_event_ns >= 2**62
+    with pytest.raises(TraceError, match="cam09"):
+        ReplayLink("cam09", [])
 
 
 @pytest.mark.parametrize(
@@ -97,13 +80,8 @@ def test_replay_of_shifted_offers_keeps_decisions_and_latencies_and_starts_over(
     [
         (0, '"freshfield_trace":2', '"other":2', "no trace header"),
         (0, '"freshfield_trace":2', '"freshfield_trace":1', "version 1, expected 2: record it again"),
-        (0, '"discipline"', '"rain"', "rain: unknown key"),
-        (0, '"seed":', '"seed":1,"seed":', "no trace header"),
         (0, '"seed":', '"seed":1e999, "of":', "no trace header"),
-        (0, "{", "[" * 100_000, "no trace header"),
         (1, '"camera"', '"kamera"', "line 2 is not a trace record"),
-        (1, '"offered_ns":', '"offered_ns":-', r"line 2 .*`\$.offered_ns`"),
-        (1, '"outcome":"', '"outcome":"un', r"line 2 .*`\$.outcome`"),
         (1, '"bytes":', '"bytes":1' + "0" * 400, r"line 2 .*`\$.bytes`"),
         (1, '"flips":[]', '"flips":[[0.5,1e999]]', "line 2 is not a trace record"),
         (1, "{", "[" * 100_000, "line 2 is not a trace record"),
@@ -111,10 +89,8 @@ def test_replay_of_shifted_offers_keeps_decisions_and_latencies_and_starts_over(
 )
 def test_damaged_traces_are_refused_with_the_place(tmp_path: Path, line: int, old: str, new: str, why: str) -> None:
     path = tmp_path / "t.jsonl"
-    record(path, channel_from_mapping({"preset": "ch5"}), frames=20)
+    record(path, {"preset": "ch5"}, 20)
     lines = path.read_text().split("\n")
-    # The first record begins at 0, which has no negative.
-    lines[1] = lines[1].replace('"offered_ns":0', '"offered_ns":1')
     assert old in lines[line]
     lines[line] = lines[line].replace(old, new, 1)
     path.write_text("\n".join(lines))
@@ -124,12 +100,6 @@ def test_damaged_traces_are_refused_with_the_place(tmp_path: Path, line: int, ol
 
 def test_a_torn_last_line_is_left_out(tmp_path: Path) -> None:
     path = tmp_path / "t.jsonl"
-    record(path, channel_from_mapping({"preset": "ch5"}), frames=20)
-    whole = len(trace.read(path).records)
+    found, _ = record(path, {"preset": "ch5"}, 20)
     path.write_text(path.read_text()[:-30])
-    assert len(trace.read(path).records) == whole - 1
-
-
-def test_a_camera_without_records_cannot_be_replayed() -> None:
-    with pytest.raises(TraceError, match="cam09"):
-        ReplayLink("cam09", [])
+    assert len(trace.read(path).records) == len(found.records) - 1

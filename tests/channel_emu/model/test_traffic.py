@@ -11,6 +11,8 @@ from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.service_time import ServiceTime, exponential, gamma, lognormal, replayed
 from channel_emu.model.traffic import PoissonArrivals, completion_ns
 
+RNG = CounterRng(5, "c", "s")
+
 
 def chain(mu1: float, mu2: float, seed: int = 0, initial: int | None = None) -> Chain:
     return Chain(two_state_generator(mu1, mu2), CounterRng(seed, "", "channel.chain"), initial)
@@ -30,7 +32,6 @@ def test_mmpp_counts_have_the_mean_and_variance_of_theory() -> None:
     variance = mean + 2 * (rates[0] - rates[1]) ** 2 * p1 * p2 * burst
     assert counts.mean() == pytest.approx(mean, rel=0.03)
     assert counts.var() == pytest.approx(variance, rel=0.03)
-    assert variance > 5 * mean
 
 
 def test_spending_follows_the_state() -> None:
@@ -43,40 +44,21 @@ def test_spending_follows_the_state() -> None:
     assert completion_ns(at_ms + 3.0, [1e-6, 0.0], path, 0) == NEVER_NS
 
 
-@pytest.mark.parametrize(
-    ("shape", "mean", "cv"),
-    [
-        (exponential(CounterRng(2, "c", "s")), 1.0, 1.0),
-        (replayed([1.0]), 1.0, 0.0),
-        (gamma(CounterRng(2, "c", "s"), 4.0), 1.0, 0.5),
-        (gamma(CounterRng(2, "c", "s"), 0.5), 1.0, 2**0.5),
-        (lognormal(CounterRng(2, "c", "s"), 0.5), 1.0, math.sqrt(math.exp(0.25) - 1)),
-        (replayed([1.0, 2.0, 6.0]), 3.0, math.sqrt(14 / 3) / 3),
-    ],
-    ids=["exponential", "deterministic", "gamma 4", "gamma 0.5", "lognormal", "replayed"],
-)
-def test_delay_laws_have_their_moments(shape, mean: float, cv: float) -> None:
-    draws = np.array([shape(n) for n in range(10_000)])
-    assert (draws >= 0).all()
-    assert draws.mean() == pytest.approx(mean, rel=4 * max(cv, 1e-9) / 10_000**0.5)
-    assert draws.std() / draws.mean() == pytest.approx(cv, rel=0.08, abs=1e-12)
-
-
-@pytest.mark.parametrize(("law", "parameter"), [("gamma", 3.0), ("lognormal", 0.7)])
-def test_delay_laws_have_their_shape(law: str, parameter: float) -> None:
-    """Kolmogorov and Smirnov against scipy's distributions: a wrong shape of right moments would fail."""
+@pytest.mark.parametrize("law", ["exponential", "gamma 3", "gamma 0.5", "lognormal"])
+def test_delay_laws_have_their_shape_and_a_mean_of_one(law: str) -> None:
+    """Kolmogorov and Smirnov against scipy's distributions."""
     stats = pytest.importorskip("scipy.stats")
-    rng = CounterRng(5, "c", "s")
-    shape = gamma(rng, parameter) if law == "gamma" else lognormal(rng, parameter)
-    exact = (
-        stats.gamma(parameter, scale=1 / parameter)
-        if law == "gamma"
-        else stats.lognorm(parameter, scale=math.exp(-(parameter**2) / 2))
-    )
-    assert stats.kstest([shape(n) for n in range(2000)], exact.cdf).pvalue > 1e-3
+    shape, exact = {
+        "exponential": (exponential(RNG), stats.expon()),
+        "gamma 3": (gamma(RNG, 3.0), stats.gamma(3.0, scale=1 / 3.0)),
+        "gamma 0.5": (gamma(RNG, 0.5), stats.gamma(0.5, scale=2.0)),
+        "lognormal": (lognormal(RNG, 0.7), stats.lognorm(0.7, scale=math.exp(-(0.7**2) / 2))),
+    }[law]
+    assert stats.kstest([shape(n) for n in range(4000)], exact.cdf).pvalue > 1e-3
 
 
 def test_service_at_start_keeps_the_delay_of_the_state_it_started_in() -> None:
+    assert [replayed([1.0, 2.0, 6.0])(n) for n in range(4)] == [1.0, 2.0, 6.0, 1.0]
     path = chain(1.0, 1e-6, initial=0)
     switch = path.segment(0)[1]
     service = ServiceTime(replayed([1.0]), [10.0, 1000.0], path)

@@ -1,52 +1,26 @@
+"""The channel in virtual time, and the same as the library's ``Channel``."""
+
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from channel_emu.model.channel import Channel
+import freshfield as ff
 from channel_emu.model.settings import channel_from_mapping
-from channel_emu.virtual.simulate import OUTCOMES, LinkRun, SimulationError, offer_all, simulate
+from channel_emu.virtual.simulate import LinkRun, SimulationError, simulate
+from freshfield.scenario import ScenarioError
 
 
 def decisions(run: LinkRun) -> list[tuple]:
     return [(t.offered_ns, t.outcome, t.started_ns, t.due_ns) for t in run.transits]
 
 
-def same(a: LinkRun, b: LinkRun) -> bool:
-    """Whether every decision is alike."""
-    return decisions(a) == decisions(b)
-
-
-@pytest.mark.parametrize("preset", ["ch5", "ch6"])
-def test_adding_and_renaming_cameras_changes_nothing_for_the_others(preset: str) -> None:
-    config = channel_from_mapping({"preset": preset})
-    few = simulate(config, ["b", "d"], 20, 3).runs
-    many = simulate(config, ["a", "b", "c", "d"], 20, 3).runs
-    assert same(few[0], many[1]) and same(few[1], many[3])
-    assert not same(many[0], many[1])
-    assert not same(few[0], simulate(config, ["b", "d"], 20, 4).runs[0])
-
-
-def test_counts_close() -> None:
-    chance = {"probability": 0.1}
-    faults = {"loss": chance, "duplication": chance, "reset": {"mean_interval_ms": 500}}
-    result = simulate(channel_from_mapping({"preset": "ch6", "faults": faults}), 3, 30).summary()
-    assert result["offered"] == result["in_flight"] + sum(result[name] for name in OUTCOMES)
-    assert result["dropped"] == sum(result[name] for name in OUTCOMES[1:])
-    assert min(result[k] for k in ("lost", "broken", "superseded", "delivered", "duplicated")) > 0
-
-
-def test_known_figures_of_the_presets() -> None:
-    """Measured independently: ch6 with a frame every 30 ms under drop-new ages 94.5 ms."""
-    config = channel_from_mapping({"preset": "ch6", "arrivals": "periodic:30ms", "discipline": "drop-new"})
-    assert simulate(config, 6, 600, 1).summary()["mean_age_ms"] == pytest.approx(94.5, rel=0.01)
-
-
-def test_replayed_offers_are_decided_as_in_the_simulation() -> None:
-    config = channel_from_mapping({"preset": "ch6", "faults": {"loss": {"probability": 0.2}}})
-    run = simulate(config, ["x"], 30, 9, frame_period_ms=33.3).runs[0]
-    offers = {"x": [(t.offered_ns, 20_000) for t in run.transits]}
-    links, transits = offer_all(Channel(config, 9), offers, run.end_ns)
-    assert same(LinkRun(links["x"], transits["x"], run.end_ns), run)
+def test_adding_and_renaming_cameras_changes_nothing_for_the_others() -> None:
+    config = channel_from_mapping({"preset": "ch6"})
+    few = [decisions(run) for run in simulate(config, ["b", "d"], 20, 3).runs]
+    many = [decisions(run) for run in simulate(config, ["a", "b", "c", "d"], 20, 3).runs]
+    assert few == [many[1], many[3]] and many[0] != many[1]
+    assert few[0] != decisions(simulate(config, ["b", "d"], 20, 4).runs[0])
 
 
 @pytest.mark.parametrize(
@@ -63,3 +37,29 @@ def test_replayed_offers_are_decided_as_in_the_simulation() -> None:
 def test_impossible_requests_are_refused(more: dict, why: str) -> None:
     with pytest.raises(SimulationError, match=why):
         simulate(channel_from_mapping({}), **{"cameras": 1, "seconds": 1, **more})
+
+
+def test_the_librarys_channel_is_the_one_that_the_command_simulates() -> None:
+    """Its ages are the sawtooth of its deliveries."""
+    channel = ff.Channel("ch5", service="exp:90ms", cameras=3, seed=5)
+    same = simulate(channel_from_mapping({"preset": "ch5", "service": "exp:90ms"}), 3, 4.0, 5)
+    deliveries = channel.deliveries(4.0).values()
+    assert sum(map(len, deliveries)) == same.summary()["delivered"]
+    t_s, ages_ms = channel.ages(4.0, every_ms=7.0)
+    assert ages_ms.shape == (3, len(t_s)) and t_s[-1] <= 4.0
+    for row, frames in zip(ages_ms, deliveries):
+        for at_ms, age_ms in zip(t_s * 1e3, row):
+            captured = [c for c, arrived in frames if arrived <= at_ms]
+            expected = at_ms - max(captured) if captured else np.nan
+            assert age_ms == pytest.approx(expected, abs=1e-6, nan_ok=True)
+
+
+@pytest.mark.stability
+def test_what_is_no_channel_or_no_period_is_refused_and_a_dead_one_has_no_age() -> None:
+    for every_ms in (0.0, -1.0, float("nan"), 1e-9):
+        with pytest.raises(SimulationError, match="every_ms"):
+            ff.Channel("ch5").ages(1.0, every_ms=every_ms)
+    with pytest.raises(ScenarioError, match="latency"):
+        ff.Channel("ch5", latency="60ms")
+    dead = ff.Channel("ideal", faults={"loss": 1.0})
+    assert np.isnan(dead.ages(1.0)[1]).all() and dead.deliveries(1.0)["cam00"].shape == (0, 2)

@@ -8,10 +8,9 @@ import time
 
 import numpy as np
 import pytest
-import yaml
 
-from camera_node.cli import main
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
+from camera_node.robot.arm.control import stop_event
 from camera_node.robot.arm.viewpoint_tour import plan_tour
 from camera_node.robot.flange_camera import TruthClient
 from camera_node.robot.simulated_controller.controller import HOME_RAD
@@ -42,14 +41,9 @@ def real(cell, **path):
 
 
 def near(file):
-    """--joints of an arm that stands some 30 degrees before the first viewpoint."""
-    angles = np.add(np.rad2deg(stops_of(file)[0]), [30, 10, 0, 0, 0, 0])
-    return "--joints=" + ",".join(f"{angle:.3f}" for angle in angles)
-
-
-def stands_at(option):
-    """Joint angles (6,) of --joints, degrees."""
-    return np.array(option.removeprefix("--joints=").split(","), float)
+    """Degrees (6,) of an arm that stands before the first viewpoint; --joints of it."""
+    angles = np.add(np.rad2deg(stops_of(file)[0]), [30, 10, 0, 0, 0, 0]).round(3)
+    return angles, "--joints=" + ",".join(map(str, angles))
 
 
 def at_rest(truth, within_s=5.0):
@@ -68,15 +62,6 @@ def shown(text):
     return np.array([line[1:] for line in lines if line and line[0].isdigit() and len(line) == 7], float)
 
 
-def drive(file, *options):
-    # Under nohup a hang-up is ignored, and whoever is started ignores it, too.
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    try:
-        return start_cli("drive-arm", file, *options)
-    finally:
-        signal.signal(signal.SIGHUP, before)
-
-
 def stops_of(file):
     scenario = load(file)
     config = source_config(scenario).arm
@@ -88,7 +73,7 @@ def test_a_round_visits_every_viewpoint_and_ends(cell):
     file, host = cell
     with simulated_arm(host):
         truth, clock = TruthClient(host), WallClock()
-        process = drive(file, "--rounds", "1")
+        process = start_cli("drive-arm", file, "--rounds", "1")
         seen = []
         while process.poll() is None:
             seen.append(truth.joints(clock.now_ns()))
@@ -104,9 +89,9 @@ def test_a_round_visits_every_viewpoint_and_ends(cell):
 def test_a_drive_that_is_killed_leaves_no_arm_moving(cell):
     """The controller's own watchdog misses it."""
     file, host = cell
-    with simulated_arm(host, near(file)):
+    with simulated_arm(host, near(file)[1]):
         truth = TruthClient(host)
-        process = drive(real(cell, speed_rad_s=0.1), "--yes")  # the first move takes many seconds
+        process = start_cli("drive-arm", real(cell, speed_rad_s=0.1), "--yes")  # the first move takes many seconds
         wait_until_moving(truth, process)
         process.kill()
         process.communicate()
@@ -118,49 +103,47 @@ def test_a_program_stopped_at_the_pendant_and_a_signal_end_the_drive(cell):
     file, host = cell
     with simulated_arm(host):
         truth = TruthClient(host)
-        process = drive(file)
+        process = start_cli("drive-arm", file)
         wait_until_moving(truth, process)
         with socket.create_connection((host, 29999), 5.0) as dashboard:
             dashboard.sendall(b"stop\n")
             assert process.wait(20.0) == 1
         assert "its program was ended" in process.communicate()[1]
         assert at_rest(truth)
-        process = drive(file)
+        process = start_cli("drive-arm", file)
         wait_until_moving(truth, process)
         process.send_signal(signal.SIGTERM)  # ends it in order
         assert process.wait(20.0) == 0 and at_rest(truth, 0.3)
 
 
-def test_a_first_move_through_half_the_bench_is_refused(cell):
-    with simulated_arm(cell[1], "--joints=-20,-90,90,-90,90,0"):
-        process = drive(real(cell), "--yes")
-        said = process.communicate(timeout=20)
-        assert process.returncode == 2
-        assert "the first move would turn a joint by" in said[1] and "with the pendant" in said[1]
+@pytest.mark.parametrize("under_nohup", [False, True])
+def test_signals_end_a_motion_and_a_closed_terminal_too_unless_it_is_ignored(under_nohup):
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.getsignal(number) for number in numbers}
+    signal.signal(signal.SIGHUP, signal.SIG_IGN if under_nohup else signal.SIG_DFL)
+    try:
+        for number in numbers:
+            requested = stop_event()
+            signal.raise_signal(number)
+            assert requested.is_set() != (under_nohup and number == signal.SIGHUP)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
-def test_a_real_arm_is_asked_about_first(cell):
+def test_a_real_arm_is_asked_about_first_and_not_driven_through_half_the_bench(cell):
     file, host = cell
-    with simulated_arm(host, near(file)):
-        assert main(["drive-arm", str(file), "--show"]) == 0
-        process = drive(real(cell))
-        said = process.communicate(timeout=20)
-        assert np.allclose(TruthClient(host).joints(WallClock().now_ns()), np.deg2rad(stands_at(near(file))), atol=1e-4)
-        assert "say that its space is clear with --yes" in said[1]
-        assert process.returncode == 2
+    stands_deg, joints = near(file)
+    with simulated_arm(host, joints):
+        process = start_cli("drive-arm", real(cell))
+        out, said = process.communicate(timeout=20)
+        assert process.returncode == 2 and "say that its space is clear with --yes" in said
+        now = TruthClient(host).joints(WallClock().now_ns())
+        assert np.allclose(now, np.deg2rad(stands_deg), atol=1e-4)
         # Before the question, and from the nearest viewpoint on.
-        stands = next(line.split()[2:] for line in said[0].splitlines() if "stands at" in line)
-        first_deg = np.abs(shown(said[0])[0] - np.array(stands, float)).max()
-        assert f"the first move turns a joint by {first_deg:.0f}" in said[0] and 0 < first_deg <= 30
-
-
-def test_a_scenario_without_an_arm_or_a_path_is_refused(cell, capsys):
-    file, _ = cell
-    for words, says in ((["tile"], "source.arm: missing"), ([str(file), "--rounds", "-1"], "--rounds: expected 0")):
-        assert main(["drive-arm", *words]) == 2
-        assert says in capsys.readouterr().err
-    data = yaml.safe_load(file.read_text())
-    del data["source"]["arm"]["path"]
-    file.write_text(yaml.safe_dump(data))
-    assert main(["drive-arm", str(file)]) == 2
-    assert "source.arm.path: missing" in capsys.readouterr().err
+        first_deg = np.abs(shown(out)[0] - stands_deg).max()
+        assert f"the first move turns a joint by {first_deg:.0f}" in out and 0 < first_deg <= 30.01
+    with simulated_arm(host, "--joints=-20,-90,90,-90,90,0"):
+        process = start_cli("drive-arm", real(cell), "--yes")
+        said = process.communicate(timeout=20)[1]
+        assert process.returncode == 2 and "the first move would turn a joint by" in said

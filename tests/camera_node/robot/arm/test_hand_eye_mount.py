@@ -9,47 +9,32 @@ import yaml
 from camera_node.pose.pairing import SampleBuffer
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.hand_eye_mount import read_hand_eye
-from freshfield.geometry import Pose, so3_exp
+from freshfield.geometry import Pose, se3, so3_exp
 
 MS = 1_000_000
-
-
-def transform(turn, shift) -> np.ndarray:
-    m = np.eye(4)
-    m[:3, :3], m[:3, 3] = so3_exp(turn), shift
-    return m
+MOUNT = se3(so3_exp((0.1, 0, 0)), (0.05, 0, 0.1))
 
 
 def written(tmp_path, **change):
-    data = {
-        "setup": "eye-in-hand",
-        "transform": transform((0.1, 0, 0), (0.05, 0, 0.1)).round(9).tolist(),
-        "time_offset_s": 0.02,
-        "method": "refined",
-        **change,
-    }
+    data = {"setup": "eye-in-hand", "transform": MOUNT.round(9).tolist(), "time_offset_s": 0.02, "method": "refined"}
     file = tmp_path / "hand.yaml"
-    file.write_text(yaml.safe_dump(data))
+    file.write_text(yaml.safe_dump({**data, **change}))
     return file
 
 
-def test_a_camera_on_a_moving_flange(tmp_path):
+def test_a_camera_on_a_moving_flange_follows_it_and_one_that_stands_does_not(tmp_path):
     calibration = read_hand_eye(written(tmp_path))
     assert calibration.details == {"method": "refined"}
     flange = SampleBuffer(Pose.interpolate)
     for k in range(10):
-        flange.add(k * 10 * MS, Pose.from_matrix(transform((0, 0, 0.1 * k), (0.01 * k, 0, 0))))
+        flange.add(k * 10 * MS, Pose.from_matrix(se3(so3_exp((0, 0, 0.1 * k)), (0.01 * k, 0, 0))))
     # The arm's stamps are 20 ms ahead: the camera's 30 ms are the arm's 50 ms.
     found, gap_ns = calibration.camera_poses(flange).at(30 * MS)
-    expected = transform((0, 0, 0.5), (0.05, 0, 0)) @ transform((0.1, 0, 0), (0.05, 0, 0.1))
+    expected = se3(so3_exp((0, 0, 0.5)), (0.05, 0, 0)) @ MOUNT
     np.testing.assert_allclose(found.matrix(), expected, atol=1e-8)
     assert gap_ns == 0
-
-
-def test_a_camera_that_stands_does_not_follow_the_flange(tmp_path):
-    calibration = read_hand_eye(written(tmp_path, setup="eye-to-hand"))
-    poses = calibration.camera_poses(SampleBuffer(Pose.interpolate))
-    np.testing.assert_allclose(poses.at(7)[0].matrix(), calibration.transform, atol=1e-12)
+    stands = read_hand_eye(written(tmp_path, setup="eye-to-hand")).camera_poses(flange)
+    np.testing.assert_allclose(stands.at(7)[0].matrix(), MOUNT, atol=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -60,17 +45,13 @@ def test_a_camera_that_stands_does_not_follow_the_flange(tmp_path):
         ({"transform": np.diag([1.0, 1, -1, 1]).tolist()}, "transform: the pose's rotation"),
         ({"transform": [[10**400] * 4] * 4}, "transform: .* too large"),
         ({"time_offset_s": float("nan")}, "time_offset_s"),
-        ({"time_offset_s": 10**400}, "time_offset_s"),
         ("[1, 2]", "expected setup and transform"),
-        (None, "cannot be read"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_named(tmp_path, change, message):
     file = written(tmp_path, **(change if isinstance(change, dict) else {}))
     if isinstance(change, str):
         file.write_text(change)
-    elif change is None:
-        file.unlink()
     with pytest.raises(ArmError, match=message) as error:
         read_hand_eye(file)
     assert "hand.yaml" in str(error.value)

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from camera_node.robot.arm import ArmError
+from camera_node.robot.arm.capsules import PAIRS, CapsuleModel, segment_distance
 from camera_node.robot.arm.kinematics import UR3E, apply_calibration
 from freshfield.geometry import se3, so3_exp
 
@@ -89,16 +90,13 @@ def test_the_inverse_finds_the_posture_and_only_such_as_reach_the_target():
         assert UR3E.inverse(se3(np.eye(3), out_of_reach)) == []
 
 
-def test_singular_postures_are_named():
+def test_singular_postures_are_named_and_a_joint_turns_a_full_turn_either_way():
+    assert np.degrees((UR3E.lower_rad, UR3E.upper_rad)) == pytest.approx(np.array([[-360.0] * 6, [360.0] * 6]))
     free = np.array([0.3, -1.2, 1.1, -0.9, 1.4, 0.2])
     assert UR3E.singularities(free) == ()
     assert UR3E.singularities(np.where(np.arange(6) == 4, np.radians(4.9), free)) == ("wrist",)
     assert UR3E.singularities(np.where(np.arange(6) == 4, np.radians(5.1), free)) == ()
     assert "elbow" in UR3E.singularities(np.where(np.arange(6) == 2, 0.0, free))
-
-
-def test_a_joint_turns_a_full_turn_either_way():
-    assert np.degrees((UR3E.lower_rad, UR3E.upper_rad)) == pytest.approx(np.array([[-360.0] * 6, [360.0] * 6]))
 
 
 def test_a_calibration_moves_the_flange_and_the_inverse_follows_it(factory):
@@ -113,29 +111,25 @@ def test_a_calibration_moves_the_flange_and_the_inverse_follows_it(factory):
     assert np.array_equal(apply_calibration(UR3E, factory).forward(POSTURES), UR3E.forward(POSTURES))
 
 
-@pytest.mark.parametrize(
-    "text, says",
-    [
-        ("[mounting]\ndelta_a = [1, 2]\n", "delta_a: expected a list of six numbers"),
+def test_a_wrong_calibration_is_refused_by_name(factory):
+    for text, says in (
         ("[mounting]\ndelta_a = [1, 2, 3, 4, 5, nan]\n", "delta_a: expected a list of six numbers"),
         ("[mounting]\nother = 1\n", "has no delta_theta"),
         ("delta_a = [0, 0, 0, 0, 0, 0]\n", "cannot be read"),
-    ],
-)
-def test_a_wrong_calibration_is_refused_by_name(factory, text, says):
-    factory.write_text(text)
-    with pytest.raises(ArmError, match=says):
-        apply_calibration(UR3E, factory)
+    ):
+        factory.write_text(text)
+        with pytest.raises(ArmError, match=says):
+            apply_calibration(UR3E, factory)
 
 
-@pytest.mark.parametrize("joints", [[0] * 5, [0] * 7, [0, 0, 0, 0, 0, math.nan], [math.inf] + [0] * 5])
-def test_joints_that_no_arm_has_are_refused(joints):
-    with pytest.raises(ArmError, match="six finite"):
-        UR3E.forward(joints)
+def test_joints_that_no_arm_has_are_refused():
+    for joints in ([0] * 5, [0] * 7, [0, 0, 0, 0, 0, math.nan]):
+        with pytest.raises(ArmError, match="six finite"):
+            UR3E.forward(joints)
 
 
 @pytest.mark.stability
-@pytest.mark.parametrize("away", [0.0, 1e-300, 1e-16, 1e-12, 1e-10, 1e-9, 1e-8, 1e-6, 1e-4, 1e-2])
+@pytest.mark.parametrize("away", [0.0, 1e-300, 1e-16, 1e-10, 1e-8, 1e-4, 1e-2])
 def test_at_and_about_singular_postures(away):
     for straight in (0.0, math.pi):
         q = np.array([0.4, -1.1, 1.3, -0.8, straight - away, 0.7])
@@ -177,3 +171,33 @@ def test_damped_steps_stay_small_next_to_a_singularity():
     reached = UR3E.refine(goal, start)
     assert reached is not None and np.abs(reached - start).max() < 0.2
     assert UR3E.refine(se3(np.eye(3), [9.0, 0.0, 0.0]), start) is None
+
+
+def test_distance_of_segments_is_the_least_of_all_their_points():
+    rng = np.random.default_rng(2)
+    a, b, c, d = rng.uniform(-1, 1, (4, 60, 3))
+    b[:5], d[5:10] = a[:5], c[5:10]  # points
+    d[10:20] = c[10:20] + (b - a)[10:20] * rng.uniform(-2, 2, (10, 1))  # parallel ones
+    share = np.linspace(0, 1, 161)
+    on_ab = a[:, None] + share[:, None] * (b - a)[:, None]
+    on_cd = c[:, None] + share[:, None] * (d - c)[:, None]
+    least = np.linalg.norm(on_ab[:, :, None] - on_cd[:, None], axis=-1).min(axis=(1, 2))
+    found = segment_distance(a, b, c, d)
+    assert (found <= least + 1e-12).all()
+    assert (least - found).max() < 0.01
+
+
+def test_parts_of_the_stretched_arm_lie_where_the_manufacturer_describes_them():
+    """Along -x, the upper arm 119.8 mm and the forearm 27.3 mm aside of the joints' axes."""
+    shape, frames = CapsuleModel(UR3E, 0.12, 0.04), UR3E.link_frames(np.zeros((1, 6)))
+    a, b = (ends[0] for ends in shape.segments(frames))
+    height, elbow, wrist = 0.15185, -0.24355, -0.24355 - 0.2132
+    np.testing.assert_allclose([a[2], b[2]], [[0, -0.1198, height], [elbow, -0.1198, height]], atol=1e-12)
+    np.testing.assert_allclose([a[3], b[3]], [[elbow, -0.0273, height], [wrist, -0.0273, height]], atol=1e-12)
+    # The tool is a capsule of 120 mm from the flange on; its ends are one radius inside.
+    flange = np.array([wrist, -0.13105 - 0.0921, height - 0.08535])
+    np.testing.assert_allclose([a[7], b[7]], np.add(flange, [[0, -0.04, 0], [0, -0.08, 0]]), atol=1e-12)
+    apart, lowest = shape.clearance(frames)
+    # Base (radius 64 mm) and forearm (40 mm): from the top of the column to the elbow's end.
+    assert apart[0][PAIRS.index((0, 3))] == pytest.approx(np.hypot(0.24355, 0.0273) - 0.064 - 0.04)
+    assert lowest[0] == pytest.approx(height - 0.08535 - 0.04)

@@ -1,12 +1,18 @@
 """A simulated arm with a camera over a target, with known truth: X is CAMERA_IN_FLANGE, Y TARGET_IN_BASE. Everything
-is within half a meter of the base, as on the table of a UR3e."""
+is within half a meter of the base, as on the table of a UR3e. Samples of it, and pictures of its board."""
 
 from __future__ import annotations
 
-import numpy as np
+from functools import lru_cache
 
-from camera_node.robot.calibration.hand_eye.samples import Array, Rotation
-from freshfield.geometry import look_at, se3, se3_inverse, so3_exp
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
+from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples
+from camera_node.robot.calibration.targets import GrayImage, Target, parse_target
+from freshfield.geometry import Pinhole, look_at, se3, se3_inverse, so3_exp
 
 # The arm's noise in the project's results.
 ARM_RAD, ARM_M = 0.002, 0.0005
@@ -55,3 +61,52 @@ def add_noise(poses: Array, rng: np.random.Generator, rad: float, meters: float)
     turns = Rotation.from_rotvec(rng.normal(0.0, rad, (len(poses), 3))).as_matrix()
     shifts = rng.normal(0.0, meters, (len(poses), 3))
     return se3(poses[:, :3, :3] @ turns, poses[:, :3, 3] + shifts)
+
+
+BOARD = "charuco:7x5:24mm:18mm"
+LENS = Pinhole.from_fov(320, 240, 65.0)
+
+
+@lru_cache(maxsize=1)
+def taken(count: int = 12) -> tuple[list[np.ndarray], np.ndarray]:
+    """Gray pictures, and the flange's true poses (N, 4, 4)."""
+    flanges = random_flanges(count, np.random.default_rng(3))
+    board = parse_target(BOARD)
+    return [photo(board, LENS, camera_in_target(h)) for h in flanges], flanges
+
+
+def noisy_samples(
+    count: int, rng: np.random.Generator, rad: float = ARM_RAD, meters: float = ARM_M, setup: str = EYE_IN_HAND
+) -> Samples:
+    """Samples with arm noise. For eye-to-hand, flange and base change places: X is the same (4, 4), then the
+    camera in the base."""
+    flanges = random_flanges(count, rng)
+    targets = observed_targets(flanges)
+    if setup != EYE_IN_HAND:
+        flanges = se3_inverse(flanges)
+    return Samples(add_noise(flanges, rng, rad, meters), targets, setup)
+
+
+@lru_cache(maxsize=4)
+def _fine_rays(lens: Pinhole) -> NDArray[np.float32]:
+    return lens.scaled(2.0).rays().astype(np.float32)
+
+
+def photo(target: Target, lens: Pinhole, camera_in_target: Array, noise: float = 0.0, seed: int = 0) -> GrayImage:
+    """Gray picture (H, W) of the target on a white plate, on gray: where each pixel's ray meets its plane. Blank from
+    behind, or along it."""
+    if camera_in_target[2, 2] < 0.2:
+        return np.full((lens.height, lens.width), 110, np.uint8)
+    drawn = np.pad(target.draw(960 // target.modules * target.modules), 60, constant_values=255)
+    pixel_m = target.size_m[0] / (drawn.shape[1] - 120)
+    eye, rays = camera_in_target[:3, 3], _fine_rays(lens) @ camera_in_target[:3, :3].T.astype(np.float32)
+    meets_m = eye[:2] - eye[2] / rays[..., 2:] * rays[..., :2]
+    at = (meets_m / pixel_m + 59.5).astype(np.float32)
+    image = cv2.remap(drawn, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110)
+    image = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA).astype(np.float64)
+    return np.clip(image + np.random.default_rng(seed).normal(0, noise, image.shape), 0, 255).astype(np.uint8)
+
+
+def camera_in_target(flange: Array) -> Array:
+    """(4, 4) of a flange in base."""
+    return np.asarray(se3_inverse(TARGET_IN_BASE) @ flange @ CAMERA_IN_FLANGE)

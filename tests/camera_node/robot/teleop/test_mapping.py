@@ -1,3 +1,5 @@
+"""From a stylus to a target of the flange, and from there to speeds of the joints."""
+
 from __future__ import annotations
 
 import msgspec
@@ -8,7 +10,8 @@ from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.teleop.mapping import Mapping, OneEuro
 from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.stylus import StylusSample
-from freshfield.geometry import so3_exp
+from camera_node.robot.teleop.teleoperator import commanded_twist, joint_speeds
+from freshfield.geometry import se3, so3_exp
 from tests.camera_node.robot.teleop.checks import HOME, sample
 
 FLANGE = UR3E.forward(HOME)
@@ -30,22 +33,15 @@ def pressed(**changed) -> Mapping:
     return mapping
 
 
-def test_the_scaled_map():
+@pytest.mark.parametrize("follows", [True, False])
+def test_the_scaled_map_and_an_orientation_that_follows_or_not(follows):
     """(4.1), with axes turned by 90 degrees."""
-    mapping = pressed(scale=(2.0, 1.0, 0.5), yaw_deg=90.0)
+    mapping = pressed(scale=(2.0, 1.0, 0.5), yaw_deg=90.0, orientation=follows)
     settle(mapping, (0.3, 0.1, 0.2), 1)
-    target = settle(mapping, (0.33, 0.11, 0.16), 100)
+    target = settle(mapping, (0.33, 0.11, 0.16), 100, (np.cos(0.1), np.sin(0.1), 0.0, 0.0))
     expected = FLANGE[:3, 3] + np.array([2.0 * -0.01, 1.0 * 0.03, 0.5 * -0.04])
     assert target[:3, 3] == pytest.approx(expected, abs=1e-6)
-    assert np.allclose(target[:3, :3], FLANGE[:3, :3])
-
-
-@pytest.mark.parametrize("follows", [True, False])
-def test_orientation_follows_about_the_bases_axes_or_not_at_all(follows):
-    mapping = pressed(orientation=follows)
-    settle(mapping, (0.3, 0.1, 0.2), 1)
-    target = settle(mapping, (0.3, 0.1, 0.2), 100, (np.cos(0.1), 0.0, 0.0, np.sin(0.1)))
-    turned = so3_exp([0.0, 0.0, 0.2]) if follows else np.eye(3)
+    turned = so3_exp([0.0, 0.2, 0.0]) if follows else np.eye(3)
     assert np.allclose(target[:3, :3], turned @ FLANGE[:3, :3], atol=1e-6)
 
 
@@ -76,21 +72,16 @@ def test_silence_lets_go_and_asks_for_a_new_press_on_any_clock():
 
 
 @pytest.mark.parametrize(
-    "bad",
-    [
-        StylusSample(5, (np.nan, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), True),
-        StylusSample(5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), True),
-        StylusSample(5, (0.0, 0.0, 10.1), (1.0, 0.0, 0.0, 0.0), True),
-        StylusSample(-5, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), True),
-        StylusSample(2**63, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), True),
-    ],
+    "change", [{"p": (np.nan, 0.0, 0.0)}, {"p": (0.0, 0.0, 10.1)}, {"q": (0.0, 0.0, 0.0, 0.0)}, {"t": -5}, {"t": 2**63}]
 )
-def test_what_is_no_pose_and_what_is_old_is_counted_and_changes_nothing(bad):
+def test_what_is_no_pose_and_what_is_old_is_counted_and_changes_nothing(change):
     assert StylusSample(2**63 - 1, (0.0, 0.0, -10.0), (1.9, 0.0, 0.0, 0.0), True).is_valid()
     mapping = pressed()
     mapping.add_sample(sample(2, (0.3, 0.1, 0.2)), FLANGE)
     before = mapping.target.copy()
-    assert not mapping.add_sample(bad, FLANGE) and mapping.counts.unsound == 1
+    bad = {"t": 5, "p": (0.0, 0.0, 0.0), "q": (1.0, 0.0, 0.0, 0.0), **change}
+    assert not mapping.add_sample(StylusSample(bad["t"], bad["p"], bad["q"], True), FLANGE)
+    assert mapping.counts.unsound == 1
     assert not mapping.add_sample(sample(2), FLANGE) and not mapping.add_sample(sample(1), FLANGE)
     assert mapping.counts.backwards == 2 and np.array_equal(mapping.target, before)
 
@@ -115,3 +106,36 @@ def test_the_filter_follows_each_part_by_its_own_speed(axis):
     position, quaternion = filtered(0.02 * axis, turned(0.7), 0.01)  # 2 m/s, 20 rad/s
     assert position == pytest.approx(0.02 * share(2.0 + 3.0 * share(2.0) * 2.0) * axis)
     assert quaternion == pytest.approx(turned(0.5 + 0.2 * share(2.0 + 3.0 * share(2.0) * 20.0)))
+
+
+CONFIG = TeleopConfig(gain_per_s=4.0, speed_m_s=0.2, speed_rad_s=6.0, acceleration_rad_s2=40.0)
+
+
+def moved(q, shift, turn=(0.0, 0.0, 0.0)):
+    """The flange's pose at ``q``, shifted and turned in the base's axes."""
+    flange = UR3E.forward(q)
+    return se3(so3_exp(turn) @ flange[:3, :3], flange[:3, 3] + shift)
+
+
+def test_the_twist_is_in_proportion_to_the_distance_up_to_its_limit():
+    near = commanded_twist(UR3E, CONFIG, HOME, moved(HOME, [0.01, 0.0, -0.02], [0.0, 0.03, 0.0]))
+    np.testing.assert_allclose(near, [0.04, 0.0, -0.08, 0.0, 0.12, 0.0], atol=1e-9)
+    far = commanded_twist(UR3E, CONFIG, HOME, moved(HOME, [0.3, 0.0, 0.4], [0.0, 0.5, 0.0]))
+    np.testing.assert_allclose(far, [0.12, 0.0, 0.16, 0.0, 0.2, 0.0], atol=1e-9)  # all of it, to a tenth
+    assert not commanded_twist(UR3E, CONFIG, HOME, UR3E.forward(HOME)).any()
+
+
+@pytest.mark.parametrize("wrist", [np.pi / 2, 0.2, 0.05, 0.0])
+def test_speeds_follow_the_twist_exactly_but_near_a_singularity(wrist):
+    q = HOME.copy()
+    q[4] = wrist
+    target = moved(q, [0.01, 0.0, -0.02], [0.0, 0.03, 0.01])
+    twist, jacobian = commanded_twist(UR3E, CONFIG, q, target), UR3E.jacobian(q)
+    least = np.linalg.svd(jacobian)[1][-1]
+    damping = 0.05 * (1.0 - (least / 0.08) ** 2) if least < 0.08 else 0.0
+    expected = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping**2 * np.eye(6), twist)
+    found = joint_speeds(UR3E, CONFIG, q, target)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert (damping > 0.0) == (wrist < 0.3) and np.abs(found).max() < 2.0
+    slow = TeleopConfig(gain_per_s=4.0, speed_m_s=0.2, speed_rad_s=0.01, acceleration_rad_s2=2.0)
+    np.testing.assert_allclose(joint_speeds(UR3E, slow, q, target), found * 0.01 / np.abs(found).max())

@@ -11,15 +11,14 @@ import pytest
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, calibrate
-from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, robust_start, solve
+from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, solve
 from camera_node.robot.calibration.hand_eye.refinement import flange_residuals, refine
 from camera_node.robot.calibration.hand_eye.samples import Samples, angle_deg, distance_mm, diversity
 from camera_node.robot.calibration.inputs import read_visp_folder
-from camera_node.robot.calibration.pose_pairs import read_pairs
 from camera_node.robot.calibration.targets import parse_target
 from freshfield.geometry import se3, se3_inverse, so3_exp
 from tests.camera_node.robot.calibration import known_truth
-from tests.camera_node.robot.calibration.rendered import noisy_samples
+from tests.camera_node.robot.calibration.known_truth import noisy_samples
 from tests.conftest import data_dir
 
 X, Y = known_truth.CAMERA_IN_FLANGE, known_truth.TARGET_IN_BASE
@@ -29,7 +28,9 @@ SETUPS = (EYE_IN_HAND, EYE_TO_HAND)
 @pytest.mark.parametrize("setup", SETUPS)
 def test_every_method_is_exact_on_exact_samples(setup):
     exact = noisy_samples(12, np.random.default_rng(1), 0.0, 0.0, setup)
-    found = calibrate(exact)
+    with warnings.catch_warnings():  # nothing overflows or divides by zero
+        warnings.simplefilter("error")
+        found = calibrate(exact)
     for name in ALL_METHODS:
         np.testing.assert_allclose(found.results[name], X, atol=1e-8 if name == "refined" else 2e-6)
     np.testing.assert_allclose(found.refined.y, Y, atol=1e-8)
@@ -47,18 +48,6 @@ def test_residuals_have_units():
     assert off.rms[0] == pytest.approx(1.5)
     # A rotation counts as the motion of a point at 330 mm.
     assert Residuals(np.array([2.0]), np.array([np.degrees(0.01)])).score_mm == pytest.approx(2.0 + 3.3)
-
-
-def test_errors_that_cost_millimeters_decide_about_a_start_rather_than_tenths_of_a_degree():
-    """Most samples are turned by a quarter of a degree (1.4 mm at 330 mm); the others are put 8 mm aside."""
-    rng = np.random.default_rng(3)
-    exact = noisy_samples(15, rng, 0.0, 0.0)
-    turned = [so3_exp(rng.normal(0.0, 0.0025, 3)) for _ in range(15)]
-    targets = exact.target @ se3(np.array(turned), np.zeros(3))
-    targets[:7] = exact.target[:7]
-    targets[:7, :3, 3] += rng.normal(0.0, 0.008, (7, 3))
-    x, y = robust_start(Samples(exact.flange, targets))
-    assert distance_mm(x, X) < 2.5 and distance_mm(y, Y) < 2.5
 
 
 @pytest.mark.parametrize(
@@ -85,40 +74,29 @@ def test_the_flanges_residual_is_the_motion_from_the_reported_to_the_predicted_p
     np.testing.assert_allclose(found, [[0.01, -0.02, 0.03, 0.001, 0.002, -0.003]] * 4, atol=1e-9)
 
 
-@pytest.mark.parametrize(("trials", "excess"), [(24, 1.25), pytest.param(300, 1.10, marks=pytest.mark.slow)])
-def test_with_noise_on_the_arm_the_refinement_is_as_exact_as_can_be_and_says_so(trials, excess):
+def test_with_noise_on_the_arm_the_refinement_is_as_exact_as_can_be_and_says_so():
     """15 poses, arm noise .5 mm and .002 rad an axis. The Cramer-Rao bound is .0768 degrees, .410 mm."""
-    found, said, noise, tsai = [], [], [], []
-    for trial in range(trials):
-        samples = noisy_samples(15, np.random.default_rng([7, trial]))
-        refined = refine(samples)
-        found.append((angle_deg(refined.x, X), distance_mm(refined.x, X)))
-        said.append((refined.std_deg, refined.std_mm))
-        noise.append((refined.arm_noise_rad, refined.arm_noise_m))
-        by_tsai = solve(samples, "tsai")
-        tsai.append((angle_deg(by_tsai, X), distance_mm(by_tsai, X)))
-    rms, rms_said, rms_tsai = (np.sqrt(np.mean(np.square(v), axis=0)) for v in (found, said, tsai))
-    assert np.all(rms < excess * np.array([0.0768, 0.410])) and np.all(rms > 0.75 * np.array([0.0768, 0.410]))
-    np.testing.assert_allclose(rms, rms_said, rtol=0.35 if trials < 300 else 0.2)
+    refined = [refine(noisy_samples(15, np.random.default_rng([7, trial]))) for trial in range(24)]
+    off = [(angle_deg(each.x, X), distance_mm(each.x, X)) for each in refined]
+    said = [(each.std_deg, each.std_mm) for each in refined]
+    rms, rms_said = (np.sqrt(np.mean(np.square(v), axis=0)) for v in (off, said))
+    bound = np.array([0.0768, 0.410])
+    assert np.all(rms < 1.25 * bound) and np.all(rms > 0.75 * bound)
+    np.testing.assert_allclose(rms, rms_said, rtol=0.35)
+    noise = [(each.arm_noise_rad, each.arm_noise_m) for each in refined]
     np.testing.assert_allclose(np.mean(noise, axis=0), [0.002, 0.0005], rtol=0.1)
-    assert trials < 300 or np.all(rms < rms_tsai)
 
 
-@pytest.mark.parametrize("setup", SETUPS)
-def test_a_few_wrong_samples_are_found_and_hardly_count(setup):
-    good = noisy_samples(20, np.random.default_rng(5), setup=setup)
+def test_a_few_wrong_samples_are_found_and_hardly_count():
+    good = noisy_samples(20, np.random.default_rng(5))
     bad = good.target.copy()
     bad[[3, 11, 17]] = known_truth.add_noise(bad[[3, 11, 17]], np.random.default_rng(6), 0.3, 0.08)
-    found = calibrate(Samples(good.flange, bad, setup))
+    found = calibrate(Samples(good.flange, bad))
     assert found.refined.outliers == [3, 11, 17]
     assert distance_mm(found.transform, X) < 1.0 < distance_mm(found.results["park"], X)
     assert sum("does not fit the others" in w for w in found.warnings) == 3
-    np.testing.assert_array_equal(calibrate(Samples(good.flange, bad, setup)).transform, found.transform)
-
-
-def test_poses_that_fit_badly_are_warned_about():
-    bad = noisy_samples(12, np.random.default_rng(5), 0.1, 0.02)
-    assert any("residuals are large" in warning for warning in calibrate(bad).warnings)
+    noisy = noisy_samples(12, np.random.default_rng(5), 0.1, 0.02)
+    assert any("residuals are large" in warning for warning in calibrate(noisy).warnings)
 
 
 @pytest.mark.parametrize(
@@ -135,14 +113,6 @@ def test_a_board_of_another_size_than_said_is_told_and_its_size_found(setup, fac
     assert refine(said, with_scale=True).scale == pytest.approx(factor, abs=0.003)
     right = said.rescaled(factor)
     assert calibrate(right, fit_size=True).warnings == calibrate(right).warnings == ()
-
-
-@pytest.mark.parametrize(("file", "percent"), [("pairs-5.json", 5), ("pairs-20.json", 20)])
-def test_real_pairs_with_a_board_of_another_size(file, percent):
-    said = read_pairs(data_dir("../cases/17-board-size-wrong") / file, EYE_IN_HAND)
-    found = calibrate(said, fit_size=True)
-    assert refine(said, with_scale=True).scale == pytest.approx(1 + percent / 100, abs=0.005)
-    assert "too large" in found.warnings[0] and np.linalg.norm(found.transform[:3, 3] - [0.03, -0.06, 0.09]) < 0.0035
 
 
 @pytest.mark.parametrize(
@@ -169,10 +139,7 @@ def test_a_real_arm_whose_calibration_was_published():
     assert list(found.results) == [*METHODS, "refined"]
 
 
-X = known_truth.CAMERA_IN_FLANGE
-
-
-def of_turns(turns, setup=EYE_IN_HAND, noise=(0.002, 0.0005)) -> Samples:
+def of_turns(turns, noise=(0.002, 0.0005)) -> Samples:
     """Samples of a flange turned by rotation vectors (N, 3) from where it began, somewhere else each time."""
     rng = np.random.default_rng(0)
     flanges = np.array([known_truth.random_flanges(1, rng)[0]] * len(turns)).reshape(-1, 4, 4)
@@ -180,51 +147,36 @@ def of_turns(turns, setup=EYE_IN_HAND, noise=(0.002, 0.0005)) -> Samples:
         flange[:3, :3] = flange[:3, :3] @ so3_exp(turn)
         flange[:3, 3] += rng.normal(0, 0.05, 3)
     targets = known_truth.observed_targets(flanges)
-    if setup == EYE_TO_HAND:
-        flanges = se3_inverse(flanges)
-    return Samples(known_truth.add_noise(flanges, rng, *noise) if turns else flanges, targets, setup)
-
-
-DEGENERATE = {
-    "parallel axes": ([[0, 0, 0.3 * k] for k in range(8)], "parallel axes"),
-    "nearly parallel axes": ([[0.02 * (-1) ** k, 0.01 * k, 0.3 * k] for k in range(8)], "parallel axes"),
-    "no turn at all": ([[0, 0, 0]] * 8, "hardly turned"),
-    "turns of two degrees": ([np.eye(3)[k % 3] * 0.035 * (k // 3) for k in range(6)], "hardly turned"),
-    "half turns": ([[0, 0, 0], [np.pi, 0, 0], [0, np.pi, 0], [0, 0, np.pi]], "near 180 degrees"),
-    "two poses": ([[0, 0, 0], [0.5, 0.5, 0]], "too few poses: 2"),
-    "none": ([], "too few poses: 0"),
-}
+    return Samples(known_truth.add_noise(flanges, rng, *noise) if turns else flanges, targets)
 
 
 @pytest.mark.stability
-@pytest.mark.parametrize("setup", SETUPS)
-@pytest.mark.parametrize("case", DEGENERATE)
-def test_degenerate_motions_are_refused_with_the_reason(case, setup):
-    turns, reason = DEGENERATE[case]
+@pytest.mark.parametrize(
+    ("turns", "reason"),
+    [
+        ([[0.02 * (-1) ** k, 0.01 * k, 0.3 * k] for k in range(8)], "parallel axes"),
+        ([np.eye(3)[k % 3] * 0.035 * (k // 3) for k in range(6)], "hardly turned"),
+        ([[0, 0, 0], [np.pi, 0, 0], [0, np.pi, 0], [0, 0, np.pi]], "near 180 degrees"),
+        ([[0, 0, 0], [0.5, 0.5, 0]], "too few poses: 2"),
+        ([], "too few poses: 0"),
+    ],
+)
+def test_degenerate_motions_are_refused_with_the_reason(turns, reason):
     with pytest.raises(CalibrationError, match=reason):
-        calibrate(of_turns(turns, setup))
+        calibrate(of_turns(turns))
 
 
 @pytest.mark.stability
-@pytest.mark.parametrize("setup", SETUPS)
-def test_the_least_that_determines_something_does(setup):
+def test_the_least_that_determines_something_does():
     """Three poses, two turns about axes at right angles."""
-    found = refine(of_turns([[0, 0, 0], [0.9, 0, 0], [0, 0.9, 0]], setup, (1e-6, 1e-7)))
+    found = refine(of_turns([[0, 0, 0], [0.9, 0, 0], [0, 0.9, 0]], (1e-6, 1e-7)))
     assert distance_mm(found.x, X) < 0.05 and np.isfinite(found.std_mm)
 
 
 @pytest.mark.stability
 def test_motions_that_turn_by_nearly_half_a_turn_among_others_do_no_harm():
-    turns = [
-        [0, 0, 0],
-        [np.pi - 0.01, 0, 0],
-        [0, np.pi, 0],
-        [0.6, 0, 0.2],
-        [0, 0.7, 0],
-        [0.3, -0.4, 0.5],
-        [-0.5, 0.2, 0],
-    ]
-    found = calibrate(of_turns([*turns, [0.1, 0.2, -0.8]]))
+    turns = [[0, 0, 0], [np.pi - 0.01, 0, 0], [0, np.pi, 0], [0.6, 0, 0.2], [0, 0.7, 0]]
+    found = calibrate(of_turns([*turns, [0.3, -0.4, 0.5], [-0.5, 0.2, 0], [0.1, 0.2, -0.8]]))
     assert distance_mm(found.transform, X) < 4 * found.refined.std_mm + 0.5
     assert any("nearly 180 degrees" in w for w in found.warnings)
 
@@ -246,17 +198,3 @@ def test_numbers_that_are_none_are_refused():
         samples.flange[3, 0, 3] = value
         with pytest.raises(CalibrationError, match="finite"):
             Samples(samples.flange, samples.target)
-
-
-@pytest.mark.stability
-def test_the_same_pose_again_and_again_changes_nothing_but_the_weight():
-    found = refine(noisy_samples(10, np.random.default_rng(3)).take([*range(10), *[4] * 30]))
-    assert np.isfinite(found.std_mm) and distance_mm(found.x, X) < 3.0
-
-
-@pytest.mark.stability
-def test_nothing_overflows_or_divides_by_zero_on_exact_data():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        found = calibrate(noisy_samples(12, np.random.default_rng(4), 0.0, 0.0))
-    assert distance_mm(found.transform, X) < 1e-6
