@@ -69,13 +69,17 @@ UNASKED = {
         *("rtde", "depthai"),
     ),
     TILE: (
-        *("camera_node.synthetic.scenes.room", "camera_node.synthetic.person", "torch", "numba"),
+        *("camera_node.synthetic.effects.", "camera_node.synthetic.depth", "camera_node.synthetic.scenes.room"),
+        *("camera_node.synthetic.person", "torch", "numba"),
         *("edge_server", "channel_emu", "scipy", "matplotlib"),
     ),
     FEW_CAMERAS: ("edge_server.fields.splat.layers.depth.network_depth", "edge_server.embed", "onnx"),
     WARM_UP: ("grpc", "zstandard", "google", "torch"),  # ``make`` compiles while it installs them
     LIBRARY: ("numpy", "grpc", "edge_server", "camera_node", "channel_emu", "freshfield_up"),
-    CHANNEL: ("torch", "numba", "camera_node", "edge_server", "channel_emu.live", "freshfield_up"),
+    CHANNEL: (
+        *("channel_emu.model.faults.", "channel_emu.live", "torch", "numba", "camera_node", "edge_server"),
+        "freshfield_up",
+    ),
     EMULATOR: ("torch", "numba", "cv2", "scipy", "matplotlib", "camera_node", "edge_server"),
 }
 
