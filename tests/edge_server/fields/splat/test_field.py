@@ -63,17 +63,6 @@ def test_damage_is_healed(array: str, column: int, value: float) -> None:
 
 
 @pytest.mark.stability
-@pytest.mark.parametrize("raw", [-30.0, 30.0])
-def test_everything_faded_or_opaque(raw: float) -> None:
-    field = StillField(TINY)
-    field.fit(TINY_VIEWS, Budget(steps=40))
-    field.cloud.params[:, OPACITY] = raw
-    field.fit(TINY_VIEWS, Budget(steps=200))
-    healthy(field, TINY_VIEWS)
-    assert mean_psnr(field, TINY_VIEWS) > 16.0
-
-
-@pytest.mark.stability
 @pytest.mark.slow
 def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """A whole fit and rendering with numba's bounds checks, in a process of its own."""

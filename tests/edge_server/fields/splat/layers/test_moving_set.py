@@ -12,6 +12,7 @@ from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.splat.densification import GaussianCloud
 from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE
+from edge_server.fields.splat.layers import moving_set
 from edge_server.fields.splat.layers.depth.body_depth import measured_frames
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate
 from edge_server.fields.splat.layers.moving_set import MovingSet
@@ -102,10 +103,13 @@ def test_a_set_that_has_lost_most_of_its_gaussians_forgets_its_motion(outside: i
     assert (moving.motion.anchors is None) == (left == 0)
 
 
-def test_new_gaussians_lie_where_the_foreground_is_while_the_anchors_are_displaced() -> None:
+def test_new_gaussians_lie_where_the_foreground_is_while_the_anchors_are_displaced(monkeypatch) -> None:
+    """Which they are follows from the seed, the number of the draw, what is drawn, and a number of the moving set's."""
     cameras, frames = zip(*map(_seen_from, range(7)))
-    moving = _displaced_set(20)
+    moving, real, drawn = _displaced_set(20), moving_set.seed_gaussians, []
+    monkeypatch.setattr(moving_set, "seed_gaussians", lambda *a: drawn.append(a[7].bit_generator.state) or real(*a))
     moving.seed_missing(list(frames), {c.view.camera: c for c in cameras})
+    assert drawn == [np.random.default_rng([0, 2, 2, 6]).bit_generator.state]
     away_m = np.linalg.norm(_new_m(moving, 20) - BALL_M, axis=1)
     assert len(away_m) > 50
     assert np.median(np.abs(away_m - RADIUS_M)) < 0.15 and (away_m < 1.5 * RADIUS_M).mean() > 0.9

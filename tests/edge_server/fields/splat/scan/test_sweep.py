@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common.threads.thread_pool import CallerPool, shared_pool
+from edge_server.fields.common.threads.thread_pool import shared_pool
 from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.sweep import neighbors, sweep_depth
 from freshfield.geometry import Pinhole, look_at, so3_exp, world_rays
@@ -47,12 +47,6 @@ def test_it_finds_the_depth_whatever_the_exposures(gain: float) -> None:
     there = (depth > 0) & np.isfinite(truth)
     error = np.abs(np.log(depth[there] / truth[there]))
     assert there.sum() > 0.6 * np.isfinite(truth).sum() and np.median(error) < 0.03 and (error < 0.1).mean() > 0.8
-
-
-def test_it_does_not_depend_on_the_number_of_threads() -> None:
-    (view, *others), _ = _arc()
-    one, two = (sweep_depth(view, others, DISTANCE_M, pool) for pool in (CallerPool(), shared_pool(2)))
-    np.testing.assert_array_equal(one, two)
 
 
 def test_neighbors_see_the_same_from_elsewhere_and_the_best_come_first() -> None:
