@@ -133,7 +133,7 @@ CASES = {
         below_easy_db=0.2,
         over=DARK.stop,
     ),
-    "ten kilometers away": Case(0.9, told=_in_world(1.0, 1e4), below_easy_db=0.5),
+    "ten kilometers away": Case(1.5, told=_in_world(1.0, 1e4), below_easy_db=0.5),
     "a third as large": Case(0.9, told=_in_world(1.0 / 3.0, 0.0), below_easy_db=1.5),
     "twice as large": Case(0.9, told=_in_world(2.0, 0.0), below_easy_db=0.7),
 }
