@@ -5,7 +5,7 @@ The tests compare the kernels and their gradients with this, in float64.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,10 +20,9 @@ ALPHA_MIN, ALPHA_MAX, STOP = 1.0 / 255.0, 0.99, 1e-4
 RAW_OPACITY, SCALE_LOW, SCALE_HIGH = 9.0, -12.0, 4.0
 
 
-@dataclass(frozen=True)
-class Flat:
-    """Projected Gaussians: mean (N, 2) in pixels, covariance (N, 2, 2), alpha (N,), color (N, 3), depth
-    (N,), seen (N,): in front of the near plane."""
+class Flat(NamedTuple):
+    """Projected Gaussians: mean (N, 2) in pixels, covariance (N, 2, 2), alpha (N,), color (N, 3), depth (N,), seen
+    (N,): in front of the near plane."""
 
     mean: Tensor
     covariance: Tensor
@@ -39,17 +38,11 @@ def rotations(quaternion: Tensor) -> Tensor:
     none = norm < 1e-10
     unit = torch.where(none, torch.tensor([1.0, 0, 0, 0]).to(quaternion), quaternion / norm.clamp(min=1e-10))
     w, x, y, z = unit.unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    first = [1 - 2 * (yy + zz), 2 * (xy - w * z), 2 * (xz + w * y)]
+    second = [2 * (xy + w * z), 1 - 2 * (xx + zz), 2 * (yz - w * x)]
+    third = [2 * (xz - w * y), 2 * (yz + w * x), 1 - 2 * (xx + yy)]
+    rows = [*first, *second, *third]
     return torch.stack(rows, dim=-1).view(-1, 3, 3)
 
 

@@ -1,15 +1,19 @@
-"""Random Gaussians in a small box, and what cameras see of them, for the tests of the kernels."""
+"""Random Gaussians in a small box, what cameras see of them, and a step, for the tests of the kernels."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.buffers import RasterBuffers
+from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, Gaussians
+from edge_server.fields.splat.kernels.rasterize import Targets
 
 BOX = SceneBox((0.0, 0.0, 0.0), 1.0, 0.05, False, 3.0, 0.05)
+BACK = np.array([0.2, 0.5, 0.9], np.float32)
 
 
 def random_params(count: int = 12, sh_degree: int = 0, seed: int = 0) -> np.ndarray:
@@ -33,3 +37,25 @@ def binned(cams: np.ndarray, params: np.ndarray, differentiate: bool = True, poo
     raster = RasterBuffers(pool or CallerPool())
     raster.project_and_bin(cams, as_gaussians(params), differentiate)
     return raster
+
+
+def targets_of(image: NDArray[np.uint8], weight: NDArray[np.float32] | None = None, *rest: object) -> Targets:
+    """One image (H, W, C) as target. rest: what is behind it, the background, exposures, share of dissimilarity."""
+    h, w = image.shape[:2]
+    behind, back, *exposed = rest or (np.zeros((0, 3), np.float32), BACK)
+    weights = np.zeros(0, np.float32) if weight is None else weight.reshape(-1)
+    return Targets(np.array([0, h * w]), np.array([[w, h]]), image.reshape(h * w, -1), weights, behind, back, *exposed)
+
+
+def stepped(
+    cams: np.ndarray, params: np.ndarray, targets: Targets, pool: Pool | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Losses, their gradient by the parameters, and force and torque; the parameters stay."""
+    raster, n = binned(cams, params, pool=pool), len(params)
+    losses, rigid = raster.train(targets, 0), np.full(6, np.nan)
+    flat = [np.zeros(n, np.float32) for _ in range(3)]
+    moments = OptimizerState(np.zeros_like(params), np.zeros_like(params), np.zeros(n, np.int32), *flat)
+    rule = AdamParameters(np.zeros(params.shape[1], np.float32), np.ones((4, 3), np.float32), np.float32(1e-8))
+    assert losses[:, 1].sum() == 0
+    assert raster.step(cams, as_gaussians(params.copy()), moments, rule, rigid) == 0
+    return losses, 10.0 * moments.m, rigid  # Adam's first moment, after one step from 0

@@ -57,7 +57,7 @@ def _costs(images: NDArray[np.float32], pool: Pool) -> NDArray[np.uint8]:
     return cost
 
 
-@pytest.mark.parametrize("count", [2, 3, 4])
+@pytest.mark.parametrize("count", [2, 4])
 def test_costs_are_those_of_the_images_that_differ_least(images: NDArray[np.float32], count: int) -> None:
     found = _costs(images[:count], CallerPool())
     unseen_somewhere = False
@@ -74,6 +74,9 @@ def test_costs_are_those_of_the_images_that_differ_least(images: NDArray[np.floa
         # Each of nine differences is rounded down, and their mean; what lies on a border may fall to either side.
         assert (np.abs(found[..., d] + 1.0 - expected) <= 1.1).mean() > 0.99
     assert unseen_somewhere
+    pool = Pool(3)
+    np.testing.assert_array_equal(_costs(images[:count], pool), found)
+    pool.close()
 
 
 def _paths(cost: NDArray[np.uint8], gray: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -111,9 +114,3 @@ def test_the_depth_of_least_cost_lies_between_steps() -> None:
     np.testing.assert_allclose(found, least * INVERSE[1], atol=0.02 * INVERSE[1])
     CallerPool().run(choose_depths, np.full_like(total, 7), INVERSE, found)
     assert (found == 0.0).all()
-
-
-def test_threads_change_nothing(images: NDArray[np.float32]) -> None:
-    pool = Pool(3)
-    np.testing.assert_array_equal(_costs(images, pool), _costs(images, CallerPool()))
-    pool.close()

@@ -25,8 +25,14 @@ def _sky(turn: np.ndarray, lens: Pinhole = LENS) -> np.ndarray:
     return (127.5 + 120.0 * waves[..., :3]).astype(np.uint8)
 
 
-@pytest.mark.parametrize("degrees", [(0.0, 2.0, 0.0), (-0.8, 0.5, 1.0), (1.5, -2.5, 0.0)])
-@pytest.mark.parametrize("distortion", [(0.0,) * 4, (-0.15, 0.02, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    ("degrees", "distortion"),
+    [
+        ((0.0, 2.0, 0.0), (0.0,) * 4),
+        ((-0.8, 0.5, 1.0), (-0.15, 0.02, 0.0, 0.0)),
+        ((1.5, -2.5, 0.0), (-0.15, 0.02, 0.0, 0.0)),
+    ],
+)
 def test_a_turn_is_found_to_a_tenth_of_a_degree_beside_a_person(degrees, distortion):
     lens, turn = replace(LENS, distortion=distortion), so3_exp(np.deg2rad(degrees))
     frame = _sky(turn, lens)

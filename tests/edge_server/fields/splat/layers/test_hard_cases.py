@@ -1,13 +1,13 @@
 """The whole layered field in hard cases: nothing diverges, and half a second after the first fresh views what
 moves is shown as well as before.
 
-Six cameras see balls that go about on a table.
+Six cameras see balls that go about on a table, or four that measure depth.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import Any
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
 from edge_server.fields.splat.layers.layered_field import LayeredField
-from edge_server.fields.splat.layers.motion import Motion
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import look_at, world_rays
 from tests.edge_server.fields.scenes import psnr, ring, seen
@@ -30,6 +29,7 @@ CAMERAS, HELD = ring(7, 64)[:6], ring(7, 64)[6]
 FRAME_S, STEPS, NETWORK_S = 1.0 / 15.0, 30, 0.05
 EVENT_S, SCORED_S = 4.0, 2.1  # after the first frame; how long before it is scored: a whole round
 RADIUS_M, AWAY = 0.3, (9.0, 9.0, 0.3)
+WITH_DEPTH = 4  # cameras
 BACK_S, BACK_DB, AFTER_S = 0.5, 1.0, 1.5
 
 Balls = tuple[tuple[float, float, float], ...]
@@ -71,6 +71,7 @@ class Case:
     balls: where they are. before: where they were. light: of the half of the table with x > 0.
     arrives: see ``_on_time``. sent: what a camera sends instead of the view that it took.
     fresh_s: instant of the first fresh views. spread: whether cameras fire one after the other.
+    measured: what a camera measures; None: cameras measure no depth.
     """
 
     balls: Callable[[float], Balls] = _walk
@@ -80,6 +81,7 @@ class Case:
     sent: Callable[[int, View, float], View] = _as_taken
     fresh_s: float = NETWORK_S
     spread: bool = True
+    measured: Callable[[Case, View, float], NDArray[np.float32]] | None = None
 
     def balls_at(self, t: float) -> Balls:
         return self.balls(t) if t >= 0 else self.before(t)
@@ -136,10 +138,12 @@ class Stage:
 
     def _capture(self, k: int, t: float) -> None:
         arrives_s = self.case.arrives(k, t) if t >= 0.0 else t + NETWORK_S
-        if arrives_s is not None:
-            view = replace(CAMERAS[k], generated_ns=round((t + EVENT_S) * 1e9))
-            view = replace(view, image=self.case.picture(view, t))
-            self.flying.append((arrives_s, k, self.case.sent(k, view, t) if t >= 0.0 else view))
+        if arrives_s is None or (self.case.measured is not None and k >= WITH_DEPTH):
+            return
+        view = replace(CAMERAS[k], image=self.case.picture(CAMERAS[k], t), generated_ns=round((t + EVENT_S) * 1e9))
+        if self.case.measured is not None:
+            view = replace(view, depth=(self.case.measured if t >= 0.0 else _true_depth)(self.case, view, t))
+        self.flying.append((arrives_s, k, self.case.sent(k, view, t) if t >= 0.0 else view))
 
     def _score(self, t: float) -> None:
         truth, body = self.case.picture(HELD, t), np.zeros(HELD.image.shape[:2], bool)
@@ -164,6 +168,42 @@ class Stage:
         other.field.load_state(self.field.state())
         other.shown = other.field.snapshot()
         return other
+
+
+def _depth_of(view: View, balls: Balls) -> NDArray[np.float32]:
+    """Along the optical axis, 0 for the sky."""
+    lens, pose = view.intrinsics, view.camera_to_world
+    away_m = np.min([seen(lens, pose, np.array(ball), RADIUS_M)[1] for ball in balls or (AWAY,)], axis=0)
+    return np.where(np.isfinite(away_m), away_m * lens.rays()[..., 2], 0.0).astype(np.float32)
+
+
+def _true_depth(case: Case, view: View, t: float) -> NDArray[np.float32]:
+    return _depth_of(view, case.balls_at(t))
+
+
+def _holes(case: Case, view: View, t: float) -> NDArray[np.float32]:
+    """Nothing is measured of what moves."""
+    depth = _depth_of(view, case.balls_at(t))
+    return np.where(depth == _depth_of(view, ()), depth, 0.0).astype(np.float32)
+
+
+def _lags(case: Case, view: View, t: float) -> NDArray[np.float32]:
+    return _depth_of(view, case.balls_at(t - 0.1))
+
+
+def _noise(case: Case, view: View, t: float) -> NDArray[np.float32]:
+    """Depth of nothing that is there, and some that is none."""
+    rng = np.random.default_rng(round(t * 1e6))
+    values = np.array([np.nan, np.inf, -1.0, 0.0, 1e-30, 0.5, 2.0, 1e30], np.float32)
+    return rng.choice(values, view.image.shape[:2])
+
+
+def _behind_a_wall(k: int, view: View, t: float) -> View:
+    """A wall before the first camera fills its image for a second."""
+    if k > 0 or t >= 1.0:
+        return view
+    shape = view.image.shape
+    return replace(view, image=np.full(shape, 90, np.uint8), depth=np.full(shape[:2], 0.4, np.float32))
 
 
 def _knocked(k: int, view: View, t: float) -> View:
@@ -211,74 +251,44 @@ CASES = {
     "a burst after a blackout": Case(arrives=lambda k, t: max(t, 1.0) + NETWORK_S, fresh_s=AGAIN_S),
     "singular": Case(sent=_without_weight, fresh_s=AGAIN_S),
     "equal times": Case(sent=_clocks_that_stick, fresh_s=0.2 + NETWORK_S),
+    "depth with holes on what moves": Case(measured=_holes),
+    "depth that lags by 100 ms": Case(measured=_lags),
+    "depth that is noise": Case(measured=_noise),
+    "a wall fills an image": Case(measured=_true_depth, sent=_behind_a_wall, fresh_s=AGAIN_S),
+    "one camera only, with depth": Case(measured=_true_depth, arrives=_one_camera, fresh_s=AGAIN_S),
 }
 
 
 @cache
-def _begun(before: Callable[[float], Balls], spread: bool) -> Stage:
+def _begun(before: Callable[[float], Balls], spread: bool, depth: bool) -> Stage:
     """As it is at the event."""
-    stage = Stage(Case(before=before, spread=spread))
+    stage = Stage(Case(before=before, spread=spread, measured=_true_depth if depth else None))
     stage.run(-SCORED_S, score=False)
     stage.run(0.0)
     return stage
 
 
 # What begins otherwise than the others: their beginnings are long. Then what a quick case is like.
-LONG = ("two cross", "one enters and leaves", "all views equally old", "a stop", "a burst after a blackout")
+LONG = (
+    "two cross",
+    "one enters and leaves",
+    "all views equally old",
+    "a stop",
+    "a burst after a blackout",
+    "a wall fills an image",
+    "one camera only, with depth",
+)
 
 
 @pytest.mark.parametrize("name", [pytest.param(c, marks=[pytest.mark.slow] * (c in LONG)) for c in CASES])
 def test_what_moves_is_shown_as_well_as_before_half_a_second_after(name: str) -> None:
     case = CASES[name]
-    stage = _begun(case.before, case.spread).going_on_as(case)
+    depth = case.measured is not None
+    stage = _begun(case.before, case.spread, depth).going_on_as(case)
     stage.run(case.fresh_s + BACK_S - FRAME_S, score=False)
-    stage.run(case.fresh_s + AFTER_S)
+    end_s = case.fresh_s + (BACK_S + SCORED_S if depth else AFTER_S)
+    stage.run(end_s)
     before_db, _ = stage.median_db(-SCORED_S, 0.0)
-    after_db, empty_db = stage.median_db(case.fresh_s + BACK_S, case.fresh_s + AFTER_S)
+    after_db, empty_db = stage.median_db(case.fresh_s + BACK_S, end_s)
     assert after_db > empty_db + 3.0
     assert after_db > before_db - BACK_DB
-
-
-def test_motion_is_solved_again_where_it_was_far_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Mostly once where all stands, twice where a ball goes around, and more often after a teleport."""
-    solve, passes = Motion.solve, list[int]()
-    monkeypatch.setattr(Motion, "solve", lambda self, rows: passes.append(1) or solve(self, rows))
-
-    def passes_a_frame(stage: Stage, until_s: float) -> float:
-        before, passes[:] = stage.frames, []
-        stage.run(until_s, score=False)
-        return len(passes) / (stage.frames - before)
-
-    stopped = _begun(_walk, True).going_on_as(CASES["a stop"])
-    stopped.run(0.8, score=False)
-    assert 1.0 <= passes_a_frame(stopped, 2.0) <= 1.4
-    around = _begun(_walk, True).going_on_as(Case())
-    assert 1.6 <= passes_a_frame(around, 0.8) <= 2.4
-    assert 2.4 < passes_a_frame(_begun(_walk, True).going_on_as(CASES["a teleport"]), 0.4) <= 3.0
-
-
-def _views(stage_s: float, cameras: Sequence[View], away: NDArray[np.float64]) -> list[View]:
-    """What ``cameras`` see of the walking ball, in a world that is shifted by ``away`` (4, 4)."""
-    views = []
-    for view in cameras:
-        ball = np.array(_walk(stage_s)[0] if stage_s > 1.0 else AWAY)
-        image = seen(view.intrinsics, view.camera_to_world, ball, RADIUS_M)[0]
-        pose, at_ns = away @ view.camera_to_world, round(stage_s * 1e9)
-        views.append(replace(view, image=image, camera_to_world=pose, generated_ns=at_ns))
-    return views
-
-
-def test_ten_kilometers_away_it_is_shown_as_here() -> None:
-    away = np.eye(4)
-    away[:3, 3] = 1e4, -1e4, 1e4
-    shown_db = []
-    for shift in (np.eye(4), away):
-        field, scores = LayeredField(SETTINGS), []
-        for frame in range(1, 46):
-            field.fit(_views(frame * FRAME_S, CAMERAS, shift), Budget(steps=STEPS // 2))
-            if frame > 30:
-                (truth,) = _views(frame * FRAME_S, [HELD], shift)
-                color = field.snapshot().render(truth.camera_to_world, HELD.intrinsics).color
-                scores.append(psnr(color, truth.image / 255.0))
-        shown_db.append(np.median(scores))
-    assert shown_db[0] > 18.0 and abs(shown_db[1] - shown_db[0]) < 0.5, shown_db

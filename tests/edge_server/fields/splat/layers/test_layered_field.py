@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import subprocess
 import sys
 import threading
@@ -15,9 +16,7 @@ import pytest
 from msgspec import structs
 
 from edge_server.fields import Budget, View
-from edge_server.fields.registry import make_field
 from edge_server.fields.splat.field import StillField
-from edge_server.fields.splat.layers import settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.layers.layered_state import VERSION
 from tests.edge_server.fields.small import same_state
@@ -33,11 +32,6 @@ from tests.edge_server.fields.splat.layers.ball import (
     score_of,
     seen_by,
 )
-
-
-def test_the_option_makes_it() -> None:
-    assert type(make_field("splat", {"layers": True, "threads": 1})) is LayeredField
-    assert type(make_field("splat", {"threads": 1})) is StillField
 
 
 def _turning() -> list[View]:
@@ -63,11 +57,12 @@ def test_it_is_the_still_field_at_first_and_where_a_camera_moves() -> None:
     np.testing.assert_array_equal(shown, expected)
 
 
-def test_one_camera_alone_begins_no_layers() -> None:
+def test_one_camera_alone_begins_no_layers_and_is_told_so_once(caplog: pytest.LogCaptureFixture) -> None:
     field = LayeredField(SMALL)
-    for frame in range(20):
-        field.fit([seen_by(0, frame, True)], Budget(steps=1))
-    assert field.layered and field.moving is None and not field.learning and field.part_s["static field"] > 0.0
+    with caplog.at_level(logging.WARNING):
+        for frame in range(20):
+            field.fit([seen_by(0, frame, True)], Budget(steps=1))
+    assert field.layered and field.tracker is None and not field.learning and caplog.text.count("tells no depth") == 1
     for frame in range(20, 30):
         field.fit([seen_by(k, frame, True) for k in range(2)], Budget(steps=1))
     assert field.moving is not None and field.learning.endswith("of 50 steps")  # little was shown before
@@ -97,18 +92,11 @@ def test_what_moves_is_shown_at_any_instant() -> None:
     np.testing.assert_array_equal(again.gaussians.params, now.gaussians.params)
 
 
-def test_a_snapshot_stays_as_it_is() -> None:
-    field = resumed_field()
-    shown = field.snapshot()
-    before = shown.render(HELD.camera_to_world, HELD.intrinsics).color
-    played(field, range(42, 45))
-    np.testing.assert_array_equal(shown.render(HELD.camera_to_world, HELD.intrinsics).color, before)
-    np.testing.assert_array_equal(shown.at(None).render(HELD.camera_to_world, HELD.intrinsics).color, before)
-
-
-def test_a_state_continues_bit_for_bit() -> None:
+def test_a_state_continues_bit_for_bit_and_a_snapshot_stays_as_it_is() -> None:
     field = resumed_field()
     same_state(field, moving_field())
+    shown = field.snapshot()
+    before = shown.render(HELD.camera_to_world, HELD.intrinsics).color
     played(field, range(42, 44))
     other = resumed_field(field.state())
     for one in (field, other):
@@ -116,23 +104,8 @@ def test_a_state_continues_bit_for_bit() -> None:
     same_state(field, other)
     one, two = (f.render(HELD.camera_to_world, HELD.intrinsics).color for f in (field, other))
     np.testing.assert_array_equal(one, two)
-
-
-def test_a_state_of_a_field_that_is_not_shown_yet_continues_bit_for_bit() -> None:
-    """What it shows meanwhile, too."""
-    field = LayeredField(SMALL)
-    played(field, range(17), steps=5)
-    assert field.supervision.earlier is not None and not field.supervision.layers_shown
-    other = resumed_field(known_plates(5))
-    for frame in range(17, 45):
-        for one in (field, other):
-            played(one, range(frame, frame + 1), steps=5)
-        one, two = (f.render(HELD.camera_to_world, HELD.intrinsics).color for f in (field, other))
-        np.testing.assert_array_equal(one, two)
-    assert field.supervision.layers_shown
-    same_state(field, other)
-    with pytest.raises(ValueError, match="what was shown before layers are"):
-        field.load_state({**known_plates(5), "earlier": np.zeros((5, 3), np.float32)})
+    for still in (shown, shown.at(None)):
+        np.testing.assert_array_equal(still.render(HELD.camera_to_world, HELD.intrinsics).color, before)
 
 
 def test_it_tells_how_much_moves_before_each_camera_in_its_newest_frame() -> None:
@@ -145,9 +118,8 @@ def test_it_tells_how_much_moves_before_each_camera_in_its_newest_frame() -> Non
 
 
 def test_the_order_and_the_threads_change_nothing() -> None:
-    one, two = LayeredField(SMALL), LayeredField(structs.replace(SMALL, threads=1))
-    for field in (one, two):
-        field.load_state(moving_field().state())
+    one, two = resumed_field(), LayeredField(structs.replace(SMALL, threads=1))
+    two.load_state(moving_field().state())
     views = [seen_by(k, frame, True) for frame in (42, 43) for k in range(len(CAMERAS))]
     one.fit(views, Budget(steps=5))
     two.fit(views[::-1], Budget(steps=5))
@@ -156,27 +128,18 @@ def test_the_order_and_the_threads_change_nothing() -> None:
     same_state(one, two)
 
 
-def test_a_refused_state_changes_nothing() -> None:
-    field = LayeredField(SMALL)
-    played(field, range(2))
-    before = field.state()
+def test_a_refused_state_changes_nothing_and_reset_forgets() -> None:
+    field, state = resumed_field(), moving_field().state()
+    old = str(state["meta"]).replace(f'"version": {VERSION}', '"version": 1')
     for wrong in (
         StillField(SMALL).state(),
-        {k: v for k, v in moving_field().state().items() if k != "moving.anchor"},
-        {k: v * np.nan if k == "moving.share" else v for k, v in moving_field().state().items()},
-        {
-            k: np.array(str(v).replace(f'"version": {VERSION}', '"version": 1')) if k == "meta" else v
-            for k, v in moving_field().state().items()
-        },
+        {k: v for k, v in state.items() if k != "moving.anchor"},
+        {**state, "moving.share": state["moving.share"] * np.nan},
+        {**state, "meta": np.array(old)},
     ):
         with pytest.raises(ValueError):
             field.load_state(wrong)
-    after = field.state()
-    assert all(np.array_equal(after[name], array) for name, array in before.items())
-
-
-def test_reset_forgets() -> None:
-    field = resumed_field()
+    same_state(field, moving_field())
     field.reset()
     same_state(field, LayeredField(SMALL))
 
@@ -188,15 +151,11 @@ from numba.core.dispatcher import Dispatcher
 from edge_server.fields.common.kernels import plane_sweep, visual_hull
 from edge_server.fields.splat.kernels import bin_tiles, optimizer_step, project, rasterize
 from edge_server.fields.splat.layers.kernels import align, plates, solve
-from edge_server.fields.splat.layers.layered_field import LayeredField
-from tests.edge_server.fields.splat.layers.test_layered_field import SMALL, played
+from tests.edge_server.fields.splat.layers.ball import SMALL, LayeredField, played
+MODULES = align, plates, solve, visual_hull, bin_tiles, optimizer_step, plane_sweep, project, rasterize
+KERNELS = [k for module in MODULES for k in vars(module).values() if isinstance(k, Dispatcher)]
 def compiled():
-    found = {}
-    still = (bin_tiles, optimizer_step, plane_sweep, project, rasterize)
-    for module in (align, plates, solve, visual_hull, *still):
-        kernels = {k for k in vars(module).values() if isinstance(k, Dispatcher)}
-        found |= {(module.__name__, k.py_func.__name__): len(k.signatures) for k in kernels}
-    return found
+    return {k.py_func.__name__: len(k.signatures) for k in KERNELS}
 field = LayeredField(SMALL)
 field.warm_up()
 before = compiled()
@@ -209,39 +168,32 @@ assert compiled() == before, (before, compiled())
     assert done.returncode == 0, done.stderr[-2000:]
 
 
-def test_in_seconds_the_static_field_learns_beside_what_moves() -> None:
-    field = resumed_field(known_plates(30))
-    assert field.tracker is not None and not field.static.finished
-    frame = 17
-    while frame < 50 or (frame < 300 and not (field.static.finished and field.moving.steps > 0)):  # a busy machine
-        began = time.perf_counter()
-        field.fit([seen_by(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=0.05))
-        time.sleep(max(0.1 - (time.perf_counter() - began), 0.0))
-        frame += 1
-    assert field.moving.steps > 0
-    assert field.static.finished
-    assert score_of(field.snapshot(round(frame * FRAME_S * 1e9)), frame * FRAME_S) > 20.0
+def _fitted_in_seconds(field: LayeredField, frame: int, seconds: float = 0.02) -> Any:
+    """The report of a fit with all views of a frame."""
+    return field.fit([seen_by(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=seconds))
 
 
 def test_in_seconds_what_moves_is_followed_once_anything_is_shown_of_it() -> None:
     """Until then the still field has the processor."""
     field = resumed_field(known_plates(5))
     assert field.tracker is not None and not field.supervision.layers_shown
-    followed = field.tracker.fits
-    for frame in range(17, 300):
-        report = field.fit([seen_by(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+    followed, frame = field.tracker.fits, 17
+    while True:
+        report = _fitted_in_seconds(field, frame)
         if field.supervision.layers_shown:
             break
         assert field.tracker.fits == followed and not report.short
+        frame += 1
     assert field.static.ready
-    for later in range(frame + 1, frame + 5):
-        field.fit([seen_by(k, later, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+    for _ in range(4):
+        frame += 1
+        _fitted_in_seconds(field, frame)
     assert field.tracker.fits == followed + 4
-    while not field.moving.alive and later < 400:
-        later += 1
-        report = field.fit([seen_by(k, later, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+    while not field.moving.alive and frame < 400:
+        frame += 1
+        report = _fitted_in_seconds(field, frame)
         assert field.moving.alive or not report.short, "there was nothing to learn"
-    assert field.fit([seen_by(k, later + 1, True) for k in range(len(CAMERAS))], Budget(seconds=1e-4)).short
+    assert _fitted_in_seconds(field, frame + 1, 1e-4).short
     field.static.stop()
 
 
@@ -260,14 +212,13 @@ def test_the_pool_leaves_a_worker_to_a_thread_that_computes_beside_it(
     played(field, range(1, 17), steps=5)
     for frame in range(17, 400):
         spared.clear()
-        field.fit([seen_by(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+        _fitted_in_seconds(field, frame)
         if spared == [seconds, follows]:
             break
     else:
         pytest.fail("it never followed beside the training")
     for turned in _turning():
-        turned = replace(turned, generated_ns=turned.generated_ns + 60_000_000_000)
-        field.fit([turned], Budget(seconds=0.02))
+        field.fit([replace(turned, generated_ns=turned.generated_ns + 60_000_000_000)], Budget(seconds=0.02))
     assert not field.layered and spared[-1] == 0
     field.pool.spare(1)
     field.reset()
@@ -277,40 +228,17 @@ def test_the_pool_leaves_a_worker_to_a_thread_that_computes_beside_it(
 def test_a_camera_that_shows_something_else_is_refused_and_changes_nothing() -> None:
     without, field, rng = resumed_field(), resumed_field(), np.random.default_rng(0)
     for frame in range(42, 46):
-        views = [seen_by(k, frame, True) for k in range(len(CAMERAS))]
-        image = views[0].image
-        shown = rng.integers(0, 255, image.shape, np.uint8)
-        without.fit(views[1:], Budget(steps=5))
-        report = field.fit([replace(views[0], image=shown), *views[1:]], Budget(steps=5))
-        assert report.refused == (CAMERAS[0].camera,)
+        first, *rest = (seen_by(k, frame, True) for k in range(len(CAMERAS)))
+        without.fit(rest, Budget(steps=5))
+        noise = rng.integers(0, 255, first.image.shape, np.uint8)
+        report = field.fit([replace(first, image=noise), *rest], Budget(steps=5))
+        assert report.refused == (first.camera,)
     one, two = without.snapshot(), field.snapshot()
     for a, b in zip((one.static, one.moving.params), (two.static, two.moving.params), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3)
     resumed = resumed_field(field.state())
-    assert resumed.refused == {CAMERAS[0].camera}
-    views = [seen_by(k, 46, True) for k in range(len(CAMERAS))]
-    assert resumed.fit(views, Budget(steps=5)).refused == ()
-
-
-def test_layers_begin_again_when_the_box_of_the_scene_changes() -> None:
-    field = resumed_field()
-    store, plates = field.still.view_store, {n: c.plate for n, c in field.cameras.items()}
-    store.box = replace(store.box, radius_m=2.0 * store.box.radius_m)  # as a late camera may have it
-    played(field, range(42, 43), steps=5)
-    assert field.moving is not None and field.moving.box is field.still.view_store.box
-    assert field.still.step == 30
-    assert {n: c.plate for n, c in field.cameras.items()} == plates
-    assert all(camera.row is not None for camera in field.cameras.values())
-
-
-def test_few_cameras_with_large_pictures_train_fewer_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    field, size = LayeredField(SMALL), CAMERAS[0].intrinsics.width * CAMERAS[0].intrinsics.height
-    for frame in range(40):
-        field.fit([seen_by(k, frame, True) for k in range(4)], Budget(steps=30))
-    for frame, (most_pixels, steps) in enumerate([(size, 10), (size - 1, 6)], 40):
-        monkeypatch.setattr(settings, "FEW_STEPS_PIXELS", most_pixels)
-        report = field.fit([seen_by(k, frame, True) for k in range(4)], Budget(steps=30))
-        assert report.steps == steps
+    assert resumed.refused == {first.camera}
+    assert resumed.fit([seen_by(k, 46, True) for k in range(len(CAMERAS))], Budget(steps=5)).refused == ()
 
 
 def test_it_wants_every_frame_and_tells_how_long_one_takes_until_a_camera_moves() -> None:
@@ -329,29 +257,24 @@ def test_it_wants_every_frame_and_tells_how_long_one_takes_until_a_camera_moves(
 
 def test_a_thread_that_trains_ends_with_the_scene_and_tells_why_it_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     field = resumed_field(known_plates(30))
-    field.fit([seen_by(k, 17, True) for k in range(len(CAMERAS))], Budget(seconds=0.01))
+    _fitted_in_seconds(field, 17, 0.01)
     assert field.static.training
     state = field.state()  # a checkpoint ends it first
     assert not field.static.training
-    field.fit([seen_by(k, 18, True) for k in range(len(CAMERAS))], Budget(seconds=0.01))
+    _fitted_in_seconds(field, 18, 0.01)
     assert field.static.training
     field.reset()
     assert not any(t.name == "static-field" for t in threading.enumerate())
-    field.load_state(state)
 
     def fail(pace: Any) -> None:
         raise FloatingPointError("of a test")
 
-    monkeypatch.setattr(field.static, "train", fail)
-    with pytest.raises(FloatingPointError, match="of a test"):
-        for frame in range(19, 40):
-            field.fit([seen_by(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=0.01))
-            time.sleep(0.01)
     field.load_state(state)
     monkeypatch.setattr(field.static, "train", fail)
-    field.fit([seen_by(k, 19, True) for k in range(len(CAMERAS))], Budget(seconds=0.01))
     with pytest.raises(FloatingPointError, match="of a test") as raised:
-        field.state()
+        for frame in range(19, 40):
+            _fitted_in_seconds(field, frame, 0.01)
+            time.sleep(0.01)
     assert "trained beside" in raised.value.__notes__[0]
     assert not field.static.training  # it is told once
 

@@ -56,10 +56,6 @@ def dense(motion: Motion, rows: list[ViewRow]) -> tuple[np.ndarray, np.ndarray]:
     return (inverse.T @ (inverse @ right)).reshape(FREE, -1, 3), inverse.T @ inverse
 
 
-def instants(motion: Motion, count: int, rng) -> np.ndarray:
-    return rng.uniform(motion.oldest_s, motion.newest_s, count)
-
-
 def walk(t: float, count: int) -> np.ndarray:
     return np.outer(np.linspace(0.8, 1.2, count), [np.sin(t), 0.3 * np.cos(2 * t), 0.1 * t % 1.0])
 
@@ -67,7 +63,7 @@ def walk(t: float, count: int) -> np.ndarray:
 @pytest.mark.parametrize("count, views", [(1, 20), (2, 3), (6, 60), (24, 40), (6, 0)])
 def test_the_solution_is_that_of_a_dense_factor(count, views):
     motion, rng = moving(count), np.random.default_rng(1)
-    rows = [row(motion, t, walk(t, count), rng) for t in instants(motion, views, rng)]
+    rows = [row(motion, t, walk(t, count), rng) for t in rng.uniform(motion.oldest_s, motion.newest_s, views)]
     wanted, covariance = dense(motion, rows)
     for _ in range(3):
         assert motion.solve(rows) == 0
@@ -75,21 +71,9 @@ def test_the_solution_is_that_of_a_dense_factor(count, views):
     assert (np.abs(motion._knots[FIXED:] - wanted) / deviation).max() < 0.02
 
 
-def test_one_camera_and_views_of_one_instant_leave_the_rest_to_the_prior():
-    motion, rng = moving(), np.random.default_rng(2)
-    t = motion.oldest_s + 0.3
-    for rows in ([row(motion, t, walk(t, 6), rng)] * 1, [row(motion, t, walk(t, 6), rng) for _ in range(12)]):
-        wanted, covariance = dense(motion, rows)
-        assert np.linalg.eigvalsh(covariance).min() > 0
-        for _ in range(3):
-            motion.solve(rows)
-        deviation = np.sqrt(np.diagonal(covariance)).reshape(FREE, -1, 3)
-        assert (np.abs(motion._knots[FIXED:] - wanted) / deviation).max() < 0.02
-
-
 def test_rows_that_are_not_finite_or_too_old_are_left_out():
     motion, rng = moving(), np.random.default_rng(3)
-    good = [row(motion, t, walk(t, 6), rng) for t in instants(motion, 20, rng)]
+    good = [row(motion, t, walk(t, 6), rng) for t in rng.uniform(motion.oldest_s, motion.newest_s, 20)]
     nan, huge = good[0].matrix.copy(), good[1].vector.copy()
     nan[3, 4], huge[0] = np.nan, np.inf
     bad = [good[0]._replace(matrix=nan), good[1]._replace(vector=huge), good[2]._replace(instant_s=np.nan)]
@@ -103,7 +87,7 @@ def test_rows_that_are_not_finite_or_too_old_are_left_out():
 
 def test_kept_sums_do_not_change_the_solution():
     motion, twin, rng = moving(), moving(), np.random.default_rng(4)
-    rows = [row(motion, t, walk(t, 6), rng) for t in instants(motion, 30, rng)]
+    rows = [row(motion, t, walk(t, 6), rng) for t in rng.uniform(motion.oldest_s, motion.newest_s, 30)]
     for k in (20, 30):
         motion.solve(rows[:k])
         motion.slide(motion.newest_s)
@@ -113,17 +97,16 @@ def test_kept_sums_do_not_change_the_solution():
     np.testing.assert_array_equal(motion._knots, twin._knots)
 
 
-def followed(path, seconds: float, period_s: float = 1 / 15, silent=lambda t: False, cameras: int = 6):
+def followed(path, seconds: float, period_s: float = 1 / 15, cameras: int = 6):
     """Errors of the displacement at each update, shown one period after the newest view; the motion."""
     motion, rng = moving(), np.random.default_rng(5)
     rows, errors, t = [], [], 10.0
     while t < 10.0 + seconds:
         t += period_s
         motion.slide(t)
-        if not silent(t):
-            for _ in range(cameras):
-                taken = t - rng.uniform(0, 1.5 * period_s)
-                rows.append(row(motion, taken, path(taken), rng))
+        for _ in range(cameras):
+            taken = t - rng.uniform(0, 1.5 * period_s)
+            rows.append(row(motion, taken, path(taken), rng))
         rows = [r for r in rows if r.instant_s >= motion.oldest_s]
         motion.solve(rows)
         errors.append(np.abs(motion.at(t) - path(t)).max())
@@ -137,31 +120,10 @@ def test_a_reversal_is_followed_within_the_window():
     assert errors[-10:].max() < 0.01
 
 
-def test_views_after_a_blackout_are_followed_again():
-    errors, _ = followed(lambda t: walk(t, 6), 8.0, silent=lambda t: 11.0 < t < 14.0)
-    assert errors[-30:].max() < 0.01
-
-
 def test_two_minutes_neither_drift_nor_lose_precision():
     errors, motion = followed(lambda t: walk(t, 6), 120.0, cameras=2)
     assert errors[-300:].max() < 2 * errors[100:400].max()
     assert np.isfinite(motion._knots).all()
-
-
-def test_the_state_continues_bit_for_bit():
-    motion, rng = moving(), np.random.default_rng(6)
-    rows = [row(motion, t, walk(t, 6), rng) for t in instants(motion, 20, rng)]
-    motion.solve(rows)
-    other = Motion(RADIUS_M, np.random.default_rng(99))
-    other.load_state(motion.state())
-    points = np.random.default_rng(7).normal(0, 0.3, (50, 3))
-    for m in (motion, other):
-        m.slide(m.newest_s)
-        m.solve(rows)
-        m.choose_anchors(points, np.ones(50), 5, m.newest_s)
-    for name, array in motion.state().items():
-        np.testing.assert_array_equal(array, other.state()[name])
-    np.testing.assert_array_equal(motion.at(motion.newest_s), other.at(motion.newest_s))
 
 
 def test_displacements_pass_through_the_knots_and_go_straight_on():
@@ -186,10 +148,7 @@ def test_shares_fall_with_the_square_of_the_distance():
     np.testing.assert_allclose(share[0], expected / expected.sum(), rtol=1e-6)
 
 
-def test_anchors_attach_what_is_near():
-    motion = moving(1)
-    anchor, share = motion.attach(np.zeros((4, 3)), 10.0)
-    assert anchor.shape == share.shape == (4, 3) and (share[:, 0] == 1.0).all() and not share[:, 1:].any()
+def test_each_anchor_attaches_what_is_nearest_to_it():
     motion = moving(8)
     anchor, share = motion.attach(motion.anchors, 10.0)
     np.testing.assert_array_equal(anchor[:, 0], np.arange(8))
@@ -205,18 +164,6 @@ def test_views_of_one_instant_that_say_nothing_or_far_too_much(strength):
     motion, rng = moving(), np.random.default_rng(1)
     motion.solve([row(motion, 10.0, walk(10.0, 6), rng, rank=1, strength=s) for s in (1e-12, 1e12, strength)])
     assert np.abs(motion.at(10.0)).max() < 3.0
-
-
-@pytest.mark.stability
-def test_a_second_of_silence_stays_bounded():
-    motion, rng = moving(), np.random.default_rng(2)
-    for k in range(20):
-        at_s = 10.0 + k / 15
-        motion.slide(at_s)
-        motion.solve([row(motion, at_s, walk(at_s, 6), rng, rank=3)])
-    motion.slide(at_s + 1.0)
-    motion.solve([])
-    assert np.abs(motion.at(at_s + 1.0)).max() < 2.5
 
 
 @pytest.mark.stability

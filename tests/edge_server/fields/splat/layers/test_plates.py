@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.splat.layers.plates import FinePlate, Plate, clean_mask, plain_share
-from edge_server.fields.splat.layers.settings import CLOSE, HOLE, LEAST_WEIGHT, SPECK
+from edge_server.fields.splat.layers.settings import CLOSE, HOLE, SPECK
 from tests.edge_server.fields.scenes import ring
 
 SIZE = 48
@@ -37,30 +37,6 @@ def _opaque_at(left: int, right: int) -> NDArray[np.float32]:
     opacity = np.zeros((SIZE, SIZE), np.float32)
     opacity[BODY, left:right] = 1.0
     return opacity
-
-
-def test_a_body_that_passes_is_foreground_and_leaves_no_trace() -> None:
-    plate = _seen()
-    for at in range(0, 36, 4):
-        expected = np.zeros((SIZE, SIZE), bool)
-        expected[BODY, at : at + 10] = True
-        foreground = plate.take(_frame(at))
-        assert (foreground != expected).sum() < 60 and foreground[expected].mean() > 0.95
-    np.testing.assert_allclose(plate.picture, WALL, atol=1.0)
-
-
-@pytest.mark.stability
-def test_colors_that_fade_count_nothing_instead_of_subnormal_numbers() -> None:
-    """Which a processor takes several times as long for, some minutes later."""
-    plate = _seen()
-    for at in (4, 20, 20, 8, 20):
-        plate.take(_frame(at))
-    weight = plate.arrays.weight
-    assert (weight[1:] > 0).any()
-    for _ in range(300):
-        plate.take(_frame())
-        assert ((weight == 0) | (weight > LEAST_WEIGHT)).all()
-    assert (weight[1:] == 0).all()
 
 
 def test_a_body_that_stays_becomes_the_plate_unless_it_is_held() -> None:
@@ -91,14 +67,6 @@ def test_a_plate_by_itself_asks_no_field_what_is_background(by_itself: bool) -> 
     assert (np.isclose(curtain, 40, atol=1) | np.isclose(curtain, 220, atol=1)).any() != by_itself
 
 
-def test_a_change_of_exposure_is_no_foreground() -> None:
-    plate = _seen()
-    darker = (WALL * 0.8 + 0.5).astype(np.uint8)
-    assert not plate.take(darker).any()
-    np.testing.assert_allclose(plate.gain, 0.8, atol=0.02)
-    np.testing.assert_allclose(plate.at_common_exposure(), WALL, atol=3.0)
-
-
 def test_what_is_unknown_is_compared_with_the_static_field() -> None:
     plate = Plate(SIZE, SIZE, CallerPool())
     for k in range(20):  # a curtain that never holds still
@@ -110,22 +78,6 @@ def test_what_is_unknown_is_compared_with_the_static_field() -> None:
     np.testing.assert_allclose(plate.picture[5:-5, 36:-5], WALL[5:-5, 36:-5], atol=0.1)
     assert not plate.take(_frame()).any()
     assert plate.take(_frame(34))[BODY, 35:43].all()
-
-
-def test_a_state_continues_bit_for_bit() -> None:
-    plate = _seen()
-    plate.take(_frame(4))
-    plate.fill_unknown(WALL / np.float32(255.0))
-    plate.take((WALL * 0.8 + 0.5).astype(np.uint8))  # all that is remembered becomes darker
-    other = Plate(SIZE, SIZE, CallerPool())
-    other.load_state(plate.state())
-    for name, array in vars(plate).items():  # also what is not stored
-        if isinstance(array, np.ndarray) and name not in ("_difference", "_flags"):
-            np.testing.assert_array_equal(array, vars(other)[name], err_msg=name)
-    for at in (8, 12, 40):
-        np.testing.assert_array_equal(plate.take(_frame(at)), other.take(_frame(at)))
-    for name, array in plate.state().items():
-        np.testing.assert_array_equal(array, other.state()[name], err_msg=name)
 
 
 def test_a_fine_plate_is_at_the_common_exposure_and_leaves_out_what_moves() -> None:
@@ -165,17 +117,13 @@ def _cleaned_whole(mask: np.ndarray) -> np.ndarray:
     return part | fill[label]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_mask_is_cleaned_as_a_whole(seed: int) -> None:
     rng = np.random.default_rng(seed)
     mask = np.zeros((40, 52), np.uint8)
     y, x = rng.integers(3, 10, 2)
-    noise = cv2.resize(rng.random((8, 9)), (26, 22)) > 0.45
-    mask[y : y + 22, x : x + 26] = noise
+    mask[y : y + 22, x : x + 26] = cv2.resize(rng.random((8, 9)), (26, 22)) > 0.45
     np.testing.assert_array_equal(clean_mask(mask), _cleaned_whole(mask))
-
-
-def test_an_empty_mask_stays_empty() -> None:
     assert not clean_mask(np.zeros((9, 9), np.uint8)).any()
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from edge_server.fields.splat.kernels.project import BASE, COLOR, QUATERNION, SCALE
 from edge_server.fields.splat.scan import settings as tuned
-from edge_server.fields.splat.scan.discs import Leaves, discs, filled, quadtree, usable_depth
+from edge_server.fields.splat.scan.discs import discs, filled, quadtree, usable_depth
 from freshfield.geometry import Pinhole, look_at, quaternion_to_matrix
 
 LENS = Pinhole(50, 38, 40.0, 40.0, 25.0, 19.0, (-0.05, 0.01, 0.0, 0.0))
@@ -73,28 +73,13 @@ def test_depth_at_jumps_is_of_no_surface_and_holes_take_the_nearest() -> None:
 
 
 @pytest.mark.stability
-@pytest.mark.parametrize("depth_m", [1e-3, 1e4])
-def test_extreme_depth_and_a_normal_along_the_vertical_stay_finite(depth_m: float) -> None:
-    depth = np.full((8, 8), depth_m, np.float32)
-    depth[::2] *= 100.0  # as steep as it gets
-    lens = Pinhole(8, 8, 8.0, 8.0, 4.0, 4.0)
-    leaves = Leaves(*(np.array(each) for each in ([0, 4, 4], [0, 0, 4], [4, 4, 4])))
-    params = discs(np.zeros((8, 8, 3), np.float32), depth, leaves, lens, np.eye(4), 0.6, np.full(3, 0.8, np.float32))
-    assert np.isfinite(params).all()
-
-
-@pytest.mark.stability
-@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0, 0.0, 1e-30, 1e30])
-def test_depth_that_cannot_be_is_none(value: float) -> None:
-    assert usable_depth(np.full((12, 16), value, np.float32)) is None
-    some = np.full((12, 16), 2.0, np.float32)
-    some[:, 3] = value
-    found = usable_depth(some)
-    assert found is not None and (found[:, 3] == 0.0).all() and (found[:, 8:] == 2.0).all()
-
-
-@pytest.mark.stability
-def test_depth_that_is_all_jumps_or_of_a_tiny_image_is_none() -> None:
+def test_depth_that_cannot_be_is_none() -> None:
+    for value in (np.nan, np.inf, -1.0, 0.0, 1e-30, 1e30):
+        some = np.full((12, 16), 2.0, np.float32)
+        some[:, 3] = value
+        found = usable_depth(some)
+        assert found is not None and (found[:, 3] == 0.0).all() and (found[:, 8:] == 2.0).all()
+        assert usable_depth(np.full((12, 16), value, np.float32)) is None
     y, x = np.indices((12, 16))
-    assert usable_depth(np.where((x + y) % 2, 1.0, 5.0).astype(np.float32)) is None
+    assert usable_depth(np.where((x + y) % 2, 1.0, 5.0).astype(np.float32)) is None  # all jumps
     assert usable_depth(np.ones((4, 64), np.float32)) is None and usable_depth(None) is None

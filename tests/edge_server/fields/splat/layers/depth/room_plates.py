@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -9,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
+from edge_server.fields.common.threads.thread_pool import shared_pool
+from edge_server.fields.splat.layers.depth.depth_plate import smooth
 from edge_server.fields.splat.layers.depth.surfaces import Surface
 from freshfield.geometry import Pinhole
 
@@ -40,3 +43,13 @@ def relative_of(depth_m: NDArray[np.floating], seed: int) -> NDArray[np.float32]
     waves = cv2.resize(rng.normal(size=(4, 4)), depth_m.shape[::-1], interpolation=cv2.INTER_CUBIC)
     inverse = cv2.GaussianBlur(1.0 / depth_m, (0, 0), 1.5) * np.exp(0.05 * waves / waves.std())
     return (rng.uniform(0.5, 2.0) * inverse + rng.uniform(-0.05, 0.15)).astype(np.float32)
+
+
+@cache
+def room_surfaces(count: int, size: int) -> list[Surface]:
+    """The plates with their exact depth, smoothed."""
+    found = []
+    for plate, depth in zip(*room_plates(count, size)):
+        inverse, slope = smooth((1.0 / depth).astype(np.float32), plate.color, shared_pool())
+        found.append(replace(plate, inverse=inverse, slope=slope))
+    return found

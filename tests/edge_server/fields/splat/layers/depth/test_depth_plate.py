@@ -85,22 +85,16 @@ def test_planes_are_those_of_numpy_whatever_the_number_of_threads() -> None:
     pool.close()
 
 
-def test_smoothing_halves_the_noise_and_keeps_edges_and_small_holes_are_filled() -> None:
+def test_small_holes_are_filled_by_the_plane_of_a_pixel_beside_them() -> None:
     inverse, image = _scene(np.random.default_rng(3))
+    found, slope = smooth(inverse, image, POOL)
     y, x = np.mgrid[:24, :24]
-    true = np.where(x < 12, 0.5 + 0.01 * x, 0.25 + 0.004 * y)
-    found, _ = smooth(inverse, image, POOL)
-    assert (found > 0).all()
-    measured = inverse > 0
-    assert np.abs(found - true)[measured].mean() < 0.5 * np.abs(inverse - true)[measured].mean()
-    assert np.abs(found - true)[~measured].max() < 4 * settings.NOISE
-
-
-def test_a_pixel_that_flies_between_surfaces_is_not_known() -> None:
-    plate = DepthPlate.empty(1, 2)
-    for k in range(9):
-        plate.take(np.array([[2.0, (1.0, 2.0, 4.0)[k % 3]]], np.float32), np.zeros((1, 2), bool), POOL)
-    np.testing.assert_allclose(plate.medians(POOL), [[0.5, 0.0]])
+    for hole in np.argwhere(inverse == 0):
+        dy, dx = hole[0] - y, hole[1] - x
+        beside = (inverse > 0) & (np.maximum(np.abs(dx), np.abs(dy)) <= settings.HOLE_PX)
+        continued = found + slope[..., 0] * dx + slope[..., 1] * dy
+        same = np.isclose(continued, found[*hole], rtol=1e-5) & (slope == slope[*hole]).all(axis=2)
+        assert found[*hole] > 0 and (same & beside).any()
 
 
 @pytest.mark.stability
@@ -112,15 +106,6 @@ def test_what_no_sensor_measures_is_no_depth() -> None:
     found = plate.medians(POOL)
     np.testing.assert_allclose(found, [[0, 0, 0, 0], [0, 0, 0, 1 / 3]], rtol=1e-6)
     assert np.isfinite(smooth(found, np.zeros((2, 4, 3), np.float32), POOL)[0]).all()
-
-
-@pytest.mark.stability
-@pytest.mark.parametrize("depth_m", [1e-4, 1e-2, 1.0, 1e3, 9e5])
-def test_planes_of_any_distance_are_finite(depth_m: float) -> None:
-    rng = np.random.default_rng(4)
-    inverse = (1.0 / (depth_m * rng.uniform(0.5, 2.0, (16, 16)))).astype(np.float32)
-    for array in smooth(inverse, rng.uniform(0, 255, (16, 16, 3)).astype(np.float32), POOL):
-        assert np.isfinite(array).all()
 
 
 def test_most_pixels_that_measure_anything_must_have_depth() -> None:

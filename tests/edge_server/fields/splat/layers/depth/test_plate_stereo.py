@@ -35,10 +35,16 @@ def _swept(plates: Sequence[Surface]) -> PlateStereo:
     return stereo
 
 
+def filled(plates: Sequence[Surface]) -> Plates:
+    """The plates with the depth that stereo finds."""
+    found = _swept(plates).fill(_named(plates))
+    assert found is not None
+    return found
+
+
 def _sweep(plates: Sequence[Surface]) -> NDArray[np.float32]:
     """Depths (N, H, W) of the plates that are as large as the first."""
     found = _swept(plates).inverses(_named(plates))
-    assert all(inverse.dtype == np.float32 and inverse.shape == p.known.shape for inverse, p in zip(found, plates))
     assert all(np.isfinite(inverse).all() and (inverse >= 0).all() for inverse in found)
     inverses = np.stack([inverse for inverse in found if inverse.shape == found[0].shape])
     return np.where(inverses > 0, 1.0 / np.maximum(inverses, 1e-12), 0.0).astype(np.float32)
@@ -72,25 +78,16 @@ def test_what_is_unknown_has_no_depth_and_says_nothing() -> None:
     np.testing.assert_array_equal(found, _sweep([replace(hidden[0], color=color), *plates[1:]]))
 
 
-def test_large_plates_are_matched_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
-    plates, truth = room_plates(4)
-    monkeypatch.setattr("edge_server.fields.splat.layers.depth.settings.SWEEP_PIXELS", 64 * 64)
-    found = _sweep(plates)
-    there = found > 0
-    assert there.mean() > 0.6 and np.median(np.abs(found - truth)[there] / truth[there]) < 0.03
-
-
 def test_measured_depth_stays_and_holes_are_filled() -> None:
     plates, truth = room_plates(4, 64)
     measured = (1.0 / truth).astype(np.float32)
     measured[:, 10:40, 10:50] = 0.0
     holes = [replace(p, inverse=inverse) for p, inverse in zip(plates, measured)]
-    found = _swept(holes).fill(_named(holes))
-    filled = np.stack([s.inverse for s in found])
-    np.testing.assert_array_equal(filled[measured > 0], measured[measured > 0])
-    there = (measured == 0) & (filled > 0)
+    found = np.stack([s.inverse for s in filled(holes)])
+    np.testing.assert_array_equal(found[measured > 0], measured[measured > 0])
+    there = (measured == 0) & (found > 0)
     assert there.sum() > 0.6 * (measured == 0).sum()
-    assert np.median(np.abs(filled * truth - 1.0)[there]) < 0.03
+    assert np.median(np.abs(found * truth - 1.0)[there]) < 0.03
 
 
 def _marked(plate: Surface, size: int) -> Surface:
@@ -116,21 +113,16 @@ def test_a_camera_is_swept_again_where_plates_change_one_a_call(monkeypatch: pyt
         return list(swept), done
 
     noise = np.random.default_rng(1).normal(0.0, 1.0, plates[0].color.shape)
-    for alike in (plates, [_marked(plates[0], 3), *plates[1:]], _changed(plates, {2: plates[2].color + noise})):
+    for alike in ([_marked(plates[0], 3), *plates[1:]], _changed(plates, {2: plates[2].color + noise})):
         assert calls(alike, 2) == ([], [False, False])
     changed = [_marked(plates[0], 20), *plates[1:]]
     assert calls(changed, 5) == (["0", "1", "2", "3"], [False, False, False, True, False])
     np.testing.assert_array_equal(stereo.inverses(_named(changed)), _swept(changed).inverses(_named(changed)))
-    pose = plates[3].pose.copy()
-    pose[:3, 3] += 0.01
-    moved = [*changed[:3], replace(plates[3], pose=pose)]
+    moved = [*changed[:3], replace(plates[3], pose=plates[3].pose + 1e-2 * np.eye(4, k=3))]
     assert calls(moved, 5)[0] == ["3", "0", "1", "2"]
-    fewer = moved[:3]
-    assert sorted(calls(fewer, 4)[0]) == ["0", "1", "2"]
-    corrected = [replace(p, pose=p.pose + 2e-3 * np.eye(4, k=3)) for p in fewer]  # a calibration: in turn, too
+    assert sorted(calls(moved[:3], 4)[0]) == ["0", "1", "2"]  # one is gone
+    corrected = [replace(p, pose=p.pose + 2e-3 * np.eye(4, k=3)) for p in moved[:3]]  # a calibration: in turn, too
     assert calls(corrected, 4) == (["0", "1", "2"], [False, False, True, False])
-    assert calls(fewer, 3)[0] == ["0", "1", "2"]
-    np.testing.assert_array_equal(stereo.inverses(_named(fewer)), _swept(fewer).inverses(_named(fewer)))
 
 
 def test_what_found_nothing_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,20 +132,6 @@ def test_what_found_nothing_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) 
     assert stereo.fill(_named(flat)) is None
     monkeypatch.setattr(PlateStereo, "_match", None)
     assert not stereo.sweep(_named(flat), _distance_m(plates)) and stereo.fill(_named(flat)) is None
-
-
-@pytest.mark.stability
-@pytest.mark.parametrize("unit", [1.0 / 3.0, 2.0, 1e-3, 1e4])
-def test_other_units_change_nothing(unit: float) -> None:
-    plates, _ = room_plates(3, 64)
-    poses = [p.pose * np.array([1.0, 1.0, 1.0, unit]) for p in plates]
-    for pose in poses:
-        pose[3, 3] = 1.0
-    scaled = [replace(p, pose=pose) for p, pose in zip(plates, poses)]
-    before, after = _sweep(plates), _sweep(scaled) / unit
-    both = (before > 0) & (after > 0)
-    assert both.sum() > 0.99 * max((before > 0).sum(), (after > 0).sum())
-    assert (np.abs(after - before)[both] < 0.01 * before[both]).mean() > 0.99
 
 
 @pytest.mark.stability
@@ -176,8 +154,7 @@ def test_cameras_that_tell_no_depth() -> None:
 
 
 @pytest.mark.stability
-@pytest.mark.parametrize("level", [0.0, 3.0, 128.0, 255.0])
-@pytest.mark.parametrize("noise", [0.0, 1.0, 2.0])
+@pytest.mark.parametrize(("level", "noise"), [(0.0, 2.0), (128.0, 0.0), (128.0, 2.0), (255.0, 1.0)])
 def test_walls_of_one_color_and_darkness_have_no_depth(level: float, noise: float) -> None:
     plates, _ = room_plates(4, 64)
     rng = np.random.default_rng(2)
@@ -189,9 +166,9 @@ def test_walls_of_one_color_and_darkness_have_no_depth(level: float, noise: floa
 def test_what_no_plate_can_show_costs_its_own_pixels_only() -> None:
     plates, _ = room_plates(4, 64)
     whole = _sweep(plates)
-    for bad in (np.nan, np.inf, -np.inf, 1e30):
+    for bad in (np.nan, np.inf, 1e30):
         broken = _sweep(_changed(plates, {0: np.full((64, 64, 3), bad)}))
-        assert ((broken[1:] > 0).mean() > 0.5 * (whole[1:] > 0).mean()) and ((broken[0] > 0).mean() < 0.01)
+        assert (broken[1:] > 0).mean() > 0.5 * (whole[1:] > 0).mean() and (broken[0] > 0).mean() < 0.01
     lens, pose = Pinhole.from_fov(1, 1, 60.0), plates[0].pose
     speck = plate_of(np.full((1, 1, 3), 9, np.uint8), pose, lens)
     assert (_sweep([*plates, speck])[0] > 0).any()

@@ -10,19 +10,14 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.scene_box import UNIT_BOX
-from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
+from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.splat.kernels.project import COLOR, QUATERNION, SCALE
 from edge_server.fields.splat.layers.depth import settings
 from edge_server.fields.splat.layers.depth.depth_plate import smooth
 from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
 from edge_server.fields.splat.layers.depth.overlaps import contradicting, exposures
 from edge_server.fields.splat.layers.depth.surfaces import Surface, SurfaceScene
-from edge_server.fields.splat.layers.depth.virtual_plates import (
-    beside_silhouettes,
-    fill_unseen,
-    poses_between,
-    virtual_plates,
-)
+from edge_server.fields.splat.layers.depth.virtual_plates import beside_silhouettes, poses_between, virtual_plates
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import Pinhole, look_at, quaternion_to_matrix
 from tests.edge_server.fields.scenes import psnr, ring, seen
@@ -71,16 +66,6 @@ def test_a_held_out_view_is_drawn_as_it_is() -> None:
     assert (color >= 0).all() and (color <= 1.0 + 1e-5).all() and ((agreement >= 0) & (agreement <= 1)).all()
 
 
-def test_it_does_not_depend_on_threads() -> None:
-    pool = Pool(2)
-    poses = [view.camera_to_world for view in CAMERAS[:2]]
-    for mine, theirs in zip(
-        SCENE.render(poses, CAMERAS[0].intrinsics, pool), SCENE.render(poses, CAMERAS[0].intrinsics, POOL)
-    ):
-        np.testing.assert_array_equal(mine, theirs)
-    pool.close()
-
-
 def _wall(lens: Pinhole, pose: NDArray, z_m: float, level: float) -> Surface:
     """A wall that fills a camera's image at one depth."""
     shape = lens.height, lens.width
@@ -126,28 +111,6 @@ def test_pixels_beside_a_silhouette_are_found(width: int, near: int | None) -> N
     assert np.flatnonzero(beside_silhouettes(q)[15]).tolist() == [*left, *right]
 
 
-def test_beside_silhouettes_virtual_plates_count_little() -> None:
-    larger = ring(7, size=96)
-    surfaces = [surface_of(view) for view in larger[:2]]
-    scene, poses = SurfaceScene.of(surfaces), [view.camera_to_world for view in larger[:2]]
-    _, agreements, inverses = scene.render(poses_between(poses, surfaces, 12), surfaces[0].lens, POOL)
-    plates = virtual_plates(scene, surfaces, poses, False, POOL)
-    for plate, agreement, inverse in zip(plates, agreements, inverses, strict=True):
-        beside = beside_silhouettes(inverse)
-        assert 0.05 < beside.mean() < 0.5
-        expected = agreement * np.where(beside, np.float32(settings.UNSEEN_WEIGHT), np.float32(1.0))
-        np.testing.assert_allclose(plate.known, expected, rtol=1e-6)
-
-
-def test_what_nobody_sees_fades_to_the_mean_color() -> None:
-    color, agreement = np.zeros((64, 64, 3), np.float32), np.zeros((64, 64), np.float32)
-    color[:, :8], agreement[:, :8] = [1.0, 0.5, 0.0], 1.0
-    color[:32, :8] = [0.0, 0.5, 1.0]
-    filled = fill_unseen(color, agreement)
-    np.testing.assert_array_equal(filled[:, :8], color[:, :8])
-    assert np.abs(filled[4, 10] - color[4, 4]).max() < 0.35 and np.abs(filled[4, 63] - 0.5).max() < 0.05
-
-
 def test_first_gaussians_lie_on_the_surfaces() -> None:
     found = first_gaussians(SURFACES, UNIT_BOX, SplatSettings(start=600), np.random.default_rng(0))
     assert found.shape[0] == 600 and np.isfinite(found).all()
@@ -176,13 +139,3 @@ def test_exposures_follow_from_what_cameras_share() -> None:
     np.testing.assert_allclose(found, np.broadcast_to(logs[:, None], (4, 3)), atol=0.03)
     blind = replace(surface_of(CAMERAS[1]), inverse=np.zeros_like(SURFACES[1].inverse))
     np.testing.assert_allclose(exposures([surface_of(CAMERAS[0], gain=0.8), blind])[:, 0], [-0.112, 0.112], atol=0.03)
-
-
-@pytest.mark.stability
-@pytest.mark.parametrize("depth_m", [1e-3, 1.0, 1e4])
-def test_any_distance_is_drawn_finitely(depth_m: float) -> None:
-    walls = [_wall(view.intrinsics, view.camera_to_world, depth_m, 100.0) for view in CAMERAS[:3]]
-    plates = virtual_plates(SurfaceScene.of(walls), walls, [wall.pose for wall in walls], True, POOL)
-    assert all(np.isfinite(plate.color).all() and np.isfinite(plate.known).all() for plate in plates)
-    assert np.isfinite(first_gaussians(walls, UNIT_BOX, SplatSettings(start=64), np.random.default_rng(0))).all()
-    assert contradicting(walls[:1]) == []

@@ -1,11 +1,10 @@
-"""The field in layers where cameras measure depth: a ball that moves before few cameras."""
+"""The field in layers before few cameras that measure depth, or whose plates tell it by stereo: a ball that moves."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,62 +12,60 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
+from edge_server.fields.splat.layers import settings as layer_settings
 from edge_server.fields.splat.layers.depth import settings as depth_settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
-from tests.edge_server.fields.scenes import ring, seen
+from tests.edge_server.fields.scenes import seen
 from tests.edge_server.fields.small import same_state
-from tests.edge_server.fields.splat.layers.depth.moving_ball import FRAME_S, SMALL, score, taken
+from tests.edge_server.fields.splat.layers.depth.moving_ball import SMALL, Rig
 
-RIG = ring(9)
-CAMERAS, HELD = [RIG[0], RIG[2], RIG[4]], RIG[1]
+RIG = Rig((0, 2, 4), held=1)
+WITHOUT = Rig((0, 1, 3), held=2, size=64, depth=False)
+CAMERAS, HELD = RIG.cameras, RIG.held
 SEEDS = (0, 1, 2)
 pytestmark = pytest.mark.usefixtures("shown_soon")
 
 Spoil = Callable[[int, int, NDArray[np.float32]], NDArray[np.float32] | None]
 
 
-@cache
-def _frame(camera: int, frame: int) -> View:
-    return taken(CAMERAS[camera], (frame + camera / len(CAMERAS)) * FRAME_S)
-
-
 def _no_depth(camera: int, frame: int, depth: NDArray[np.float32]) -> None:
     return None
 
 
-def _run(field: Any, frames: range, spoil: Spoil | None = None, cameras: int = 3, steps: int = 20) -> None:
-    for frame in frames:
-        views = [_frame(k, frame) for k in range(cameras)]
-        if spoil is not None:
-            views = [
-                replace(v, depth=None if v.depth is None else spoil(k, frame, v.depth)) for k, v in enumerate(views)
-            ]
-        field.fit(views, Budget(steps=steps))
+def _true(camera: int, frame: int, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    return depth
+
+
+def _spoiled(spoil: Spoil) -> Callable[[int, int, View], View]:
+    return lambda camera, frame, view: replace(view, depth=spoil(camera, frame, view.depth))
 
 
 @cache
-def _shown(spoil: Spoil | None, seed: int = 0) -> tuple[LayeredField, list[float]]:
+def _shown(spoil: Spoil, seed: int = 0) -> tuple[LayeredField, list[float]]:
     """The field after 40 frames, and PSNR of each frame of the last half second."""
     field, shown_db = LayeredField(structs.replace(SMALL, seed=seed)), []
     for frame in range(40):
-        _run(field, range(frame, frame + 1), spoil)
+        RIG.run(field, range(frame, frame + 1), _spoiled(spoil))
         if frame >= 32:
-            shown_db.append(score(field, HELD, frame * FRAME_S))
+            shown_db.append(RIG.score(field, frame))
     return field, shown_db
 
 
 def test_depth_lets_layers_begin_sooner_and_shows_what_is_between_the_cameras() -> None:
-    field = LayeredField(SMALL)
-    _run(field, range(13))
+    field = RIG.run(LayeredField(SMALL), range(13))
     assert field.tracker is not None and field.supervision.early
     assert all(" " not in view.camera for view in field.views) and len(field.still.views) > len(field.views)
-    field, shown_db = _shown(None)
+    field, shown_db = _shown(_true)
     assert not field.supervision.early and field.supervision.with_depth
     assert shown_db[-1] > _shown(_no_depth)[1][-1] + 0.3
-    unseen = field.snapshot().unseen(HELD.camera_to_world, HELD.intrinsics)
+
+
+def test_it_tells_what_no_camera_has_seen() -> None:
+    shown = _shown(_true)[0].snapshot()
+    unseen = shown.unseen(HELD.camera_to_world, HELD.intrinsics)
     _, distance = seen(HELD.intrinsics, HELD.camera_to_world)
     assert unseen is not None and unseen[~np.isfinite(distance)].mean() > 0.9 > 0.5 > unseen[distance < 9].mean()
-    surfaces, camera = field.snapshot().surfaces, CAMERAS[0]
+    surfaces, camera = shown.surfaces, CAMERAS[0]
     assert surfaces is not None
     depth = surfaces.meshes.depth[: camera.image[..., 0].size].reshape(camera.image.shape[:2])
     on_axis = camera.intrinsics.rays() / camera.intrinsics.rays()[..., 2:]
@@ -77,61 +74,37 @@ def test_depth_lets_layers_begin_sooner_and_shows_what_is_between_the_cameras() 
     assert shares[:2] == [0.0, 0.0] and shares[2] > 0.9
 
 
-def test_one_camera_with_depth_has_layers() -> None:
-    field = LayeredField(SMALL)
-    _run(field, range(14), cameras=1)
-    assert field.tracker is not None
-    without = LayeredField(SMALL)
-    _run(without, range(30), _no_depth, cameras=1)
-    assert without.tracker is None
-
-
-def test_each_fifth_depth_does() -> None:
-    field = LayeredField(SMALL)
-    _run(field, range(40), lambda camera, frame, depth: depth if frame % 5 == 0 else None)
-    assert score(field, HELD, 39 * FRAME_S) > _shown(None)[1][-1] - 1.0
+def test_one_camera_has_layers_with_depth_only() -> None:
+    assert RIG.run(LayeredField(SMALL), range(14), cameras=1).tracker is not None
+    assert RIG.run(LayeredField(SMALL), range(30), _spoiled(_no_depth), cameras=1).tracker is None
 
 
 def test_depth_of_another_instant_says_nothing_of_what_moves() -> None:
     """The plates keep it; the moving set takes only what was measured within BODY_GAP_NS of the image."""
     gaps_ns = (0, depth_settings.BODY_GAP_NS, -depth_settings.BODY_GAP_NS - 1)
     field = LayeredField(SMALL)
-    for frame in range(16):
-        views = [_frame(k, frame) for k in range(3)]
-        late = [replace(v, depth_ns=v.generated_ns + gap_ns) for v, gap_ns in zip(views, gaps_ns)]
-        field.fit(late, Budget(steps=5))
+    RIG.run(field, range(16), lambda k, frame, v: replace(v, depth_ns=v.generated_ns + gaps_ns[k]), steps=5)
     measured = {o.camera for o in field.observations if o.view.depth is not None}
     assert measured == {view.camera for view in CAMERAS[:2]}
     plate = field.cameras[CAMERAS[2].camera].depth
     assert field.tracker is not None and plate is not None and plate.count.any()
 
 
-def test_a_camera_without_depth_beside_others_is_learned_too() -> None:
-    field = LayeredField(SMALL)
-    _run(field, range(40), lambda camera, frame, depth: None if camera == 1 else depth)
-    assert field.supervision.with_depth and score(field, HELD, 39 * FRAME_S) > _shown(_no_depth)[1][-1]
-
-
-@pytest.mark.parametrize("frames", [6, 12, 30])
-def test_it_resumes_bit_for_bit(frames: int) -> None:
+@pytest.mark.parametrize(("rig", "frames"), [(RIG, 6), (RIG, 12), (RIG, 30), (WITHOUT, 20)])
+def test_it_resumes_bit_for_bit(rig: Rig, frames: int) -> None:
     field, other = LayeredField(SMALL), LayeredField(SMALL)
-    _run(field, range(frames), steps=5)
+    rig.run(field, range(frames), steps=5)
     other.load_state(field.state())
     for each in (field, other):
-        _run(each, range(frames, frames + 8), steps=5)
-    same_state(field, other)
+        rig.run(each, range(frames, frames + 8), steps=5)
+    assert field.supervision.with_depth
+    same_state(field, other, settings=True)
 
 
-def test_with_a_budget_in_seconds_the_long_work_is_done_beside() -> None:
-    field = LayeredField(SMALL)
-    for frame in range(20):
-        field.fit([_frame(k, frame) for k in range(3)], Budget(seconds=0.02))
-    for _ in range(1500):  # where the machine is busy, the work beside begins late
-        if field.static.ready:
-            break
-        field.fit([_frame(k, 20) for k in range(3)], Budget(seconds=0.02))
-    assert field.static.ready and field.supervision.with_depth
-    field.static.stop()
+def test_depth_of_another_size_is_refused() -> None:
+    view = replace(RIG.frame(0, 0), depth=np.ones((3, 4), np.float32))
+    with pytest.raises(ValueError, match="cam00: depth must be float32 of shape"):
+        LayeredField(SMALL).fit([view], Budget(steps=1))
 
 
 _RNG = np.random.default_rng(5)
@@ -145,22 +118,12 @@ _SPOILED: dict[str, Spoil] = {
     "ten times too far, later": lambda camera, frame, depth: depth * np.float32(10.0 if frame > 20 else 1.0),
     "half of the image": lambda camera, frame, depth: np.where(np.arange(48) < 24, depth, 0).astype(np.float32),
 }
-
-
 # Cameras whose depth the page then says is not used. Noise, and a unit that changes later, are refused by frames.
 _NAMED = {
     "constant": ("cam00", "cam04"),
     **dict.fromkeys(("inverted", "millimeters"), ("cam00", "cam02", "cam04")),
     "one camera ten times too far": ("cam00",),
 }
-
-
-def test_depth_of_another_size_is_refused() -> None:
-    view = replace(_frame(0, 0), depth=np.ones((3, 4), np.float32))
-    with pytest.raises(ValueError, match="cam00: depth must be float32 of shape"):
-        LayeredField(SMALL).fit([view], Budget(steps=1))
-
-
 # The others are refused or believed by the rules that ``test_surfaces`` and ``test_depth_plate`` hold.
 _QUICK = ("holes, NaN, infinite", "noise", "one camera ten times too far")
 
@@ -178,3 +141,48 @@ def test_broken_depth_costs_little(kind: str) -> None:
     # A constant depth of the right order of magnitude, before cameras that share little, is believed.
     without_db = np.mean([_shown(_no_depth, seed)[1] for seed in SEEDS])
     assert np.mean(shown_db) > without_db - (2.5 if kind == "constant" else 0.5)
+
+
+# --- by stereo --------------------------------------------------------------------------------------
+
+
+def test_stereo_shows_what_is_between_few_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = []
+    monkeypatch.setattr(layer_settings, "PLAIN_CAMERAS", 0)
+    for most in (0, layer_settings.STEREO_CAMERAS):
+        monkeypatch.setattr(layer_settings, "STEREO_CAMERAS", most)
+        field = WITHOUT.run(LayeredField(SMALL), range(36))
+        assert field.supervision.with_depth == (most > 0)
+        scores.append(WITHOUT.score(field, 35))
+    assert scores[1] > scores[0] + 1.0
+
+
+@pytest.mark.parametrize(("plain_rows", "plain"), [(0, False), (14, True), (64, False)])
+def test_with_more_cameras_stereo_is_used_where_some_of_the_plates_is_plain(
+    plain_rows: int, plain: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the images the uppermost rows show a plain sky, which the others would, too, but for a grain."""
+    monkeypatch.setattr(layer_settings, "STEREO_CAMERAS", 2)
+    monkeypatch.setattr(layer_settings, "PLAIN_CAMERAS", 3)
+    grain = np.random.default_rng(0).integers(-12, 13, WITHOUT.held.image.shape)
+    grain[:plain_rows] = 0
+
+    def grained(camera: int, frame: int, view: View) -> View:
+        return replace(view, image=np.clip(view.image + grain, 0, 255).astype(np.uint8))
+
+    field = WITHOUT.run(LayeredField(SMALL), range(24), grained, steps=5)
+    stereo = field.supervision.depth is not None and field.supervision.depth.stereo is not None
+    assert field.supervision.plain == field.supervision.with_depth == stereo == plain
+    again = LayeredField(SMALL)
+    again.load_state(field.state())
+    assert again.supervision.plain == plain
+
+
+def test_with_a_budget_in_seconds_it_is_found_beside() -> None:
+    field = LayeredField(SMALL)
+    for frame in range(20):
+        field.fit([WITHOUT.frame(k, frame) for k in range(3)], Budget(seconds=0.02))
+    while field.static.training and not field.static.ready:
+        field.fit([WITHOUT.frame(k, 20) for k in range(3)], Budget(seconds=0.02))
+    assert field.static.ready and len(field.still.views) > 3
+    field.static.stop()

@@ -95,19 +95,6 @@ def test_one_anchor_near_each_gaussian_is_a_gauss_newton_by_pixels(anchors):
     assert np.linalg.eigvalsh(matrix).min() > -1e-5 * np.abs(wanted).max()
 
 
-def test_anchors_of_what_lies_together_agree_roughly():
-    """As in use: an anchor's Gaussians lie within a small angle."""
-    params, anchor, share, image, plate, weight = case()
-    middles = np.random.default_rng(1).normal(0, 0.4, (ANCHORS, 3))
-    anchor[:] = np.arange(ANCHORS)[np.arange(40) % ANCHORS][:, None]
-    params[:, :3] = middles[anchor[:, 0]] + 0.1 * params[:, :3]
-    given = (params, anchor, share, image, plate, weight)
-    matrix, vector, _, _ = aligned(*given)
-    wanted, right, _ = by_pixels(*given)
-    assert np.linalg.norm(matrix - wanted) < 0.05 * np.linalg.norm(wanted)
-    assert np.linalg.norm(vector - right) < 0.05 * np.linalg.norm(right)
-
-
 def test_nothing_is_said_without_weight_or_gaussians():
     params, anchor, share, image, plate, weight = case()
     matrix, vector, shown, opacity = aligned(params, anchor, share, image, plate, 0 * weight)
