@@ -17,6 +17,7 @@ from msgspec import structs
 
 from edge_server.fields import Budget, View
 from edge_server.fields.splat.field import StillField
+from edge_server.fields.splat.layers import settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.layers.layered_state import VERSION
 from tests.edge_server.fields.small import same_state
@@ -239,6 +240,27 @@ def test_a_camera_that_shows_something_else_is_refused_and_changes_nothing() -> 
     resumed = resumed_field(field.state())
     assert resumed.refused == {first.camera}
     assert resumed.fit([seen_by(k, 46, True) for k in range(len(CAMERAS))], Budget(steps=5)).refused == ()
+
+
+def test_layers_begin_again_when_the_box_of_the_scene_changes() -> None:
+    field = resumed_field()
+    store, plates = field.still.view_store, {n: c.plate for n, c in field.cameras.items()}
+    store.box = replace(store.box, radius_m=2.0 * store.box.radius_m)  # as a late camera may have it
+    played(field, range(42, 43), steps=5)
+    assert field.moving is not None and field.moving.box is field.still.view_store.box
+    assert field.still.step == 30
+    assert {n: c.plate for n, c in field.cameras.items()} == plates
+    assert all(camera.row is not None for camera in field.cameras.values())
+
+
+def test_few_cameras_with_large_pictures_train_fewer_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    field, size = LayeredField(SMALL), CAMERAS[0].intrinsics.width * CAMERAS[0].intrinsics.height
+    for frame in range(40):
+        field.fit([seen_by(k, frame, True) for k in range(4)], Budget(steps=30))
+    for frame, (most_pixels, steps) in enumerate([(size, 10), (size - 1, 6)], 40):
+        monkeypatch.setattr(settings, "FEW_STEPS_PIXELS", most_pixels)
+        report = field.fit([seen_by(k, frame, True) for k in range(4)], Budget(steps=30))
+        assert report.steps == steps
 
 
 def test_it_wants_every_frame_and_tells_how_long_one_takes_until_a_camera_moves() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.layers import settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
+from edge_server.fields.splat.layers.plates import Plate
 from tests.edge_server.fields.scenes import picture, psnr
 from tests.edge_server.fields.small import same_state
 from tests.edge_server.fields.splat.layers.ball import (
@@ -127,6 +129,41 @@ def test_a_still_field_that_began_anew_is_shown_once_it_fits_as_well_as_what_it_
     assert static.ready, "a step that errs takes nothing back"
     static.begin(plates, 20)
     assert not static.ready
+
+
+@pytest.mark.parametrize(("shown_after", "anew_s"), [(20, 1.2), (10_000, 2.0)])
+def test_in_seconds_the_still_field_begins_anew_after_it_was_shown_or_late(
+    monkeypatch: pytest.MonkeyPatch, shown_after: int, anew_s: float
+) -> None:
+    """Else nobody would ever see what a slow machine learns before plates are certain."""
+    for name, value in {"EARLY_S": 0.6, "PLATE_S": 1.2, "PLATES_SURE_S": 2.0, "EARLY_SHOWN_AFTER": shown_after}.items():
+        monkeypatch.setattr(settings, name, value)
+    field, frame = LayeredField(SMALL), 0
+    while not field.tracker or field.supervision.early:
+        assert (frame - 1) * FRAME_S < anew_s, "it goes on"
+        field.fit([seen_by(k, frame, False) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+        frame += 1
+    assert field.observations.newest_s == pytest.approx(anew_s, abs=FRAME_S)
+    while field.supervision.anew:  # the thread is at work on what it knows
+        field.fit([seen_by(k, frame, False) for k in range(len(CAMERAS))], Budget(seconds=0.02))
+        frame += 1
+    assert field.supervision.earlier is not None, "what is shown stays"
+    field.static.stop()
+
+
+def test_plates_ask_no_field_before_they_are_certain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(settings, "EARLY_S", 0.6)
+    field, asked = LayeredField(SMALL), dict[int, bool]()
+    take = Plate.take
+
+    def told(self: Plate, image: Any, may_refuse: bool = False, by_itself: bool = False) -> Any:
+        asked[self.count] = by_itself
+        return take(self, image, may_refuse, by_itself)
+
+    monkeypatch.setattr(Plate, "take", told)
+    played(field, range(20), steps=1)
+    first, last = round(0.6 / FRAME_S) + 1, round(1.0 / FRAME_S)
+    assert [frame for frame, by_itself in asked.items() if by_itself] == list(range(first, last + 1))
 
 
 def test_plates_do_not_wait_for_a_camera_that_has_gone_silent() -> None:

@@ -79,6 +79,19 @@ def test_one_camera_has_layers_with_depth_only() -> None:
     assert RIG.run(LayeredField(SMALL), range(30), _spoiled(_no_depth), cameras=1).tracker is None
 
 
+@pytest.mark.parametrize(
+    ("spoil", "lost_db"),
+    [
+        (lambda camera, frame, depth: depth if frame % 5 == 0 else None, 1.0),
+        (lambda camera, frame, depth: None if camera == 1 else depth, 1.5),
+    ],
+    ids=["each fifth", "two of three cameras"],
+)
+def test_depth_of_some_frames_or_cameras_does(spoil: Spoil, lost_db: float) -> None:
+    field, shown_db = _shown(spoil)
+    assert field.supervision.with_depth and shown_db[-1] > _shown(_true)[1][-1] - lost_db
+
+
 def test_depth_of_another_instant_says_nothing_of_what_moves() -> None:
     """The plates keep it; the moving set takes only what was measured within BODY_GAP_NS of the image."""
     gaps_ns = (0, depth_settings.BODY_GAP_NS, -depth_settings.BODY_GAP_NS - 1)
