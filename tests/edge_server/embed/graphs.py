@@ -22,13 +22,16 @@ def save(
     opset: int = 17,
     meta: dict[str, str] | None = None,
     further: tuple[tuple[str, list], ...] = (),
+    kind: int = TensorProto.FLOAT,
+    gives: int = TensorProto.FLOAT,
 ) -> Path:
-    """Write a graph from ``images`` (of this shape) to ``output`` (name and shape), and ``further`` ones."""
+    """Write a graph from ``images`` (of this shape, type ``kind``) to ``output`` (name and shape), and ``further``
+    ones, of type ``gives``."""
     graph = helper.make_graph(
         nodes,
         path.stem,
-        [helper.make_tensor_value_info("images", TensorProto.FLOAT, images)],
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in (output, *further)],
+        [helper.make_tensor_value_info("images", kind, images)],
+        [helper.make_tensor_value_info(name, gives, shape) for name, shape in (output, *further)],
         [*(numpy_helper.from_array(value, name) for name, value in constants.items()), *weights],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8)

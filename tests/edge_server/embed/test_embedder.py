@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ import pytest
 pytest.importorskip("onnxruntime", reason="the extra embed is not installed")
 pytest.importorskip("onnx", reason="the extra embed is not installed")
 
-from edge_server.embed import MODELS, EmbeddingConfig, EmbeddingError, make_embedder
-from edge_server.embed.backbone import load_backbone
+from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
+from edge_server.settings import read_config
+from freshfield.scenario import parse
 from tests.conftest import data_dir
 from tests.edge_server.embed.graphs import CHANNELS, detector, expected
 
@@ -32,10 +34,10 @@ def test_the_backbones_end_is_what_the_neck_enlarges_and_the_head_is_not_run(tmp
     images = [image(32, 32) for _ in range(3)]
     ready = np.stack(images).transpose(0, 3, 1, 2) / 255.0
     assert made.pooled(images) == pytest.approx(expected(ready), abs=1e-5)
+    assert b"impossible" not in made.backbone.model and b"scales" not in made.backbone.model
 
 
-@pytest.mark.parametrize("batch", [None, 1, 4])
-@pytest.mark.parametrize("count", [0, 1, 70])
+@pytest.mark.parametrize(("batch", "count"), [(None, 0), (1, 1), (1, 70), (4, 70)])
 def test_fixed_and_free_batches_give_one_result(tmp_path, batch, count):
     free = embedder(detector(tmp_path / "a.onnx"))
     fixed = embedder(detector(tmp_path / "b.onnx", batch=batch))
@@ -67,16 +69,7 @@ def test_the_size_is_the_files_or_the_exporters(tmp_path):
     assert embedder(detector(tmp_path / "fixed.onnx")).backbone.height == 32
 
 
-def test_alpha_is_laid_over_gray(tmp_path):
-    made = embedder(detector(tmp_path / "d.onnx"))
-    clear = np.zeros((32, 32, 4), np.uint8)
-    gray = np.full((32, 32, 3), 114, np.uint8)
-    solid = np.concatenate([image(32, 32), np.full((32, 32, 1), 255, np.uint8)], axis=2)
-    rows = made.embed([clear, gray, solid, np.ascontiguousarray(solid[..., :3])])
-    assert (rows[0] == rows[1]).all() and (rows[2] == rows[3]).all()
-
-
-def test_the_real_yolo11n_works_unchanged():
+def test_the_real_yolo11n_and_the_shipped_detector_work_unchanged():
     path = data_dir("yolo") / "yolo11n_int8_320.onnx"
     made = embedder(path, dim=32)
     assert made.backbone.tap == "/model.10/cv2/act/Mul_output_0"
@@ -85,16 +78,18 @@ def test_the_real_yolo11n_works_unchanged():
     rows = made.embed(images)
     assert np.isfinite(rows).all() and made.failed == 0
     assert (rows == made.embed(images)).all()
+    shipped = embedder("default", dim=32)
+    assert shipped.backbone.tap.startswith("/model.7/") and shipped.backbone.projection is not None
+    assert np.ptp(shipped.embed(images), axis=0).min() > 0
 
 
-@pytest.mark.parametrize("file", [MODELS / "detector_int8.onnx", "default"])
-def test_the_shipped_detectors_go_the_same_way(file):
-    made = embedder(file, dim=32)
-    assert made.backbone.tap.startswith("/model.7/") and made.backbone.projection is not None
-    rows = made.embed([image(128, 128), image(480, 640), image(33, 17)])
-    assert np.isfinite(rows).all() and np.ptp(rows, axis=0).min() > 0
-    with pytest.raises(EmbeddingError, match="dim: "):
-        embedder(file, dim=4096)
+def test_a_scenario_names_a_model_beside_it():
+    def config(**section) -> EmbeddingConfig | None:
+        return read_config(parse({"cameras": {"count": 2}, "edge": section}, Path("/somewhere/room.yaml"))).embedding
+
+    assert config() is None and config(embedding={}) == EmbeddingConfig()
+    assert config(embedding={"model": "m/yolo.onnx", "dim": 16}) == EmbeddingConfig("/somewhere/m/yolo.onnx", 16)
+    assert config(embedding={"model": "default"}).model == "default"
 
 
 def test_a_library_that_is_missing_is_named_with_what_installs_it(monkeypatch):
@@ -103,8 +98,3 @@ def test_a_library_that_is_missing_is_named_with_what_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(EmbeddingError, match=r"embedding needs onnx, .*freshfield\[embed\]"):
         make_embedder(EmbeddingConfig())
-
-
-def test_the_cut_model_holds_no_weights_of_the_head(tmp_path):
-    backbone = load_backbone(detector(tmp_path / "d.onnx"))
-    assert b"impossible" not in backbone.model and b"scales" not in backbone.model

@@ -20,6 +20,8 @@ def test_mean_color_of_black_and_white_views_is_gray():
     images = [np.zeros((8, 8, 3), np.uint8), np.full((20, 4, 3), 255, np.uint8)]
     assert mean_color_db(images, np.full((8, 8, 3), 0.5)) == PSNR_CEILING_DB
     assert mean_color_db(images, np.zeros((8, 8, 3))) == pytest.approx(10 * np.log10(4))
+    for size in ((32, 48, 3), (8, 12, 3)):  # a view of another size is resampled
+        assert view_db(np.full(size, 80, np.uint8), np.full((16, 24, 3), 80, np.uint8)) == PSNR_CEILING_DB
 
 
 def test_the_nearest_of_a_ring_is_the_neighbor():
@@ -33,11 +35,6 @@ def test_at_one_place_the_viewing_direction_decides():
     here = (1.0, 0.0, 0.0)
     views = [view("away", here, target=(9, 0, 0)), view("same", here, target=(-1, 0.1, 0))]
     assert nearest_view(views, look_at(here, (-1, 0, 0))).camera == "same"
-
-
-def test_a_view_of_another_size_is_resampled():
-    assert view_db(np.full((32, 48, 3), 80, np.uint8), np.full((16, 24, 3), 80, np.uint8)) == PSNR_CEILING_DB
-    assert view_db(np.full((8, 12, 3), 80, np.uint8), np.full((16, 24, 3), 80, np.uint8)) == PSNR_CEILING_DB
 
 
 def test_both_together_and_none_without_views():

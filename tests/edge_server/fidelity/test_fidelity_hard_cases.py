@@ -61,13 +61,3 @@ def test_poison_is_refused_by_name_and_never_scored(poison, which):
     pair = (bad, good) if which == "rendering" else (good, bad)
     with pytest.raises(ImageError, match=f"{which}.*row 39, column 39"):
         Scorer().score("h", pair[0], 0, pair[1], 0)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 40), (10, 10), (11, 11), (31, 31)])
-def test_tiny_images_are_scored_as_far_as_the_metrics_go(size):
-    lpips, _ = open_lpips(data_dir("lpips"))
-    image = RNG.random((*size, 3))
-    score = Scorer(lpips).score("h", image, 0, image, 0, [1 - image])
-    assert score.psnr_db == PSNR_CEILING_DB
-    assert (score.ssim is None) == (min(size) < 11)
-    assert (score.lpips is None) == (min(size) < 31)

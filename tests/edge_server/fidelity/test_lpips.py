@@ -11,8 +11,6 @@ from tests.conftest import data_dir
 
 # Values published with the weights: (reference, p0) and (reference, p1) of the authors' example images.
 GOLDEN = (0.7219, 0.1376)
-# On a fox photograph at 270 x 480, Gaussian blur of sigma 0.5, 1, 2, 4 and 8.
-GOLDEN_BLUR = (0.022, 0.186, 0.388, 0.593, 0.748)
 
 
 def metric():
@@ -31,15 +29,9 @@ def test_golden_values():
     assert lpips(example("p0"), example("ref")) == pytest.approx(first, abs=1e-4)
     assert lpips(example("p1"), example("ref")) == pytest.approx(second, abs=1e-4)
     assert lpips(example("ref"), example("ref")) == 0.0
-
-
-def test_golden_blurs_of_a_photograph():
-    photo = cv2.imread(str(data_dir("fox") / "images_2" / "0001.jpg"))[..., ::-1]
-    photo = cv2.resize(photo, (270, 480), interpolation=cv2.INTER_AREA)
-    blurred = np.stack([cv2.GaussianBlur(photo, (0, 0), s) for s in (0.5, 1, 2, 4, 8)]) / 255.0
-    distances = metric().batch(blurred, np.stack([photo / 255.0] * 5))
-    # The photograph and its resampling are not recorded to the digit, hence 10 % and not 1e-3.
-    assert distances == pytest.approx(GOLDEN_BLUR, rel=0.1)
+    assert lpips.minimum_side == 31
+    with pytest.raises(ImageError, match=r"LPIPS needs .* 31 x 31"):
+        lpips(np.zeros((30, 64, 3)), np.ones((30, 64, 3)))
 
 
 def test_a_mask_blackens_the_rest_and_weighs_each_cell_of_a_slice_by_its_share():
@@ -84,23 +76,6 @@ def test_it_computes_with_one_thread_whatever_torch_may_use(monkeypatch):
         torch.set_num_threads(before)
 
 
-def test_the_smallest_image_works_and_a_smaller_one_is_refused_with_the_limit():
-    lpips = metric()
-    side = lpips.minimum_side
-    assert np.isfinite(lpips(np.zeros((side, side, 3)), np.ones((side, side, 3))))
-    with pytest.raises(ImageError, match=r"LPIPS needs .* 31 x 31"):
-        lpips(np.zeros((side - 1, 64, 3)), np.ones((side - 1, 64, 3)))
-
-
-def test_missing_weights_give_a_reason_that_says_what_to_do(tmp_path, monkeypatch):
-    for name in (FOLDER_VARIABLE, "FRESHFIELD_DATA"):
-        monkeypatch.delenv(name, raising=False)
-    lpips, reason = open_lpips()
-    assert lpips is None and "--lpips" in reason and FOLDER_VARIABLE in reason
-    lpips, reason = open_lpips(tmp_path)
-    assert lpips is None and "alexnet_features.npz" in reason and str(tmp_path) in reason
-
-
 def test_torn_and_wrong_weights_give_a_reason_and_no_metric(tmp_path):
     source = data_dir("lpips")
     features, lin = FILES
@@ -121,12 +96,14 @@ def test_torn_and_wrong_weights_give_a_reason_and_no_metric(tmp_path):
 
 def test_the_weights_folder_is_the_nearest_that_was_named(tmp_path, monkeypatch):
     data, named = tmp_path / "data", tmp_path / "named"
-    monkeypatch.delenv("FRESHFIELD_LPIPS", raising=False)
+    monkeypatch.delenv(FOLDER_VARIABLE, raising=False)
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
+    lpips, reason = open_lpips()
+    assert lpips is None and "--lpips" in reason and FOLDER_VARIABLE in reason
     assert weights_folder() is None and weights_folder(None, data) is None
     (data / "lpips").mkdir(parents=True)
     assert weights_folder(None, data) == data / "lpips"
     monkeypatch.setenv("FRESHFIELD_DATA", str(data))
     assert weights_folder() == data / "lpips"
-    monkeypatch.setenv("FRESHFIELD_LPIPS", str(named))
+    monkeypatch.setenv(FOLDER_VARIABLE, str(named))
     assert weights_folder(None, data) == named and weights_folder(tmp_path, data) == tmp_path

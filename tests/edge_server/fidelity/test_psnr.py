@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edge_server.fidelity.images import ImageError
-from edge_server.fidelity.psnr import PSNR_CEILING_DB, psnr, psnr_of_mse
+from edge_server.fidelity.psnr import PSNR_CEILING_DB, psnr
 
 RNG = np.random.default_rng(5)
 
@@ -15,20 +15,14 @@ def test_a_known_error_gives_the_value_of_3_31():
     assert psnr(rendering, truth) == pytest.approx(10 * np.log10(255**2 / 100), abs=1e-9)
 
 
-def test_8_bit_and_floating_images_agree():
+def test_8_bit_floating_and_transparent_images_agree():
     truth = RNG.integers(0, 256, (12, 12, 3), dtype=np.uint8)
     rendering = RNG.integers(0, 256, (12, 12, 3), dtype=np.uint8)
     assert psnr((rendering / 255).astype(np.float32), truth) == pytest.approx(psnr(rendering, truth), abs=1e-4)
-
-
-def test_alpha_is_laid_over_the_background():
     rgba = np.zeros((4, 4, 4), np.uint8)
     rgba[..., 0] = 255
     assert psnr(rgba, np.zeros((4, 4, 3))) == PSNR_CEILING_DB  # transparent red on black is black
-
-
-def test_values_outside_the_range_are_clipped_as_a_screen_clips_them():
-    assert psnr(np.full((4, 4, 3), 1.7), np.ones((4, 4, 3))) == PSNR_CEILING_DB
+    assert psnr(np.full((4, 4, 3), 1.7), np.ones((4, 4, 3))) == PSNR_CEILING_DB  # clipped, as a screen does
 
 
 def test_a_mask_restricts_the_mean_and_an_empty_one_gives_nothing():
@@ -46,23 +40,13 @@ def test_a_mask_restricts_the_mean_and_an_empty_one_gives_nothing():
 @pytest.mark.parametrize(
     "image, said",
     [
-        (np.zeros((4, 4)), "shape"),
-        (np.zeros((0, 4, 3)), "shape"),
-        (np.zeros((4, 4, 2)), "shape"),
-        (np.zeros((4, 4, 3), np.int32), "int32"),
+        (np.zeros((4, 4)), "rendering.*shape"),
+        (np.zeros((0, 4, 3)), "rendering.*shape"),
+        (np.zeros((4, 4, 2)), "rendering.*shape"),
+        (np.zeros((4, 4, 3), np.int32), "rendering.*int32"),
+        (np.zeros((4, 5, 3)), "5 x 4.*4 x 4"),
     ],
 )
 def test_what_is_no_image_is_refused_by_name(image, said):
-    with pytest.raises(ImageError, match=r"rendering.*" + said):
+    with pytest.raises(ImageError, match=said):
         psnr(image, np.zeros((4, 4, 3)))
-
-
-def test_different_sizes_are_refused_and_both_are_named():
-    with pytest.raises(ImageError, match=r"5 x 4.*4 x 4"):
-        psnr(np.zeros((4, 5, 3)), np.zeros((4, 4, 3)))
-
-
-@pytest.mark.parametrize("mse", [-1.0, float("nan"), float("inf")])
-def test_an_impossible_error_is_refused(mse):
-    with pytest.raises(ValueError, match="mean squared error"):
-        psnr_of_mse(mse)

@@ -20,13 +20,11 @@ def test_a_score_has_every_metric_of_the_whole_image_and_of_its_parts():
     assert (score.psnr_moving_db, score.psnr_still_db) == (pytest.approx(20.0), pytest.approx(40.0))
     assert score.psnr_db == pytest.approx(-10 * np.log10((0.01 + 3 * 0.0001) / 4))
     assert score.moving_share == 0.25 and 0.0 < score.ssim < 1.0
+    clear = np.zeros((16, 16, 4), np.uint8)  # a truth with alpha lies over the background
+    white = Scorer(background=(1.0, 1.0, 1.0)).score("h", np.ones((16, 16, 3)), 0, clear, 0)
+    assert white.psnr_db == PSNR_CEILING_DB
     quick = Scorer().score("h", shown, 0, truth, 0, psnr_only=True)
     assert (quick.psnr_db, quick.psnr_moving_db, quick.ssim) == (score.psnr_db, None, None)
-
-
-def test_a_truth_with_alpha_lies_over_the_background():
-    clear = np.zeros((16, 16, 4), np.uint8)
-    assert Scorer(background=(1.0, 1.0, 1.0)).score("h", np.ones((16, 16, 3)), 0, clear, 0).psnr_db == PSNR_CEILING_DB
 
 
 def test_selected_views_are_averaged_and_say_so():
@@ -39,14 +37,6 @@ def test_selected_views_are_averaged_and_say_so():
     assert Scorer().score_selected([], 0) is None
 
 
-def test_lpips_is_scored_where_the_image_is_large_enough():
-    scorer = Scorer(open_lpips(data_dir("lpips"))[0])
-    truth = np.random.default_rng(0).random((48, 48, 3))
-    assert scorer.score("h", truth, 0, truth, 0).lpips == 0.0
-    small = scorer.score("h", truth[:30, :30], 0, truth[:30, :30], 0)
-    assert small.lpips is None and small.ssim == pytest.approx(1.0)
-
-
 def test_the_mean_over_cameras_skips_what_a_camera_lacks():
     gray = np.full((16, 16, 3), 0.5)
     scorer = Scorer()
@@ -55,3 +45,12 @@ def test_the_mean_over_cameras_skips_what_a_camera_lacks():
     mean = mean_score([a, b])
     assert mean.ssim == a.ssim and b.ssim is None and mean.psnr_moving_db == pytest.approx(20.0)
     assert mean.camera == "a,b"
+
+
+@pytest.mark.parametrize("size", [(1, 40), (10, 10), (11, 11), (31, 31)])
+def test_tiny_images_are_scored_as_far_as_the_metrics_go(size):
+    image = np.random.default_rng(0).random((*size, 3))
+    score = Scorer(open_lpips(data_dir("lpips"))[0]).score("h", image, 0, image, 0, [1 - image])
+    assert score.psnr_db == PSNR_CEILING_DB
+    assert score.ssim == (None if min(size) < 11 else pytest.approx(1.0))
+    assert score.lpips == (None if min(size) < 31 else 0.0)

@@ -48,8 +48,5 @@ def test_a_mask_leaves_the_windows_that_lie_wholly_within_it():
     assert ssim(a, b, mask) == pytest.approx(reference_ssim(a[4:15, 20:31], b[4:15, 20:31]), abs=1e-9)
     mask[4, 20] = False
     assert ssim(a, b, mask) is None
-
-
-def test_an_image_smaller_than_the_window_is_refused():
     with pytest.raises(ImageError, match="at least 11 x 11"):
-        ssim(np.zeros((10, 40, 3)), np.zeros((10, 40, 3)))
+        ssim(a[:10], b[:10])

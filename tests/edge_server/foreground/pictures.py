@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def disc(
-    height: int = 96, width: int = 128, center: tuple[int, int] = (50, 70), radius: int = 22, seed: int = 0
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+def disc(height: int, width: int, center: tuple[int, int], radius: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """(picture (H, W, 3), truth (H, W)): an orange disc on a noisy blue ground; center is (row, column)."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     y, x = np.mgrid[:height, :width]
     truth = (y - center[0]) ** 2 + (x - center[1]) ** 2 <= radius**2
     picture = np.where(truth[..., None], (230, 120, 20), (40, 70, 160)) + rng.normal(0, 8, (height, width, 3))
@@ -23,9 +21,7 @@ def iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
     return float((a & b).sum() / max((a | b).sum(), 1))
 
 
-def save_orange_detector(
-    path: Path, kinds: int = 3, side: int = 64, transposed: bool = False, masks: bool = True
-) -> Path:
+def save_orange_detector(path: Path, masks: bool = True) -> Path:
     """An ONNX with a YOLO head's output: one cell a pixel of an 8 x 8 grid, of which those on orange score,
     with boxes of 40 pixels around them. masks: of a segmentation model, orange at a quarter of the side;
     False: a detection model without them."""
@@ -33,7 +29,7 @@ def save_orange_detector(
 
     from tests.edge_server.embed.graphs import save
 
-    grid = 8
+    grid, side, kinds = 8, 64, ("apple", "orange", "pear")
     step = side // grid
     centers = (np.arange(grid) + 0.5) * step
     x, y = np.meshgrid(centers, centers)
@@ -46,12 +42,9 @@ def save_orange_detector(
         helper.make_node("Relu", ["orange"], ["score"]),
         helper.make_node("Reshape", ["score", "flat"], ["row"]),
         helper.make_node("Mul", ["row", "spread"], ["scores"]),
-        helper.make_node("Concat", ["boxes", "scores", *["ones"] * masks], ["table"], axis=1),
-        helper.make_node("Transpose", ["table"], ["output0"], perm=[0, 2, 1])
-        if transposed
-        else helper.make_node("Identity", ["table"], ["output0"]),
+        helper.make_node("Concat", ["boxes", "scores", *["ones"] * masks], ["output0"], axis=1),
     ]
-    spread = np.zeros((1, kinds, 1), np.float32)
+    spread = np.zeros((1, len(kinds), 1), np.float32)
     spread[0, 1] = 1.0
     constants = {
         "weight": weight,
@@ -66,10 +59,8 @@ def save_orange_detector(
             helper.make_node("Conv", ["fine", "weight"], ["fine_orange"]),
             helper.make_node("Sub", ["fine_orange", "half"], ["output1"]),
         ]
-    columns = 4 + kinds + masks
-    shape = [1, grid * grid, columns] if transposed else [1, columns, grid * grid]
-    names = {k: name for k, name in enumerate(["apple", "orange", "pear"][:kinds])}
-    meta = {"names": str(names)}
+    shape = [1, 4 + len(kinds) + masks, grid * grid]
+    meta = {"names": str(dict(enumerate(kinds)))}
     further = (("output1", [1, 1, side // 4, side // 4]),) if masks else ()
     return save(path, nodes, [1, 3, side, side], ("output0", shape), constants, opset=13, meta=meta, further=further)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import ClassVar
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,16 +25,10 @@ for module in ("onnx", "onnxruntime"):
 NOISE = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
 
 
-class Says:
-    """A detector that always gives the same detections."""
-
-    kinds: ClassVar[dict[int, str]] = {}
-
-    def __init__(self, *found: Detection) -> None:
-        self.found = list(found)
-
-    def detect(self, image, confidence):
-        return self.found
+def cut(*detections: Detection, **config) -> Foreground:
+    """With a detector that always gives the same detections."""
+    detector = SimpleNamespace(detect=lambda image, confidence: list(detections))
+    return Foreground(ForegroundConfig("model.onnx", **config), detector)
 
 
 def found(box, mask=None, kind="tile", score=0.9) -> Detection:
@@ -44,27 +38,21 @@ def found(box, mask=None, kind="tile", score=0.9) -> Detection:
     return Detection(box, score, kind, broken if mask is None else lambda: mask)
 
 
-def cut(*detections: Detection, **config) -> Foreground:
-    return Foreground(ForegroundConfig("model.onnx", **config), Says(*detections))
-
-
 def test_what_the_mask_shows_within_the_box_and_its_margin_stays():
     mask = np.ones((40, 60), np.bool_)
     mask[:, 30] = False
-    rgba = cut(found((20.0, 10.0, 40.0, 30.0), mask), margin=0.1).apply("cam00", NOISE)
+    alpha = np.full((40, 60), 255, np.uint8)
+    alpha[:20] = 100
+    foreground = cut(found((20.0, 10.0, 40.0, 30.0), mask), margin=0.1)
+    rgba = foreground.apply("cam00", np.dstack([NOISE, alpha]))
     kept = np.zeros((40, 60), np.bool_)
     kept[8:32, 18:42] = True  # a tenth of 20 pixels on each side
     kept[:, 30] = False
-    assert np.array_equal(rgba[..., 3], np.where(kept, 255, 0))
+    assert np.array_equal(rgba[..., 3], np.where(kept, alpha, 0)), "transparency that an image has stays"
     assert np.array_equal(rgba[kept][:, :3], NOISE[kept])
     assert not rgba[~kept].any(), "what is transparent has no color either"
-
-
-def test_transparency_that_an_image_has_stays():
-    alpha = np.full((40, 60), 255, np.uint8)
-    alpha[:20] = 100
-    rgba = cut(found((0.0, 0.0, 30.0, 40.0), np.ones((40, 60), np.bool_))).apply("cam00", np.dstack([NOISE, alpha]))
-    assert np.array_equal(rgba[:, :30, 3], alpha[:, :30]) and not rgba[:, 32:, 3].any()
+    assert np.array_equal(foreground.apply("cam00", NOISE)[..., 3], np.where(kept, 255, 0))
+    assert clipped((-3.0, 2.5, 10.2, 99.0), 60, 40) == (0, 2, 11, 40)
 
 
 def test_the_surest_detection_of_a_kind_asked_for_counts():
@@ -85,12 +73,9 @@ ALL, NONE = np.ones((40, 60), np.bool_), np.zeros((40, 60), np.bool_)
     "detections, counted",
     [
         ([], "not_detected"),
-        ([found((10.0, 10.0, 10.0, 30.0), ALL)], "empty_box"),
         ([found((10.0, 30.0, 20.0, 10.0), ALL)], "empty_box"),
-        ([found((100.0, 100.0, 120.0, 130.0), ALL)], "empty_box"),
         ([found((-30.0, -30.0, 0.0, 0.0), ALL)], "empty_box"),
         ([found((np.nan, 0.0, 10.0, 10.0), ALL)], "empty_box"),
-        ([found((0.0, 0.0, np.inf, 10.0), ALL)], "empty_box"),
         ([found((0.0, 0.0, 30.0, 30.0), NONE)], "empty_mask"),
         ([found((-5.0, -5.0, 65.0, 45.0), ALL)], "full_mask"),
         ([found((0.0, 0.0, 30.0, 30.0))], "failed"),
@@ -106,14 +91,8 @@ def test_what_cannot_be_cut_passes_whole_and_is_counted_and_said_once(detections
     assert foreground.status()[counted] == 2 and foreground.status()["ms_per_image"] > 0
 
 
-def test_boxes_are_clipped_to_whole_pixels():
-    assert clipped((-3.0, 2.5, 10.2, 99.0), 60, 40) == (0, 2, 11, 40)
-    assert clipped((59.9, 39.9, 70.0, 50.0), 60, 40) == (59, 39, 60, 40)
-
-
-@pytest.mark.parametrize("transposed", [False, True])
-def test_boxes_and_masks_come_back_through_the_letterbox(tmp_path, transposed):
-    model = save_orange_detector(tmp_path / "orange-seg.onnx", transposed=transposed)
+def test_boxes_and_masks_come_back_through_the_letterbox(tmp_path):
+    model = save_orange_detector(tmp_path / "orange-seg.onnx")
     picture, truth = disc(96, 128, (48, 72), 14)
     (only,) = Detector(str(model)).detect(picture, 0.25)  # overlapping ones are suppressed
     assert only.kind == "orange"
@@ -149,8 +128,6 @@ def test_a_head_is_decoded_to_corners_best_score_first():
     # The same box twice is one object; the same box of another kind is another.
     twice = head((10, 20, 4, 6, 0.3, 0.0, 7.0), (10, 20, 4, 6, 0.4, 0.0, 8.0), (10, 20, 4, 6, 0.0, 0.5, 9.0))
     assert [row[6] for row in decode(twice, 0.25, "test", 1)] == [9.0, 8.0]
-    with pytest.raises(ForegroundError, match=r"test: gives \(1, 4, 64\), not the boxes and scores"):
-        decode(np.zeros((1, 4, 64)), 0.25, "test", 1)
 
 
 def columns(*rows, cells=64):
@@ -164,20 +141,18 @@ TILE = (8.0, 17.0, 12.0, 23.0)  # corners of a box around (10, 20)
 
 
 @pytest.mark.parametrize(
-    ("output", "kinds", "end_to_end"),
+    ("output", "kinds", "end_to_end", "kind"),
     [
-        (head((10, 20, 4, 6, 0.1, 0.9, 5.0)), 2, None),
-        (head((10, 20, 4, 6, 0.1, 0.9, 5.0)), 0, False),
-        (columns((10, 20, 4, 6, 0.0, 0.1, 0.9, 5.0)).transpose(0, 2, 1), 3, False),
-        (columns((10, 20, 4, 6, 1.0, 0.1, 0.9, 5.0)).transpose(0, 2, 1), 2, None),  # v5: objectness first
-        (columns((*TILE, 0.9, 1.0, 5.0), cells=300), 80, None),
-        (columns((*TILE, 0.9, 1.0, 5.0), cells=300), 2, True),
-        (columns((*TILE, 0.9, 1.0, 5.0), cells=5), 0, None),
+        (head((10, 20, 4, 6, 0.1, 0.9, 5.0)), 0, False, 1.0),
+        (columns((10, 20, 4, 6, 0.0, 0.1, 0.9, 5.0)).transpose(0, 2, 1), 3, False, 2.0),
+        (columns((10, 20, 4, 6, 1.0, 0.1, 0.9, 5.0)).transpose(0, 2, 1), 2, None, 1.0),  # v5: objectness first
+        (columns((*TILE, 0.9, 1.0, 5.0), cells=300), 80, None, 1.0),
+        (columns((*TILE, 0.9, 1.0, 5.0), cells=300), 2, True, 1.0),
+        (columns((*TILE, 0.9, 1.0, 5.0), cells=5), 0, None, 1.0),
     ],
 )
-def test_every_head_of_a_segmentation_model_is_told_and_decoded(output, kinds, end_to_end):
+def test_every_head_of_a_segmentation_model_is_told_and_decoded(output, kinds, end_to_end, kind):
     (row,) = decode(output, 0.5, "test", 1, kinds, end_to_end)
-    kind = 2.0 if output.shape == (1, 8, 64) and kinds == 3 else 1.0
     assert row == pytest.approx((*TILE, 0.9, kind, 5.0))
     # What suppresses by itself is not suppressed again.
     twice = columns((*TILE, 0.9, 1.0, 5.0), (*TILE, 0.8, 1.0, 6.0), cells=300)
@@ -188,7 +163,6 @@ def test_every_head_of_a_segmentation_model_is_told_and_decoded(output, kinds, e
     ("output", "kinds", "message"),
     [
         (head((10, 20, 4, 6, 79.0, 0.0, 5.0)), 2, "scores lie in 0 to 79, not in 0 to 1"),
-        (head((10, 20, 4, 6, -3.0, 0.0, 5.0)), 2, "scores lie in -3 to 0"),
         (head((0.5, 0.5, 0.1, 0.1, 0.9, 0.0, 5.0)), 2, "boxes are not in pixels"),
         (head((10, 20, 4, 6, 0.9, 0.0, 5.0)), 5, "fits no head of 5 classes"),
         (columns((*TILE, 0.9, 1.5, 5.0), cells=300), 80, "fits no head of 80 classes"),
@@ -200,24 +174,17 @@ def test_a_head_that_is_not_understood_is_refused_with_the_command_that_exports_
         decode(output, 0.5, "test", 2 if output.shape[2] == 6 else 1, kinds)
 
 
-def test_names_are_a_list_or_a_mapping():
-    assert (
-        _kinds({"names": "['apple', 'pear']"})
-        == _kinds({"names": "{0: 'apple', 1: 'pear'}"})
-        == {0: "apple", 1: "pear"}
-    )
+def test_the_exporters_metadata_are_read_and_nonsense_is_none():
+    for names in ("['apple', 'pear']", "{0: 'apple', 1: 'pear'}"):
+        assert _kinds({"names": names}) == {0: "apple", 1: "pear"}
     assert _kinds({}) == _kinds({"names": "apple"}) == _kinds({"names": "{'a': 3}"}) == {}
-    assert [
-        _end_to_end(meta) for meta in ({}, {"end2end": "True"}, {"args": "{'nms': True}"}, {"args": "{'nms': False}"})
-    ] == [None, True, True, False]
+    said = ({}, {"end2end": "True"}, {"args": "{'nms': True}"}, {"args": "{'nms': False}"})
+    assert [_end_to_end(meta) for meta in said] == [None, True, True, False]
 
 
 def test_reported_models_without_masks_are_refused_by_what_they_are():
-    tasks = {"obb": "obb", "pose": "pose", "v5": "detect", "v8": "detect", "rtdetr": "detect", "e2e_nms": "detect"}
-    for name, task in tasks.items():
-        with pytest.raises(
-            ForegroundError, match=rf"{name}.onnx: gives no masks: it is a model of the task {task}; name"
-        ):
+    for name, task in (("pose", "pose"), ("v5", "detect"), ("e2e_nms", "detect")):
+        with pytest.raises(ForegroundError, match=rf"{name}.onnx: gives no masks: it is a model of the task {task}"):
             Detector(str(case_dir("02-yolo-end-to-end-export") / f"{name}.onnx"))
 
 
@@ -231,54 +198,21 @@ def test_a_model_that_gives_no_numbers_detects_nothing(value):
     assert decode(head((10.0, 20.0, 0.0, 6.0, 0.9, 0.1, 1.0)), 0.25, "test", 1) == [], "a box without area"
 
 
-def test_the_loop_fits_to_cut_views(tmp_path):
-    """From the scenario to what the field is given, in virtual time."""
-    data = {
-        "name": "cut",
-        "seed": 3,
-        "cameras": {"count": 3, "held_out": ["cam00"]},
-        "source": {"kind": "world", "scene": "tile", "width": 96, "height": 96, "fps": 5},
-        "channel": {"preset": "ch5"},
-        "edge": {"field": "ngp", "foreground": {"detector": "tile"}},
-    }
-    deployment = build_deployment(parse(data, tmp_path / "cut.yaml"), RunSettings(steps=1, score_every_ms=None))
-    deployment.run(0.8)
-    decoder = deployment.updates.decoder
-    assert deployment.publications and decoder.foreground.counts["masked"] >= 2
-    for view in decoder.views(deployment.updates.buffer.newest().values()):
-        assert view.image.shape == (96, 96, 4)
-        assert 0.01 < (view.image[..., 3] > 0).mean() < 0.6
-
-
-@pytest.mark.parametrize(
-    "section, part",
-    [
-        ({}, "detector: missing"),
-        ({"detector": "tile", "confidence": 1.5}, "confidence: expected a number, 0 to 1"),
-        ({"detector": "tile", "margin": -0.1}, "margin: expected a number, 0 to 1"),
-        ({"detector": "tile", "box": [0, 0, 1, 1]}, "box: unknown key"),
-    ],
-)
-def test_wrong_sections_are_refused_by_file_and_key(section, part):
-    with pytest.raises(ScenarioError, match=rf"scene\.yaml: edge\.foreground.*{part}"):
-        read_foreground(section, Path("scene.yaml"))
-
-
 def test_a_scenario_turns_it_on_with_a_file_beside_it(tmp_path):
     scenario = load("tile")
     assert read_config(scenario).foreground is None
     text = scenario.path.read_text().replace("edge: {}", "edge: {foreground: {detector: cat-seg.onnx}}")
     (tmp_path / "cut.yaml").write_text(text)
     assert read_config(load(str(tmp_path / "cut.yaml"))).foreground.detector == str(tmp_path / "cat-seg.onnx")
+    with pytest.raises(ScenarioError, match=r"scene\.yaml: edge\.foreground.*confidence: expected a number, 0 to 1"):
+        read_foreground({"detector": "tile", "confidence": 1.5}, Path("scene.yaml"))
 
 
 def test_wrong_models_are_refused(tmp_path):
-    (tmp_path / "text.onnx").write_text("no model")
     boxes = save_orange_detector(tmp_path / "boxes.onnx", masks=False)
     orange = save_orange_detector(tmp_path / "orange.onnx")
     for config, part in (
         (ForegroundConfig(str(tmp_path / "none.onnx")), "none.onnx: cannot be read"),
-        (ForegroundConfig(str(tmp_path / "text.onnx")), "text.onnx: not an ONNX file"),
         (ForegroundConfig(str(boxes)), "boxes.onnx: gives no masks"),
         (ForegroundConfig(str(orange), kinds=["dog"]), "knows no dog; it knows apple"),
     ):
@@ -298,3 +232,21 @@ def test_a_model_that_takes_terabytes_is_refused(tmp_path, kind):
     config = ForegroundConfig(str(save_memory_bomb(tmp_path / "bomb.onnx", kind)))
     with pytest.raises(ForegroundError, match=r"bomb\.onnx: ONNX Runtime .* (may take|more than) 4"):
         make_foreground(config)
+
+
+def test_the_loop_fits_to_cut_views(tmp_path):
+    """From the scenario to what the field is given, in virtual time."""
+    data = {
+        "name": "cut",
+        "cameras": {"count": 3, "held_out": ["cam00"]},
+        "source": {"kind": "world", "scene": "tile", "width": 96, "height": 96, "fps": 5},
+        "channel": {"preset": "ch5"},
+        "edge": {"field": "ngp", "foreground": {"detector": "tile"}},
+    }
+    deployment = build_deployment(parse(data, tmp_path / "cut.yaml"), RunSettings(steps=1, score_every_ms=None))
+    deployment.run(0.8)
+    decoder = deployment.updates.decoder
+    assert deployment.publications and decoder.foreground.counts["masked"] >= 2
+    for view in decoder.views(deployment.updates.buffer.newest().values()):
+        assert view.image.shape == (96, 96, 4)
+        assert 0.01 < (view.image[..., 3] > 0).mean() < 0.6

@@ -52,14 +52,6 @@ def test_the_tile_is_cut_out_as_a_hand_sees_it(tile, bench):
     assert np.mean(found) > (0.85 if bench else 0.94) and min(found) > (0.75 if bench else 0.9), found
 
 
-@pytest.mark.parametrize("azimuth", [-60, 10, 100])
-def test_a_tile_far_away_is_found(tile, azimuth):
-    image, truth = seen(2.0, azimuth, 45, 60.0)
-    assert truth.mean() < 0.04
-    # Some 30 pixels wide, with a mask at half of that: where it is, not its outline.
-    assert iou(mask_of(tile, image), truth) > 0.25
-
-
 def test_a_picture_without_the_tile_is_used_whole():
     scene = make_scene("tile", {"count": 1, "bench": True})
     parts = scene.world.static_parts[len(object_parts()) :]

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from edge_server.surface import SurfaceError
 from edge_server.surface.kernels.fuse import SIDE
 from edge_server.surface.mesh import extract_mesh, remove_small_components
 from edge_server.surface.sdf import fit_sdf, gradient_norm, sample_grid
@@ -69,8 +68,3 @@ def test_the_number_of_threads_changes_no_bit():
     finally:
         torch.set_num_threads(before)
     np.testing.assert_array_equal(*found)
-
-
-def test_too_many_nodes_say_what_would_do():
-    with pytest.raises(SurfaceError, match=r"too many nodes: take [\d.]+ mm or more"):
-        fit_sdf(Grid((-0.13,) * 3, (0.13,) * 3, 0.0009, 0.004), ball_maps(2))

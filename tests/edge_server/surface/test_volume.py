@@ -8,7 +8,7 @@ import pytest
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.kernels.fuse import SIDE
-from edge_server.surface.volume import BLOCK_BYTES, Grid, bounding_box, fuse_maps
+from edge_server.surface.volume import Grid, bounding_box, fuse_maps
 from tests.edge_server.surface.ball import (
     DISTORTED_LENS,
     LENS,
@@ -43,14 +43,6 @@ def test_blocks_hold_every_voxel_near_the_surface():
     assert (volume.table[tuple((near // SIDE).T)] >= 0).all()
 
 
-def test_distances_are_those_of_the_ball():
-    volume = fuse_maps(BOX, ball_maps())
-    exact = np.linalg.norm(voxel_points(volume), axis=-1) - RADIUS_M
-    near = (np.abs(exact) < 0.01) & (volume.blocks.weight > 0.5)
-    assert near.sum() > 1000
-    assert np.abs(volume.blocks.distance - exact)[near].mean() < 0.0012
-
-
 def test_the_number_of_threads_changes_no_bit():
     maps = ball_maps(6)
     one, three = (fuse_maps(BOX, maps, pool=pool) for pool in (Pool(1, nice=0), Pool(3, nice=0)))
@@ -70,7 +62,6 @@ def test_too_fine_a_grid_says_what_would_do():
     ):
         with pytest.raises(SurfaceError, match=said):
             Grid(*grid)
-    assert BLOCK_BYTES == SIDE**3 * 24
 
 
 def test_bounds_are_those_of_what_is_seen():

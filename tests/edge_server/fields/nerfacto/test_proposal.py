@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from msgspec import structs
 
 from edge_server.fields import Budget
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT
@@ -24,12 +25,10 @@ from edge_server.fields.nerfacto.kernels.proposal import (
     bin_weights,
     make_bins,
     place_samples,
-    unwarp,
-    warp,
 )
 from edge_server.fields.nerfacto.kernels.train import WEIGHT_FLOOR, interlevel_loss, scatter_proposal
-from edge_server.fields.nerfacto.settings import NerfactoSettings
 from tests.edge_server.fields.scenes import ring
+from tests.edge_server.fields.small_rays import TINY
 
 F = np.float32
 CELLS, BINS, ZERO = 8, 48, np.int64(0)
@@ -79,20 +78,6 @@ def test_bins_cover_the_ray_and_know_their_cells(contracted: bool, shift: float)
     assert (cell == expected).mean() > 0.95  # float32 may round a middle into the neighbor
     sigma = np.exp(np.clip(RAW_GAIN * values.astype(F)[cell] + RAW_START, RAW_LOW, RAW_HIGH))
     np.testing.assert_allclose(depth, sigma * (edges[1] - edges[0]), rtol=1e-5)
-
-
-def test_spacing_is_linear_in_the_box_and_even_in_contracted_space_beyond() -> None:
-    _, _, edges, _ = _bins_of(_space(True), _encoding(np.zeros(CELLS**3)), shift=0.0, leave=19.0)
-    points = edges[0][:, None] * np.array(TOWARDS) + np.array(START_AT)
-    length = np.diff(edges[0])
-    inside = np.abs(points).max(axis=1)[:-1] < 1.0
-    inside[: np.flatnonzero(inside)[0]] = True  # before the box: linear, too
-    knee = np.flatnonzero(inside)[-1]
-    np.testing.assert_allclose(length[:knee], length[0], rtol=1e-3)
-    along = (_unit(points, True) * 4)[:, 0]
-    np.testing.assert_allclose(np.diff(along)[knee + 1 :], np.diff(along)[knee + 1], rtol=0.02)
-    knee_t, slope, end = warp(True, START_AT, TOWARDS, F(0.1), F(19.0))
-    assert unwarp(end, knee_t, slope) == pytest.approx(19.0, rel=1e-3)
 
 
 def test_bins_end_where_it_is_dark_and_skip_what_is_empty() -> None:
@@ -148,14 +133,6 @@ def test_samples_are_dealt_by_weight_and_leave_no_bin_out(seed: int) -> None:
                 assert earned[members].sum() <= 1.01 and (earned[members] < 1.0).all()
     heavy = earned >= 1
     np.testing.assert_allclose(counts[heavy], earned[heavy], atol=0.03)
-
-
-def test_even_and_empty_weights_are_dealt_evenly() -> None:
-    for weight, even in ((np.zeros(48), 0.1), (np.full(48, 1e-30), 0.0)):
-        _, share = _allocated(weight, 16, even, 0.3)
-        assert (share == 1).all() and len(share) in (16, 24)  # three bins each, or two where rounding forbids
-    assert _allocated(np.zeros(0), 16, 0.5, 0.3)[1].size == 0
-    assert _allocated(np.array([1e-3]), 16, 0.5, 0.3)[1].tolist() == [16]
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.999])
@@ -221,21 +198,8 @@ def test_interlevel_loss_and_gradient_equal_the_oracle(seed: int) -> None:
     encoding, cell, length, depth, group, of, w = _interlevel_case(seed)
     weight, grad = np.empty(14, F), np.full(14, 7.0, F)
     bin_weights(depth, 2, 12, weight)
-    loss = interlevel_loss(
-        encoding,
-        np.r_[0, 0, cell].astype(np.int32),
-        depth,
-        weight,
-        group,
-        2,
-        12,
-        w,
-        of,
-        0,
-        len(of),
-        np.empty((2, BINS), F),
-        grad,
-    )
+    bins = np.r_[0, 0, cell].astype(np.int32), depth, weight, group, 2, 12
+    loss = interlevel_loss(encoding, *bins, w, of, 0, len(of), np.empty((2, BINS), F), grad)
     values = torch.as_tensor(encoding.table[SEGMENT:].reshape(-1), dtype=torch.float64).requires_grad_(True)
     rest = cell, length, group[2:], of, torch.as_tensor(w, dtype=torch.float64)
     expected, total = _interlevel_oracle(values, *rest)
@@ -264,34 +228,19 @@ def test_the_proposals_gradient_is_added_up_once() -> None:
 
 def test_a_whole_steps_gradients_equal_finite_differences() -> None:
     """Of the color error, by the network's parameters and by the cameras' embeddings."""
-    settings = NerfactoSettings(
-        levels=3,
-        log2_table=9,
-        base_resolution=4,
-        finest_resolution=24,
-        hidden=8,
-        rays=64,
-        batch_samples=4096,
-        samples=12,
-        samples_start=12,
-        bins=24,
-        cells=16,
-        proposal_cells=8,
-        appearance=2,
-        sh_degree=1,
-        threads=1,
-        contracted=True,
-    )
-    field, views = NerfactoField(settings), ring(5, size=16)
+    changed = {"hidden": 8, "rays": 64, "appearance": 2, "sh_degree": 1, "threads": 1, "contracted": True}
+    field, views = NerfactoField(structs.replace(TINY["nerfacto"], **changed)), ring(5, size=16)
     field.fit(views, Budget(steps=30))
     # A thin fog: no ray becomes opaque, where one sample more or less would be a step in the loss.
     field._net.params[-field._net.widths[-1]] = -1.0
-    assert field.view_store.box is not None
-    data = field._cameras.corrected(views, field.view_store.add(views).data, field.view_store.box)
+    box = field.view_store.box
+    assert box is not None
+    data = field._cameras.corrected(views, field.view_store.add(views).data, box)
     looks = field._cameras.embeddings
-    ray_sampling = RaySampling(np.uint64(3), 32, 3, 1, F(0.0), np.full(3, 0.5, F), looks)
+    levels = field.settings.levels
+    ray_sampling = RaySampling(np.uint64(3), 32, levels, 1, F(0.0), np.full(3, 0.5, F), looks)
     weights, batch = Weights(F(0.0)), field._batch
-    space = OccupancyGrid(settings.cells, 0, field.view_store.box).space(0.1)
+    space = OccupancyGrid(field.settings.cells, 0, box).space(0.1)
     space.occupied[:], space.coarse[:] = 1, 1
 
     def loss() -> float:
@@ -301,10 +250,8 @@ def test_a_whole_steps_gradients_equal_finite_differences() -> None:
 
     loss()
     slopes = batch.d_params.sum(axis=0), batch.d_embeddings.sum(axis=0)
-    assert batch.rays.sum() == 64 and batch.samples.sum() > 64 and np.abs(slopes[1]).max() > 1e-4
-    net = field._net.params
-    checked = 0
-    for array, slope in ((net, slopes[0]), (looks, slopes[1])):
+    assert batch.rays.sum() >= 32 and batch.samples.sum() > 64 and np.abs(slopes[1]).max() > 1e-4
+    for array, slope in ((field._net.params, slopes[0]), (looks, slopes[1])):
         flat, wanted = array.reshape(-1), slope.reshape(-1)
         for k in np.argsort(-np.abs(wanted))[:24:3]:
             kept, step = flat[k], F(4e-3)
@@ -314,5 +261,3 @@ def test_a_whole_steps_gradients_equal_finite_differences() -> None:
             slope_here = (above - loss()) / (2 * float(step))
             flat[k] = kept
             assert slope_here == pytest.approx(wanted[k], rel=0.03, abs=2e-3)
-            checked += 1
-    assert checked >= 10

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from msgspec import structs
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget
@@ -16,32 +17,17 @@ from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.nerfacto.field import NerfactoField
-from edge_server.fields.nerfacto.settings import NerfactoSettings
 from tests.edge_server.fields.scenes import ring
+from tests.edge_server.fields.small_rays import TINY
 from tests.edge_server.fields.torch_model import encode, mlp, ray_weights, shade, to_torch
 
 VIEWS = ring(6, size=24)
-SETTINGS = NerfactoSettings(
-    levels=4,
-    log2_table=10,
-    finest_resolution=32,
-    hidden=16,
-    rays=256,
-    batch_samples=4096,
-    samples=16,
-    samples_start=24,
-    bins=32,
-    cells=16,
-    proposal_cells=16,
-    anneal=20,
-    sh_degree=1,
-    threads=1,
-)
 
 
 @pytest.fixture(scope="module")
 def snapshot() -> Any:
-    field = NerfactoField(SETTINGS, CallerPool())
+    settings = structs.replace(TINY["nerfacto"], samples=16, anneal=20, sh_degree=1, threads=1)
+    field = NerfactoField(settings, CallerPool())
     field.fit(VIEWS, Budget(steps=60))
     return field.snapshot()
 
@@ -70,7 +56,7 @@ def test_a_ray_is_what_torch_makes_of_its_samples(snapshot: RaySnapshot) -> None
     params = torch.as_tensor(snapshot.net.params, dtype=torch.float64)
     for pixel in np.random.default_rng(0).uniform(0.0, 24.0, (40, 2)):
         places, t, delta, rendered = _render(snapshot, pixel[None])
-        assert len(places) <= 2 * SETTINGS.samples + 1 and (np.diff(t) > 0).all()
+        assert len(places) <= 2 * snapshot.settings.samples + 1 and (np.diff(t) > 0).all()
         way = (view.intrinsics.rays(pixel[None]) @ view.camera_to_world[:3, :3].T).repeat(len(places), axis=0)
         way /= np.linalg.norm(way, axis=-1, keepdims=True)
         at, d = torch.as_tensor(places, dtype=torch.float64), torch.as_tensor(way, dtype=torch.float64)
@@ -86,12 +72,8 @@ def test_a_ray_is_what_torch_makes_of_its_samples(snapshot: RaySnapshot) -> None
         assert rendered[0, 3] == pytest.approx(away, rel=1e-3, abs=1e-5)
         solid.append(opacity)
     assert np.ptp(solid) > 0.5, "the pixels must show full and empty space"
-
-
-def test_rays_do_not_depend_on_those_beside_them(snapshot: RaySnapshot) -> None:
-    """More rays than one task holds, and more samples than there is room for at a time."""
+    # Rays do not depend on those beside them: more than one task holds, and more samples than there is room for.
     pixels = np.random.default_rng(1).uniform(0.0, 24.0, (TILE + 30, 2))
-    assert TILE * SETTINGS.samples >= 2 * BATCH
-    together = _render(snapshot, pixels)[-1]
+    assert TILE * snapshot.settings.samples >= 2 * BATCH
     alone = np.concatenate([_render(snapshot, p[None])[-1] for p in pixels])
-    np.testing.assert_allclose(together, alone, atol=1e-6)
+    np.testing.assert_allclose(_render(snapshot, pixels)[-1], alone, atol=1e-6)

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from msgspec import structs
 
-from edge_server.fields import Budget
 from edge_server.fields.tensorf.field import TensorfField, upsample_table
 from edge_server.fields.tensorf.kernels.vector_matrix import (
     CHANNELS,
@@ -18,9 +16,6 @@ from edge_server.fields.tensorf.kernels.vector_matrix import (
     scatter_planes,
 )
 from edge_server.fields.tensorf.settings import TensorfSettings
-from tests.edge_server.fields.scenes import psnr
-from tests.edge_server.fields.small import HELD, SEEN
-from tests.edge_server.fields.small_rays import SMALL
 
 SETTINGS = TensorfSettings(density_rank=8, color_rank=16, resolution_start=9, resolution=17, first=1.0)
 AXES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # the plane's two axes and the line's
@@ -115,15 +110,3 @@ def test_finer_planes_say_the_same(new: int) -> None:
         np.testing.assert_allclose(after, before, atol=1e-4)
     else:
         assert np.corrcoef(before.ravel(), after.ravel())[0, 1] > 0.95
-
-
-def test_upsampling_hardly_changes_the_picture() -> None:
-    field = TensorfField(structs.replace(SMALL["tensorf"], upsample=(60,)))
-    field.fit(SEEN, Budget(steps=59))
-    before, table = field.render(HELD.camera_to_world, HELD.intrinsics).color, field._encoding.table
-    field.step = 60
-    field._grow()
-    field._snapshot = None
-    after = field.render(HELD.camera_to_world, HELD.intrinsics).color
-    assert field._encoding.size == 64 and len(field._encoding.table) > len(table)
-    assert psnr(before, after) > 35.0

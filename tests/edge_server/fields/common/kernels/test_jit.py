@@ -2,19 +2,7 @@
 
 from __future__ import annotations
 
-import pytest
-
-from edge_server.fields.common.kernels.jit import cache_folder, kernel
-
-
-def test_a_kernel_within_a_function_needs_a_name_of_its_own() -> None:
-    """Two of one name would share the code of the first."""
-
-    def named(counter, worker, out):
-        out[0] = 1.0
-
-    with pytest.raises(ValueError, match=r"locals.*needs a __qualname__ of its own"):
-        kernel(named)
+from edge_server.fields.common.kernels.jit import cache_folder
 
 
 def test_compiled_kernels_are_kept_apart_for_every_state_of_the_sources(tmp_path, monkeypatch) -> None:

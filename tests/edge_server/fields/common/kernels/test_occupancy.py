@@ -41,13 +41,6 @@ def _centers(cells: int, contracted: bool) -> tuple[NDArray, NDArray]:
     return points, far**2
 
 
-@pytest.mark.parametrize("contracted", [False, True])
-def test_centers_of_cells_are_those_of_contracted_space(contracted: bool) -> None:
-    points, stretch = _centers(CELLS, contracted)
-    for mine, expected in zip(cell_centers(CELLS, contracted), (points, stretch)):
-        np.testing.assert_allclose(mine, expected, rtol=1e-6)
-
-
 def test_cells_where_most_cameras_see_motion_are_occupied() -> None:
     """At least two cameras, and half of those that see the cell: the visual hull of what moved."""
     box, moved = scene_box(VIEWS), np.zeros((24, 24), bool)
@@ -70,27 +63,16 @@ def test_cells_where_most_cameras_see_motion_are_occupied() -> None:
     assert (grid.occupied[grid.density > 0] == 1).all()
 
 
-@pytest.mark.parametrize("contracted", [False, True])
-@pytest.mark.parametrize("phase", [0, 2])
+@pytest.mark.parametrize(("contracted", "phase"), [(False, 0), (True, 2)])
 def test_density_of_cells_is_the_oracles(field: NgpField, contracted: bool, phase: int) -> None:
     phases, fade, few = 3, 0.75, 2
     rng = np.random.default_rng(3)
     seen = rng.integers(0, 5, CELLS**3).astype(np.uint16)
     before = rng.random(CELLS**3).astype(np.float32) * 3.0
     density, acts, x = before.copy(), field._scratch.acts, np.full_like(field._batch.x, np.nan)
-    CallerPool().run(
-        sample_density,
-        np.uint64(11),
-        phase,
-        phases,
-        np.float32(fade),
-        field._encoding,
-        SETTINGS.levels,
-        field._net,
-        Cells(CELLS, seen, few, cell_centers(CELLS, contracted)[1], density),
-        acts,
-        x,
-    )
+    cells = Cells(CELLS, seen, few, cell_centers(CELLS, contracted)[1], density)
+    model = field._encoding, SETTINGS.levels, field._net
+    CallerPool().run(sample_density, np.uint64(11), phase, phases, np.float32(fade), *model, cells, acts, x)
     here = np.arange(phase, CELLS**3, phases)
     np.testing.assert_array_equal(np.delete(density, here), np.delete(before, here))
     np.testing.assert_array_equal(density[here[seen[here] < few]], 0.0)
@@ -112,19 +94,9 @@ def test_density_of_cells_is_the_oracles(field: NgpField, contracted: bool, phas
 def test_a_density_that_is_not_finite_is_looked_at_again(field: NgpField) -> None:
     poisoned = field._net._replace(params=np.full_like(field._net.params, np.nan))
     density = np.zeros(CELLS**3, np.float32)
-    CallerPool().run(
-        sample_density,
-        np.uint64(1),
-        0,
-        1,
-        np.float32(0.5),
-        field._encoding,
-        SETTINGS.levels,
-        poisoned,
-        Cells(CELLS, np.ones(CELLS**3, np.uint16), 1, np.ones(CELLS**3, np.float32), density),
-        field._scratch.acts,
-        field._batch.x.copy(),
-    )
+    cells = Cells(CELLS, np.ones(CELLS**3, np.uint16), 1, np.ones(CELLS**3, np.float32), density)
+    model, scratch = (field._encoding, SETTINGS.levels, poisoned), (field._scratch.acts, field._batch.x.copy())
+    CallerPool().run(sample_density, np.uint64(1), 0, 1, np.float32(0.5), *model, cells, *scratch)
     assert np.isfinite(density).all() and density.min() > 1.0
 
 

@@ -96,26 +96,17 @@ def test_samples_equal_the_oracle(contracted: bool, filled: float) -> None:
     assert from_inside and (missing or contracted)
 
 
-def test_empty_space_is_skipped_and_room_is_respected() -> None:
+def test_a_ray_ends_where_the_room_does_or_the_known_density_makes_it_opaque() -> None:
     o, d = np.array([-3.0, 0.1, 0.1]), np.array([1.0, 0.0, 0.0])
-    assert _march(_space(False, 0.0), o, d)[0].size == 0
+    assert _march(_space(False, 0.0), o, d)[0].size == 0, "empty space is skipped"
     space = _space(False, 1.0)
-    whole = _march(space, o, d)[1]
-    x, ts, dts = np.zeros((3, 9), np.float32), np.zeros(9, np.float32), np.zeros(9, np.float32)
-    enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
-    way = _single(o), _single(d), np.float32(enter), np.float32(leave)
-    n, t, _ = march(space, *way, x, ts, dts, 4, 9, NEVER)
-    assert n == 9 and t < leave and (x[:, :4] == 0).all()
-    np.testing.assert_array_equal(ts[4:], whole[:5])
-
-
-def test_a_ray_ends_where_the_known_density_makes_it_opaque() -> None:
-    space = _space(False, 1.0)
-    o, d = np.array([-3.0, 0.1, 0.1]), np.array([1.0, 0.0, 0.0])
     whole = _march(space, o, d)[1]
     enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
     x, ts, dts = np.zeros((3, 99), np.float32), np.zeros(99, np.float32), np.zeros(99, np.float32)
     way = _single(o), _single(d), np.float32(enter), np.float32(leave)
+    n, t, _ = march(space, *way, x, ts, dts, 4, 9, NEVER)
+    assert n == 9 and t < leave and (x[:, :4] == 0).all()
+    np.testing.assert_array_equal(ts[4:9], whole[:5])
     n, t, depth = march(space, *way, x, ts, dts, 0, 99, np.float32(1.0))
     assert n == int(np.ceil(1.0 / (1.5 * space.step))) and depth > 1.0 and t < leave
     np.testing.assert_array_equal(ts[:n], whole[:n])

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.kernels.train import RaySampling, train_chunks
-from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, Weights
+from edge_server.fields.common.kernels.volume_rendering import Weights
 from edge_server.fields.common.supervision import pack_views
 from edge_server.fields.common.training_schedule import step_length
 from edge_server.fields.ngp.field import NgpField
@@ -92,20 +92,6 @@ def test_loss_and_gradient_equal_the_oracle(field: NgpField, weighted: bool) -> 
     np.testing.assert_allclose(gradient, expected, atol=1e-4 * np.abs(expected).max())
 
 
-def test_rays_are_whole_and_in_order(field: NgpField) -> None:
-    _, _, rays = _train(field, _packed(field, None))
-    batch, scratch = field._batch, field._scratch
-    first, column = scratch.ray_first[0, : rays + 1], scratch.column[0, : batch.columns[0]]
-    assert batch.samples[0] == first[rays] <= batch.columns[0]
-    assert sorted(column) == list(range(batch.columns[0]))  # each once, those nobody uses last
-    density = scratch.by_ray[0, 0]
-    for a, b in pairwise(first):
-        t, length = scratch.line[0, :2, column[a:b]].T
-        assert (np.diff(t) > 0).all()
-        depth = np.cumsum(density[a:b] * length)
-        assert (depth[:-1] <= OPAQUE_DEPTH).all()  # nothing behind the first opaque sample
-
-
 def test_no_ray_is_cut_off_where_the_grid_is_wrong(field: NgpField) -> None:
     def rays_of(over: float) -> list[NDArray[np.float32]]:
         _, _, rays = _train(field, _packed(field, None), rays=512, over=over)
@@ -113,7 +99,7 @@ def test_no_ray_is_cut_off_where_the_grid_is_wrong(field: NgpField) -> None:
         return [field._scratch.line[0, 0, column[a:b]] for a, b in pairwise(first[: rays + 1])]
 
     whole = rays_of(0.0)  # nothing to be asked about: each in one span
-    assert sum(map(len, whole)) > 1500
+    assert sum(map(len, whole)) > 1500 and all((np.diff(t) > 0).all() for t in whole)
     for over in (1.0, 5.0, 30.0):
         found = rays_of(over)
         assert len(found) > 0.8 * len(whole)

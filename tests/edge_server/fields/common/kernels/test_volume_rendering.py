@@ -8,8 +8,6 @@ import torch
 
 from edge_server.fields.common.kernels.volume_rendering import (
     GUIDE_REACH,
-    OPAQUE_DEPTH,
-    RAW_HIGH,
     Weights,
     activate,
     add_harmonics,
@@ -20,19 +18,6 @@ from edge_server.fields.common.kernels.volume_rendering import (
 from tests.edge_server.fields import torch_model
 
 SAMPLES = 24
-
-
-def test_the_oracles_distortion_is_the_sum_over_all_pairs() -> None:
-    rng = np.random.default_rng(0)
-    t = np.sort(rng.random((5, SAMPLES)), axis=1)
-    t[:, -4:] = t[:, -4:-3]  # where a ray has ended its samples stay where they are
-    delta = np.diff(t, axis=1, append=t[:, -1:])
-    sigma, color = (torch.as_tensor(rng.random(shape)) for shape in ((5, SAMPLES), (5, SAMPLES, 3)))
-    at, step, black = torch.as_tensor(t), torch.as_tensor(delta), torch.zeros((5, 3), dtype=torch.float64)
-    error, loss = torch_model.ray_losses(sigma, color, at, step, black, black, 1.0)
-    w = torch_model.ray_weights(sigma, step)[0].numpy()
-    pairs = (w[:, :, None] * w[:, None, :] * np.abs(t[:, :, None] - t[:, None, :])).sum(axis=(1, 2))
-    np.testing.assert_allclose((loss - error).numpy(), pairs + (w**2 * delta).sum(axis=1) / 3, rtol=1e-12)
 
 
 def _ray(seed: int, density: float, sh_degree: int = 0):
@@ -68,7 +53,7 @@ def _oracle(raw, line, ray, distortion, sh_degree=0):
     return params, error, loss
 
 
-@pytest.mark.parametrize("density", [-4.0, 0.0, 3.0, 7.0])
+@pytest.mark.parametrize("density", [-4.0, 3.0, 7.0])
 @pytest.mark.parametrize("sh_degree", [0, 1])
 def test_loss_and_gradient_equal_the_oracle(density: float, sh_degree: int) -> None:
     raw, line, ray = _ray(3, density, sh_degree)
@@ -98,18 +83,6 @@ def test_weight_away_from_a_guide_costs_what_geman_and_mcclure_say(guide: float)
     np.testing.assert_allclose(d_out.T, params.grad.numpy(), atol=2e-5, rtol=2e-3)
 
 
-def test_nothing_behind_an_opaque_sample_has_a_gradient() -> None:
-    raw, line, ray = _ray(5, 0.0)
-    raw[0, 6] = RAW_HIGH - 1.0
-    out = raw.copy()
-    activate(out, 0, SAMPLES)
-    assert out[0, 6] * line[1, 6] > OPAQUE_DEPTH
-    assert samples_until_opaque(out, line[1], 0, SAMPLES) == 7
-    assert samples_until_opaque(out, line[1], 7, SAMPLES) == SAMPLES - 7
-    _, d_out = _kernel(raw, line, ray, Weights(np.float32(0.1)))
-    assert (d_out[:, 7:] == 0).all() and (d_out[1:4, 6] != 0).all()
-
-
 def test_a_ray_ends_where_a_ten_thousandth_of_the_light_is_left() -> None:
     """Later, samples are evaluated for nothing; earlier, what is left out can be seen."""
     raw, line, ray = _ray(5, 0.0)
@@ -126,7 +99,7 @@ def test_a_ray_ends_where_a_ten_thousandth_of_the_light_is_left() -> None:
     assert (d_out[0, seen:] == 0).all() and (d_out[0, :seen] != 0).all()
 
 
-def test_clamped_density_has_no_gradient() -> None:
+def test_clamped_density_and_what_is_not_finite_have_no_gradient() -> None:
     raw, line, ray = _ray(6, 0.0)
     raw[0, 0], raw[0, 1] = -40.0, -11.0
     _, d_out = _kernel(raw, line, ray, Weights(np.float32(0)))
@@ -134,14 +107,8 @@ def test_clamped_density_has_no_gradient() -> None:
     raw[0, 2] = 500.0  # overflows an unclamped exponential
     error, d_out = _kernel(raw, line, ray, Weights(np.float32(0)))
     assert np.isfinite(error) and error >= 0 and np.isfinite(d_out).all() and d_out[0, 2] == 0.0
-
-
-@pytest.mark.parametrize("poison", [np.nan, np.inf])
-def test_a_ray_that_is_not_finite_is_refused_whole(poison: float) -> None:
-    raw, line, ray = _ray(7, 0.0)
-    raw[2, 3] = poison
+    raw[2, 3] = np.inf  # full color
+    assert np.isfinite(_kernel(raw, line, ray, Weights(np.float32(0.1)))[1]).all()
+    raw[2, 3] = np.nan
     error, d_out = _kernel(raw, line, ray, Weights(np.float32(0.1)))
-    if np.isnan(poison):
-        assert error == -1.0 and (d_out == 0).all()
-    else:  # an infinite raw color is full color, or refused: never silent corruption
-        assert np.isfinite(d_out).all()
+    assert error == -1.0 and (d_out == 0).all(), "a ray that is not finite is refused whole"
