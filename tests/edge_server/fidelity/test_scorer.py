@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
+from edge_server.fidelity.images import ImageError
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.psnr import PSNR_CEILING_DB
+from edge_server.fidelity.psnr import PSNR_CEILING_DB, psnr
 from edge_server.fidelity.scorer import Scorer, mean_score
+from edge_server.fidelity.ssim import ssim
 from tests.conftest import data_dir
 
 
@@ -54,3 +58,38 @@ def test_tiny_images_are_scored_as_far_as_the_metrics_go(size):
     assert score.psnr_db == PSNR_CEILING_DB
     assert score.ssim == (None if min(size) < 11 else pytest.approx(1.0))
     assert score.lpips == (None if min(size) < 31 else 0.0)
+
+
+RNG = np.random.default_rng(9)
+HARD = {
+    "black": np.zeros((40, 40, 3)),
+    "white": np.ones((40, 40, 3)),
+    "subnormal": np.full((40, 40, 3), 5e-324),
+    "one pixel": np.pad(np.ones((1, 1, 3)), ((20, 19), (20, 19), (0, 0))),
+    "checkers": np.indices((40, 40)).sum(0)[..., None].repeat(3, 2) % 2 * 1.0,
+    "noise": RNG.random((40, 40, 3)),
+    "one channel": np.concatenate([np.ones((40, 40, 1)), np.zeros((40, 40, 2))], axis=2),
+}
+
+
+@pytest.mark.stability
+def test_every_pair_scores_finite_and_in_range_and_equal_images_score_the_most():
+    lpips = open_lpips(data_dir("lpips"))[0]
+    for one, other in itertools.product(HARD, HARD):
+        a, b = HARD[one], HARD[other]
+        assert 0.0 <= psnr(a, b) <= PSNR_CEILING_DB, (one, other)
+        assert -1.0 <= ssim(a, b) <= 1.0 and 0.0 <= lpips(a, b) < np.inf, (one, other)
+        if one == other:
+            assert psnr(a, b) == PSNR_CEILING_DB and ssim(a, b) == pytest.approx(1.0, abs=1e-9), one
+            assert lpips(a, b) == 0.0, one
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("poison", [np.nan, np.inf])
+@pytest.mark.parametrize("which", ["rendering", "held-out frame"])
+def test_poison_is_refused_by_name_and_never_scored(poison, which):
+    good, bad = np.full((40, 40, 3), 0.5, np.float32), np.full((40, 40, 3), 0.5, np.float32)
+    bad[-1, -1, -1] = poison
+    pair = (bad, good) if which == "rendering" else (good, bad)
+    with pytest.raises(ImageError, match=f"{which}.*row 39, column 39"):
+        Scorer().score("h", pair[0], 0, pair[1], 0)

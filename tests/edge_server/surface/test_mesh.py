@@ -1,4 +1,4 @@
-"""Marching cubes over blocks: the right surface, without dirt."""
+"""Marching cubes over blocks: the right surface, without dirt, also of depth that is empty, noisy or contradictory."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ import pytest
 
 from edge_server.surface import SurfaceError
 from edge_server.surface import mesh as mesh_module
+from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.mesh import extract_mesh, remove_degenerate, remove_small_components
-from edge_server.surface.volume import Grid, fuse_maps
+from edge_server.surface.reconstruct import mesh_from_depth_maps
+from edge_server.surface.settings import MeshSettings
+from edge_server.surface.volume import Grid, bounding_box, fuse_maps
 from tests.edge_server.surface.ball import RADIUS_M, ball_maps
 
 pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
 trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed (extra surface)")
 
 GRID = Grid((-0.13,) * 3, (0.13,) * 3, 0.005, 0.02)
+RNG = np.random.default_rng(11)
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +38,9 @@ def test_a_ball_comes_out_as_a_ball(ball):
     assert np.abs(top.astype(int) - (200, 20, 20)).mean() < 6 and np.abs(bottom.astype(int) - 90).mean() < 6
 
 
-def test_a_mesh_beyond_memory_says_what_would_do(ball, monkeypatch):
-    assert mesh_module.MOST_VOXELS == 1 << 27
+def test_a_mesh_beyond_memory_or_without_a_surface_is_refused(ball, monkeypatch):
+    with pytest.raises(SurfaceError, match="no surface"):
+        extract_mesh(ball, min_weight=1e9)
     monkeypatch.setattr(mesh_module, "MOST_VOXELS", 50_000)
     with pytest.raises(SurfaceError, match=r"5 mm has too many voxels: take [\d.]+ mm or more"):
         extract_mesh(ball)
@@ -46,20 +51,57 @@ def test_what_nobody_saw_stays_open():
     assert extract_mesh(seen_from_above).vertices[:, 2].min() > -0.09  # the ball's lower end is missing
 
 
-def test_dirt_goes_and_pieces_stay(ball):
+def test_dirt_and_faces_without_area_go_and_pieces_stay(ball):
     mesh = remove_small_components(extract_mesh(ball))
     dirt = mesh + trimesh.Trimesh([[0.2, 0, 0], [0.21, 0, 0], [0.2, 0.01, 0]], [[0, 1, 2]])
     assert len(remove_small_components(dirt).faces) == len(mesh.faces)
     assert len(remove_small_components(dirt, keep_share=0.0).faces) == len(mesh.faces) + 1
-
-
-def test_faces_without_area_go():
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0]], np.float32)
     faces = np.array([[0, 1, 2], [0, 1, 1], [0, 1, 3]], np.int32)
     found = remove_degenerate(trimesh.Trimesh(vertices, faces, process=False))
     assert found.faces.tolist() == [[0, 1, 2]] and len(found.vertices) == 3
 
 
-def test_no_surface_is_an_error(ball):
+def with_depth(found: DepthMap, depth: np.ndarray) -> DepthMap:
+    return depth_map(depth.astype(np.float32), found.color, found.camera_to_world, found.intrinsics)
+
+
+def radii(maps) -> np.ndarray:
+    mesh = mesh_from_depth_maps(maps, MeshSettings(voxel_m=0.005, bounds=(GRID.lower, GRID.upper)))
+    assert np.isfinite(mesh.vertices).all()
+    return np.linalg.norm(mesh.vertices, axis=1)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf, 1e30, 1e-30])
+def test_depth_that_is_nothing_gives_no_surface_and_says_so(value):
+    maps = [with_depth(m, np.full((64, 64), value)) for m in ball_maps(3)]
+    volume = fuse_maps(GRID, maps)
+    for array in (volume.blocks.distance, volume.blocks.weight, volume.blocks.color):
+        assert np.isfinite(array).all()
     with pytest.raises(SurfaceError, match="no surface"):
-        extract_mesh(ball, min_weight=1e9)
+        extract_mesh(volume)
+    if not any(m.seen.any() for m in maps):
+        with pytest.raises(SurfaceError, match="no camera sees anything solid"):
+            bounding_box(maps, 0.01)
+
+
+@pytest.mark.stability
+def test_one_camera_that_contradicts_all_others_is_outvoted():
+    maps = ball_maps(30)
+    liar = with_depth(maps[7], np.where(maps[7].seen, maps[7].depth - 0.06, maps[7].depth))
+    found = radii([*maps[:7], liar, *maps[8:]])
+    assert np.percentile(np.abs(found - RADIUS_M), 99) < 0.004
+
+
+@pytest.mark.stability
+def test_noise_averages_out_and_single_pixels_of_nonsense_do_not_spread():
+    maps = []
+    for m in ball_maps(30):
+        depth = m.depth + RNG.normal(0, 0.002, m.depth.shape)
+        depth[RNG.random(depth.shape) < 0.05] = RNG.choice([np.nan, -3.0, 0.0, 1e20])
+        maps.append(with_depth(m, depth))
+    found = radii(maps)
+    # 2 mm of noise a pixel; a voxel hears of some dozens of them.
+    assert abs(np.median(found) - RADIUS_M) < 0.001
+    assert np.percentile(np.abs(found - RADIUS_M), 90) < 0.003

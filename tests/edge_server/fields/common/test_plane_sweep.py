@@ -10,7 +10,7 @@ import pytest
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget, View
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.plane_sweep import GUIDE_RAYS, depth_guide, foreground_mask, sweep_depths
+from edge_server.fields.common.plane_sweep import GUIDE_RAYS, depth_guide, foreground_mask
 from edge_server.fields.common.scene_box import SceneBox, scene_box
 from edge_server.fields.common.supervision import pack_views
 from edge_server.fields.common.threads.thread_pool import shared_pool
@@ -51,14 +51,6 @@ def test_what_is_transparent_or_of_one_color_has_no_depth() -> None:
     assert (found[~sky] > 0).mean() > 0.5 and (found[sky] == 0).all()
     views = [replace(v, image=np.full_like(v.image, 128)) for v in SEEN]
     assert (_guide(views, *_packed(views)) == 0).all()
-
-
-def test_of_places_that_score_the_same_the_one_at_the_usual_distance_is_taken() -> None:
-    data, box = _packed(ring(4, 24))
-    cells, pixels = 64, np.arange(0, 24 * 24, 7)
-    scores, view_of = np.full(cells**3, 0.5, np.float32), np.zeros(len(pixels), np.int64)
-    found = sweep_depths(shared_pool(2), box, data, view_of, pixels, scores, cells)
-    np.testing.assert_allclose(found, box.distance_m / box.radius_m, rtol=0.05)
 
 
 def _silent(view: View) -> View:
@@ -103,31 +95,3 @@ def test_it_is_used_where_it_is_called_for() -> None:
         field.fit(SEEN, Budget(steps=1))
         weights.append(field._present_guide_weight())
     np.testing.assert_allclose(weights, [0.075, 0.05, 0.025, 0.0, 0.0])
-
-
-def test_no_sweep_where_the_budget_is_too_short(monkeypatch) -> None:
-    swept, clock = [], [0.0]
-
-    def slow(settings, pool, box, views, data):
-        swept.append(len(views))
-        clock[0] += 0.4
-        return np.zeros(0, np.float32)
-
-    monkeypatch.setattr("edge_server.fields.common.plane_sweep.depth_guide", slow)
-    small("ngp", refine_m=0.05).fit(SEEN, Budget(steps=1))
-    assert swept == []
-    sky = small("ngp")
-    sky.now = lambda: clock[0]
-    sky.fit(SEEN, Budget(seconds=0.2))  # who does not know how long it takes tries
-    steps, one_step = sky.step, sky._one_step
-
-    def step(*args):
-        clock[0] += 0.02
-        return one_step(*args)
-
-    monkeypatch.setattr(sky, "_one_step", step)
-    for k in range(6):  # a new picture each time, and a clock that stands still but for the sweep and the steps
-        sky.fit([replace(v, generated_ns=1000 + k) for v in SEEN], Budget(seconds=0.2))
-    assert sky.step > steps + 20 and len(swept) == 1
-    sky.fit([replace(v, generated_ns=5000) for v in SEEN], Budget(steps=1))
-    assert len(swept) == 2, "steps have no clock"

@@ -28,17 +28,6 @@ def test_the_box_is_where_the_axes_meet() -> None:
     assert box.pixels_across == pytest.approx(4 * box.radius_m / box.distance_m * VIEWS[0].intrinsics.fx)
 
 
-def test_it_moves_and_scales_with_the_rig() -> None:
-    grown = []
-    for view in VIEWS:
-        pose = view.camera_to_world.copy()
-        pose[:3, 3] = 100.0 * pose[:3, 3] + [5.0, 6.0, 7.0]
-        grown.append(replace(view, camera_to_world=pose))
-    a, b = scene_box(VIEWS), scene_box(grown)
-    assert b.radius_m == pytest.approx(100 * a.radius_m) and b.near_m == pytest.approx(100 * a.near_m)
-    np.testing.assert_allclose(b.center_m, 100 * np.array(a.center_m) + [5, 6, 7], atol=1e-6)
-
-
 def test_transparent_pictures_and_a_plain_background_show_an_object() -> None:
     box = scene_box([replace(v, image=np.zeros((16, 16, 4), np.uint8)) for v in VIEWS])
     assert not box.contracted and 0.5 < box.radius_m < 1.3

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.common.scene_box import UNIT_BOX
-from edge_server.fields.common.supervision import CHANGE, FARTHEST_M, check_view, moved_pixels, pack_views
+from edge_server.fields.common.supervision import CHANGE, FARTHEST_M, check_view, moved_pixels
 from tests.edge_server.fields.scenes import ring
 from tests.edge_server.fields_for_tests import tiny_field
 
@@ -77,10 +76,3 @@ def test_pixels_move_where_they_change_beyond_the_noise_and_two_around() -> None
     assert moved is not None
     np.testing.assert_array_equal(np.argwhere(moved)[[0, -1]], [[3, 3], [11, 11]])
     assert moved.sum() == 81
-
-
-def test_opaque_and_transparent_pictures_are_packed_together() -> None:
-    clear = replace(VIEW, camera="clear", image=np.full((16, 16, 4), 7, np.uint8))
-    packed = pack_views([VIEW, clear], UNIT_BOX, {})
-    np.testing.assert_array_equal(packed.pixels[:256, :3], VIEW.image.reshape(-1, 3))
-    assert (packed.pixels[:256, 3] == 255).all() and (packed.pixels[256:] == 7).all()

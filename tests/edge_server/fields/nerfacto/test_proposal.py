@@ -5,30 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from msgspec import structs
 
-from edge_server.fields import Budget
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT
 from edge_server.fields.common.kernels.rays import COARSE, Space
-from edge_server.fields.common.kernels.train import RaySampling, train_chunks
-from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW, Weights
-from edge_server.fields.common.occupancy_grid import OccupancyGrid
-from edge_server.fields.nerfacto.field import NerfactoField
+from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
+from edge_server.fields.nerfacto.kernels import proposal
 from edge_server.fields.nerfacto.kernels.proposal import (
-    CUTOFF_DEPTH,
-    DARK_SHARE,
     RAW_GAIN,
     RAW_START,
     ProposalGrid,
     ProposalSampling,
-    allocate_samples,
     bin_weights,
-    make_bins,
-    place_samples,
 )
 from edge_server.fields.nerfacto.kernels.train import WEIGHT_FLOOR, interlevel_loss, scatter_proposal
-from tests.edge_server.fields.scenes import ring
-from tests.edge_server.fields.small_rays import TINY
 
 F = np.float32
 CELLS, BINS, ZERO = 8, 48, np.int64(0)
@@ -52,7 +41,7 @@ def _encoding(values: np.ndarray) -> ProposalGrid:
 def _bins_of(space: Space, encoding: ProposalGrid, shift: float = 0.4, leave: float = 6.0, bins: int = BINS):
     cell, depth = np.full(bins + 5, -1, np.int32), np.full(bins + 5, np.nan, F)
     edges, at = np.empty((2, bins + 1), F), np.empty((2, bins), np.int32)
-    count, finite = make_bins(
+    count, finite = proposal.make_bins(
         space, encoding, bins, START_AT, TOWARDS, F(0.1), F(leave), F(shift), 5, cell, depth, edges, at
     )
     return cell[5 : 5 + count], depth[5 : 5 + count], edges[:, :count].copy(), finite
@@ -82,7 +71,7 @@ def test_bins_cover_the_ray_and_know_their_cells(contracted: bool, shift: float)
 
 def test_bins_end_where_it_is_dark_and_skip_what_is_empty() -> None:
     _, depth, _, _ = _bins_of(_space(False), _encoding(np.full(CELLS**3, 1.5)), leave=2.4)
-    assert depth.sum() > CUTOFF_DEPTH > depth[:-1].sum()
+    assert depth.sum() > proposal.CUTOFF_DEPTH > depth[:-1].sum()
     occupied = np.ones((16, 16, 16), np.uint8)
     occupied[:, :, 6:10] = 0  # x in the middle
     _, _, edges, _ = _bins_of(_space(False, occupied.ravel()), _encoding(np.zeros(CELLS**3)), leave=2.4)
@@ -92,23 +81,16 @@ def test_bins_end_where_it_is_dark_and_skip_what_is_empty() -> None:
     assert edges.shape[1] == 0
 
 
-def test_a_proposal_that_is_not_finite_is_noticed_and_passes_for_fog() -> None:
-    values = np.full(CELLS**3, np.nan)
-    cell, depth, edges, finite = _bins_of(_space(False), _encoding(values), leave=2.4)
-    assert not finite and len(cell) > 0
-    np.testing.assert_allclose(depth, np.exp(RAW_START) * (edges[1] - edges[0]), rtol=1e-5)
-
-
 def _allocated(weight: np.ndarray, samples: int, even: float, shift: float):
     group, share = np.full(len(weight), -1, np.int32), np.full(len(weight), -1, np.int64)
-    groups = allocate_samples(weight.astype(F), ZERO, len(weight), samples, F(even), F(shift), group, share)
+    groups = proposal.allocate_samples(weight.astype(F), ZERO, len(weight), samples, F(even), F(shift), group, share)
     return group, share[:groups]
 
 
 def _earned(weight: np.ndarray, samples: int, even: float) -> np.ndarray:
     left, right = np.r_[weight[0], weight[:-1]], np.r_[weight[1:], weight[-1]]
     wide = 0.5 * (np.maximum(left, weight) + np.maximum(weight, right))
-    light = 1.0 - np.r_[0.0, np.cumsum(weight)[:-1]] + DARK_SHARE
+    light = 1.0 - np.r_[0.0, np.cumsum(weight)[:-1]] + proposal.DARK_SHARE
     return samples * ((1 - even) * wide / wide.sum() + even * light / light.sum())
 
 
@@ -147,7 +129,8 @@ def test_samples_lie_in_their_groups_and_stand_for_all_of_them(shift: float) -> 
     np.testing.assert_allclose(weight, np.exp(-total[:-1]) - np.exp(-total[1:]), atol=1e-6)
     group, share = _allocated(weight, 16, 0.2, shift)
     x, line = np.empty((3, 99), F), np.empty((3, 99), F)
-    n = place_samples(True, START_AT, TOWARDS, edges, group, ZERO, count, share, F(shift), np.int64(2), x, line)
+    dealt = True, START_AT, TOWARDS, edges, group, ZERO, count, share, F(shift)
+    n = proposal.place_samples(*dealt, np.int64(2), x, line)
     t, length, of = line[:, 2:n]
     assert n - 2 == share.sum() and (np.diff(t) > 0).all()
     assert length.sum() == pytest.approx((edges[1] - edges[0]).sum(), rel=1e-5)
@@ -157,9 +140,7 @@ def test_samples_lie_in_their_groups_and_stand_for_all_of_them(shift: float) -> 
         assert ((edges[0, members] <= t[k]) & (t[k] <= edges[1, members])).any()
     points = t[:, None] * np.array(TOWARDS) + np.array(START_AT)
     np.testing.assert_allclose(x[:, 2:n].T, _unit(points, True), atol=1e-5)
-    limited = place_samples(
-        True, START_AT, TOWARDS, edges, group, ZERO, count, share, F(shift), ZERO, x[:, :3].copy(), line
-    )
+    limited = proposal.place_samples(*dealt, ZERO, x[:, :3].copy(), line)
     assert limited == 3
 
 
@@ -224,40 +205,3 @@ def test_the_proposals_gradient_is_added_up_once() -> None:
     touched = (gradient.reshape(len(dirty), -1) != 0).any(axis=1)
     np.testing.assert_array_equal(dirty, touched)
     assert not dirty[0] and dirty.any()
-
-
-def test_a_whole_steps_gradients_equal_finite_differences() -> None:
-    """Of the color error, by the network's parameters and by the cameras' embeddings."""
-    changed = {"hidden": 8, "rays": 64, "appearance": 2, "sh_degree": 1, "threads": 1, "contracted": True}
-    field, views = NerfactoField(structs.replace(TINY["nerfacto"], **changed)), ring(5, size=16)
-    field.fit(views, Budget(steps=30))
-    # A thin fog: no ray becomes opaque, where one sample more or less would be a step in the loss.
-    field._net.params[-field._net.widths[-1]] = -1.0
-    box = field.view_store.box
-    assert box is not None
-    data = field._cameras.corrected(views, field.view_store.add(views).data, box)
-    looks = field._cameras.embeddings
-    levels = field.settings.levels
-    ray_sampling = RaySampling(np.uint64(3), 32, levels, 1, F(0.0), np.full(3, 0.5, F), looks)
-    weights, batch = Weights(F(0.0)), field._batch
-    space = OccupancyGrid(field.settings.cells, 0, box).space(0.1)
-    space.occupied[:], space.coarse[:] = 1, 1
-
-    def loss() -> float:
-        model = field._encoding, field._net, weights
-        field.pool.run(train_chunks, data, ray_sampling, space, *model, batch, field._scratch, field._bins)
-        return float(batch.loss.sum())
-
-    loss()
-    slopes = batch.d_params.sum(axis=0), batch.d_embeddings.sum(axis=0)
-    assert batch.rays.sum() >= 32 and batch.samples.sum() > 64 and np.abs(slopes[1]).max() > 1e-4
-    for array, slope in ((field._net.params, slopes[0]), (looks, slopes[1])):
-        flat, wanted = array.reshape(-1), slope.reshape(-1)
-        for k in np.argsort(-np.abs(wanted))[:24:3]:
-            kept, step = flat[k], F(4e-3)
-            flat[k] = kept + step
-            above = loss()
-            flat[k] = kept - step
-            slope_here = (above - loss()) / (2 * float(step))
-            flat[k] = kept
-            assert slope_here == pytest.approx(wanted[k], rel=0.03, abs=2e-3)

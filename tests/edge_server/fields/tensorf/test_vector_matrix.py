@@ -7,14 +7,8 @@ import pytest
 import torch
 
 from edge_server.fields.tensorf.field import TensorfField, upsample_table
-from edge_server.fields.tensorf.kernels.vector_matrix import (
-    CHANNELS,
-    ROWS,
-    Planes,
-    color_components,
-    raw_density,
-    scatter_planes,
-)
+from edge_server.fields.tensorf.kernels import vector_matrix
+from edge_server.fields.tensorf.kernels.vector_matrix import CHANNELS, ROWS, Planes
 from edge_server.fields.tensorf.settings import TensorfSettings
 
 SETTINGS = TensorfSettings(density_rank=8, color_rank=16, resolution_start=9, resolution=17, first=1.0)
@@ -53,8 +47,8 @@ def _oracle(planes: Planes, table: torch.Tensor, x: torch.Tensor) -> torch.Tenso
 def test_density_and_components_equal_the_oracle() -> None:
     planes, (x, _) = _planes(), _points(300)
     raw, acts = np.full(300, np.nan, np.float32), np.full((60, 300), np.nan, np.float32)
-    raw_density(planes, x[0], 10, 290, raw)
-    color_components(planes, x[0], 10, 290, acts)
+    vector_matrix.raw_density(planes, x[0], 10, 290, raw)
+    vector_matrix.color_components(planes, x[0], 10, 290, acts)
     expected = _oracle(planes, torch.as_tensor(planes.table), torch.as_tensor(x[0].T[10:290])).numpy()
     summed = planes.bias + expected[:, : planes.density_groups].sum(axis=(1, 2))
     np.testing.assert_allclose(raw[10:290], summed, atol=1e-3)
@@ -67,7 +61,7 @@ def test_density_and_components_equal_the_oracle() -> None:
 def _gradient(planes: Planes, x, d, counts):
     gradient = np.zeros_like(planes.table)
     dirty = np.zeros(len(planes.table) // ROWS, np.bool_)
-    scatter_planes(np.zeros(1, np.int64), 0, planes, x, d, counts, gradient, dirty)
+    vector_matrix.scatter_planes(np.zeros(1, np.int64), 0, planes, x, d, counts, gradient, dirty)
     return gradient, dirty
 
 

@@ -46,16 +46,10 @@ def test_equals_torch_and_touches_only_what_has_a_gradient() -> None:
     np.testing.assert_allclose(table[0][:SEGMENT], names[1].detach().numpy(), atol=1e-5)
     np.testing.assert_array_equal(table[0][SEGMENT:], before[SEGMENT:])
     assert not dirty.any() and (table[3] == 0).all()
-
-
-def test_an_entry_without_gradient_keeps_its_moments() -> None:
-    net, table, dirty = _state(np.random.default_rng(2))
-    table[1][:] = 0.5
-    table[3][1, 0], dirty[0] = 1.0, True
-    before = table[0].copy()
+    # An entry without a gradient keeps its moments.
+    table[1][:], table[3][1, 0], dirty[0], before = 0.5, 1.0, True, table[0].copy()
     _step(net, table, dirty, np.zeros((1, 40), np.float32), 1)
-    changed = np.argwhere(table[0] != before)
-    assert changed.tolist() == [[1, 0]] and table[1][0, 0] == 0.5 and table[1][1, 0] != 0.5
+    assert np.argwhere(table[0] != before).tolist() == [[1, 0]] and table[1][0, 0] == 0.5 != table[1][1, 0]
 
 
 def test_what_is_not_finite_is_dropped_and_counted_and_broken_parameters_are_repaired() -> None:

@@ -11,48 +11,37 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from edge_server.fields.common.kernels.rays import Views
+from edge_server.fields import View
 from edge_server.fields.common.kernels.train import RaySampling, train_chunks
 from edge_server.fields.common.kernels.volume_rendering import Weights
 from edge_server.fields.common.supervision import pack_views
 from edge_server.fields.common.training_schedule import step_length
 from edge_server.fields.ngp.field import NgpField
-from tests.edge_server.fields.common.kernels.small_field import SETTINGS, VIEWS, fitted
-from tests.edge_server.fields.torch_model import encode, mlp, ray_losses, shade, to_torch
+from tests.edge_server.fields.small import KERNEL_SETTINGS as SETTINGS
+from tests.edge_server.fields.small import KERNEL_VIEWS as VIEWS
+from tests.edge_server.fields.small import kernel_field
+from tests.edge_server.fields.torch_model import TorchGrid, encode, mlp, ray_losses, shade, to_torch
 
 DISTORTION = 0.2
-
-
-@pytest.fixture
-def field() -> NgpField:
-    return fitted()
-
-
-def _weights() -> list[NDArray[np.float32]]:
-    rng = np.random.default_rng(2)
-    return [rng.choice(np.array([0.0, 0.3, 1.0], np.float32), v.image.shape[:2]) for v in VIEWS]
-
-
-def _packed(field: NgpField, weights: list[NDArray[np.float32]] | None) -> Views:
-    assert field.view_store.box is not None
-    views = VIEWS if weights is None else [replace(v, weight=w) for v, w in zip(VIEWS, weights)]
-    return pack_views(views, field.view_store.box, field.view_store.memory)
+LEVELS = 3  # of the encoding's four: those that are in use at first
 
 
 def _train(
-    field: NgpField, data: Views, rays: int = SETTINGS.rays, over: float = 1.0
+    field: NgpField, views: list[View] = VIEWS, rays: int = SETTINGS.rays, over: float = 1.0
 ) -> tuple[float, NDArray[np.float32], int]:
     """Loss, the network's gradient and number of rays of one chunk of at most ``rays``; the occupancy grid
     takes everything to be ``over`` times as dense as it knows."""
     ray_sampling = RaySampling(
         key=np.uint64(7),
         chunk_rays=rays,
-        levels=SETTINGS.levels,
-        sh_degree=0,
+        levels=LEVELS,
+        sh_degree=SETTINGS.sh_degree,
         changed_share=np.float32(0.5),
         background=np.full(3, 0.5, np.float32),
         embeddings=np.zeros((len(VIEWS), 0), np.float32),
     )
+    assert field.view_store.box is not None
+    data = pack_views(views, field.view_store.box, field.view_store.memory)
     space = field._occupancy.space(step_length(SETTINGS, field.step))
     space = space._replace(density=space.density * np.float32(over))
     weights = Weights(np.float32(DISTORTION))
@@ -61,14 +50,18 @@ def _train(
     return float(batch.loss[0]), batch.d_params[0].copy(), int(batch.rays[0])
 
 
-def _oracle(field: NgpField, rays: int, weight: NDArray[np.float32], params: Tensor) -> tuple[Tensor, Tensor]:
-    """Color error and loss of the samples that the last chunk took, for the network ``params``."""
+def _oracle(
+    field: NgpField, rays: int, weight: NDArray[np.float32], grid: TorchGrid, params: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Color error and loss of the samples that the last chunk took, for an encoding and the network ``params``."""
     batch, scratch = field._batch, field._scratch
     first, ray = scratch.ray_first[0], scratch.ray[0]
     column = scratch.column[0, : first[rays]]
     x = torch.as_tensor(batch.x[0][:, column].T.copy(), dtype=torch.float64)
-    grid = to_torch(field._encoding, dtype=torch.float64)
-    sigma, color = shade(mlp(field._net.widths.tolist(), params, encode(grid, SETTINGS.levels, x)), 0, x)
+    toward = torch.as_tensor(ray[:rays, :3], dtype=torch.float64)
+    toward = toward.repeat_interleave(torch.as_tensor(np.diff(first[: rays + 1])), dim=0)
+    raw = mlp(field._net.widths.tolist(), params, encode(grid, LEVELS, x))
+    sigma, color = shade(raw, SETTINGS.sh_degree, toward)
     error = loss = torch.zeros((), dtype=torch.float64)
     for r in range(rays):
         a, b = int(first[r]), int(first[r + 1])
@@ -81,20 +74,35 @@ def _oracle(field: NgpField, rays: int, weight: NDArray[np.float32], params: Ten
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_loss_and_gradient_equal_the_oracle(field: NgpField, weighted: bool) -> None:
-    loss, gradient, rays = _train(field, _packed(field, _weights() if weighted else None))
+def test_loss_and_gradient_equal_the_oracle(weighted: bool) -> None:
+    field = kernel_field()
+    rng = np.random.default_rng(2)
+    weights = [rng.choice(np.array([0.0, 0.3, 1.0], np.float32), v.image.shape[:2]) for v in VIEWS]
+    views = [replace(v, weight=w) for v, w in zip(VIEWS, weights)] if weighted else VIEWS
+    loss, gradient, rays = _train(field, views)
     weight = field._scratch.ray[0, :rays, 10] if weighted else np.ones(rays, np.float32)
+    assert field._encoding.dense[:LEVELS].any() and not field._encoding.dense[:LEVELS].all()
+    grid = to_torch(field._encoding, dtype=torch.float64)
     params = torch.as_tensor(field._net.params, dtype=torch.float64).requires_grad_(True)
-    error, total = _oracle(field, rays, weight, params)
+    grid.table.requires_grad_(True)
+    error, total = _oracle(field, rays, weight, grid, params)
     total.backward()
-    assert rays > 20 and loss == pytest.approx(error.item(), rel=1e-4) and params.grad is not None
-    expected = params.grad.numpy()
-    np.testing.assert_allclose(gradient, expected, atol=1e-4 * np.abs(expected).max())
+    assert rays > 20 and loss == pytest.approx(error.item(), rel=1e-4)
+    field._gather(LEVELS)
+    touched = field._table_g.reshape(len(field._dirty), -1).any(axis=1)
+    assert (field._dirty >= touched).all() and not field._dirty.all()
+    for found, learned in ((gradient, params), (field._table_g, grid.table)):
+        assert learned.grad is not None
+        expected = learned.grad.numpy()
+        np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+    field._table_g[:], field._dirty[:] = 0.0, False
 
 
-def test_no_ray_is_cut_off_where_the_grid_is_wrong(field: NgpField) -> None:
+def test_no_ray_is_cut_off_where_the_grid_is_wrong() -> None:
+    field = kernel_field()
+
     def rays_of(over: float) -> list[NDArray[np.float32]]:
-        _, _, rays = _train(field, _packed(field, None), rays=512, over=over)
+        _, _, rays = _train(field, rays=512, over=over)
         first, column = field._scratch.ray_first[0], field._scratch.column[0]
         return [field._scratch.line[0, 0, column[a:b]] for a, b in pairwise(first[: rays + 1])]
 
@@ -105,16 +113,3 @@ def test_no_ray_is_cut_off_where_the_grid_is_wrong(field: NgpField) -> None:
         assert len(found) > 0.8 * len(whole)
         for mine, other in zip(found, whole, strict=False):
             np.testing.assert_array_equal(mine, other)
-
-
-def test_pixels_of_weight_zero_are_not_drawn(field: NgpField) -> None:
-    weights = _weights()
-    data = _packed(field, weights)
-    flat = np.concatenate([w.reshape(-1) for w in weights])
-    assert (flat == 0).any() and (flat[data.drawn] > 0).all() and len(data.drawn) == (flat > 0).sum()
-    _, _, rays = _train(field, data)
-    drawn = field._scratch.ray[0, :rays, 10]
-    assert set(np.unique(drawn)) == {np.float32(0.3), np.float32(1.0)}
-    target = field._scratch.ray[0, :rays, 3:6]
-    pixels = data.pixels[data.drawn].astype(np.float32) / 255.0
-    assert all(np.abs(pixels - color).max(axis=1).min() < 1e-6 for color in target)

@@ -12,20 +12,11 @@ import numpy as np
 import pytest
 from numba import njit
 
-from edge_server.fields.common.kernels.simd import draw, fetch_add
+from edge_server.fields.common.kernels.simd import draw
 from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
 
 # With a nice of 0 the caller is a worker itself.
 either_priority = pytest.mark.parametrize("nice", [0, 5])
-
-
-@njit(nogil=True)
-def _count(counter, worker, done):
-    while True:
-        task = fetch_add(counter, 1)
-        if task >= done.size:
-            return
-        done[task] += 1
 
 
 @njit(nogil=True)
@@ -46,21 +37,28 @@ def _engaged(pool: Pool) -> list[int]:
 
 @either_priority
 @pytest.mark.parametrize("threads", [1, 7])
-def test_all_workers_compute_at_once_and_each_task_is_done_once(threads: int, nice: int) -> None:
+def test_all_workers_compute_at_once_each_task_once_until_the_pool_is_closed(threads: int, nice: int) -> None:
     """They wait for each other here: who computed first and woke the others then would wait for ever."""
-    pool, together, seen = Pool(threads, nice), threading.Barrier(threads), []
+    before, pool, together, seen = set(threading.enumerate()), Pool(threads, nice), threading.Barrier(threads), []
+    own = set(threading.enumerate()) - before
 
     def meet(counter, worker):
         together.wait(10)
         seen.append(worker)
 
-    for kernel in (_count, _share):
-        pool.run(meet)
-        done = np.zeros(10_000, np.int64)
-        pool.run(kernel, done)
-        assert (done == 1).all()
+    pool.run(meet)
+    assert sorted(seen) == list(range(threads))
+    done = [np.zeros(2_000, np.int64) for _ in range(4)]  # several callers at a time
+    callers = [threading.Thread(target=lambda each=each: [pool.run(_share, each) for _ in range(5)]) for each in done]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join(30)
+    assert all((each == 5).all() for each in done)
     pool.close()
-    assert sorted(seen) == sorted(2 * list(range(threads)))
+    for thread in own:
+        thread.join(10)
+    assert not any(thread.is_alive() for thread in own)
 
 
 @either_priority
@@ -116,28 +114,6 @@ def test_the_number_of_threads_is_that_of_the_cores_the_environment_or_the_calle
     assert shared_pool(1, 3) is shared_pool(1, 3) and shared_pool(1, 3) is not shared_pool(1, 4)
 
 
-@either_priority
-def test_several_python_threads_may_run_kernels_at_once(nice: int) -> None:
-    """Whether they work along or not: no more compute than the pool has threads."""
-    pool, arrays = Pool(3, nice), [np.zeros(200, np.int64) for _ in range(8)]
-    now, most = set(), [0]
-
-    def noted(counter, worker, done):
-        now.add(threading.get_ident())
-        most[0] = max(most[0], len(now))
-        time.sleep(0.002)
-        _count(counter, worker, done)
-        now.discard(threading.get_ident())
-
-    callers = [threading.Thread(target=lambda a=a: [pool.run(noted, a) for _ in range(5)]) for a in arrays]
-    for caller in callers:
-        caller.start()
-    for caller in callers:
-        caller.join(30)
-    assert all((a == 5).all() for a in arrays) and most[0] == 3
-    pool.close()
-
-
 @pytest.mark.skipif(os.uname().sysname != "Linux", reason="priorities of single threads: Linux only")
 def test_a_caller_works_along_unless_it_is_to_go_first() -> None:
     def look(counter, worker):
@@ -154,17 +130,6 @@ def test_a_caller_works_along_unless_it_is_to_go_first() -> None:
     seen = {}
     CallerPool().run(look)
     assert seen == {0: (threading.get_ident(), mine)}
-
-
-@either_priority
-def test_a_closed_pool_ends_its_threads(nice: int) -> None:
-    before, pool = set(threading.enumerate()), Pool(5, nice)
-    own = set(threading.enumerate()) - before
-    assert len(own) == (5 if nice else 4)
-    pool.close()
-    for thread in own:
-        thread.join(10)
-    assert not any(thread.is_alive() for thread in own)
 
 
 @either_priority
@@ -186,23 +151,6 @@ def test_a_caller_that_is_interrupted_waits_for_what_it_has_begun(nice: int) -> 
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
     assert seen == ["slow"] and _engaged(pool) == [0, 1, 2]
-    pool.close()
-
-
-def test_a_caller_interrupted_before_it_has_woken_all_workers_loses_none(monkeypatch) -> None:
-    pool, seen = Pool(3), []
-    wake = pool._wake_others
-
-    def interrupted(worker, job):
-        pool._inboxes[1].put(job)
-        monkeypatch.setattr(pool, "_wake_others", wake)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(pool, "_wake_others", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        pool.run(lambda counter, worker: seen.append(worker))
-    assert sorted(seen) == [1, 2], "one of them twice, or not at all"
-    assert _engaged(pool) == [0, 1, 2]
     pool.close()
 
 
