@@ -29,10 +29,7 @@ def test_the_nearest_of_a_ring_is_the_neighbor():
     ring = [view(str(i), (3 * np.cos(a), 3 * np.sin(a), 1)) for i, a in enumerate(angles)]
     held_out = look_at((3 * np.cos(0.6), 3 * np.sin(0.6), 1), (0, 0, 0))  # 34 degrees
     assert nearest_view(ring, held_out).camera == "1"
-
-
-def test_at_one_place_the_viewing_direction_decides():
-    here = (1.0, 0.0, 0.0)
+    here = (1.0, 0.0, 0.0)  # at one place the viewing direction decides
     views = [view("away", here, target=(9, 0, 0)), view("same", here, target=(-1, 0.1, 0))]
     assert nearest_view(views, look_at(here, (-1, 0, 0))).camera == "same"
 

@@ -18,6 +18,8 @@ from tests.edge_server.fields.small import every_field, healthy, reaches, small,
 
 VIEWS = ring(9, size=24)
 pytestmark = pytest.mark.stability
+# Representations with rays share what holds views and cameras, and their trainer: one stands for them.
+each_kind = pytest.mark.parametrize("name", ["ngp", "splat"])
 
 
 @every_field
@@ -44,7 +46,7 @@ def test_pictures_of_one_row_and_of_one_column(name: str) -> None:
         assert mean_psnr(field, views) > 9.0
 
 
-@every_field
+@each_kind
 def test_a_scene_ten_kilometers_away_is_learned_as_here(name: str) -> None:
     """A float32 of ten kilometers has steps of a millimeter."""
     away = np.eye(4)
@@ -57,7 +59,7 @@ def test_a_scene_ten_kilometers_away_is_learned_as_here(name: str) -> None:
     assert abs(mean_psnr(fields[1], views) - mean_psnr(fields[0], VIEWS)) < 0.01
 
 
-@pytest.mark.parametrize("name", ["ngp", "splat"])  # the networks share what holds views
+@each_kind
 def test_two_hundred_cameras(name: str) -> None:
     """And three updates of 200 new pictures, in memory that does not grow."""
     views = ring(200, size=16)
@@ -78,7 +80,7 @@ def test_two_hundred_cameras(name: str) -> None:
     assert held_mb[2] - held_mb[1] < 0.5 and most_mb < 10.0, (held_mb, most_mb)
 
 
-@every_field
+@each_kind
 def test_cameras_a_ten_millionth_of_a_meter_apart_and_from_straight_down(name: str) -> None:
     for eye in ((2.5, 0.0, 1.0), (0.0, 0.0, 2.5)):
         poses = [look_at(np.add(eye, 1e-7 * np.array([np.sin(k), np.cos(k), 0])), (0, 0, 0)) for k in range(9)]
@@ -132,7 +134,7 @@ def test_views_that_contradict_each_other(name: str) -> None:
     reaches(name, "after noise", mean_psnr(field, VIEWS), margin_db=1.0)  # learning noise is chaotic
 
 
-@every_field
+@each_kind
 def test_cameras_that_move_at_every_update(name: str) -> None:
     field = tiny(name)
     for update in range(30):
@@ -157,7 +159,7 @@ def _shown(name: str, views: list[View], steps: int = 12) -> np.ndarray:
     return field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color
 
 
-@every_field
+@each_kind
 def test_a_view_of_no_weight_teaches_nothing_and_one_of_full_weight_all(name: str) -> None:
     noise = replace(VIEWS[3], image=np.random.default_rng(0).integers(0, 256, (24, 24, 3), dtype=np.uint8))
     silent = ([*VIEWS[:3], _weighed(third, 0.0), *VIEWS[4:]] for third in (VIEWS[3], noise))
@@ -165,7 +167,7 @@ def test_a_view_of_no_weight_teaches_nothing_and_one_of_full_weight_all(name: st
     np.testing.assert_array_equal(_shown(name, VIEWS), _shown(name, [_weighed(view, 1.0) for view in VIEWS]))
 
 
-@every_field
+@each_kind
 def test_views_of_no_weight_at_all_break_nothing(name: str) -> None:
     field, views = tiny(name, background="#808080"), ring(7, size=24)
     nothing = [_weighed(view, 0.0) for view in views]
@@ -223,7 +225,7 @@ def test_a_poisoned_view_is_survived(poison: Poison, warm: int) -> None:
     assert _after_db(warm, poison) > _after_db(warm, None) - WITHIN_DB
 
 
-@every_field
+@each_kind
 def test_a_picture_repeated_is_not_a_scene_in_motion(name: str) -> None:
     """One wrong picture makes all of the next one seem to have moved; equal ones after it must end that."""
     field = small(name)
