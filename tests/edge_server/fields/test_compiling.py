@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import runpy
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -25,22 +24,21 @@ def doubled(x):
 """
 
 
-def _kernel(path: Path) -> Any:
-    """``doubled`` of a module that is imported anew."""
-    return runpy.run_path(str(path))["doubled"]
-
-
 def test_compiling_is_told_and_loading_is_not(tmp_path: Path) -> None:
     source = tmp_path / "kernels_of_a_test.py"
     source.write_text(KERNEL)
     lines: list[str] = []
+
+    def doubled(x: complex) -> complex:
+        """Of a module that is imported anew."""
+        return runpy.run_path(str(source))["doubled"](x)
+
     with told(lines.append):
-        assert _kernel(source)(4) == 8
-        assert _kernel(source)(4.0) == 8.0
+        assert doubled(4) == 8 and doubled(4.0) == 8.0
         assert [line.split("): ")[1] for line in lines] == ["number 1 after 0 s", "number 2 after 0 s"]
-        assert _kernel(source)(4) == 8
+        assert doubled(4) == 8
     assert len(lines) == 2, "the third was loaded from numba's cache"
-    assert _kernel(source)(4j) == 8j
+    assert doubled(4j) == 8j
     assert len(lines) == 2, "nobody is told after the end of the block"
 
 

@@ -42,6 +42,12 @@ def test_depth_is_where_the_scene_is(size: int) -> None:
     wrong = np.abs(found - truth)[told & there] / truth[told & there]
     # Before an area of one color, every place that all see in that area agrees as well.
     assert np.median(wrong) < 0.05 and np.mean(wrong < 0.1) > 0.6
+    grown = [replace(v, camera_to_world=v.camera_to_world.copy()) for v in views]
+    for view in grown:
+        view.camera_to_world[:3, 3] *= 100.0
+    data, larger = _packed(grown)
+    assert larger.radius_m == pytest.approx(100.0 * box.radius_m)
+    assert np.mean(np.isclose(_guide(grown, data, larger), found, rtol=1e-3)) > 0.99, "in units of the scene"
 
 
 def test_what_is_transparent_or_of_one_color_has_no_depth() -> None:
