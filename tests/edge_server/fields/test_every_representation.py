@@ -11,6 +11,7 @@ import pytest
 
 from edge_server.fields import Budget
 from edge_server.fields.common.cameras import settings as refinement
+from edge_server.fields.common.supervision import pack_cameras
 from tests.edge_server.fields.small import (
     HELD,
     SEEN,
@@ -88,6 +89,10 @@ def test_resuming_continues_bit_for_bit(name: str, monkeypatch: pytest.MonkeyPat
     if extra:
         assert a._cameras.meta() == b._cameras.meta()
     if name == "tensorf":
+        box = a.view_store.box
+        origin = a._cameras.corrected(SEEN, pack_cameras(SEEN, box), box).origin
+        learned = np.stack([a._cameras.poses.pose(view)[:3, 3] for view in SEEN])
+        np.testing.assert_array_equal(origin, box.normalise(learned))
         assert any(np.abs(shift).max() > 0 for _, shift, *_ in a._cameras.meta()["poses"].values())
 
 
