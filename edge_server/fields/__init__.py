@@ -1,7 +1,7 @@
 """Radiance fields behind one small protocol: fit a view set within a budget, render a camera, save, load.
 
 A representation is one folder here and one line in ``registry``, which says what a folder must have. The
-tests of all representations find what they need in ``tests/edge_server/fields/NAME/small.py``.
+tests of all representations find what they need in ``tests/edge_server/fields/small.py``.
 """
 
 from __future__ import annotations

@@ -25,13 +25,6 @@ class Means:
         return np.array([[*i.reshape(-1, 3).mean(0), 1.0] for i in images], np.float32)
 
 
-class NanForTheFirst(Means):
-    def embed(self, images):
-        rows = super().embed(images)
-        rows[0, 1] = np.nan
-        return rows
-
-
 def cached(**more) -> tuple[Means, EmbeddingCache]:
     means = Means()
     return means, EmbeddingCache(means, ViewDecoder().view, **more)
@@ -51,23 +44,8 @@ def test_a_frame_is_embedded_once_whoever_asks_again():
     assert means.asked == [2] and cache.computed == 2
     cache.of([*items, buffered("cam01", 1)])
     assert means.asked == [2, 1], "only what is new"
-
-
-def test_another_session_with_the_same_number_is_another_frame():
-    means, cache = cached()
-    cache.of([buffered("cam01", 1)])
     cache.of([buffered("cam01", 1, session="s2")])
-    assert means.asked == [1, 1]
-
-
-def test_a_nan_costs_its_own_camera_and_is_counted_once():
-    cache = EmbeddingCache(NanForTheFirst(), ViewDecoder().view)
-    items = [buffered("cam01"), buffered("cam02")]
-    for _ in range(3):
-        rows, ok = cache.of(items)
-        assert ok.tolist() == [False, True]
-        assert (rows[0] == 0).all() and rows[1].any() and np.isfinite(rows).all()
-    assert cache.failed == 1
+    assert means.asked == [2, 1, 1], "another session with the same number is another frame"
 
 
 def test_a_frame_that_cannot_be_decoded_is_a_camera_without_embedding():
@@ -86,12 +64,5 @@ def test_memory_is_bounded_and_the_latest_used_stay():
         cache.of([buffered("cam01", k), kept])
     assert len(cache._rows) == 4
     assert sum(means.asked) == 21, "the frame that every decision used was embedded once"
-
-
-def test_a_decision_larger_than_the_cache_is_answered_whole():
-    _, cache = cached(capacity=2)
-    items = [buffered(f"cam{k:02d}") for k in range(9)]
-    for _ in range(2):
-        rows, ok = cache.of(items)
-        assert ok.all() and len(rows) == 9
-    assert len(cache._rows) == 2
+    rows, ok = cache.of([buffered(f"cam{k:02d}") for k in range(9)])
+    assert ok.all() and len(rows) == 9 and len(cache._rows) == 4, "a larger decision is answered whole"

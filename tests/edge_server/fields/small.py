@@ -1,33 +1,66 @@
 """Every representation made small, and the views that tests fit it to.
 
-``small_rays`` and ``splat.small`` have their classes, settings for images of 48 pixels (SMALL) and of 24 (TINY, for
-hard cases), and REACHED_DB: the PSNR that a healthy field reaches in these tests. Another CPU rounds differently, which
-costs tenths of a decibel.
+By name: classes, settings for images of 48 pixels (SMALL) and of 24 (TINY, for hard cases), and REACHED_DB: the PSNR
+that a healthy field reaches in these tests. Another CPU rounds differently, which costs tenths of a decibel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 from msgspec import structs
 
-from edge_server.fields import View
+from edge_server.fields import Budget, View
 from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT
-from edge_server.fields.registry import field_names
-from tests.edge_server.fields import small_rays
+from edge_server.fields.common.threads.thread_pool import CallerPool
+from edge_server.fields.nerfacto.field import NerfactoField
+from edge_server.fields.nerfacto.settings import NerfactoSettings
+from edge_server.fields.ngp.field import NgpField
+from edge_server.fields.ngp.settings import NgpSettings
+from edge_server.fields.tensorf.field import TensorfField
+from edge_server.fields.tensorf.settings import TensorfSettings
 from tests.edge_server.fields.scenes import picture, psnr, ring
 from tests.edge_server.fields.splat import small as splat
 
-NAMES = field_names()
-CLASSES: dict[str, Any] = {**small_rays.CLASSES, "splat": splat.FIELD}
-SMALL: dict[str, Any] = {**small_rays.SMALL, "splat": splat.SMALL}
-TINY: dict[str, Any] = {**small_rays.TINY, "splat": splat.TINY}
-REACHED_DB: dict[str, dict[str, float]] = {**small_rays.REACHED_DB, "splat": splat.REACHED_DB}
-every_field = pytest.mark.parametrize("name", NAMES)
+_SMALL: dict[str, Any] = {"hidden": 16, "rays": 1024, "batch_samples": 8192, "cells": 32, "threads": 2}
+_TINY: dict[str, Any] = {"hidden": 16, "rays": 512, "batch_samples": 4096, "cells": 16, "threads": 2}
+_HASHED: dict[str, Any] = {"levels": 6, "log2_table": 12, "finest_resolution": 64}
+_MARCHED: dict[str, Any] = {"samples": 96, "samples_ramp": 100}
+_PROPOSED: dict[str, Any] = {"samples": 12, "samples_start": 16, "bins": 48}
+
+CLASSES: dict[str, Any] = {"ngp": NgpField, "nerfacto": NerfactoField, "tensorf": TensorfField, "splat": splat.FIELD}
+SMALL: dict[str, Any] = {
+    "splat": splat.SMALL,
+    "ngp": NgpSettings(**_SMALL, **_HASHED, **_MARCHED, levels_every=15),
+    "nerfacto": NerfactoSettings(**_SMALL, **_HASHED, **_PROPOSED, proposal_cells=32, anneal=60),
+    "tensorf": TensorfSettings(
+        **_SMALL, **_MARCHED, color_rank=8, resolution_start=16, resolution=64, upsample=(20, 60, 120)
+    ),
+}
+_COARSE: dict[str, Any] = {**_TINY, "samples": 48, "samples_ramp": 100}
+TINY: dict[str, Any] = {
+    "splat": splat.TINY,
+    "ngp": NgpSettings(**_COARSE, levels=4, levels_every=10, log2_table=11, finest_resolution=32),
+    "nerfacto": NerfactoSettings(
+        **{**_TINY, **_PROPOSED, "levels": 5, "log2_table": 11, "base_resolution": 8, "finest_resolution": 48},
+        proposal_cells=16,
+        anneal=40,
+    ),
+    "tensorf": TensorfSettings(**_COARSE, color_rank=8, resolution_start=12, resolution=32, upsample=(10, 25)),
+}
+_CASES = ("held out", "moved", "one view", "after noise", "moving cameras", "after no weights")
+REACHED_DB: dict[str, dict[str, float]] = {
+    "splat": splat.REACHED_DB,
+    "ngp": dict(zip(_CASES, (23.25, 21.77, 32.25, 18.21, 26.95, 20.97))),
+    "nerfacto": dict(zip(_CASES, (23.0, 21.15, 26.81, 20.17))),
+    "tensorf": dict(zip(_CASES, (24.76, 24.16, 20.18, 19.19))),
+}
+every_field = pytest.mark.parametrize("name", CLASSES)
 
 VIEWS = ring(13)
 HELD, SEEN = VIEWS[6], VIEWS[:6] + VIEWS[7:]
@@ -48,6 +81,18 @@ def small(name: str, **changed: Any) -> Any:
 def tiny(name: str, **changed: Any) -> Any:
     """A tiny field of that name, with other settings as ``changed`` says."""
     return CLASSES[name](structs.replace(TINY[name], **changed))
+
+
+KERNEL_VIEWS = ring(5, size=24)
+KERNEL_SETTINGS = structs.replace(TINY["ngp"], rays=64, batch_samples=2048, base_resolution=4, sh_degree=1, threads=1)
+
+
+@cache
+def kernel_field() -> NgpField:
+    """That has made ten steps, for tests of the kernels that fields with rays share."""
+    made = NgpField(KERNEL_SETTINGS, CallerPool())
+    made.fit(KERNEL_VIEWS, Budget(steps=10))
+    return made
 
 
 def healthy(field: Any, views: Sequence[View]) -> None:

@@ -46,30 +46,18 @@ def test_a_budget_is_used_up_and_never_exceeded_once_a_step_is_known(first_s: fl
             fits.fit(5.0)
 
 
-def test_a_single_step_may_be_a_tenth_late_but_no_second_one() -> None:
-    fits = Fits()
-    fits.fit(5.0)
-    assert fits.fit(0.92) == (1, 1.0) and fits.fit(1.95) == (1, 1.0)
-    assert fits.fit(0.9) == (0, 0.0)
-
-
-def test_one_hiccup_changes_nothing() -> None:
-    fits = Fits()
-    fits.fit(5.0)
-    fits.step_s = 40.0
-    assert fits.fit(5.0) == (1, 40.0)
-    fits.step_s = 1.0
-    assert [fits.fit(5.0) for _ in range(3)] == [(5, 5.0)] * 3
-
-
-def test_load_that_stays_is_known_after_three_steps() -> None:
+def test_one_hiccup_changes_nothing_and_load_that_stays_is_known_after_three_steps() -> None:
     fits = Fits()
     fits.fit(8.0)
+    # A single step may be a tenth late, but no second one.
+    assert fits.fit(0.92) == (1, 1.0) and fits.fit(1.95) == (1, 1.0) and fits.fit(0.9) == (0, 0.0)
+    fits.step_s = 40.0
+    assert fits.fit(8.0) == (1, 40.0)
+    fits.step_s = 1.0
+    assert [fits.fit(8.0) for _ in range(3)] == [(8, 8.0)] * 3
     fits.step_s = 3.0
     assert fits.fit(8.0) == (3, 9.0)
     assert [fits.fit(8.0) for _ in range(3)] == [(2, 6.0)] * 3
-    fits.step_s = 1.0
-    assert fits.fit(8.0) == (8, 8.0)
 
 
 def test_fits_too_short_for_a_step_make_one_now_and_then() -> None:
@@ -80,17 +68,11 @@ def test_fits_too_short_for_a_step_make_one_now_and_then() -> None:
     assert set(made) == {0, 1} and 10 <= sum(made) <= 20
     fits.step_s = 0.1
     assert sum(fits.fit(0.5)[0] for _ in range(8)) >= 20
-
-
-def test_budgets_in_steps_ask_no_clock() -> None:
-    pace, usual, said = StepBudget(Budget(steps=4), lambda: 0.0), StepTimer(), []
+    pace, usual, said = StepBudget(Budget(steps=4), lambda: 0.0), StepTimer(), []  # which asks no clock
     while (progress := pace.begin_step(usual)) is not None:
         said.append(progress)
         pace.end_step()
     assert said == [0.0, 0.25, 0.5, 0.75]
-
-
-# --- whole fields ---------------------------------------------------------------------------------
 
 
 class Work(CallerPool):

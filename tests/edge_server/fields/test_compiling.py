@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
+import runpy
 from pathlib import Path
-from typing import Any
 
 import pytest
-from numba.core import event
 
 from edge_server.cli import main
-from edge_server.fields import compiling
-from edge_server.fields.compiling import LOG_EVERY_S, USUAL, Teller, told
+from edge_server.fields.common.kernels.jit import cache_folder
+from edge_server.fields.compiling import told
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.scan.carried_field import CarriedField
@@ -26,44 +24,22 @@ def doubled(x):
 """
 
 
-def _kernel(path: Path) -> Any:
-    """``doubled`` of a module that is imported anew."""
-    spec = importlib.util.spec_from_file_location("kernels_of_a_test", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.doubled
-
-
 def test_compiling_is_told_and_loading_is_not(tmp_path: Path) -> None:
     source = tmp_path / "kernels_of_a_test.py"
     source.write_text(KERNEL)
     lines: list[str] = []
+
+    def doubled(x: complex) -> complex:
+        """Of a module that is imported anew."""
+        return runpy.run_path(str(source))["doubled"](x)
+
     with told(lines.append):
-        assert _kernel(source)(4) == 8
-        assert _kernel(source)(4.0) == 8.0
+        assert doubled(4) == 8 and doubled(4.0) == 8.0
         assert [line.split("): ")[1] for line in lines] == ["number 1 after 0 s", "number 2 after 0 s"]
-        assert _kernel(source)(4) == 8
+        assert doubled(4) == 8
     assert len(lines) == 2, "the third was loaded from numba's cache"
-    assert _kernel(source)(4j) == 8j
+    assert doubled(4j) == 8j
     assert len(lines) == 2, "nobody is told after the end of the block"
-
-
-def test_kernels_that_are_compiled_later_are_counted_and_timed_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = [0.0]
-    monkeypatch.setattr(compiling.time, "perf_counter", lambda: clock[0])
-    lines: list[str] = []
-    teller = Teller(lines.append, every_s=0.0)
-
-    began = event.Event("numba:compile", event.EventStatus.START, {})
-    for now_s, starts in ((1.0, True), (3.0, True), (11.0, False), (12.0, False), (300.0, True), (302.0, False)):
-        clock[0] = now_s
-        (teller.on_start if starts else teller.on_end)(began)
-    assert [line.split("): ")[1] for line in lines] == [
-        "number 1 after 0 s",
-        "number 2 after 2 s",
-        "number 1 after 0 s",
-    ]
 
 
 @pytest.mark.parametrize(
@@ -85,11 +61,20 @@ def test_warm_up_compiles_what_is_used(
     assert found == expected
 
 
-def test_a_log_gets_one_line_in_ten_seconds(tmp_path: Path) -> None:
-    source = tmp_path / "kernels_of_a_test.py"
-    source.write_text(KERNEL)
-    lines: list[str] = []
-    with event.install_listener("numba:compile", Teller(lines.append, LOG_EVERY_S)):
-        _kernel(source)(1)
-        _kernel(source)(1.0)
-    assert len(lines) == 1 and USUAL in lines[0]
+def test_compiled_kernels_are_kept_apart_for_every_state_of_the_sources(tmp_path, monkeypatch) -> None:
+    """Or an edit to one file would leave yesterday's code running where it is inlined into another."""
+    source, other = tmp_path / "fields" / "kernels" / "a.py", tmp_path / "fields" / "field.py"
+    source.parent.mkdir(parents=True)
+    source.write_text("x = 1")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    first = cache_folder(tmp_path)
+    assert first.parent == tmp_path / "cache"
+    other.write_text("y = 1")
+    assert cache_folder(tmp_path) == first
+    source.write_text("x = 2")
+    second = cache_folder(tmp_path)
+    (source.parents[1] / "settings.py").write_text("NUMBER = 1")  # which kernels hold as a constant
+    assert len({first, second, cache_folder(tmp_path)}) == 3
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
+    assert cache_folder(tmp_path).parent == tmp_path / "user" / "freshfield"

@@ -1,41 +1,36 @@
-"""Hard cases of every representation: whatever comes, a field stays finite and useful afterwards.
-
-Damage to parameters, and limits of a single representation, are in files of their own beside this one.
-"""
+"""Hard cases of every representation: whatever comes, a field stays finite and useful afterwards."""
 
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 
-from edge_server.fields import Budget
+from edge_server.fields import Budget, View
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.scenes import mean_psnr, picture, ring
-from tests.edge_server.fields.small import NAMES, every_field, healthy, reaches, tiny
+from tests.edge_server.fields.small import every_field, healthy, reaches, small, tiny
 
 VIEWS = ring(9, size=24)
 pytestmark = pytest.mark.stability
+# Representations with rays share what holds views and cameras, and their trainer: one stands for them.
+each_kind = pytest.mark.parametrize("name", ["ngp", "splat"])
 
 
 @every_field
-def test_one_view(name: str) -> None:
+def test_one_view_and_one_pixel(name: str) -> None:
     field = tiny(name)
     field.fit(VIEWS[:1], Budget(steps=60))
     healthy(field, VIEWS)
     reaches(name, "one view", mean_psnr(field, VIEWS[:1]))
-
-
-@pytest.mark.parametrize(
-    ("name", "changed"), [*((name, {}) for name in NAMES), ("splat", {"gaussians": 1, "start": 1})]
-)
-def test_one_pixel(name: str, changed: dict[str, Any]) -> None:
     camera = replace(VIEWS[0].intrinsics, width=1, height=1, cx=0.5, cy=0.5)
     view = replace(VIEWS[0], image=np.full((1, 1, 3), 99, np.uint8), intrinsics=camera)
-    field = tiny(name, **changed)
+    field = tiny(name, **({"gaussians": 1, "start": 1} if name == "splat" else {}))
     field.fit([view], Budget(steps=30))
     healthy(field, [view])
 
@@ -51,7 +46,7 @@ def test_pictures_of_one_row_and_of_one_column(name: str) -> None:
         assert mean_psnr(field, views) > 9.0
 
 
-@every_field
+@each_kind
 def test_a_scene_ten_kilometers_away_is_learned_as_here(name: str) -> None:
     """A float32 of ten kilometers has steps of a millimeter."""
     away = np.eye(4)
@@ -64,7 +59,7 @@ def test_a_scene_ten_kilometers_away_is_learned_as_here(name: str) -> None:
     assert abs(mean_psnr(fields[1], views) - mean_psnr(fields[0], VIEWS)) < 0.01
 
 
-@every_field
+@each_kind
 def test_two_hundred_cameras(name: str) -> None:
     """And three updates of 200 new pictures, in memory that does not grow."""
     views = ring(200, size=16)
@@ -85,7 +80,7 @@ def test_two_hundred_cameras(name: str) -> None:
     assert held_mb[2] - held_mb[1] < 0.5 and most_mb < 10.0, (held_mb, most_mb)
 
 
-@every_field
+@each_kind
 def test_cameras_a_ten_millionth_of_a_meter_apart_and_from_straight_down(name: str) -> None:
     for eye in ((2.5, 0.0, 1.0), (0.0, 0.0, 2.5)):
         poses = [look_at(np.add(eye, 1e-7 * np.array([np.sin(k), np.cos(k), 0])), (0, 0, 0)) for k in range(9)]
@@ -96,9 +91,9 @@ def test_cameras_a_ten_millionth_of_a_meter_apart_and_from_straight_down(name: s
         assert mean_psnr(field, views) > 14.0
 
 
-@pytest.mark.parametrize(("value", "channels"), [(0, 3), (255, 3), (77, 4)])
+@pytest.mark.parametrize(("value", "channels"), [(0, 3), (77, 4)])
 @every_field
-def test_constant_black_and_saturated_pictures(name: str, value: int, channels: int) -> None:
+def test_constant_pictures_black_and_half_transparent(name: str, value: int, channels: int) -> None:
     views = [replace(v, image=np.full((24, 24, channels), value, np.uint8)) for v in VIEWS]
     field = tiny(name)
     field.fit(views, Budget(steps=60))
@@ -139,34 +134,7 @@ def test_views_that_contradict_each_other(name: str) -> None:
     reaches(name, "after noise", mean_psnr(field, VIEWS), margin_db=1.0)  # learning noise is chaotic
 
 
-@pytest.mark.slow
-# The networks share their optimiser and their warm starts.
-@pytest.mark.parametrize("name", ["ngp", "splat"])
-def test_a_thousand_updates_do_not_drift_or_grow(name: str) -> None:
-    """A moving ball, a new selection of views each time, warm starts only."""
-    rng = np.random.default_rng(1)
-    still = ring(9, size=24)
-    places = [np.array([0.3 * np.sin(a), 0.3 * np.cos(a), 0.5]) for a in np.linspace(0, 2 * np.pi, 12)]
-    frames = [[replace(v, image=picture(v.intrinsics, v.camera_to_world, p)) for v in still] for p in places]
-    field, scores, sizes = tiny(name), [], []
-    for update in range(1000):
-        frame = frames[update % 12]
-        now = [replace(frame[k], generated_ns=update * 10**8) for k in rng.choice(9, 6, replace=False)]
-        field.fit(now, Budget(steps=3 if name == "splat" else 2))
-        if name == "splat":
-            assert len(field.cloud) <= field.settings.gaussians
-        if update % 100 >= 88:
-            scores.append(mean_psnr(field, frame[::4]))
-            sizes.append(np.abs(field.state()["params" if name == "splat" else "table"]).mean())
-    healthy(field, VIEWS)
-    first, last = np.mean(scores[12:36]), np.mean(scores[-24:])
-    assert last > first - 1.0, f"drifted from {first:.1f} to {last:.1f} dB"
-    assert last > 15.0
-    assert np.mean(sizes[-12:]) < 3.0 * np.mean(sizes[12:24]), "parameters grow"
-    assert len(field.view_store.memory) == 9
-
-
-@every_field
+@each_kind
 def test_cameras_that_move_at_every_update(name: str) -> None:
     field = tiny(name)
     for update in range(30):
@@ -178,3 +146,92 @@ def test_cameras_that_move_at_every_update(name: str) -> None:
         field.fit(views, Budget(steps=5))
     healthy(field, VIEWS)
     reaches(name, "moving cameras", mean_psnr(field, views))
+
+
+def _weighed(view: View, weight: float) -> View:
+    return replace(view, weight=np.full(view.image.shape[:2], weight, np.float32))
+
+
+def _shown(name: str, views: list[View], steps: int = 12) -> np.ndarray:
+    # The color behind everything is found from whole pictures, not from what they teach.
+    field = tiny(name, background="#808080")
+    field.fit(views, Budget(steps=steps))
+    return field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color
+
+
+@each_kind
+def test_a_view_of_no_weight_teaches_nothing_and_one_of_full_weight_all(name: str) -> None:
+    noise = replace(VIEWS[3], image=np.random.default_rng(0).integers(0, 256, (24, 24, 3), dtype=np.uint8))
+    silent = ([*VIEWS[:3], _weighed(third, 0.0), *VIEWS[4:]] for third in (VIEWS[3], noise))
+    np.testing.assert_array_equal(*(_shown(name, views) for views in silent))
+    np.testing.assert_array_equal(_shown(name, VIEWS), _shown(name, [_weighed(view, 1.0) for view in VIEWS]))
+
+
+@each_kind
+def test_views_of_no_weight_at_all_break_nothing(name: str) -> None:
+    field, views = tiny(name, background="#808080"), ring(7, size=24)
+    nothing = [_weighed(view, 0.0) for view in views]
+    for seen in (nothing, views, nothing, nothing[:1]):
+        field.fit(seen, Budget(steps=40))
+        healthy(field, views)
+    field.fit(views, Budget(steps=120))
+    reaches(name, "after no weights", mean_psnr(field, views))  # it goes on learning
+
+
+# One camera sends what cannot be in one update: 30 updates later the field is as good as one that never saw it.
+STEPS, WARM, AFTER = 4, 40, 30  # of an update; updates before and after the poison
+WITHIN_DB = 0.5
+SEEN, BAD = ring(13, size=64)[:12], 3
+# Splat's score on one view differs by 0.2 dB between seeds, on these by 0.06.
+BETWEEN = ring(26, size=64)[1::4]
+
+Poison = Callable[[View], View]
+
+
+def _noise(view: View) -> View:
+    return replace(view, image=np.random.default_rng(1).integers(0, 256, view.image.shape, dtype=np.uint8))
+
+
+def _a_meter_off(view: View) -> View:
+    pose = view.camera_to_world.copy()
+    pose[:3, 3] += pose[:3, 0]
+    return replace(view, camera_to_world=pose)
+
+
+def _update(field: Any, first: int, times: int, poison: Poison | None = None) -> None:
+    """Every update has new frames, equal where nothing changed. first: the number of the first one."""
+    for update in range(first, first + times):
+        now = [replace(v, generated_ns=update * 10**8, image=v.image.copy()) for v in SEEN]
+        if poison is not None:
+            now[BAD] = poison(now[BAD])
+        field.fit(now, Budget(steps=STEPS))
+
+
+@cache
+def _after_db(warm: int, poison: Poison | None) -> float:
+    """The score of a field that saw the poison in one update, after so many others."""
+    field = small("splat")
+    _update(field, 0, warm)
+    _update(field, warm, 1, poison)
+    _update(field, warm + 1, AFTER)
+    assert all(np.isfinite(a).all() for a in field.state().values() if a.dtype.kind == "f")
+    return mean_psnr(field, BETWEEN)
+
+
+# Also in the very first update: before anything is known, and where the scene's box is found.
+@pytest.mark.parametrize("warm", [WARM, 0])
+@pytest.mark.parametrize("poison", [_noise, _a_meter_off])
+def test_a_poisoned_view_is_survived(poison: Poison, warm: int) -> None:
+    assert _after_db(warm, poison) > _after_db(warm, None) - WITHIN_DB
+
+
+@each_kind
+def test_a_picture_repeated_is_not_a_scene_in_motion(name: str) -> None:
+    """One wrong picture makes all of the next one seem to have moved; equal ones after it must end that."""
+    field = small(name)
+    for update, poison in enumerate((None, _noise, None)):
+        _update(field, update, 1, poison)
+    moved = field.view_store.memory[SEEN[BAD].camera].moved
+    assert moved is not None and moved.mean() > 0.9
+    _update(field, 3, 1)
+    assert field.view_store.memory[SEEN[BAD].camera].moved is None

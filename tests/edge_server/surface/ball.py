@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Rendering
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels.fuse import CLOSE, FAR, FREE, SIDE
 from edge_server.surface.volume import Grid, Volume
@@ -88,19 +87,3 @@ def _between(depth: NDArray, u: float, v: float, band: float) -> float:
         return near
     a, b = u - 0.5 - x, v - 0.5 - y
     return float((four[0] @ [1 - a, a]) * (1 - b) + (four[1] @ [1 - a, a]) * b)
-
-
-class BallRenderer:
-    """Shows the ball exactly: a renderer for what only needs one. cameras: as a field's snapshot has them."""
-
-    def __init__(self, cameras: tuple = ()) -> None:
-        self.cameras = cameras
-
-    def render(self, camera_to_world: NDArray, intrinsics: Pinhole) -> Rendering:
-        depth = ball_depth(intrinsics, camera_to_world)
-        solid = np.isfinite(depth)
-        color = np.where(solid[..., None], 0.5, 0.1).astype(np.float32) * np.ones(3, np.float32)
-        return Rendering(color, np.where(solid, depth, 0).astype(np.float32), solid.astype(np.float32))
-
-    def points(self, count: int):
-        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)

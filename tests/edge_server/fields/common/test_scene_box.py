@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.scenes.multiview_still import synthetic_still
-from edge_server.fields.common.scene_box import _main_group, plain_background, scene_box
+from edge_server.fields.common.scene_box import plain_background, scene_box
 from freshfield.geometry import converging_point, look_at
 from tests.edge_server.fields.scenes import ring
 
@@ -28,46 +28,15 @@ def test_the_box_is_where_the_axes_meet() -> None:
     assert box.pixels_across == pytest.approx(4 * box.radius_m / box.distance_m * VIEWS[0].intrinsics.fx)
 
 
-def test_it_moves_and_scales_with_the_rig() -> None:
-    grown = []
-    for view in VIEWS:
-        pose = view.camera_to_world.copy()
-        pose[:3, 3] = 100.0 * pose[:3, 3] + [5.0, 6.0, 7.0]
-        grown.append(replace(view, camera_to_world=pose))
-    a, b = scene_box(VIEWS), scene_box(grown)
-    assert b.radius_m == pytest.approx(100 * a.radius_m) and b.near_m == pytest.approx(100 * a.near_m)
-    np.testing.assert_allclose(b.center_m, 100 * np.array(a.center_m) + [5, 6, 7], atol=1e-6)
-
-
-def test_axes_that_meet_less_than_a_meter_ahead_meet() -> None:
-    poses = np.stack([view.camera_to_world for view in ring(8, size=16, distance_m=0.2)])
-    point = converging_point(poses[:, :3, 3], poses[:, :3, 2])
-    assert point is not None
-    np.testing.assert_allclose(point, [0, 0, 0.4], atol=1e-6)
-
-
-def test_the_main_group_is_without_a_quarter_at_most() -> None:
-    places = np.random.default_rng(0).normal(size=(8, 3))
-    for far, kept in ((1, 7), (2, 6), (3, 8)):
-        assert len(_main_group(places + 1e3 * (np.arange(8) < far)[:, None])) == kept
-
-
-def test_transparent_pictures_show_an_object() -> None:
-    views = [replace(v, image=np.zeros((16, 16, 4), np.uint8)) for v in VIEWS]
-    box = scene_box(views)
+def test_transparent_pictures_and_a_plain_background_show_an_object() -> None:
+    box = scene_box([replace(v, image=np.zeros((16, 16, 4), np.uint8)) for v in VIEWS])
     assert not box.contracted and 0.5 < box.radius_m < 1.3
-
-
-def test_a_plain_background_shows_an_object_too() -> None:
     color = plain_background(RING)
     assert color is not None and np.abs(color - RING[0].image[0, 0] / 255.0).max() < 0.01
     assert plain_background(VIEWS) is None
     assert not scene_box(RING).contracted
-
-
-def test_what_is_given_is_kept() -> None:
-    box = scene_box(VIEWS, (1.0, 2.0, 3.0), 4.0, 0.5, False)
-    assert (box.center_m, box.radius_m, box.near_m, box.contracted) == ((1.0, 2.0, 3.0), 4.0, 0.5, False)
+    given = scene_box(VIEWS, (1.0, 2.0, 3.0), 4.0, 0.5, False)
+    assert (given.center_m, given.radius_m, given.near_m, given.contracted) == ((1.0, 2.0, 3.0), 4.0, 0.5, False)
 
 
 def test_parallel_outward_and_single_cameras_have_a_box_too() -> None:
@@ -84,7 +53,7 @@ def test_parallel_outward_and_single_cameras_have_a_box_too() -> None:
     assert np.isfinite(scene_box(same).radius_m) and scene_box(same).radius_m > 0
 
 
-@pytest.mark.parametrize("scene", ["tile", "room", "tower"])
+@pytest.mark.parametrize("scene", ["tile", "room"])
 @pytest.mark.parametrize("off_m", [30.0, 1e6])
 def test_a_camera_that_is_far_away_does_not_move_the_box(scene: str, off_m: float) -> None:
     """Whichever it is, and in whatever direction: ahead, behind and aside of where it looks among them."""
@@ -100,19 +69,3 @@ def test_a_camera_that_is_far_away_does_not_move_the_box(scene: str, off_m: floa
             moved_m = np.linalg.norm(np.subtract(box.center_m, expected.center_m))
             assert moved_m < 0.15 * expected.radius_m and box.contracted == expected.contracted
             assert box.radius_m == pytest.approx(expected.radius_m, rel=0.2)
-
-
-def test_where_many_cameras_disagree_all_are_heard() -> None:
-    """Looking outwards, or only three cameras: nothing tells who is wrong."""
-    views = ring(8)
-    poses = []
-    for k, view in enumerate(views):
-        pose = view.camera_to_world.copy()
-        if k % 2:
-            pose[:3, 3] += 2.0 * pose[:3, 0]
-        poses.append(replace(view, camera_to_world=pose))
-    origins = np.stack([v.camera_to_world[:3, 3] for v in poses])
-    axes = np.stack([v.camera_to_world[:3, 2] for v in poses])
-    expected = converging_point(origins, axes)
-    assert expected is not None
-    np.testing.assert_allclose(np.array(scene_box(poses).center_m), expected)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.common.scene_box import UNIT_BOX
-from edge_server.fields.common.supervision import CHANGE, FARTHEST_M, check_view, moved_pixels, pack_views
+from edge_server.fields.common.supervision import CHANGE, FARTHEST_M, check_view, moved_pixels
 from tests.edge_server.fields.scenes import ring
 from tests.edge_server.fields_for_tests import tiny_field
 
@@ -30,26 +29,20 @@ def _lens(*distortion: float) -> View:
     ("view", "text"),
     [
         (_posed(np.zeros((3, 3))), "not orthonormal"),
-        (_posed(3.0 * np.eye(3)), "not orthonormal"),
         (_posed(np.diag([-1.0, 1.0, 1.0])), "right-handed"),
         (_posed(np.eye(3), np.nan), "finite"),
         (_posed(np.eye(3), 1e300), "more than 1e.09 m from the origin"),
         (replace(VIEW, intrinsics=replace(VIEW.intrinsics, fx=5e-324)), "no lens for an image of 16 x 16"),
         (replace(VIEW, intrinsics=replace(VIEW.intrinsics, fy=1e30)), "no lens"),
-        (replace(VIEW, intrinsics=replace(VIEW.intrinsics, cx=1e308)), "principal point .* far outside"),
         (replace(VIEW, intrinsics=replace(VIEW.intrinsics, cy=-16.1)), "principal point .* far outside"),
         (replace(VIEW, intrinsics=replace(VIEW.intrinsics, fx=0.0)), "focal"),
         (replace(VIEW, image=VIEW.image[:-1]), "16 x 15"),
         (replace(VIEW, image=VIEW.image.astype(np.float32)), "uint8"),
         (_lens(0.0, 0.0, 78.0, 69.6), "distortion"),
-        (_lens(100.0, 100.0, 100.0, 100.0), "distortion"),
-        (_lens(-100.0, 100.0, 0.0, 0.0), "distortion"),
         (_lens(1e30, 0.0, 0.0, 0.0), "distortion"),
         (replace(VIEW, weight=np.ones((16, 15), np.float32)), "weight must be float32 of shape .16, 16. within 0..1"),
         (replace(VIEW, weight=np.ones((16, 16))), "weight must be float32"),
-        (replace(VIEW, weight=np.full((16, 16), np.nan, np.float32)), "weight must be"),
-        (replace(VIEW, weight=np.full((16, 16), 1.5, np.float32)), "weight must be"),
-        (replace(VIEW, weight=np.full((16, 16), -0.1, np.float32)), "weight must be"),
+        *((replace(VIEW, weight=np.full((16, 16), w, np.float32)), "weight must be") for w in (np.nan, 1.5, -0.1)),
     ],
 )
 def test_cameras_that_cannot_be_are_refused_by_name(view: View, text: str) -> None:
@@ -83,10 +76,3 @@ def test_pixels_move_where_they_change_beyond_the_noise_and_two_around() -> None
     assert moved is not None
     np.testing.assert_array_equal(np.argwhere(moved)[[0, -1]], [[3, 3], [11, 11]])
     assert moved.sum() == 81
-
-
-def test_opaque_and_transparent_pictures_are_packed_together() -> None:
-    clear = replace(VIEW, camera="clear", image=np.full((16, 16, 4), 7, np.uint8))
-    packed = pack_views([VIEW, clear], UNIT_BOX, {})
-    np.testing.assert_array_equal(packed.pixels[:256, :3], VIEW.image.reshape(-1, 3))
-    assert (packed.pixels[:256, 3] == 255).all() and (packed.pixels[256:] == 7).all()

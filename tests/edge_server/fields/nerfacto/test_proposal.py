@@ -6,30 +6,18 @@ import numpy as np
 import pytest
 import torch
 
-from edge_server.fields import Budget
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT
 from edge_server.fields.common.kernels.rays import COARSE, Space
-from edge_server.fields.common.kernels.train import RaySampling, train_chunks
-from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW, Weights
-from edge_server.fields.common.occupancy_grid import OccupancyGrid
-from edge_server.fields.nerfacto.field import NerfactoField
+from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
+from edge_server.fields.nerfacto.kernels import proposal
 from edge_server.fields.nerfacto.kernels.proposal import (
-    CUTOFF_DEPTH,
-    DARK_SHARE,
     RAW_GAIN,
     RAW_START,
     ProposalGrid,
     ProposalSampling,
-    allocate_samples,
     bin_weights,
-    make_bins,
-    place_samples,
-    unwarp,
-    warp,
 )
 from edge_server.fields.nerfacto.kernels.train import WEIGHT_FLOOR, interlevel_loss, scatter_proposal
-from edge_server.fields.nerfacto.settings import NerfactoSettings
-from tests.edge_server.fields.scenes import ring
 
 F = np.float32
 CELLS, BINS, ZERO = 8, 48, np.int64(0)
@@ -53,7 +41,7 @@ def _encoding(values: np.ndarray) -> ProposalGrid:
 def _bins_of(space: Space, encoding: ProposalGrid, shift: float = 0.4, leave: float = 6.0, bins: int = BINS):
     cell, depth = np.full(bins + 5, -1, np.int32), np.full(bins + 5, np.nan, F)
     edges, at = np.empty((2, bins + 1), F), np.empty((2, bins), np.int32)
-    count, finite = make_bins(
+    count, finite = proposal.make_bins(
         space, encoding, bins, START_AT, TOWARDS, F(0.1), F(leave), F(shift), 5, cell, depth, edges, at
     )
     return cell[5 : 5 + count], depth[5 : 5 + count], edges[:, :count].copy(), finite
@@ -81,23 +69,9 @@ def test_bins_cover_the_ray_and_know_their_cells(contracted: bool, shift: float)
     np.testing.assert_allclose(depth, sigma * (edges[1] - edges[0]), rtol=1e-5)
 
 
-def test_spacing_is_linear_in_the_box_and_even_in_contracted_space_beyond() -> None:
-    _, _, edges, _ = _bins_of(_space(True), _encoding(np.zeros(CELLS**3)), shift=0.0, leave=19.0)
-    points = edges[0][:, None] * np.array(TOWARDS) + np.array(START_AT)
-    length = np.diff(edges[0])
-    inside = np.abs(points).max(axis=1)[:-1] < 1.0
-    inside[: np.flatnonzero(inside)[0]] = True  # before the box: linear, too
-    knee = np.flatnonzero(inside)[-1]
-    np.testing.assert_allclose(length[:knee], length[0], rtol=1e-3)
-    along = (_unit(points, True) * 4)[:, 0]
-    np.testing.assert_allclose(np.diff(along)[knee + 1 :], np.diff(along)[knee + 1], rtol=0.02)
-    knee_t, slope, end = warp(True, START_AT, TOWARDS, F(0.1), F(19.0))
-    assert unwarp(end, knee_t, slope) == pytest.approx(19.0, rel=1e-3)
-
-
 def test_bins_end_where_it_is_dark_and_skip_what_is_empty() -> None:
     _, depth, _, _ = _bins_of(_space(False), _encoding(np.full(CELLS**3, 1.5)), leave=2.4)
-    assert depth.sum() > CUTOFF_DEPTH > depth[:-1].sum()
+    assert depth.sum() > proposal.CUTOFF_DEPTH > depth[:-1].sum()
     occupied = np.ones((16, 16, 16), np.uint8)
     occupied[:, :, 6:10] = 0  # x in the middle
     _, _, edges, _ = _bins_of(_space(False, occupied.ravel()), _encoding(np.zeros(CELLS**3)), leave=2.4)
@@ -107,23 +81,16 @@ def test_bins_end_where_it_is_dark_and_skip_what_is_empty() -> None:
     assert edges.shape[1] == 0
 
 
-def test_a_proposal_that_is_not_finite_is_noticed_and_passes_for_fog() -> None:
-    values = np.full(CELLS**3, np.nan)
-    cell, depth, edges, finite = _bins_of(_space(False), _encoding(values), leave=2.4)
-    assert not finite and len(cell) > 0
-    np.testing.assert_allclose(depth, np.exp(RAW_START) * (edges[1] - edges[0]), rtol=1e-5)
-
-
 def _allocated(weight: np.ndarray, samples: int, even: float, shift: float):
     group, share = np.full(len(weight), -1, np.int32), np.full(len(weight), -1, np.int64)
-    groups = allocate_samples(weight.astype(F), ZERO, len(weight), samples, F(even), F(shift), group, share)
+    groups = proposal.allocate_samples(weight.astype(F), ZERO, len(weight), samples, F(even), F(shift), group, share)
     return group, share[:groups]
 
 
 def _earned(weight: np.ndarray, samples: int, even: float) -> np.ndarray:
     left, right = np.r_[weight[0], weight[:-1]], np.r_[weight[1:], weight[-1]]
     wide = 0.5 * (np.maximum(left, weight) + np.maximum(weight, right))
-    light = 1.0 - np.r_[0.0, np.cumsum(weight)[:-1]] + DARK_SHARE
+    light = 1.0 - np.r_[0.0, np.cumsum(weight)[:-1]] + proposal.DARK_SHARE
     return samples * ((1 - even) * wide / wide.sum() + even * light / light.sum())
 
 
@@ -150,14 +117,6 @@ def test_samples_are_dealt_by_weight_and_leave_no_bin_out(seed: int) -> None:
     np.testing.assert_allclose(counts[heavy], earned[heavy], atol=0.03)
 
 
-def test_even_and_empty_weights_are_dealt_evenly() -> None:
-    for weight, even in ((np.zeros(48), 0.1), (np.full(48, 1e-30), 0.0)):
-        _, share = _allocated(weight, 16, even, 0.3)
-        assert (share == 1).all() and len(share) in (16, 24)  # three bins each, or two where rounding forbids
-    assert _allocated(np.zeros(0), 16, 0.5, 0.3)[1].size == 0
-    assert _allocated(np.array([1e-3]), 16, 0.5, 0.3)[1].tolist() == [16]
-
-
 @pytest.mark.parametrize("shift", [0.0, 0.999])
 def test_samples_lie_in_their_groups_and_stand_for_all_of_them(shift: float) -> None:
     values = np.random.default_rng(2).normal(0.0, 0.5, CELLS**3)
@@ -170,7 +129,8 @@ def test_samples_lie_in_their_groups_and_stand_for_all_of_them(shift: float) -> 
     np.testing.assert_allclose(weight, np.exp(-total[:-1]) - np.exp(-total[1:]), atol=1e-6)
     group, share = _allocated(weight, 16, 0.2, shift)
     x, line = np.empty((3, 99), F), np.empty((3, 99), F)
-    n = place_samples(True, START_AT, TOWARDS, edges, group, ZERO, count, share, F(shift), np.int64(2), x, line)
+    dealt = True, START_AT, TOWARDS, edges, group, ZERO, count, share, F(shift)
+    n = proposal.place_samples(*dealt, np.int64(2), x, line)
     t, length, of = line[:, 2:n]
     assert n - 2 == share.sum() and (np.diff(t) > 0).all()
     assert length.sum() == pytest.approx((edges[1] - edges[0]).sum(), rel=1e-5)
@@ -180,9 +140,7 @@ def test_samples_lie_in_their_groups_and_stand_for_all_of_them(shift: float) -> 
         assert ((edges[0, members] <= t[k]) & (t[k] <= edges[1, members])).any()
     points = t[:, None] * np.array(TOWARDS) + np.array(START_AT)
     np.testing.assert_allclose(x[:, 2:n].T, _unit(points, True), atol=1e-5)
-    limited = place_samples(
-        True, START_AT, TOWARDS, edges, group, ZERO, count, share, F(shift), ZERO, x[:, :3].copy(), line
-    )
+    limited = proposal.place_samples(*dealt, ZERO, x[:, :3].copy(), line)
     assert limited == 3
 
 
@@ -221,21 +179,8 @@ def test_interlevel_loss_and_gradient_equal_the_oracle(seed: int) -> None:
     encoding, cell, length, depth, group, of, w = _interlevel_case(seed)
     weight, grad = np.empty(14, F), np.full(14, 7.0, F)
     bin_weights(depth, 2, 12, weight)
-    loss = interlevel_loss(
-        encoding,
-        np.r_[0, 0, cell].astype(np.int32),
-        depth,
-        weight,
-        group,
-        2,
-        12,
-        w,
-        of,
-        0,
-        len(of),
-        np.empty((2, BINS), F),
-        grad,
-    )
+    bins = np.r_[0, 0, cell].astype(np.int32), depth, weight, group, 2, 12
+    loss = interlevel_loss(encoding, *bins, w, of, 0, len(of), np.empty((2, BINS), F), grad)
     values = torch.as_tensor(encoding.table[SEGMENT:].reshape(-1), dtype=torch.float64).requires_grad_(True)
     rest = cell, length, group[2:], of, torch.as_tensor(w, dtype=torch.float64)
     expected, total = _interlevel_oracle(values, *rest)
@@ -260,59 +205,3 @@ def test_the_proposals_gradient_is_added_up_once() -> None:
     touched = (gradient.reshape(len(dirty), -1) != 0).any(axis=1)
     np.testing.assert_array_equal(dirty, touched)
     assert not dirty[0] and dirty.any()
-
-
-def test_a_whole_steps_gradients_equal_finite_differences() -> None:
-    """Of the color error, by the network's parameters and by the cameras' embeddings."""
-    settings = NerfactoSettings(
-        levels=3,
-        log2_table=9,
-        base_resolution=4,
-        finest_resolution=24,
-        hidden=8,
-        rays=64,
-        batch_samples=4096,
-        samples=12,
-        samples_start=12,
-        bins=24,
-        cells=16,
-        proposal_cells=8,
-        appearance=2,
-        sh_degree=1,
-        threads=1,
-        contracted=True,
-    )
-    field, views = NerfactoField(settings), ring(5, size=16)
-    field.fit(views, Budget(steps=30))
-    # A thin fog: no ray becomes opaque, where one sample more or less would be a step in the loss.
-    field._net.params[-field._net.widths[-1]] = -1.0
-    assert field.view_store.box is not None
-    data = field._cameras.corrected(views, field.view_store.add(views).data, field.view_store.box)
-    looks = field._cameras.embeddings
-    ray_sampling = RaySampling(np.uint64(3), 32, 3, 1, F(0.0), np.full(3, 0.5, F), looks)
-    weights, batch = Weights(F(0.0)), field._batch
-    space = OccupancyGrid(settings.cells, 0, field.view_store.box).space(0.1)
-    space.occupied[:], space.coarse[:] = 1, 1
-
-    def loss() -> float:
-        model = field._encoding, field._net, weights
-        field.pool.run(train_chunks, data, ray_sampling, space, *model, batch, field._scratch, field._bins)
-        return float(batch.loss.sum())
-
-    loss()
-    slopes = batch.d_params.sum(axis=0), batch.d_embeddings.sum(axis=0)
-    assert batch.rays.sum() == 64 and batch.samples.sum() > 64 and np.abs(slopes[1]).max() > 1e-4
-    net = field._net.params
-    checked = 0
-    for array, slope in ((net, slopes[0]), (looks, slopes[1])):
-        flat, wanted = array.reshape(-1), slope.reshape(-1)
-        for k in np.argsort(-np.abs(wanted))[:24:3]:
-            kept, step = flat[k], F(4e-3)
-            flat[k] = kept + step
-            above = loss()
-            flat[k] = kept - step
-            slope_here = (above - loss()) / (2 * float(step))
-            flat[k] = kept
-            assert slope_here == pytest.approx(wanted[k], rel=0.03, abs=2e-3)
-            checked += 1
-    assert checked >= 10

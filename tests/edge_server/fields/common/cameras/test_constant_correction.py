@@ -31,12 +31,8 @@ def test_the_mounts_error_is_found_though_the_world_moved_and_poses_scatter():
     assert found.scatter_deg == pytest.approx(0.05 * 3**0.5, rel=0.2)
     assert found.scatter_mm == pytest.approx(0.5 * 3**0.5, rel=0.3)
     assert "in common 0.6" in found.words and found.words.endswith("hand-eye calibration is off")
-
-
-def test_scatter_alone_is_no_reason_to_calibrate():
-    rng, given = np.random.default_rng(4), arm_poses()
-    noise = [small(*rng.normal(scale=[[0.3], [5.0]], size=(2, 3))) for _ in given]
-    found = constant_correction(given, [pose @ error for pose, error in zip(given, noise)])
+    scattered = [small(*rng.normal(scale=[[0.3], [5.0]], size=(2, 3))) for _ in given]
+    found = constant_correction(given, [pose @ error for pose, error in zip(given, scattered)])
     assert found is not None and "no sure part in common" in found.words
 
 
@@ -52,37 +48,16 @@ def test_what_cannot_be_told_is_not_said():
 
 
 @pytest.mark.parametrize(
-    ("pitch_deg", "yaw_deg", "said"), [(0.0, 60.0, False), (10.0, 30.0, False), (40.0, 40.0, True)]
-)
-def test_the_mount_is_accused_once_turns_about_two_axes_tell_it_from_the_world(pitch_deg, yaw_deg, said):
-    """What scatters varies slowly, as errors of tracking do; to and fro, by so much to either side."""
-    phase, mount, world = (
-        np.linspace(0.0, 6.0, 40),
-        small([2.0, 0.0, 0.0], [0.0] * 3),
-        small([-1.5, 0.0, 0.0], [0.0] * 3),
-    )
-    turns = np.deg2rad([[pitch_deg * np.sin(2 * a), yaw_deg * np.cos(a), 0.0] for a in phase])
-    given = [se3(so3_exp(turn), [0.0, 0.0, 0.0]) for turn in turns]
-    noise = [small([0.2 * np.sin(3 * a), 0.2 * np.cos(5 * a), 0.0], [0.0] * 3) for a in phase]
-    found = constant_correction(given, [world @ pose @ mount @ error for pose, error in zip(given, noise)])
-    assert found is not None and found.sure is said
-    assert ("turned too little to tell" in found.words) is not said and ("hand-eye" in found.words) is said
-
-
-@pytest.mark.parametrize(
     ("rotation_deg", "shift_mm", "away_m"),
     [
         ([-2.85, 0.2, 0.14], [-36.4, -106.8, 67.9], 2.2),  # what a minute of `redkitchen` drifted by
-        ([0.0, 2.0, 0.0], [-69.8, 0.0, 0.0], 2.0),
         ([0.0, 2.0, 0.0], [69.8, 0.0, 0.0], None),  # they add up
         ([0.0, 2.0, 0.0], [0.0, 69.8, 0.0], None),  # the one has nothing to do with the other
         ([0.0, 2.0, 0.0], [-3.0, 0.0, 0.0], None),  # nothing is so near
-        ([0.0, 2.0, 0.0], [0.0, 0.0, 0.0], None),
     ],
 )
 def test_a_turn_and_a_shift_that_undo_each_other_do_not_accuse_the_mount(rotation_deg, shift_mm, away_m):
     mount, given = small(rotation_deg, shift_mm), arm_poses()
     found = constant_correction(given, [pose @ mount for pose in given])
     assert found is not None and found.sure is (away_m is None)
-    if away_m is not None:
-        assert found.cancels_m == pytest.approx(away_m, abs=0.1) and f"cancel {away_m} m ahead" in found.words
+    assert found.cancels_m == (away_m and pytest.approx(away_m, abs=0.1))

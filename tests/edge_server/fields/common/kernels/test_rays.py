@@ -12,7 +12,7 @@ from edge_server.fields.common.supervision import lens_row
 from freshfield.geometry import Pinhole, look_at
 
 _direction = njit(lambda lens, rotation, u, v: pixel_direction(lens, rotation, u, v))
-_interval = njit(lambda space, o, d: interval(space, (o[0], o[1], o[2]), (d[0], d[1], d[2])))
+_interval = njit(lambda space, o, d: interval(space, o, d))
 
 CELLS = 16
 
@@ -25,17 +25,15 @@ def _space(contracted: bool, filled: float) -> Space:
     return Space(occupied, blocks, density, CELLS, contracted, np.float32(2 * 3**0.5 / 32), np.float32(0.1))
 
 
-def _single(values) -> tuple[np.float32, ...]:
-    return tuple(map(np.float32, values))
-
-
-def _march(space: Space, o, d, jitter: float = 0.0):
+def _march(space: Space, o, d, jitter: float = 0.0, room=slice(0, 500), opaque=NEVER):
+    """Places (3, N), distances and lengths (N,) of the samples in ``room``, where the march ended, and its depth."""
     x, ts, dts = np.zeros((3, 500), np.float32), np.zeros(500, np.float32), np.zeros(500, np.float32)
-    enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
-    enter, leave = np.float32(enter + np.float32(jitter) * space.step), np.float32(leave)
-    way = _single(o), _single(d), np.float32(enter), np.float32(leave)
-    n, t, _ = march(space, *way, x, ts, dts, 0, 500, NEVER)
-    return x[:, :n], ts[:n], dts[:n], (t, leave)
+    o, d = (tuple(map(np.float32, v)) for v in (o, d))
+    enter, leave = map(np.float32, _interval(space, o, d))
+    first = np.float32(enter + np.float32(jitter) * space.step)
+    n, t, depth = march(space, o, d, first, leave, x, ts, dts, room.start, room.stop, opaque)
+    assert (x[:, : room.start] == 0).all() and (n < room.stop or t < leave)
+    return x[:, room.start : n], ts[room.start : n], dts[room.start : n], depth
 
 
 @pytest.mark.parametrize("distortion", [(0, 0, 0, 0), (0.06, -0.08, -0.001, 0.0002)])
@@ -96,26 +94,11 @@ def test_samples_equal_the_oracle(contracted: bool, filled: float) -> None:
     assert from_inside and (missing or contracted)
 
 
-def test_empty_space_is_skipped_and_room_is_respected() -> None:
-    o, d = np.array([-3.0, 0.1, 0.1]), np.array([1.0, 0.0, 0.0])
-    assert _march(_space(False, 0.0), o, d)[0].size == 0
-    space = _space(False, 1.0)
-    whole = _march(space, o, d)[1]
-    x, ts, dts = np.zeros((3, 9), np.float32), np.zeros(9, np.float32), np.zeros(9, np.float32)
-    enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
-    way = _single(o), _single(d), np.float32(enter), np.float32(leave)
-    n, t, _ = march(space, *way, x, ts, dts, 4, 9, NEVER)
-    assert n == 9 and t < leave and (x[:, :4] == 0).all()
-    np.testing.assert_array_equal(ts[4:], whole[:5])
-
-
-def test_a_ray_ends_where_the_known_density_makes_it_opaque() -> None:
-    space = _space(False, 1.0)
-    o, d = np.array([-3.0, 0.1, 0.1]), np.array([1.0, 0.0, 0.0])
-    whole = _march(space, o, d)[1]
-    enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
-    x, ts, dts = np.zeros((3, 99), np.float32), np.zeros(99, np.float32), np.zeros(99, np.float32)
-    way = _single(o), _single(d), np.float32(enter), np.float32(leave)
-    n, t, depth = march(space, *way, x, ts, dts, 0, 99, np.float32(1.0))
-    assert n == int(np.ceil(1.0 / (1.5 * space.step))) and depth > 1.0 and t < leave
-    np.testing.assert_array_equal(ts[:n], whole[:n])
+def test_a_ray_ends_where_the_room_does_or_the_known_density_makes_it_opaque() -> None:
+    way, space = (np.array([-3.0, 0.1, 0.1]), np.array([1.0, 0.0, 0.0])), _space(False, 1.0)
+    assert _march(_space(False, 0.0), *way)[1].size == 0, "empty space is skipped"
+    whole = _march(space, *way)[1]
+    np.testing.assert_array_equal(_march(space, *way, room=slice(4, 9))[1], whole[:5])
+    _, seen, _, depth = _march(space, *way, opaque=np.float32(1.0))
+    np.testing.assert_array_equal(seen, whole[: int(np.ceil(1.0 / (1.5 * space.step)))])
+    assert depth > 1.0 and len(seen) < len(whole)

@@ -1,23 +1,12 @@
-"""Exponential, logarithm and random numbers of the kernels against numpy.
-
-Arithmetic, masks and sums of vectors are those of ``composite`` and ``align``, which have tests of their own.
-"""
+"""Exponential, logarithm and random numbers of the kernels against numpy; vectors are tested by what uses them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
-import pytest
-from numba import njit, types
-from numba.core.errors import TypingError
-from numba.extending import intrinsic
-from numpy.typing import NDArray
+from numba import njit
 
 from edge_server.fields.common.kernels.jit import FAST
-from edge_server.fields.common.kernels.simd import exp32, log32, uniform
-from edge_server.fields.common.kernels.simd_vectors import LANES, Vector, require_contiguous
+from edge_server.fields.common.kernels.simd import COUNTER, draw, exp32, log32, uniform
 
 
 def _of_each(function):
@@ -34,18 +23,14 @@ def _of_each(function):
 _exp, _log = _of_each(exp32), _of_each(log32)
 
 
-def test_exp32_is_exp() -> None:
+def test_exponential_and_logarithm_are_numpys() -> None:
     x = np.linspace(-86.9, 87.9, 100_001).astype(np.float32)
     np.testing.assert_allclose(_exp(x), np.exp(x.astype(np.float64)), rtol=3e-7)
+    for values in (np.exp(np.linspace(-87.0, 88.0, 100_001)), np.linspace(0.99, 1.01, 10_001)):
+        x = values.astype(np.float32)
+        np.testing.assert_allclose(_log(x), np.log(x.astype(np.float64)), rtol=2e-7, atol=1e-8)
     edge = _exp(np.array([-1e30, 1e30, np.nan], np.float32))
     assert 0 < edge[0] < 1e-37 and 1e38 < edge[1] < np.inf and np.isnan(edge[2])
-
-
-def test_log32_is_log() -> None:
-    x = np.exp(np.linspace(-87.0, 88.0, 100_001)).astype(np.float32)
-    np.testing.assert_allclose(_log(x), np.log(x.astype(np.float64)), rtol=2e-7, atol=1e-8)
-    near = np.linspace(0.99, 1.01, 10_001).astype(np.float32)
-    np.testing.assert_allclose(_log(near), np.log(near.astype(np.float64)), rtol=2e-7, atol=1e-8)
 
 
 @njit
@@ -59,60 +44,14 @@ def test_uniform_is_uniform_and_streams_differ() -> None:
     assert abs(np.corrcoef(a[:-1], a[1:])[0, 1]) < 0.03 and abs(np.corrcoef(a, b)[0, 1]) < 0.03
 
 
-def _run(work: Callable[[Vector, Vector], Vector], a: NDArray[np.float32], b: NDArray[np.float32]) -> Any:
-    """What ``work`` makes of two vectors."""
-
-    @intrinsic
-    def code(typingctx: Any, x: Any, y: Any, out: Any) -> Any:
-        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            data = [
-                context.make_array(kind)(context, builder, arg).data
-                for kind, arg in zip(signature.args, args, strict=True)
-            ]
-            work(Vector.load(builder, data[0]), Vector.load(builder, data[1])).store(data[2])
-            return context.get_dummy_value()
-
-        return types.void(x, y, out), codegen
-
-    @njit(fastmath=FAST)  # as the kernels are
-    def run(x, y, out):
-        code(x, y, out)
-
-    out = np.full(LANES, -7.0, np.float32)
-    run(a, b, out)
-    return out
+@njit
+def _drawn(counter, worker, tasks):
+    found = np.full(tasks, -1)
+    for k in range(tasks):
+        found[k] = draw(counter, worker, tasks)
+    return found, draw(counter, worker, tasks)
 
 
-def test_minimum_and_maximum_replace_nan():
-    a = np.array([np.nan, np.inf, -np.inf, 0.5] * 4, np.float32)
-    np.testing.assert_array_equal(_run(lambda x, y: x.minimum(2.0), a, a), [2.0, 2.0, -np.inf, 0.5] * 4)
-    np.testing.assert_array_equal(_run(lambda x, y: x.maximum(-2.0), a, a), [-2.0, np.inf, -2.0, 0.5] * 4)
-
-
-def test_exp2_is_exact_to_the_last_bits():
-    for given in np.linspace(-63.99, 0.0, 160).astype(np.float32).reshape(-1, LANES):
-        got = _run(lambda x, y: x.exp2(), given, given)
-        np.testing.assert_allclose(got, np.exp2(given.astype(np.float64)), rtol=3e-7)
-
-
-def test_exp2_clamps_its_argument():
-    given = np.array([1.0, 300.0, np.inf, -64.0, -1e3, -3e38, -np.inf, np.nan] * 2, np.float32)
-    least = 2.0**-64
-    got = _run(lambda x, y: x.exp2(), given, given)
-    np.testing.assert_allclose(got, [1, 1, 1, least, least, least, least, least] * 2, rtol=3e-7)
-
-
-def test_strided_arrays_are_refused():
-    @njit
-    def sliced(x):
-        checked(x)
-
-    @intrinsic
-    def checked(typingctx: Any, x: Any) -> Any:
-        require_contiguous(x)
-        return types.void(x), lambda context, builder, signature, args: context.get_dummy_value()
-
-    given = np.zeros(2 * LANES, np.float32)
-    sliced(given)
-    with pytest.raises(TypingError, match="contiguous"):
-        sliced(given[::2])
+def test_a_worker_draws_its_own_tasks_and_then_those_of_the_others() -> None:
+    found, after = _drawn(np.zeros(3 * COUNTER, np.int64), 1, 10)
+    assert found.tolist() == [3, 4, 5, 6, 7, 8, 9, 0, 1, 2] and after >= 10

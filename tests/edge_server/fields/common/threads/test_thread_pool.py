@@ -7,26 +7,16 @@ import signal
 import threading
 import time
 import weakref
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 from numba import njit
 
-from edge_server.fields.common.kernels.simd import draw, fetch_add
+from edge_server.fields.common.kernels.simd import draw
 from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
 
 # With a nice of 0 the caller is a worker itself.
 either_priority = pytest.mark.parametrize("nice", [0, 5])
-
-
-@njit(nogil=True)
-def _count(counter, worker, done):
-    while True:
-        task = fetch_add(counter, 1)
-        if task >= done.size:
-            return
-        done[task] += 1
 
 
 @njit(nogil=True)
@@ -38,42 +28,48 @@ def _share(counter, worker, done):
         done[task] += 1
 
 
+def _engaged(pool: Pool) -> list[int]:
+    """The workers that a job engages."""
+    seen: list[int] = []
+    pool.run(lambda counter, worker: seen.append(worker))
+    return sorted(seen)
+
+
 @either_priority
-@pytest.mark.parametrize("threads", [1, 3, 7])
-def test_all_workers_compute_at_once_and_each_task_is_done_once(threads: int, nice: int) -> None:
+@pytest.mark.parametrize("threads", [1, 7])
+def test_all_workers_compute_at_once_each_task_once_until_the_pool_is_closed(threads: int, nice: int) -> None:
     """They wait for each other here: who computed first and woke the others then would wait for ever."""
-    pool, together, seen = Pool(threads, nice), threading.Barrier(threads), []
+    before, pool, together, seen = set(threading.enumerate()), Pool(threads, nice), threading.Barrier(threads), []
+    own = set(threading.enumerate()) - before
 
     def meet(counter, worker):
         together.wait(10)
         seen.append(worker)
 
-    for kernel in (_count, _share):
-        pool.run(meet)
-        done = np.zeros(10_000, np.int64)
-        pool.run(kernel, done)
-        assert (done == 1).all()
+    pool.run(meet)
+    assert sorted(seen) == list(range(threads))
+    done = [np.zeros(2_000, np.int64) for _ in range(4)]  # several callers at a time
+    callers = [threading.Thread(target=lambda each=each: [pool.run(_share, each) for _ in range(5)]) for each in done]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join(30)
+    assert all((each == 5).all() for each in done)
     pool.close()
-    assert sorted(seen) == sorted(2 * list(range(threads)))
+    for thread in own:
+        thread.join(10)
+    assert not any(thread.is_alive() for thread in own)
 
 
 @either_priority
-def test_workers_that_are_spared_stay_idle(nice: int) -> None:
+def test_workers_that_are_spared_stay_idle_and_callers_of_the_last_compute_side_by_side(nice: int) -> None:
     pool, done = Pool(3, nice), np.zeros(1000, np.int64)
-    for spared, engaged in ((1, [0, 1]), (9, [0]), (0, [0, 1, 2])):
-        seen: list[int] = []
+    for spared, engaged in ((1, [0, 1]), (0, [0, 1, 2]), (9, [0])):
         pool.spare(spared)
-        pool.run(lambda counter, worker, seen=seen: seen.append(worker))
+        assert _engaged(pool) == engaged
         pool.run(_share, done)
-        assert sorted(seen) == engaged
     assert (done == 3).all()
-    pool.close()
-
-
-@either_priority
-def test_where_one_worker_is_left_callers_compute_themselves_side_by_side(nice: int) -> None:
-    pool, together, seen = Pool(2, nice), threading.Barrier(2), list[tuple[int, int]]()
-    pool.spare(1)
+    together, seen = threading.Barrier(2), []
 
     def meet(counter, worker):
         together.wait(10)
@@ -101,9 +97,7 @@ def test_an_error_reaches_the_caller_after_all_are_done_and_the_pool_lives_on(ni
 
     with pytest.raises(RuntimeError, match="worker 0"):
         pool.run(fails_first)
-    assert done == [1]
-    pool.run(lambda counter, worker: done.append(worker))
-    assert sorted(done) == [0, 1, 1]
+    assert done == [1] and _engaged(pool) == [0, 1]
     pool.close()
 
 
@@ -117,37 +111,7 @@ def test_the_number_of_threads_is_that_of_the_cores_the_environment_or_the_calle
         monkeypatch.setenv("FRESHFIELD_THREADS", given)
         with pytest.raises(ValueError, match=says):
             Pool()
-    with pytest.raises(ValueError, match="at least one thread"):
-        Pool(-1)
     assert shared_pool(1, 3) is shared_pool(1, 3) and shared_pool(1, 3) is not shared_pool(1, 4)
-
-
-@either_priority
-@pytest.mark.parametrize("threads", [1, 3])
-def test_several_python_threads_may_run_kernels_at_once(threads: int, nice: int) -> None:
-    """Whether they work along or not: no more compute than the pool has threads."""
-    pool, arrays = Pool(threads, nice), [np.zeros(2000, np.int64) for _ in range(8)]
-    now, most = set(), [0]
-
-    def noted(counter, worker, done):
-        now.add(threading.get_ident())
-        most[0] = max(most[0], len(now))
-        time.sleep(0.002)
-        _count(counter, worker, done)
-        now.discard(threading.get_ident())
-
-    def call(done):
-        for _ in range(5):
-            pool.run(noted, done)
-
-    callers = [threading.Thread(target=call, args=(a,)) for a in arrays]
-    for caller in callers:
-        caller.start()
-    for caller in callers:
-        caller.join(30)
-    assert all((a == 5).all() for a in arrays)
-    assert most[0] == threads
-    pool.close()
 
 
 @pytest.mark.skipif(os.uname().sysname != "Linux", reason="priorities of single threads: Linux only")
@@ -169,46 +133,7 @@ def test_a_caller_works_along_unless_it_is_to_go_first() -> None:
 
 
 @either_priority
-def test_a_closed_pool_ends_its_threads_after_what_was_begun(nice: int) -> None:
-    before, pool = set(threading.enumerate()), Pool(5, nice)
-    own = set(threading.enumerate()) - before
-    go, begun, done = threading.Event(), threading.Barrier(6), np.zeros(10_000, np.int64)
-
-    def waits(counter, worker, done):
-        begun.wait(10)
-        go.wait(10)
-        _count(counter, worker, done)
-
-    caller, closer = threading.Thread(target=pool.run, args=(waits, done)), threading.Thread(target=pool.close)
-    caller.start()
-    begun.wait(10)  # all five compute
-    closer.start()
-    go.set()
-    for thread in (caller, closer, *own):
-        thread.join(10)
-    assert (done == 1).all() and not any(thread.is_alive() for thread in own)
-    with pytest.raises(RuntimeError, match="closed"):
-        pool.run(_count, done)
-
-
-def _interrupted_after(seconds: float, run: Callable[[], None]) -> None:
-    """KeyboardInterrupt reaches ``run``, as from Ctrl-C."""
-
-    def stop(number, frame):
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGALRM, stop)
-    try:
-        signal.setitimer(signal.ITIMER_REAL, seconds)
-        with pytest.raises(KeyboardInterrupt):
-            run()
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
-
-
-@either_priority
-def test_a_caller_that_is_interrupted_waits_for_what_it_has_begun(nice) -> None:
+def test_a_caller_that_is_interrupted_waits_for_what_it_has_begun(nice: int) -> None:
     """Else others would write to arrays that are the caller's."""
     pool, seen = Pool(3, nice), []
 
@@ -217,48 +142,27 @@ def test_a_caller_that_is_interrupted_waits_for_what_it_has_begun(nice) -> None:
             time.sleep(0.3)
             seen.append("slow")
 
-    for _ in range(2):
-        _interrupted_after(0.1, lambda: pool.run(slow))
-        assert seen == ["slow"]
-        pool.run(lambda counter, worker: seen.append(worker))
-        assert sorted(seen[1:]) == [0, 1, 2]
-        seen.clear()
-    pool.close()
-
-
-def test_a_caller_interrupted_before_it_has_woken_all_workers_loses_none(monkeypatch) -> None:
-    pool, seen = Pool(3), []
-    wake = pool._wake_others
-
-    def interrupted(worker, job):
-        pool._inboxes[1].put(job)
-        monkeypatch.setattr(pool, "_wake_others", wake)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(pool, "_wake_others", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        pool.run(lambda counter, worker: seen.append(worker))
-    assert sorted(seen) == [1, 2], "one of them twice, or not at all"
-    pool.run(lambda counter, worker: seen.append(worker))
-    assert sorted(seen[2:]) == [0, 1, 2]
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)  # as from Ctrl-C
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        with pytest.raises(KeyboardInterrupt):
+            pool.run(slow)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    assert seen == ["slow"] and _engaged(pool) == [0, 1, 2]
     pool.close()
 
 
 @either_priority
-def test_a_pool_that_rests_keeps_no_arrays(nice) -> None:
+def test_a_pool_that_rests_keeps_no_arrays(nice: int) -> None:
     """Not those of a worker either that was done long before the others."""
-    pool = Pool(3, nice)
-
-    def unequal(counter, worker, array):
-        time.sleep(0.05 * (worker == 0))
-
-    for _ in range(3):
-        array = np.zeros(8)
-        alive = weakref.ref(array)
-        pool.run(unequal, array)
-        del array
-        deadline = time.monotonic() + 5.0
-        while alive() is not None and time.monotonic() < deadline:
-            time.sleep(0.005)
-        assert alive() is None
+    pool, array = Pool(3, nice), np.zeros(8)
+    alive = weakref.ref(array)
+    pool.run(lambda counter, worker, array: time.sleep(0.05 * (worker == 0)), array)
+    del array
+    deadline = time.monotonic() + 5.0
+    while alive() is not None and time.monotonic() < deadline:
+        time.sleep(0.005)
+    assert alive() is None
     pool.close()
