@@ -316,7 +316,7 @@ def _spread_first(count: int) -> list[int]:
     """0 to ``count`` - 1, in an order whose every beginning is spread (van der Corput's)."""
     bits = max(count - 1, 0).bit_length()
     reversed_bits = (sum((k >> bit & 1) << (bits - 1 - bit) for bit in range(bits)) for k in range(1 << bits))
-    return [k for k in reversed_bits if k < count]
+    return list(dict.fromkeys(count * k >> bits for k in reversed_bits))[:count]
 
 
 def aim_of(view: View, seen_m: float) -> tuple[NDArray[np.float64], float]:
