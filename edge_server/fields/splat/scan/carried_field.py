@@ -336,7 +336,7 @@ class CarriedField(ScanField):
             self._follow(view)
             self._append(view, self._aim(view, None))
         if swept:
-            self._seed_on(list(swept.values()), nearer=False)
+            self._seed_on([view for view in views if view.camera in swept], nearer=False)
         else:
             self._seen_m = 0.0  # what an earlier start found says nothing of this one's guesses
             self._seed()

@@ -8,7 +8,7 @@ step makes anyway.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from typing import Any, NamedTuple, TypeVar
 
@@ -158,10 +158,27 @@ class ScanField(StillField):
         """Seed on measured depth, in the order of the views; without any, on what a plane sweep finds; without that
         either, where the cameras agree on colors."""
         measured = [view for view in self._views if view.depth is not None]
-        views = _some(measured, tuned.SEED_VIEWS) or self._swept()
-        if not views:
-            return super()._seed()
-        self._seed_on(views, nearer=bool(measured))
+        if measured:
+            self._seed_on(_some(measured, tuned.SEED_VIEWS), nearer=True)
+        elif not self._seed_swept():
+            super()._seed()
+
+    def _seed_swept(self) -> bool:
+        """Seed on depth that views tell of each other, until further views show hardly anything new: to sweep all of
+        them takes seconds before the first step. Returns False if poses tell no depth."""
+        self.cloud = GaussianCloud.empty(self.settings)
+        swept: list[View] = []
+        new: list[float] = []
+        for view in self._sweep_views():
+            shown = self._look(view)
+            _, there = self._as_rendered(view)
+            new.append(np.count_nonzero(there & (shown.opacity < tuned.COVERED)) / max(np.count_nonzero(there), 1))
+            self._add(self._seeds_of(view, shown, nearer=False))
+            swept.append(view)
+            if len(new) >= tuned.SWEPT_LAST and np.mean(new[-tuned.SWEPT_LAST :]) < tuned.SWEPT_NEW:
+                break
+        self._learn_distance(swept)
+        return bool(swept)
 
     def _seed_on(self, views: Sequence[View], nearer: bool) -> None:
         """Replace the Gaussians by seeds on the depth of ``views``. nearer: see ``_seeds_of``."""
@@ -170,18 +187,30 @@ class ScanField(StillField):
             self._add(self._seeds_of(view, nearer=nearer))
 
     def _swept(self) -> list[View]:
-        """Views with depth that others tell, see ``sweep_depth``: none where poses tell nothing. Also learns how far
-        away is what cameras see. Poses are those given: a field without good depth refines them to fit its errors."""
+        """All that ``_sweep_views`` finds. Also learns how far away is what cameras see."""
+        swept = list(self._sweep_views())
+        self._learn_distance(swept)
+        return swept
+
+    def _sweep_views(self) -> Iterator[View]:
+        """Views, spread ones first, with depth that others tell, see ``sweep_depth``: none where poses tell nothing.
+        Poses are those given: a field without good depth refines them to fit its errors."""
         box, some = self.view_store.box, _some(self._views, tuned.SWEPT_VIEWS)
         assert box is not None
-        found: list[tuple[View, NDArray[np.float32]]] = []
+        found = False
         for distance_m in (box.distance_m, self._distance_by_path()):
-            if not found and distance_m >= box.distance_m:
-                depths = [usable_depth(sweep_depth(view, self._views, distance_m, self.pool)) for view in some]
-                found = [(view, depth) for view, depth in zip(some, depths) if depth is not None]
-        if found:
-            self._seen_m = float(np.median([np.median(depth[depth > 0]) for _, depth in found]))
-        return [replace(view, depth=depth) for view, depth in found]
+            if found or distance_m < box.distance_m:
+                continue
+            for k in _spread_first(len(some)):
+                depth = usable_depth(sweep_depth(some[k], self._views, distance_m, self.pool))
+                if depth is not None:
+                    found = True
+                    yield replace(some[k], depth=depth)
+
+    def _learn_distance(self, views: Sequence[View]) -> None:
+        """Learn from depth how far away is what cameras see."""
+        seen_m = [np.median(v.depth[v.depth > 0]) for v in views if v.depth is not None]
+        self._seen_m = float(np.median(seen_m)) if seen_m else self._seen_m
 
     def _distance_by_path(self) -> float:
         """How far away what cameras see may be, by how far apart they are, whatever the unit of their poses: one camera
@@ -281,6 +310,13 @@ class ScanField(StillField):
 def _some(items: Sequence[T], most: int) -> list[T]:
     """At most so many, spread evenly."""
     return [items[k] for k in np.unique(np.linspace(0, len(items) - 1, most).astype(int))] if items else []
+
+
+def _spread_first(count: int) -> list[int]:
+    """0 to ``count`` - 1, in an order whose every beginning is spread (van der Corput's)."""
+    bits = max(count - 1, 0).bit_length()
+    reversed_bits = (sum((k >> bit & 1) << (bits - 1 - bit) for bit in range(bits)) for k in range(1 << bits))
+    return list(dict.fromkeys(count * k >> bits for k in reversed_bits))[:count]
 
 
 def aim_of(view: View, seen_m: float) -> tuple[NDArray[np.float64], float]:

@@ -31,6 +31,9 @@ GUESSED_OPACITY = 0.5  # of seeds at a depth that is guessed
 
 # --- depth by plane sweep, where none is measured (sweep); found on redkitchen, against its depth camera ---
 SWEPT_VIEWS = 40  # from at most so many
+# Mean share of the last so many views' pixels that show no seed yet, below which no further view is swept: `lego` and
+# `fox` need 8 views, `redkitchen` without depth 14.
+SWEPT_LAST, SWEPT_NEW = 4, 0.05
 SWEPT_PIXELS = 20_000  # of an image that is matched as it is; larger ones are matched smaller
 SWEPT_STEPS = 64  # inverse depths, from 0
 SWEPT_NEAR = 0.3  # nearest depth, share of the distance to the scene
