@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from edge_server.experiments.fitting.misfits import misfits
 from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, RefinesCameras, View
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.densification import opacity, raw_opacity
 from edge_server.fields.splat.kernels.project import OPACITY
+from edge_server.fields.splat.scan import scan_field
 from edge_server.fields.splat.scan.scan_field import ScanField
+from edge_server.fields.splat.scan.sweep import sweep_depth
 from edge_server.fields.splat.settings import SplatSettings
 from tests.edge_server.fields.scenes import BALL_M, RADIUS_M
 from tests.edge_server.fields.small import same_state
@@ -61,6 +65,21 @@ def test_first_gaussians_lie_on_measured_depth() -> None:
     from_ball, from_ground = np.linalg.norm(at - BALL_M, axis=1) - RADIUS_M, at[:, 2]
     near = np.minimum(np.abs(from_ball), np.abs(from_ground)) < 0.05
     assert len(near) > 50 and near.mean() > 0.9
+
+
+def test_views_are_swept_until_further_ones_show_hardly_anything_new(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spread ones first. To sweep all of them took two seconds before the first step of a fit."""
+    swept: list[int] = []
+
+    def noted(view: View, others: Sequence[View], distance_m: float, pool: Pool) -> NDArray[np.float32] | None:
+        swept.append(int(view.camera))
+        return sweep_depth(view, others, distance_m, pool)
+
+    monkeypatch.setattr(scan_field, "sweep_depth", noted)
+    field = ScanField(_settings(refine=False))
+    field.fit(WITHOUT, Budget(steps=0))
+    assert swept[:4] == [0, 40, 20, 60] and 8 <= len(swept) < 20
+    assert field._seen_m == pytest.approx(2.07, abs=0.1)
 
 
 def test_what_is_transparent_goes_every_hundredth_step() -> None:
