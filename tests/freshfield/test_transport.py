@@ -17,15 +17,7 @@ import pytest
 
 from freshfield import transport
 from freshfield.limits import MAX_PAYLOAD_BYTES
-from freshfield.transport import (
-    Transport,
-    TransportError,
-    add_arguments,
-    backoff_s,
-    from_arguments,
-    host_port,
-    peer_text,
-)
+from freshfield.transport import Transport, TransportError, host_port, peer_text
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, frames_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
 
@@ -70,12 +62,6 @@ async def push(transport: Transport, port: int, size: int) -> int:
         return (await call.read()).sequence
 
 
-def refusal(work) -> grpc.StatusCode:
-    with pytest.raises(grpc.aio.AioRpcError) as error:
-        asyncio.run(work)
-    return error.value.code()
-
-
 async def test_plain_text_and_messages_up_to_the_limit():
     """Larger ones are refused by who sends them, and where that is a stranger by the server, which lives on."""
     async with (
@@ -97,32 +83,19 @@ async def test_plain_text_and_messages_up_to_the_limit():
 RIGHT = Transport(tokens={"camera:*": "right"})
 
 
-async def test_a_port_in_use_is_not_shared():
+async def test_a_port_in_use_is_not_shared_nor_one_opened_unprotected():
     async with serving(Transport()) as port:
-        with pytest.raises(TransportError, match=f"localhost:{port}"):
-            Transport().bind(Transport().aio_server(), f"localhost:{port}")
+        for address, why in ((f"localhost:{port}", f"localhost:{port}"), ("0.0.0.0:0", "nothing is encrypted")):
+            with pytest.raises(TransportError, match=why):
+                Transport().bind(Transport().aio_server(), address)
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("emu:7001", ("emu", 7001)),
-        (":7001", ("127.0.0.1", 7001)),
-        ("0.0.0.0:0", ("0.0.0.0", 0)),
-        ("[::1]:65535", ("[::1]", 65535)),
-    ],
-)
-def test_host_and_port_are_told_apart(text, expected):
-    assert host_port(text) == expected
-
-
-NO_ADDRESSES = ["", "host", "7001", "host:", "host:-1", "host:65536", "host:\u00b2", "::1:7001", "unix:/tmp/s"]
-
-
-@pytest.mark.parametrize("text", NO_ADDRESSES)
-def test_what_is_no_address_is_refused_by_name(text):
-    with pytest.raises(TransportError, match="expected HOST:PORT"):
-        host_port(text)
+def test_host_and_port_are_told_apart():
+    assert host_port("emu:7001") == ("emu", 7001) and host_port(":7001") == ("127.0.0.1", 7001)
+    assert host_port("0.0.0.0:0") == ("0.0.0.0", 0) and host_port("[::1]:65535") == ("[::1]", 65535)
+    for wrong in ("", "host", "7001", "host:", "host:-1", "host:65536", "host:\u00b2", "::1:7001", "unix:/tmp/s"):
+        with pytest.raises(TransportError, match="expected HOST:PORT"):
+            host_port(wrong)
 
 
 @pytest.fixture(scope="module")
@@ -145,32 +118,25 @@ def pem(tmp_path_factory):
     return folder
 
 
-def test_tls_and_mutual_tls(pem):
+async def test_tls_and_mutual_tls(pem):
     server_tls = Transport(cert=pem / "server.pem", key=pem / "server.key")
     mutual = Transport(cert=pem / "server.pem", key=pem / "server.key", ca=pem / "ca.pem")
-    trusting = Transport(ca=pem / "ca.pem")
+    trusting, deceived = Transport(ca=pem / "ca.pem"), Transport(ca=pem / "stranger.pem")
     known = Transport(cert=pem / "client.pem", key=pem / "client.key", ca=pem / "ca.pem")
-    deceived = Transport(ca=pem / "stranger.pem")
 
-    async def scene(server_side, client):
-        async with serving(server_side) as port:
-            return await ask(client, port)
+    async def refusal(client: Transport, port: int) -> str:
+        with pytest.raises(grpc.aio.AioRpcError) as error:
+            await ask(client, port)
+        return error.value.code().name
 
-    assert asyncio.run(scene(server_tls, trusting)) == 42
-    assert asyncio.run(scene(mutual, known)) == 42
-    for server_side, client in ((server_tls, deceived), (server_tls, Transport()), (mutual, trusting)):
-        assert refusal(scene(server_side, client)) == grpc.StatusCode.UNAVAILABLE
-    other = Transport(cert=pem / "server.pem", key=pem / "server.key", ca=pem / "ca.pem")
-    assert refusal(scene(mutual, other)) == grpc.StatusCode.UNAUTHENTICATED  # its name is no caller's
-
-
-async def test_a_connection_without_its_tls_handshake_ends(pem, monkeypatch):
-    sooner = [(name, 500 if "handshake" in name else value) for name, value in transport.SERVER_OPTIONS]
-    monkeypatch.setattr(transport, "SERVER_OPTIONS", sooner)
-    async with serving(Transport(cert=pem / "server.pem", key=pem / "server.key")) as port:
-        reader, writer = await asyncio.open_connection("localhost", port)
-        assert await asyncio.wait_for(reader.read(1), 10.0) == b""
-        writer.close()
+    async with serving(server_tls) as port:
+        assert await ask(trusting, port) == 42
+        for client in (deceived, Transport()):
+            assert await refusal(client, port) == "UNAVAILABLE"
+    async with serving(mutual) as port:
+        assert await ask(known, port) == 42
+        assert await refusal(trusting, port) == "UNAVAILABLE"
+        assert await refusal(mutual, port) == "UNAUTHENTICATED", "its name is no caller's"
 
 
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # and empty SETTINGS
@@ -206,28 +172,21 @@ async def test_connections_are_few_and_those_that_do_nothing_end(encrypted, pem,
             writer.close()
 
 
-LISTENING = {
-    "an authority alone": (Transport(ca=Path("ca")), "127.0.0.1", "--tls-ca .* needs --tls-cert"),
-    "a token without a name": (Transport(tokens={"": "x"}), "127.0.0.1", "NAME TOKEN"),
-    "plain text": (RIGHT, "0.0.0.0", "nothing is encrypted"),
-    "nobody asked": (Transport(cert=Path("c"), key=Path("k")), "0.0.0.0", "nobody is asked"),
-    "no address": (Transport(), "[::]", "nothing is encrypted .* and nobody is asked"),
-}
-
-
-@pytest.mark.parametrize("what", LISTENING)
-async def test_a_server_refuses_to_listen_unprotected(what):
-    transport, host, why = LISTENING[what]
-    with pytest.raises(TransportError, match=why):
-        transport.bind(Transport().aio_server(), f"{host}:0")
-
-
-def test_what_protects_a_port_beyond_this_machine():
+def test_a_server_refuses_to_listen_unprotected_beyond_this_machine():
     tls = {"cert": Path("c"), "key": Path("k")}
-    assert Transport(**tls, tokens={"viewer": "x"}).guard("0.0.0.0", "page", http=True) == ""
-    assert Transport(**tls, ca=Path("ca")).guard("0.0.0.0", "gRPC") == ""
+    for given, host, why in (
+        (Transport(ca=Path("ca")), "127.0.0.1", "--tls-ca .* needs --tls-cert"),
+        (Transport(tokens={"": "x"}), "127.0.0.1", "NAME TOKEN"),
+        (RIGHT, "0.0.0.0", "nothing is encrypted"),
+        (Transport(**tls), "0.0.0.0", "nobody is asked"),
+        (Transport(), "[::]", "nothing is encrypted .* and nobody is asked"),
+    ):
+        with pytest.raises(TransportError, match=why):
+            given.guard(host, "gRPC")
     with pytest.raises(TransportError, match="machines, and nobody can log in"):
         Transport(**tls, ca=Path("ca")).guard("0.0.0.0", "page", http=True)
+    assert Transport(**tls, tokens={"viewer": "x"}).guard("0.0.0.0", "page", http=True) == ""
+    assert Transport(**tls, ca=Path("ca")).guard("0.0.0.0", "gRPC") == ""
     for host in ("127.0.0.1", "127.1.2.3", "::1", "[::1]", "localhost"):
         assert Transport().guard(host, "page") == ""
     words = Transport(insecure=True).guard("0.0.0.0", "page")
@@ -242,38 +201,30 @@ async def test_a_token_does_not_leave_the_machine_in_plain_text():
 
 def parsed(*arguments: str) -> Transport:
     parser = argparse.ArgumentParser()
-    add_arguments(parser)
-    return from_arguments(parser.parse_args(arguments))
+    transport.add_arguments(parser)
+    return transport.from_arguments(parser.parse_args(arguments))
 
 
-def test_options_become_a_transport(tmp_path):
-    token = tmp_path / "token"
+def test_options_become_a_transport(pem, tmp_path):
+    token, damaged = tmp_path / "token", tmp_path / "damaged.pem"
     token.write_text("  secret\n")
-    transport = parsed("--token-file", str(token))
-    assert transport.metadata() == (("authorization", "Bearer secret"),)
     assert parsed() == Transport()
+    assert parsed("--token-file", str(token)).metadata() == (("authorization", "Bearer secret"),)
     token.write_text("camera:cam00 one\n\noperator two\n")
     assert parsed("--token-file", str(token)).tokens == {"camera:cam00": "one", "operator": "two"}
-    for wrong in ("viewer a\nviewer b", "viewer a\noperator a", "a\nb", "viewer a b"):
+    for wrong in ("viewer a\nviewer b", "viewer a\noperator a", "a\nb", "viewer a b", "\n"):
         token.write_text(wrong)
-        with pytest.raises(TransportError, match="NAME TOKEN"):
+        with pytest.raises(TransportError, match=r"NAME TOKEN|is empty"):
             parsed("--token-file", str(token))
-    token.write_text("\n")
-    with pytest.raises(TransportError, match="empty"):
-        parsed("--token-file", str(token))
-    with pytest.raises(TransportError, match="cannot read"):
-        parsed("--tls-ca", str(tmp_path / "none.pem"))
-    with pytest.raises(TransportError, match="go together"):
-        parsed("--tls-cert", str(token))
-
-
-@pytest.mark.parametrize("text", ["", "no certificate", "-----BEGIN CERTIFICATE-----\nMIIB\n"])
-def test_files_that_hold_no_certificate_are_refused_by_name(pem, tmp_path, text):
-    (damaged := tmp_path / "damaged.pem").write_text(text)
-    with pytest.raises(TransportError, match=r"--tls-ca .*damaged\.pem holds no certificate"):
-        parsed("--tls-ca", str(damaged))
-    with pytest.raises(TransportError, match=r"cannot use --tls-cert .*damaged\.pem"):
-        parsed("--tls-cert", str(damaged), "--tls-key", str(pem / "server.key"))
+    damaged.write_text("-----BEGIN CERTIFICATE-----\nMIIB\n")
+    for words, why in (
+        (("--tls-ca", str(tmp_path / "none.pem")), "cannot read"),
+        (("--tls-cert", str(token)), "go together"),
+        (("--tls-ca", str(damaged)), r"damaged\.pem holds no certificate"),
+        (("--tls-cert", str(damaged), "--tls-key", str(pem / "server.key")), r"cannot use --tls-cert .*damaged\.pem"),
+    ):
+        with pytest.raises(TransportError, match=why):
+            parsed(*words)
 
 
 async def test_a_slow_reader_is_felt_at_once():
@@ -300,7 +251,7 @@ async def test_a_slow_reader_is_felt_at_once():
 
 def test_the_back_off_doubles_to_its_bound_and_draws_once_each_time():
     jitter, same = np.random.default_rng(4), np.random.default_rng(4)
-    pauses = [backoff_s(failures, 0.2, 3.0, jitter) for failures in (0, 1, 2, 3, 4, 5, 10_000)]
+    pauses = [transport.backoff_s(failures, 0.2, 3.0, jitter) for failures in (0, 1, 2, 3, 4, 5, 10_000)]
     expected = [0.2, 0.4, 0.8, 1.6, 3.0, 3.0, 3.0]
     assert pauses == [pause * same.uniform(0.5, 1.0) for pause in expected]
 
