@@ -137,6 +137,8 @@ async def test_tls_and_mutual_tls(pem):
         assert await ask(known, port) == 42
         assert await refusal(trusting, port) == "UNAVAILABLE"
         assert await refusal(mutual, port) == "UNAUTHENTICATED", "its name is no caller's"
+        wrong_token = dataclasses.replace(known, tokens={"": "wrong"})
+        assert await refusal(wrong_token, port) == "UNAUTHENTICATED", "a certificate does not make it good"
 
 
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # and empty SETTINGS
