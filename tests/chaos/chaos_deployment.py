@@ -12,13 +12,12 @@ from __future__ import annotations
 import os
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
 from math import inf, nan
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from msgspec.structs import replace
 
 from camera_node.capture import Camera
 from channel_emu.live.camera_stream import CREDITS
@@ -29,9 +28,8 @@ from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.settings import channel_from_mapping
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment, WakeCondition
-from edge_server.fields import Field, checkpoint
-from edge_server.fields.ngp import field as ngp_field
-from edge_server.fields.registry import make_field, settings_of
+from edge_server.fields import checkpoint
+from edge_server.fields.registry import make_field
 from edge_server.live.field_updater import FieldUpdater, open_updater
 from edge_server.live.ingest import FrameAdmission
 from edge_server.scheduler import make_policy, parse_policy
@@ -43,8 +41,6 @@ from freshfield.scenario import Scenario, seed_sequence
 from freshfield.v1 import frames_pb2 as pb
 from tests.chaos.fault_plan import ROLES, Fault
 
-# On a slow disk a checkpoint takes as long as this many lines.
-_CHECKPOINT_LINES = 20
 # Period of a node's clock exchanges; until the next one it does not know of a step of its clock.
 _CLOCK_PERIOD_NS = 10**9
 
@@ -72,11 +68,10 @@ class ChaosDeployment(VirtualDeployment):
         self.arrivals: dict[str, list[int]] = {camera.name: [] for camera in cameras}
         self.most_inside = self.lines_lost = self.damaged_admitted = 0
         self.restarts: Counter[str] = Counter()
-        self._out = out
+        self._out, self._checkpoint = out, out / "field.npz"
         self._down: set[str] = set()
         self._stalled: set[str] = set()
         self._stands_until_ns = dict.fromkeys(ROLES, 0)
-        self._line_ns = dict.fromkeys(ROLES, 0)  # what a process waits for its disk
         self._away: Counter[str] = Counter()
         self._steps: dict[str, list[tuple[int, int]]] = {camera.name: [] for camera in cameras}
         self._synced_ns = 0  # when the node last asked for the edge's time for other reasons than its period
@@ -157,14 +152,11 @@ class ChaosDeployment(VirtualDeployment):
 
     def _do_stall(self, fault: Fault) -> None:
         """SIGSTOP of a process, and SIGCONT ``for_ms`` later."""
-        if fault.target not in self._down:
-            self._stand(fault.target, self.clock.now_ns() + round(fault.for_ms * 1e6))
-
-    def _stand(self, role: str, until_ns: int) -> None:
-        """Let a process do nothing until ``until_ns``."""
-        self._stalled.add(role)
-        self._stands_until_ns[role] = max(self._stands_until_ns[role], until_ns)
-        self.at(until_ns, lambda: self._go_on(role))
+        role, until_ns = fault.target, self.clock.now_ns() + round(fault.for_ms * 1e6)
+        if role not in self._down:
+            self._stalled.add(role)
+            self._stands_until_ns[role] = max(self._stands_until_ns[role], until_ns)
+            self.at(until_ns, lambda: self._go_on(role))
 
     def _go_on(self, role: str) -> None:
         if role not in self._stalled or self.clock.now_ns() < self._stands_until_ns[role]:
@@ -192,16 +184,6 @@ class ChaosDeployment(VirtualDeployment):
 
         self._after(fault, space_again)
 
-    def _do_slow_disk(self, fault: Fault) -> None:
-        """A process pauses for ``value`` ms after each line of its ledger, and checkpoints take long."""
-        line_ns = round(fault.value * 1e6)
-        self._line_ns[fault.target] += line_ns
-
-        def fast_again() -> None:
-            self._line_ns[fault.target] -= line_ns
-
-        self._after(fault, fast_again)
-
     def _do_away(self, fault: Fault) -> None:
         """A camera is unplugged for a while."""
         self._away[fault.target] += 1
@@ -216,18 +198,8 @@ class ChaosDeployment(VirtualDeployment):
         self.next_policy = make_policy(name, value, self.scenario.rng("policy", name))
 
     def _do_checkpoint(self, fault: Fault) -> None:
-        line_ns, life = self._line_ns["edge"], self.restarts["edge"]
-        if "edge" in self._down or ("edge" in self._stalled and not line_ns):
-            return
-        # After the line that it may be writing.
-        over_ns = max(self.clock.now_ns(), self._stands_until_ns["edge"]) + _CHECKPOINT_LINES * line_ns
-
-        def rename() -> None:
-            if "edge" not in self._down and self.restarts["edge"] == life:  # not killed while it wrote
-                checkpoint.save(self._out / "field.npz", self.updates.field.state(), durable=False)
-
-        self.at(over_ns, rename)
-        self._stand("edge", over_ns)
+        if "edge" not in self._down | self._stalled:
+            checkpoint.save(self._checkpoint, self.updates.field.state(), durable=False)
 
     def _do_hostile(self, fault: Fault) -> None:
         """Send messages to the edge that come from no node of this deployment."""
@@ -255,49 +227,33 @@ class ChaosDeployment(VirtualDeployment):
         camera = self._cameras[cameras[rng.integers(len(cameras))]]
         shot, now_ns = camera.capture(0), self.clock.now_ns()
         self._attempts += 1
+        lens, data = shot.intrinsics, shot.payload
+        depth = DepthImage(np.full((lens.height, lens.width), 2000, np.uint16), 0.001).encode()
         sequence = 2**40 + self._attempts
-        lens = shot.intrinsics
-        measured = DepthImage(np.full((lens.height, lens.width), 2000, np.uint16), 0.001).encode()
-        frame = Frame(
-            camera.name, "hostile", sequence, now_ns, shot.pose, lens, camera.codec, shot.payload, depth=measured
-        )
+        frame = Frame(camera.name, "hostile", sequence, now_ns, shot.pose, lens, camera.codec, data, depth=depth)
         request = to_request(frame)
-        header, depth, data = request.header, request.depth, shot.payload
-        wrong: list[tuple[Any, str, list[Any]]] = [
-            (header, "camera_id", ["mars", "../etc", "", "a" * 65, "cam01\t"]),
-            (header, "session_id", ["a\nb", "", "x" * 1000]),
-            (header, "generated_ns", [now_ns + 10**10, now_ns - 2 * 3600 * 10**9, -(2**63), 2**63 - 1]),
-            (header, "clock_offset_ns", [10**9, -(10**9), -(2**63), 2**63 - 1]),
-            (header, "clock_uncertainty_ns", [-1, 2**63 - 1]),
-            (header, "pose_gap_ns", [-1, 2**63 - 1]),
-            (header, "codec", [-1, 0, 99]),
-            (header, "role", [-7, 0, 2, 99]),
-            (header, "width", [0, 1, 33, 4097, 2**31 - 1]),
-            (header, "height", [0, 1, 33, 4097, 2**31 - 1]),
-            *((header.pose, name, [0.0, 1.0, nan, inf, 1e300, 5e-324]) for name in ("qw", "qz")),
-            *((header.pose, name, [1e7, nan, -inf, 3.0]) for name in ("tx_m", "tz_m")),
-            *((header.intrinsics, name, [0.0, -5.0, 1e-9, 1e9, nan]) for name in ("fx", "cy", "k1", "p2")),
-            (depth, "codec", [-1, 0, 99]),
-            (depth, "width", [0, 1, lens.width + 1, 2**31 - 1]),
-            (depth, "meters_per_count", [0.0, nan, -inf, 1e300]),
-            (depth, "after_image_ns", [-(2**63), 2**63 - 1]),
-            (depth, "payload", [b"", measured.payload[:-5], data, bytes(rng.bytes(200))]),
-            (
-                request,
-                "payload",
-                [
-                    b"",
-                    data[: len(data) // 2],
-                    bytes(rng.bytes(200)),
-                    data + data,
-                    damage(data, tuple((float(rng.random()), 255) for _ in range(20))),
-                ],
-            ),
+        wrong: list[tuple[str, list[Any]]] = [
+            ("header.camera_id", ["mars", "../etc", "", "a" * 65, "cam01\t"]),
+            ("header.session_id", ["a\nb", "", "x" * 1000]),
+            ("header.generated_ns", [now_ns + 10**10, now_ns - 2 * 3600 * 10**9, -(2**63), 2**63 - 1]),
+            ("header.clock_offset_ns", [10**9, -(2**63), 2**63 - 1]),
+            ("header.clock_uncertainty_ns", [-1, 2**63 - 1]),
+            ("header.codec", [-1, 0, 99]),
+            ("header.role", [-7, 0, 2]),
+            ("header.width", [0, 33, 2**31 - 1]),
+            ("header.pose.qw", [0.0, nan, 1e300, 5e-324]),
+            ("header.pose.tx_m", [1e7, -inf, 3.0]),
+            ("header.intrinsics.fx", [0.0, 1e9, nan, lens.fx + 1.0]),
+            ("depth.width", [0, lens.width + 1]),
+            ("depth.meters_per_count", [0.0, nan, 0.002]),
+            ("depth.payload", [b"", depth.payload[:-5], data, rng.bytes(200)]),
+            ("payload", [b"", data[: len(data) // 2], rng.bytes(200), damage(data, ((0.5, 255), (0.9, 255)))]),
         ]
         for k in rng.permutation(len(wrong))[: rng.integers(1, 4)]:
-            message, name, values = wrong[k]
-            setattr(message, name, values[rng.integers(len(values))])
-        if rng.random() < 0.9:
+            path, values = wrong[k]
+            *parents, name = path.split(".")
+            setattr(reduce(getattr, parents, request), name, values[rng.integers(len(values))])
+        if rng.random() < 0.8:
             request.crc32c = checksum(request)
         return request
 
@@ -383,10 +339,9 @@ class ChaosDeployment(VirtualDeployment):
     def _new_updater(self, now_ns: int, resume: bool = False) -> FieldUpdater:
         """The updater of an edge that was just started. resume: load the last checkpoint, if there is one."""
         scenario, config = self.scenario, read_config(self.scenario)
-        field = _small_field(config.field, config.field_options, scenario.seed)
-        file = self._out / "field.npz"
-        if resume and file.exists():
-            field.load_state(checkpoint.load(file)[0])
+        field = make_field(config.field, config.field_options, scenario.seed)
+        if resume and self._checkpoint.exists():
+            field.load_state(checkpoint.load(self._checkpoint)[0])
         name, value = config.policy.name, config.policy.value
         policy = make_policy(name, value, scenario.rng("policy", name))
         return open_updater(scenario, config, policy, field, now_ns, resume)
@@ -401,17 +356,7 @@ class ChaosDeployment(VirtualDeployment):
         self._write(role, event, frame.camera, frame.session, frame.sequence, detail)
 
     def _write(self, role: str, event: str, camera: str, session: str, sequence: int, detail: str = "") -> None:
-        now_ns = self.clock.now_ns()
-        self._ledgers[role].write(now_ns, camera, session, sequence, event, detail)
-        if self._line_ns[role]:
-            self._stand(role, max(now_ns, self._stands_until_ns[role]) + self._line_ns[role])
+        self._ledgers[role].write(self.clock.now_ns(), camera, session, sequence, event, detail)
 
     def _after(self, fault: Fault, action: Callable[[], None]) -> None:
         self.at(self.clock.now_ns() + round(fault.for_ms * 1e6), action)
-
-
-def _small_field(name: str, options: dict[str, Any], seed: int) -> Field:
-    """The field of an edge; that of ``ngp`` with an eighth of the cells, whose counting would take half the time."""
-    if name != "ngp":
-        return make_field(name, options, seed)
-    return ngp_field.make(replace(settings_of(name, options, seed), cells=32, finest_resolution=64))

@@ -9,7 +9,7 @@ import threading
 from freshfield.transport import host_port
 from freshfield_up.net import LOOPBACK
 
-FAULTS = ("black hole", "half-open", "corrupted bytes")
+FAULTS = ("black hole", "corrupted bytes")
 _CHUNK = 1 << 16
 
 
@@ -19,8 +19,6 @@ class TcpFaultProxy:
     ``fault`` starts one of FAULTS, ``mend`` ends it:
 
     - black hole: nothing passes; sent data waits in the TCP buffers.
-    - half-open: the far ends of existing connections are closed, of which the near ends learn only at
-      ``mend``; new connections work.
     - corrupted bytes: one byte of every chunk of at most 64 kB is changed.
     """
 
@@ -29,19 +27,20 @@ class TcpFaultProxy:
     def __init__(self, to: str) -> None:
         self._to = host_port(to)
         self._corrupts = False
-        self._pairs: list[tuple[asyncio.StreamWriter, asyncio.StreamWriter]] = []
-        self._cut: set[asyncio.StreamWriter] = set()
         started = threading.Event()
         self._thread = threading.Thread(target=lambda: asyncio.run(self._serve(started)), daemon=True)
         self._thread.start()
         started.wait()
 
     def fault(self, kind: str) -> None:
-        act = {"black hole": self._passes.clear, "half-open": self._halve, "corrupted bytes": self._corrupt}
-        self._loop.call_soon_threadsafe(act[kind])
+        if kind == "corrupted bytes":
+            self._corrupts = True
+        else:
+            self._loop.call_soon_threadsafe(self._passes.clear)
 
     def mend(self) -> None:
-        self._loop.call_soon_threadsafe(self._mend)
+        self._corrupts = False
+        self._loop.call_soon_threadsafe(self._passes.set)
 
     def close(self) -> None:
         self._loop.call_soon_threadsafe(self._closing.set)
@@ -62,38 +61,15 @@ class TcpFaultProxy:
         except OSError:
             near.transport.abort()
             return
-        self._pairs.append((near, far))
-        await asyncio.gather(self._pump(reader, far, near), self._pump(far_reader, near, near))
-        if near not in self._cut:
-            near.transport.abort()
-            far.transport.abort()
-        self._pairs.remove((near, far))
+        await asyncio.gather(self._pump(reader, far), self._pump(far_reader, near))
 
-    async def _pump(self, reader: asyncio.StreamReader, to: asyncio.StreamWriter, near: asyncio.StreamWriter) -> None:
+    async def _pump(self, reader: asyncio.StreamReader, to: asyncio.StreamWriter) -> None:
         with contextlib.suppress(OSError):
             while data := await reader.read(_CHUNK):
                 await self._passes.wait()
-                if near in self._cut:
-                    continue  # swallowed
                 if self._corrupts:
                     middle = len(data) // 2
                     data = data[:middle] + bytes([(data[middle] + 1) % 256]) + data[middle + 1 :]
                 to.write(data)
                 await to.drain()
-        if near not in self._cut:
-            to.close()
-
-    def _halve(self) -> None:
-        for near, far in self._pairs:
-            self._cut.add(near)
-            far.transport.abort()
-
-    def _corrupt(self) -> None:
-        self._corrupts = True
-
-    def _mend(self) -> None:
-        self._passes.set()
-        self._corrupts = False
-        for near in self._cut:
-            near.transport.abort()
-        self._cut.clear()
+        to.transport.abort()
