@@ -24,9 +24,7 @@ def answer(outcome: pb.Outcome = pb.OUTCOME_ACCEPTED, reason: str = "", after_s:
     async def give(request: pb.PushRequest) -> pb.PushResponse:
         if after_s:
             await asyncio.sleep(after_s)
-        return pb.PushResponse(
-            sequence=request.header.sequence, outcome=outcome, reason=reason, detail="as the test says"
-        )
+        return pb.PushResponse(sequence=request.header.sequence, outcome=outcome, reason=reason, detail="a test says")
 
     return give
 

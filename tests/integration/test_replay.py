@@ -25,7 +25,7 @@ from freshfield.clock import WallClock
 from freshfield.frame import Frame, to_request
 from freshfield.geometry import Pinhole, Pose
 from freshfield.ledger import Ledger
-from freshfield.scenario import ScenarioError, parse
+from freshfield.scenario import parse
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
 from tests.camera_node.depth_source import DepthSource
@@ -48,6 +48,12 @@ CAMERAS = {"count": 3, "held_out": ["cam00"]}
 def replay_scenario(file: Path, **source):
     section = {"kind": "mcap", "file": str(file), **source}
     return parse({"name": "replay", "seed": 3, "cameras": CAMERAS, "source": section}, file.parent / "r.yaml")
+
+
+def camera_of(scenario) -> Camera:
+    """That of cam01."""
+    (camera,) = build_cameras(scenario, source_config(scenario), ["cam01"])
+    return camera
 
 
 def node_of(scenario, to: str, cameras=None, seconds: float | None = None) -> Node:
@@ -109,19 +115,22 @@ def test_everything_that_was_accepted_is_recorded(session):
     file, sent = session
     found = Session(file)
     assert found.cut is None and len(sent) > 60
-    for camera in ("cam00", "cam01", "cam02"):
-        mine = [r for r in sent if r.header.camera_id == camera]
+    for camera, mine, _ in of_each_camera(sent, ()):
         assert [f.header for f in found.frames[camera]] == [r.header for r in mine]
         assert [found.payload(f) for f in found.frames[camera]] == [r.payload for r in mine]
+
+
+def of_each_camera(sent, got):
+    """Messages sent and got, camera by camera."""
+    for camera in ("cam00", "cam01", "cam02"):
+        yield camera, *([r for r in rows if r.header.camera_id == camera] for rows in (sent, got))
 
 
 @pytest.mark.parametrize("after_s", [0.0, 0.05], ids=["quick answers", "answers slower than frames"])
 def test_replay_is_exact_to_the_message(session, after_s):
     file, sent = session
-    got = sent_by(replay_scenario(file), after_s=after_s)
     shifts = set()
-    for camera in ("cam00", "cam01", "cam02"):
-        before, after = ([r for r in rows if r.header.camera_id == camera] for rows in (sent, got))
+    for _, before, after in of_each_camera(sent, sent_by(replay_scenario(file), after_s=after_s)):
         assert [said(r) for r in after] == [said(r) for r in before]
         assert [r.header.sequence for r in after] == list(range(len(before)))
         shifts |= {b.header.generated_ns - a.header.generated_ns for a, b in zip(before, after)}
@@ -136,30 +145,27 @@ def test_a_cut_recording_replays_what_is_whole(session, tmp_path, caplog):
         got = sent_by(replay_scenario(tmp_path / "cut.mcap"))
     assert "cut short at byte" in caplog.text and "complete messages are used" in caplog.text
     part = Session(tmp_path / "cut.mcap")
-    for camera, frames in part.frames.items():
-        before, after = ([r for r in rows if r.header.camera_id == camera] for rows in (sent, got))
-        assert [said(r) for r in after] == [said(r) for r in before[: len(frames)]]
+    for camera, before, after in of_each_camera(sent, got):
+        assert [said(r) for r in after] == [said(r) for r in before[: len(part.frames[camera])]]
     assert 10 < len(got) < len(sent)
 
 
 def test_cameras_may_be_renamed_or_wrong(session, tmp_path):
     file, _ = session
     scenario = replay_scenario(file, assignment={"cam00": "cam00", "cam01": "cam02", "cam02": "cam01"})
-    (camera,) = build_cameras(scenario, source_config(scenario), ["cam01"])
-    recorded = Session(file)
+    camera, recorded = camera_of(scenario), Session(file)
     assert camera.capture(0).payload == recorded.payload(recorded.frames["cam02"][0])
-    with pytest.raises(ScenarioError, match=r"no camera 'nobody'.*cam00"):
-        build_cameras(s := replay_scenario(file, assignment={"cam01": "nobody"}), source_config(s), ["cam01"])
-    with pytest.raises(ScenarioError, match=r"source\.file: .*does not exist"):
-        build_cameras(s := replay_scenario(tmp_path / "no.mcap"), source_config(s), ["cam01"])
     (tmp_path / "text.mcap").write_text("no recording")
-    with pytest.raises(ScenarioError, match=r"source\.file: .*is no MCAP file"):
-        build_cameras(s := replay_scenario(tmp_path / "text.mcap"), source_config(s), ["cam01"])
     SessionWriter(tmp_path / "empty.mcap", {}).close({})
-    with pytest.raises(ValueError, match="holds no frames"):
-        build_cameras(s := replay_scenario(tmp_path / "empty.mcap"), source_config(s), ["cam01"])
-    with pytest.raises(ScenarioError, match="replayed as it was"):
-        source_config(replay_scenario(file, effects={"sensor_noise": None}))
+    for wrong, why in (
+        (replay_scenario(file, assignment={"cam01": "nobody"}), r"no camera 'nobody'.*cam00"),
+        (replay_scenario(tmp_path / "no.mcap"), r"source\.file: .*does not exist"),
+        (replay_scenario(tmp_path / "text.mcap"), r"source\.file: .*is no MCAP file"),
+        (replay_scenario(tmp_path / "empty.mcap"), "holds no frames"),
+        (replay_scenario(file, effects={"sensor_noise": None}), "replayed as it was"),
+    ):
+        with pytest.raises(ValueError, match=why):
+            camera_of(wrong)
 
 
 def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
@@ -174,24 +180,29 @@ def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
     writer.close({})
     scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam01": "cam01", "cam02": "y"})
     with caplog.at_level(logging.WARNING):
-        (camera,) = build_cameras(scenario, source_config(scenario), ["cam01"])
+        camera = camera_of(scenario)
     assert "cam01: 1 frames do not follow the one before in time" in caplog.text
     schedule = camera.schedule(7)
     assert [schedule.due_ns(k) - 7 for k in range(3)] == [0, 10**9, 2 * 10**9] and schedule.next(2, 0) == (None, 0)
+
+
+def recorded(camera: Camera, file: Path, count: int) -> list[pb.PushRequest]:
+    """Frames of a camera, written to a session."""
+    writer, sent = SessionWriter(file, {}), []
+    for k in range(count):
+        shot, at_ns = camera.capture(k), (k + 10) * 10**8
+        frame = Frame("cam01", "s", k, at_ns, shot.pose, shot.intrinsics, "jpeg", shot.payload)
+        sent.append(to_request(replace(frame, depth=shot.encoded_depth)))
+        writer.frame(sent[-1], at_ns + 5)
+    writer.close({})
+    return sent
 
 
 def test_a_recorded_run_replays_with_its_depth(tmp_path):
     """As it came, also where it belongs to another instant; what shows a held-out camera sends none."""
     source = DepthSource("cam01", 4, after_image_ns=-40_000_000)
     camera = Camera(source, WorldConfig(kind="world"), ShotCache(10**6), depth_every=2)
-    recorder = Recorder(tmp_path / "a.mcap", "test")
-    sent = []
-    for k in range(4):
-        shot, at_ns = camera.capture(k), (k + 10) * 10**8
-        frame = Frame("cam01", "s", k, at_ns, shot.pose, shot.intrinsics, "jpeg", shot.payload)
-        sent.append(to_request(replace(frame, depth=shot.encoded_depth)))
-        recorder.frame(sent[-1], at_ns + 5)
-    recorder.close()
+    sent = recorded(camera, tmp_path / "a.mcap", 4)
     scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam02": "y"})
     got = sent_by(scenario, ["cam01"])
     assert [said(request) for request in got] == [said(request) for request in sent]
@@ -205,14 +216,9 @@ def test_a_recorded_run_replays_with_its_depth(tmp_path):
 def test_depth_that_cannot_be_read_again_costs_only_the_depth(tmp_path):
     """The file is damaged after it was opened: within, checksums leave whole chunks out."""
     camera = Camera(DepthSource("cam01", 2), WorldConfig(kind="world"), ShotCache(10**6), depth_every=1)
-    writer = SessionWriter(tmp_path / "a.mcap", {})
-    for k in range(2):
-        shot, at_ns = camera.capture(k), (k + 10) * 10**8
-        frame = Frame("cam01", "s", k, at_ns, shot.pose, shot.intrinsics, "jpeg", shot.payload)
-        writer.frame(to_request(replace(frame, depth=shot.encoded_depth)), at_ns + 5)
-    writer.close({})
+    recorded(camera, tmp_path / "a.mcap", 2)
     scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam02": "y"})
-    (replayed,) = build_cameras(scenario, source_config(scenario), ["cam01"])
+    replayed = camera_of(scenario)
     location = Session(tmp_path / "a.mcap").frames["cam01"][0].depth_location
     with (tmp_path / "a.mcap").open("r+b") as file:
         file.seek(location.offset + location.size // 2)

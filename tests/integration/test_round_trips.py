@@ -58,16 +58,6 @@ def test_a_colmap_model_is_what_fit_starts_from(tmp_path):
     assert [v.camera for v in found.held_out] == ["view1.png"] and found.held_out[0].intrinsics == BENT
 
 
-def test_the_sets_own_split_can_be_held_out(tmp_path):
-    sets.write_eyeful(tmp_path, sets.rig(3))
-    found = load_recorded(tmp_path, holdout="split", name="eyeful")
-    assert {v.camera for v in found.held_out} == {"10/10_DSC0000", "10/10_DSC0001"}
-    assert len(found.training) == 4
-    sets.write_colmap(tmp_path / "c", sets.rig(3), "PINHOLE", True)
-    with pytest.raises(ValueError, match="does not say what it keeps for testing"):
-        load_recorded(tmp_path / "c", holdout="split")
-
-
 def test_trajectories_are_read_to_the_nanosecond(tmp_path):
     poses = [Pose.from_matrix(c.camera_to_world) for c in sets.rig(3)]
     rows = [(*pose.translation_m, *np.roll(pose.quaternion, -1)) for pose in poses]  # its quaternions are w-last
