@@ -17,7 +17,6 @@ from camera_node.settings import source_config
 from camera_node.sources.base import pixels
 from camera_node.synthetic.effects import load_effects
 from channel_emu.model.settings import channel_from_mapping
-from edge_server.experiments import compare
 from edge_server.experiments.virtual.simulate import main as simulate
 from edge_server.export import ExportError
 from edge_server.export.run_source import open_source
@@ -92,23 +91,6 @@ def test_a_source_that_raises_loses_those_frames_alone(folder, caplog):
     for status in node.status()["cameras"].values():
         assert status["captured"] > 2 and status["failed"] > 2
     assert len([line for line in caplog.messages if "KeyError('no such frame')" in line]) == 2
-
-
-def test_comparing_uses_them_in_worker_processes_and_sees_that_the_file_changed(folder, capsys, monkeypatch):
-    monkeypatch.setattr(compare, "LEAD_S", 0.4)
-    monkeypatch.chdir(folder)
-    words = ["mine.yaml", "all", "own.py:Youngest:1", "--seeds", "2", "--seconds", "0.4", "--jobs", "2"]
-    words += ["--results", "known.jsonl", "--json", "scores.json"]
-    assert compare.main(words) == 0
-    assert "own.py:Youngest:1" in capsys.readouterr().out
-    policies = json.loads(Path("scores.json").read_text())["policies"]
-    assert [found["views"][0] for name, found in policies.items() if "Youngest" in name] == [1.0]
-    known = len(Path("known.jsonl").read_text().splitlines())
-    assert compare.main(words) == 0 and len(Path("known.jsonl").read_text().splitlines()) == known
-    with Path("own.py").open("a") as file:
-        file.write("\n# another version\n")
-    assert compare.main(words) == 0
-    assert len(Path("known.jsonl").read_text().splitlines()) > known  # was computed anew
 
 
 def updates(folder, name: str) -> FieldUpdater:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,15 +31,13 @@ from tests.camera_node.depth_source import DepthSource
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 from tests.edge_server.fields_for_tests import TINY
 from tests.integration.peer import Peer
+from tests.integration.test_node_stream import run_while
 from tests.support import free_port
 
 pytest.importorskip("mcap", reason="MCAP is not installed (extra mcap)")
 
 from freshfield.session.reader import Session
 from freshfield.session.writer import SessionWriter
-
-EDGE = {"field": "ngp", "field_options": TINY, "update_ms": 100, "grace_ms": 500, "lpips": "none"}
-
 
 CAMERAS = {"count": 3, "held_out": ["cam00"]}
 
@@ -229,36 +226,25 @@ def test_depth_that_cannot_be_read_again_costs_only_the_depth(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_whole_edge_server_records_what_it_decides(tmp_path):
+async def test_a_whole_edge_server_records_what_it_decides(tmp_path):
     """Decisions, and their scores when these are known, beside the frames they were made on."""
-    played = photo_scenario(write_photos(tmp_path / "data", 24), 3, fps=25)
-    port = free_port()
-    top = {"name": "edge", "seed": 3, "cameras": CAMERAS, "edge": EDGE}
-    edge = parse(top, tmp_path / "e.yaml")
-    options = ServerOptions(f"127.0.0.1:{port}", tmp_path / "out", record=tmp_path / "b.mcap")
-    server = EdgeServer(edge, read_config(edge), options)
-    thread = threading.Thread(target=server.run)
-    thread.start()
+    field = {"field": "ngp", "field_options": TINY, "update_ms": 100, "grace_ms": 500, "lpips": "none"}
+    edge = parse({"name": "edge", "seed": 3, "cameras": CAMERAS, "edge": field}, tmp_path / "e.yaml")
+    address = f"127.0.0.1:{free_port()}"
+    server = EdgeServer(edge, read_config(edge), ServerOptions(address, tmp_path / "out", record=tmp_path / "b.mcap"))
+    running = asyncio.ensure_future(asyncio.to_thread(server.run))
 
-    async def scene() -> None:
-        node = node_of(played, f"127.0.0.1:{port}")
-        running = asyncio.ensure_future(node.run())
-        async with asyncio.timeout(90):
-            while not any(p.psnr_db is not None for p in server.state.publications()):
-                await asyncio.sleep(0.1)
-        node.stop()
-        await running
+    async def scored():
+        while not any(p.psnr_db is not None for p in server.state.publications()):
+            await asyncio.sleep(0.1)
 
-    try:
-        asyncio.run(scene())
-    finally:
-        server.stop()
-        thread.join(30)
-    status = json.loads((tmp_path / "out/edge.json").read_text())
-    found = Session(tmp_path / "b.mcap")
-    assert found.cut is None
-    assert status["recording"] == {"file": "b.mcap", "written": found.messages.total(), "dropped": 0, "failed": False}
+    await run_while(node_of(photo_scenario(write_photos(tmp_path / "data", 24), 3, fps=25), address), scored())
+    server.stop()
+    await running
+    status, found = json.loads((tmp_path / "out/edge.json").read_text()), Session(tmp_path / "b.mcap")
+    written = found.messages.total()
+    assert status["recording"] == {"file": "b.mcap", "written": written, "dropped": 0, "failed": False}
     delivered = {c["camera"]: c["delivered"] for c in status["cameras"]}
     assert {camera: len(frames) for camera, frames in found.frames.items()} == delivered
-    assert found.messages["/decisions"] == status["updates"]["count"]
+    assert found.cut is None and found.messages["/decisions"] == status["updates"]["count"]
     assert 0 < found.messages["/scores"] <= found.messages["/decisions"]

@@ -7,7 +7,6 @@ import pytest
 
 from camera_node.pose.providers import read_tum
 from camera_node.sources.datasets.formats import open_dataset
-from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.export import PosedImage
 from edge_server.export.colmap import Cloud, write_model
 from edge_server.export.images import write_images
@@ -47,15 +46,6 @@ def test_exports_read_back_to_the_pixel(tmp_path, form):
         there, back = (pixels(shot.camera_to_world, shot.intrinsics), pixels(record.camera_to_world, record.intrinsics))
         assert np.abs(there - back).max() < NEAR_PX
         np.testing.assert_array_equal(record.read(), shot.image)
-
-
-def test_a_colmap_model_is_what_fit_starts_from(tmp_path):
-    of = shots()
-    write_images(tmp_path / "images", of)
-    write_model(tmp_path / "sparse/0", of, Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 4), bool)))
-    found = load_recorded(tmp_path, holdout="view1")
-    assert [v.camera for v in found.training] == ["view0.png", "view2.png", "view3.png"]
-    assert [v.camera for v in found.held_out] == ["view1.png"] and found.held_out[0].intrinsics == BENT
 
 
 def test_trajectories_are_read_to_the_nanosecond(tmp_path):
