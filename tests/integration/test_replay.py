@@ -58,18 +58,18 @@ def node_of(scenario, to: str, cameras=None, seconds: float | None = None) -> No
     return Node(scenario, built, NodeOptions(to=to, transport=Transport(), seconds=seconds))
 
 
-def sent_by(
-    scenario, cameras=None, seconds: float | None = None, take=None, after_s: float = 0.0
-) -> list[pb.PushRequest]:
+def accepted(request: pb.PushRequest) -> pb.PushResponse:
+    return pb.PushResponse(sequence=request.header.sequence, outcome=pb.OUTCOME_ACCEPTED)
+
+
+def sent_by(scenario, cameras=None, seconds=None, take=accepted, after_s: float = 0.0) -> list[pb.PushRequest]:
     """What a node sends until it ends by itself (or after some seconds); ``take`` answers, after a while."""
     got: list[pb.PushRequest] = []
 
     async def respond(request: pb.PushRequest) -> pb.PushResponse:
         got.append(request)
         await asyncio.sleep(after_s)
-        if take is not None:
-            return take(request)
-        return pb.PushResponse(sequence=request.header.sequence, outcome=pb.OUTCOME_ACCEPTED)
+        return take(request)
 
     async def scene() -> None:
         peer = await Peer(respond=respond).start()
@@ -108,15 +108,6 @@ def said(request: pb.PushRequest) -> tuple:
     return (*parts, h.codec, h.width, h.height, h.role, h.pose_gap_ns, request.payload, depth)
 
 
-def test_everything_that_was_accepted_is_recorded(session):
-    file, sent = session
-    found = Session(file)
-    assert found.cut is None and len(sent) > 60
-    for camera, mine, _ in of_each_camera(sent, ()):
-        assert [f.header for f in found.frames[camera]] == [r.header for r in mine]
-        assert [found.payload(f) for f in found.frames[camera]] == [r.payload for r in mine]
-
-
 def of_each_camera(sent, got):
     """Messages sent and got, camera by camera."""
     for camera in ("cam00", "cam01", "cam02"):
@@ -126,7 +117,10 @@ def of_each_camera(sent, got):
 @pytest.mark.parametrize("after_s", [0.0, 0.05], ids=["quick answers", "answers slower than frames"])
 def test_replay_is_exact_to_the_message(session, after_s):
     file, sent = session
-    shifts = set()
+    shifts, found = set(), Session(file)
+    assert found.cut is None and len(sent) > 60
+    for camera, mine, _ in of_each_camera(sent, ()):
+        assert [f.header for f in found.frames[camera]] == [r.header for r in mine]
     for _, before, after in of_each_camera(sent, sent_by(replay_scenario(file), after_s=after_s)):
         assert [said(r) for r in after] == [said(r) for r in before]
         assert [r.header.sequence for r in after] == list(range(len(before)))
@@ -150,14 +144,12 @@ def test_a_cut_recording_replays_what_is_whole(session, tmp_path, caplog):
 def test_cameras_may_be_renamed_or_wrong(session, tmp_path):
     file, _ = session
     scenario = replay_scenario(file, assignment={"cam00": "cam00", "cam01": "cam02", "cam02": "cam01"})
-    camera, recorded = camera_of(scenario), Session(file)
-    assert camera.capture(0).payload == recorded.payload(recorded.frames["cam02"][0])
-    (tmp_path / "text.mcap").write_text("no recording")
+    recorded = Session(file)
+    assert camera_of(scenario).capture(0).payload == recorded.payload(recorded.frames["cam02"][0])
     SessionWriter(tmp_path / "empty.mcap", {}).close({})
     for wrong, why in (
         (replay_scenario(file, assignment={"cam01": "nobody"}), r"no camera 'nobody'.*cam00"),
         (replay_scenario(tmp_path / "no.mcap"), r"source\.file: .*does not exist"),
-        (replay_scenario(tmp_path / "text.mcap"), r"source\.file: .*is no MCAP file"),
         (replay_scenario(tmp_path / "empty.mcap"), "holds no frames"),
         (replay_scenario(file, effects={"sensor_noise": None}), "replayed as it was"),
     ):
@@ -222,7 +214,6 @@ def test_depth_that_cannot_be_read_again_costs_only_the_depth(tmp_path):
         file.write(b"\xff" * (location.size - location.size // 2))
     assert replayed.capture(0).payload == camera.capture(0).payload
     assert replayed.capture(0).encoded_depth is None and replayed.depth_failed == 1
-    assert replayed.capture(1) == camera.capture(1) and replayed.depth_failed == 1
 
 
 @pytest.mark.slow
