@@ -12,17 +12,12 @@ from __future__ import annotations
 import os
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from functools import partial, reduce
-from math import inf, nan
+from functools import partial
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from camera_node.capture import Camera
 from channel_emu.live.camera_stream import CREDITS
 from channel_emu.model.channel import Channel
-from channel_emu.model.faults.corruption import damage
 from channel_emu.model.link import Event, EventKind
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.settings import channel_from_mapping
@@ -34,11 +29,9 @@ from edge_server.live.field_updater import FieldUpdater, open_updater
 from edge_server.live.ingest import FrameAdmission
 from edge_server.scheduler import make_policy, parse_policy
 from edge_server.settings import read_config
-from freshfield.depth import DepthImage
-from freshfield.frame import Frame, FrameRejected, checksum, from_request, to_request, valid_id
+from freshfield.frame import Frame
 from freshfield.ledger import Ledger
-from freshfield.scenario import Scenario, seed_sequence
-from freshfield.v1 import frames_pb2 as pb
+from freshfield.scenario import Scenario
 from tests.chaos.fault_plan import ROLES, Fault
 
 # Period of a node's clock exchanges; until the next one it does not know of a step of its clock.
@@ -52,9 +45,9 @@ class ChaosDeployment(VirtualDeployment):
 
     Attributes:
     really: numbers of frames and copies by their outcome, with the names of ``FrameCounts``; refusals as
-        ``rejected:reason``, those of unknown origin as ``strangers``.
+        ``rejected:reason``.
     arrivals: instants of deliveries, by camera.
-    damaged_admitted: number of frames admitted although their checksum was wrong.
+    damaged_admitted: number of frames admitted although the network had damaged them.
     most_inside: largest number of frames inside a link.
     lines_lost: number of ledger lines lost to full disks.
     restarts: number of restarts, by role.
@@ -78,8 +71,6 @@ class ChaosDeployment(VirtualDeployment):
         self._waiting: dict[str, Frame] = {}  # at the node, while the emulator takes none
         self._upstream: deque[Event] = deque()  # sent to an edge that does not answer
         self._ledgers: dict[str, Ledger] = {}
-        self._rng = np.random.default_rng(seed_sequence(scenario.seed, "chaos", "hostile"))
-        self._attempts = 0
         config = channel_from_mapping(scenario.channel, f"{scenario.path}: channel", scenario.path.parent)
         self._config = config
         self.shared = config.server.shared
@@ -200,62 +191,6 @@ class ChaosDeployment(VirtualDeployment):
     def _do_checkpoint(self, fault: Fault) -> None:
         if "edge" not in self._down | self._stalled:
             checkpoint.save(self._checkpoint, self.updates.field.state(), durable=False)
-
-    def _do_hostile(self, fault: Fault) -> None:
-        """Send messages to the edge that come from no node of this deployment."""
-        if "edge" in self._down | self._stalled:
-            return
-        for _ in range(round(fault.value)):
-            request = self._garble()
-            header = request.header
-            try:
-                reason = self._deliver(from_request(request), ())
-                self.damaged_admitted += not reason and checksum(request) != request.crc32c
-            except FrameRejected as error:
-                reason = error.reason
-                self.rejected[reason] += 1
-            camera, session = (i if valid_id(i) else "?" for i in (header.camera_id, header.session_id))
-            self._write("edge", "rejected" if reason else "delivered", camera, session, header.sequence, reason or "")
-            if reason and (session == "?" or camera not in self._cameras):
-                self.really["strangers"] += 1
-            else:
-                self.really.update(("captured", "sent", f"rejected:{reason}" if reason else "delivered"))
-
-    def _garble(self) -> pb.PushRequest:
-        """A message with one to three invalid fields; its checksum is right most of the time."""
-        rng, cameras = self._rng, list(self._cameras)
-        camera = self._cameras[cameras[rng.integers(len(cameras))]]
-        shot, now_ns = camera.capture(0), self.clock.now_ns()
-        self._attempts += 1
-        lens, data = shot.intrinsics, shot.payload
-        depth = DepthImage(np.full((lens.height, lens.width), 2000, np.uint16), 0.001).encode()
-        sequence = 2**40 + self._attempts
-        frame = Frame(camera.name, "hostile", sequence, now_ns, shot.pose, lens, camera.codec, data, depth=depth)
-        request = to_request(frame)
-        wrong: list[tuple[str, list[Any]]] = [
-            ("header.camera_id", ["mars", "../etc", "", "a" * 65, "cam01\t"]),
-            ("header.session_id", ["a\nb", "", "x" * 1000]),
-            ("header.generated_ns", [now_ns + 10**10, now_ns - 2 * 3600 * 10**9, -(2**63), 2**63 - 1]),
-            ("header.clock_offset_ns", [10**9, -(2**63), 2**63 - 1]),
-            ("header.clock_uncertainty_ns", [-1, 2**63 - 1]),
-            ("header.codec", [-1, 0, 99]),
-            ("header.role", [-7, 0, 2]),
-            ("header.width", [0, 33, 2**31 - 1]),
-            ("header.pose.qw", [0.0, nan, 1e300, 5e-324]),
-            ("header.pose.tx_m", [1e7, -inf, 3.0]),
-            ("header.intrinsics.fx", [0.0, 1e9, nan, lens.fx + 1.0]),
-            ("depth.width", [0, lens.width + 1]),
-            ("depth.meters_per_count", [0.0, nan, 0.002]),
-            ("depth.payload", [b"", depth.payload[:-5], data, rng.bytes(200)]),
-            ("payload", [b"", data[: len(data) // 2], rng.bytes(200), damage(data, ((0.5, 255), (0.9, 255)))]),
-        ]
-        for k in rng.permutation(len(wrong))[: rng.integers(1, 4)]:
-            path, values = wrong[k]
-            *parents, name = path.split(".")
-            setattr(reduce(getattr, parents, request), name, values[rng.integers(len(values))])
-        if rng.random() < 0.8:
-            request.crc32c = checksum(request)
-        return request
 
     # --- what a frame meets ---------------------------------------------------------------------------
 

@@ -27,12 +27,10 @@ _SMALL = {"gaussians": 300, "start": 200, "seed_cells": 12}
 class Fault:
     """A fault.
 
-    kind: of a process: crash, stall, full_disk; of a camera: away, clock_step; of the edge:
-        hostile, policy, checkpoint.
+    kind: of a process: crash, stall, full_disk; of a camera: away, clock_step; of the edge: policy, checkpoint.
     at_ms: when it begins. for_ms: how long it lasts; 0 for an instantaneous one.
     target: the process, the camera, or the new policy.
-    value: of crash, whether an edge resumes its last checkpoint; of clock_step, ms;
-        of hostile, the number of messages.
+    value: of crash, whether an edge resumes its last checkpoint; of clock_step, ms.
     """
 
     number: int
@@ -92,7 +90,7 @@ def draw_faults(seed: int, cameras: tuple[str, ...]) -> tuple[Fault, ...]:
 
 
 def _draw(rng: np.random.Generator, number: int, at_ms: float, cameras: tuple[str, ...]) -> Fault:
-    kinds = ["crash", "stall", "full_disk", "away", "clock_step", "hostile", "policy", "checkpoint"]
+    kinds = ["crash", "stall", "full_disk", "away", "clock_step", "policy", "checkpoint"]
     kind, value, target = str(rng.choice(kinds)), 0.0, ""
     for_ms = float(rng.uniform(20.0, 1e3 * (FAULTS_OVER_S - _FAULTS_BEGIN_S[1])))
     if kind in ("crash", "stall", "full_disk"):
@@ -100,8 +98,6 @@ def _draw(rng: np.random.Generator, number: int, at_ms: float, cameras: tuple[st
     elif kind in ("away", "clock_step"):
         target = str(rng.choice(cameras))
         value = round(float(rng.uniform(-500.0, 500.0)), 3) if kind == "clock_step" else 0.0
-    elif kind == "hostile":
-        value = float(rng.integers(1, 40))
     elif kind == "policy":
         target = str(rng.choice(POLICIES))
     lasts = kind in ("crash", "stall", "full_disk", "away")

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from edge_server.report import frame_accounting
-from freshfield.frame import checksum, from_request
-from tests.chaos import chaos_deployment, seeds
+from tests.chaos import seeds
 from tests.chaos.chaos_deployment import ChaosDeployment
 from tests.chaos.fault_plan import FAULTS_OVER_S, Fault, draw_faults, scenario_of
 
@@ -32,7 +31,7 @@ def faults(request: pytest.FixtureRequest) -> list[int] | None:
 def test_a_seed_holds(seed: int, faults: list[int] | None) -> None:
     found = seeds.run_seed(seed, faults)
     assert found["problems"] == [], "\n".join(found["faults"])  # --faults 0,3 runs some of them
-    assert found["counts"]["delivered"] > 20
+    assert found["delivered"] > 20
 
 
 def test_seeds_draw_every_kind_of_fault_and_all_are_over_in_time() -> None:
@@ -56,12 +55,11 @@ def run(tmp_path: Path, faults: tuple[Fault, ...], seed: int = 11) -> ChaosDeplo
     return deployment
 
 
-def test_what_a_crashed_process_held_and_what_strangers_sent_is_accounted_for(tmp_path: Path) -> None:
-    deployment = run(tmp_path, (*CRASHES, Fault(3, "hostile", 600.0, value=300.0)))
+def test_what_a_crashed_process_held_is_gone_and_accounted_for(tmp_path: Path) -> None:
+    deployment = run(tmp_path, CRASHES)
     assert deployment.restarts == {"node": 1, "emulator": 1, "edge": 1}
     assert {f.session for f in deployment.updates.buffer.newest().values()} == {"restart-1"}
     assert deployment.really["broken"] > 0, "the edge was away"
-    assert len(deployment.rejected) >= 8 and deployment.really["strangers"] > 20
     assert list(seeds.accounting(deployment, frame_accounting.account_frames(tmp_path))) == []
 
 
@@ -81,27 +79,10 @@ def forget_kills(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(frame_accounting, "_cut_off_ends", lambda ledgers: [])
 
 
-def check_no_checksum(patch: pytest.MonkeyPatch) -> None:
-    """Whatever arrives is given the checksum that it should have."""
-
-    def repaired(request):
-        kept, request.crc32c = request.crc32c, checksum(request)
-        try:
-            return from_request(request)
-        finally:
-            request.crc32c = kept
-
-    patch.setattr(chaos_deployment, "from_request", repaired)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("broken", "fault", "says"),
-    [
-        (lose_a_line, Fault(0, "away", 500.0, 100.0, "cam01"), "off by"),
-        (forget_kills, CRASHES[1], "in no ledger"),
-        (check_no_checksum, Fault(0, "hostile", 600.0, value=300.0), "with a wrong checksum were taken in"),
-    ],
+    [(lose_a_line, Fault(0, "away", 500.0, 100.0, "cam01"), "off by"), (forget_kills, CRASHES[1], "in no ledger")],
     ids=lambda value: getattr(value, "__name__", ""),
 )
 def test_what_is_broken_is_found(broken, fault: Fault, says: str, tmp_path: Path, monkeypatch) -> None:
