@@ -52,19 +52,10 @@ def test_it_is_lossless(size, seed, most, holes):
 
 
 @pytest.mark.stability
-@pytest.mark.parametrize(
-    "counts",
-    [
-        np.zeros((30, 40)),
-        np.full((30, 40), 65535),
-        np.tile([1, 32768, 65535, 0], (30, 10)),  # the largest differences of either sign
-        np.arange(65536).reshape(256, 256),  # every count: no table
-        [[7]],
-    ],
-    ids=["all holes", "all at the end", "extremes", "every count", "one pixel"],
-)
-def test_extreme_counts_come_back(counts):
-    np.testing.assert_array_equal(image(counts).encode().decode().counts, counts)
+def test_extreme_counts_come_back():
+    """The largest differences of either sign, and every count, which leaves no room for a table."""
+    for counts in (np.tile([1, 32768, 65535, 0], (30, 10)), np.arange(65536).reshape(256, 256)):
+        np.testing.assert_array_equal(image(counts).encode().decode().counts, counts)
 
 
 def test_steps_of_disparity_take_half_the_bytes_of_a_png():
@@ -78,9 +69,6 @@ def test_other_arrays_are_no_depth():
             DepthImage(bad, 0.001).encode()
     with pytest.raises(PayloadError, match="with a lens of"):
         image(np.zeros((4, 4)), intrinsics=LENS).encode()
-
-
-# --- what is refused before anything is decompressed -------------------------------------------
 
 
 def zstd(size: int, value: bytes = b"\0") -> bytes:
@@ -129,9 +117,6 @@ def test_registered_depth_may_be_smaller_but_not_of_another_shape():
     replace(GOOD, intrinsics=LENS).check(Pinhole.from_fov(40, 40, 60.0), 1)  # of a lens of its own
 
 
-# --- what passes and is damaged ----------------------------------------------------------------
-
-
 def packed(*words: int, side: int = 4) -> EncodedDepth:
     """A payload of given words and zeros: a table, then the pixels of a square."""
     planes = np.array(words, "<u2").view(np.uint8).reshape(-1, 2).T.tobytes()
@@ -149,18 +134,3 @@ def test_counts_outside_the_table_are_undecodable(depth):
     with pytest.raises(PayloadError) as error:
         depth.decode()
     assert error.value.reason == "undecodable"
-
-
-@pytest.mark.stability
-@given(data=st.binary(max_size=200), at=st.integers(0, 10**6), cut=st.integers(0, 10**6))
-def test_damaged_bytes_are_decoded_to_counts_or_refused(data, at, cut):
-    whole = GOOD.payload
-    at, cut = at % len(whole), cut % len(whole)
-    for payload in (data, whole[:at] + data + whole[at + len(data) :], whole[:cut]):
-        depth = replace(GOOD, payload=payload)
-        try:
-            depth.check(LENS, 1)
-            counts = depth.decode().counts
-        except PayloadError:
-            continue
-        assert counts.shape == (30, 40) and counts.dtype == np.uint16

@@ -18,8 +18,6 @@ from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_PAYLOAD_BYTES
 from freshfield.payload import CODECS, PayloadError, check, decode, encode
 from tests.support import MOST_MS, work_ms
 
-# --- what is encoded comes back ----------------------------------------------------------------
-
 sizes = st.tuples(st.integers(1, 40), st.integers(1, 40))
 
 
@@ -62,36 +60,29 @@ def test_exif_orientation_does_not_turn_pixels():
     np.testing.assert_array_equal(decode(marked, "jpeg", 64, 48), decode(JPEG, "jpeg", 64, 48))
 
 
-@pytest.mark.parametrize(
-    ("image", "codec", "reason"),
-    [
-        (np.zeros((4, 4, 3), np.float32), "png", "bad_image"),
-        (np.zeros((4, 4), np.uint8), "png", "bad_image"),
-        (np.zeros((1, MAX_IMAGE_SIDE_PX + 1, 3), np.uint8), "png", "too_large"),
-        (np.zeros((0, 4, 3), np.uint8), "zstd", "too_large"),
-        (np.zeros((4, 4, 3), np.uint8), "webp", "unknown_codec"),
-    ],
-)
-def test_what_cannot_be_sent_is_refused(image, codec, reason):
-    with pytest.raises(PayloadError) as error:
-        encode(image, codec)
-    assert error.value.reason == reason
-
-
-# --- hostile input ---------------------------------------------------------------------------
+def test_what_cannot_be_sent_is_refused():
+    side = MAX_IMAGE_SIDE_PX + 1
+    for shape, dtype, codec, reason in (
+        ((4, 4, 3), np.float32, "png", "bad_image"),
+        ((4, 4), np.uint8, "png", "bad_image"),
+        ((1, side, 3), np.uint8, "png", "too_large"),
+        ((0, 4, 3), np.uint8, "zstd", "too_large"),
+        ((4, 4, 3), np.uint8, "webp", "unknown_codec"),
+    ):
+        with pytest.raises(PayloadError) as error:
+            encode(np.zeros(shape, dtype), codec)
+        assert error.value.reason == reason
 
 
 def chunk(name: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
-def png(
-    width: int, height: int, depth: int = 8, kind: int = 2, rows: bytes | None = None, interlaced: int = 0
-) -> bytes:
+def png(width: int, height: int, depth: int = 8, kind: int = 2, rows: bytes = bytes(1000), interlaced: int = 0):
     """A PNG with any header, well-formed or not."""
-    data = zlib.compress(rows if rows is not None else b"\0" * 1000)
     header = struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, interlaced)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
 def forge_jpeg(data: bytes, width: int, height: int) -> bytes:
@@ -170,17 +161,6 @@ def test_a_progressive_jpeg_and_one_with_fill_bytes_are_welcome():
     assert decode(PROGRESSIVE, "jpeg", 64, 48).shape == (48, 64, 3)
     padded = JPEG[:2] + b"\xff\xff" + JPEG[2:]
     np.testing.assert_array_equal(decode(padded, "jpeg", 64, 48), decode(JPEG, "jpeg", 64, 48))
-
-
-def test_a_bomb_of_the_announced_size_is_bounded():
-    """The worst that passes the headers: the largest image there may be, from a few kilobytes."""
-    side = MAX_IMAGE_SIDE_PX
-    row = b"\0" + bytes(side * 3)
-    data = png(side, side, rows=row * side)
-    assert len(data) < 200_000
-    assert decode(data, "png", side, side).shape == (side, side, 3)
-    squeezed = zstandard.ZstdCompressor(level=19).compress(bytes(side * side * 3))
-    assert decode(squeezed, "zstd", side, side).nbytes == side * side * 3
 
 
 def test_only_what_the_pixels_of_a_png_need_is_inflated():

@@ -11,17 +11,7 @@ from freshfield.session import SessionError
 from tests.fuzz.targets import MOST_FILE_MS, MOST_MS, TARGETS, seeds
 from tests.support import work_ms
 
-HONEST = {
-    "request": 3,
-    "header": 2,
-    "payload": 3,
-    "depth": 2,
-    "scenario": 15,
-    "checkpoint": 1,
-    "mcap": 1,
-    "colmap": 2,
-    "transforms": 2,
-}
+HONEST = {"request": 3, "header": 2, "payload": 3, "depth": 2, "scenario": 15, "checkpoint": 1, "mcap": 1}
 ACCEPTED = ("accepted", "read", "jpeg", "png", "zstd", "depth", "2 cameras")
 
 
