@@ -40,11 +40,6 @@ class Fault:
     target: str = ""
     value: float = 0.0
 
-    def __str__(self) -> str:
-        lasts = f" for {self.for_ms:.0f} ms" if self.for_ms else ""
-        value = f" ({self.value:g})" if self.value else ""
-        return f"{self.number}: {self.kind} {self.target}{value} at {self.at_ms:.0f} ms{lasts}"
-
 
 def scenario_of(seed: int) -> Scenario:
     """A small deployment: four cameras, and a channel, a field and a policy that the seed chooses."""

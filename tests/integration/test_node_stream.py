@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import logging
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +18,6 @@ from freshfield import ledger, payload
 from freshfield.clock import WallClock
 from freshfield.limits import MAX_CAPTURE_AGE_NS
 from freshfield.transport import Transport
-from freshfield.v1 import frames_pb2 as pb
 from tests.camera_node.sources.datasets.photos import photo_scenario, picture, write_photos
 from tests.integration.peer import Peer, answer, silence, wrong_number
 
@@ -117,23 +115,6 @@ def test_a_slow_peer_gets_the_newest_frame_and_never_two(tmp_path):
     # What was sent had been captured just then, not when the last answer was awaited.
     late_ms = [(a - f.generated_edge_ns) / 1e6 for a, f in zip(peer.arrived_ns, peer.frames)]
     assert np.median(late_ms) < 120
-
-
-@pytest.mark.parametrize(
-    ("outcome", "reason", "expected"),
-    [(pb.OUTCOME_DROPPED_BUSY, "", "dropped_busy"), (pb.OUTCOME_REJECTED, "tab\tand\nnewline", "rejected:unspecified")],
-)
-def test_refusals_are_counted_and_said_once(tmp_path, caplog, outcome, reason, expected):
-    with caplog.at_level(logging.INFO, "camera-node"):
-        node = run_against(Peer(respond=answer(outcome, reason)), tmp_path, frames=20, cameras=2)
-    check_books(tmp_path / "out")
-    (file,) = ledger.read_all(tmp_path / "out")
-    details = {e.detail for e in file.events if e.event == "answered"}
-    assert details == {expected} and not file.torn
-    for name, outbox in node.outboxes.items():
-        assert outbox.counts[expected] >= 8
-        said = [r for r in caplog.records if r.getMessage().startswith(f"{name}: frame refused")]
-        assert len(said) == (1 if expected.startswith("rejected") else 0)
 
 
 @pytest.mark.parametrize("respond", [silence, wrong_number])
