@@ -14,6 +14,7 @@ from freshfield.frame import FrameRejected
 from freshfield.streams import ServedCall, SessionStreams
 from freshfield.transport import Transport
 from freshfield.v1 import channel_pb2, clock_pb2, edge_pb2, frames_pb2
+from tests.freshfield.serving import serving
 from tests.role_table import TOKENS, cells_of
 
 HEALTH = "/grpc.health.v1.Health/Check"
@@ -54,7 +55,7 @@ class Every(grpc.GenericRpcHandler):
 async def outcome(port: int, method: str, token: str | None, message: bytes = b"") -> str:
     """The status of a call, or the answer to a camera's frame."""
     metadata = (("authorization", f"Bearer {token}"),) if token else ()
-    async with Transport().aio_channel(f"127.0.0.1:{port}") as channel:
+    async with Transport().aio_channel(f"localhost:{port}") as channel:
         try:
             if not method.endswith(STREAMS):
                 await channel.unary_unary(method)(b"", metadata=metadata, timeout=5)
@@ -74,15 +75,8 @@ def asked(*calls: tuple) -> list[str]:
     """The outcomes of calls at a server with the tokens of the table."""
 
     async def scene() -> list[str]:
-        transport = Transport(tokens=TOKENS)
-        server = transport.aio_server()
-        server.add_generic_rpc_handlers((Every(),))
-        port = transport.bind(server, "127.0.0.1:0")
-        await server.start()
-        try:
+        async with serving(Transport(tokens=TOKENS), Every()) as port:
             return [await outcome(port, *call) for call in calls]
-        finally:
-            await server.stop(None)
 
     return asyncio.run(scene())
 

@@ -14,8 +14,9 @@ from freshfield import streams as served
 from freshfield.access import ANYBODY
 from freshfield.frame import FrameRejected
 from freshfield.limits import MAX_SESSIONS_PER_CAMERA, SESSION_IDLE_NS
-from freshfield.streams import OpenStreams, SessionStreams, serve_health
+from freshfield.streams import OpenStreams, SessionStreams
 from freshfield.transport import Transport
+from tests.freshfield.serving import serving
 
 
 @asynccontextmanager
@@ -45,14 +46,11 @@ async def echoing(streams: OpenStreams):
         "Echo": grpc.stream_stream_rpc_method_handler(answer),
         "Pour": grpc.unary_stream_rpc_method_handler(pour),
     }
-    server = Transport().aio_server()
-    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("t", handler),))
-    await serve_health(server, ())
-    port = Transport().bind(server, "127.0.0.1:0")
-    await server.start()
-    async with Transport().aio_channel(f"127.0.0.1:{port}") as channel:
+    async with (
+        serving(Transport(), grpc.method_handlers_generic_handler("t", handler), health=True) as port,
+        Transport().aio_channel(f"localhost:{port}") as channel,
+    ):
         yield channel
-    await server.stop(None)
 
 
 async def opened(channel, say: bytes | None = None):

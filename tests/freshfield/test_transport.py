@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import dataclasses
 import shutil
 import subprocess
-from contextlib import asynccontextmanager
 from pathlib import Path
 
 import grpc
@@ -18,66 +18,59 @@ import pytest
 from freshfield import transport
 from freshfield.limits import MAX_PAYLOAD_BYTES
 from freshfield.transport import Transport, TransportError, host_port, peer_text
-from freshfield.v1 import clock_pb2, clock_pb2_grpc, frames_pb2_grpc
-from freshfield.v1 import frames_pb2 as pb
+from tests.freshfield.serving import serving
+
+CLOCK, FRAMES = "freshfield.v1.ClockService", "freshfield.v1.FrameStreamService"
 
 
-class Clock(clock_pb2_grpc.ClockServiceServicer):
-    async def Exchange(self, request, context):
-        return clock_pb2.ExchangeResponse(client_sent_ns=request.client_sent_ns)
+async def echo(request, context):
+    return request
 
 
-class Frames(frames_pb2_grpc.FrameStreamServiceServicer):
-    async def Push(self, request_iterator, context):
-        async for request in request_iterator:
-            yield pb.PushResponse(sequence=len(request.payload))
+async def sizes(_, context):
+    while (message := await context.read()) is not grpc.aio.EOF:
+        await context.write(str(len(message)).encode())
 
 
-@asynccontextmanager
-async def serving(transport: Transport, frames: frames_pb2_grpc.FrameStreamServiceServicer | None = None):
-    """A server of both services; gives its port."""
-    server = transport.aio_server()
-    clock_pb2_grpc.add_ClockServiceServicer_to_server(Clock(), server)
-    frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(frames or Frames(), server)
-    port = transport.bind(server, "localhost:0")
-    await server.start()
-    try:
-        yield port
-    finally:
-        await server.stop(None)
+async def nothing(_, context):
+    await asyncio.sleep(30)
 
 
-async def ask(transport: Transport, port: int) -> int:
+def handlers(push=sizes) -> list[grpc.GenericRpcHandler]:
+    """Of a service that echoes, and of one that answers each message with its size."""
+    exchange, stream = grpc.unary_unary_rpc_method_handler(echo), grpc.stream_stream_rpc_method_handler(push)
+    return [
+        grpc.method_handlers_generic_handler(CLOCK, {"Exchange": exchange}),
+        grpc.method_handlers_generic_handler(FRAMES, {"Push": stream}),
+    ]
+
+
+async def ask(transport: Transport, port: int) -> bytes:
     async with transport.aio_channel(f"localhost:{port}") as channel:
-        call = clock_pb2_grpc.ClockServiceStub(channel).Exchange(
-            clock_pb2.ExchangeRequest(client_sent_ns=42), metadata=transport.metadata(), timeout=5
-        )
-        return (await call).client_sent_ns
+        return await channel.unary_unary(f"/{CLOCK}/Exchange")(b"42", metadata=transport.metadata(), timeout=5)
 
 
-async def push(transport: Transport, port: int, size: int) -> int:
-    async with transport.aio_channel(f"localhost:{port}") as channel:
-        call = frames_pb2_grpc.FrameStreamServiceStub(channel).Push(metadata=transport.metadata(), timeout=20)
-        await call.write(pb.PushRequest(payload=bytes(size)))
-        return (await call.read()).sequence
+async def push(channel: grpc.aio.Channel, size: int) -> int:
+    call = channel.stream_stream(f"/{FRAMES}/Push")(timeout=20)
+    await call.write(bytes(size))
+    return int(await call.read())
 
 
 async def test_plain_text_and_messages_up_to_the_limit():
     """Larger ones are refused by who sends them, and where that is a stranger by the server, which lives on."""
+    unbounded = [("grpc.max_send_message_length", -1)]
     async with (
-        serving(Transport()) as port,
-        grpc.aio.insecure_channel(f"localhost:{port}", options=[("grpc.max_send_message_length", -1)]) as of_stranger,
+        serving(Transport(), *handlers()) as port,
+        Transport().aio_channel(f"localhost:{port}") as channel,
+        grpc.aio.insecure_channel(f"localhost:{port}", options=unbounded) as of_stranger,
     ):
-        assert await ask(Transport(), port) == 42
-        assert await push(Transport(), port, MAX_PAYLOAD_BYTES) == MAX_PAYLOAD_BYTES
+        assert await push(channel, MAX_PAYLOAD_BYTES) == MAX_PAYLOAD_BYTES
         with pytest.raises(grpc.aio.AioRpcError):
-            await push(Transport(), port, MAX_PAYLOAD_BYTES + 8192)
-        call = frames_pb2_grpc.FrameStreamServiceStub(of_stranger).Push(timeout=20)
-        await call.write(pb.PushRequest(payload=bytes(4 * MAX_PAYLOAD_BYTES)))
+            await push(channel, MAX_PAYLOAD_BYTES + 8192)
         with pytest.raises(grpc.aio.AioRpcError) as refused:
-            await call.read()
+            await push(of_stranger, 4 * MAX_PAYLOAD_BYTES)
         assert refused.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
-        assert await ask(Transport(), port) == 42
+        assert await ask(Transport(), port) == b"42"
 
 
 RIGHT = Transport(tokens={"camera:*": "right"})
@@ -129,12 +122,12 @@ async def test_tls_and_mutual_tls(pem):
             await ask(client, port)
         return error.value.code().name
 
-    async with serving(server_tls) as port:
-        assert await ask(trusting, port) == 42
+    async with serving(server_tls, *handlers()) as port:
+        assert await ask(trusting, port) == b"42"
         for client in (deceived, Transport()):
             assert await refusal(client, port) == "UNAVAILABLE"
-    async with serving(mutual) as port:
-        assert await ask(known, port) == 42
+    async with serving(mutual, *handlers()) as port:
+        assert await ask(known, port) == b"42"
         assert await refusal(trusting, port) == "UNAVAILABLE"
         assert await refusal(mutual, port) == "UNAUTHENTICATED", "its name is no caller's"
         wrong_token = dataclasses.replace(known, tokens={"": "wrong"})
@@ -159,7 +152,7 @@ async def test_connections_are_few_and_those_that_do_nothing_end(encrypted, pem,
         while await reader.read(4096):
             pass
 
-    async with serving(tls) as port:
+    async with serving(tls, *handlers()) as port:
         kept = [await asyncio.open_connection("localhost", port) for _ in range(4)]
         if not encrypted:
             for reader, writer in kept:
@@ -169,7 +162,7 @@ async def test_connections_are_few_and_those_that_do_nothing_end(encrypted, pem,
         surplus = [await asyncio.open_connection("localhost", port) for _ in range(20)]
         assert await asyncio.wait_for(asyncio.gather(*(r.read(1) for r, _ in surplus)), 5.0) == [b""] * 20
         await asyncio.wait_for(asyncio.gather(*(ended(reader) for reader, _ in kept)), 10.0)
-        assert await ask(caller, port) == 42
+        assert await ask(caller, port) == b"42"
         for _, writer in kept + surplus:
             writer.close()
 
@@ -232,21 +225,15 @@ def test_options_become_a_transport(pem, tmp_path):
 async def test_a_slow_reader_is_felt_at_once():
     """bdp_probe=0: a client cannot bury a stalled reader under megabytes of frames, which are age."""
 
-    class Stalled(frames_pb2_grpc.FrameStreamServiceServicer):
-        async def Push(self, request_iterator, context):
-            await asyncio.sleep(30)
-            yield pb.PushResponse()
-
     written = 0
-    async with serving(Transport(), Stalled()) as port, Transport().aio_channel(f"localhost:{port}") as channel:
-        call = frames_pb2_grpc.FrameStreamServiceStub(channel).Push()
-        try:
+    plain = Transport()
+    async with serving(plain, *handlers(nothing)) as port, plain.aio_channel(f"localhost:{port}") as channel:
+        call = channel.stream_stream(f"/{FRAMES}/Push")()
+        with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(2):
                 while written < 100:
-                    await call.write(pb.PushRequest(payload=bytes(100_000)))
+                    await call.write(bytes(100_000))
                     written += 1
-        except TimeoutError:
-            pass
         call.cancel()
     assert written < 20
 
