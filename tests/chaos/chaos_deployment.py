@@ -1,15 +1,13 @@
-"""A deployment in virtual time whose processes crash, stall and lose their disks; each writes its ledger.
+"""A deployment in virtual time whose processes crash and stall; each writes its ledger.
 
 A crash loses the state of the process. Node: captures and the waiting frame. Emulator: links and the frames
 inside them. Edge: buffer, sessions, policy, decisions and what the field has learned since its last
 checkpoint. Each event of a frame is written to the ledger of the process that would write it live, and
-counted in ``really`` even if that process cannot write, so that the ledgers' accounting can be compared with
-what really happened.
+counted in ``really``, so that the ledgers' accounting can be compared with what really happened.
 """
 
 from __future__ import annotations
 
-import os
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -49,7 +47,6 @@ class ChaosDeployment(VirtualDeployment):
     arrivals: instants of deliveries, by camera.
     damaged_admitted: number of frames admitted although the network had damaged them.
     most_inside: largest number of frames inside a link.
-    lines_lost: number of ledger lines lost to full disks.
     restarts: number of restarts, by role.
     """
 
@@ -59,7 +56,7 @@ class ChaosDeployment(VirtualDeployment):
         self.scenario = scenario
         self.really: Counter[str] = Counter()
         self.arrivals: dict[str, list[int]] = {camera.name: [] for camera in cameras}
-        self.most_inside = self.lines_lost = self.damaged_admitted = 0
+        self.most_inside = self.damaged_admitted = 0
         self.restarts: Counter[str] = Counter()
         self._out, self._checkpoint = out, out / "field.npz"
         self._down: set[str] = set()
@@ -92,7 +89,6 @@ class ChaosDeployment(VirtualDeployment):
             self._break_upstream()
         for ledger in self._ledgers.values():
             ledger.close(now_ns)
-            self.lines_lost += ledger.lines_lost
 
     # --- faults ---------------------------------------------------------------------------------------
 
@@ -104,9 +100,7 @@ class ChaosDeployment(VirtualDeployment):
         self._down.add(role)
         self._stalled.discard(role)
         self._stands_until_ns[role] = 0
-        ledger = self._ledgers.pop(role)
-        ledger._lines.close()  # without the line ``closed``
-        self.lines_lost += ledger.lines_lost
+        self._ledgers.pop(role)._lines.close()  # without the line ``closed``
         if role == "node":
             self.really["waiting"] += len(self._waiting)
             self._waiting.clear()
@@ -158,22 +152,6 @@ class ChaosDeployment(VirtualDeployment):
         self._send_waiting()
         while role == "edge" and self._upstream and role not in self._stalled:
             self._arrive(self._upstream.popleft())
-
-    def _do_full_disk(self, fault: Fault) -> None:
-        """Every write to a process's ledger fails for a while."""
-        if fault.target in self._down:
-            return
-        lines = self._ledgers[fault.target]._lines
-        kept, full = os.dup(lines._fd), os.open("/dev/full", os.O_WRONLY)
-        os.dup2(full, lines._fd)
-        os.close(full)
-
-        def space_again() -> None:
-            if lines._fd >= 0:  # the process lives
-                os.dup2(kept, lines._fd)
-            os.close(kept)
-
-        self._after(fault, space_again)
 
     def _do_away(self, fault: Fault) -> None:
         """A camera is unplugged for a while."""

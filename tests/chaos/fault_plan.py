@@ -27,7 +27,7 @@ _SMALL = {"gaussians": 300, "start": 200, "seed_cells": 12}
 class Fault:
     """A fault.
 
-    kind: of a process: crash, stall, full_disk; of a camera: away, clock_step; of the edge: policy, checkpoint.
+    kind: of a process: crash, stall; of a camera: away, clock_step; of the edge: policy, checkpoint.
     at_ms: when it begins. for_ms: how long it lasts; 0 for an instantaneous one.
     target: the process, the camera, or the new policy.
     value: of crash, whether an edge resumes its last checkpoint; of clock_step, ms.
@@ -85,15 +85,15 @@ def draw_faults(seed: int, cameras: tuple[str, ...]) -> tuple[Fault, ...]:
 
 
 def _draw(rng: np.random.Generator, number: int, at_ms: float, cameras: tuple[str, ...]) -> Fault:
-    kinds = ["crash", "stall", "full_disk", "away", "clock_step", "policy", "checkpoint"]
+    kinds = ["crash", "stall", "away", "clock_step", "policy", "checkpoint"]
     kind, value, target = str(rng.choice(kinds)), 0.0, ""
     for_ms = float(rng.uniform(20.0, 1e3 * (FAULTS_OVER_S - _FAULTS_BEGIN_S[1])))
-    if kind in ("crash", "stall", "full_disk"):
+    if kind in ("crash", "stall"):
         target, value = str(rng.choice(ROLES)), float(kind == "crash" and rng.random() < 0.7)
     elif kind in ("away", "clock_step"):
         target = str(rng.choice(cameras))
         value = round(float(rng.uniform(-500.0, 500.0)), 3) if kind == "clock_step" else 0.0
     elif kind == "policy":
         target = str(rng.choice(POLICIES))
-    lasts = kind in ("crash", "stall", "full_disk", "away")
+    lasts = kind in ("crash", "stall", "away")
     return Fault(number, kind, at_ms, for_ms if lasts else 0.0, target, value)
