@@ -29,9 +29,6 @@ STUDY ?=
 SEED ?= 1
 COUNT ?= 200
 
-# Option of `make pythons`: versions, or files of interpreters.
-PYTHONS ?= 3.12 3.13
-
 # Options of `make images`: docker or podman, and more for its build, such as --build-arg TORCH=cpu.
 ENGINE ?= docker
 BUILD ?=
@@ -62,7 +59,7 @@ endef
 BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrome 2>/dev/null))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test docs lint format types bench figures mutants pythons proto proto-check lock images clean
+.PHONY: help demo test docs lint format types figures mutants proto proto-check lock images clean
 
 help:  ## what there is to make
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 22
@@ -98,10 +95,6 @@ types: .venv/.ok-test  ## mypy
 	$(PY) -m mypy
 	MYPYPATH=proto:deploy $(PY) -m mypy deploy/freshfield_up
 
-bench: .venv/.ok-test  ## what a frame costs emulator and ingest, by the number of cameras: runs/bench.json
-	@mkdir -p runs
-	$(PY) -m tests.tools.scale --json runs/bench.json
-
 figures: .venv/.ok-test  ## the thesis's figures, hours to days: docs/results/thesis; DATA=FOLDER JOBS=2 STUDY=--quick
 	for name in $(FIGURES); do \
 	  $(if $(DATA),FRESHFIELD_DATA=$(DATA)) .venv/bin/edge-server study $$name --out runs/figures \
@@ -112,10 +105,6 @@ figures: .venv/.ok-test  ## the thesis's figures, hours to days: docs/results/th
 
 mutants: .venv/.ok-test  ## careless edits drawn from a seed, and whether quick tests notice, hours: SEED=1 COUNT=200
 	$(PY) -m tests.mutation_sample --seed $(SEED) --count $(COUNT)
-
-pythons: .venv/.ok-test  ## quick tests with other Pythons, kept in docs/results/pythons.json: PYTHONS="3.12 3.13"
-	$(PY) -m tests.tools.pythons $(PYTHONS) --json docs/results/pythons.json \
-	  $(if $(TORCH_INDEX),--pip="--extra-index-url $(TORCH_INDEX)")
 
 proto: .venv/.ok-test  ## regenerate proto/freshfield/v1 from its .proto files
 	$(call PROTOC,.)

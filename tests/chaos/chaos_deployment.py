@@ -1,50 +1,37 @@
-"""A deployment in virtual time whose processes crash, stall and lose their disks; each writes its ledger.
+"""A deployment in virtual time whose processes crash and stall; each writes its ledger.
 
 A crash loses the state of the process. Node: captures and the waiting frame. Emulator: links and the frames
 inside them. Edge: buffer, sessions, policy, decisions and what the field has learned since its last
 checkpoint. Each event of a frame is written to the ledger of the process that would write it live, and
-counted in ``really`` even if that process cannot write, so that the ledgers' accounting can be compared with
-what really happened.
+counted in ``really``, so that the ledgers' accounting can be compared with what really happened.
 """
 
 from __future__ import annotations
 
-import os
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from functools import partial
-from math import inf, nan
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from msgspec.structs import replace
 
 from camera_node.capture import Camera
 from channel_emu.live.camera_stream import CREDITS
 from channel_emu.model.channel import Channel
-from channel_emu.model.faults.corruption import damage
 from channel_emu.model.link import Event, EventKind
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.settings import channel_from_mapping
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment, WakeCondition
-from edge_server.fields import Field, checkpoint
-from edge_server.fields.ngp import field as ngp_field
-from edge_server.fields.registry import make_field, settings_of
+from edge_server.fields import checkpoint
+from edge_server.fields.registry import make_field
 from edge_server.live.field_updater import FieldUpdater, open_updater
 from edge_server.live.ingest import FrameAdmission
 from edge_server.scheduler import make_policy, parse_policy
 from edge_server.settings import read_config
-from freshfield.depth import DepthImage
-from freshfield.frame import Frame, FrameRejected, checksum, from_request, to_request, valid_id
+from freshfield.frame import Frame
 from freshfield.ledger import Ledger
-from freshfield.scenario import Scenario, seed_sequence
-from freshfield.v1 import frames_pb2 as pb
+from freshfield.scenario import Scenario
 from tests.chaos.fault_plan import ROLES, Fault
 
-# On a slow disk a checkpoint takes as long as this many lines.
-_CHECKPOINT_LINES = 20
 # Period of a node's clock exchanges; until the next one it does not know of a step of its clock.
 _CLOCK_PERIOD_NS = 10**9
 
@@ -56,11 +43,10 @@ class ChaosDeployment(VirtualDeployment):
 
     Attributes:
     really: numbers of frames and copies by their outcome, with the names of ``FrameCounts``; refusals as
-        ``rejected:reason``, those of unknown origin as ``strangers``.
+        ``rejected:reason``.
     arrivals: instants of deliveries, by camera.
-    damaged_admitted: number of frames admitted although their checksum was wrong.
+    damaged_admitted: number of frames admitted although the network had damaged them.
     most_inside: largest number of frames inside a link.
-    lines_lost: number of ledger lines lost to full disks.
     restarts: number of restarts, by role.
     """
 
@@ -70,21 +56,18 @@ class ChaosDeployment(VirtualDeployment):
         self.scenario = scenario
         self.really: Counter[str] = Counter()
         self.arrivals: dict[str, list[int]] = {camera.name: [] for camera in cameras}
-        self.most_inside = self.lines_lost = self.damaged_admitted = 0
+        self.most_inside = self.damaged_admitted = 0
         self.restarts: Counter[str] = Counter()
-        self._out = out
+        self._out, self._checkpoint = out, out / "field.npz"
         self._down: set[str] = set()
         self._stalled: set[str] = set()
         self._stands_until_ns = dict.fromkeys(ROLES, 0)
-        self._line_ns = dict.fromkeys(ROLES, 0)  # what a process waits for its disk
         self._away: Counter[str] = Counter()
         self._steps: dict[str, list[tuple[int, int]]] = {camera.name: [] for camera in cameras}
         self._synced_ns = 0  # when the node last asked for the edge's time for other reasons than its period
         self._waiting: dict[str, Frame] = {}  # at the node, while the emulator takes none
         self._upstream: deque[Event] = deque()  # sent to an edge that does not answer
         self._ledgers: dict[str, Ledger] = {}
-        self._rng = np.random.default_rng(seed_sequence(scenario.seed, "chaos", "hostile"))
-        self._attempts = 0
         config = channel_from_mapping(scenario.channel, f"{scenario.path}: channel", scenario.path.parent)
         self._config = config
         self.shared = config.server.shared
@@ -106,7 +89,6 @@ class ChaosDeployment(VirtualDeployment):
             self._break_upstream()
         for ledger in self._ledgers.values():
             ledger.close(now_ns)
-            self.lines_lost += ledger.lines_lost
 
     # --- faults ---------------------------------------------------------------------------------------
 
@@ -118,9 +100,7 @@ class ChaosDeployment(VirtualDeployment):
         self._down.add(role)
         self._stalled.discard(role)
         self._stands_until_ns[role] = 0
-        ledger = self._ledgers.pop(role)
-        ledger._lines.close()  # without the line ``closed``
-        self.lines_lost += ledger.lines_lost
+        self._ledgers.pop(role)._lines.close()  # without the line ``closed``
         if role == "node":
             self.really["waiting"] += len(self._waiting)
             self._waiting.clear()
@@ -157,14 +137,11 @@ class ChaosDeployment(VirtualDeployment):
 
     def _do_stall(self, fault: Fault) -> None:
         """SIGSTOP of a process, and SIGCONT ``for_ms`` later."""
-        if fault.target not in self._down:
-            self._stand(fault.target, self.clock.now_ns() + round(fault.for_ms * 1e6))
-
-    def _stand(self, role: str, until_ns: int) -> None:
-        """Let a process do nothing until ``until_ns``."""
-        self._stalled.add(role)
-        self._stands_until_ns[role] = max(self._stands_until_ns[role], until_ns)
-        self.at(until_ns, lambda: self._go_on(role))
+        role, until_ns = fault.target, self.clock.now_ns() + round(fault.for_ms * 1e6)
+        if role not in self._down:
+            self._stalled.add(role)
+            self._stands_until_ns[role] = max(self._stands_until_ns[role], until_ns)
+            self.at(until_ns, lambda: self._go_on(role))
 
     def _go_on(self, role: str) -> None:
         if role not in self._stalled or self.clock.now_ns() < self._stands_until_ns[role]:
@@ -175,32 +152,6 @@ class ChaosDeployment(VirtualDeployment):
         self._send_waiting()
         while role == "edge" and self._upstream and role not in self._stalled:
             self._arrive(self._upstream.popleft())
-
-    def _do_full_disk(self, fault: Fault) -> None:
-        """Every write to a process's ledger fails for a while."""
-        if fault.target in self._down:
-            return
-        lines = self._ledgers[fault.target]._lines
-        kept, full = os.dup(lines._fd), os.open("/dev/full", os.O_WRONLY)
-        os.dup2(full, lines._fd)
-        os.close(full)
-
-        def space_again() -> None:
-            if lines._fd >= 0:  # the process lives
-                os.dup2(kept, lines._fd)
-            os.close(kept)
-
-        self._after(fault, space_again)
-
-    def _do_slow_disk(self, fault: Fault) -> None:
-        """A process pauses for ``value`` ms after each line of its ledger, and checkpoints take long."""
-        line_ns = round(fault.value * 1e6)
-        self._line_ns[fault.target] += line_ns
-
-        def fast_again() -> None:
-            self._line_ns[fault.target] -= line_ns
-
-        self._after(fault, fast_again)
 
     def _do_away(self, fault: Fault) -> None:
         """A camera is unplugged for a while."""
@@ -216,90 +167,8 @@ class ChaosDeployment(VirtualDeployment):
         self.next_policy = make_policy(name, value, self.scenario.rng("policy", name))
 
     def _do_checkpoint(self, fault: Fault) -> None:
-        line_ns, life = self._line_ns["edge"], self.restarts["edge"]
-        if "edge" in self._down or ("edge" in self._stalled and not line_ns):
-            return
-        # After the line that it may be writing.
-        over_ns = max(self.clock.now_ns(), self._stands_until_ns["edge"]) + _CHECKPOINT_LINES * line_ns
-
-        def rename() -> None:
-            if "edge" not in self._down and self.restarts["edge"] == life:  # not killed while it wrote
-                checkpoint.save(self._out / "field.npz", self.updates.field.state(), durable=False)
-
-        self.at(over_ns, rename)
-        self._stand("edge", over_ns)
-
-    def _do_hostile(self, fault: Fault) -> None:
-        """Send messages to the edge that come from no node of this deployment."""
-        if "edge" in self._down | self._stalled:
-            return
-        for _ in range(round(fault.value)):
-            request = self._garble()
-            header = request.header
-            try:
-                reason = self._deliver(from_request(request), ())
-                self.damaged_admitted += not reason and checksum(request) != request.crc32c
-            except FrameRejected as error:
-                reason = error.reason
-                self.rejected[reason] += 1
-            camera, session = (i if valid_id(i) else "?" for i in (header.camera_id, header.session_id))
-            self._write("edge", "rejected" if reason else "delivered", camera, session, header.sequence, reason or "")
-            if reason and (session == "?" or camera not in self._cameras):
-                self.really["strangers"] += 1
-            else:
-                self.really.update(("captured", "sent", f"rejected:{reason}" if reason else "delivered"))
-
-    def _garble(self) -> pb.PushRequest:
-        """A message with one to three invalid fields; its checksum is right most of the time."""
-        rng, cameras = self._rng, list(self._cameras)
-        camera = self._cameras[cameras[rng.integers(len(cameras))]]
-        shot, now_ns = camera.capture(0), self.clock.now_ns()
-        self._attempts += 1
-        sequence = 2**40 + self._attempts
-        lens = shot.intrinsics
-        measured = DepthImage(np.full((lens.height, lens.width), 2000, np.uint16), 0.001).encode()
-        frame = Frame(
-            camera.name, "hostile", sequence, now_ns, shot.pose, lens, camera.codec, shot.payload, depth=measured
-        )
-        request = to_request(frame)
-        header, depth, data = request.header, request.depth, shot.payload
-        wrong: list[tuple[Any, str, list[Any]]] = [
-            (header, "camera_id", ["mars", "../etc", "", "a" * 65, "cam01\t"]),
-            (header, "session_id", ["a\nb", "", "x" * 1000]),
-            (header, "generated_ns", [now_ns + 10**10, now_ns - 2 * 3600 * 10**9, -(2**63), 2**63 - 1]),
-            (header, "clock_offset_ns", [10**9, -(10**9), -(2**63), 2**63 - 1]),
-            (header, "clock_uncertainty_ns", [-1, 2**63 - 1]),
-            (header, "pose_gap_ns", [-1, 2**63 - 1]),
-            (header, "codec", [-1, 0, 99]),
-            (header, "role", [-7, 0, 2, 99]),
-            (header, "width", [0, 1, 33, 4097, 2**31 - 1]),
-            (header, "height", [0, 1, 33, 4097, 2**31 - 1]),
-            *((header.pose, name, [0.0, 1.0, nan, inf, 1e300, 5e-324]) for name in ("qw", "qz")),
-            *((header.pose, name, [1e7, nan, -inf, 3.0]) for name in ("tx_m", "tz_m")),
-            *((header.intrinsics, name, [0.0, -5.0, 1e-9, 1e9, nan]) for name in ("fx", "cy", "k1", "p2")),
-            (depth, "codec", [-1, 0, 99]),
-            (depth, "width", [0, 1, lens.width + 1, 2**31 - 1]),
-            (depth, "meters_per_count", [0.0, nan, -inf, 1e300]),
-            (depth, "after_image_ns", [-(2**63), 2**63 - 1]),
-            (depth, "payload", [b"", measured.payload[:-5], data, bytes(rng.bytes(200))]),
-            (
-                request,
-                "payload",
-                [
-                    b"",
-                    data[: len(data) // 2],
-                    bytes(rng.bytes(200)),
-                    data + data,
-                    damage(data, tuple((float(rng.random()), 255) for _ in range(20))),
-                ],
-            ),
-        ]
-        for k in rng.permutation(len(wrong))[: rng.integers(1, 4)]:
-            message, name, values = wrong[k]
-            setattr(message, name, values[rng.integers(len(values))])
-        if rng.random() < 0.9:
-            request.crc32c = checksum(request)
-        return request
+        if "edge" not in self._down | self._stalled:
+            checkpoint.save(self._checkpoint, self.updates.field.state(), durable=False)
 
     # --- what a frame meets ---------------------------------------------------------------------------
 
@@ -383,10 +252,9 @@ class ChaosDeployment(VirtualDeployment):
     def _new_updater(self, now_ns: int, resume: bool = False) -> FieldUpdater:
         """The updater of an edge that was just started. resume: load the last checkpoint, if there is one."""
         scenario, config = self.scenario, read_config(self.scenario)
-        field = _small_field(config.field, config.field_options, scenario.seed)
-        file = self._out / "field.npz"
-        if resume and file.exists():
-            field.load_state(checkpoint.load(file)[0])
+        field = make_field(config.field, config.field_options, scenario.seed)
+        if resume and self._checkpoint.exists():
+            field.load_state(checkpoint.load(self._checkpoint)[0])
         name, value = config.policy.name, config.policy.value
         policy = make_policy(name, value, scenario.rng("policy", name))
         return open_updater(scenario, config, policy, field, now_ns, resume)
@@ -401,17 +269,7 @@ class ChaosDeployment(VirtualDeployment):
         self._write(role, event, frame.camera, frame.session, frame.sequence, detail)
 
     def _write(self, role: str, event: str, camera: str, session: str, sequence: int, detail: str = "") -> None:
-        now_ns = self.clock.now_ns()
-        self._ledgers[role].write(now_ns, camera, session, sequence, event, detail)
-        if self._line_ns[role]:
-            self._stand(role, max(now_ns, self._stands_until_ns[role]) + self._line_ns[role])
+        self._ledgers[role].write(self.clock.now_ns(), camera, session, sequence, event, detail)
 
     def _after(self, fault: Fault, action: Callable[[], None]) -> None:
         self.at(self.clock.now_ns() + round(fault.for_ms * 1e6), action)
-
-
-def _small_field(name: str, options: dict[str, Any], seed: int) -> Field:
-    """The field of an edge; that of ``ngp`` with an eighth of the cells, whose counting would take half the time."""
-    if name != "ngp":
-        return make_field(name, options, seed)
-    return ngp_field.make(replace(settings_of(name, options, seed), cells=32, finest_resolution=64))

@@ -20,22 +20,17 @@ SECONDS = 4.5
 # Faults begin within this part of a run and are over by FAULTS_OVER_S, so that the rest shows the recovery.
 _FAULTS_BEGIN_S = (0.3, 2.0)
 FAULTS_OVER_S = 2.5
-_SMALL: dict[str, dict[str, Any]] = {
-    "ngp": {"levels": 4, "log2_table": 12, "batch_samples": 4096, "rays": 512, "samples": 32},
-    "splat": {"gaussians": 300, "start": 200, "seed_cells": 12},
-}
+_SMALL = {"gaussians": 300, "start": 200, "seed_cells": 12}
 
 
 @dataclass(frozen=True)
 class Fault:
     """A fault.
 
-    kind: of a process: crash, stall, full_disk, slow_disk; of a camera: away, clock_step; of the edge:
-        hostile, policy, checkpoint.
+    kind: of a process: crash, stall; of a camera: away, clock_step; of the edge: policy, checkpoint.
     at_ms: when it begins. for_ms: how long it lasts; 0 for an instantaneous one.
     target: the process, the camera, or the new policy.
-    value: of crash, whether an edge resumes its last checkpoint; of slow_disk, ms a line; of clock_step, ms;
-        of hostile, the number of messages.
+    value: of crash, whether an edge resumes its last checkpoint; of clock_step, ms.
     """
 
     number: int
@@ -44,11 +39,6 @@ class Fault:
     for_ms: float = 0.0
     target: str = ""
     value: float = 0.0
-
-    def __str__(self) -> str:
-        lasts = f" for {self.for_ms:.0f} ms" if self.for_ms else ""
-        value = f" ({self.value:g})" if self.value else ""
-        return f"{self.number}: {self.kind} {self.target}{value} at {self.at_ms:.0f} ms{lasts}"
 
 
 def scenario_of(seed: int) -> Scenario:
@@ -67,7 +57,6 @@ def scenario_of(seed: int) -> Scenario:
         "reset": {"at_ms": [900.0]},
     }
     channel["faults"] = {name: about for name, about in faults.items() if rng.random() < 0.4}
-    field = str(rng.choice(sorted(_SMALL)))
     policy, value = parse_policy(str(rng.choice(POLICIES)))
     return parse(
         {
@@ -78,8 +67,8 @@ def scenario_of(seed: int) -> Scenario:
             "source": small_world(motion_seed=seed),
             "channel": channel,
             "edge": {
-                "field": field,
-                "field_options": _SMALL[field],
+                "field": "splat",
+                "field_options": _SMALL,
                 "updates": "cycle",
                 "policy": {"name": policy, "value": value},
             },
@@ -96,24 +85,15 @@ def draw_faults(seed: int, cameras: tuple[str, ...]) -> tuple[Fault, ...]:
 
 
 def _draw(rng: np.random.Generator, number: int, at_ms: float, cameras: tuple[str, ...]) -> Fault:
-    kind = str(
-        rng.choice(
-            ["crash", "stall", "full_disk", "slow_disk", "away", "clock_step", "hostile", "policy", "checkpoint"]
-        )
-    )
-    for_ms, value, target = float(rng.uniform(20.0, 1e3 * FAULTS_OVER_S - _FAULTS_BEGIN_S[1] * 1e3)), 0.0, ""
-    if kind in ("crash", "stall", "full_disk", "slow_disk"):
+    kinds = ["crash", "stall", "away", "clock_step", "policy", "checkpoint"]
+    kind, value, target = str(rng.choice(kinds)), 0.0, ""
+    for_ms = float(rng.uniform(20.0, 1e3 * (FAULTS_OVER_S - _FAULTS_BEGIN_S[1])))
+    if kind in ("crash", "stall"):
         target, value = str(rng.choice(ROLES)), float(kind == "crash" and rng.random() < 0.7)
-        if kind == "slow_disk":
-            value = round(float(rng.uniform(1.0, 20.0)), 3)
     elif kind in ("away", "clock_step"):
         target = str(rng.choice(cameras))
-        if kind == "clock_step":
-            value = round(float(rng.uniform(-500.0, 500.0)), 3)
-    elif kind == "hostile":
-        value = float(rng.integers(1, 40))
+        value = round(float(rng.uniform(-500.0, 500.0)), 3) if kind == "clock_step" else 0.0
     elif kind == "policy":
         target = str(rng.choice(POLICIES))
-    if kind in ("clock_step", "hostile", "policy", "checkpoint"):
-        for_ms = 0.0
-    return Fault(number, kind, at_ms, for_ms, target, value)
+    lasts = kind in ("crash", "stall", "away")
+    return Fault(number, kind, at_ms, for_ms if lasts else 0.0, target, value)

@@ -1,18 +1,12 @@
-"""Deployments with faults drawn from seeds: ``pytest -m chaos --seeds 0..99``; what is broken on purpose is found."""
+"""Deployments with faults drawn from seeds: ``pytest -m chaos --seeds 0..99``."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-
-import numpy as np
 import pytest
 
-from edge_server.report import frame_accounting
-from freshfield.frame import checksum, from_request
-from tests.chaos import chaos_deployment, seeds
+from tests.chaos import seeds
 from tests.chaos.chaos_deployment import ChaosDeployment
-from tests.chaos.fault_plan import FAULTS_OVER_S, Fault, draw_faults, scenario_of
+from tests.chaos.fault_plan import FAULTS_OVER_S, draw_faults, scenario_of
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 
@@ -33,8 +27,8 @@ def faults(request: pytest.FixtureRequest) -> list[int] | None:
 @pytest.mark.chaos
 def test_a_seed_holds(seed: int, faults: list[int] | None) -> None:
     found = seeds.run_seed(seed, faults)
-    assert found["problems"] == [], seeds.failure(found, faults)
-    assert found["counts"]["delivered"] > 20
+    assert found["problems"] == [], "\n".join(found["faults"])  # --faults 0,3 runs some of them
+    assert found["delivered"] > 20
 
 
 def test_seeds_draw_every_kind_of_fault_and_all_are_over_in_time() -> None:
@@ -45,107 +39,3 @@ def test_seeds_draw_every_kind_of_fault_and_all_are_over_in_time() -> None:
     assert all(f.at_ms + f.for_ms <= 1e3 * FAULTS_OVER_S for f in drawn)
     assert draw_faults(3, CAMERAS) == draw_faults(3, CAMERAS) != draw_faults(4, CAMERAS)
     assert len({str(scenario_of(seed).channel) for seed in range(50)}) > 10
-
-
-CRASHES = tuple(Fault(k, "crash", 500.0 + 200 * k, 150.0, role) for k, role in enumerate(("node", "emulator", "edge")))
-
-
-def run(tmp_path: Path, faults: tuple[Fault, ...], seed: int = 11) -> ChaosDeployment:
-    scenario = scenario_of(seed)
-    deployment = ChaosDeployment(scenario, seeds.training_cameras(scenario), seeds.SETTINGS, faults, tmp_path)
-    deployment.run(2.0)
-    deployment.end()
-    return deployment
-
-
-def test_what_a_crashed_process_held_is_gone_and_accounted_for(tmp_path: Path) -> None:
-    deployment = run(tmp_path, CRASHES)
-    assert deployment.restarts == {"node": 1, "emulator": 1, "edge": 1}
-    sessions = {f.session for f in deployment.updates.buffer.newest().values()}
-    assert sessions == {"restart-1"}
-    assert deployment.really["broken"] > 0, "the edge was away"
-    assert deployment.updates.start_ns > 10**9 > deployment.publications[0].published_ns
-    assert list(seeds.accounting(deployment, frame_accounting.account_frames(tmp_path))) == []
-
-
-def test_an_edge_goes_on_from_its_checkpoint_if_it_is_told_to(tmp_path: Path) -> None:
-    saved = Fault(0, "checkpoint", 900.0)
-    state = []
-    for resume in (0.0, 1.0):
-        (folder := tmp_path / str(resume)).mkdir()
-        crash = replace(CRASHES[2], at_ms=1000.0, for_ms=990.0, value=resume)  # it is back just before the end
-        state.append(run(folder, (saved, crash)).updates.field.state())
-    kept = np.load(tmp_path / "1.0" / "field.npz")
-    trained = [name for name in state[0] if not np.array_equal(state[0][name], kept[name])]
-    assert trained and all(np.array_equal(state[1][name], kept[name]) for name in state[1])
-
-
-def test_hostile_messages_are_refused_by_many_reasons_and_counted_apart(tmp_path: Path) -> None:
-    deployment = run(tmp_path, (Fault(0, "hostile", 600.0, value=300.0),))
-    assert len(deployment.rejected) >= 8 and deployment.really["strangers"] > 20
-    assert list(seeds.accounting(deployment, frame_accounting.account_frames(tmp_path))) == []
-
-
-def lose_a_line(patch: pytest.MonkeyPatch) -> None:
-    written = []
-    whole = ChaosDeployment._write
-
-    def write(self, role, event, *about):
-        written.append(event)
-        if written.count("delivered") % 20 or event != "delivered":
-            whole(self, role, event, *about)
-
-    patch.setattr(ChaosDeployment, "_write", write)
-
-
-def forget_kills(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(frame_accounting, "_cut_off_ends", lambda ledgers: [])
-
-
-def check_no_checksum(patch: pytest.MonkeyPatch) -> None:
-    """Whatever arrives is given the checksum that it should have."""
-
-    def repaired(request):
-        kept, request.crc32c = request.crc32c, checksum(request)
-        try:
-            return from_request(request)
-        finally:
-            request.crc32c = kept
-
-    patch.setattr(chaos_deployment, "from_request", repaired)
-
-
-def draw_without_seed(patch: pytest.MonkeyPatch) -> None:
-    whole = ChaosDeployment._stamp
-    draw = np.random.default_rng()
-
-    def stamp(self, name, now_ns):
-        stamped_ns, offset_ns = whole(self, name, now_ns)
-        return stamped_ns, offset_ns + int(draw.integers(10**6))
-
-    patch.setattr(ChaosDeployment, "_stamp", stamp)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "broken, seed, says, kind",
-    [
-        (lose_a_line, 10, "off by", None),
-        (forget_kills, 20, "in no ledger", "crash emulator"),
-        (check_no_checksum, 35, "with a wrong checksum were taken in", "hostile"),
-        (draw_without_seed, 2, "a second run has another digest", None),
-    ],
-    ids=lambda value: getattr(value, "__name__", None),
-)
-def test_what_is_broken_is_found_and_its_faults_are_reduced(
-    broken, seed: int, says: str, kind: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    broken(monkeypatch)
-    found = seeds.run_seed(seed)
-    told = seeds.failure(found).splitlines()
-    assert any(says in line for line in told)
-    kept = [line for line in told if line.startswith("    ")]
-    assert len(kept) == (kind is not None) and (kind is None or kind in kept[0])
-    words = told[-1].partition("--faults ")[2]
-    again = seeds.run_seed(seed, [] if words == "none" else [int(word) for word in words.split(",")])
-    assert any(says in problem for problem in again["problems"])

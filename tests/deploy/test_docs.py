@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import json
 import re
 import shlex
 from functools import cache
@@ -13,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
-from tests.tools import scale
 
 _SPEC = importlib.util.spec_from_file_location("site_pages", ROOT / "docs" / "site_pages.py")
 assert _SPEC is not None and _SPEC.loader is not None
@@ -115,11 +113,6 @@ def test_files_and_modules_that_are_named_exist(page: Path) -> None:
             parent, _, last = found.rpartition(".")
             assert not parent or importlib.util.find_spec(parent) is not None, f"{name(page)}: {found}"
             assert importlib.util.find_spec(found) or hasattr(importlib.import_module(parent), last)
-
-
-def test_the_table_of_scale_is_that_of_its_file() -> None:
-    docs = ROOT / "docs"
-    assert scale.table(json.loads((docs / "results" / "scale.json").read_text())) in (docs / "scale.md").read_text()
 
 
 def defaults(program: str) -> dict[str, str]:

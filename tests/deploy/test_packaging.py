@@ -6,7 +6,6 @@ import contextlib
 import importlib.metadata
 import itertools
 import re
-import sys
 import tomllib
 
 import pytest
@@ -15,7 +14,6 @@ from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 from tests.conftest import ROOT
-from tests.tools import pythons
 
 DECLARED = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT, BUILD = DECLARED["project"], DECLARED["build-system"]["requires"]
@@ -104,12 +102,3 @@ def test_an_image_installs_locked_wheels_and_the_project_alone(image: str, locks
     assert all(("--require-hashes" in words) != ("--no-index /dist/" in words) for words in installs)
     assert set(re.findall(r"-r deploy/locks/(\S+)\.txt", text)) == locks
     assert "!deploy/locks" in (ROOT / ".dockerignore").read_text().splitlines()
-
-
-def test_another_python_is_found_or_its_lack_is_said(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert pythons.interpreter(sys.executable) == sys.executable
-    monkeypatch.setattr(sys, "argv", ["pythons", "2.99"])
-    assert pythons.main() == 2
-    assert "Python 2.99 not found: install it" in capsys.readouterr().err

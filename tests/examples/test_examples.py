@@ -16,7 +16,6 @@ from tests.deploy.test_up import SMALL
 from tests.edge_server.experiments.sets import write_photos
 from tests.support import free_port
 
-EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 ONE_CAMERA = """
 name: mine
 description: one camera that somebody else's program streams
@@ -34,12 +33,6 @@ def start(name: str, *words: object) -> str:
     done = subprocess.run(command, env={**os.environ, "MPLBACKEND": "agg"}, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
-
-
-@pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.name)
-def test_an_example_is_short_and_linked(file: Path) -> None:
-    assert len([line for line in file.read_text().splitlines() if line.strip()]) < 30
-    assert f"examples/{file.name}" in (ROOT / "docs/library.md").read_text()
 
 
 def test_own_data_become_splats_and_a_video(tmp_path: Path) -> None:

@@ -9,11 +9,12 @@ import grpc
 import grpc.aio
 import pytest
 
-from freshfield.access import ANYBODY, CALLS, LOOK, Access, Caller, HttpDoor, HttpRefused, caller
+from freshfield.access import ANYBODY, CALLS, LOOK, Access, Caller, HttpDoor, HttpRefused
 from freshfield.frame import FrameRejected
-from freshfield.streams import Admission, ServedCall, SessionStreams
+from freshfield.streams import ServedCall, SessionStreams
 from freshfield.transport import Transport
 from freshfield.v1 import channel_pb2, clock_pb2, edge_pb2, frames_pb2
+from tests.freshfield.serving import serving
 from tests.role_table import TOKENS, cells_of
 
 HEALTH = "/grpc.health.v1.Health/Check"
@@ -54,7 +55,7 @@ class Every(grpc.GenericRpcHandler):
 async def outcome(port: int, method: str, token: str | None, message: bytes = b"") -> str:
     """The status of a call, or the answer to a camera's frame."""
     metadata = (("authorization", f"Bearer {token}"),) if token else ()
-    async with Transport().aio_channel(f"127.0.0.1:{port}") as channel:
+    async with Transport().aio_channel(f"localhost:{port}") as channel:
         try:
             if not method.endswith(STREAMS):
                 await channel.unary_unary(method)(b"", metadata=metadata, timeout=5)
@@ -74,15 +75,8 @@ def asked(*calls: tuple) -> list[str]:
     """The outcomes of calls at a server with the tokens of the table."""
 
     async def scene() -> list[str]:
-        transport = Transport(tokens=TOKENS)
-        server = transport.aio_server()
-        server.add_generic_rpc_handlers((Every(),))
-        port = transport.bind(server, "127.0.0.1:0")
-        await server.start()
-        try:
+        async with serving(Transport(tokens=TOKENS), Every()) as port:
             return [await outcome(port, *call) for call in calls]
-        finally:
-            await server.stop(None)
 
     return asyncio.run(scene())
 
@@ -105,7 +99,7 @@ def test_every_cell_of_the_role_table() -> None:
         assert outcome_of_cell == expected(camera, who, may), cell
 
 
-def test_every_method_has_its_row() -> None:
+def test_every_method_has_its_row_and_others_are_the_operators() -> None:
     ours = {
         f"/{service.full_name}/{method.name}"
         for module in (frames_pb2, clock_pb2, channel_pb2, edge_pb2)
@@ -114,11 +108,8 @@ def test_every_method_has_its_row() -> None:
     }
     rows = {what.replace("`", "").partition(" of ")[0] for what, *_ in cells_of("`/")}
     assert ours < CALLS.keys() and rows == {*CALLS, HEALTH}
-
-
-def test_a_method_that_nobody_listed_is_the_operators() -> None:
-    method = "/your.Tracker/Follow"
-    assert asked((method, TOKENS["operator"]), (method, TOKENS["viewer"])) == ["OK", "PERMISSION_DENIED"]
+    other = "/your.Tracker/Follow"
+    assert asked((other, TOKENS["operator"]), (other, TOKENS["viewer"])) == ["OK", "PERMISSION_DENIED"]
 
 
 def test_a_name_says_role_and_cameras() -> None:
@@ -130,73 +121,30 @@ def test_a_name_says_role_and_cameras() -> None:
             Caller.named(wrong)
 
 
-def test_a_wrong_token_is_not_made_good_by_a_certificate() -> None:
-    """And a call that shows none is its certificate's."""
-
-    class Context:
-        def auth_context(self) -> dict:
-            return {"x509_common_name": [b"operator"]}
-
-        async def read(self) -> bytes:
-            return b""
-
-        def set_code(self, code: grpc.StatusCode) -> None:
-            raise PermissionError(code.name)
-
-    class Details:
-        method = "/freshfield.v1.EdgeService/ResetField"
-
-        def __init__(self, *metadata: tuple[str, str]) -> None:
-            self.invocation_metadata = metadata
-
-    async def reset(*metadata: tuple[str, str]) -> str:
-        async def continuation(_: object) -> grpc.RpcMethodHandler:
-            return grpc.unary_unary_rpc_method_handler(who)
-
-        async def who(request: object, context: object) -> str:
-            return caller.get().role
-
-        admission = Admission(Access({"viewer": "v"}, certificates=True), 9)
-        handler = await admission.intercept_service(continuation, Details(*metadata))
-        return await handler.stream_unary(None, Context())
-
-    assert asyncio.run(reset()) == "operator"
-    for header in ("Bearer x", "Bearer v", "Bearer", "Basic !", ""):
-        with pytest.raises(PermissionError):
-            asyncio.run(reset(("authorization", header)))
-
-
-def test_a_browsers_login_is_the_token_as_password() -> None:
+def test_a_browsers_login_is_the_token_as_password():
     access = Access(TOKENS, certificates=False)
     for name, token in TOKENS.items():
         basic = base64.b64encode(f"whoever:{token}".encode()).decode()
         assert access.of_header(f"Basic {basic}") == access.of_header(f"bearer {token}") == Caller.named(name)
-    for wrong in ("Basic é", "Basic ====", "Basic", f"Digest {TOKENS['viewer']}", f"{TOKENS['viewer']}", "Bearer "):
+    for wrong in ("Basic é", "Basic ====", "Basic", f"Digest {TOKENS['viewer']}", TOKENS["viewer"], "Bearer ", ""):
         assert access.of_header(wrong) is None
-
-
-def test_who_gives_tokens_has_everybody_asked_on_loopback_too() -> None:
-    """An authority alone lets nobody log in: a browser shows no certificate."""
-    with pytest.raises(HttpRefused, match="log in"):
-        HttpDoor(Access(TOKENS, certificates=True), "127.0.0.1").caller(None)
+    # Who gives tokens has everybody asked, on loopback too. An authority alone lets nobody log in.
+    for tokens, host in ((TOKENS, "127.0.0.1"), ({}, "0.0.0.0")):
+        with pytest.raises(HttpRefused, match="log in"):
+            HttpDoor(Access(tokens, certificates=True), host).caller(None)
     for certificates in (False, True):
         assert HttpDoor(Access({}, certificates), "127.0.0.1").caller(None) == ANYBODY
-    with pytest.raises(HttpRefused, match="log in"):
-        HttpDoor(Access({}, certificates=True), "0.0.0.0").caller(None)
 
 
-@pytest.mark.parametrize("host", ["localhost", "localhost:9090", "127.0.0.1:1", "[::1]:80", "192.0.2.7"])
-def test_an_own_host_may_be_asked_for(host: str) -> None:
+def test_a_page_answers_its_own_names_and_origins_alone():
     door = HttpDoor(Access({}, certificates=False), "127.0.0.1")
-    door.check_origin(host, None)
-    door.check_origin(host, f"http://{host}")
-    for foreign in ("http://evil.example", "null", f"http://{host}.evil.example", f"http://{host}0", ""):
-        with pytest.raises(HttpRefused):
-            door.check_origin(host, foreign)
-
-
-@pytest.mark.parametrize("host", [None, "", "evil.example:8080", "localhost.evil.example", "127.0.0.1.nip.io"])
-def test_a_foreign_name_for_this_machine_is_refused(host: str | None) -> None:
-    with pytest.raises(HttpRefused, match="Host"):
-        HttpDoor(Access({}, certificates=False), "127.0.0.1").check_origin(host, None)
-    HttpDoor(Access(TOKENS, certificates=False), "0.0.0.0").check_origin(host, None)  # its cookie is not sent
+    for host in ("localhost", "localhost:9090", "127.0.0.1:1", "[::1]:80", "192.0.2.7"):
+        door.check_origin(host, None)
+        door.check_origin(host, f"http://{host}")
+        for foreign in ("http://evil.example", "null", f"http://{host}.evil.example", f"http://{host}0", ""):
+            with pytest.raises(HttpRefused):
+                door.check_origin(host, foreign)
+    for host in (None, "", "evil.example:8080", "localhost.evil.example", "127.0.0.1.nip.io"):
+        with pytest.raises(HttpRefused, match="Host"):
+            door.check_origin(host, None)
+        HttpDoor(Access(TOKENS, certificates=False), "0.0.0.0").check_origin(host, None)  # its cookie is not sent

@@ -40,21 +40,8 @@ def test_two_opposite_cameras_share_nothing_and_two_at_one_place_everything():
 def test_the_parallax_is_the_angle_between_the_cameras():
     wide, narrow = (reckon([camera(-a), camera(a)]).parallax_deg for a in (20, 10))
     assert wide / narrow == pytest.approx(2.0, rel=0.1) and 30.0 < wide < 45.0
-    assert reckon([camera(-20), camera(0), camera(20)]).parallax_deg > narrow
-
-
-def test_a_narrow_lens_sees_less():
-    narrow = Pinhole.from_fov(100, 100, 20.0)
-    assert reckon([camera(a, lens=narrow) for a in (-20, 20)]).seen_by[0] > reckon([camera(-20), camera(20)]).seen_by[0]
-
-
-@pytest.mark.parametrize("scale", [1 / 3, 2.0])
-def test_units_do_not_matter(scale):
-    cameras = [camera(a, height=0.4) for a in (-50, -10, 45)]
-    scaled = [(lens, np.block([[p[:3, :3], scale * p[:3, 3:]], [p[3:]]])) for lens, p in cameras]
-    one, other = reckon(cameras), reckon(scaled)
-    assert one.seen_by == pytest.approx(other.seen_by, abs=0.01)
-    np.testing.assert_allclose(scale * one.further.pose[:3, 3], other.further.pose[:3, 3], atol=1e-6)
+    lens = Pinhole.from_fov(100, 100, 20.0)
+    assert reckon([camera(a, lens=lens) for a in (-20, 20)]).seen_by[0] > reckon([camera(-20), camera(20)]).seen_by[0]
 
 
 def test_the_plan_counts_cameras():
@@ -81,8 +68,5 @@ def test_odd_rigs_give_finite_numbers(poses):
     found = reckon([(LENS, np.asarray(pose, np.float64)) for pose in poses])
     assert sum(found.seen_by) == pytest.approx(1.0) and np.isfinite(found.further.pose).all()
     assert "nan" not in plan_svg({str(k): (LENS, p) for k, p in enumerate(poses)}, found) and "nan" not in found.words
-
-
-def test_no_camera_is_an_error():
     with pytest.raises(ValueError, match="no camera"):
         reckon([])

@@ -42,34 +42,20 @@ def steps(width: int = 40, height: int = 30, seed: int = 0) -> np.ndarray:
 def test_it_is_lossless(size, seed, most, holes):
     rng = np.random.default_rng(seed)
     counts = np.where(rng.random(size) < holes, 0, rng.integers(0, most + 1, size))
-    sent = image(counts).encode()
-    sent.check(replace(LENS, width=size[1], height=size[0]), 0)
+    lens, pose = replace(LENS, width=size[1], height=size[0]), Pose((1.0, 0.0, 0.0, 0.0), (0.05, 0.0, 0.0))
+    sent = image(counts, intrinsics=lens, to_camera=pose, after_image_ns=-7).encode()
+    sent.check(lens, 0)
     back = sent.decode()
     assert back.counts.dtype == np.uint16 and back.meters_per_count == 0.001
+    assert (back.intrinsics, back.to_camera, back.after_image_ns) == (lens, pose, -7)
     np.testing.assert_array_equal(back.counts, counts)
 
 
 @pytest.mark.stability
-@pytest.mark.parametrize(
-    "counts",
-    [
-        np.zeros((30, 40)),
-        np.full((30, 40), 65535),
-        np.tile([1, 32768, 65535, 0], (30, 10)),  # the largest differences of either sign
-        np.arange(65536).reshape(256, 256),  # every count: no table
-        [[7]],
-    ],
-    ids=["all holes", "all at the end", "extremes", "every count", "one pixel"],
-)
-def test_extreme_counts_come_back(counts):
-    np.testing.assert_array_equal(image(counts).encode().decode().counts, counts)
-
-
-def test_what_belongs_to_it_stays_with_it():
-    lens, pose = Pinhole.from_fov(40, 30, 70.0), Pose((1.0, 0.0, 0.0, 0.0), (0.05, 0.0, 0.0))
-    given_ = image(steps(), intrinsics=lens, to_camera=pose, after_image_ns=-7)
-    back = given_.encode().decode()
-    assert (back.intrinsics, back.to_camera, back.after_image_ns) == (lens, pose, -7)
+def test_extreme_counts_come_back():
+    """The largest differences of either sign, and every count, which leaves no room for a table."""
+    for counts in (np.tile([1, 32768, 65535, 0], (30, 10)), np.arange(65536).reshape(256, 256)):
+        np.testing.assert_array_equal(image(counts).encode().decode().counts, counts)
 
 
 def test_steps_of_disparity_take_half_the_bytes_of_a_png():
@@ -77,19 +63,12 @@ def test_steps_of_disparity_take_half_the_bytes_of_a_png():
     assert len(image(counts).encode().payload) < 0.5 * len(cv2.imencode(".png", counts)[1])
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [np.zeros((4, 4), np.int32), np.zeros((4, 4), np.float32), np.zeros((4, 4, 1), np.uint16), np.zeros((0, 4), "u2")],
-    ids=["integers", "meters", "three axes", "empty"],
-)
-def test_other_arrays_are_no_depth(bad):
-    with pytest.raises(PayloadError, match=r"expected uint16 \(H, W\)"):
-        DepthImage(bad, 0.001).encode()
+def test_other_arrays_are_no_depth():
+    for bad in (np.zeros((4, 4), np.int32), np.zeros((4, 4, 1), np.uint16), np.zeros((0, 4), "u2")):
+        with pytest.raises(PayloadError, match=r"expected uint16 \(H, W\)"):
+            DepthImage(bad, 0.001).encode()
     with pytest.raises(PayloadError, match="with a lens of"):
         image(np.zeros((4, 4)), intrinsics=LENS).encode()
-
-
-# --- what is refused before anything is decompressed -------------------------------------------
 
 
 def zstd(size: int, value: bytes = b"\0") -> bytes:
@@ -98,33 +77,21 @@ def zstd(size: int, value: bytes = b"\0") -> bytes:
 
 GOOD = image(steps()).encode()
 UNDECLARED = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(2400))
-SMALL = Pinhole.from_fov(20, 15, 60.0)
 REFUSED = {
     "a bomb": (replace(GOOD, payload=zstd(2**28)), "size_mismatch"),
     "too few bytes": (replace(GOOD, payload=zstd(2 * 1200 - 2)), "size_mismatch"),
-    "half a count": (replace(GOOD, payload=zstd(2 * 1200 + 1)), "size_mismatch"),
     "too long a table": (replace(GOOD, payload=zstd(2 * (1200 + 76))), "size_mismatch"),
     "no size declared": (replace(GOOD, payload=UNDECLARED), "size_mismatch"),
     "no zstandard": (replace(GOOD, payload=b"not depth"), "bad_payload"),
-    "nothing": (replace(GOOD, payload=b""), "bad_payload"),
     "other sides": (replace(GOOD, width=30, height=40), "size_mismatch"),
-    "no side": (replace(GOOD, width=0), "too_large"),
     "a long side": (replace(GOOD, height=MAX_IMAGE_SIDE_PX + 1), "too_large"),
     "more bytes than a frame may have": (replace(GOOD, payload=bytes(MAX_PAYLOAD_BYTES)), "too_large"),
     "no scale": (replace(GOOD, meters_per_count=0.0), "bad_header"),
-    "a negative scale": (replace(GOOD, meters_per_count=-0.001), "bad_header"),
     "a scale of NaN": (replace(GOOD, meters_per_count=math.nan), "bad_header"),
-    "an infinite scale": (replace(GOOD, meters_per_count=math.inf), "bad_header"),
     "kilometers": (replace(GOOD, meters_per_count=1000.0), "bad_header"),
     "of another time": (replace(GOOD, after_image_ns=MAX_DEPTH_GAP_NS + 1), "bad_header"),
-    "of an earlier time": (replace(GOOD, after_image_ns=-MAX_DEPTH_GAP_NS - 1), "bad_header"),
     "a pose without a lens": (replace(GOOD, to_camera=Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))), "bad_header"),
 }
-
-
-@pytest.mark.parametrize("size", [(4096, 1), (1, 4096)])
-def test_the_longest_sides_are_taken(size):
-    image(np.ones(size)).encode().check(replace(LENS, width=size[1], height=size[0]), 0)
 
 
 @pytest.mark.stability
@@ -141,51 +108,29 @@ def test_what_must_not_be_decoded_is_refused_by_name(kind):
 
 
 def test_registered_depth_may_be_smaller_but_not_of_another_shape():
-    for lens in (LENS, SMALL, Pinhole.from_fov(81, 61, 60.0)):
-        GOOD.check(lens, 1)
+    for width, height in ((40, 30), (20, 15), (81, 61)):
+        GOOD.check(Pinhole.from_fov(width, height, 60.0), 1)
+    for size in ((4096, 1), (1, 4096)):
+        image(np.ones(size)).encode().check(replace(LENS, width=size[1], height=size[0]), 0)
     with pytest.raises(PayloadError, match="40 x 30, its image 40 x 40"):
         GOOD.check(Pinhole.from_fov(40, 40, 60.0), 1)
     replace(GOOD, intrinsics=LENS).check(Pinhole.from_fov(40, 40, 60.0), 1)  # of a lens of its own
 
 
-# --- what passes and is damaged ----------------------------------------------------------------
-
-
-def packed(*words: int) -> EncodedDepth:
-    """A payload of given words and zeros: a table of one entry, then 4 x 4 pixels."""
-    planes = np.pad(np.array(words, "<u2"), (0, 17 - len(words))).view(np.uint8).reshape(-1, 2).T.tobytes()
-    return EncodedDepth(zstandard.ZstdCompressor().compress(planes), 4, 4, 0.001)
+def packed(*words: int, side: int = 4) -> EncodedDepth:
+    """A payload of given words and zeros: a table, then the pixels of a square."""
+    planes = np.array(words, "<u2").view(np.uint8).reshape(-1, 2).T.tobytes()
+    return EncodedDepth(zstandard.ZstdCompressor().compress(planes), side, side, 0.001)
 
 
 @pytest.mark.stability
 @pytest.mark.parametrize(
-    "depth", [packed(5, 1, 1, 1, 3), packed(5, 65535, 1, 1, 1)], ids=["beyond the table", "far beyond the table"]
+    "depth",
+    [packed(5, 1, 1, 1, 3, *[0] * 12), packed(5, 65535, *[1] * 15), packed(65535, 1, *[1] * 36, side=6)],
+    ids=["beyond the table", "far beyond the table", "a table beyond 16 bits"],
 )
 def test_counts_outside_the_table_are_undecodable(depth):
-    depth.check(Pinhole.from_fov(4, 4, 60.0), 1)
+    depth.check(Pinhole.from_fov(depth.width, depth.height, 60.0), 1)
     with pytest.raises(PayloadError) as error:
         depth.decode()
     assert error.value.reason == "undecodable"
-
-
-@pytest.mark.stability
-def test_a_table_beyond_16_bits_is_undecodable():
-    words = np.concatenate([[65535, 1], np.ones(32)]).astype("<u2")
-    payload = zstandard.ZstdCompressor().compress(words.view(np.uint8).reshape(-1, 2).T.tobytes())
-    with pytest.raises(PayloadError, match="not in the table"):
-        EncodedDepth(payload, 8, 4, 0.001).decode()
-
-
-@pytest.mark.stability
-@given(data=st.binary(max_size=200), at=st.integers(0, 10**6), cut=st.integers(0, 10**6))
-def test_damaged_bytes_are_decoded_to_counts_or_refused(data, at, cut):
-    whole = GOOD.payload
-    at, cut = at % len(whole), cut % len(whole)
-    for payload in (data, whole[:at] + data + whole[at + len(data) :], whole[:cut]):
-        depth = replace(GOOD, payload=payload)
-        try:
-            depth.check(LENS, 1)
-            counts = depth.decode().counts
-        except PayloadError:
-            continue
-        assert counts.shape == (30, 40) and counts.dtype == np.uint16

@@ -9,22 +9,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from freshfield import geometry
 from freshfield.geometry import (
     GeometryError,
     Pinhole,
     Pose,
-    converging_point,
     look_at,
     matrix_to_quaternion,
-    on_sphere,
-    quaternion_multiply,
     quaternion_normalize,
     quaternion_to_matrix,
     se3_inverse,
-    slerp,
     so3_exp,
     so3_log,
-    world_rays,
 )
 
 finite = st.floats(-1e3, 1e3, allow_subnormal=True)
@@ -35,9 +31,6 @@ unit = st.floats(0, 1)
 
 def scipy(q) -> Rotation:
     return Rotation.from_quat([q[1], q[2], q[3], q[0]])
-
-
-# --- quaternions ------------------------------------------------------------------------------
 
 
 @given(quaternions)
@@ -53,22 +46,19 @@ def test_quaternions_and_matrices_agree_with_scipy(q):
 @given(quaternions, quaternions)
 def test_products_compose_rotations(a, b):
     np.testing.assert_allclose(
-        quaternion_to_matrix(quaternion_multiply(a, b)), quaternion_to_matrix(a) @ quaternion_to_matrix(b), atol=1e-9
+        quaternion_to_matrix(geometry.quaternion_multiply(a, b)),
+        quaternion_to_matrix(a) @ quaternion_to_matrix(b),
+        atol=1e-9,
     )
 
 
-@pytest.mark.parametrize("scale", [5e-324, 1e-300, 1e-30, 1.0, 1e30, 1e300])
-def test_normalising_survives_any_scale(scale):
-    q = np.array([0.0, 3.0, -4.0, 0.0]) * scale
-    if scale == 5e-324:
-        q = np.array([0.0, scale, -scale, 0.0])
-    np.testing.assert_allclose(np.linalg.norm(quaternion_normalize(q)), 1.0, rtol=1e-12)
-
-
-@pytest.mark.parametrize("q", [[0, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1]])
-def test_quaternions_without_a_direction_are_refused(q):
-    with pytest.raises(GeometryError):
-        quaternion_normalize(q)
+def test_normalising_survives_any_scale_and_refuses_what_has_no_direction():
+    for scale in (1e-300, 1e-30, 1.0, 1e30, 1e300):
+        np.testing.assert_allclose(quaternion_normalize([0.0, 3.0 * scale, -4.0 * scale, 0.0]), [0, 0.6, -0.8, 0])
+    np.testing.assert_allclose(np.linalg.norm(quaternion_normalize([0.0, 5e-324, -5e-324, 0.0])), 1.0, rtol=1e-12)
+    for none in ([0, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1]):
+        with pytest.raises(GeometryError):
+            quaternion_normalize(none)
 
 
 @pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, -2, 3]])
@@ -87,13 +77,12 @@ def test_half_turns_and_tiny_turns(axis, angle):
 def test_slerp_goes_the_shorter_way_at_constant_speed(a, b, fraction):
     start, end = quaternion_to_matrix(a), quaternion_to_matrix(b)
     whole = np.linalg.norm(so3_log(start.T @ end))
-    middle = quaternion_to_matrix(slerp(a, b, fraction))
+    middle = quaternion_to_matrix(geometry.slerp(a, b, fraction))
     assert np.linalg.norm(so3_log(start.T @ middle)) == pytest.approx(fraction * whole, abs=1e-6)
-    np.testing.assert_allclose(quaternion_to_matrix(slerp(a, b, 0)), start, atol=1e-9)
-    np.testing.assert_allclose(quaternion_to_matrix(slerp(a, b, 1)), end, atol=1e-9)
-
-
-# --- poses ------------------------------------------------------------------------------------
+    np.testing.assert_allclose(quaternion_to_matrix(geometry.slerp(a, b, 1)), end, atol=1e-9)
+    between = Pose(tuple(a), (0.0, 0.0, 1.0)).interpolate(Pose(tuple(b), (2.0, 4.0, 1.0)), fraction)
+    assert between.translation_m == pytest.approx((2 * fraction, 4 * fraction, 1.0))
+    np.testing.assert_allclose(between.matrix()[:3, :3], middle, atol=1e-9)
 
 
 @given(quaternions, vectors)
@@ -113,7 +102,6 @@ def test_poses_survive_the_way_through_a_matrix(q, t):
         lambda m: m + np.triu(np.full((4, 4), 0.01)),  # sheared
         lambda m: np.where(np.eye(4) > 0, np.nan, m),
         lambda m: m[:2],
-        lambda m: m.T,
         lambda m: m * [[1], [1], [1], [2]],
     ],
 )
@@ -132,22 +120,18 @@ def test_look_at_looks_at(eye, target):
     distance = np.linalg.norm(np.subtract(eye, target))
     np.testing.assert_allclose(local[:3], [0, 0, distance], atol=1e-6 * max(1, distance, *map(abs, eye)))
     assert m[2, 1] <= 1e-9  # image-down never points up
-
-
-def test_look_at_refuses_a_point_and_survives_straight_down():
+    Pose.from_matrix(look_at(eye, np.subtract(eye, (0, 0, 1))))  # straight down
     with pytest.raises(GeometryError):
-        look_at([1, 1, 1], [1, 1, 1])
-    Pose.from_matrix(look_at([0, 0, 5], [0, 0, 0]))
-    Pose.from_matrix(look_at([5, 0, 0], [0, 0, 0], up=(1, 0, 0)))
+        look_at(eye, eye)
 
 
 def test_a_pose_on_a_sphere_looks_at_its_middle_or_away_from_it():
     away = np.array([0.75**0.5, 0.0, 0.5])
     for outward, sign in ((False, -1.0), (True, 1.0)):
-        pose = on_sphere([1.0, 2.0, 3.0], 2.0, 90.0, 30.0, outward)
+        pose = geometry.on_sphere([1.0, 2.0, 3.0], 2.0, 90.0, 30.0, outward)
         assert pose[:3, 3] == pytest.approx(np.array([1.0, 2.0, 3.0]) + 2.0 * away)
         assert pose[:3, 2] == pytest.approx(sign * away)
-    assert on_sphere(np.zeros(3), 1.0, 0.0, 0.0)[:3, 3] == pytest.approx([0.0, -1.0, 0.0])
+    assert geometry.on_sphere(np.zeros(3), 1.0, 0.0, 0.0)[:3, 3] == pytest.approx([0.0, -1.0, 0.0])
 
 
 def test_rays_converge_where_least_squares_says():
@@ -157,20 +141,10 @@ def test_rays_converge_where_least_squares_says():
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     across = np.eye(3) - ways[:, :, None] * ways[:, None, :]
     wanted = np.linalg.lstsq(across.reshape(-1, 3), (across @ origins[..., None]).ravel(), rcond=None)[0]
-    assert converging_point(origins, ways) == pytest.approx(wanted)
-    assert converging_point(origins, -ways) is None, "they run apart"
-    assert converging_point(origins, np.tile(ways[0], (5, 1))) is None, "they are parallel"
+    assert geometry.converging_point(origins, ways) == pytest.approx(wanted)
+    assert geometry.converging_point(origins, -ways) is None, "they run apart"
+    assert geometry.converging_point(origins, np.tile(ways[0], (5, 1))) is None, "they are parallel"
 
-
-def test_interpolated_poses_move_in_a_straight_line():
-    a, b = Pose.from_matrix(look_at([0, 0, 1], [5, 0, 1])), Pose.from_matrix(look_at([2, 4, 1], [2, 9, 1]))
-    m = a.interpolate(b, 0.25)
-    assert m.translation_m == pytest.approx((0.5, 1.0, 1.0))
-    assert a.interpolate(b, 0.0) == a
-    np.testing.assert_allclose(a.interpolate(b, 1.0).matrix(), b.matrix(), atol=1e-12)
-
-
-# --- cameras ----------------------------------------------------------------------------------
 
 lenses = st.builds(
     Pinhole,
@@ -204,11 +178,6 @@ def test_rays_undo_projection(camera, seed):
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-12)
 
 
-def test_points_behind_the_camera_have_no_pixel():
-    camera = Pinhole.from_fov(64, 48, 60)
-    assert np.isnan(camera.project([[0, 0, -1.0], [0, 0, 0.0]])).all()
-
-
 @given(st.integers(8, 200), st.integers(8, 200), st.floats(20, 120), st.sampled_from([0.25, 0.5, 1 / 3, 2.0]))
 def test_scaling_leaves_directions_where_they_were(width, height, fov, factor):
     """The corners of the image look the same way at any size."""
@@ -223,8 +192,9 @@ def test_scaling_leaves_directions_where_they_were(width, height, fov, factor):
 def test_from_fov_and_world_rays():
     camera = Pinhole.from_fov(100, 50, 90)
     assert camera.fx == pytest.approx(50) and (camera.cx, camera.cy) == (50, 25)
+    assert np.isnan(camera.project([[0, 0, -1.0], [0, 0, 0.0]])).all(), "behind the camera there is no pixel"
     pose = look_at([0, -3, 1], [0, 0, 1])
-    origin, directions = world_rays(camera, pose)
+    origin, directions = geometry.world_rays(camera, pose)
     np.testing.assert_array_equal(origin, [0, -3, 1])
     assert directions.shape == (50, 100, 3)
     np.testing.assert_allclose(directions[24:26, 49:51].mean((0, 1)), [0, 1, 0], atol=1e-3)

@@ -12,13 +12,10 @@ from freshfield import machine_load
 from freshfield.machine_load import LoadMeter, cpu_s, outside_cores, outside_load, rss_mb
 
 
-def test_memory_and_processor_time_of_a_process():
+def test_memory_and_processor_time_of_a_process_and_of_one_that_is_gone():
     block = np.ones(8 * 2**20)  # 64 MB that are touched
     assert rss_mb() > 60.0
     assert cpu_s(os.getpid()) > 0.0 and block[0] == 1.0
-
-
-def test_a_process_that_is_gone_tells_nothing():
     assert rss_mb(2**22 + 1) is None and cpu_s(2**22 + 1) is None
 
 
@@ -29,9 +26,6 @@ def use(cpu):
 def test_outside_load_is_what_the_machine_used_minus_ours():
     rows = [{"t_s": 2.0 * i, "machine": {"cpu": 2.0}, "edge": use(1.2), "node": use(0.1)} for i in range(5)]
     assert outside_load(rows) == {"cores": pytest.approx(0.7), "ours": 1.3, "method": "machine minus ours"}
-
-
-def test_nothing_known_is_none():
     assert outside_load([]) == {"cores": None, "ours": None, "method": None}
     assert outside_load([{"t_s": 0.0, "edge": use(1.0)}])["cores"] is None
 

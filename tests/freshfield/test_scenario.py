@@ -22,27 +22,18 @@ def test_a_whole_file(tmp_path):
     assert load(file, seed=9).seed == 9
 
 
-def test_shipped_ones_go_by_name():
-    assert len(load("room").cameras) == 13 and load("room").held_out == ("cam00",)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("[1, 2]", "expected a mapping"),
         ("cameras: {count: 2}\nsede: 3", "sede: unknown key; did you mean 'seed'"),
-        ("cameras: {count: 2}\nsource: 3", "source: expected a mapping"),
         ("{}", "either count"),
-        ("cameras: {count: 0}", "either count"),
         ("cameras: {count: 1001}", "cameras.count: expected a whole number, 0 to 1000"),
         ("cameras: {count: 2, ids: [a, b]}", "either count"),
-        ("cameras: {count: two}", "cameras.count: expected a whole number, 0 to 1000, got 'two'"),
         ("cameras: {ids: [a, a]}", "same id twice"),
         ("cameras: {ids: ['a/b']}", "'a/b' is not an id"),
         ("cameras: {count: 2, held_out: [cam02]}", "'cam02' is not one of the cameras"),
         ("cameras: {count: 1, held_out: [cam00]}", "every camera is held out"),
-        ("cameras: {count: 2}\nseed: -1", "seed"),
-        ("a: [1", "not YAML"),
     ],
 )
 def test_errors_are_one_line_with_the_file(tmp_path, text, message):
@@ -53,13 +44,10 @@ def test_errors_are_one_line_with_the_file(tmp_path, text, message):
     assert str(error.value).startswith(str(file)) and "\n" not in str(error.value)
 
 
-def test_a_folder_does_not_hide_a_shipped_one(tmp_path, monkeypatch):
+def test_shipped_ones_go_by_name_and_a_missing_file_lists_them(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "room").mkdir()
-    assert len(load("room").cameras) == 13
-
-
-def test_a_missing_file_lists_what_is_shipped():
+    (tmp_path / "room").mkdir()  # hides nothing
+    assert len(load("room").cameras) == 13 and load("room").held_out == ("cam00",)
     with pytest.raises(ScenarioError, match=r"shipped scenarios: .*room"):
         load("no-such-scenario")
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import shutil
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,21 +46,9 @@ def requests(count: int = 12, cameras: tuple[str, ...] = ("cam00", "cam01")):
             pose = Pose.from_matrix(look_at(rng.normal(size=3), [0, 0, 5]))
             data = payload.encode(rng.integers(0, 255, (24, 32, 3), dtype=np.uint8))
             captured = START_NS + k * 33_333_333 + number
-            frame = wire.Frame(
-                camera,
-                "s1",
-                k,
-                captured,
-                pose,
-                LENS,
-                "jpeg",
-                data,
-                held_out=number == 0,
-                clock_offset_ns=-1_234_567,
-                clock_uncertainty_ns=1000,
-                pose_gap_ns=7,
-                depth=depth_of(rng) if number and k % 3 == 0 else None,
-            )
+            frame = wire.Frame(camera, "s1", k, captured, pose, LENS, "jpeg", data, number == 0, -1_234_567, 1000, 7)
+            if number and k % 3 == 0:
+                frame = replace(frame, depth=depth_of(rng))
             yield wire.to_request(frame), captured + 2_000_000
 
 
@@ -93,34 +81,27 @@ def test_frames_are_read_as_they_were_sent(tmp_path):
 def test_viewers_find_what_they_know(tmp_path):
     sent = list(requests(3))
     write(tmp_path / "a.mcap", sent)
+    found: dict[str, list] = {}
     with (tmp_path / "a.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        summary = reader.get_summary()
-        assert summary is not None and summary.statistics.message_count == 4 * 6 + 1 + 2 + 3
-        found: dict[str, list] = {}
-        for schema, channel, message, decoded in reader.iter_decoded_messages(
-            topics=[c.topic for c in summary.channels.values() if c.message_encoding == "protobuf"]
-        ):
-            found.setdefault(channel.topic, []).append((schema.name, message, decoded))
+        topics = [c.topic for c in reader.get_summary().channels.values() if c.message_encoding == "protobuf"]
+        for schema, channel, message, decoded in reader.iter_decoded_messages(topics=topics):
+            found.setdefault(f"{channel.topic} {schema.name}", []).append((message, decoded))
         decisions = [json.loads(m.data) for _, _, m in reader.iter_messages(topics=[DECISIONS])]
     assert decisions == [{"number": 0}, {"number": 1}, {"number": 2}]
-    kinds = {topic: rows[0][0] for topic, rows in found.items()}
-    assert kinds["/cam00/image"] == "foxglove.CompressedImage"
-    assert kinds["/cam00/calibration"] == "foxglove.CameraCalibration" and len(found["/cam00/calibration"]) == 1
-    assert kinds["/cam00/pose"] == "foxglove.PoseInFrame" and kinds["/tf"] == "foxglove.FrameTransform"
-    assert kinds["/cam00/header"] == "freshfield.v1.FrameHeader"
-    request, arrived_ns = sent[0]
-    h, (_, message, image) = request.header, found["/cam00/image"][0]
+    (request, arrived_ns), h = sent[0], sent[0][0].header
+    message, image = found["/cam00/image foxglove.CompressedImage"][0]
     assert (image.format, image.data, image.frame_id) == ("jpeg", request.payload, "cam00")
     captured_ns = h.generated_ns + h.clock_offset_ns
     assert (message.log_time, message.publish_time) == (arrived_ns, captured_ns)
     assert image.timestamp.ToNanoseconds() == captured_ns
-    transform = next(d for _, _, d in found["/tf"] if d.child_frame_id == "cam00")
-    pose = found["/cam00/pose"][0][2].pose
+    assert found["/cam00/header freshfield.v1.FrameHeader"][0][1].SerializeToString() == h.SerializeToString()
+    transform = next(d for _, d in found["/tf foxglove.FrameTransform"] if d.child_frame_id == "cam00")
+    pose = found["/cam00/pose foxglove.PoseInFrame"][0][1].pose
     for turn, place in ((transform.rotation, transform.translation), (pose.orientation, pose.position)):
         assert (turn.w, turn.x, turn.y, turn.z) == (h.pose.qw, h.pose.qx, h.pose.qy, h.pose.qz)
         assert (place.x, place.y, place.z) == (h.pose.tx_m, h.pose.ty_m, h.pose.tz_m)
-    calibration = found["/cam00/calibration"][0][2]
+    ((_, calibration),) = found["/cam00/calibration foxglove.CameraCalibration"]
     assert list(calibration.K) == [LENS.fx, 0, LENS.cx - 0.5, 0, LENS.fy, LENS.cy - 0.5, 0, 0, 1]
     assert list(calibration.D) == [*LENS.distortion, 0.0]
 
@@ -164,24 +145,18 @@ def test_damage_is_left_out_and_said(tmp_path):
     assert 0 < len(left) < len(sent) and set(left) < {r.payload for r, _ in sent}
 
 
-def test_what_is_no_recording_says_so(tmp_path):
+def test_what_is_no_recording_says_so_and_one_is_never_overwritten(tmp_path):
     for data in (b"", b"\x89MCAP0", b"not an MCAP file at all"):
         (tmp_path / "x.mcap").write_bytes(data)
         with pytest.raises(SessionError, match=r"x\.mcap: is no MCAP file"):
             Session(tmp_path / "x.mcap")
-
-
-def test_a_recording_is_never_overwritten(tmp_path):
-    write(tmp_path / "a.mcap", [])
-    shutil.copy(tmp_path / "a.mcap", tmp_path / "b.mcap")
     with pytest.raises(FileExistsError):
-        SessionWriter(tmp_path / "b.mcap", {})
+        SessionWriter(tmp_path / "x.mcap", {})
 
 
-@pytest.mark.parametrize("how", ["zstd", "lz4", "rot13"])
-def test_compressed_chunks_are_left_out_unopened_and_said(tmp_path, how):
+def test_compressed_chunks_are_left_out_unopened_and_said(tmp_path):
     """Whatever they claim to hold."""
-    body = struct.pack("<QQQI", 0, 0, 2**28, 0) + struct.pack("<I", len(how)) + how.encode()
+    body = struct.pack("<QQQI", 0, 0, 2**28, 0) + struct.pack("<I", 4) + b"zstd"
     body += struct.pack("<Q", 100) + zstandard.compress(bytes(2**20))
     (tmp_path / "a.mcap").write_bytes(MCAP0_MAGIC + struct.pack("<BQ", Opcode.CHUNK, len(body)) + body)
     session = Session(tmp_path / "a.mcap")

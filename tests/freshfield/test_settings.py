@@ -34,7 +34,8 @@ class Outer(Settings, frozen=True):
 def test_a_mapping_becomes_a_struct():
     given = {"share": 1, "size": [3, 4], "inner": {"rate": 2}, "tags": ["a"], "table": {"k": 0.5}}
     assert read_settings(Outer, given, "s: x") == Outer(1, False, 1.0, (3, 4), Inner(2.0), 3, "mean", ["a"], {"k": 0.5})
-    assert read_settings(Outer, {"share": None}, "s: x").share is None
+    found = read_settings(Outer, given, "s: x")
+    assert read_settings(Outer, as_mapping(found), "s: x") == found
 
 
 @pytest.mark.parametrize(
@@ -43,15 +44,9 @@ def test_a_mapping_becomes_a_struct():
         ({"cuont": 1}, r"s: x\.cuont: unknown key; did you mean 'count'"),
         ({"count": 1.0}, r"s: x\.count: expected a whole number"),
         ({"on": 1}, r"s: x\.on: expected true or false"),
-        ({"share": float("nan")}, r"s: x\.share: expected a number"),
         ({"share": float("inf")}, r"s: x\.share: expected a number"),
-        ({"share": 10**400}, r"s: x\.share: expected a number"),
-        ({"size": [1, 2, 3]}, r"s: x\.size: expected a list of 2 values"),
         ({"size": [1, "b"]}, r"s: x\.size\[1\]: expected a whole number"),
         ({"inner": {}}, r"s: x\.inner\.rate: missing"),
-        ({"inner": {"rate": 1, "nmae": "y"}}, r"s: x\.inner\.nmae: unknown key; did you mean 'name'"),
-        ({"table": {"k": "v"}}, r"s: x\.table\.k: expected a number"),
-        ({"tags": "a"}, r"s: x\.tags: expected a list"),
         ({"level": 11}, r"s: x\.level: expected a whole number, 0 to 10, got 11"),
         ({"mode": "sum"}, r"s: x\.mode: expected one of mean, max, got 'sum'"),
         ({"tags": [7]}, r"s: x\.tags\[0\]: expected text, got 7: put it in quotes"),
@@ -69,8 +64,3 @@ def test_keys_are_described_with_default_bounds_and_help():
     assert "    level                  default 3; 0 to 10; of noise" in lines
     assert "    mode                   default 'mean'; one of mean, max" in lines
     assert not any("inner" in line for line in lines)
-
-
-def test_settings_become_the_mapping_that_gives_them():
-    found = read_settings(Outer, {"size": [3, 4], "inner": {"rate": 2}}, "s: x")
-    assert read_settings(Outer, as_mapping(found), "s: x") == found

@@ -14,14 +14,9 @@ from freshfield import streams as served
 from freshfield.access import ANYBODY
 from freshfield.frame import FrameRejected
 from freshfield.limits import MAX_SESSIONS_PER_CAMERA, SESSION_IDLE_NS
-from freshfield.streams import OpenStreams, SessionStreams, serve_health
+from freshfield.streams import OpenStreams, SessionStreams
 from freshfield.transport import Transport
-
-
-def _said(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """What was logged, but for gRPC's poller: it may wake the closed event loop of an earlier test."""
-    said = [record.getMessage() for record in caplog.records]
-    return [line for line in said if "PollerCompletionQueue._handle_events" not in line]
+from tests.freshfield.serving import serving
 
 
 @asynccontextmanager
@@ -51,14 +46,11 @@ async def echoing(streams: OpenStreams):
         "Echo": grpc.stream_stream_rpc_method_handler(answer),
         "Pour": grpc.unary_stream_rpc_method_handler(pour),
     }
-    server = Transport().aio_server()
-    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("t", handler),))
-    await serve_health(server, ())
-    port = Transport().bind(server, "127.0.0.1:0")
-    await server.start()
-    async with Transport().aio_channel(f"127.0.0.1:{port}") as channel:
+    async with (
+        serving(Transport(), grpc.method_handlers_generic_handler("t", handler), health=True) as port,
+        Transport().aio_channel(f"localhost:{port}") as channel,
+    ):
         yield channel
-    await server.stop(None)
 
 
 async def opened(channel, say: bytes | None = None):
@@ -109,20 +101,13 @@ async def test_before_the_server_stops_every_stream_is_told_so_and_nothing_is_lo
     async with echoing(streams) as channel:
         calls = [await opened(channel, b"use"), await opened(channel)]
         streams.end_all("the server ends")
-        assert [await call.code() for call in calls] == 2 * [grpc.StatusCode.UNAVAILABLE]
-        assert [await call.details() for call in calls] == 2 * ["the server ends"]
-    assert not _said(caplog)
-
-
-async def test_a_stream_that_opens_while_the_server_ends_is_told_so_and_nothing_is_logged(caplog):
-    streams = OpenStreams(4)
-    async with echoing(streams) as channel:
-        streams.end_all("the server ends")
-        late = channel.stream_stream("/t/Echo")()
-        assert (await late.code(), await late.details()) == (grpc.StatusCode.UNAVAILABLE, "the server ends")
+        calls.append(channel.stream_stream("/t/Echo")())  # opens while the server ends
+        assert [await call.code() for call in calls] == 3 * [grpc.StatusCode.UNAVAILABLE]
+        assert [await call.details() for call in calls] == 3 * ["the server ends"]
         assert await poured(channel) is grpc.StatusCode.UNAVAILABLE  # one that begins with an answer
         assert not streams._silent and not streams._used
-    assert not _said(caplog)
+    # gRPC's poller may wake the closed event loop of an earlier test.
+    assert all("PollerCompletionQueue._handle_events" in line for line in caplog.messages)
 
 
 async def test_among_streams_of_use_the_one_that_is_idle_longest_ends():
@@ -137,16 +122,6 @@ async def test_among_streams_of_use_the_one_that_is_idle_longest_ends():
         assert await first.read() == b"x"
 
 
-async def test_a_closed_stream_leaves_its_place():
-    streams = OpenStreams(2)
-    async with echoing(streams) as channel:
-        for _ in range(10):
-            call = await opened(channel, b"use")
-            await call.done_writing()
-            assert await call.code() is grpc.StatusCode.OK
-        assert streams.ended == 0 and not streams._used and not streams._silent
-
-
 class Stream:
     open = True
     caller = ANYBODY
@@ -156,28 +131,18 @@ def test_a_session_belongs_to_the_stream_that_sends_it():
     sessions, mine, spoofer = SessionStreams(["cam00"]), Stream(), Stream()
     sessions.claim("cam00", "s", mine, 0)
     with pytest.raises(FrameRejected) as refused:
-        sessions.claim("cam00", "s", spoofer, 1)
+        sessions.claim("cam00", "s", spoofer, SESSION_IDLE_NS - 1)
     assert refused.value.reason == "session_in_use"
-    sessions.claim("cam00", "s", mine, SESSION_IDLE_NS)
-    sessions.claim("cam00", "other", spoofer, SESSION_IDLE_NS)
-
-
-def test_a_node_that_comes_back_goes_on_with_its_session():
-    sessions, before, after = SessionStreams(["cam00"]), Stream(), Stream()
-    sessions.claim("cam00", "s", before, 0)
-    before.open = False
-    sessions.claim("cam00", "s", after, 1)  # its stream ended
+    sessions.claim("cam00", "other", spoofer, 1)
+    mine.open = False
+    sessions.claim("cam00", "s", spoofer, 2)  # its stream ended
     again = Stream()
-    sessions.claim("cam00", "s", again, 1 + SESSION_IDLE_NS)  # or is gone without a word
+    sessions.claim("cam00", "s", again, 2 + SESSION_IDLE_NS)  # or is gone without a word
     with pytest.raises(FrameRejected):
-        sessions.claim("cam00", "s", after, 2 + SESSION_IDLE_NS)
-    sessions.claim("cam00", "s", after, 0)  # a clock that was set back delays nobody
-
-
-def test_a_thousand_sessions_leave_no_trace():
-    sessions, stream = SessionStreams(["cam00"]), Stream()
+        sessions.claim("cam00", "s", spoofer, 3 + SESSION_IDLE_NS)
+    sessions.claim("cam00", "s", spoofer, 0)  # a clock that was set back delays nobody
     for k in range(1000):
-        sessions.claim("cam00", f"s{k}", stream, k)
+        sessions.claim("cam00", f"s{k}", spoofer, k)
     assert len(sessions._sent["cam00"]) == MAX_SESSIONS_PER_CAMERA
 
 

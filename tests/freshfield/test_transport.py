@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import dataclasses
 import shutil
 import subprocess
-from contextlib import asynccontextmanager
 from pathlib import Path
 
 import grpc
@@ -17,112 +17,78 @@ import pytest
 
 from freshfield import transport
 from freshfield.limits import MAX_PAYLOAD_BYTES
-from freshfield.transport import (
-    Transport,
-    TransportError,
-    add_arguments,
-    backoff_s,
-    from_arguments,
-    host_port,
-    peer_text,
-)
-from freshfield.v1 import clock_pb2, clock_pb2_grpc, frames_pb2_grpc
-from freshfield.v1 import frames_pb2 as pb
+from freshfield.transport import Transport, TransportError, host_port, peer_text
+from tests.freshfield.serving import serving
+
+CLOCK, FRAMES = "freshfield.v1.ClockService", "freshfield.v1.FrameStreamService"
 
 
-class Clock(clock_pb2_grpc.ClockServiceServicer):
-    async def Exchange(self, request, context):
-        return clock_pb2.ExchangeResponse(client_sent_ns=request.client_sent_ns)
+async def echo(request, context):
+    return request
 
 
-class Frames(frames_pb2_grpc.FrameStreamServiceServicer):
-    async def Push(self, request_iterator, context):
-        async for request in request_iterator:
-            yield pb.PushResponse(sequence=len(request.payload))
+async def sizes(_, context):
+    while (message := await context.read()) is not grpc.aio.EOF:
+        await context.write(str(len(message)).encode())
 
 
-@asynccontextmanager
-async def serving(transport: Transport, frames: frames_pb2_grpc.FrameStreamServiceServicer | None = None):
-    """A server of both services; gives its port."""
-    server = transport.aio_server()
-    clock_pb2_grpc.add_ClockServiceServicer_to_server(Clock(), server)
-    frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(frames or Frames(), server)
-    port = transport.bind(server, "localhost:0")
-    await server.start()
-    try:
-        yield port
-    finally:
-        await server.stop(None)
+async def nothing(_, context):
+    await asyncio.sleep(30)
 
 
-async def ask(transport: Transport, port: int) -> int:
+def handlers(push=sizes) -> list[grpc.GenericRpcHandler]:
+    """Of a service that echoes, and of one that answers each message with its size."""
+    exchange, stream = grpc.unary_unary_rpc_method_handler(echo), grpc.stream_stream_rpc_method_handler(push)
+    return [
+        grpc.method_handlers_generic_handler(CLOCK, {"Exchange": exchange}),
+        grpc.method_handlers_generic_handler(FRAMES, {"Push": stream}),
+    ]
+
+
+async def ask(transport: Transport, port: int) -> bytes:
     async with transport.aio_channel(f"localhost:{port}") as channel:
-        call = clock_pb2_grpc.ClockServiceStub(channel).Exchange(
-            clock_pb2.ExchangeRequest(client_sent_ns=42), metadata=transport.metadata(), timeout=5
-        )
-        return (await call).client_sent_ns
+        return await channel.unary_unary(f"/{CLOCK}/Exchange")(b"42", metadata=transport.metadata(), timeout=5)
 
 
-async def push(transport: Transport, port: int, size: int) -> int:
-    async with transport.aio_channel(f"localhost:{port}") as channel:
-        call = frames_pb2_grpc.FrameStreamServiceStub(channel).Push(metadata=transport.metadata(), timeout=20)
-        await call.write(pb.PushRequest(payload=bytes(size)))
-        return (await call.read()).sequence
-
-
-def refusal(work) -> grpc.StatusCode:
-    with pytest.raises(grpc.aio.AioRpcError) as error:
-        asyncio.run(work)
-    return error.value.code()
+async def push(channel: grpc.aio.Channel, size: int) -> int:
+    call = channel.stream_stream(f"/{FRAMES}/Push")(timeout=20)
+    await call.write(bytes(size))
+    return int(await call.read())
 
 
 async def test_plain_text_and_messages_up_to_the_limit():
     """Larger ones are refused by who sends them, and where that is a stranger by the server, which lives on."""
+    unbounded = [("grpc.max_send_message_length", -1)]
     async with (
-        serving(Transport()) as port,
-        grpc.aio.insecure_channel(f"localhost:{port}", options=[("grpc.max_send_message_length", -1)]) as of_stranger,
+        serving(Transport(), *handlers()) as port,
+        Transport().aio_channel(f"localhost:{port}") as channel,
+        grpc.aio.insecure_channel(f"localhost:{port}", options=unbounded) as of_stranger,
     ):
-        assert await ask(Transport(), port) == 42
-        assert await push(Transport(), port, MAX_PAYLOAD_BYTES) == MAX_PAYLOAD_BYTES
+        assert await push(channel, MAX_PAYLOAD_BYTES) == MAX_PAYLOAD_BYTES
         with pytest.raises(grpc.aio.AioRpcError):
-            await push(Transport(), port, MAX_PAYLOAD_BYTES + 8192)
-        call = frames_pb2_grpc.FrameStreamServiceStub(of_stranger).Push(timeout=20)
-        await call.write(pb.PushRequest(payload=bytes(4 * MAX_PAYLOAD_BYTES)))
+            await push(channel, MAX_PAYLOAD_BYTES + 8192)
         with pytest.raises(grpc.aio.AioRpcError) as refused:
-            await call.read()
+            await push(of_stranger, 4 * MAX_PAYLOAD_BYTES)
         assert refused.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
-        assert await ask(Transport(), port) == 42
+        assert await ask(Transport(), port) == b"42"
 
 
 RIGHT = Transport(tokens={"camera:*": "right"})
 
 
-async def test_a_port_in_use_is_not_shared():
+async def test_a_port_in_use_is_not_shared_nor_one_opened_unprotected():
     async with serving(Transport()) as port:
-        with pytest.raises(TransportError, match=f"localhost:{port}"):
-            Transport().bind(Transport().aio_server(), f"localhost:{port}")
+        for address, why in ((f"localhost:{port}", f"localhost:{port}"), ("0.0.0.0:0", "nothing is encrypted")):
+            with pytest.raises(TransportError, match=why):
+                Transport().bind(Transport().aio_server(), address)
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("emu:7001", ("emu", 7001)),
-        (":7001", ("127.0.0.1", 7001)),
-        ("0.0.0.0:0", ("0.0.0.0", 0)),
-        ("[::1]:65535", ("[::1]", 65535)),
-    ],
-)
-def test_host_and_port_are_told_apart(text, expected):
-    assert host_port(text) == expected
-
-
-NO_ADDRESSES = ["", "host", "7001", "host:", "host:-1", "host:65536", "host:\u00b2", "::1:7001", "unix:/tmp/s"]
-
-
-@pytest.mark.parametrize("text", NO_ADDRESSES)
-def test_what_is_no_address_is_refused_by_name(text):
-    with pytest.raises(TransportError, match="expected HOST:PORT"):
-        host_port(text)
+def test_host_and_port_are_told_apart():
+    assert host_port("emu:7001") == ("emu", 7001) and host_port(":7001") == ("127.0.0.1", 7001)
+    assert host_port("0.0.0.0:0") == ("0.0.0.0", 0) and host_port("[::1]:65535") == ("[::1]", 65535)
+    for wrong in ("", "host", "7001", "host:", "host:-1", "host:65536", "host:\u00b2", "::1:7001", "unix:/tmp/s"):
+        with pytest.raises(TransportError, match="expected HOST:PORT"):
+            host_port(wrong)
 
 
 @pytest.fixture(scope="module")
@@ -145,32 +111,27 @@ def pem(tmp_path_factory):
     return folder
 
 
-def test_tls_and_mutual_tls(pem):
+async def test_tls_and_mutual_tls(pem):
     server_tls = Transport(cert=pem / "server.pem", key=pem / "server.key")
     mutual = Transport(cert=pem / "server.pem", key=pem / "server.key", ca=pem / "ca.pem")
-    trusting = Transport(ca=pem / "ca.pem")
+    trusting, deceived = Transport(ca=pem / "ca.pem"), Transport(ca=pem / "stranger.pem")
     known = Transport(cert=pem / "client.pem", key=pem / "client.key", ca=pem / "ca.pem")
-    deceived = Transport(ca=pem / "stranger.pem")
 
-    async def scene(server_side, client):
-        async with serving(server_side) as port:
-            return await ask(client, port)
+    async def refusal(client: Transport, port: int) -> str:
+        with pytest.raises(grpc.aio.AioRpcError) as error:
+            await ask(client, port)
+        return error.value.code().name
 
-    assert asyncio.run(scene(server_tls, trusting)) == 42
-    assert asyncio.run(scene(mutual, known)) == 42
-    for server_side, client in ((server_tls, deceived), (server_tls, Transport()), (mutual, trusting)):
-        assert refusal(scene(server_side, client)) == grpc.StatusCode.UNAVAILABLE
-    other = Transport(cert=pem / "server.pem", key=pem / "server.key", ca=pem / "ca.pem")
-    assert refusal(scene(mutual, other)) == grpc.StatusCode.UNAUTHENTICATED  # its name is no caller's
-
-
-async def test_a_connection_without_its_tls_handshake_ends(pem, monkeypatch):
-    sooner = [(name, 500 if "handshake" in name else value) for name, value in transport.SERVER_OPTIONS]
-    monkeypatch.setattr(transport, "SERVER_OPTIONS", sooner)
-    async with serving(Transport(cert=pem / "server.pem", key=pem / "server.key")) as port:
-        reader, writer = await asyncio.open_connection("localhost", port)
-        assert await asyncio.wait_for(reader.read(1), 10.0) == b""
-        writer.close()
+    async with serving(server_tls, *handlers()) as port:
+        assert await ask(trusting, port) == b"42"
+        for client in (deceived, Transport()):
+            assert await refusal(client, port) == "UNAVAILABLE"
+    async with serving(mutual, *handlers()) as port:
+        assert await ask(known, port) == b"42"
+        assert await refusal(trusting, port) == "UNAVAILABLE"
+        assert await refusal(mutual, port) == "UNAUTHENTICATED", "its name is no caller's"
+        wrong_token = dataclasses.replace(known, tokens={"": "wrong"})
+        assert await refusal(wrong_token, port) == "UNAUTHENTICATED", "a certificate does not make it good"
 
 
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # and empty SETTINGS
@@ -191,7 +152,7 @@ async def test_connections_are_few_and_those_that_do_nothing_end(encrypted, pem,
         while await reader.read(4096):
             pass
 
-    async with serving(tls) as port:
+    async with serving(tls, *handlers()) as port:
         kept = [await asyncio.open_connection("localhost", port) for _ in range(4)]
         if not encrypted:
             for reader, writer in kept:
@@ -201,33 +162,26 @@ async def test_connections_are_few_and_those_that_do_nothing_end(encrypted, pem,
         surplus = [await asyncio.open_connection("localhost", port) for _ in range(20)]
         assert await asyncio.wait_for(asyncio.gather(*(r.read(1) for r, _ in surplus)), 5.0) == [b""] * 20
         await asyncio.wait_for(asyncio.gather(*(ended(reader) for reader, _ in kept)), 10.0)
-        assert await ask(caller, port) == 42
+        assert await ask(caller, port) == b"42"
         for _, writer in kept + surplus:
             writer.close()
 
 
-LISTENING = {
-    "an authority alone": (Transport(ca=Path("ca")), "127.0.0.1", "--tls-ca .* needs --tls-cert"),
-    "a token without a name": (Transport(tokens={"": "x"}), "127.0.0.1", "NAME TOKEN"),
-    "plain text": (RIGHT, "0.0.0.0", "nothing is encrypted"),
-    "nobody asked": (Transport(cert=Path("c"), key=Path("k")), "0.0.0.0", "nobody is asked"),
-    "no address": (Transport(), "[::]", "nothing is encrypted .* and nobody is asked"),
-}
-
-
-@pytest.mark.parametrize("what", LISTENING)
-async def test_a_server_refuses_to_listen_unprotected(what):
-    transport, host, why = LISTENING[what]
-    with pytest.raises(TransportError, match=why):
-        transport.bind(Transport().aio_server(), f"{host}:0")
-
-
-def test_what_protects_a_port_beyond_this_machine():
+def test_a_server_refuses_to_listen_unprotected_beyond_this_machine():
     tls = {"cert": Path("c"), "key": Path("k")}
-    assert Transport(**tls, tokens={"viewer": "x"}).guard("0.0.0.0", "page", http=True) == ""
-    assert Transport(**tls, ca=Path("ca")).guard("0.0.0.0", "gRPC") == ""
+    for given, host, why in (
+        (Transport(ca=Path("ca")), "127.0.0.1", "--tls-ca .* needs --tls-cert"),
+        (Transport(tokens={"": "x"}), "127.0.0.1", "NAME TOKEN"),
+        (RIGHT, "0.0.0.0", "nothing is encrypted"),
+        (Transport(**tls), "0.0.0.0", "nobody is asked"),
+        (Transport(), "[::]", "nothing is encrypted .* and nobody is asked"),
+    ):
+        with pytest.raises(TransportError, match=why):
+            given.guard(host, "gRPC")
     with pytest.raises(TransportError, match="machines, and nobody can log in"):
         Transport(**tls, ca=Path("ca")).guard("0.0.0.0", "page", http=True)
+    assert Transport(**tls, tokens={"viewer": "x"}).guard("0.0.0.0", "page", http=True) == ""
+    assert Transport(**tls, ca=Path("ca")).guard("0.0.0.0", "gRPC") == ""
     for host in ("127.0.0.1", "127.1.2.3", "::1", "[::1]", "localhost"):
         assert Transport().guard(host, "page") == ""
     words = Transport(insecure=True).guard("0.0.0.0", "page")
@@ -242,65 +196,51 @@ async def test_a_token_does_not_leave_the_machine_in_plain_text():
 
 def parsed(*arguments: str) -> Transport:
     parser = argparse.ArgumentParser()
-    add_arguments(parser)
-    return from_arguments(parser.parse_args(arguments))
+    transport.add_arguments(parser)
+    return transport.from_arguments(parser.parse_args(arguments))
 
 
-def test_options_become_a_transport(tmp_path):
-    token = tmp_path / "token"
+def test_options_become_a_transport(pem, tmp_path):
+    token, damaged = tmp_path / "token", tmp_path / "damaged.pem"
     token.write_text("  secret\n")
-    transport = parsed("--token-file", str(token))
-    assert transport.metadata() == (("authorization", "Bearer secret"),)
     assert parsed() == Transport()
+    assert parsed("--token-file", str(token)).metadata() == (("authorization", "Bearer secret"),)
     token.write_text("camera:cam00 one\n\noperator two\n")
     assert parsed("--token-file", str(token)).tokens == {"camera:cam00": "one", "operator": "two"}
-    for wrong in ("viewer a\nviewer b", "viewer a\noperator a", "a\nb", "viewer a b"):
+    for wrong in ("viewer a\nviewer b", "viewer a\noperator a", "a\nb", "viewer a b", "\n"):
         token.write_text(wrong)
-        with pytest.raises(TransportError, match="NAME TOKEN"):
+        with pytest.raises(TransportError, match=r"NAME TOKEN|is empty"):
             parsed("--token-file", str(token))
-    token.write_text("\n")
-    with pytest.raises(TransportError, match="empty"):
-        parsed("--token-file", str(token))
-    with pytest.raises(TransportError, match="cannot read"):
-        parsed("--tls-ca", str(tmp_path / "none.pem"))
-    with pytest.raises(TransportError, match="go together"):
-        parsed("--tls-cert", str(token))
-
-
-@pytest.mark.parametrize("text", ["", "no certificate", "-----BEGIN CERTIFICATE-----\nMIIB\n"])
-def test_files_that_hold_no_certificate_are_refused_by_name(pem, tmp_path, text):
-    (damaged := tmp_path / "damaged.pem").write_text(text)
-    with pytest.raises(TransportError, match=r"--tls-ca .*damaged\.pem holds no certificate"):
-        parsed("--tls-ca", str(damaged))
-    with pytest.raises(TransportError, match=r"cannot use --tls-cert .*damaged\.pem"):
-        parsed("--tls-cert", str(damaged), "--tls-key", str(pem / "server.key"))
+    damaged.write_text("-----BEGIN CERTIFICATE-----\nMIIB\n")
+    for words, why in (
+        (("--tls-ca", str(tmp_path / "none.pem")), "cannot read"),
+        (("--tls-cert", str(token)), "go together"),
+        (("--tls-ca", str(damaged)), r"damaged\.pem holds no certificate"),
+        (("--tls-cert", str(damaged), "--tls-key", str(pem / "server.key")), r"cannot use --tls-cert .*damaged\.pem"),
+    ):
+        with pytest.raises(TransportError, match=why):
+            parsed(*words)
 
 
 async def test_a_slow_reader_is_felt_at_once():
     """bdp_probe=0: a client cannot bury a stalled reader under megabytes of frames, which are age."""
 
-    class Stalled(frames_pb2_grpc.FrameStreamServiceServicer):
-        async def Push(self, request_iterator, context):
-            await asyncio.sleep(30)
-            yield pb.PushResponse()
-
     written = 0
-    async with serving(Transport(), Stalled()) as port, Transport().aio_channel(f"localhost:{port}") as channel:
-        call = frames_pb2_grpc.FrameStreamServiceStub(channel).Push()
-        try:
+    plain = Transport()
+    async with serving(plain, *handlers(nothing)) as port, plain.aio_channel(f"localhost:{port}") as channel:
+        call = channel.stream_stream(f"/{FRAMES}/Push")()
+        with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(2):
                 while written < 100:
-                    await call.write(pb.PushRequest(payload=bytes(100_000)))
+                    await call.write(bytes(100_000))
                     written += 1
-        except TimeoutError:
-            pass
         call.cancel()
     assert written < 20
 
 
 def test_the_back_off_doubles_to_its_bound_and_draws_once_each_time():
     jitter, same = np.random.default_rng(4), np.random.default_rng(4)
-    pauses = [backoff_s(failures, 0.2, 3.0, jitter) for failures in (0, 1, 2, 3, 4, 5, 10_000)]
+    pauses = [transport.backoff_s(failures, 0.2, 3.0, jitter) for failures in (0, 1, 2, 3, 4, 5, 10_000)]
     expected = [0.2, 0.4, 0.8, 1.6, 3.0, 3.0, 3.0]
     assert pauses == [pause * same.uniform(0.5, 1.0) for pause in expected]
 

@@ -12,20 +12,20 @@ import numpy as np
 import pytest
 import yaml
 
+from freshfield import untrusted
 from freshfield.limits import MAX_ERROR_CHARS, MAX_YAML_CHARS
 from freshfield.scenario import ScenarioError, load
-from freshfield.untrusted import (
-    UntrustedError,
-    YamlWriter,
-    check_file,
-    read_bytes,
-    read_json,
-    read_text,
-    read_yaml,
-    refuse_expansion,
-    stored_bytes,
-)
+from freshfield.untrusted import UntrustedError, read_bytes, read_json, read_text, read_yaml
 from tests.support import work_ms
+
+
+def one_line(read, text: str) -> str:
+    """Why a text is refused."""
+    with pytest.raises(UntrustedError) as error:
+        read(text)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 500
+    return str(error.value)
+
 
 LEVELS = "abcdefghijklmnop"
 
@@ -54,47 +54,30 @@ def test_an_alias_bomb_is_refused_at_once(text):
     ("text", "why"),
     [
         ("[" * 10_000, "nested too deeply"),
-        ("{a: " * 10_000, "nested too deeply"),
         ("a: [1", "not YAML"),
         ("a: " + "9" * 5000, "not YAML"),
-        ("a: 2001-99-99", "not YAML"),
         ("x" * (MAX_YAML_CHARS + 1), "characters, more than"),
         ("!!python/object/apply:os.system [true]", "could not determine a constructor"),
         ("a: 0x" + "f" * 5000, "not YAML"),  # a message could not quote it
         ("a: !!float 1" + ":00" * 300 + ":00.5", "not YAML"),
-        ("a: !!bool maybe", "not YAML"),
-        ("a: !!int", "not YAML"),
-        ("a: !!timestamp soon", "not YAML"),
         ("a: 1\nb: 2\na: 3", "line 3: the key 'a' is there twice"),
-        ("a: {b: 1, c: 2, 'b': 1}", "line 1: the key 'b' is there twice"),
         ("[{b: 1}, {b: 1, b: 1}]", "the key 'b' is there twice"),
-        ("{1: a, +1: b}", "the key '1' is there twice"),
-        ("{yes: a, true: b}", "the key 'True' is there twice"),
         ("a: &a {b: 1}\nc: {<<: *a, <<: *a}", "line 2: the key '<<' is there twice"),
         (f"? {'k' * 10**4}\n? {'k' * 10**4}", "is there twice"),
         ("{? [1]: a}", "unhashable key"),
-        (f"{LISTS}z: {{? *p : 1, ? *p : 2}}", "stand for more than"),
         ("? !x [1]\n: 2", "not YAML"),
-        ("? !x {a: 1}\n: 2", "not YAML"),
         ("{1: a, 1.0: b}", "the key '1.0' is there twice"),
     ],
     ids=lambda v: v[:12],
 )
 def test_what_is_no_yaml_is_one_line(text, why):
-    with pytest.raises(UntrustedError, match=why) as error:
-        read_yaml(text)
-    assert "\n" not in str(error.value) and len(str(error.value)) < 500
+    assert why in one_line(read_yaml, text)
 
 
 def test_nesting_costs_no_more_than_its_bound():
     """The parser looks at every open bracket for each token."""
     text = "[a,\n" * 400 + "a,\n" * 40_000
-
-    def refused() -> None:
-        with pytest.raises(UntrustedError, match="nested too deeply"):
-            read_yaml(text)
-
-    assert work_ms(refused) < 100
+    assert work_ms(lambda: one_line(read_yaml, text)) < 100
 
 
 def test_honest_references_are_followed():
@@ -116,7 +99,7 @@ def test_numbers_are_those_of_yaml_1_2():
     words = ["08", "1e3", "1:30", "1_000", "0b11", "010", "7", "cam00", "0x1F", ".5"]
     kept = [*words, 8, 1e-5, 1e300, 0.1, True, None, math.inf]
     for read in (read_yaml, yaml.safe_load):
-        assert read(yaml.dump(kept, Dumper=YamlWriter)) == kept, "names stay words, numbers stay themselves"
+        assert read(yaml.dump(kept, Dumper=untrusted.YamlWriter)) == kept, "names stay words, numbers stay themselves"
 
 
 @pytest.mark.parametrize(
@@ -127,19 +110,15 @@ def test_numbers_are_those_of_yaml_1_2():
         ("{", "Expecting"),
         ("9" * 5000, "limit"),
     ],
-    ids=lambda v: v[:12],
+    ids=["twice", "deep", "cut", "long"],
 )
 def test_what_is_no_json_is_one_line(text, why):
-    with pytest.raises(UntrustedError, match=why) as error:
-        read_json(text)
-    assert "\n" not in str(error.value) and len(str(error.value)) < 500
+    assert why in one_line(read_json, text)
     assert read_json('{"a": [{"a": 1}, {"a": 2}]}') == {"a": [{"a": 1}, {"a": 2}]}
 
 
-@pytest.mark.parametrize("text", [f"edge: 1\n{LISTS}", "name: " + "[" * 5000, f"name: {'x' * 10**5}\ncameras: 1"])
-def test_a_scenario_that_is_a_bomb_is_one_short_line(tmp_path, text):
-    file = tmp_path / "a.yaml"
-    file.write_text(text)
+def test_a_scenario_that_is_a_bomb_is_one_short_line(tmp_path):
+    (file := tmp_path / "a.yaml").write_text(f"edge: 1\n{LISTS}")
     with pytest.raises(ScenarioError) as error:
         load(file)
     assert len(str(error.value)) < MAX_ERROR_CHARS + 10 and "\n" not in str(error.value)
@@ -149,26 +128,23 @@ def test_a_wide_value_takes_no_more_than_itself():
     """Lists in lists: what waits is counted, not only what was seen."""
     wide = [[0] * 1000] * 1000
     with pytest.raises(UntrustedError):
-        refuse_expansion(wide, 5000, lambda v: v if isinstance(v, list) else ())
-    refuse_expansion(wide, 1_001_001, lambda v: v if isinstance(v, list) else ())
+        untrusted.refuse_expansion(wide, 5000, lambda v: v if isinstance(v, list) else ())
+    untrusted.refuse_expansion(wide, 1_001_001, lambda v: v if isinstance(v, list) else ())
 
 
 def test_an_uncompressed_archive_holds_no_more_than_its_size(tmp_path):
     np.savez(tmp_path / "a.npz", a=np.zeros(1000))
-    assert 8000 < stored_bytes(tmp_path / "a.npz") < 9000 and stored_bytes(tmp_path / "none") == 0
-    assert work_ms(lambda: stored_bytes(tmp_path / "a.npz")) < 5
+    assert 8000 < untrusted.stored_bytes(tmp_path / "a.npz") < 9000 and untrusted.stored_bytes(tmp_path / "none") == 0
+    assert work_ms(lambda: untrusted.stored_bytes(tmp_path / "a.npz")) < 5
 
 
-@pytest.mark.parametrize("read", [check_file, read_bytes, read_text])
-def test_what_has_no_end_is_not_read(tmp_path, read):
+def test_what_has_no_end_is_not_read(tmp_path):
     """A pipe would hang for ever, a device fill the memory."""
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    for path in (Path("/dev/zero"), pipe, tmp_path):
-        with pytest.raises(OSError, match="a folder, a device or a pipe, not a file"):
-            read(path)
-    with pytest.raises(FileNotFoundError):
-        read(tmp_path / "nothing")
+    os.mkfifo(tmp_path / "pipe")
+    for read in (untrusted.check_file, read_bytes, read_text):
+        for path in (Path("/dev/zero"), tmp_path / "pipe", tmp_path):
+            with pytest.raises(OSError, match="a folder, a device or a pipe, not a file"):
+                read(path)
 
 
 def test_a_file_is_read_up_to_its_bound(tmp_path):
@@ -180,11 +156,8 @@ def test_a_file_is_read_up_to_its_bound(tmp_path):
         read_bytes(file, 2**20)
 
 
-@pytest.mark.parametrize(
-    ("read", "text"), [(read_yaml, r'{a: [x, "\ud800y"]}'), (read_yaml, r'"\uDFFF": 1'), (read_json, r'["\ud800"]')]
-)
+@pytest.mark.parametrize(("read", "text"), [(read_yaml, r'{a: [x, "\ud800y"]}'), (read_json, r'["\ud800"]')])
 def test_half_a_character_is_refused_where_it_is_read(read, text):
     """No log, report or message could hold it."""
-    with pytest.raises(UntrustedError, match=r"is half of a character: no file can hold it"):
-        read(text)
+    assert "is half of a character: no file can hold it" in one_line(read, text)
     assert read(r'["\ud83d\ude00"]' if read is read_json else '["\U0001f600"]') == ["\U0001f600"]

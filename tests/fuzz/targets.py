@@ -7,7 +7,6 @@ found, lie in ``corpus/TARGET/``.
 from __future__ import annotations
 
 import contextlib
-import json
 import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -17,8 +16,6 @@ from types import SimpleNamespace
 import numpy as np
 
 from camera_node.settings import source_config
-from camera_node.sources.datasets import colmap, transforms
-from camera_node.sources.datasets.records import Dataset, DatasetError
 from channel_emu.live.frame_proxy import damage_payload
 from channel_emu.model.settings import channel_from_mapping
 from edge_server.fields import checkpoint
@@ -161,34 +158,6 @@ def mcap(folder: Path) -> Target:
     return of_file("a.mcap", folder, read, SessionError)
 
 
-def _images(dataset: Dataset) -> str:
-    for image in dataset:
-        assert np.isfinite(image.camera_to_world).all() and image.intrinsics.width > 0
-        if image.depth is not None:
-            assert image.depth().counts.dtype == np.uint16
-    return "read"
-
-
-def models(folder: Path) -> Target:
-    """A COLMAP model: first byte even for binary, then cameras and images with ``SPLIT`` between them."""
-    for name in ("a.png", "b.png"):
-        (folder / name).write_bytes(PNG)
-
-    def take(data: bytes) -> str:
-        ending = ".bin" if data[:1] < b"\x80" else ".txt"
-        cameras, _, images = data[1:].partition(SPLIT)
-        (folder / f"images{ending}").write_bytes(images)
-        return of_file(f"cameras{ending}", folder, lambda f: _images(colmap.load_dataset(f)), DatasetError)(cameras)
-
-    return take
-
-
-def transform_files(folder: Path) -> Target:
-    (folder / "a.png").write_bytes(PNG)
-    np.save(folder / "d.npy", np.ones((4, 4), np.float32))
-    return of_file("a.json", folder, lambda f: _images(transforms.load_dataset(f)), DatasetError)
-
-
 TARGETS: dict[str, Callable[[Path], Target]] = {
     "request": request,
     "header": header,
@@ -197,13 +166,10 @@ TARGETS: dict[str, Callable[[Path], Target]] = {
     "scenario": scenarios,
     "checkpoint": checkpoints,
     "mcap": mcap,
-    "colmap": models,
-    "transforms": transform_files,
 }
 MOST_MS = {"request": 50.0, "header": 50.0, "payload": 200.0, "depth": 50.0}
 """Of one input's processor time: what a loop with other callers may be kept; a file may take MOST_FILE_MS."""
 MOST_FILE_MS = 2000.0
-SPLIT = b"\n--\n"
 PNG = payload.encode(np.zeros((2, 2, 3), np.uint8), "png")
 
 
@@ -254,31 +220,6 @@ def _sessions() -> Iterable[bytes]:
         yield (Path(folder) / "a").read_bytes()
 
 
-def _models() -> Iterable[bytes]:
-    yield (
-        b"\xff1 OPENCV 2 2 2.0 2.0 1.0 1.0 0.1 0 0 0\n2 SIMPLE_RADIAL 2 2 2 1 1 0"
-        + SPLIT
-        + b"# IMAGE\n1 1 0 0 0 0 0 1 1 a.png\n0 0 -1\n2 .7 .7 0 0 1 2 3 2 b.png\n\n"
-    )
-    numbers = np.array([2.0, 2.0, 1.0, 1.0], "<f8").tobytes()
-    camera = np.array([1, 1], "<i4").tobytes() + np.array([2, 2], "<u8").tobytes() + numbers
-    pose = np.array([1.0, 0, 0, 0, 0, 0, 1], "<f8").tobytes()
-    image = b"\1\0\0\0" + pose + b"\1\0\0\0a.png\0" + bytes(8)
-    one = (1).to_bytes(8, "little")
-    yield b"\0" + one + camera + SPLIT + one + image
-
-
-def _transforms() -> Iterable[bytes]:
-    pose = np.eye(4).tolist()
-    entry = {"file_path": "a.png", "transform_matrix": pose, "time": 0.5, "camera": "c"}
-    lens = {"fl_x": 2.0, "fl_y": 2.0, "cx": 1, "cy": 1, "w": 2, "h": 2, "k1": 0.1, "fps": 30}
-    yield json.dumps({**lens, "frames": [entry, {**entry, "file_path": "none"}]}).encode()
-    yield json.dumps(
-        {**lens, "depth_unit_scale_factor": 0.5, "frames": [{**entry, "depth_file_path": "d.npy"}]}
-    ).encode()
-    yield json.dumps({"camera_angle_x": 0.7, "frames": [{"file_path": "./a", "transform_matrix": pose}]}).encode()
-
-
 _HONEST: dict[str, Callable[[], Iterable[bytes]]] = {
     "request": _messages,
     "header": _messages,
@@ -286,7 +227,5 @@ _HONEST: dict[str, Callable[[], Iterable[bytes]]] = {
     "depth": _depths,
     "checkpoint": _checkpoints,
     "mcap": _sessions,
-    "colmap": _models,
-    "transforms": _transforms,
     "scenario": lambda: (f.read_bytes() for f in sorted(scenario.SCENARIO_FOLDER.glob("*.yaml"))),
 }

@@ -38,10 +38,6 @@ class Turning(Source):
         return Shot(np.full((24, 32, 3), (self.level + content) % 256, np.uint8), self.pose, self.intrinsics)
 
 
-class NoKeys(Turning):
-    Config = Settings
-
-
 class RaisesOften(Turning):
     """Every other capture fails in a way that nobody foresaw."""
 

@@ -22,11 +22,8 @@ def answer(outcome: pb.Outcome = pb.OUTCOME_ACCEPTED, reason: str = "", after_s:
     """Answers every frame the same way, after a while."""
 
     async def give(request: pb.PushRequest) -> pb.PushResponse:
-        if after_s:
-            await asyncio.sleep(after_s)
-        return pb.PushResponse(
-            sequence=request.header.sequence, outcome=outcome, reason=reason, detail="as the test says"
-        )
+        await asyncio.sleep(after_s)
+        return pb.PushResponse(sequence=request.header.sequence, outcome=outcome, reason=reason, detail="a test says")
 
     return give
 
@@ -83,10 +80,10 @@ class Peer:
             while len(self.frames) < frames:
                 await asyncio.sleep(0.01)
 
-    async def until_each(self, cameras: list[str], frames: int, timeout_s: float = 60.0) -> None:
+    async def until_each(self, cameras: list[str], frames: int) -> None:
         """Until so many more frames of each camera arrived."""
         begin = len(self.frames)
-        async with asyncio.timeout(timeout_s):
+        async with asyncio.timeout(60.0):
             while any(sum(f.camera == c for f in self.frames[begin:]) < frames for c in cameras):
                 await asyncio.sleep(0.01)
 

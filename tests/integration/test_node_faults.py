@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import yaml
 
@@ -53,51 +52,19 @@ async def test_a_peer_that_comes_late_and_dies_again_and_again(tmp_path):
     assert sorted(late_ms)[len(late_ms) // 2] < 100 and max(late_ms) < 1000
 
 
-def start_node(tmp_path: Path, to: str, *options: str, cameras: str = "--all") -> subprocess.Popen:
-    data = write_photos(tmp_path / "data", 24)
-    file = tmp_path / "photos.yaml"
-    file.write_text(
-        yaml.safe_dump(
-            {
-                "name": "photos",
-                "cameras": {"count": 3, "held_out": ["cam00"]},
-                "source": {"kind": "transforms", "data": str(data), "fps": 50, "codec": "png"},
-            }
-        )
-    )
-    command = [sys.executable, "-m", "camera_node.cli", "run", str(file), cameras, "--to", to]
-    return subprocess.Popen([*command, "--out", str(tmp_path / "out"), *options], stderr=subprocess.PIPE)
-
-
-async def test_books_close_after_sigkill_of_the_node(tmp_path):
-    peer = await Peer().start()
-    node = start_node(tmp_path, peer.address)
-    await peer.until_each(CAMERAS, 30)
-    node.send_signal(signal.SIGKILL)
-    node.wait()
-    await asyncio.sleep(0.3)
-    await peer.stop()
-    (file,) = ledger.read_all(tmp_path / "out")
-    assert not file.closed
-    counts = check_books(tmp_path / "out")
-    for camera in CAMERAS:
-        arrived = {f.sequence for f in peer.frames if f.camera == camera}
-        sent = {e.sequence for e in file.events if e.camera == camera and e.event == "sent"}
-        assert arrived <= sent and len(sent - arrived) <= 1
-        assert counts[camera]["captured"] >= 30
-
-
 async def test_sigterm_ends_cleanly_with_the_last_answer(tmp_path):
     peer = await Peer().start()
-    node = start_node(tmp_path, peer.address, "--quiet")
+    source = {"kind": "transforms", "data": str(write_photos(tmp_path / "data", 24)), "fps": 50, "codec": "png"}
+    scenario = {"name": "photos", "cameras": {"count": 3, "held_out": ["cam00"]}, "source": source}
+    (file := tmp_path / "photos.yaml").write_text(yaml.safe_dump(scenario))
+    command = [sys.executable, "-m", "camera_node.cli", "run", str(file), "--all", "--to", peer.address, "--quiet"]
+    node = subprocess.Popen([*command, "--out", str(tmp_path / "out")], stderr=subprocess.PIPE)
     await peer.until_each(CAMERAS, 10)
     status = json.loads((tmp_path / "out" / "node-cam00+2.json").read_text())
-    begin = time.perf_counter()
     node.send_signal(signal.SIGTERM)
-    _, said = await asyncio.to_thread(node.communicate, timeout=10)
+    _, said = await asyncio.to_thread(node.communicate, timeout=5)
     await peer.stop()
-    code, seconds, said = node.returncode, time.perf_counter() - begin, said.decode()
-    assert code == 0 and seconds < 5 and said == ""
+    assert (node.returncode, said) == (0, b"")
     assert status["phase"] in ("preparing", "streaming") and status["cameras"]["cam02"]["fps"] == 50
     (file,) = ledger.read_all(tmp_path / "out")
     assert file.events and file.closed and not file.torn

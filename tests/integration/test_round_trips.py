@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.pose.providers import read_tum
 from camera_node.sources.datasets.formats import open_dataset
-from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.export import PosedImage
 from edge_server.export.colmap import Cloud, write_model
 from edge_server.export.images import write_images
 from edge_server.export.transforms import write_transforms
-from freshfield.geometry import Pinhole, Pose, se3_inverse
+from freshfield.geometry import Pinhole, se3_inverse
 from tests.camera_node.sources.datasets import sets
 
 BENT = Pinhole(64, 48, 60.0, 61.0, 31.2, 24.9, (-0.08, 0.02, 0.002, -0.003))
@@ -47,35 +45,3 @@ def test_exports_read_back_to_the_pixel(tmp_path, form):
         there, back = (pixels(shot.camera_to_world, shot.intrinsics), pixels(record.camera_to_world, record.intrinsics))
         assert np.abs(there - back).max() < NEAR_PX
         np.testing.assert_array_equal(record.read(), shot.image)
-
-
-def test_a_colmap_model_is_what_fit_starts_from(tmp_path):
-    of = shots()
-    write_images(tmp_path / "images", of)
-    write_model(tmp_path / "sparse/0", of, Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 4), bool)))
-    found = load_recorded(tmp_path, holdout="view1")
-    assert [v.camera for v in found.training] == ["view0.png", "view2.png", "view3.png"]
-    assert [v.camera for v in found.held_out] == ["view1.png"] and found.held_out[0].intrinsics == BENT
-
-
-def test_the_sets_own_split_can_be_held_out(tmp_path):
-    sets.write_eyeful(tmp_path, sets.rig(3))
-    found = load_recorded(tmp_path, holdout="split", name="eyeful")
-    assert {v.camera for v in found.held_out} == {"10/10_DSC0000", "10/10_DSC0001"}
-    assert len(found.training) == 4
-    sets.write_colmap(tmp_path / "c", sets.rig(3), "PINHOLE", True)
-    with pytest.raises(ValueError, match="does not say what it keeps for testing"):
-        load_recorded(tmp_path / "c", holdout="split")
-
-
-def test_trajectories_are_read_to_the_nanosecond(tmp_path):
-    poses = [Pose.from_matrix(c.camera_to_world) for c in sets.rig(3)]
-    rows = [(*pose.translation_m, *np.roll(pose.quaternion, -1)) for pose in poses]  # its quaternions are w-last
-    lines = [f"{k}.000000123 {' '.join(repr(float(v)) for v in row)}" for k, row in enumerate(rows)]
-    (tmp_path / "path.tum").write_text("\n".join(lines))
-    track = read_tum(tmp_path / "path.tum", False, 0)
-    for k, pose in enumerate(poses):
-        found, gap_ns = track.at(1_000_000_000 * k + 123)
-        assert gap_ns == 0
-        lens = sets.rig(1)[0].lens
-        assert np.abs(pixels(found.matrix(), lens) - pixels(pose.matrix(), lens)).max() < NEAR_PX
