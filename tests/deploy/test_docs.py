@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import json
 import re
 import shlex
 from functools import cache
@@ -13,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
-from tests.tools import scale
 
 _SPEC = importlib.util.spec_from_file_location("site_pages", ROOT / "docs" / "site_pages.py")
 assert _SPEC is not None and _SPEC.loader is not None
@@ -74,19 +72,6 @@ def test_every_page_is_in_the_site_s_navigation_and_the_readme_is_short() -> Non
         assert path.startswith("results/") or re.search(rf"[ ]{re.escape(path)}$", shown, re.M), path
 
 
-def test_the_site_tells_every_command_and_every_key_of_a_scenario() -> None:
-    """What mkdocs builds from it is checked by ``make docs``."""
-    commands, keys = site_pages.commands_page(), site_pages.scenario_page()
-    for heading in (
-        "freshfield scenario init",
-        "camera-node calibrate rig",
-        "channel-emu proxy",
-        "edge-server explain",
-    ):
-        assert f"\n### {heading}\n" in commands
-    assert "| `update_ms` | default 800.0; 10 to 3600000;" in keys and "\n### `edge.compute`\n" in keys
-
-
 @pytest.mark.parametrize("page", CURRENT, ids=name)
 def test_commands_exist_with_the_options_they_are_given(page: Path) -> None:
     for code in code_of(of_today(page)):
@@ -115,11 +100,6 @@ def test_files_and_modules_that_are_named_exist(page: Path) -> None:
             parent, _, last = found.rpartition(".")
             assert not parent or importlib.util.find_spec(parent) is not None, f"{name(page)}: {found}"
             assert importlib.util.find_spec(found) or hasattr(importlib.import_module(parent), last)
-
-
-def test_the_table_of_scale_is_that_of_its_file() -> None:
-    docs = ROOT / "docs"
-    assert scale.table(json.loads((docs / "results" / "scale.json").read_text())) in (docs / "scale.md").read_text()
 
 
 def defaults(program: str) -> dict[str, str]:

@@ -3,27 +3,18 @@ the edge."""
 
 from __future__ import annotations
 
-import copy
-import json
-import os
 import shutil
-import subprocess
-import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-import yaml
 
 import camera_node.cli
 import channel_emu.cli
 import edge_server.cli
 from edge_server.live.keys import make_keys
-from edge_server.report.build_report import build_report
 from freshfield.scenario import load
 from tests.conftest import ROOT
 from tests.deploy.kustomize import Document, by_kubectl, rendered
-from tests.support import wait_until
 
 SCENES = sorted(folder.name for folder in (ROOT / "deploy/kubernetes/overlays").iterdir())
 SCHEMAS = "1.31"
@@ -57,10 +48,6 @@ def of(documents: list[Document], *kinds: str) -> dict[str, Document]:
 def pods(documents: list[Document]) -> dict[str, Document]:
     """Name -> template of its pods."""
     return {name: d["spec"]["template"] for name, d in of(documents, "StatefulSet", "Deployment").items()}
-
-
-def test_no_document_stands_twice(documents: list[Document]) -> None:
-    assert len(documents) == len({(d["kind"], d["metadata"]["name"]) for d in documents})
 
 
 @pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl is not installed")
@@ -175,97 +162,3 @@ def test_pods_are_confined_limited_and_watched(documents: list[Document]) -> Non
     edge = pods(documents)["edge"]
     scraped = edge["metadata"]["annotations"]["prometheus.io/port"]
     assert f"--metrics-port={scraped}" in edge["spec"]["containers"][0]["command"]
-
-
-def as_pod(documents: list[Document], name: str, keys: Path, index: int | None = None) -> Document:
-    """One pod of a workload, as ``podman play kube`` takes it, which knows no Secret, StatefulSet or limit here."""
-    spec = copy.deepcopy(pods(documents)[name]["spec"])
-    (container,) = spec["containers"]
-    (config,) = of(documents, "ConfigMap").values()
-    del container["envFrom"]
-    container["env"] = [{"name": key, "value": value} for key, value in config["data"].items()]
-    container["env"] += [] if index is None else [{"name": "INDEX", "value": str(index)}]
-    for each in container["env"]:  # podman hands $(NAME) on as it is
-        container["command"] = [word.replace(f"$({each['name']})", each["value"]) for word in container["command"]]
-    for key in ("resources", "startupProbe", "readinessProbe"):
-        container.pop(key, None)
-    spec.pop("initContainers", None)  # a new volume of podman's begins with the kernels that the image has there
-    mounts = [mount for mount in container["volumeMounts"] if mount["name"] != "keys"]
-    container["volumeMounts"] = [*mounts, {"name": "keys", "mountPath": "/keys", "readOnly": True}]
-    own = keys / (name if index is None else load("quad").cameras[index])
-    pod = name if index is None else f"{name}-{index}"
-    # Also for each emptyDir, of which podman 4.3 makes one volume for all pods that call it alike.
-    names = {mount["name"] for mount in mounts}
-    spec["volumes"] = [{"name": each, "persistentVolumeClaim": {"claimName": f"{pod}-{each}"}} for each in names]
-    spec["volumes"].append({"name": "keys", "hostPath": {"path": str(own), "type": "Directory"}})
-    return {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": pod, "labels": {"app": pod}}, "spec": spec}
-
-
-def podman(*words: str | Path, check: bool = True) -> str:
-    done = subprocess.run(["podman", *map(str, words)], capture_output=True, text=True, timeout=600.0)
-    assert done.returncode == 0 or not check, f"podman {words}: {done.stderr[-2000:]}"
-    return done.stdout
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1500)
-def test_played_by_podman_a_dead_edge_goes_on_and_every_frame_is_accounted_for(overlays: Path, tmp_path: Path) -> None:
-    if shutil.which("podman") is None or "FRESHFIELD_IMAGES_ARE_BUILT" not in os.environ:
-        pytest.skip("no podman with the images of deploy/*.Dockerfile (FRESHFIELD_IMAGES_ARE_BUILT=1)")
-    documents, keys = rendered(overlays / "quad"), overlays / "quad" / "keys"
-    if os.geteuid() == 0:
-        subprocess.run(["chown", "-R", "10001", keys], check=True)
-    cameras = [f"camera-{index}" for index in range(len(load("quad").cameras))]
-
-    def play(name: str, networks: Sequence[str], index: int | None = None) -> None:
-        pod = as_pod(documents, name, keys, index)
-        file = tmp_path / f"{pod['metadata']['name']}.yaml"
-        file.write_text(yaml.safe_dump(pod))
-        podman("play", "kube", *(word for each in networks for word in ("--network", each)), file)
-
-    def status() -> Document:
-        text = podman("exec", "edge-edge", "cat", "/runs/edge.json", check=False)
-        return dict(json.loads(text)) if text else {"updates": {"count": 0}, "started_ns": 0}
-
-    def checkpoint_written() -> bool:
-        return "field.npz" in podman("exec", "edge-edge", "ls", "/runs", check=False)
-
-    try:
-        podman("network", "create", "freshfield-edge")
-        podman("network", "create", "--internal", "freshfield-cameras")
-        play("edge", ["freshfield-edge"])
-        play("emulator", ["freshfield-edge", "freshfield-cameras"])
-        for index, _ in enumerate(cameras):
-            play("camera", ["freshfield-cameras"], index)
-        wait_until(lambda: status()["updates"]["count"] >= 5, "no five updates", 300.0)
-        wait_until(checkpoint_written, "no checkpoint", 120.0)
-        before = status()
-        podman("pod", "rm", "-f", "-t", "0", "edge")
-        died_s = time.monotonic()
-        play("edge", ["freshfield-edge"])
-
-        def goes_on() -> bool:
-            now = status()
-            if now["started_ns"] == before["started_ns"] or now["updates"]["first_ms"] is None:
-                return False
-            return all(camera["delivered"] > 0 for camera in now["cameras"])
-
-        wait_until(goes_on, "the new edge hears no camera, or makes no update", 300.0)
-        print(f"killed after {before['updates']['count']} updates; all is well {time.monotonic() - died_s:.1f} s later")
-        time.sleep(5.0)
-        (tmp_path / "runs").mkdir()
-        for pod in (*cameras, "emulator", "edge"):
-            podman("pod", "stop", "-t", "30", pod)
-            podman("cp", f"{pod}-{pod.partition('-')[0]}:/runs/.", tmp_path / "runs")
-    finally:
-        for pod in (*cameras, "emulator", "edge"):
-            podman("pod", "rm", "-f", "-t", "0", pod, check=False)
-            podman("volume", "rm", *(f"{pod}-{name}" for name in ("runs", "tmp", "kernels")), check=False)
-        podman("network", "rm", "freshfield-edge", "freshfield-cameras", check=False)
-    series = [json.loads(line) for line in (tmp_path / "runs" / "series.jsonl").read_text().splitlines()]
-    (again,) = [k for k in range(1, len(series)) if series[k]["t_s"] < series[k - 1]["t_s"]]
-    assert series[again]["number"] > 0, "it began anew"
-    report = build_report(tmp_path / "runs")
-    assert report["frames"]["closes"], report["frames"]["doubts"]
-    assert report["frames"]["delivered"] > 100
-    print({key: report["frames"][key] for key in ("captured", "sent", "delivered", "cut_off")})

@@ -16,28 +16,6 @@ from freshfield.scenario import SCENARIO_FOLDER, load
 from tests.conftest import data_dir
 
 FILES = sorted(SCENARIO_FOLDER.glob("*.yaml"))
-NAMES = {
-    "room",
-    "room19",
-    "tile",
-    "tower",
-    "ideal",
-    "fox",
-    "lego",
-    "kitchen",
-    "cell",
-    "scan",
-    "card",
-    "thesis",
-    "duo",
-    "quad",
-    "handheld",
-    "redkitchen",
-}
-
-
-def test_the_promised_scenarios_are_there() -> None:
-    assert {file.stem for file in FILES} >= NAMES
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)

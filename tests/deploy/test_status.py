@@ -57,7 +57,6 @@ def test_missing_and_damaged_status_files_leave_gaps(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "found, expected",
     [
-        ({"closes": True}, "; all accounted for\n"),
         ({"closes": True, "cut_off": 2}, "; all accounted for, 2 of them cut off by the end of a process\n"),
         (
             {"closes": False, "doubts": ["2,014 lines of the ledgers were lost", "another"]},
@@ -65,16 +64,11 @@ def test_missing_and_damaged_status_files_leave_gaps(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_it_says_whether_all_frames_are_accounted_for(tmp_path, found, expected):
-    frames = {"captured": 3, "sent": 3, "delivered": 3, "rejected": {}, **found}
-    (tmp_path / "report.json").write_text(json.dumps({"frames": frames}))
-    assert expected in summarize(tmp_path)
-
-
-def test_the_summary_is_the_conclusion_of_the_report(tmp_path: Path) -> None:
-    sentences = ["In the last fifth of the run, what was shown read 25.1 dB.", "Waiting for an update was the limit."]
-    (tmp_path / "report.json").write_text(json.dumps({"conclusion": sentences, "frames": None}))
-    assert summarize(tmp_path).startswith("\n" + "\n".join(sentences) + "\nframes     - captured, - sent")
+def test_the_summary_is_the_conclusion_and_whether_all_frames_are_accounted_for(tmp_path, found, expected):
+    frames, sentences = {"captured": 3, "sent": 3, "delivered": 3, "rejected": {}, **found}, ["Good.", "Late."]
+    (tmp_path / "report.json").write_text(json.dumps({"conclusion": sentences, "frames": frames}))
+    said = summarize(tmp_path)
+    assert said.startswith("\nGood.\nLate.\nframes     3 captured, 3 sent") and expected in said
 
 
 def test_a_moving_held_out_camera_reads_its_frames_at_refined_poses(tmp_path: Path) -> None:

@@ -9,8 +9,8 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,12 @@ import freshfield as ff
 from freshfield.scenario import ScenarioError, load
 from freshfield_up import run as launcher
 from freshfield_up.commands import ProcessSet
+from freshfield_up.demo_command import seconds
 from freshfield_up.deployment import DeploymentError
 from freshfield_up.folder import EARLIER, prepare
 from freshfield_up.processes import Child
-from freshfield_up.status import read_json
 from tests.conftest import ROOT
-from tests.support import free_port
+from tests.support import free_port, wait_until
 
 SMALL = """
 name: small
@@ -60,67 +60,16 @@ class Up:
     def output(self) -> str:
         return self._log.read_text()
 
-    def wait_until(self, what: Callable[[], Any], seconds: float = READY_S) -> Any:
-        deadline = time.monotonic() + seconds
-        while not (found := what()):
-            assert self.process.poll() is None, f"the launcher ended too early:\n{self.output}"
-            assert time.monotonic() < deadline, f"it did not happen in {seconds:.0f} s:\n{self.output}"
-            time.sleep(0.1)
-        return found
-
-    def wait_for_updates(self, count: int = 2) -> None:
-        self.wait_until(lambda: (self.status().get("updates") or {}).get("count", 0) >= count)
-
-    def status(self) -> dict[str, Any]:
-        return read_json(self.out / "edge.json")
-
-    def pid(self, name: str) -> int:
-        """Process id as the launcher's own record has it."""
-
-        def find() -> int | None:
-            lines = (self.out / "processes.jsonl").read_text().splitlines()
-            return json.loads(lines[-1]).get(name, {}).get("pid") if lines else None
-
-        return self.wait_until(find)
-
     def report(self) -> dict[str, Any]:
         return json.loads((self.out / "report.json").read_text())
 
-    def end(self, seconds: float = 90.0) -> int:
-        return self.process.wait(seconds)
-
-
-@pytest.fixture
-def up(tmp_path: Path) -> Iterator[Callable[..., Up]]:
-    started: list[Up] = []
-
-    def start(*options: str, **more: str) -> Up:
-        started.append(Up(tmp_path, *options, **more))
-        return started[-1]
-
-    yield start
-    for one in started:
-        if one.process.poll() is None:
-            one.process.terminate()
-            one.process.wait(60.0)
-
-
-def leftovers(out: Path) -> list[str]:
-    """Command lines of processes that still work on the run."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            words = path.read_bytes().decode(errors="replace").replace("\0", " ")
-        except OSError:
-            continue
-        if str(out) in words:
-            found.append(words)
-    return found
+    def end(self, within_s: float = 90.0) -> int:
+        return self.process.wait(within_s)
 
 
 @pytest.mark.slow  # 11 s; make demo in CI ends so, too
-def test_a_run_ends_when_its_time_is_up_with_a_report(up: Callable[..., Up]) -> None:
-    run = up("--for", "6s")
+def test_a_run_ends_when_its_time_is_up_with_a_report(tmp_path: Path) -> None:
+    run = Up(tmp_path, "--for", "6s")
     assert run.end(READY_S + 60.0) == 0, run.output
     assert re.search(rf"page: http://127\.0\.0\.1:{run.port}\b", run.output)
     assert "0.0.0.0" not in run.output
@@ -132,7 +81,8 @@ def test_a_run_ends_when_its_time_is_up_with_a_report(up: Callable[..., Up]) -> 
     assert report["updates"]["count"] >= 3
     used = [json.loads(line) for line in (run.out / "processes.jsonl").read_text().splitlines()]
     assert all(used[-1][name]["rss_mb"] > 10 for name in ("node", "emulator", "edge"))
-    assert not leftovers(run.out)
+    left = subprocess.run(["pgrep", "-af", str(run.out)], capture_output=True, text=True)
+    assert left.stdout == ""
     prepare(run.out, {}).close()  # knows all the names that a run writes
 
 
@@ -208,15 +158,19 @@ def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(asleep: Asleep, monkey
     assert edge.process is not None and not any(child.running for child in run.processes.children)
 
 
-@pytest.mark.slow  # 6 s
-def test_ctrl_c_ends_a_run_with_its_report(up: Callable[..., Up]) -> None:
-    run = up("--for", "0")
-    run.wait_for_updates()
-    run.process.send_signal(signal.SIGINT)
-    assert run.end() == 0, run.output
-    assert "stopping (Ctrl-C)" in run.output and "Traceback" not in run.output
-    assert run.report()["frames"]["closes"]
-    assert not leftovers(run.out)
+def test_ctrl_c_ends_a_run_and_a_second_one_kills(asleep: Asleep, capfd: pytest.CaptureFixture[str]) -> None:
+    run = asleep("import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up'); time.sleep(60)")
+    log = run.processes.node.log
+
+    def press_twice() -> None:
+        wait_until(lambda: log.exists() and "\nup\n" in log.read_text(), "no node")
+        for _ in range(2):
+            run._on_signal(signal.SIGINT, None)
+
+    threading.Thread(target=press_twice, daemon=True).start()
+    assert run.run() == 0 and run.processes.node.killed
+    said = capfd.readouterr().out
+    assert "stopping (Ctrl-C)" in said and "the node did not end in time and was killed" in said
 
 
 def test_a_start_that_fails_says_why_and_costs_no_earlier_run(tmp_path: Path) -> None:
@@ -263,11 +217,14 @@ def test_a_run_does_not_delete_the_policy_that_it_loads(tmp_path: Path) -> None:
     assert learned.read_bytes() == b"weights"
 
 
-@pytest.mark.parametrize("text, seconds", [("60", 60.0), ("60s", 60.0), ("1.5m", 90.0), ("2h", 7200.0), ("0", 0.0)])
-def test_times_are_read_as_people_write_them(text: str, seconds: float) -> None:
-    from freshfield_up import demo_command as script
+def test_times_are_read_as_people_write_them() -> None:
+    assert [seconds(text) for text in ("60", "60s", "1.5m", "2h", "0")] == [60.0, 60.0, 90.0, 7200.0, 0.0]
 
-    assert script.seconds(text) == seconds
+
+def test_the_record_names_the_command_that_can_be_given_again() -> None:
+    assert launcher.command_line(["/usr/bin/freshfield", "demo", "my file"]) == "freshfield demo 'my file'"
+    assert launcher.command_line(["/lib/freshfield_up/__main__.py", "demo"]) == "freshfield demo"
+    assert launcher.command_line(["examples/deployment.py", "card", "6"]) == "python examples/deployment.py card 6"
 
 
 @pytest.mark.parametrize(("duration_s", "headline"), [(0.0, "12 s"), (60.0, "12 of 60 s")])
@@ -287,17 +244,3 @@ def test_a_deployment_in_a_script_says_why_it_cannot_start(tmp_path: Path) -> No
         pass
     with pytest.raises(ScenarioError, match="shipped scenarios"):
         ff.deployment("nothing")
-
-
-@pytest.mark.parametrize(
-    ("argv", "command"),
-    [
-        (["/usr/bin/freshfield", "demo", "my file"], "freshfield demo 'my file'"),
-        (["/lib/freshfield_up/__main__.py", "demo"], "freshfield demo"),
-        (["examples/deployment.py", "card", "6"], "python examples/deployment.py card 6"),
-    ],
-)
-def test_the_record_names_the_command_that_can_be_given_again(argv: list[str], command: str) -> None:
-    from freshfield_up.run import command_line
-
-    assert command_line(argv) == command
