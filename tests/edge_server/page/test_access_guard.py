@@ -20,7 +20,6 @@ import websocket
 from edge_server.live.keys import make_keys
 from edge_server.live.output import guarded_http
 from edge_server.live.output.prometheus import serve_metrics
-from edge_server.live.state import EdgeState
 from edge_server.page import Page, access_guard, start_page
 from edge_server.page.access_guard import AccessGuard
 from freshfield.access import HttpDoor
@@ -28,21 +27,12 @@ from freshfield.limits import MAX_SCRAPES, MAX_VISITOR_MESSAGE_BYTES
 from freshfield.transport import Transport, TransportError
 from tests.edge_server.page.preview import BallScene
 from tests.edge_server.page.test_page import bare_state, publication
-from tests.edge_server.page.visitor import Visitor
+from tests.edge_server.page.visitor import Visitor, page_of
 from tests.role_table import TOKENS, cells_of
 from tests.support import free_port, wait_until
 
 # Without TLS the login is the same, and easier to talk to.
 LOGIN = Transport(tokens=TOKENS, insecure=True)
-
-
-@contextlib.contextmanager
-def page_of(state: EdgeState, transport: Transport | None = None, host: str = "127.0.0.1") -> Iterator[Page]:
-    page = start_page(state, host, 0, transport)
-    try:
-        yield page
-    finally:
-        page.stop()
 
 
 def login(who: str) -> dict[str, str]:
@@ -349,18 +339,6 @@ def test_viewpoints_that_nobody_can_have_are_not_taken(change: dict, taken: bool
     assert guard.refused.total() == (not taken)
 
 
-def test_only_what_viser_serves_is_guarded() -> None:
-    import websockets.asyncio.server
-    from viser.infra import _infra
-
-    guard, original = AccessGuard(HttpDoor(Transport().access, "127.0.0.1"), None), websockets.asyncio.server.serve
-    with guard.before_viser():
-        assert websockets.asyncio.server.serve is original
-        assert _infra.websockets.asyncio.server.serve is not original
-        assert _infra.websockets.exceptions is websockets.exceptions
-    assert _infra.websockets is websockets
-
-
 def test_nothing_is_uploaded() -> None:
     with page_of(bare_state()) as page, Visitor(page.port) as visitor:
         visitor.wait_for(lambda: page._server.get_clients(), "the visitor")
@@ -384,20 +362,6 @@ def test_nothing_is_uploaded() -> None:
 
 
 # --- what one can cost ---------------------------------------------------------------------------------
-
-
-def test_there_is_a_bound_on_visitors_and_their_places_are_given_again(monkeypatch) -> None:
-    monkeypatch.setattr(access_guard, "MAX_VISITORS", 3)
-    with page_of(bare_state()) as page:
-        visitors = [Visitor(page.port) for _ in range(3)]
-        with pytest.raises(websocket.WebSocketBadStatusException, match="503"):
-            Visitor(page.port)
-        assert get(page.port)[0] == 200
-        at = guard_of(page)
-        visitors.pop().close()
-        wait_until(lambda: len(at.visitors) == 2, "the place was kept")
-        for visitor in [*visitors, Visitor(page.port)]:
-            visitor.close()
 
 
 def test_half_requests_end_for_new_ones(monkeypatch) -> None:

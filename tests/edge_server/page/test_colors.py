@@ -23,17 +23,9 @@ def test_ends_and_middle_of_the_scale():
     assert age_color(0.0) == age_color(FRESH_MS) == FRESH
     assert age_color(STALE_MS) == age_color(1e9) == STALE
     assert age_color(math.sqrt(FRESH_MS * STALE_MS)) == MIDDLE
-
-
-def test_what_is_no_age_has_a_color_too():
-    assert age_color(None) == UNKNOWN
-    assert age_color(float("nan")) == STALE
-    assert age_color(float("inf")) == STALE
     assert age_color(-30.0) == FRESH  # a clock a little ahead
-
-
-def test_many_ages_have_the_colors_of_each():
-    ages = np.array([0.0, FRESH_MS, 90.0, 400.0, STALE_MS, 1e9])
+    assert (age_color(None), age_color(float("nan")), age_color(float("inf"))) == (UNKNOWN, STALE, STALE)
+    ages = np.array([0.0, 90.0, 400.0, 1e9])
     np.testing.assert_allclose(age_colors(ages), [np.array(age_color(age)) / 255 for age in ages], atol=1e-6)
 
 

@@ -46,9 +46,7 @@ def test_views_that_were_learned_from_are_not_blurred_by_cameras_that_share_litt
         (12.0, [13.0] * FLAT_SCORES),
         (12.0, [5.0] * (FLAT_SCORES - 1)),
         (12.0, [float("nan")] * FLAT_SCORES),
-        (12.0, [float("inf")] * FLAT_SCORES),
         (None, [5.0] * FLAT_SCORES),
-        (12.0, []),
     ],
 )
 def test_nothing_is_said_of_a_better_picture_and_of_what_is_not_known(flat_db, scores):

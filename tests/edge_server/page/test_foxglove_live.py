@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-import re
 import struct
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import is_dataclass
 from importlib import import_module
 from itertools import count
-from types import SimpleNamespace, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -22,8 +19,6 @@ import websocket
 pytest.importorskip("foxglove", reason="needs the extra foxglove")
 pytest.importorskip("foxglove_schemas_protobuf", reason="needs the extra mcap")
 
-from foxglove import layouts
-
 from edge_server.cli import main as edge_server
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.snapshot import SplatSnapshot
@@ -32,6 +27,7 @@ from edge_server.page.foxglove_live.settings import IDLE_S, MOST_POINTS
 from freshfield.transport import TransportError
 from tests.conftest import ROOT
 from tests.edge_server.page.preview import CAMERAS, LENS, Preview
+from tests.support import wait_until
 
 MESSAGE = struct.Struct("<BIQ")  # opcode 1, subscription, log time
 
@@ -57,11 +53,15 @@ class Client:
             self.channels |= {c["topic"]: c for c in json.loads(self.socket.recv())["channels"]}
         self._numbers = count(1)
 
+    def subscribe(self, topic: str) -> int:
+        number = next(self._numbers)
+        asked = {"op": "subscribe", "subscriptions": [{"id": number, "channelId": self.channels[topic]["id"]}]}
+        self.socket.send(json.dumps(asked))
+        return number
+
     def first(self, topic: str):
         """The first message of a topic, decoded, and its log time."""
-        channel, number = self.channels[topic], next(self._numbers)
-        asked = {"op": "subscribe", "subscriptions": [{"id": number, "channelId": channel["id"]}]}
-        self.socket.send(json.dumps(asked))
+        channel, number = self.channels[topic], self.subscribe(topic)
         while True:
             kind, data = self.socket.recv_data()
             if kind == websocket.ABNF.OPCODE_BINARY and MESSAGE.unpack_from(data)[:2] == (1, number):
@@ -148,14 +148,8 @@ def test_a_taken_port_and_a_view_that_fails_are_said(served, caplog):
     client.first("/rendered/image")
     preview.stop()
     preview.state.publish(preview.state.newest(), broken)
-    client.socket.send(
-        json.dumps(
-            {"op": "subscribe", "subscriptions": [{"id": 99, "channelId": client.channels["/rendered/image"]["id"]}]}
-        )
-    )
-    deadline = time.monotonic() + 20
-    while "serving Foxglove failed: ZeroDivisionError" not in caplog.text and time.monotonic() < deadline:
-        time.sleep(0.05)
+    client.subscribe("/rendered/image")
+    wait_until(lambda: "serving Foxglove failed: ZeroDivisionError" in caplog.text, "no word of it")
     assert caplog.text.count("failed: ZeroDivisionError") == 1 and server._thread.is_alive()
 
 
@@ -177,42 +171,6 @@ def test_the_layout_shows_topics_and_values_that_are_served(served):
         topic, _, value = name.partition(".")
         assert topic in client.channels, name
         assert not value or value in json.loads(client.channels[topic]["schema"])["properties"], name
-    panels, pending = set(), [layout["layout"]]
-    while pending:
-        node = pending.pop()
-        panels |= {node} if isinstance(node, str) else set()
-        pending += [] if isinstance(node, str) else [node["first"], node["second"]]
-    assert panels == set(layout["configById"])
-
-
-def test_panels_of_the_layout_have_the_keys_that_foxglove_knows():
-    """``foxglove.layouts`` is generated from the app's own schema."""
-    types = {"3D": layouts.ThreeDeeConfig, "Image": layouts.ImageConfig, "Plot": layouts.PlotConfig}
-    types["RawMessages"] = layouts.RawMessagesConfig
-    layout = json.loads((ROOT / "deploy/foxglove-layout.json").read_text())
-    for name, config in layout["configById"].items():
-        kind = types[name.partition("!")[0]]
-        config.pop("foxglovePanelTitle", None)  # of any panel
-        assert fits(config, kind), name
-        assert not fits(config | {"title": "a key of no panel"}, kind)
-
-
-def fits(value: Any, wanted: Any) -> bool:
-    """Whether a part of a layout has the keys and values that Foxglove's own types (``foxglove.layouts``) have."""
-    kind, options = get_origin(wanted), get_args(wanted)
-    if is_dataclass(wanted):
-        hints = {re.sub("_(.)", lambda m: m[1].upper(), k): hint for k, hint in get_type_hints(wanted).items()}
-        if not isinstance(value, dict) or not set(value) <= set(hints):
-            return False
-        return all(fits(each, hints[k]) for k, each in value.items())
-    if kind in (Union, UnionType):
-        return any(fits(value, option) for option in options)
-    if kind is Literal:
-        return value in options
-    if kind in (list, dict):
-        children = value.values() if isinstance(value, dict) else value
-        return isinstance(value, kind) and all(fits(each, options[-1]) for each in children)
-    return isinstance(value, (int, float) if wanted is float else wanted)
 
 
 def test_it_is_refused_beside_a_login_which_it_would_go_around(tmp_path, capsys):

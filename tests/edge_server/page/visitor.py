@@ -5,10 +5,11 @@ For what a browser is too slow and too large to test: message rates, many visito
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import threading
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import msgspec
@@ -17,7 +18,20 @@ import viser
 import websocket
 import zstandard
 
+from edge_server.live.state import EdgeState
+from edge_server.page import Page, start_page
+from freshfield.transport import Transport
 from tests.support import wait_until
+
+
+@contextlib.contextmanager
+def page_of(state: EdgeState, transport: Transport | None = None, host: str = "127.0.0.1") -> Iterator[Page]:
+    """The page of a state, while it is needed."""
+    page = start_page(state, host, 0, transport)
+    try:
+        yield page
+    finally:
+        page.stop()
 
 
 class Visitor:
@@ -30,14 +44,12 @@ class Visitor:
         port: int,
         position: tuple[float, float, float] = (4.0, 0.0, 3.0),
         reads: bool = True,
-        size: tuple[int, int] = (800, 600),
         headers: Sequence[str] = (),
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.bytes = 0
         self.images = 0
         self.image: bytes | None = None
-        self._size = size
         self._closing = False
         self._socket = websocket.create_connection(
             f"ws://127.0.0.1:{port}",
@@ -77,8 +89,8 @@ class Visitor:
             fov=0.9,
             near=0.01,
             far=1000.0,
-            image_width=self._size[0],
-            image_height=self._size[1],
+            image_width=800,
+            image_height=600,
             look_at=[0.0, 0.0, 0.0],
             up_direction=[0.0, 0.0, 1.0],
         )
