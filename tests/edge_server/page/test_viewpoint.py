@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge_server.page.viewpoint import DISTANCES, MARGIN, SEEN_SHARE, initial_viewpoint, row_band, visitor_camera
-from freshfield.geometry import look_at, matrix_to_quaternion, quaternion_to_matrix
+from freshfield.geometry import look_at, matrix_to_quaternion, quaternion_to_matrix, world_up
 from tests.edge_server.page.preview import BallScene
 
 TARGET = np.array([1.0, -2.0, 0.5])
@@ -22,6 +22,18 @@ def rig(count: int, spread_deg: float, elevation_deg: float = 20.0, radius_m: fl
         out = np.array([np.cos(azimuth) * np.cos(e), np.sin(azimuth) * np.cos(e), np.sin(e)])
         poses.append(look_at(TARGET + radius_m * out, TARGET))
     return np.stack(poses)
+
+
+def test_up_is_vertical_although_cameras_look_down_and_without_a_common_level_the_first_ones_own():
+    poses = rig(9, 100, elevation_deg=70)
+    assert np.allclose(world_up(poses), (0, 0, 1), atol=1e-9)
+    poses[:, :3, :2] *= -1  # held upside down
+    assert np.allclose(world_up(poses), (0, 0, -1), atol=1e-9)
+    assert np.allclose(world_up(rig(1, 0, elevation_deg=0)), (0, 0, 1), atol=1e-9)
+    rolling = np.stack([np.eye(4)] * 4)
+    for i, pose in enumerate(rolling):
+        pose[:2, :2] = [[np.cos(a := i * np.pi / 2), -np.sin(a)], [np.sin(a), np.cos(a)]]
+    assert np.allclose(world_up(rolling), (0, -1, 0))
 
 
 @pytest.mark.parametrize(("cameras_deg", "visitor_deg"), [(20, 30), (35, 45), (0, 18), (60, 55), (-20, 18)])

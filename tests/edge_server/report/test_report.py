@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 
@@ -11,12 +10,10 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.live.state import Publication
+from edge_server.report import figures
 from edge_server.report.build_report import METRICS, SERIES, assemble, build_report, fidelity, updates
 from edge_server.report.figures import draw_ages, draw_fidelity, draw_frontier
-from edge_server.report.report_page import counts, number
 from edge_server.report.run_files import continuous, read_run_files
-from edge_server.report.style import figure, label_lines
 from edge_server.run_records import EdgeStatus, UpdateCounts, UpdateRow
 from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, EDGE, SECONDS, page_of, publication, write_run
 
@@ -32,6 +29,11 @@ def run(tmp_path_factory):
     return out, build_report(out)
 
 
+def words_of(page: str) -> str:
+    """What a page shows."""
+    return re.sub(r"\s+", " ", re.sub(r"<style>.*?</style>|<[^>]*>", " ", page))
+
+
 def edit_edge(out, **more):
     """Change edge.json."""
     (out / "edge.json").write_text(json.dumps(json.loads((out / "edge.json").read_text()) | more))
@@ -42,26 +44,24 @@ def test_report_json_holds_what_is_returned_and_every_documented_key(run):
     assert json.loads((out / "report.json").read_text()) == report
     assert (report["scenario"], report["seed"], report["seconds"]) == ("sample", 7, SECONDS)
     assert report["policy"] == {"name": "threshold", "value": 120.0} and report["kind"] == "live"
-    assert set(report["age_ms"]) == {"mean", "p50", "p95", "by_camera"}
     assert set(report["fidelity"]["final"]) == set(report["fidelity"]["mean"]) == set(METRICS)
     assert report["fidelity"]["baseline"] == {"mean_color_db": 14.5, "nearest_view_db": 13.8}
     assert all(tuple(row) == SERIES for row in report["fidelity"]["series"])
-    assert report["channel"] == CHANNEL
+    assert report["channel"] == CHANNEL and report["chosen"] is None
     words = ("network set: 400 ms, 20 % lost", "the scenario's network again")
     assert report["events"] == [{"t_s": t_s, "what": what} for t_s, what in zip((10.0, 14.0), words)]
     assert report["run"] == {**EDGE["run"], "command": "freshfield demo"}, "of the run, not of the report"
     assert set(report["outside_load"]) == {"cores", "ours", "method"}
 
 
-def test_a_line_of_the_series_is_a_publication():
-    assert set(UpdateRow.__struct_fields__) <= {field.name for field in dataclasses.fields(Publication)}
-
-
-def test_frames_close(run):
-    frames = run[1]["frames"]
+def test_frames_close_and_ages_are_time_averages(run):
+    frames, ages = run[1]["frames"], run[1]["age_ms"]
     assert frames["captured"] == 200 == frames["replaced"] + frames["waiting"] + frames["sent"]
     assert (frames["dropped_busy"], frames["delivered"], frames["rejected"]) == (80, 76, {"crc": 4})
     assert frames["closes"] and frames["contradiction_count"] == 0 and frames["ledgers"] == 3
+    assert ages["by_camera"]["never"] is None
+    means = [ages["by_camera"][c]["mean"] for c in CAMERAS[1:]]
+    assert ages["mean"] == pytest.approx(np.mean(means)) and 60.0 < ages["p50"] < ages["p95"]
 
 
 def test_what_was_shown_and_what_its_age_consists_of(run):
@@ -87,16 +87,6 @@ def test_final_is_the_mean_of_the_last_fifth_of_the_run(run):
     assert found["final"]["psnr_db"] is None and found["mean"]["psnr_db"] == 20.0
 
 
-def test_a_phone_that_shows_the_left_of_a_figure_shows_its_legend(tmp_path):
-    with figure(tmp_path / "curves.png") as (fig, axes):
-        for name in ("whole image", "moving pixels"):
-            axes[0, 0].plot([1.0, 2.0], label=name)
-        label_lines(axes[0, 0], "PSNR (dB)", title="Fidelity")
-        fig.canvas.draw()
-        shown_px = 0.5 * fig.bbox.width
-        assert axes[0, 0].get_legend().get_window_extent().x1 < shown_px < axes[0, 0].get_window_extent().x1
-
-
 def test_the_last_fifth_is_counted_from_the_first_publication(tmp_path):
     write_run(tmp_path)
     # Kernels were compiled until then, and files were written for 8 s at the end.
@@ -106,7 +96,7 @@ def test_the_last_fifth_is_counted_from_the_first_publication(tmp_path):
     assert found["shown"]["count"] == sum(publication(i).t_s + 0.1 >= found["late_s"] for i in range(49)) > 0
 
 
-@pytest.mark.parametrize("name", ["", "ledger-node-a-1.tsv", "series.jsonl", "edge.json", "run.json"])
+@pytest.mark.parametrize("name", ["", "ledger-node-a-1.tsv", "edge.json"])
 def test_the_command_takes_folders_in_which_a_run_left_something(tmp_path, capsys, name):
     (tmp_path / "field.npz").touch()
     if name:
@@ -114,13 +104,6 @@ def test_the_command_takes_folders_in_which_a_run_left_something(tmp_path, capsy
     assert edge_server(["report", str(tmp_path)]) == (0 if name else 2)
     assert (tmp_path / "report.html").exists() == bool(name)
     assert name or f"{tmp_path}: holds none of" in capsys.readouterr().err
-
-
-def test_ages_are_time_averages_and_none_without_a_report(run):
-    ages = run[1]["age_ms"]
-    assert ages["by_camera"]["never"] is None
-    means = [ages["by_camera"][c]["mean"] for c in CAMERAS[1:]]
-    assert ages["mean"] == pytest.approx(np.mean(means)) and 60.0 < ages["p50"] < ages["p95"]
 
 
 def test_updates_are_counted_as_the_edge_counted_them(run):
@@ -174,7 +157,7 @@ def test_every_figure_is_drawn_and_inside_a_page_that_loads_nothing(run):
 
 
 def test_the_page_says_what_the_report_holds(run):
-    text = re.sub(r"\s+", " ", re.sub(r"<style>.*?</style>|<[^>]*>", " ", (run[0] / "report.html").read_text()))
+    text = words_of((run[0] / "report.html").read_text())
     for words in (
         "40 s · seed 7 · field ngp · policy threshold 120",
         "24.0 dB PSNR of what was shown, last fifth of the run 17.0 dB",
@@ -191,21 +174,6 @@ def test_the_page_says_what_the_report_holds(run):
         "drawn delay (ms) delay error (ms) mean 60.20 – 50 % 41.00 0.10 95 % 180.00 – 99 % – 1.20 largest – 4.00",
     ):
         assert words in text, words
-
-
-def test_numbers_are_written_for_people():
-    assert number(1234.56, 1, " ms") == "1,234.6 ms" and number(None) == "–"
-    assert number(1500.0, 2, " s", 0.001) == "1.50 s"
-    assert counts({"crc": 4, "stale": 1200}) == "crc 4, stale 1,200"
-
-
-def test_a_report_of_the_same_files_is_the_same(run):
-    out, report = run
-    before = {p.name: p.read_bytes() for p in out.glob("figure-*.png")}
-    again = build_report(out)
-    again["outside_load"] = report["outside_load"]
-    assert again == report
-    assert {p.name: p.read_bytes() for p in out.glob("figure-*.png")} == before
 
 
 def test_a_killed_run_is_reported_with_notes_on_what_is_torn(tmp_path):
@@ -254,9 +222,6 @@ def test_rows_are_in_order_of_time_across_a_restart(tmp_path):
     assert [row["t_s"] for row in files.processes][-2:] == [38.0, 38.0]
 
 
-DEEP = "[" * 100_000
-
-
 def test_a_held_out_camera_that_moves_is_drawn_and_tabled_at_refined_poses(tmp_path) -> None:
     write_run(tmp_path)
     so_far = {"now_psnr_db": 23.5, "all_psnr_db": 24.7, "now_ssim": 0.79, "all_ssim": 0.8125, "frames": 9}
@@ -267,7 +232,7 @@ def test_a_held_out_camera_that_moves_is_drawn_and_tabled_at_refined_poses(tmp_p
     report, page = page_of(tmp_path)
     assert draw_fidelity(report, read_run_files(tmp_path), tmp_path / "figure.png")
     assert (tmp_path / "figure.png").read_bytes() != (tmp_path / "of an earlier version.png").read_bytes()
-    text = re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", page))
+    text = words_of(page)
     for words in (
         "0.812 SSIM of the same",
         "newest held-out frame, at refined poses 23.50 0.7900",
@@ -291,18 +256,13 @@ def test_the_band_of_ages_reaches_from_the_youngest_camera_to_the_oldest(run, tm
     [
         ("edge.json", '{"updates": [1]}', "edge.json left out: Expected"),
         ("edge.json", f'{{"seconds": {10**400}}}', "edge.json left out"),
-        ("edge.json", DEEP, "edge.json left out"),
-        ("edge.json", "[]", "edge.json left out: Expected `object`"),
-        ("channel.json", '{"drawn_delay_ms": {"histogram": [1]}}', "channel.json left out"),
+        ("edge.json", "[" * 100_000, "edge.json left out"),
         ("channel.json", '{"drawn_delay_ms": {"histogram": {"edges_ms": [1], "counts": [2]}}}', "do not bound"),
         ("frontier.json", '{"points": [{"update_ms": [1]}]}', "frontier.json left out"),
         ("ages.jsonl", '{"t_s": 1, "age_ms": [5]}', "ages.jsonl: 1 of 1 lines"),
         ("shown.jsonl", '{"t_s": 1, "age_ms": "x"}', "shown.jsonl: 1 of 1 lines"),
-        ("series.jsonl", f'{{"t_s": 1, "update_ms": {10**400}}}', "series.jsonl: 1 of 1 lines"),
         ("series.jsonl", '{"t_s": 1e16}', "series.jsonl: 1 of 1 lines"),
         ("series.jsonl", '{"t_s": 9.0, "psnr_db": NaN}\n{"t_s": "8"}\n[1]\n{}\nnull\n', "series.jsonl: 5 of 5"),
-        ("series.jsonl", DEEP, "series.jsonl: 1 of 1 lines"),
-        ("processes.jsonl", '{"t_s": {}, "edge": {"cpu": 1}}', "processes.jsonl: 1 of 1 lines"),
         ("processes.jsonl", '{"t_s": 1, "edge": {"cpu": "x"}}', "processes.jsonl: 1 of 1 lines"),
     ],
 )
@@ -318,10 +278,10 @@ def test_what_should_be_something_else_adds_a_note(tmp_path, file, text, note):
 def test_hostile_names_do_not_reach_the_page_as_markup(tmp_path):
     write_run(tmp_path, publications=2, ages=2)
     evil = "<script>alert(1)</script>"
-    edit_edge(tmp_path, scenario=evil, field=evil, lpips_missing=evil)
+    edit_edge(tmp_path, scenario=evil, field=evil, lpips_missing=evil, chosen=evil)
     (tmp_path / "ages.jsonl").write_text(json.dumps({"t_s": 1, "age_ms": {evil: 3}}) + "\n")
     page = page_of(tmp_path)[1]
-    assert "<script" not in page and page.count("&lt;script&gt;alert(1)") == 5
+    assert "<script" not in page and page.count("&lt;script&gt;alert(1)") == 6
 
 
 def test_the_run_stands_beside_the_measured_frontier(tmp_path, monkeypatch):
@@ -341,18 +301,10 @@ def test_the_run_stands_beside_the_measured_frontier(tmp_path, monkeypatch):
     assert ((cv2.imread(str(path)) < 200).any(axis=-1)).sum() > 2000, "axes, words and points are drawn"
 
 
-def test_what_was_chosen_and_why_is_said(tmp_path):
-    write_run(tmp_path, publications=2, ages=2)
-    assert page_of(tmp_path)[0]["chosen"] is None
-    edit_edge(tmp_path, chosen="splat in layers: no <camera> moves")
-    report, page = page_of(tmp_path)
-    assert report["chosen"] == "splat in layers: no <camera> moves" and "no &lt;camera&gt; moves" in page
-
-
-def test_two_runs_are_printed_side_by_side(run, tmp_path, capsys):
+def test_two_runs_are_printed_side_by_side(run, tmp_path, capsys, monkeypatch):
     out, report = run
     write_run(tmp_path / "b")
-    edit_edge(tmp_path / "b", updates={"count": 4242})
+    monkeypatch.setattr(figures, "draw_all", lambda report, files: {})  # they take seconds
     assert edge_server(["report", str(out), "--beside", str(tmp_path / "b")]) == 0
     rows = {line.split("  ")[0]: line.split()[-2:] for line in capsys.readouterr().out.splitlines()}
     shown = f"{report['fidelity']['final']['psnr_db']:.2f}"
