@@ -3,6 +3,7 @@ the edge."""
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -73,21 +74,17 @@ def test_a_pod_for_each_camera_and_commands_that_their_programs_take(
     assert config["data"] == {"SCENARIO": scene}
     cameras = load(scene).cameras
     assert of(documents, "StatefulSet")["camera"]["spec"]["replicas"] == len(cameras)
+    last = {"$(SCENARIO)": scene, "$(INDEX)": str(len(cameras) - 1)}
     for name, template in pods(documents).items():
         (container,) = template["spec"]["containers"]
-        program, *words = (
-            word.replace("$(SCENARIO)", scene).replace("$(INDEX)", str(len(cameras) - 1))
-            for word in container["command"]
-        )
+        program, *words = (re.sub(r"\$\(\w+\)", lambda found: last[found[0]], word) for word in container["command"])
         taken = []
         monkeypatch.setattr(CLI[program], "_run", lambda args, taken=taken: taken.append(args) or 0)
         assert CLI[program].main(words) == 0 and taken[0].scenario == scene, name
         if name == "camera":
             assert camera_node.cli._chosen(load(scene), taken[0]) == (cameras[-1],)
-        probe = container["livenessProbe"]["exec"]["command"]
-        assert (
-            probe[:3] == ["python", "-m", "freshfield_up.healthy"] == container["startupProbe"]["exec"]["command"][:3]
-        )
+        probe, started = (container[f"{kind}Probe"]["exec"]["command"] for kind in ("liveness", "startup"))
+        assert probe[:3] == started[:3] == ["python", "-m", "freshfield_up.healthy"]
         if name != "camera":  # asked at the port it listens on, as the Service names it
             port = taken[0].listen.rpartition(":")[2]
             assert f"--serving=127.0.0.1:{port}" in probe and container["readinessProbe"]["exec"]["command"] == probe
@@ -101,11 +98,8 @@ def test_every_volume_is_there_and_nobody_sees_anothers_key(scene: str, document
     for name, template in pods(documents).items():
         spec = template["spec"]
         (container,) = spec["containers"]
-        volumes = {each["name"] for each in spec["volumes"]}
-        volumes |= {
-            each["metadata"]["name"]
-            for each in of(documents, "StatefulSet").get(name, {"spec": {}})["spec"].get("volumeClaimTemplates", ())
-        }
+        claims = of(documents, "StatefulSet").get(name, {"spec": {}})["spec"].get("volumeClaimTemplates", ())
+        volumes = {each["name"] for each in spec["volumes"]} | {each["metadata"]["name"] for each in claims}
         mounts = {each["mountPath"]: each for each in container["volumeMounts"]}
         assert {each["name"] for each in mounts.values()} == volumes
         (secret,) = [each["secret"]["secretName"] for each in spec["volumes"] if "secret" in each]

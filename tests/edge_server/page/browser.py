@@ -3,7 +3,7 @@
     with Browser(url) as browser:
         browser.wait_for_text("updates")
         browser.click_text("Pause")
-        browser.screenshot(path)
+        image = browser.screenshot()
 
 Nothing outside the machine is contacted: background services of the browser are off, and ``requests``
 lists every address that the page asked for.
@@ -40,14 +40,10 @@ FLAGS = (
     "--enable-unsafe-swiftshader",
     "--disable-background-networking",
     "--disable-component-update",
-    "--disable-default-apps",
     "--disable-dev-shm-usage",
-    "--disable-extensions",
     "--disable-sync",
     "--hide-scrollbars",
-    "--mute-audio",
     "--no-first-run",
-    "--no-default-browser-check",
     "--remote-debugging-port=0",
     "--remote-allow-origins=*",
 )
@@ -120,8 +116,6 @@ class Browser:
         self._process.wait(timeout=10)
         shutil.rmtree(self._profile, ignore_errors=True)
 
-    # --- the protocol --------------------------------------------------------------------------
-
     def call(self, method: str, **params: Any) -> dict[str, Any]:
         """One DevTools command and its result; raises RuntimeError with the browser's message."""
         assert self._socket is not None
@@ -175,8 +169,6 @@ class Browser:
             time.sleep(0.1)
         raise AssertionError(failure if isinstance(failure, str) else failure())
 
-    # --- what a visitor sees and does ----------------------------------------------------------
-
     def text(self) -> str:
         """All text that the page shows."""
         return self.evaluate("document.body ? document.body.innerText : ''") or ""
@@ -193,11 +185,8 @@ class Browser:
         self.wait_for(lambda: wanted in self.text(), f"the text {wanted!r}", timeout_s)
         return self.text()
 
-    def hover(self, x: float, y: float) -> None:
-        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=float(x), y=float(y))
-
     def click(self, x: float, y: float) -> None:
-        self.hover(x, y)
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=float(x), y=float(y))
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=float(x), y=float(y), button="left", clickCount=1)
 
@@ -212,11 +201,9 @@ class Browser:
         gone = "!document.querySelector('.mantine-Notification-root')"
         self.wait_for(lambda: self.evaluate(gone), "the end of the notifications")
 
-    def screenshot(self, path: str | Path | None = None) -> NDArray[np.uint8]:
-        """The window as RGB (H, W, 3), also written as PNG to ``path``."""
+    def screenshot(self) -> NDArray[np.uint8]:
+        """The window as RGB (H, W, 3)."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        if path is not None:
-            Path(path).write_bytes(data)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8)

@@ -18,7 +18,7 @@ from edge_server.viewpoints.preference_session import PreferenceSession
 from freshfield.transport import Transport, TransportError
 from tests.edge_server.page.browser import Browser
 
-COUNT, FRAMES, COLUMNS, SIDE = 6, 6, 3, 48
+COUNT, FRAMES, COLUMNS = 6, 6, 3
 NEW = PreferenceSession(
     "tile", tuple((k, k + 1) for k in range(COUNT)), np.random.default_rng(0).normal(size=(COUNT, 3)), wanted=9
 )
@@ -26,7 +26,7 @@ NEW = PreferenceSession(
 
 def sprite(k):
     """Of reconstruction k: its gray level says which it is."""
-    return cv2.imencode(".jpg", np.full((2 * SIDE, 3 * SIDE, 3), 30 * k + 40, np.uint8))[1].tobytes()
+    return cv2.imencode(".jpg", np.full((96, 144, 3), 30 * k + 40, np.uint8))[1].tobytes()
 
 
 @pytest.fixture
@@ -144,10 +144,9 @@ def swipe(browser, dx):
         "(({x, y, width, height}) => [x + width / 2, y + height / 2])"
         "(document.getElementById('pair').getBoundingClientRect())"
     )
-    points = [{"x": box[0] + share * dx, "y": box[1]} for share in (0, 0.5, 1)]
-    browser.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=points[:1])
-    for point in points[1:]:
-        browser.call("Input.dispatchTouchEvent", type="touchMove", touchPoints=[point])
+    for kind, share in (("touchStart", 0), ("touchMove", 0.5), ("touchMove", 1)):
+        point = {"x": box[0] + share * dx, "y": box[1]}
+        browser.call("Input.dispatchTouchEvent", type=kind, touchPoints=[point])
     browser.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
 
@@ -184,11 +183,7 @@ def test_a_whole_session_by_keys_and_touch(asked):
         ready(2)
         swipe(browser, 90)
         ready(3)
-        browser.click_text("← Left")
-        ready(4)
-        assert [a.choice for a in page.session.answers] == ["left", "neither", "right", "left"]
-        press(browser, "z", 90)
-        ready(3)
+        assert [a.choice for a in page.session.answers] == ["left", "neither", "right"]
         browser.click_text("Undo")
         ready(2)
         # Who wants less motion moves the viewpoint by hand.
@@ -204,9 +199,7 @@ def test_a_whole_session_by_keys_and_touch(asked):
             press(browser, "ArrowRight", 39)
             ready(k)
         assert "repeated pairs answered alike: 0 of 1" in browser.text()  # always right, sides swapped
-        press(browser, "ArrowRight", 39)
         browser.wait_for_text("All questions are answered")
-        assert "it does not know" in browser.text()
         browser.click_text("Finish and plan")
         browser.wait_for_text("Finished")
         assert page.finished.is_set() and len(page.session.answers) == 9 and browser.errors == []
