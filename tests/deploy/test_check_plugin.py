@@ -11,18 +11,17 @@ import pytest
 
 from channel_emu.model import faults
 from edge_server.scheduler import POLICIES, SelectionWindow
-from freshfield.geometry import Pinhole
 from freshfield.settings import Settings
 from freshfield_up.cli import main
 from tests.integration.own_classes import Darker, Flat, LastFirst, Late, Turning, Youngest
 
+COUNT = itertools.count()
 OWN = Path(__file__).parent.parent / "integration/own_classes.py"
 # Effects: tests/camera_node/synthetic/effects/test_registry.py.
 BUILT_IN = [("policy", name) for name in POLICIES] + [("fault", name) for name in faults.NAMES]
 BUILT_IN += [("selector", name) for name in ("random", "coverage", "fisher")]
 FAULTS = {"loss": "probability=0.5", "duplication": "probability=0.5", "corruption": "probability=0.5 count=3"}
 FAULTS |= {"blackout": "windows_ms=[[0,50]]", "reset": "mean_interval_ms=100", "bandwidth": "megabits_per_s=1"}
-COUNT = itertools.count()
 
 
 class ByState(Youngest):
@@ -68,11 +67,6 @@ def first_of(share):
     return lambda self, epoch, window: tuple(epoch.generated_ns)[: share(epoch.generated_ns)]
 
 
-def after(self):
-    self.last = (getattr(self, "last", -1) + 1) % 50
-    return self.last
-
-
 def shot(**changed):
     return lambda self, content: replace(Turning.read(self, content), **changed)
 
@@ -86,12 +80,9 @@ OWN_CLASSES = [(kind, f"{OWN}:{good.__name__}") for kind, good in BASES.items()]
 BROKEN = {
     "source": {
         "Fast": ({"fps": 10}, "the first frames: fps: expected a Fraction"),
-        "Another": ({"camera": property(lambda _: "cam07", lambda *_: None)}, "the first frames: camera: not the one"),
         "Ends": ({"contents": 3, "content": lambda s, tick: tick}, "the first frames: content: expected 0 to contents"),
         "Picture": ({"read": lambda s, n: Turning.read(s, n).image}, "the first frames: read: expected a Shot"),
         "Halves": ({"read": shot(image=np.ones((24, 32, 3)) / 2)}, "the first frames: PayloadError: expected uint8"),
-        "OtherLens": ({"read": shot(intrinsics=Pinhole.from_fov(64, 24, 60.0))}, "the first frames: "),
-        "InOrder": ({"read": lambda s, n: Turning.read(s, after(s))}, "does not depend on the order of reads: a shot"),
     },
     "policy": {
         "Patient": ({"plan": lambda *_: LATE}, "six cameras: plan: it waits for more than an hour"),
@@ -107,11 +98,13 @@ BROKEN = {
     "fault": {
         "Early": ({"extra_ns": lambda *_: -1}, "usual messages: extra_ns: expected nanoseconds from 0"),
         "Fraction": ({"extra_ns": lambda *_: 0.5}, "usual messages: extra_ns: expected int, got float"),
-        "InTurn": ({"loses": in_turn}, "does not depend on the order of questions: draw by the number"),
+        "InTurn": (
+            {"loses": in_turn},
+            "does not depend on the order of questions: draw by the number",
+        ),
         "Demanding": ({"Params": NO_DEFAULT}, "is constructed: ScenarioError"),
     },
     "field": {
-        "NoNumber": ({"render": painted(lambda s: np.nan)}, "one camera: color: a value is not finite"),
         "Bytes": ({"render": painted(lambda s: 255)}, "one camera: color: below 0, or above 1"),
         "Forgets": ({"render": painted(seen)}, "snapshots stay and states go on: load_state: it renders"),
         "Itself": (NO_COPY, "snapshots stay and states go on: snapshot: it changes"),

@@ -41,12 +41,7 @@ def test_ctrl_c_while_it_starts_prints_no_traceback(after_s):
 
 @pytest.mark.parametrize(
     ("command", "words", "unbuffered"),
-    [
-        ("freshfield", ["scenario", "keys", "effects"], ""),
-        ("channel-emu", ["presets"], "1"),
-        ("camera-node", ["--help"], ""),
-        ("edge-server", ["--help"], ""),
-    ],
+    [("freshfield", ["scenario", "keys", "effects"], ""), ("channel-emu", ["presets"], "1")],
 )
 def test_output_that_nobody_reads_ends_it_without_a_word(command, words, unbuffered, tmp_path, monkeypatch):
     """Where it is buffered, the last of it is written at the end."""

@@ -15,7 +15,7 @@ import edge_server.cli
 from edge_server.live.keys import make_keys
 from freshfield.scenario import load
 from tests.conftest import ROOT
-from tests.deploy.kustomize import Document, by_kubectl, rendered
+from tests.deploy.kustomize import Document, rendered
 
 SCENES = sorted(folder.name for folder in (ROOT / "deploy/kubernetes/overlays").iterdir())
 SCHEMAS = "1.31"
@@ -49,12 +49,6 @@ def of(documents: list[Document], *kinds: str) -> dict[str, Document]:
 def pods(documents: list[Document]) -> dict[str, Document]:
     """Name -> template of its pods."""
     return {name: d["spec"]["template"] for name, d in of(documents, "StatefulSet", "Deployment").items()}
-
-
-@pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl is not installed")
-def test_they_are_what_kubectl_makes_of_them(overlays: Path, scene: str, documents: list[Document]) -> None:
-    theirs, key = by_kubectl(overlays / scene), lambda d: (d["kind"], d["metadata"]["name"])
-    assert sorted(documents, key=key) == sorted(theirs, key=key)
 
 
 def test_they_follow_the_published_schemas(documents: list[Document]) -> None:

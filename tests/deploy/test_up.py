@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,6 @@ from freshfield_up.demo_command import seconds
 from freshfield_up.deployment import DeploymentError
 from freshfield_up.folder import EARLIER, prepare
 from freshfield_up.processes import Child
-from tests.conftest import ROOT
 from tests.support import free_port, wait_until
 
 SMALL = """
@@ -44,7 +44,7 @@ pytestmark = pytest.mark.timeout(600)
 
 
 class Up:
-    """A running launcher; its output goes to a file, as with nohup."""
+    """A running launcher; its output goes to a file."""
 
     def __init__(self, folder: Path, *options: str, scenario: str = SMALL) -> None:
         self.out = folder / "run"
@@ -178,6 +178,18 @@ def test_a_start_that_fails_says_why_and_costs_no_earlier_run(tmp_path: Path) ->
     assert (run.out / EARLIER / "report.json").exists()
 
 
+def test_times_and_commands_are_read_and_written_as_people_write_them(asleep: Asleep) -> None:
+    assert [seconds(text) for text in ("60", "60s", "1.5m", "2h", "0")] == [60.0, 60.0, 90.0, 7200.0, 0.0]
+    assert launcher.command_line(["/usr/bin/freshfield", "demo", "my file"]) == "freshfield demo 'my file'"
+    assert launcher.command_line(["/lib/freshfield_up/__main__.py", "demo"]) == "freshfield demo"
+    assert launcher.command_line(["examples/deployment.py", "card", "6"]) == "python examples/deployment.py card 6"
+    run = asleep("pass")
+    run._ready_s = 100.0
+    assert run._headline(112.9) == "12 of 60 s"
+    run.options = replace(run.options, duration_s=0.0)
+    assert run._headline(112.9) == "12 s"
+
+
 def test_what_cannot_run_is_refused_in_one_line_before_anything_starts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -199,24 +211,6 @@ def test_what_cannot_run_is_refused_in_one_line_before_anything_starts(
     (learned := out / "learned.npz").write_bytes(b"weights")
     said = refusal("room", free_port(), "run", "--policy", f"bandit:{learned}")
     assert "is emptied first; choose another --out" in said and learned.read_bytes() == b"weights"
-
-
-def test_times_are_read_as_people_write_them() -> None:
-    assert [seconds(text) for text in ("60", "60s", "1.5m", "2h", "0")] == [60.0, 60.0, 90.0, 7200.0, 0.0]
-
-
-def test_the_record_names_the_command_that_can_be_given_again() -> None:
-    assert launcher.command_line(["/usr/bin/freshfield", "demo", "my file"]) == "freshfield demo 'my file'"
-    assert launcher.command_line(["/lib/freshfield_up/__main__.py", "demo"]) == "freshfield demo"
-    assert launcher.command_line(["examples/deployment.py", "card", "6"]) == "python examples/deployment.py card 6"
-
-
-@pytest.mark.parametrize(("duration_s", "headline"), [(0.0, "12 s"), (60.0, "12 of 60 s")])
-def test_a_line_says_how_much_of_its_time_a_run_has_run(tmp_path: Path, duration_s: float, headline: str) -> None:
-    options = launcher.Options(tmp_path, duration_s=duration_s)
-    run = launcher.Launcher(load(ROOT / "deploy" / "scenarios" / "room.yaml"), options)
-    run._ready_s = 100.0
-    assert run._headline(112.9) == headline
 
 
 def test_a_deployment_in_a_script_says_why_it_cannot_start(tmp_path: Path) -> None:
