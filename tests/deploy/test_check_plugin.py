@@ -98,10 +98,7 @@ BROKEN = {
     "fault": {
         "Early": ({"extra_ns": lambda *_: -1}, "usual messages: extra_ns: expected nanoseconds from 0"),
         "Fraction": ({"extra_ns": lambda *_: 0.5}, "usual messages: extra_ns: expected int, got float"),
-        "InTurn": (
-            {"loses": in_turn},
-            "does not depend on the order of questions: draw by the number",
-        ),
+        "InTurn": ({"loses": in_turn}, "does not depend on the order of questions: draw by the number"),
         "Demanding": ({"Params": NO_DEFAULT}, "is constructed: ScenarioError"),
     },
     "field": {

@@ -70,13 +70,3 @@ def test_on_a_phone_the_scene_is_above_the_panels_and_nothing_is_clipped(shown):
         phone.close_notices()
         phone.click(100, 440)  # folds the panels up
         phone.wait_for(lambda: phone.evaluate(size_of % "canvas")[1] > 780, "a scene of the whole window")
-
-
-def test_on_a_tablet_the_timelines_are_folded_up_until_they_are_wanted(shown):
-    _, page, _ = shown
-    with Browser(page.url, 768, 1024, timeout_s=90.0) as tablet:
-        tablet.wait_for_text("PSNR on cam04")
-        assert "Age of the newest frames" not in tablet.text()
-        tablet.close_notices()
-        tablet.click_text("Timelines")
-        tablet.wait_for_text("Age of the newest frames")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 import threading
 import time
@@ -156,16 +157,7 @@ def test_a_taken_port_and_a_view_that_fails_are_said(served, caplog):
 def test_the_layout_shows_topics_and_values_that_are_served(served):
     _, server = served
     client = Client(server)
-    layout = json.loads((ROOT / "deploy/foxglove-layout.json").read_text())
-
-    def names(value) -> set[str]:
-        if isinstance(value, dict):
-            return set().union(*map(names, value.values()), *map(names, value))
-        if isinstance(value, list):
-            return set().union(*map(names, value))
-        return {value} if isinstance(value, str) and value.startswith("/") else set()
-
-    shown = names(layout["configById"])
+    shown = set(re.findall(r'"(/[^"]*)"', (ROOT / "deploy/foxglove-layout.json").read_text()))
     assert len(shown) > 6
     for name in shown:
         topic, _, value = name.partition(".")

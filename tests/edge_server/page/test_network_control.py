@@ -38,11 +38,9 @@ def test_a_visitor_changes_the_network_and_gives_it_back(tmp_path):
             browser.click_text("blackout")
             browser.wait_for_text("The network is blackout: mean delay 0 ms, 100 % of the frames lost.")
             browser.wait_for_text("2 set by hand")  # a state of the channel's chart
-            x, y, width = browser.evaluate(
-                "(() => { const r = document.querySelector('.mantine-Slider-track').getBoundingClientRect();"
-                "return [r.x, r.y + r.height / 2, r.width]; })()"
-            )
-            browser.click(x + width / 2, y)
+            track = "document.querySelector('.mantine-Slider-track').getBoundingClientRect()"
+            x, y = browser.evaluate(f"(r => [r.x + r.width / 2, r.y + r.height / 2])({track})")
+            browser.click(x, y)
             browser.wait_for_text("The network is set by hand: mean delay 1")
             browser.click_text("scenario")
             browser.wait_for_text("The network is the scenario's.")

@@ -199,6 +199,7 @@ def test_a_whole_session_by_keys_and_touch(asked):
             press(browser, "ArrowRight", 39)
             ready(k)
         assert "repeated pairs answered alike: 0 of 1" in browser.text()  # always right, sides swapped
+        press(browser, "ArrowRight", 39)
         browser.wait_for_text("All questions are answered")
         browser.click_text("Finish and plan")
         browser.wait_for_text("Finished")
