@@ -164,15 +164,18 @@ def test_what_cameras_see_is_reckoned_when_they_stand_still():
     assert coverage.reached(2, depth=True) in coverage_of(-1.0, 1.2, depth=("cam00",))
 
 
-def test_a_learned_policy_is_shown_by_its_files_name_and_chosen_by_its_path():
-    chosen = []
-    path = "bandit:/far/away/p.npz"
-    state = replace(bare_state(), policies=(path, "all"), set_policy=lambda *p: chosen.append(p))
+def control_panel(state: EdgeState) -> ControlPanel:
     gui = MagicMock()
     gui.add_dropdown.side_effect = lambda _, options, initial_value=None, **more: MagicMock(
         options=options, value=initial_value
     )
-    panel = ControlPanel(MagicMock(gui=gui), state)
+    return ControlPanel(MagicMock(gui=gui), state)
+
+
+def test_a_learned_policy_is_shown_by_its_files_name_and_chosen_by_its_path():
+    chosen, path = [], "bandit:/far/away/p.npz"
+    state = replace(bare_state(), policies=(path, "all"), set_policy=lambda *p: chosen.append(p))
+    panel = control_panel(state)
     state.chosen = "splat with keyframes: cam01 moves"
     assert panel.policy.options == ("bandit:p.npz", "all") and panel.policy.value == "all"
     panel._policy_chosen(MagicMock(target=MagicMock(value="bandit:p.npz")))
@@ -192,10 +195,7 @@ def test_what_an_operator_does_reaches_the_state_or_is_answered_with_what_was_wr
         asked.append((name, value))
 
     state = replace(bare_state(), policies=("all", "freshest-k"), set_policy=set_policy)
-    gui = MagicMock()
-    for kind in (gui.add_number, gui.add_html, gui.add_dropdown, gui.add_button_group):
-        kind.side_effect = lambda *words, **more: MagicMock(options=("all", "freshest-k"))
-    panel = ControlPanel(MagicMock(gui=gui), state)
+    panel = control_panel(state)
     panel._policy_chosen(MagicMock(target=MagicMock(value="freshest-k"), client=client))
     panel._value_entered(MagicMock(target=MagicMock(value=3), client=client))
     panel._value_entered(MagicMock(target=MagicMock(value=4), client=None))  # set by refresh, not by a visitor
@@ -279,6 +279,8 @@ def test_the_page_outlives_a_broken_field_and_stops_at_once(raises, capfd):
         with pytest.raises(PageError, match="--page-port"):
             start_page(bare_state(), "127.0.0.1", page.port)
     page.stop()  # twice is once
+    assert page_url("", 8080) == page_url("0.0.0.0", 8080) == "http://localhost:8080"
+    assert page_url("::1", 8080, tls=True) == "https://[::1]:8080"
     start_page(bare_state(), "127.0.0.1", page.port).stop()
     assert not [t for t in set(threading.enumerate()) - before if t.name.startswith("page")]
     assert "viser" not in capfd.readouterr().out  # no banner of a library on the operator's terminal
@@ -286,11 +288,6 @@ def test_the_page_outlives_a_broken_field_and_stops_at_once(raises, capfd):
 
 def decoded(image: bytes) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
-
-
-def test_an_address_is_one_that_a_browser_takes():
-    assert page_url("0.0.0.0", 8080) == page_url("", 8080) == "http://localhost:8080"
-    assert page_url("::1", 8080, tls=True) == "https://[::1]:8080"
 
 
 def test_a_state_that_fails_to_answer_is_reported_once_and_survived(caplog):

@@ -1,7 +1,4 @@
-"""A visitor without a browser: speaks the viewer's wire protocol, counts what the page sends.
-
-For what a browser is too slow and too large to test: message rates, many visitors, one who does not read.
-"""
+"""A visitor without a browser: speaks the viewer's wire protocol, counts what the page sends."""
 
 from __future__ import annotations
 
@@ -35,19 +32,11 @@ def page_of(state: EdgeState, transport: Transport | None = None, host: str = "1
 
 
 class Visitor:
-    """Connects, with more ``headers``, and stands at ``position`` looking at the origin; reads in a thread
-    unless ``reads`` is False. ``counts``: messages by type; ``bytes``: all that came; ``images``: number of
-    renderings; ``image``: the last one, encoded."""
+    """Connects, with more ``headers``, and looks at the origin; reads in a thread unless ``reads`` is False.
+    ``counts``: messages by type; ``images``: number of renderings; ``image``: the last one, encoded."""
 
-    def __init__(
-        self,
-        port: int,
-        position: tuple[float, float, float] = (4.0, 0.0, 3.0),
-        reads: bool = True,
-        headers: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, port: int, reads: bool = True, headers: Sequence[str] = ()) -> None:
         self.counts: Counter[str] = Counter()
-        self.bytes = 0
         self.images = 0
         self.image: bytes | None = None
         self._closing = False
@@ -58,7 +47,7 @@ class Visitor:
             header=list(headers),
             sockopt=() if reads else ((socket.SOL_SOCKET, socket.SO_RCVBUF, 4096),),
         )
-        self.stand_at(position)
+        self.stand_at((4.0, 0.0, 3.0))
         self._thread = threading.Thread(target=self._read, daemon=True)
         if reads:
             self._thread.start()
@@ -112,7 +101,6 @@ class Visitor:
                 return
             packed = int.from_bytes(data[8:16], "little")
             inner = zstandard.ZstdDecompressor().decompress(data[16 : 16 + packed])
-            self.bytes += len(data)
             for message in msgspec.msgpack.decode(inner)["messages"]:
                 if message["type"] == "BackgroundImageMessage":
                     self.image = message["rgb_data"]

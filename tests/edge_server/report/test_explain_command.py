@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib.util import find_spec
 
 import cv2
 import numpy as np
@@ -17,10 +18,9 @@ from edge_server.scheduler.learned.state import StateLayout
 from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, state
 from tests.edge_server.scheduler.learned.test_decision_record import a_decision
 
-
-def onnx_or_skip():
-    for name in ("onnxruntime", "onnx"):
-        pytest.importorskip(name, reason="the extra embed is not installed")
+NEEDS_ONNX = pytest.mark.skipif(
+    not (find_spec("onnx") and find_spec("onnxruntime")), reason="the extra embed is not installed"
+)
 
 
 def ages_only(run):
@@ -42,8 +42,8 @@ def test_a_decision_by_ages_is_explained(tmp_path, capsys):
     assert cv2.imread(str(tmp_path / "decision-000004.png")).shape[1] > 500
 
 
+@NEEDS_ONNX
 def test_regions_are_found_with_what_embedded_the_frames(tmp_path, capsys):
-    onnx_or_skip()
     from tests.edge_server.embed.graphs import detector
 
     model = detector(tmp_path / "d.onnx")
@@ -54,12 +54,12 @@ def test_regions_are_found_with_what_embedded_the_frames(tmp_path, capsys):
     assert abs(float(said[1])) > 0
 
 
+@NEEDS_ONNX
 @pytest.mark.parametrize(
     ("embedding", "says"),
     [({"model": "/nowhere/d.onnx", "dim": 3}, "No such file"), (None, "does not say what embedded its frames")],
 )
 def test_where_frames_cannot_be_embedded_again_the_rest_is_told(embedding, says, tmp_path, capsys):
-    onnx_or_skip()
     DecisionWriter(tmp_path, embedding).write(a_decision(2))
     assert main([str(tmp_path)]) == 0
     told = capsys.readouterr()

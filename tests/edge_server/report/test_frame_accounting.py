@@ -55,6 +55,13 @@ RUNS = {
         {"captured": 4, "sent": 4, "delivered": 1, "lost": 1, "rejected": {"bad_id": 2}},
         "no node's ledger",
     ),
+    "a restarted node is a new session": (
+        [("a", "one", 0, "captured"), ("a", "one", 0, "sent"), ("a", "two", 0, "captured"), ("a", "two", 0, "sent")],
+        None,
+        [("a", "two", 0, "delivered"), ("a", "one", 0, "rejected", "stale")],
+        {"captured": 2, "sent": 2, "delivered": 1, "rejected": {"stale": 1}},
+        "",
+    ),
     "a delivery at the edge outranks a broken stream": (
         [*sent(0, 1), (0, "broken"), (1, "broken")],
         [(0, "received"), (0, "forwarded"), (0, "broken")],
@@ -119,26 +126,6 @@ def test_no_term_is_a_remainder(tmp_path, role, line, doubt):
     assert (doubt in found["doubts"]) if doubt else not found["doubts"]
 
 
-def test_an_old_frame_without_an_end_is_no_excuse_of_a_kill(tmp_path):
-    """A killed process explains what it held in its last seconds, not what was lost a minute before."""
-    write(tmp_path, "node", sent(0, 1))
-    path = write(tmp_path, "emulator", [], closed=False)
-    with path.open("a") as file:
-        file.write(f"0\ta\ts\t0\treceived\t\n{60 * 10**9}\ta\ts\t1\treceived\t\n")
-    found = account_frames(tmp_path)
-    assert found.total.cut_off == 1 and found.total.without_end == (0, 1)
-    assert found.contradictions == ["a s 0: the end of 1 sent copies is in no ledger"]
-    assert found.doubts[0] == COPIES_OFF
-
-
-def test_a_restarted_node_is_a_new_session(tmp_path):
-    write(tmp_path, "node", [("a", "one", 0, "captured"), ("a", "one", 0, "sent")], start_ns=1, closed=False)
-    write(tmp_path, "node", [("a", "two", 0, "captured"), ("a", "two", 0, "sent")], start_ns=2)
-    write(tmp_path, "edge", [("a", "two", 0, "delivered")])
-    accounting = counts(tmp_path, captured=2, sent=2, delivered=1, cut_off=1)
-    assert any("ledger-node-x-1.tsv: not closed" in note for note in accounting.notes)
-
-
 def test_killed_processes_and_torn_lines(tmp_path):
     node = write(tmp_path, "node", [*sent(0, 1, 2), (3, "captured")], closed=False)
     emulator = write(tmp_path, "emulator", [(0, "received"), (0, "forwarded"), (1, "received")], closed=False)
@@ -191,6 +178,17 @@ def test_contradictions_are_listed_and_every_end_counts_as_written(tmp_path, mes
     assert not found["closes"] and found["doubts"]
     ends = ("delivered", "dropped_busy", "lost", "skipped", "in_flight", "duplicated")
     assert {k: found[k] for k in ends if found[k]} == Counter(counted)
+
+
+def test_an_old_frame_without_an_end_is_no_excuse_of_a_kill(tmp_path):
+    """A killed process explains what it held in its last seconds, not what was lost a minute before."""
+    write(tmp_path, "node", sent(0, 1))
+    path = write(tmp_path, "emulator", [], closed=False)
+    with path.open("a") as file:
+        file.write(f"0\ta\ts\t0\treceived\t\n{60 * 10**9}\ta\ts\t1\treceived\t\n")
+    found = account_frames(tmp_path)
+    assert found.total.cut_off == 1 and found.total.without_end == (0, 1)
+    assert found.contradictions == ["a s 0: the end of 1 sent copies is in no ledger"]
 
 
 def test_frames_of_unknown_origin_are_counted_apart(tmp_path):
