@@ -127,7 +127,6 @@ def test_a_path_of_nerfstudio_keeps_its_size_and_poses(run, tmp_path, capsys):
     [
         ({"camera_type": "fisheye"}, "camera_type"),
         ({"render_width": "wide"}, "render_width"),
-        ({"camera_path": []}, "camera_path"),
         ({"camera_path": [{"camera_to_world": [float("nan")] * 16}]}, "camera_path"),
         ({"camera_path": [{**nerfstudio()["camera_path"][0], "fov": 200}]}, "camera_path[0].fov"),
         ({"fps": 0}, "fps"),
@@ -144,7 +143,6 @@ def test_a_path_that_cannot_be_flown_is_refused_by_key(change, says, run, tmp_pa
     ("words", "says"),
     [
         (["--orbit", "view.gif"], "ends in .png"),
-        (["--orbit", "view.mp4", "--seconds", "0"], "--seconds 0"),
         (["--orbit", "view.mp4", "--size", "33x20"], "videos need even sizes, not 33 x 20"),
         (["--orbit", "view.mp4", "--fov", "nan"], "--fov nan"),
         (["--camera", "cam99", "view.png"], "--camera cam99: the run has cam01"),
@@ -156,7 +154,8 @@ def test_what_cannot_be_rendered_is_refused_in_one_line(words, says, run, tmp_pa
     assert render(run, *words) == 2
     error = capsys.readouterr().err
     assert says in error and error.count("\n") == 1
-    assert render(tmp_path / "none", "--orbit", "view.mp4") == 2
+    assert freshfield(["render", "none", "--orbit", "view.mp4"]) == 2
+    assert capsys.readouterr().err.startswith("freshfield render: none")
     assert not list(tmp_path.iterdir())
 
 
@@ -170,11 +169,3 @@ def test_a_camera_is_rendered_with_its_own_lens(tmp_path):
     for camera in (last.camera, "hand"):  # a carried camera is its newest view
         assert render(tmp_path, "--camera", camera, tmp_path / "own.png") == 0
         np.testing.assert_array_equal(cv2.imread(str(tmp_path / "own.png"))[..., ::-1], expected)
-
-
-def test_it_names_itself_as_it_was_called(capsys):
-    assert freshfield(["render", "nowhere", "--orbit", "x.mp4"]) == 2
-    assert capsys.readouterr().err.startswith("freshfield render: nowhere")
-    with pytest.raises(SystemExit):
-        freshfield(["render", "--help"])
-    assert "edge-server" not in capsys.readouterr().out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -45,14 +46,8 @@ BLOCKS = [
 def test_every_block_comes_back():
     number, instant_s, found = read_message(write_message(2**32 + 5, 12.5, BLOCKS))
     assert (number, instant_s) == (5, 12.5) and len(found) == len(BLOCKS)
-    assert found[0] == SCENE and found[5] == BLOCKS[5]
-    for wanted, got, names in (
-        (BLOCKS[1], found[1], ("set_number", "total", "first", "scales", "records")),
-        (BLOCKS[2], found[2], ("anchors", "scales", "records", "anchor", "share")),
-        (BLOCKS[3], found[3], ("anchors", "first_s", "knots_per_s", "newest_s", "ahead_s")),
-        (BLOCKS[4], found[4], ("set_number", "bits")),
-    ):
-        for name in names:
+    for wanted, got in zip(BLOCKS, found):
+        for name in {field.name for field in fields(wanted)} - {"displacements"}:
             np.testing.assert_array_equal(getattr(got, name), getattr(wanted, name))
     np.testing.assert_allclose(found[3].displacements, KNOTS.displacements, atol=0.7 / 32767)
 
@@ -87,14 +82,12 @@ def lying(block, *numbers):
     [
         lying(SCENE, (0, 2)),  # another version
         lying(SCENE, (2, 0x7FC00000)),  # NaN
-        lying(SCENE, (5, 0)),  # a unit of no length
         lying(BLOCKS[1], (2, 21)),  # one more than there are
         lying(BLOCKS[1], (3, 39)),
         lying(BLOCKS[2], (1, 41)),
         lying(BLOCKS[3], (8, 3)),
         lying(BLOCKS[3], (5, 0)),  # no knots a second
         lying(BLOCKS[4], (1, 2**31)),
-        write_message(0, 0.0, []) + struct.pack("<II", messages.STATUS, 2**31),
         write_message(0, 0.0, []) + struct.pack("<II", messages.STATUS, 4) + b"[1] ",
         write_message(0, float("nan"), []),
     ],

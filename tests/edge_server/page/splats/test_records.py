@@ -80,23 +80,18 @@ def test_what_cannot_be_drawn_is_not_drawn_and_spoils_nothing(column, value):
 
 def test_larger_nearer_and_denser_ones_weigh_more():
     one = np.array([[0, 0, 0, -3, -3, -3, 1, 0, 0, 0, 0, 0, 0, 0]], np.float32)
-    for column, value in ((3, -2.0), (10, 2.0), (0, 0.9)):
-        other = one.copy()
-        other[0, column] = value
-        bigger = weights(other)[0] / weights(one)[0]
-        assert bigger == 1.0 if column == 0 else bigger > (1.0 if column == 10 else 2.0)
-    far = one.copy()
-    far[0, 0] = 4.0
-    np.testing.assert_allclose(weights(far) / weights(one), 1 / 16)
+    others = np.tile(one, (4, 1))
+    others[[0, 1, 2, 3], [3, 10, 0, 0]] = -2.0, 2.0, 0.9, 4.0  # larger, denser, within the unit, far
+    larger, denser, within, far = weights(others) / weights(one)
+    assert larger > 2.0 and denser > 1.0 and within == 1.0 and far == pytest.approx(1 / 16)
 
 
 def test_what_is_noticed():
     before = to_records(gaussians(6, 6), (-5.0, -2.0))
     now = before.copy()
-    for row, (name, step) in enumerate([("place", 3), ("scale", 3), ("turn", 6), ("color", 2), ("alpha", 3)]):
-        there = now[name][row] if name != "alpha" else now[name]
-        where = 1 if name != "alpha" else row
-        there[where] = before[name][row, 1] + step if name != "alpha" else before[name][row] - step
+    for row, (name, step) in enumerate([("place", 3), ("scale", 3), ("turn", 6), ("color", 2)]):
+        now[name][row, 1] += step
+    now["alpha"][4] -= 3
     assert not noticeable(before, now).any()
     now["color"][3, 1] += 1
     now["alpha"][4] -= 1
