@@ -87,28 +87,6 @@ def test_a_pod_for_each_camera_and_commands_that_their_programs_take(
     assert container["env"][0]["name"] == "INDEX"
 
 
-def test_every_volume_is_there_and_nobody_sees_anothers_key(scene: str, documents: list[Document]) -> None:
-    secrets = of(documents, "Secret")
-    for name, template in pods(documents).items():
-        spec = template["spec"]
-        (container,) = spec["containers"]
-        claims = of(documents, "StatefulSet").get(name, {"spec": {}})["spec"].get("volumeClaimTemplates", ())
-        volumes = {each["name"] for each in spec["volumes"]} | {each["metadata"]["name"] for each in claims}
-        mounts = {each["mountPath"]: each for each in container["volumeMounts"]}
-        assert {each["name"] for each in mounts.values()} == volumes
-        (secret,) = [each["secret"]["secretName"] for each in spec["volumes"] if "secret" in each]
-        assert secret == f"{name}-keys" and secret in secrets
-        given = {word.partition("=")[2] for word in container["command"] if word.startswith(("--tls", "--token"))}
-        files = secrets[secret]["data"].keys()
-        if name == "camera":
-            for number in range(len(load(scene).cameras)):
-                parts = [m.get("subPathExpr", m.get("subPath")) for at, m in mounts.items() if at.startswith("/keys")]
-                assert {part.replace("$(INDEX)", str(number)) for part in parts} <= files
-            assert given == {at for at in mounts if at.startswith("/keys/")}
-        else:
-            assert {f"/keys/{file}" for file in files} == given
-
-
 def test_the_emulator_is_the_only_way_from_a_camera_to_the_edge(documents: list[Document]) -> None:
     policies = of(documents, "NetworkPolicy")
     labels = {name: template["metadata"]["labels"] for name, template in pods(documents).items()}

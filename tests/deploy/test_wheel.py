@@ -14,8 +14,6 @@ import pytest
 from tests.conftest import ROOT
 from tests.support import free_port
 
-BEYOND_THE_EMULATOR = ("cv2", "torch", "numba", "scipy", "viser", "jinja2", "onnxruntime")
-
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
@@ -28,23 +26,17 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
-def installed(wheel: Path, home: Path, without: tuple[str, ...] = ()) -> Path:
-    """The bin folder of a new environment that holds the wheel and sees this one's third-party packages, but some."""
+def installed(wheel: Path, home: Path) -> Path:
+    """The bin folder of a new environment that holds the wheel and sees this one's third-party packages."""
     subprocess.run([sys.executable, "-m", "venv", str(home)], check=True, timeout=120)
     python = home / "bin" / "python"
     (site,) = (home / "lib").glob("python*/site-packages")
     # A .pth file in a folder named by a .pth file is not read: the checkout itself stays out of sight.
     here = [path for path in sys.path if path.endswith("site-packages")]
-    blocked = f"import sys; sys.modules.update(dict.fromkeys({without}))"
-    (site / "third-party.pth").write_text("\n".join([*here, blocked]))
+    (site / "third-party.pth").write_text("\n".join(here))
     install = [str(python), "-m", "pip", "install", "-q", "--no-deps", "--force-reinstall", str(wheel)]
     subprocess.run(install, check=True, capture_output=True, timeout=300)
     return home / "bin"
-
-
-def run(command: list[str], cwd: Path) -> subprocess.CompletedProcess[str]:
-    there = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "MYPYPATH")}
-    return subprocess.run(command, cwd=cwd, env=there, capture_output=True, text=True, timeout=120, check=False)
 
 
 def test_the_wheel_carries_scenarios_models_and_launcher(wheel: Path) -> None:
@@ -60,23 +52,9 @@ def test_the_wheel_carries_scenarios_models_and_launcher(wheel: Path) -> None:
 
 def test_the_launcher_runs_a_shipped_scenario_by_name(wheel: Path, tmp_path: Path) -> None:
     words = ["demo", "quad", "--for", "5s", "--out", "runs/up", "--port", str(free_port())]
-    done = run([str(installed(wheel, tmp_path / "venv") / "freshfield"), *words], tmp_path)
+    command = [str(installed(wheel, tmp_path / "venv") / "freshfield"), *words]
+    there = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "MYPYPATH")}
+    done = subprocess.run(command, cwd=tmp_path, env=there, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((tmp_path / "runs/up/report.json").read_text())
     assert report["frames"]["closes"] and report["frames"]["delivered"] > 0
-
-
-def test_the_emulator_works_where_nothing_else_does(wheel: Path, tmp_path: Path) -> None:
-    """``freshfield[emu]`` on a machine that cannot load what cameras and edge need besides."""
-    programs = installed(wheel, tmp_path / "venv", without=BEYOND_THE_EMULATOR)
-    emulator, python = str(programs / "channel-emu"), str(programs / "python")
-    for words in (
-        "simulate --preset ch5 --cameras 4 --seconds 60 --csv frames.csv",
-        "fit frames.csv --plot fit.png --out fitted.yaml",
-        "simulate --scenario fitted.yaml --cameras 4 --seconds 10",
-    ):
-        done = run([emulator, *words.split()], tmp_path)
-        assert done.returncode == 0, words + done.stdout + done.stderr
-    assert {"fit.png", "fitted.yaml"} <= {path.name for path in tmp_path.iterdir()}
-    missing = run([python, "-c", "import camera_node.synthetic.render"], tmp_path)
-    assert "import of cv2 halted" in missing.stderr, "OpenCV was within reach: nothing was tested"

@@ -12,7 +12,6 @@ import pytest
 from edge_server.cli import main as edge_server
 from edge_server.export import ExportError
 from edge_server.export.run_source import open_source
-from edge_server.surface import reconstruct
 from tests.edge_server.export.learned import saved
 
 
@@ -39,19 +38,6 @@ def test_everything_at_once(run, tmp_path, capsys):
     assert len(list((tmp_path / "colmap" / "images").glob("*.png"))) == 8
     assert "8 cameras" in said and "triangles" in said
     assert "%" not in said.replace("% of", "")  # progress is for terminals
-
-
-def test_depth_is_sharpened_for_a_mesh_alone(run, tmp_path, monkeypatch):
-    """It takes minutes; progress is one line of a terminal."""
-    pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
-    sharpened, sharpen = [], reconstruct.refine_depth
-    monkeypatch.setattr(reconstruct, "refine_depth", lambda *args: sharpened.append(1) or sharpen(*args))
-    assert export(run, "--points", tmp_path / "p.ply", "--colmap", tmp_path / "colmap") == 0 and not sharpened
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    written = []
-    monkeypatch.setattr(sys.stderr, "write", written.append, raising=False)
-    assert export(run, "--mesh", tmp_path / "m.ply", "--voxel", 10) == 0 and sharpened
-    assert any(text.startswith("\r  sharpen") for text in written)
 
 
 def test_a_field_comes_back_as_it_was(tmp_path):

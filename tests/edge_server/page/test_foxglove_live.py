@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import re
 import struct
-import threading
-import time
 from collections.abc import Iterator
 from importlib import import_module
 from itertools import count
@@ -24,7 +22,7 @@ from edge_server.cli import main as edge_server
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.page.foxglove_live import FoxgloveServer, point_cloud
-from edge_server.page.foxglove_live.settings import IDLE_S, MOST_POINTS
+from edge_server.page.foxglove_live.settings import MOST_POINTS
 from freshfield.transport import TransportError
 from tests.conftest import ROOT
 from tests.edge_server.page.preview import CAMERAS, LENS, Preview
@@ -126,18 +124,6 @@ def test_points_are_the_gaussians_that_are_seen(served):
     cloud, log_ns = Client(server).first("/points")
     assert (cloud.frame_id, log_ns, cloud.point_stride) == ("world", 7, points.dtype.itemsize)
     assert [f.name for f in cloud.fields] == list(points.dtype.names) and cloud.data == points.tobytes()
-
-
-def test_nothing_is_made_for_nobody(served, monkeypatch):
-    _, server = served
-    made = threading.Event()
-    monkeypatch.setattr(server, "_send", made.set)
-    client = Client(server)
-    time.sleep(3 * IDLE_S)
-    assert not made.is_set(), "a client that has subscribed to nothing"
-    monkeypatch.undo()
-    client.first("/ages")
-    client.socket.close()
 
 
 def test_a_taken_port_and_a_view_that_fails_are_said(served, caplog):

@@ -49,9 +49,6 @@ class Broken:
 
 
 def bare_state(cameras: list[CameraView] | None = None) -> EdgeState:
-    def refuse(name: str, value: float | None) -> None:
-        raise ValueError("no policies here")
-
     return EdgeState(
         scenario="bare",
         policies=(),
@@ -59,8 +56,8 @@ def bare_state(cameras: list[CameraView] | None = None) -> EdgeState:
         cameras=lambda: cameras or [],
         start_ns=0,
         now_ns=time.monotonic_ns,
-        set_policy=refuse,
-        save_snapshot=lambda: (_ for _ in ()).throw(OSError("full")),
+        set_policy=MagicMock(side_effect=ValueError("no policies here")),
+        save_snapshot=MagicMock(side_effect=OSError("full")),
     )
 
 
