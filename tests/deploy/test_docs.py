@@ -41,22 +41,11 @@ def of_today(page: Path) -> str:
     return "\n".join(part for part in parts if TAG not in part)
 
 
-def anchors(text: str) -> set[str]:
-    """Names that GitHub gives the headings of a page."""
-    heads = re.findall(r"^#+ (.*)$", text, re.M)
-    return {re.sub(r"[^\w -]", "", head.lower()).strip().replace(" ", "-") for head in heads}
-
-
 @pytest.mark.parametrize("page", PAGES)
 def test_relative_links_resolve(page: Path) -> None:
-    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
-        if "://" in link:
-            continue
-        path, _, anchor = link.partition("#")
-        target = (page.parent / path).resolve() if path else page
-        assert target.exists(), f"{page}: {link}"
-        if anchor:
-            assert anchor in anchors(target.read_text()), f"{page}: {link}"
+    """Anchors are checked by ``make docs``."""
+    for link in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
+        assert "://" in link or (page.parent / link).exists(), f"{page}: {link}"
 
 
 def test_every_page_is_in_the_site_s_navigation_and_the_readme_is_short() -> None:

@@ -35,6 +35,11 @@ def test_the_line_says_what_the_processes_wrote(tmp_path: Path) -> None:
         "ch6-slow, state high (75% of the time), forwarded 481, superseded 17, delay error p99 0.12 ms"
     )
 
+    so_far = {"now_psnr_db": 24.0, "all_psnr_db": 25.0, "frames": 9, "refined": True}
+    (tmp_path / "edge.json").write_text(json.dumps({"updates": {"count": 2}, "so_far": so_far, "scores": {}}))
+    said = "held out now 24.00 dB, all 9 frames so far 25.00 dB, at refined poses, policy"
+    assert said in status_line(tmp_path, 2)
+
 
 def test_missing_and_damaged_status_files_leave_gaps(tmp_path: Path) -> None:
     assert status_line(tmp_path, 13) == "0/13 cameras; no update yet; no channel yet"
@@ -58,10 +63,3 @@ def test_the_summary_is_the_conclusion_and_whether_all_frames_are_accounted_for(
     (tmp_path / "report.json").write_text(json.dumps({"conclusion": sentences, "frames": frames}))
     said = summarize(tmp_path)
     assert said.startswith("\nGood.\nLate.\nframes     3 captured, 3 sent") and expected in said
-
-
-def test_a_moving_held_out_camera_reads_its_frames_at_refined_poses(tmp_path: Path) -> None:
-    so_far = {"now_psnr_db": 24.0, "all_psnr_db": 25.0, "frames": 9, "refined": True}
-    (tmp_path / "edge.json").write_text(json.dumps({"updates": {"count": 2}, "so_far": so_far, "scores": {}}))
-    said = "held out now 24.00 dB, all 9 frames so far 25.00 dB, at refined poses, policy"
-    assert said in status_line(tmp_path, 2)

@@ -20,8 +20,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -31,6 +30,8 @@ import numpy as np
 import pytest
 import websocket
 from numpy.typing import NDArray
+
+from tests.support import wait_until
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
@@ -88,7 +89,8 @@ class Browser:
             start_new_session=True,
         )
         try:
-            self._socket = websocket.create_connection(self._debugger(), timeout=timeout_s, suppress_origin=True)
+            address = wait_until(self._debugger, "the browser did not start", timeout_s)
+            self._socket = websocket.create_connection(address, timeout=timeout_s, suppress_origin=True)
             for domain in ("Page", "Runtime", "Network", "Log"):
                 self.call(f"{domain}.enable")
             # The window's own decorations would eat into the size asked for.
@@ -147,27 +149,15 @@ class Browser:
         elif event.get("method") == "Runtime.exceptionThrown":
             self.errors.append(str(params["exceptionDetails"].get("exception", {}).get("description")))
 
-    def _debugger(self) -> str:
+    def _debugger(self) -> str | None:
         """Address of the first tab's debugger, once the browser has written its port down."""
         file = Path(self._profile) / "DevToolsActivePort"
-        for _ in self._tries("the browser did not start"):
-            if self._process.poll() is not None:
-                raise AssertionError(f"the browser ended with status {self._process.returncode}")
-            lines = file.read_text().splitlines() if file.exists() else []
-            if lines:
-                with contextlib.suppress(OSError), urlopen(f"http://127.0.0.1:{lines[0]}/json") as reply:
-                    tabs = [t for t in json.load(reply) if t["type"] == "page"]
-                    if tabs:
-                        return tabs[0]["webSocketDebuggerUrl"]
-        raise AssertionError("unreachable")
-
-    def _tries(self, failure: str | Callable[[], str], timeout_s: float | None = None) -> Iterator[None]:
-        """Yields every 0.1 s until the time is up, then raises AssertionError."""
-        end = time.monotonic() + (timeout_s or self.timeout_s)
-        while time.monotonic() < end:
-            yield
-            time.sleep(0.1)
-        raise AssertionError(failure if isinstance(failure, str) else failure())
+        assert self._process.poll() is None, f"the browser ended with status {self._process.returncode}"
+        lines = file.read_text().splitlines() if file.exists() else []
+        if lines:
+            with contextlib.suppress(OSError), urlopen(f"http://127.0.0.1:{lines[0]}/json") as reply:
+                return next((tab["webSocketDebuggerUrl"] for tab in json.load(reply) if tab["type"] == "page"), None)
+        return None
 
     def text(self) -> str:
         """All text that the page shows."""
@@ -175,15 +165,12 @@ class Browser:
 
     def wait_for(self, wanted: Callable[[], Any], what: str, timeout_s: float | None = None) -> Any:
         """First true value of ``wanted``; ``what`` names it in the error."""
-        for _ in self._tries(lambda: f"{what} did not happen; the page shows:\n{self.text()}", timeout_s):
-            value = wanted()
-            if value:
-                return value
+        said = f"{what} did not happen; the page shows:\n"
+        return wait_until(wanted, lambda: said + self.text(), timeout_s or self.timeout_s)
 
     def wait_for_text(self, wanted: str, timeout_s: float | None = None) -> str:
         """The page's text, once ``wanted`` is part of it."""
-        self.wait_for(lambda: wanted in self.text(), f"the text {wanted!r}", timeout_s)
-        return self.text()
+        return self.wait_for(lambda: wanted in (text := self.text()) and text, f"the text {wanted!r}", timeout_s)
 
     def click(self, x: float, y: float) -> None:
         self.call("Input.dispatchMouseEvent", type="mouseMoved", x=float(x), y=float(y))

@@ -12,7 +12,6 @@ import pytest
 from edge_server.report.build_report import assemble
 from edge_server.report.conclusion import conclusion
 from edge_server.report.events import silences
-from edge_server.report.figures import draw_ages, draw_fidelity
 from edge_server.report.run_files import read_run_files
 from edge_server.run_records import AgesRow
 from tests.edge_server.report.sample_run import CHANNEL, EDGE, page_of, write_run
@@ -87,12 +86,6 @@ def test_events_of_operators_network_and_cameras_are_listed_in_order(tmp_path: P
         (20.0, "the scenario's network again"),
     ]
     assert "9.0 s: network set" in page
-    for draw in (draw_fidelity, draw_ages):
-        drawn = set()
-        for events in ([], report["events"]):
-            assert draw({**report, "events": events}, read_run_files(tmp_path), tmp_path / "figure.png")
-            drawn.add((tmp_path / "figure.png").read_bytes())
-        assert len(drawn) == 2, "they are marked on both"
 
 
 def test_cameras_that_fall_silent_together_are_one_event() -> None:
