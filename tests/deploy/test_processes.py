@@ -19,15 +19,6 @@ def python(tmp_path: Path, code: str, name: str = "one") -> Child:
     return Child(name, f"process {name}", [sys.executable, "-c", code], tmp_path / f"log-{name}.txt")
 
 
-def test_the_exit_summary_names_the_exit_code_and_the_last_lines(tmp_path: Path) -> None:
-    child = python(tmp_path, "print('reading'); raise SystemExit('the lens cap is on')")
-    child.start()
-    wait_until(lambda: not child.running, "it did not end")
-    text = child.exit_summary()
-    assert "process one ended by itself with exit code 1" in text
-    assert "| the lens cap is on" in text and "| reading" in text and str(child.log) in text
-
-
 def test_a_child_becomes_its_command_and_runs_no_python_between_fork_and_exec(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,7 +12,6 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -57,12 +56,6 @@ class Up:
     @property
     def output(self) -> str:
         return self._log.read_text()
-
-    def report(self) -> dict[str, Any]:
-        return json.loads((self.out / "report.json").read_text())
-
-    def end(self, within_s: float = 90.0) -> int:
-        return self.process.wait(within_s)
 
 
 Asleep = Callable[..., launcher.Launcher]
@@ -150,8 +143,8 @@ def test_a_start_that_fails_says_why_and_costs_no_earlier_run(tmp_path: Path) ->
     prepare(tmp_path / "run", {}).close()
     (tmp_path / "run" / "report.json").write_text("{}")
     run = Up(tmp_path, "--policy", "foo")
-    assert run.end() == 1
-    assert "'foo' is not known" in run.output and "PSNR" not in run.output
+    assert run.process.wait(90.0) == 1
+    assert "'foo' is not known" in run.output and "ended by itself with exit code 2" in run.output
     assert run.output.endswith(f"the run was never up; an earlier run's files are in {run.out / EARLIER}\n")
     assert (run.out / EARLIER / "report.json").exists()
 

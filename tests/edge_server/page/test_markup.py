@@ -49,6 +49,7 @@ def test_the_frontier_stands_beside_the_present_or_says_how_to_measure_it():
     assert "50 ms an update" in html and "800 ms" in html and "at &lt;1&gt; m/s" in html
     html = markup.frontier(found, (200.0, 28.0, None))
     assert html.count("<circle") == 1 and 'cx="170.0" cy="8.0"' in html, "at the best point, half way"
+    assert "30.0,8.0" in markup.frontier(Frontier(found.points[:1], ""), None), "one point"
     unknown = Frontier([], "run `edge-server frontier --field x`")
     assert "edge-server frontier --field x" in markup.frontier(unknown, None)
 

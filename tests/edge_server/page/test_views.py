@@ -62,6 +62,8 @@ def test_truth_and_rendering_are_as_large_as_they_fit(size, beside):
     assert shown.any(axis=0).sum() > 0.8 * size[0] or shown.any(axis=1).sum() > 0.8 * size[1]
     first = image[:, : size[0] // 2] if beside else image[: size[1] // 2]
     assert np.median(first[(first != views.BACKDROP).all(axis=2)]) == pytest.approx(200 / 255)
+    second = image[:, size[0] // 2 :] if beside else image[size[1] // 2 :]
+    assert first.max() == second.max() == 1.0, "both are labeled"
     error = views.compared(comparison, *size, error=True)
     assert error[size[1] // 2, size[0] // 2] == pytest.approx(4 * 5 / 255, abs=1e-3)
 

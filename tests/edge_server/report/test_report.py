@@ -188,7 +188,7 @@ def test_rows_are_in_order_of_time_also_across_a_restart(tmp_path):
     assert [row.t_s for row in files.shown][-3:] == [9.9, 10.0, 10.05]
 
 
-def test_a_held_out_camera_that_moves_is_drawn_and_tabled_at_refined_poses(tmp_path) -> None:
+def test_a_held_out_camera_that_moves_is_drawn_and_tabled_at_refined_poses(tmp_path, monkeypatch) -> None:
     write_run(tmp_path)
     so_far = {"now_psnr_db": 23.5, "all_psnr_db": 24.7, "now_ssim": 0.79, "all_ssim": 0.8125, "frames": 9}
     edit_edge(tmp_path, so_far={**so_far, "refined": True})
@@ -196,8 +196,10 @@ def test_a_held_out_camera_that_moves_is_drawn_and_tabled_at_refined_poses(tmp_p
     assert draw_fidelity(page_of(tmp_path)[0], read_run_files(tmp_path), tmp_path / "of an earlier version.png")
     (tmp_path / "shown.jsonl").write_text("".join(json.dumps({**line, "so_far": so_far}) + "\n" for line in lines))
     report, page = page_of(tmp_path)
+    lines = []
+    monkeypatch.setattr(figures, "label_lines", lambda axes, *_, **__: lines.append(len(axes.lines)))
     assert draw_fidelity(report, read_run_files(tmp_path), tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").read_bytes() != (tmp_path / "of an earlier version.png").read_bytes()
+    assert lines == [4, 2], "now and so far; two levels to compare with"
     text = words_of(page)
     for words in (
         "0.812 SSIM of the same",
@@ -214,6 +216,18 @@ def test_the_band_of_ages_reaches_from_the_youngest_camera_to_the_oldest(run, tm
     assert draw_ages(run[1], files, tmp_path / "ages.png")
     known = np.array([[row.age_ms[camera] for camera in CAMERAS[1:]] for row in files.ages])
     np.testing.assert_array_equal(bands, [(known.min(axis=1), known.max(axis=1))])
+
+
+def test_each_part_of_a_figure_is_drawn_on_axes_of_its_own(run, tmp_path, monkeypatch) -> None:
+    drawn = []
+    monkeypatch.setattr(
+        figures, "label_lines", lambda axes, *_, **__: drawn.append((axes, len(axes.patches), len(axes.lines)))
+    )
+    for draw in (figures.draw_channel, figures.draw_processes):
+        assert draw(run[1], read_run_files(run[0]), tmp_path / "figure.png")
+    # Two states; fifty delays and their mean; memory and processor time of edge, emulator and nodes.
+    assert [counts for _, *counts in drawn] == [[2, 0], [50, 1], [0, 3], [0, 3]]
+    assert len({axes for axes, *_ in drawn}) == 4
 
 
 @pytest.mark.stability
