@@ -50,6 +50,9 @@ def test_the_visitor_stands_as_near_as_lets_them_see_the_share(spread_deg):
     assert np.allclose(view.up, (0, 0, 1), atol=1e-9)
     poses[:, :3, :2] *= -1  # held upside down
     assert np.allclose(initial_viewpoint(poses).up, (0, 0, -1), atol=1e-9)
+    rolling = np.stack([np.eye(4)] * 4)  # evenly: no common up, the first one's is taken
+    rolling[1:, :2, :2] = [[[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]]
+    assert np.allclose(initial_viewpoint(rolling).up, (0, -1, 0))
 
 
 def test_a_ring_has_no_behind_so_the_visitor_stands_behind_its_first_camera():
