@@ -1,9 +1,8 @@
-"""What ``kubectl kustomize`` makes of the overlays, for machines without kubectl: the few features that they use."""
+"""What ``kubectl kustomize`` makes of the overlays: the few features that they use."""
 
 from __future__ import annotations
 
 import base64
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +13,8 @@ _GENERATORS = {"configMapGenerator": "ConfigMap", "secretGenerator": "Secret"}
 _KNOWN = {"apiVersion", "kind", "namespace", "resources", "components", "replicas", "images", *_GENERATORS}
 
 
-def by_kubectl(folder: Path) -> list[Document]:
-    """The documents of an overlay, names of generated ones without their hashes. Raises OSError without kubectl."""
-    done = subprocess.run(["kubectl", "kustomize", str(folder)], capture_output=True, text=True, check=True)
-    text = done.stdout
-    documents = [document for document in yaml.safe_load_all(text) if document]
-    for name in [d["metadata"]["name"] for d in documents if d["kind"] in _GENERATORS.values()]:
-        text = text.replace(name, name.rpartition("-")[0])
-    documents = [document for document in yaml.safe_load_all(text) if document]
-    for document in documents:
-        if document["kind"] == "Secret":  # kubectl wraps long lines
-            document["data"] = {name: "".join(value.split()) for name, value in document["data"].items()}
-    return documents
-
-
 def rendered(folder: Path) -> list[Document]:
-    """The same without kubectl."""
+    """The documents of an overlay, names of generated ones without their hashes."""
     overlay = yaml.safe_load((folder / "kustomization.yaml").read_text())
     documents = _accumulated(folder)
     counts = {each["name"]: each["count"] for each in overlay.get("replicas", ())}

@@ -9,22 +9,18 @@ from pathlib import Path
 import pytest
 
 from freshfield.scenario import load
+from freshfield_up import commands
+from freshfield_up.status import read_json
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde
 from tests.deploy.test_up import Up
+from tests.support import wait_until
 
 CELL = load("cell")
 
 
-@pytest.fixture
-def process_set(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    from freshfield_up import commands
-
+def test_a_simulated_arm_and_its_driver_belong_to_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(commands, "program", lambda name: name)
-    return lambda scenario: commands.process_set(scenario, tmp_path, 8080)
-
-
-def test_a_simulated_arm_and_its_driver_belong_to_the_run(process_set) -> None:
-    found = process_set(CELL)
+    found = commands.process_set(CELL, tmp_path, 8080)
     assert [child.command[1] for child in found.arms + found.drivers] == ["simulate-arm", "drive-arm"]
     assert found.arm_address == "127.0.0.2:30004"
     # Senders stop before receivers: driver, cameras, arm, channel, edge.
@@ -41,12 +37,14 @@ def test_the_cell_runs_from_one_command(tmp_path: Path) -> None:
     text = text.replace("width: 128", "width: 48").replace("height: 128", "height: 48")
     run = Up(tmp_path, scenario=text)
     try:
-        run.wait_for_updates(30)
+        wait_until(
+            lambda: read_json(run.out / "edge.json").get("updates", {}).get("count", 0) >= 30, "no updates", 400.0
+        )
         run.process.terminate()
-        assert run.end(300.0) == 0, run.output
+        assert run.process.wait(300.0) == 0, run.output
     finally:
         run.process.kill()
-    frames = run.report()["frames"]
+    frames = read_json(run.out / "report.json")["frames"]
     assert frames["closes"] and frames["by_camera"]["hand"]["delivered"] > 5
     assert "43 viewpoints in 62 stops\n" in (run.out / "log-driver.txt").read_text()
     # The arm sets out when the field can learn: after the emulator, which waits for the edge to serve.

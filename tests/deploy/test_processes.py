@@ -19,16 +19,6 @@ def python(tmp_path: Path, code: str, name: str = "one") -> Child:
     return Child(name, f"process {name}", [sys.executable, "-c", code], tmp_path / f"log-{name}.txt")
 
 
-def test_the_exit_summary_names_the_exit_code_and_the_last_lines(tmp_path: Path) -> None:
-    child = python(tmp_path, "print('reading'); raise SystemExit('the lens cap is on')")
-    child.start()
-    wait_until(lambda: not child.running, "it did not end")
-    text = child.exit_summary()
-    assert "process one ended by itself with exit code 1" in text
-    assert "| the lens cap is on" in text and "| reading" in text
-    assert str(child.log) in text
-
-
 def test_a_child_becomes_its_command_and_runs_no_python_between_fork_and_exec(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -44,17 +34,14 @@ def test_a_child_becomes_its_command_and_runs_no_python_between_fork_and_exec(
 
 
 def test_stop_terminates_first_and_kills_after_the_grace_time(tmp_path: Path) -> None:
-    obedient = python(
-        tmp_path,
-        "import signal, sys, time\n"
-        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(print('goodbye')))\n"
-        "print('up')\ntime.sleep(60)",
-        "obedient",
-    )
-    stubborn = python(
-        tmp_path,
-        "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nprint('up')\ntime.sleep(60)",
-        "stubborn",
+    answers = {"obedient": "lambda *_: sys.exit(print('goodbye'))", "stubborn": "signal.SIG_IGN"}
+    obedient, stubborn = (
+        python(
+            tmp_path,
+            f"import signal, sys, time\nsignal.signal(signal.SIGTERM, {answer})\nprint('up')\ntime.sleep(60)",
+            name,
+        )
+        for name, answer in answers.items()
     )
     for child in (obedient, stubborn):
         child.start()
@@ -84,12 +71,11 @@ time.sleep(60)
         pid = int(parent.stdout.readline())
         assert Path(f"/proc/{pid}").exists()
         parent.kill()
-    wait_until(lambda: not _lives(pid), "the child outlived its parent")
 
+    def ended() -> bool:
+        try:
+            return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+        except FileNotFoundError:
+            return True
 
-def _lives(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-    except FileNotFoundError:
-        return False
-    return state != "Z"  # a zombie has ended
+    wait_until(ended, "the child outlived its parent")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import re
 from importlib.metadata import EntryPoint
@@ -17,6 +16,7 @@ from freshfield import plugins
 from freshfield.scenario import SCENARIO_FOLDER
 from freshfield.untrusted import read_yaml
 from freshfield_up.cli import main
+from freshfield_up.keys import schema
 
 OWN = Path(__file__).parent.parent / "integration/own_classes.py"
 SHIPPED = sorted(SCENARIO_FOLDER.glob("*.yaml"))
@@ -40,7 +40,7 @@ def test_the_list_names_each_shipped_scenario_and_the_data_that_it_needs(capsys)
     assert "[--data: fox]" in lines["fox"] and "--data" not in lines["room"]
 
 
-@pytest.mark.parametrize("name", ["quad", "card", "videos"])
+@pytest.mark.parametrize("name", ["card", "videos"])
 def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path, capsys):
     mine = tmp_path / "new" / "mine.yaml"
     said = printed(capsys, "scenario", "init", str(mine), "--like", name)
@@ -51,38 +51,29 @@ def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path,
     assert "valid" in printed(capsys, "scenario", "check", str(mine))
     assert "exists" in refused(capsys, "scenario", "init", str(mine))
     assert mine.read_text() == text
-    assert ".yaml" in refused(capsys, "scenario", "init", str(tmp_path / "mine.txt"))
-    for odd in ("a: b.yaml", "x\\1.yaml"):
+    for odd in ("a: b.yaml", "mine.txt"):
         assert "expected a name" in refused(capsys, "scenario", "init", str(tmp_path / odd))
-    for plain in ("123.yaml", "yes.yaml"):  # that YAML would not read as text
-        printed(capsys, "scenario", "init", str(tmp_path / "plain" / plain), "--like", "quad")
-        assert "valid" in printed(capsys, "scenario", "check", str(tmp_path / "plain" / plain))
-
-
-def test_a_folder_that_is_there_already_is_not_written_into(tmp_path, capsys):
+    number = tmp_path / "plain" / "123.yaml"  # which YAML would not read as text
+    printed(capsys, "scenario", "init", str(number), "--like", "quad")
+    assert "valid" in printed(capsys, "scenario", "check", str(number))
     (tmp_path / "card").mkdir()
-    assert "card: exists" in refused(capsys, "scenario", "init", str(tmp_path / "mine.yaml"), "--like", "card")
-    assert not (tmp_path / "mine.yaml").exists()
+    assert "card: exists" in refused(capsys, "scenario", "init", str(tmp_path / "third.yaml"), "--like", "card")
+    assert not (tmp_path / "third.yaml").exists()
 
 
 @pytest.mark.parametrize(
     ("section", "wrong"),
     [
-        ("source: {kind: world, scene: room, fps: fast}", "source.fps"),
         ("source: {kind: mcap, file: a.mcap}", "cameras.phase: spread is for source.kind world alone"),
         ("source: {kind: world, scene: castle}", "source: .*castle"),
         ("source: {kind: world, effects: {rain: null}}", "source.effects: effect 'rain' is not known"),
-        ("source: {kind: world, effects: {sensor_noise: {x: 3}}}", "sensor_noise.x: unknown key"),
         ("source: {kind: world, effects: {OWN:Darker: {counts: 256}}}", "Darker.counts: expected .*0 to 255, got 256"),
         ("source: {kind: OWN:Turning, level: 256}", "source.level: expected .*0 to 255, got 256"),
         ("edge: {policy: {name: freshest}}", "edge.policy: policy 'freshest' is not known"),
         ("edge: {policy: {name: freshest-k, value: 0.5}}", "edge.policy: k: expected a whole number"),
         ("edge: {field: OWN:Flat, field_options: {level: 2}}", "edge.field: flat.level: expected .*0 to 1, got 2"),
-        ("channel: {preset: ch7}", "channel.preset"),
         ("channel: {faults: {rain: 1}}", "channel.faults.rain"),
         ("edge: {update_ms: 1}", "edge.update_ms"),
-        ("edge: {field_options: {colour: red}}", "colour"),
-        ("edge: {field: fog}", "fog"),
     ],
 )
 def test_check_reads_every_section(section, wrong, tmp_path, capsys):
@@ -94,14 +85,8 @@ def test_check_reads_every_section(section, wrong, tmp_path, capsys):
 
 def test_keys_of_a_section_and_of_all(capsys):
     everything = printed(capsys, "scenario", "keys")
-    for section, key in (
-        ("cameras", "held_out"),
-        ("source", "source: {kind: realsense, ...}"),
-        ("effects", "sensor_noise (acts on: image)"),
-        ("channel", "channel.service"),
-        ("faults", "probability"),
-        ("edge", "edge.field_options of field splat"),
-    ):
+    keys = {"source": "source: {kind: realsense, ...}", "effects": "sensor_noise (acts on: image)"}
+    for section, key in {**keys, "edge": "edge.field_options of field splat"}.items():
         part = printed(capsys, "scenario", "keys", section)
         assert key in part and part.strip() in everything
     assert "there are: cameras" in refused(capsys, "scenario", "keys", "camera")
@@ -127,59 +112,27 @@ def test_options_of_plug_ins_are_keys_named_or_installed(section, name, line, ca
     assert line in everything and "mine" in everything and "broken" not in everything
     assert line in printed(capsys, "scenario", "keys", section, "mine")
     assert "no_such_module" in refused(capsys, "scenario", "keys", section, "broken")
-    if name == "Youngest":
-        return
-    from freshfield_up.keys import schema
-
-    ours, key = jsonschema.Draft202012Validator(schema()), line.split()[0]
-    for value, valid in ((0.5 if name == "Flat" else 1, True), (-1, False)):
-        options = {key: value}
-        data = {
-            "source": {"source": {"kind": "mine", **options}},
-            "effects": {"source": {"kind": "world", "effects": {"mine": options}}},
-            "faults": {"channel": {"faults": {"mine": options}}},
-            "edge": {"edge": {"field": "mine", "field_options": options}},
-        }[section]
-        assert ours.is_valid({"cameras": {"count": 2}, "source": {"kind": "world"}, **data}) == valid
+    if name == "Late":
+        ours = jsonschema.Draft202012Validator(schema())
+        for value, valid in ((1, True), (-1, False)):
+            faults = {"channel": {"faults": {"mine": {"ms": value}}}}
+            assert ours.is_valid({"cameras": {"count": 2}, "source": {"kind": "world"}, **faults}) == valid
 
 
-@pytest.fixture(scope="module")
-def validator() -> Any:
-    from freshfield_up.keys import schema
-
+def test_the_schema_takes_what_ships_and_knows_kinds_bounds_and_short_notation() -> None:
     found = json.loads(json.dumps(schema()))
     jsonschema.Draft202012Validator.check_schema(found)
-    return jsonschema.Draft202012Validator(found)
+    validator = jsonschema.Draft202012Validator(found)
+    for file in SHIPPED:
+        validator.validate(read_yaml(file.read_text()))
 
-
-@pytest.mark.parametrize("file", SHIPPED, ids=lambda file: file.stem)
-def test_the_schema_takes_what_ships_and_no_unknown_key(file: Path, validator: Any) -> None:
-    data = read_yaml(file.read_text())
-    validator.validate(data)
-    for path in ((), ("cameras",), ("source",), ("channel",), ("edge",)):
-        wrong = copy.deepcopy(data)
-        section = wrong
-        for step in path:
-            section = section.setdefault(step, {}) or {}
-        if section or not path:
-            section["unknown_key"] = 1
-            assert not validator.is_valid(wrong), path
-
-
-def test_the_schema_knows_kinds_bounds_and_short_notation(validator: Any) -> None:
     def valid(**sections: Any) -> bool:
         return validator.is_valid({"cameras": {"count": 4}, "source": {"kind": "world"}, **sections})
 
+    assert valid() and not valid(unknown={}) and not valid(cameras={"count": 4, "unknown": 1})
     assert valid(source={"kind": "mine.py:Mine", "anything": 1}) and valid(channel={"faults": {"mine.py:Late": {}}})
     assert valid(edge={"field_options": {"layers": True}}) and not valid(edge={"field_options": {"lairs": True}})
     assert not valid(edge={"field": "ngp", "field_options": {"layers": True}})
     assert valid(channel={"service": "exp:60ms", "faults": {"loss": 0.1}}) and valid(edge=None)
     assert valid(source={"kind": "realsense", "width": 640}) and not valid(source={"kind": "world", "iso": 400})
-    assert (
-        not valid(source={"kind": "webcam"}) and not valid(edge={"update_ms": 1}) and not valid(cameras={"count": -1})
-    )
-
-
-def test_completion_knows_the_commands(capsys):
-    text = printed(capsys, "completion", "bash")
-    assert "scenario" in text and "--like" in text
+    assert not valid(edge={"update_ms": 1}) and not valid(cameras={"count": -1})

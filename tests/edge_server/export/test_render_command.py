@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,12 +11,11 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.export.camera_paths import lens, orbit, read_nerfstudio, vertical_fov_deg
-from edge_server.fields import Budget, View, checkpoint
-from edge_server.fields.registry import make_field
+from edge_server.fields import View
 from freshfield.geometry import Pinhole, look_at
 from freshfield_up.cli import main as freshfield
+from tests.edge_server.export.learned import saved, tile
 
 LENS = Pinhole.from_fov(64, 48, 60.0)
 
@@ -59,25 +59,17 @@ def test_an_orbit_stays_within_an_arc_of_cameras():
 def test_cameras_that_have_nothing_in_common_still_give_a_path(which):
     chosen = views([0.0, 90.0, 180.0, 270.0], outward=True) if which == "outward" else views([20.0])
     if which == "parallel":
-        chosen = [
-            View(f"cam{k}", v.image, v.camera_to_world + np.eye(4, k=3) * k, LENS) for k, v in enumerate(chosen * 3)
-        ]
+        poses = [chosen[0].camera_to_world + np.eye(4, k=3) * k for k in range(3)]
+        chosen = [replace(chosen[0], camera_to_world=pose) for pose in poses]
     for step in orbit(chosen, 8, 50.0):
         assert np.isfinite(step.camera_to_world).all()
         np.testing.assert_allclose(step.camera_to_world[:3, :3] @ step.camera_to_world[:3, :3].T, np.eye(3), atol=1e-9)
 
 
-def test_a_lens_has_the_field_of_view_that_was_asked_for():
-    assert vertical_fov_deg(lens(640, 480, 50.0)) == pytest.approx(50.0)
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a field that has learned ``tile`` a little."""
     folder = tmp_path_factory.mktemp("run")
-    field = make_field("splat", {"gaussians": 512, "start": 256, "seed_cells": 16}, seed=3)
-    field.fit(synthetic_still("tile", cameras=9, size=32).training, Budget(steps=60))
-    checkpoint.save(folder / "field.npz", field.state(), {"field": "splat", "options": {}, "seed": 3})
+    saved(folder)
     return folder
 
 
@@ -92,16 +84,6 @@ def frames(file: Path) -> list[np.ndarray]:
     return found
 
 
-def test_a_camera_of_the_run_sees_what_the_field_renders_there(run, tmp_path):
-    still = synthetic_still("tile", cameras=9, size=32).training[0]
-    file = tmp_path / "view.png"
-    assert render(run, "--camera", still.camera, file, "--size", "32x32") == 0
-    image = cv2.imread(str(file))[..., ::-1].astype(float)
-    assert image.shape == (32, 32, 3)
-    # Much nearer to what this camera saw than to any other camera's image turned upside down.
-    assert np.abs(image - still.image[..., :3]).mean() < 0.5 * np.abs(image - still.image[::-1, :, :3]).mean()
-
-
 def test_an_orbit_is_a_video_and_two_runs_stand_side_by_side(run, tmp_path, capsys):
     file = tmp_path / "orbit.mp4"
     assert render(run, "--orbit", file, "--seconds", 0.4, "--fps", 10, "--size", "64x48") == 0
@@ -113,26 +95,12 @@ def test_an_orbit_is_a_video_and_two_runs_stand_side_by_side(run, tmp_path, caps
     assert both.shape == (48, 128, 3) and np.abs(both[:, :64].astype(int) - both[:, 64:]).mean() < 4  # it is compressed
 
 
-def test_depth_has_one_scale(run, tmp_path):
-    file = tmp_path / "depth.png"
-    assert render(run, "--pose", 0, -0.5, 0.4, 0, 0, 0, file, "--depth", "--size", "64x48") == 0
-    image = cv2.imread(str(file))
-    assert image.shape == (48, 64, 3) and np.ptp(image.reshape(-1, 3), axis=0).max() > 100
-
-
 def nerfstudio(**other) -> dict:
     """A path of two poses that look along -z and y, as nerfstudio writes it: OpenGL axes, row by row."""
-    along_y = [1, 0, 0, 0, 0, 0, -1, -0.5, 0, 1, 0, 0, 0, 0, 0, 1]
-    step = {"camera_to_world": [float(v) for v in along_y], "fov": 40.0, "aspect": 1.0}
-    return {
-        "camera_type": "perspective",
-        "render_height": 48,
-        "render_width": 64,
-        "fps": 12,
-        "seconds": 1.0,
-        "camera_path": [step, step],
-        **other,
-    }
+    along_y = [1.0, 0, 0, 0, 0, 0, -1, -0.5, 0, 1, 0, 0, 0, 0, 0, 1]
+    step = {"camera_to_world": along_y, "fov": 40.0, "aspect": 1.0}
+    size = {"camera_type": "perspective", "render_height": 48, "render_width": 64}
+    return {**size, "fps": 12, "seconds": 1.0, "camera_path": [step, step], **other}
 
 
 def test_a_path_of_nerfstudio_keeps_its_size_and_poses(run, tmp_path, capsys):
@@ -144,10 +112,14 @@ def test_a_path_of_nerfstudio_keeps_its_size_and_poses(run, tmp_path, capsys):
     timeless = {key: value for key, value in nerfstudio().items() if key not in ("fps", "seconds")}
     (tmp_path / "timeless.json").write_text(json.dumps(timeless))
     assert read_nerfstudio(tmp_path / "timeless.json")[1] == 2.0  # two poses take a second
+    assert vertical_fov_deg(lens(64, 48, 40.0)) == pytest.approx(40.0)
     # The same viewpoint, said by eye and target.
     assert render(run, "--path", path, tmp_path / "a.png") == 0
     assert render(run, "--pose", 0, -0.5, 0, 0, 0, 0, tmp_path / "b.png", "--fov", 40, "--size", "64x48") == 0
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png")), cv2.imread(str(tmp_path / "b.png")))
+    assert render(run, "--path", path, tmp_path / "depth.png", "--depth") == 0
+    depth = cv2.imread(str(tmp_path / "depth.png"))
+    assert depth.shape == (48, 64, 3) and np.ptp(depth.reshape(-1, 3), axis=0).max() > 100
 
 
 @pytest.mark.parametrize(
@@ -155,8 +127,6 @@ def test_a_path_of_nerfstudio_keeps_its_size_and_poses(run, tmp_path, capsys):
     [
         ({"camera_type": "fisheye"}, "camera_type"),
         ({"render_width": "wide"}, "render_width"),
-        ({"camera_path": []}, "camera_path"),
-        ({"camera_path": [{"camera_to_world": [1, 2]}]}, "camera_path[0].camera_to_world"),
         ({"camera_path": [{"camera_to_world": [float("nan")] * 16}]}, "camera_path"),
         ({"camera_path": [{**nerfstudio()["camera_path"][0], "fov": 200}]}, "camera_path[0].fov"),
         ({"fps": 0}, "fps"),
@@ -173,13 +143,10 @@ def test_a_path_that_cannot_be_flown_is_refused_by_key(change, says, run, tmp_pa
     ("words", "says"),
     [
         (["--orbit", "view.gif"], "ends in .png"),
-        (["--orbit", "view.mp4", "--seconds", "0"], "--seconds 0"),
         (["--orbit", "view.mp4", "--size", "33x20"], "videos need even sizes, not 33 x 20"),
-        (["--orbit", "view.mp4", "--size", "big"], "--size big: expected pixels"),
         (["--orbit", "view.mp4", "--fov", "nan"], "--fov nan"),
         (["--camera", "cam99", "view.png"], "--camera cam99: the run has cam01"),
         (["--pose", "0", "0", "1", "0", "0", "1", "view.png"], "--pose: "),
-        (["--pose", "0", "0", "nan", "0", "0", "1", "view.png"], "--pose: "),
     ],
 )
 def test_what_cannot_be_rendered_is_refused_in_one_line(words, says, run, tmp_path, capsys, monkeypatch):
@@ -187,27 +154,18 @@ def test_what_cannot_be_rendered_is_refused_in_one_line(words, says, run, tmp_pa
     assert render(run, *words) == 2
     error = capsys.readouterr().err
     assert says in error and error.count("\n") == 1
-    assert render(tmp_path / "none", "--orbit", "view.mp4") == 2
+    assert freshfield(["render", "none", "--orbit", "view.mp4"]) == 2
+    assert capsys.readouterr().err.startswith("freshfield render: none")
     assert not list(tmp_path.iterdir())
 
 
 def test_a_camera_is_rendered_with_its_own_lens(tmp_path):
     """Its focal lengths differ, and its axis is off the middle: the picture fits the photograph."""
-    still = synthetic_still("tile", cameras=9, size=32).training
     lens = Pinhole(32, 32, 40.0, 30.0, 12.0, 18.0)
-    field = make_field("splat", {"gaussians": 512, "start": 256, "seed_cells": 16}, seed=3)
-    field.fit([View(f"hand#{k}", v.image, v.camera_to_world, lens) for k, v in enumerate(still)], Budget(steps=5))
-    checkpoint.save(tmp_path / "field.npz", field.state(), {"field": "splat", "options": {}, "seed": 3})
+    views = [View(f"hand#{k}", v.image, v.camera_to_world, lens) for k, v in enumerate(tile())]
+    field = saved(tmp_path, views=views)
     last = field.views[-1]
     expected = np.clip(field.render(last.camera_to_world, lens).color * 255 + 0.5, 0, 255).astype(np.uint8)
     for camera in (last.camera, "hand"):  # a carried camera is its newest view
         assert render(tmp_path, "--camera", camera, tmp_path / "own.png") == 0
         np.testing.assert_array_equal(cv2.imread(str(tmp_path / "own.png"))[..., ::-1], expected)
-
-
-def test_it_names_itself_as_it_was_called(capsys):
-    assert freshfield(["render", "nowhere", "--orbit", "x.mp4"]) == 2
-    assert capsys.readouterr().err.startswith("freshfield render: nowhere")
-    with pytest.raises(SystemExit):
-        freshfield(["render", "--help"])
-    assert "edge-server" not in capsys.readouterr().out

@@ -3,7 +3,7 @@
     with Browser(url) as browser:
         browser.wait_for_text("updates")
         browser.click_text("Pause")
-        browser.screenshot(path)
+        image = browser.screenshot()
 
 Nothing outside the machine is contacted: background services of the browser are off, and ``requests``
 lists every address that the page asked for.
@@ -20,8 +20,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -32,6 +31,8 @@ import pytest
 import websocket
 from numpy.typing import NDArray
 
+from tests.support import wait_until
+
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
     "--headless=new",
@@ -40,14 +41,10 @@ FLAGS = (
     "--enable-unsafe-swiftshader",
     "--disable-background-networking",
     "--disable-component-update",
-    "--disable-default-apps",
     "--disable-dev-shm-usage",
-    "--disable-extensions",
     "--disable-sync",
     "--hide-scrollbars",
-    "--mute-audio",
     "--no-first-run",
-    "--no-default-browser-check",
     "--remote-debugging-port=0",
     "--remote-allow-origins=*",
 )
@@ -92,7 +89,8 @@ class Browser:
             start_new_session=True,
         )
         try:
-            self._socket = websocket.create_connection(self._debugger(), timeout=timeout_s, suppress_origin=True)
+            address = wait_until(self._debugger, "the browser did not start", timeout_s)
+            self._socket = websocket.create_connection(address, timeout=timeout_s, suppress_origin=True)
             for domain in ("Page", "Runtime", "Network", "Log"):
                 self.call(f"{domain}.enable")
             # The window's own decorations would eat into the size asked for.
@@ -119,8 +117,6 @@ class Browser:
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait(timeout=10)
         shutil.rmtree(self._profile, ignore_errors=True)
-
-    # --- the protocol --------------------------------------------------------------------------
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
         """One DevTools command and its result; raises RuntimeError with the browser's message."""
@@ -153,29 +149,15 @@ class Browser:
         elif event.get("method") == "Runtime.exceptionThrown":
             self.errors.append(str(params["exceptionDetails"].get("exception", {}).get("description")))
 
-    def _debugger(self) -> str:
+    def _debugger(self) -> str | None:
         """Address of the first tab's debugger, once the browser has written its port down."""
         file = Path(self._profile) / "DevToolsActivePort"
-        for _ in self._tries("the browser did not start"):
-            if self._process.poll() is not None:
-                raise AssertionError(f"the browser ended with status {self._process.returncode}")
-            lines = file.read_text().splitlines() if file.exists() else []
-            if lines:
-                with contextlib.suppress(OSError), urlopen(f"http://127.0.0.1:{lines[0]}/json") as reply:
-                    tabs = [t for t in json.load(reply) if t["type"] == "page"]
-                    if tabs:
-                        return tabs[0]["webSocketDebuggerUrl"]
-        raise AssertionError("unreachable")
-
-    def _tries(self, failure: str | Callable[[], str], timeout_s: float | None = None) -> Iterator[None]:
-        """Yields every 0.1 s until the time is up, then raises AssertionError."""
-        end = time.monotonic() + (timeout_s or self.timeout_s)
-        while time.monotonic() < end:
-            yield
-            time.sleep(0.1)
-        raise AssertionError(failure if isinstance(failure, str) else failure())
-
-    # --- what a visitor sees and does ----------------------------------------------------------
+        assert self._process.poll() is None, f"the browser ended with status {self._process.returncode}"
+        lines = file.read_text().splitlines() if file.exists() else []
+        if lines:
+            with contextlib.suppress(OSError), urlopen(f"http://127.0.0.1:{lines[0]}/json") as reply:
+                return next((tab["webSocketDebuggerUrl"] for tab in json.load(reply) if tab["type"] == "page"), None)
+        return None
 
     def text(self) -> str:
         """All text that the page shows."""
@@ -183,21 +165,15 @@ class Browser:
 
     def wait_for(self, wanted: Callable[[], Any], what: str, timeout_s: float | None = None) -> Any:
         """First true value of ``wanted``; ``what`` names it in the error."""
-        for _ in self._tries(lambda: f"{what} did not happen; the page shows:\n{self.text()}", timeout_s):
-            value = wanted()
-            if value:
-                return value
+        said = f"{what} did not happen; the page shows:\n"
+        return wait_until(wanted, lambda: said + self.text(), timeout_s or self.timeout_s)
 
     def wait_for_text(self, wanted: str, timeout_s: float | None = None) -> str:
         """The page's text, once ``wanted`` is part of it."""
-        self.wait_for(lambda: wanted in self.text(), f"the text {wanted!r}", timeout_s)
-        return self.text()
-
-    def hover(self, x: float, y: float) -> None:
-        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=float(x), y=float(y))
+        return self.wait_for(lambda: wanted in (text := self.text()) and text, f"the text {wanted!r}", timeout_s)
 
     def click(self, x: float, y: float) -> None:
-        self.hover(x, y)
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=float(x), y=float(y))
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=float(x), y=float(y), button="left", clickCount=1)
 
@@ -212,11 +188,9 @@ class Browser:
         gone = "!document.querySelector('.mantine-Notification-root')"
         self.wait_for(lambda: self.evaluate(gone), "the end of the notifications")
 
-    def screenshot(self, path: str | Path | None = None) -> NDArray[np.uint8]:
-        """The window as RGB (H, W, 3), also written as PNG to ``path``."""
+    def screenshot(self) -> NDArray[np.uint8]:
+        """The window as RGB (H, W, 3)."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        if path is not None:
-            Path(path).write_bytes(data)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8)

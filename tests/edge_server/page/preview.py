@@ -66,7 +66,6 @@ class Preview:
             now_ns=self._clock.now_ns,
             set_policy=lambda name, value: None,
             save_snapshot=lambda: Path("none"),
-            channel=lambda: {"preset": "toy", "states": ["low", "high"], "state": "low"},
             field_name="analytic",
         )
         self._thread = threading.Thread(target=self._update, name="preview", daemon=True)
@@ -86,9 +85,6 @@ class Preview:
     def _update(self) -> None:
         number = 0
         while not self._stopped.wait(UPDATE_S):
-            self.state.controls.reset_requested = False
-            if self.state.controls.paused:
-                continue
             now_ns = self._clock.now_ns()
             scene = BallScene((now_ns - self.state.start_ns) / 1e9)
             for name in self._reporting:

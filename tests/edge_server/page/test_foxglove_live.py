@@ -5,14 +5,10 @@ from __future__ import annotations
 import json
 import re
 import struct
-import threading
-import time
 from collections.abc import Iterator
-from dataclasses import is_dataclass
 from importlib import import_module
 from itertools import count
-from types import SimpleNamespace, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -22,16 +18,15 @@ import websocket
 pytest.importorskip("foxglove", reason="needs the extra foxglove")
 pytest.importorskip("foxglove_schemas_protobuf", reason="needs the extra mcap")
 
-from foxglove import layouts
-
 from edge_server.cli import main as edge_server
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.page.foxglove_live import FoxgloveServer, point_cloud
-from edge_server.page.foxglove_live.settings import IDLE_S, MOST_POINTS
+from edge_server.page.foxglove_live.settings import MOST_POINTS
 from freshfield.transport import TransportError
 from tests.conftest import ROOT
 from tests.edge_server.page.preview import CAMERAS, LENS, Preview
+from tests.support import wait_until
 
 MESSAGE = struct.Struct("<BIQ")  # opcode 1, subscription, log time
 
@@ -57,11 +52,15 @@ class Client:
             self.channels |= {c["topic"]: c for c in json.loads(self.socket.recv())["channels"]}
         self._numbers = count(1)
 
+    def subscribe(self, topic: str) -> int:
+        number = next(self._numbers)
+        asked = {"op": "subscribe", "subscriptions": [{"id": number, "channelId": self.channels[topic]["id"]}]}
+        self.socket.send(json.dumps(asked))
+        return number
+
     def first(self, topic: str):
         """The first message of a topic, decoded, and its log time."""
-        channel, number = self.channels[topic], next(self._numbers)
-        asked = {"op": "subscribe", "subscriptions": [{"id": number, "channelId": channel["id"]}]}
-        self.socket.send(json.dumps(asked))
+        channel, number = self.channels[topic], self.subscribe(topic)
         while True:
             kind, data = self.socket.recv_data()
             if kind == websocket.ABNF.OPCODE_BINARY and MESSAGE.unpack_from(data)[:2] == (1, number):
@@ -127,18 +126,6 @@ def test_points_are_the_gaussians_that_are_seen(served):
     assert [f.name for f in cloud.fields] == list(points.dtype.names) and cloud.data == points.tobytes()
 
 
-def test_nothing_is_made_for_nobody(served, monkeypatch):
-    _, server = served
-    made = threading.Event()
-    monkeypatch.setattr(server, "_send", made.set)
-    client = Client(server)
-    time.sleep(3 * IDLE_S)
-    assert not made.is_set(), "a client that has subscribed to nothing"
-    monkeypatch.undo()
-    client.first("/ages")
-    client.socket.close()
-
-
 def test_a_taken_port_and_a_view_that_fails_are_said(served, caplog):
     preview, server = served
     with pytest.raises(TransportError, match=f"--foxglove-port {server._server.port}: .*in use"):
@@ -148,71 +135,20 @@ def test_a_taken_port_and_a_view_that_fails_are_said(served, caplog):
     client.first("/rendered/image")
     preview.stop()
     preview.state.publish(preview.state.newest(), broken)
-    client.socket.send(
-        json.dumps(
-            {"op": "subscribe", "subscriptions": [{"id": 99, "channelId": client.channels["/rendered/image"]["id"]}]}
-        )
-    )
-    deadline = time.monotonic() + 20
-    while "serving Foxglove failed: ZeroDivisionError" not in caplog.text and time.monotonic() < deadline:
-        time.sleep(0.05)
+    client.subscribe("/rendered/image")
+    wait_until(lambda: "serving Foxglove failed: ZeroDivisionError" in caplog.text, "no word of it")
     assert caplog.text.count("failed: ZeroDivisionError") == 1 and server._thread.is_alive()
 
 
 def test_the_layout_shows_topics_and_values_that_are_served(served):
     _, server = served
     client = Client(server)
-    layout = json.loads((ROOT / "deploy/foxglove-layout.json").read_text())
-
-    def names(value) -> set[str]:
-        if isinstance(value, dict):
-            return set().union(*map(names, value.values()), *map(names, value))
-        if isinstance(value, list):
-            return set().union(*map(names, value))
-        return {value} if isinstance(value, str) and value.startswith("/") else set()
-
-    shown = names(layout["configById"])
+    shown = set(re.findall(r'"(/[^"]*)"', (ROOT / "deploy/foxglove-layout.json").read_text()))
     assert len(shown) > 6
     for name in shown:
         topic, _, value = name.partition(".")
         assert topic in client.channels, name
         assert not value or value in json.loads(client.channels[topic]["schema"])["properties"], name
-    panels, pending = set(), [layout["layout"]]
-    while pending:
-        node = pending.pop()
-        panels |= {node} if isinstance(node, str) else set()
-        pending += [] if isinstance(node, str) else [node["first"], node["second"]]
-    assert panels == set(layout["configById"])
-
-
-def test_panels_of_the_layout_have_the_keys_that_foxglove_knows():
-    """``foxglove.layouts`` is generated from the app's own schema."""
-    types = {"3D": layouts.ThreeDeeConfig, "Image": layouts.ImageConfig, "Plot": layouts.PlotConfig}
-    types["RawMessages"] = layouts.RawMessagesConfig
-    layout = json.loads((ROOT / "deploy/foxglove-layout.json").read_text())
-    for name, config in layout["configById"].items():
-        kind = types[name.partition("!")[0]]
-        config.pop("foxglovePanelTitle", None)  # of any panel
-        assert fits(config, kind), name
-        assert not fits(config | {"title": "a key of no panel"}, kind)
-
-
-def fits(value: Any, wanted: Any) -> bool:
-    """Whether a part of a layout has the keys and values that Foxglove's own types (``foxglove.layouts``) have."""
-    kind, options = get_origin(wanted), get_args(wanted)
-    if is_dataclass(wanted):
-        hints = {re.sub("_(.)", lambda m: m[1].upper(), k): hint for k, hint in get_type_hints(wanted).items()}
-        if not isinstance(value, dict) or not set(value) <= set(hints):
-            return False
-        return all(fits(each, hints[k]) for k, each in value.items())
-    if kind in (Union, UnionType):
-        return any(fits(value, option) for option in options)
-    if kind is Literal:
-        return value in options
-    if kind in (list, dict):
-        children = value.values() if isinstance(value, dict) else value
-        return isinstance(value, kind) and all(fits(each, options[-1]) for each in children)
-    return isinstance(value, (int, float) if wanted is float else wanted)
 
 
 def test_it_is_refused_beside_a_login_which_it_would_go_around(tmp_path, capsys):

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import socket
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -20,62 +17,38 @@ from edge_server.fidelity.scorer import Score
 from edge_server.fields import Rendering
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication
-from edge_server.page import Page, PageError, page_url, panel, start_page, views
+from edge_server.page import PageError, page_url, panel, start_page, views
 from edge_server.page.controls import ControlPanel
 from edge_server.page.panel import PAIR_WIDTH, side_by_side
 from edge_server.page.rendering import LEVELS, MOVING, NEWER, ClientState, RenderLoop, browser_image, hatched
 from edge_server.page.scene import Scene, thumbnail
 from edge_server.page.viewpoint import initial_viewpoint
-from freshfield import coverage, payload
+from freshfield import coverage
 from freshfield.geometry import Pinhole, Pose, look_at
 from tests.edge_server.frames import frame
-from tests.edge_server.page.preview import LENS, BallScene, Preview
-from tests.edge_server.page.visitor import Visitor
+from tests.edge_server.page.preview import LENS, BallScene
+from tests.edge_server.page.visitor import Visitor, page_of
 from tests.support import wait_until
 
 
-@contextlib.contextmanager
-def preview_page() -> Iterator[tuple[Preview, Page]]:
-    preview = Preview()
-    page = start_page(preview.state, "127.0.0.1", 0)
-    preview.start()
-    try:
-        yield preview, page
-    finally:
-        page.stop()
-        preview.stop()
-
-
 class Broken:
-    """A field that has diverged: everything it renders is not a number."""
+    """A field that has diverged: it renders nothing but not a number, or nothing at all."""
 
-    renders = 0
+    def __init__(self, raises: bool = False) -> None:
+        self._raises, self.renders = raises, 0
 
     def at(self, present_ns):
         return self
 
     def render(self, camera_to_world, intrinsics: Pinhole) -> Rendering:
         self.renders += 1
-        shape = (intrinsics.height, intrinsics.width)
-        return Rendering(
-            np.full((*shape, 3), np.nan, np.float32),
-            np.full(shape, np.inf, np.float32),
-            np.full(shape, np.nan, np.float32),
-        )
-
-
-class Raising(Broken):
-    """A renderer that fails outright."""
-
-    def render(self, camera_to_world, intrinsics: Pinhole) -> Rendering:
-        self.renders += 1
-        raise FloatingPointError("no such density")
+        if self._raises:
+            raise FloatingPointError("no such density")
+        depth = np.full((intrinsics.height, intrinsics.width), np.nan, np.float32)
+        return Rendering(np.stack([depth] * 3, axis=-1), depth, depth)
 
 
 def bare_state(cameras: list[CameraView] | None = None) -> EdgeState:
-    def refuse(name: str, value: float | None) -> None:
-        raise ValueError("no policies here")
-
     return EdgeState(
         scenario="bare",
         policies=(),
@@ -83,16 +56,13 @@ def bare_state(cameras: list[CameraView] | None = None) -> EdgeState:
         cameras=lambda: cameras or [],
         start_ns=0,
         now_ns=time.monotonic_ns,
-        set_policy=refuse,
-        save_snapshot=lambda: (_ for _ in ()).throw(OSError("full")),
+        set_policy=MagicMock(side_effect=ValueError("no policies here")),
+        save_snapshot=MagicMock(side_effect=OSError("full")),
     )
 
 
 def publication(number: int) -> Publication:
     return Publication(number, float(number), 0, None, (), (), float("nan"), 1.0)
-
-
-# --- what is sent ------------------------------------------------------------------------------
 
 
 def test_what_is_not_finite_shows_the_backdrop_and_the_rest_its_color():
@@ -101,6 +71,14 @@ def test_what_is_not_finite_shows_the_backdrop_and_the_rest_its_color():
     image = browser_image(color)
     assert image.dtype == np.uint8 and (image[0] == 128).all()
     assert image[1, 1].tolist() == image[2, 2].tolist() == [18, 20, 24]
+
+
+def test_what_no_camera_has_seen_is_hatched():
+    image, unseen = np.ones((48, 64, 3), np.float32), np.zeros((12, 16), bool)
+    assert hatched(image, None) is image and hatched(image, unseen) is image
+    unseen[:, 8:] = True
+    shaded = hatched(image, unseen) < 1.0
+    assert not shaded[:, :32].any() and 0.4 < shaded[:, 32:].mean() < 0.6
 
 
 @pytest.mark.parametrize(("took_s", "bands"), [(0.05, 1), (0.4, 4), (1.2, 12)])
@@ -112,16 +90,8 @@ def test_an_image_at_rest_has_a_band_for_every_tenth_of_a_second_that_the_last_o
     camera = Pinhole.from_fov(40, 300, 60)
     assert loop._render(broken, np.eye(4), camera, visitor, visitor.serial, finest).color.shape == (300, 40, 3)
     assert broken.renders == bands
-    broken.renders = 0
     loop._render(broken, np.eye(4), camera, visitor, visitor.serial, MOVING)
-    assert broken.renders == 1
-
-
-def test_thumbnails_are_small_and_damaged_frames_have_none():
-    image = payload.encode(np.zeros((96, 128, 3), np.uint8))
-    good = frame(payload=image, intrinsics=Pinhole.from_fov(128, 96, 55.0))
-    assert thumbnail(good).shape == (84, 112, 3)
-    assert thumbnail(replace(good, payload=b"\xff\xd8 nothing")) is None
+    assert broken.renders == bands + 1
 
 
 def test_one_camera_is_first_seen_from_before_it_and_then_from_where_the_fields_box_is():
@@ -130,6 +100,7 @@ def test_one_camera_is_first_seen_from_before_it_and_then_from_where_the_fields_
     server = MagicMock()
     server.get_clients.return_value = {}
     scene = Scene(server, state)
+    assert thumbnail(replace(seen, payload=b"\xff\xd8 nothing")) is None
     scene._seen_at = -1.0  # long enough ago: the other camera may never report
     scene._seen = 1
     scene.refresh(state.cameras(), watched=True)
@@ -150,6 +121,7 @@ def test_a_visitor_looks_through_a_camera_from_its_refined_pose():
     scene._viewpoint = initial_viewpoint(refined[None])
     scene._look_through(client, "cam01")
     np.testing.assert_array_equal(client.camera.position, seen.pose.translation_m)
+    assert client.camera.fov == pytest.approx(2 * np.arctan(0.5 * seen.intrinsics.height / seen.intrinsics.fy))
     refined[:3, 3] += 0.02
     state.publish(publication(0), SimpleNamespace(correction=lambda view: SimpleNamespace(camera_to_world=refined)))
     scene._look_through(client, "cam01")
@@ -189,35 +161,18 @@ def test_what_cameras_see_is_reckoned_when_they_stand_still():
     assert coverage.reached(2, depth=True) in coverage_of(-1.0, 1.2, depth=("cam00",))
 
 
-def test_a_visitor_who_moves_by_a_millimeter_has_moved():
-    loop, client = RenderLoop(bare_state()), MagicMock(client_id=1)
-    client.camera = SimpleNamespace(
-        position=(1.0, 0.0, 0.0), wxyz=(1.0, 0, 0, 0), fov=0.9, image_width=8, image_height=6
-    )
-    loop.add_client(client)
-    for x_m, serial in ((1.0, 1), (1.001, 2), (1.001 + 1e-9, 2)):
-        client.camera.position = (x_m, 0.0, 0.0)
-        loop.camera_moved(client)
-        assert loop._visitors[1].serial == serial
-
-
-def test_truth_and_rendering_of_any_size_fit_side_by_side():
-    for shape in ((128, 128, 3), (1080, 1920, 3), (7, 500, 3), (500, 7, 3)):
-        image = np.full(shape, 200, np.uint8)
-        pair = side_by_side(image, image[: shape[0] // 2 + 1])
-        assert pair.shape[1] == PAIR_WIDTH and pair.dtype == np.uint8
-        assert (pair[:, :100] == 200).all() and (pair[:, -100:] == 200).all()
-
-
-def test_a_learned_policy_is_shown_by_its_files_name_and_chosen_by_its_path():
-    chosen = []
-    path = "bandit:/far/away/p.npz"
-    state = replace(bare_state(), policies=(path, "all"), set_policy=lambda *p: chosen.append(p))
+def control_panel(state: EdgeState) -> ControlPanel:
     gui = MagicMock()
     gui.add_dropdown.side_effect = lambda _, options, initial_value=None, **more: MagicMock(
         options=options, value=initial_value
     )
-    panel = ControlPanel(MagicMock(gui=gui), state)
+    return ControlPanel(MagicMock(gui=gui), state)
+
+
+def test_a_learned_policy_is_shown_by_its_files_name_and_chosen_by_its_path():
+    chosen, path = [], "bandit:/far/away/p.npz"
+    state = replace(bare_state(), policies=(path, "all"), set_policy=lambda *p: chosen.append(p))
+    panel = control_panel(state)
     state.chosen = "splat with keyframes: cam01 moves"
     assert panel.policy.options == ("bandit:p.npz", "all") and panel.policy.value == "all"
     panel._policy_chosen(MagicMock(target=MagicMock(value="bandit:p.npz")))
@@ -237,10 +192,7 @@ def test_what_an_operator_does_reaches_the_state_or_is_answered_with_what_was_wr
         asked.append((name, value))
 
     state = replace(bare_state(), policies=("all", "freshest-k"), set_policy=set_policy)
-    gui = MagicMock()
-    for kind in (gui.add_number, gui.add_html, gui.add_dropdown, gui.add_button_group):
-        kind.side_effect = lambda *words, **more: MagicMock(options=("all", "freshest-k"))
-    panel = ControlPanel(MagicMock(gui=gui), state)
+    panel = control_panel(state)
     panel._policy_chosen(MagicMock(target=MagicMock(value="freshest-k"), client=client))
     panel._value_entered(MagicMock(target=MagicMock(value=3), client=client))
     panel._value_entered(MagicMock(target=MagicMock(value=4), client=None))  # set by refresh, not by a visitor
@@ -265,60 +217,34 @@ def test_the_present_point_is_the_mean_of_the_last_instants_and_updates():
     assert state.present() == (pytest.approx(1e3 * np.diff(times).mean()), 21.0, 10.0)
 
 
-# --- the port ----------------------------------------------------------------------------------
-
-
-def test_a_taken_port_is_reported():
-    with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        other.listen()
-        with pytest.raises(PageError, match="--page-port"):
-            start_page(bare_state(), "127.0.0.1", other.getsockname()[1])
-    assert page_url("0.0.0.0", 8080) == page_url("", 8080) == "http://localhost:8080"
-    assert page_url("::1", 8080, tls=True) == "https://[::1]:8080"
-
-
-def test_stop_frees_the_port_and_ends_the_threads(capfd):
-    before = set(threading.enumerate())
-    with preview_page() as (_, page):
-        port = page.port
-        with Visitor(port) as visitor:
-            visitor.wait_for(lambda: visitor.images > 0, "an image")
-    page.stop()  # twice is once
-    start_page(bare_state(), "127.0.0.1", port).stop()
-    left = [t for t in set(threading.enumerate()) - before if t.name.startswith(("page", "preview"))]
-    assert not left
-    assert "viser" not in capfd.readouterr().out  # no banner of a library on the operator's terminal
-
-
-# --- visitors ----------------------------------------------------------------------------------
-
-
-def test_a_visitor_is_sent_the_scene_from_where_they_stand():
-    with preview_page() as (preview, page):
-        wait_until(lambda: preview.state.started, "no update")
-        preview.state.controls.paused = True
-        with Visitor(page.port, (4.0, 0.0, 3.0)) as visitor:
-            visitor.wait_for(lambda: visitor.images >= 2, "a coarse and a finer image")
-            here = _decode(visitor)
-            visitor.stand_at((0.2, 0.1, 2.5))
-            at = visitor.images
-            visitor.wait_for(lambda: visitor.images > at + 1, "an image from the new place")
-            above = _decode(visitor)
-    assert here.shape[1] / here.shape[0] == pytest.approx(800 / 600, rel=0.02)
-    assert here.std() > 20 and above.std() > 20
-    size = (64, 48)
-    assert np.abs(cv2.resize(here, size).astype(float) - cv2.resize(above, size)).mean() > 10
-
-
-def test_who_looks_at_truth_gets_each_comparison_once_and_the_picture_before_there_is_one():
-    state, client = bare_state(), MagicMock(client_id=1)
+def shown_to(loop: RenderLoop) -> MagicMock:
+    """A visitor of the loop."""
+    client = MagicMock(client_id=1)
     client.camera = SimpleNamespace(
         position=(4.0, 0.0, 3.0), wxyz=(1.0, 0, 0, 0), fov=0.9, image_width=80, image_height=60
     )
-    loop = RenderLoop(state)
     loop.add_client(client)
-    loop.choose(client, views.TRUTH)
+    return client
+
+
+def test_nothing_is_rendered_without_visitors_and_one_who_moves_by_a_millimeter_has_moved():
+    state, broken = bare_state(), Broken()
+    loop = RenderLoop(state)
+    state.publish(replace(publication(1), update_ms=800.0), broken)
+    assert not loop._step(0.0) and broken.renders == 0
+    client = shown_to(loop)
+    for x_m, serial in ((4.0, 1), (4.001, 2), (4.001 + 1e-9, 2)):
+        client.camera.position = (x_m, 0.0, 3.0)
+        loop.camera_moved(client)
+        assert loop._visitors[1].serial == serial
+    assert loop._budget_s(NEWER) == pytest.approx(0.16), "a fifth of an update, 0.2 s at most"
+    assert loop._budget_s(MOVING) == LEVELS[MOVING].budget_s
+
+
+def test_who_looks_at_truth_gets_each_comparison_once_and_the_picture_before_there_is_one():
+    state = bare_state()
+    loop = RenderLoop(state)
+    loop.choose(client := shown_to(loop), views.TRUTH)
     sent = client.scene.set_background_image
     state.publish(publication(0), BallScene(0.0))
     assert loop._step(1e9) and sent.call_count == 1
@@ -329,97 +255,52 @@ def test_who_looks_at_truth_gets_each_comparison_once_and_the_picture_before_the
         assert sent.call_count == 1 + number and (sent.call_args.args[0] == 200).mean() > 0.2
     loop.choose(client, views.PICTURE)
     assert loop._step(9e9) and (sent.call_args.args[0] == 200).mean() < 0.2
+    for shape in ((1080, 1920, 3), (7, 500, 3), (500, 7, 3)):
+        image = np.full(shape, 200, np.uint8)
+        pair = side_by_side(image, image[: shape[0] // 2 + 1])
+        assert pair.shape[1] == PAIR_WIDTH and (pair[:, :100] == 200).all() and (pair[:, -100:] == 200).all()
 
 
-@pytest.mark.parametrize(("update_ms", "newer_s"), [(25.0, 0.03), (800.0, 0.16), (5000.0, 0.2)])
-def test_a_picture_of_what_is_newer_takes_no_longer_than_its_share_of_an_update(update_ms, newer_s):
-    state = bare_state()
-    loop = RenderLoop(state)
-    state.publish(replace(publication(1), update_ms=update_ms), BallScene(0.0))
-    assert loop._budget_s(NEWER) == pytest.approx(newer_s)
-    assert loop._budget_s(MOVING) == LEVELS[MOVING].budget_s
+@pytest.mark.parametrize("raises", [False, True])
+def test_the_page_outlives_a_broken_field_and_stops_at_once(raises, capfd):
+    before, state, field = set(threading.enumerate()), bare_state(), Broken(raises)
+    state.cameras = lambda: [CameraView("never", False, None, None, 0, 0)]
+    with page_of(state) as page, Visitor(page.port) as visitor:
+        for number in range(8):
+            state.publish(publication(number), field)
+        black = np.zeros((4, 4, 3), np.uint8)
+        state.scored(replace(publication(7), psnr_db=float("inf")), Comparison("never", black, black, 7))
+        wait_until(lambda: field.renders > 0, "nothing was rendered")
+        state.publish(publication(8), BallScene(0.0))  # it has recovered
+        visitor.wait_for(lambda: visitor.image is not None and decoded(visitor.image).std() > 20, "the ball")
+        with pytest.raises(PageError, match="--page-port"):
+            start_page(bare_state(), "127.0.0.1", page.port)
+    page.stop()  # twice is once
+    assert page_url("", 8080) == page_url("0.0.0.0", 8080) == "http://localhost:8080"
+    assert page_url("::1", 8080, tls=True) == "https://[::1]:8080"
+    start_page(bare_state(), "127.0.0.1", page.port).stop()
+    assert not [t for t in set(threading.enumerate()) - before if t.name.startswith("page")]
+    assert "viser" not in capfd.readouterr().out  # no banner of a library on the operator's terminal
 
 
-def test_nothing_is_rendered_without_visitors():
-    state, broken = bare_state(), Broken()
-    state.publish(publication(1), broken)
-    assert not RenderLoop(state)._step(0.0) and broken.renders == 0
-
-
-# --- whatever happens --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("field", [Broken(), Raising()])
-def test_the_page_outlives_a_broken_field(tmp_path, field):
-    state = bare_state([CameraView("never", False, None, None, 0, 0)])
-    page = start_page(state, "127.0.0.1", 0)
-    try:
-        with Visitor(page.port) as visitor:
-            for i in range(8):
-                state.publish(publication(i), field)
-            state.scored(
-                Publication(7, 7.0, 0, 5.0, ("never",), (1.0,), 1.0, 1.0, psnr_db=float("inf")),
-                Comparison("never", np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4, 3), np.uint8), 7),
-            )
-            wait_until(lambda: field.renders > 0, "nothing was rendered")
-            state.publish(publication(8), BallScene(0.0))  # it has recovered
-            visitor.wait_for(lambda: visitor.images and _decode(visitor).std() > 20, "the ball")
-    finally:
-        page.stop()
-
-
-def test_who_clicks_a_camera_looks_through_it():
-    with preview_page() as (preview, page), Visitor(page.port) as visitor:
-        visitor.wait_for(lambda: visitor.counts["CameraFrustumMessage"] >= 9, "the frustums")
-        (client,) = page._server.get_clients().values()
-        click = {"instance_index": None, "screen_pos": [0.5, 0.5], "modifier": None}
-        visitor.send("SceneNodeClickMessage", name="/cameras/cam02", ray_origin=[0] * 3, ray_direction=[1] * 3, **click)
-        pose = preview._poses["cam02"]
-        fov = pytest.approx(2 * np.arctan(0.5 * LENS.height / LENS.fy))
-        # The field of view is set last, on a thread of the page's own.
-        wait_until(lambda: client.camera.fov == fov, "the field of view is not the camera's")
-        assert np.allclose(client.camera.position, pose[:3, 3])
-        ahead = client.camera.look_at - pose[:3, 3]
-        assert np.allclose(ahead / np.linalg.norm(ahead), pose[:3, 2], atol=1e-6)
+def decoded(image: bytes) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
 
 
 def test_a_state_that_fails_to_answer_is_reported_once_and_survived(caplog):
-    state = bare_state()
-    answers = {"fail": True}
+    state, failing = bare_state(), threading.Event()
+    failing.set()
 
     def cameras() -> list[CameraView]:
-        if answers["fail"]:
+        if failing.is_set():
             raise RuntimeError("half started")
         return [CameraView("late", False, None, None, 0, 0)]
 
     state.cameras = cameras
-    page = start_page(state, "127.0.0.1", 0)
-    try:
-        with Visitor(page.port) as visitor:
-            wait_until(lambda: "half started" in caplog.text, "no log entry")
-            time.sleep(1.2)
-            assert caplog.text.count("page: refresh failed") == 1
-            answers["fail"] = False
-            at = visitor.counts["GuiUpdateMessage"]
-            visitor.wait_for(lambda: visitor.counts["GuiUpdateMessage"] > at, "the table")
-    finally:
-        page.stop()
-
-
-# --- helpers -----------------------------------------------------------------------------------
-
-
-def _decode(visitor: Visitor) -> np.ndarray:
-    assert visitor.image is not None
-    data = np.frombuffer(visitor.image, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR)
-    assert image is not None
-    return image
-
-
-def test_what_no_camera_has_seen_is_hatched():
-    image, unseen = np.ones((48, 64, 3), np.float32), np.zeros((12, 16), bool)
-    assert hatched(image, None) is image and hatched(image, unseen) is image
-    unseen[:, 8:] = True
-    shaded = hatched(image, unseen) < 1.0
-    assert not shaded[:, :32].any() and 0.4 < shaded[:, 32:].mean() < 0.6
+    with page_of(state) as page, Visitor(page.port) as visitor:
+        wait_until(lambda: "half started" in caplog.text, "no log entry")
+        time.sleep(1.2)
+        assert caplog.text.count("page: refresh failed") == 1
+        failing.clear()
+        at = visitor.counts["GuiUpdateMessage"]
+        visitor.wait_for(lambda: visitor.counts["GuiUpdateMessage"] > at, "the table")

@@ -23,17 +23,11 @@ def test_history_keeps_the_window_and_leaves_the_held_out_camera_aside():
     t, mean, worst, state = history.columns()
     assert t[0] >= t[-1] - 10.0 and len(t) <= 102
     assert np.allclose(mean, 200.0) and np.allclose(worst, 300.0) and np.allclose(state, 0.0)
+    history.sample(5.0, views(1.0), None)
+    assert len(history.columns()[0]) == len(t), "time that goes back"
 
 
-def test_history_is_bounded_even_if_time_stands_still_or_goes_back():
-    history = History(window_s=1e9, most=50)
-    for t in [*range(200), 5, 5, 199]:
-        history.sample(float(t), views(1.0), None)
-    t = history.columns()[0]
-    assert len(t) == 50 and (np.diff(t) > 0).all()
-
-
-def test_states_are_numbered_by_the_emulators_list_or_as_they_come():
+def test_states_are_numbered_by_the_emulators_list_or_as_they_come_and_averaged_over_cameras():
     history = History()
     said = [{"state": "high", "states": ["low", "high"]}, {"state": "low"}, {}, None, {"state": 2}]
     for i, status in enumerate([*said, {"state": [1]}]):
@@ -42,21 +36,10 @@ def test_states_are_numbered_by_the_emulators_list_or_as_they_come():
     state = history.columns()[3]
     assert state[:2].tolist() == [1, 0] and np.isnan(state[[2, 3, 5]]).all() and state[4] == 2
     assert np.isnan(history.columns()[1]).all()  # no camera has reported
-
-
-def test_chains_of_each_camera_are_averaged_and_odd_status_files_survived():
-    history = History()
     chains = {"a": {"state": "low"}, "b": {"state": "high"}, "c": {}, "d": 3}
-    history.sample(0.0, views(), {"state": None, "states": ["low", "high"], "by_camera": chains})
-    history.sample(1.0, views(), {"states": 7, "by_camera": [1], "state": None})
-    assert history.columns()[3][0] == 0.5 and np.isnan(history.columns()[3][1])
-
-
-def test_thinning_keeps_the_newest_and_its_place():
-    t = np.arange(1000.0)
-    thin_t, thin_y = _decimate(t, 2 * t)
-    assert len(thin_t) <= MAX_POINTS and thin_t[-1] == 999 and np.array_equal(thin_y, 2 * thin_t)
-    assert np.array_equal(_decimate(t[:5])[0], t[:5])
+    history.sample(9.0, views(), {"state": None, "by_camera": chains})
+    history.sample(10.0, views(), {"states": 7, "by_camera": [1], "state": None})
+    assert history.columns()[3][-2] == 0.5 and np.isnan(history.columns()[3][-1])
 
 
 def test_the_charts_show_ages_scored_updates_of_the_window_and_states_by_name(monkeypatch):
@@ -76,13 +59,8 @@ def test_the_charts_show_ages_scored_updates_of_the_window_and_states_by_name(mo
     ]
     timelines.Timelines(MagicMock()).refresh(history, publications)
     (_, t, (mean, worst, omega), _), (title, when, (psnr, _), _), (_, _, (state,), names) = drawn
-    assert (
-        t == [0.0, 200.0]
-        and mean == [200.0, 200.0]
-        and worst == [300.0, 300.0]
-        and np.isnan(omega[0])
-        and omega[1] == 50.0
-    )
+    assert (t, mean, worst) == ([0.0, 200.0], [200.0, 200.0], [300.0, 300.0])
+    assert np.isnan(omega[0]) and omega[1] == 50.0
     assert (when, psnr) == ([90.0, 195.0], [20.0, 22.0]) and title.endswith(", dB")
     assert state == [1.0, 1.0] and names == "0 good, 1 bad"
 
@@ -90,37 +68,28 @@ def test_the_charts_show_ages_scored_updates_of_the_window_and_states_by_name(mo
 def test_a_chart_draws_lines_with_recent_values_and_is_made_anew_where_they_change():
     gui, made = MagicMock(), []
     gui.add_uplot.side_effect = lambda **props: made.append(MagicMock(**props)) or made[-1]
-    gui.add_html.side_effect = lambda content, visible: MagicMock(content=content, visible=visible)
-    lines = (("mean", (0, 1, 2)), ("omega", (3, 4, 5)))
-    chart = timelines._Chart(gui, "Age", lines, zero=True)
+    chart = timelines._Chart(gui, "Age", (("mean", (0, 1, 2)), ("omega", (3, 4, 5))), zero=True)
     t = np.arange(RECENT + 2.0)
-    nan = np.full(len(t), np.nan)
-    chart.draw(t[:1], t[:1], nan[:1])
-    assert not made and not chart._caption.visible  # one point is no line
-    chart.draw(t[:2], t[:2], nan[:2])
-    assert len(made) == 1 and chart._caption.visible and "omega" not in chart._caption.content
-    x, y = made[0].data
-    assert x.tolist() == y.tolist() == [0.0, 1.0]
-    props = gui.add_uplot.call_args.kwargs
-    assert [each["label"] for each in props["series"]] == ["s", "mean"]
-    assert props["series"][1]["stroke"] == "#000102" and "fill" not in props["series"][1]
-    assert props["series"][1]["points"] == {"show": False}
-    assert props["scales"] == {"x": {"time": False}, "y": {"range": (0.0, None)}} and props["legend"] == {"show": False}
-    omega = nan.copy()
+    omega = np.full(len(t), np.nan)
+    chart.draw(t[:1], t[:1], omega[:1])
+    assert not made  # one point is no line
+    chart.draw(t[:2], t[:2], omega[:2])
+    assert [column.tolist() for column in made[0].data] == [[0.0, 1.0]] * 2
+    assert [(line["label"], line.get("stroke")) for line in made[0].series] == [("s", None), ("mean", "#000102")]
+    assert made[0].scales == {"x": {"time": False}, "y": {"range": (0.0, None)}}
     omega[2] = 7.0  # the first of the last RECENT rows
     chart.draw(t, t, omega)
     assert len(made) == 2 and made[0].remove.called and made[1].data[2].tolist() == [7.0] * len(t)
-    omega[2:] = np.nan
-    omega[1] = 7.0
+    omega[1:] = [7.0, *[np.nan] * RECENT]
     chart.draw(t, t, omega)
     assert len(made) == 3 and len(made[2].data) == 2
-    chart.draw(t, 2 * t, omega, remark="as before")
-    assert len(made) == 3 and made[2].data[1].tolist() == (2 * t).tolist() and "as before" in chart._caption.content
+    chart.draw(t, 2 * t, omega)
+    assert len(made) == 3 and made[2].data[1].tolist() == (2 * t).tolist()
 
 
-def test_a_stepped_chart_is_a_filled_staircase_from_any_value():
-    gui = MagicMock()
-    timelines._Chart(gui, "Channel", (("state", (0, 1, 2)),), stepped=True).draw(np.arange(2.0), np.arange(2.0))
-    props = gui.add_uplot.call_args.kwargs
-    assert [column.tolist() for column in props["data"]] == [[0, 1, 1], [0, 0, 1]]
-    assert props["series"][1]["fill"] == "#00010230" and "y" not in props["scales"]
+def test_a_stepped_chart_is_a_staircase_and_a_long_one_is_thinned_and_keeps_the_newest():
+    gui, t = MagicMock(), np.arange(1000.0)
+    timelines._Chart(gui, "Channel", (("state", (0, 1, 2)),), stepped=True).draw(t[:2], t[:2])
+    assert [column.tolist() for column in gui.add_uplot.call_args.kwargs["data"]] == [[0, 1, 1], [0, 0, 1]]
+    thin_t, thin_y = _decimate(t, 2 * t)
+    assert len(thin_t) <= MAX_POINTS and thin_t[-1] == 999 and np.array_equal(thin_y, 2 * thin_t)

@@ -7,16 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_server.page.viewpoint import (
-    DISTANCES,
-    MARGIN,
-    SEEN_SHARE,
-    VERTICAL_FOV_RAD,
-    initial_viewpoint,
-    row_band,
-    visitor_camera,
-)
-from freshfield.geometry import look_at, matrix_to_quaternion, quaternion_to_matrix, se3_inverse, world_up
+from edge_server.page.viewpoint import DISTANCES, MARGIN, SEEN_SHARE, initial_viewpoint, row_band, visitor_camera
+from freshfield.geometry import look_at, matrix_to_quaternion, quaternion_to_matrix
 from tests.edge_server.page.preview import BallScene
 
 TARGET = np.array([1.0, -2.0, 0.5])
@@ -32,42 +24,6 @@ def rig(count: int, spread_deg: float, elevation_deg: float = 20.0, radius_m: fl
     return np.stack(poses)
 
 
-@pytest.mark.parametrize("elevation_deg", [0, 35, 70])
-def test_up_is_vertical_although_the_cameras_look_down(elevation_deg):
-    poses = rig(9, 100, elevation_deg)
-    assert np.allclose(world_up(poses), (0, 0, 1), atol=1e-9)
-    poses[:, :3, :2] *= -1  # held upside down
-    assert np.allclose(world_up(poses), (0, 0, -1), atol=1e-9)
-
-
-def test_up_without_a_common_level_is_the_cameras_own():
-    assert np.allclose(world_up(rig(1, 0, elevation_deg=0)), (0, 0, 1), atol=1e-9)
-    row = np.stack([np.eye(4)] * 5)
-    assert np.allclose(world_up(row), (0, -1, 0))
-    # Cameras that roll evenly have no common up: the first one's is taken, and it is finite.
-    rolling = np.stack([np.eye(4)] * 4)
-    for i, pose in enumerate(rolling):
-        a = i * np.pi / 2
-        pose[:2, :2] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
-    assert np.allclose(world_up(rolling), (0, -1, 0))
-
-
-@pytest.mark.parametrize(("spread_deg", "share"), [(40, 0.75), (120, 0.75), (170, 0.5)])
-def test_the_visitor_sees_the_rig_from_behind_and_above(spread_deg, share):
-    poses = rig(9, spread_deg)
-    view = initial_viewpoint(poses)
-    assert np.allclose(view.look_at, TARGET, atol=1e-6)
-    assert view.radius_m == pytest.approx(3.0)
-    eyes = poses[:, :3, 3]
-    assert (view.position - TARGET) @ view.up > eyes.mean(axis=0)[2] - TARGET[2]
-    # Behind the cameras, but not lost in space of which a field knows nothing.
-    assert 1.2 < np.linalg.norm(view.position - TARGET) / view.radius_m < 2.3
-    camera = look_at(view.position, view.look_at, view.up)
-    local = (eyes - camera[:3, 3]) @ camera[:3, :3]
-    seen = (np.abs(local[:, :2] / local[:, 2:]) < np.tan(VERTICAL_FOV_RAD / 2)).all(axis=1) & (local[:, 2] > 0)
-    assert seen.mean() >= share
-
-
 @pytest.mark.parametrize(("cameras_deg", "visitor_deg"), [(20, 30), (35, 45), (0, 18), (60, 55), (-20, 18)])
 def test_the_visitor_looks_from_ten_degrees_above_the_cameras_within_bounds(cameras_deg, visitor_deg):
     view = initial_viewpoint(rig(9, 60, cameras_deg))
@@ -75,7 +31,7 @@ def test_the_visitor_looks_from_ten_degrees_above_the_cameras_within_bounds(came
     assert np.rad2deg(np.arcsin(out @ view.up)) == pytest.approx(visitor_deg, abs=0.1)
 
 
-@pytest.mark.parametrize("spread_deg", [90, 140, 160])
+@pytest.mark.parametrize("spread_deg", [90, 160])
 def test_the_visitor_stands_as_near_as_lets_them_see_the_share(spread_deg):
     poses = rig(9, spread_deg)
     eyes, view = poses[:, :3, 3], initial_viewpoint(poses)
@@ -90,25 +46,22 @@ def test_the_visitor_stands_as_near_as_lets_them_see_the_share(spread_deg):
 
     assert DISTANCES[0] * view.radius_m + 1e-6 < away_m < DISTANCES[-1] * view.radius_m - 1e-6
     assert share_at(away_m) >= SEEN_SHARE > share_at(away_m - step_m)
+    assert np.allclose(view.look_at, TARGET, atol=1e-6) and view.radius_m == pytest.approx(3.0)
+    assert np.allclose(view.up, (0, 0, 1), atol=1e-9)
+    poses[:, :3, :2] *= -1  # held upside down
+    assert np.allclose(initial_viewpoint(poses).up, (0, 0, -1), atol=1e-9)
+    rolling = np.stack([np.eye(4)] * 4)  # evenly: no common up, the first one's is taken
+    rolling[1:, :2, :2] = [[[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]]
+    assert np.allclose(initial_viewpoint(rolling).up, (0, -1, 0))
 
 
 def test_a_ring_has_no_behind_so_the_visitor_stands_behind_its_first_camera():
     poses = rig(12, 330)
-    view = initial_viewpoint(poses)
-    out, first = view.position - TARGET, poses[0, :3, 3] - TARGET
+    out, first = initial_viewpoint(poses).position - TARGET, poses[0, :3, 3] - TARGET
     assert out[:2] @ first[:2] > 0.98 * np.linalg.norm(out[:2]) * np.linalg.norm(first[:2])
 
 
-def test_one_camera_uses_the_fields_box_or_else_what_is_before_it():
-    pose = rig(1, 0)
-    boxed = initial_viewpoint(pose, TARGET)
-    assert np.allclose(boxed.look_at, TARGET)
-    alone = initial_viewpoint(pose)
-    ahead = alone.look_at - pose[0, :3, 3]
-    assert np.allclose(ahead / np.linalg.norm(ahead), pose[0, :3, 2], atol=1e-6)
-
-
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50)
 @given(
     st.lists(st.tuples(*[st.floats(-1, 1)] * 4, *[st.floats(-1e3, 1e3)] * 3), min_size=1, max_size=8).filter(
         lambda rows: all(np.linalg.norm(r[:4]) > 1e-3 for r in rows)
@@ -125,7 +78,7 @@ def test_any_poses_give_a_place_from_which_one_can_look(rows):
     assert np.linalg.norm(np.cross(gap, view.up)) > 1e-6 * np.linalg.norm(gap)  # never along up
 
 
-@pytest.mark.parametrize("rows", [60, 151, 600])
+@pytest.mark.parametrize("rows", [60, 151])
 def test_a_windows_camera_sees_what_the_window_sees(rows):
     pose = look_at((3, 1, 2), (0, 0, 0))
     wxyz = matrix_to_quaternion(pose[:3, :3])
@@ -136,22 +89,11 @@ def test_a_windows_camera_sees_what_the_window_sees(rows):
     top = np.tan(np.deg2rad(25))
     corner = camera.project(np.array([top * 811 / 600, top, 1.0]))
     assert np.allclose(corner, (camera.width, camera.height), atol=1e-6)
-    local = se3_inverse(pose) @ np.array([0, 0, 0, 1.0])
-    assert np.allclose(camera.project(local[:3]), (camera.width / 2, camera.height / 2), atol=1e-6)
-
-
-def test_never_more_rows_than_the_window_has():
-    _, camera = visitor_camera((0, 0, 0), (1, 0, 0, 0), 0.9, 300, 200, 720)
-    assert (camera.width, camera.height) == (300, 200)
+    _, small = visitor_camera((0, 0, 0), (1, 0, 0, 0), 0.9, 300, 200, 720)
+    assert (small.width, small.height) == (300, 200), "never more rows than the window has"
     _, tiny = visitor_camera((0, 0, 0), (1, 0, 0, 0), 0.9, 1, 1, 100)
     assert (tiny.width, tiny.height) == (1, 1) and tiny.fx == pytest.approx(tiny.fy)
-
-
-def test_bands_are_the_image():
-    pose = look_at((3, 1, 2), (0, 0, 0.3))
-    _, camera = visitor_camera(pose[:3, 3], matrix_to_quaternion(pose[:3, :3]), 0.8, 160, 120, 61)
-    scene = BallScene(0.7)
-    whole = scene.render(pose, camera)
-    parts = [scene.render(pose, row_band(camera, a, b - a)) for a, b in ((0, 20), (20, 47), (47, 61))]
-    assert np.allclose(np.concatenate([p.color for p in parts]), whole.color, atol=1e-6)
-    assert np.allclose(np.concatenate([p.depth for p in parts]), whole.depth, atol=1e-4)
+    # Bands are the image.
+    bands = [(20, 0), (rows - 20, 20)]
+    parts = [BallScene(0.7).render(pose, row_band(camera, first, count)).color for count, first in bands]
+    assert np.allclose(np.concatenate(parts), BallScene(0.7).render(pose, camera).color, atol=1e-6)

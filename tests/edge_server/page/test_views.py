@@ -1,7 +1,8 @@
-"""What a visitor may look at beside the picture."""
+"""What a visitor may look at beside the picture, and the colors of ages."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 from edge_server.fields import Rendering
 from edge_server.live.state import CameraView, Comparison
 from edge_server.page import views
-from edge_server.page.colors import FRESH, STALE, UNKNOWN
+from edge_server.page.colors import FRESH, MIDDLE, STALE, UNKNOWN, age_color, age_colors
+from edge_server.page.settings import FRESH_MS, STALE_MS
 from freshfield.geometry import Pinhole, Pose, look_at
 from tests.edge_server.frames import frame
 
@@ -59,8 +61,18 @@ def test_truth_and_rendering_are_as_large_as_they_fit(size, beside):
     shown = (image != views.BACKDROP).all(axis=2)
     assert shown.any(axis=0).sum() > 0.8 * size[0] or shown.any(axis=1).sum() > 0.8 * size[1]
     first = image[:, : size[0] // 2] if beside else image[: size[1] // 2]
-    assert (
-        np.median(first[(first != views.BACKDROP).all(axis=2)]) == pytest.approx(200 / 255) and image.mean() < 200 / 255
-    )
+    assert np.median(first[(first != views.BACKDROP).all(axis=2)]) == pytest.approx(200 / 255)
+    second = image[:, size[0] // 2 :] if beside else image[size[1] // 2 :]
+    assert first.max() == second.max() == 1.0, "both are labeled"
     error = views.compared(comparison, *size, error=True)
     assert error[size[1] // 2, size[0] // 2] == pytest.approx(4 * 5 / 255, abs=1e-3)
+
+
+def test_ends_and_middle_of_the_scale():
+    assert age_color(0.0) == age_color(FRESH_MS) == FRESH
+    assert age_color(STALE_MS) == age_color(1e9) == STALE
+    assert age_color(math.sqrt(FRESH_MS * STALE_MS)) == MIDDLE
+    assert age_color(-30.0) == FRESH  # a clock a little ahead
+    assert (age_color(None), age_color(float("nan")), age_color(float("inf"))) == (UNKNOWN, STALE, STALE)
+    ages = np.array([0.0, 90.0, 400.0, 1e9])
+    np.testing.assert_allclose(age_colors(ages), [np.array(age_color(age)) / 255 for age in ages], atol=1e-6)

@@ -1,14 +1,12 @@
-"""A visitor without a browser: speaks the viewer's wire protocol, counts what the page sends.
-
-For what a browser is too slow and too large to test: message rates, many visitors, one who does not read.
-"""
+"""A visitor without a browser: speaks the viewer's wire protocol, counts what the page sends."""
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import threading
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import msgspec
@@ -17,27 +15,30 @@ import viser
 import websocket
 import zstandard
 
+from edge_server.live.state import EdgeState
+from edge_server.page import Page, start_page
+from freshfield.transport import Transport
 from tests.support import wait_until
 
 
-class Visitor:
-    """Connects, with more ``headers``, and stands at ``position`` looking at the origin; reads in a thread
-    unless ``reads`` is False. ``counts``: messages by type; ``bytes``: all that came; ``images``: number of
-    renderings; ``image``: the last one, encoded."""
+@contextlib.contextmanager
+def page_of(state: EdgeState, transport: Transport | None = None, host: str = "127.0.0.1") -> Iterator[Page]:
+    """The page of a state, while it is needed."""
+    page = start_page(state, host, 0, transport)
+    try:
+        yield page
+    finally:
+        page.stop()
 
-    def __init__(
-        self,
-        port: int,
-        position: tuple[float, float, float] = (4.0, 0.0, 3.0),
-        reads: bool = True,
-        size: tuple[int, int] = (800, 600),
-        headers: Sequence[str] = (),
-    ) -> None:
+
+class Visitor:
+    """Connects, with more ``headers``, and looks at the origin; reads in a thread unless ``reads`` is False.
+    ``counts``: messages by type; ``images``: number of renderings; ``image``: the last one, encoded."""
+
+    def __init__(self, port: int, reads: bool = True, headers: Sequence[str] = ()) -> None:
         self.counts: Counter[str] = Counter()
-        self.bytes = 0
         self.images = 0
         self.image: bytes | None = None
-        self._size = size
         self._closing = False
         self._socket = websocket.create_connection(
             f"ws://127.0.0.1:{port}",
@@ -46,7 +47,7 @@ class Visitor:
             header=list(headers),
             sockopt=() if reads else ((socket.SOL_SOCKET, socket.SO_RCVBUF, 4096),),
         )
-        self.stand_at(position)
+        self.stand_at((4.0, 0.0, 3.0))
         self._thread = threading.Thread(target=self._read, daemon=True)
         if reads:
             self._thread.start()
@@ -77,8 +78,8 @@ class Visitor:
             fov=0.9,
             near=0.01,
             far=1000.0,
-            image_width=self._size[0],
-            image_height=self._size[1],
+            image_width=800,
+            image_height=600,
             look_at=[0.0, 0.0, 0.0],
             up_direction=[0.0, 0.0, 1.0],
         )
@@ -100,7 +101,6 @@ class Visitor:
                 return
             packed = int.from_bytes(data[8:16], "little")
             inner = zstandard.ZstdDecompressor().decompress(data[16 : 16 + packed])
-            self.bytes += len(data)
             for message in msgspec.msgpack.decode(inner)["messages"]:
                 if message["type"] == "BackgroundImageMessage":
                     self.image = message["rgb_data"]

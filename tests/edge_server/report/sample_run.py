@@ -33,13 +33,12 @@ EDGE = {
     "baseline": {"mean_color_db": 14.5, "nearest_view_db": 13.8},
     "lpips_missing": None,
     "lpips_network": "alex",
-    "run": {
-        "started": "2026-02-03T04:05:06+01:00",
-        "host": "bench",
-        "commit": "abc1234567",
-        "command": "edge-server run",
-    }
+    "run": {"started": "2026-02-03T04:05:06+01:00", "host": "bench", "commit": "abc1234567", "command": "edge-server"}
     | {"machine": machine(), "versions": versions()},
+}
+HISTOGRAM = {
+    "edges_ms": [6.0 * i for i in range(51)],
+    "counts": [round(500 * 2.718 ** (-i / 10), 2) for i in range(50)],
 }
 CHANNEL = {
     "changes": [
@@ -47,15 +46,7 @@ CHANNEL = {
         {"at_ns": 15_000_000_000, "delay_ms": None, "loss": None},
     ],
     "state_share": {"high": 0.4, "low": 0.6},
-    "drawn_delay_ms": {
-        "mean": 60.2,
-        "p50": 41.0,
-        "p95": 180.0,
-        "histogram": {
-            "edges_ms": [6.0 * i for i in range(51)],
-            "counts": [round(500 * 2.718 ** (-i / 10), 2) for i in range(50)],
-        },
-    },
+    "drawn_delay_ms": {"mean": 60.2, "p50": 41.0, "p95": 180.0, "histogram": HISTOGRAM},
     "delay_error_ms": {"p50": 0.1, "p99": 1.2, "max": 4.0},
 }
 

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge_server.report import figures
 from edge_server.report.build_report import assemble
 from edge_server.report.conclusion import conclusion
-from edge_server.report.events import MOST, silences
-from edge_server.report.figures import draw_ages, draw_fidelity
+from edge_server.report.events import silences
 from edge_server.report.run_files import read_run_files
 from edge_server.run_records import AgesRow
-from freshfield.untrusted import read_json
 from tests.edge_server.report.sample_run import CHANNEL, EDGE, page_of, write_run
+
+SO_FAR = {"now_psnr_db": 20.0, "all_psnr_db": 23.0, "frames": 9}
+TRAINED_ON = {"fidelity.scored_on": ["selected"], "fidelity.final.psnr_db": 17.4, "fidelity.shown.psnr_db": None}
 
 
 @pytest.fixture
@@ -42,10 +42,8 @@ def test_three_sentences_say_what_was_shown_its_age_and_its_limit(tmp_path: Path
         "an image of one mean color reads 14.5 dB."
     )
     assert "(50 ms network, " in age and age.endswith("reads 26.0 dB, 9.0 above what moves.")
-    assert (
-        limit.startswith("Showing each image until the next was the limit")
-        and "50% of the frames sent did not pass" in limit
-    )
+    assert limit.startswith("Showing each image until the next was the limit")
+    assert "50% of the frames sent did not pass" in limit
     assert " ".join(report["conclusion"]) in page
 
 
@@ -54,30 +52,13 @@ def test_three_sentences_say_what_was_shown_its_age_and_its_limit(tmp_path: Path
     [
         ({"updates.count": 0}, 0, "Nothing was shown: the field was never updated."),
         ({"fidelity.shown.psnr_db": 12.0}, 0, "worse than an image of one mean color, which reads 14.5 dB."),
-        ({"fidelity.baseline.mean_color_db": None}, 0, "17.0 dB where the scene moves."),
         ({"fidelity.shown.psnr_db": None, "fidelity.final.psnr_db": None}, 0, "is not known"),
-        ({"fidelity.so_far": {"now_psnr_db": 20.0, "all_psnr_db": 23.0, "frames": 9}}, 0, "all 9 so far 23.0 dB"),
+        ({"fidelity.so_far": SO_FAR}, 0, "all 9 so far 23.0 dB"),
         ({"fidelity.shown.age_ms.waiting": 0.0}, 2, "Waiting for an update and computing it were the limit"),
         ({"fidelity.shown.age_ms.display": 10.0}, 2, "The network was the limit: it takes the largest part"),
         ({"fidelity.shown.psnr_still_db": 15.0}, 2, "too few cameras"),
-        (
-            {
-                "fidelity.scored_on": ["selected"],
-                "fidelity.final.psnr_db": 17.4,
-                "fidelity.shown.psnr_db": None,
-                "fidelity.shown.psnr_still_db": None,
-            },
-            2,
-            "What is shown is little better than one mean color: poses that do not fit, or too short a run",
-        ),
-        (
-            {
-                "fidelity.shown.psnr_still_db": 15.0,
-                "fidelity.so_far": {"now_psnr_db": 20.0, "all_psnr_db": 23.0, "frames": 9},
-            },
-            2,
-            "the limit: it takes",
-        ),
+        ({**TRAINED_ON, "fidelity.shown.psnr_still_db": None}, 2, "poses that do not fit, or too short a run"),
+        ({"fidelity.shown.psnr_still_db": 15.0, "fidelity.so_far": SO_FAR}, 2, "the limit: it takes"),
         ({"updates.without_step": 3, "updates.count": 50}, 2, "6% of the updates had no time for a step of training"),
         ({"updates.shed": 70}, 2, "92% of those delivered were left out for lack of time"),
     ],
@@ -95,11 +76,9 @@ def test_events_of_operators_network_and_cameras_are_listed_in_order(tmp_path: P
     began_ns = 1_800_000_000_000_000_000
     told = {"started_ns": began_ns, "events": [{"t_s": 12.5, "what": "an operator reset the field"}]}
     (tmp_path / "edge.json").write_text(json.dumps(EDGE | told))
-    changes = [
-        {"at_ns": began_ns + 9_000_000_000, "delay_ms": 200.0, "loss": 0.1},
-        {"at_ns": began_ns + 20_000_000_000},
-    ]
-    (tmp_path / "channel.json").write_text(json.dumps(CHANNEL | {"changes": changes}))
+    by_hand = {"at_ns": began_ns + 9_000_000_000, "delay_ms": 200.0, "loss": 0.1}
+    changes = {"changes": [by_hand, {"at_ns": began_ns + 20_000_000_000}]}
+    (tmp_path / "channel.json").write_text(json.dumps(CHANNEL | changes))
     report, page = page_of(tmp_path)
     assert [(event["t_s"], event["what"]) for event in report["events"]] == [
         (9.0, "network set: 200 ms, 10 % lost"),
@@ -107,25 +86,6 @@ def test_events_of_operators_network_and_cameras_are_listed_in_order(tmp_path: P
         (20.0, "the scenario's network again"),
     ]
     assert "9.0 s: network set" in page
-    files, drawn = read_run_files(tmp_path), []
-    for events in ([], report["events"]):
-        marked = {**report, "events": events}
-        for draw in (draw_fidelity, draw_ages):
-            assert draw(marked, files, tmp_path / "figure.png")
-            drawn.append((tmp_path / "figure.png").read_bytes())
-    assert drawn[0] != drawn[2] and drawn[1] != drawn[3], "they are marked on both"
-
-
-def test_a_lone_score_gives_its_axis_its_name_beside_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_run(tmp_path)
-    files, said = read_run_files(tmp_path), []
-    report = {**assemble(files), "events": [{"t_s": 1.0, "what": "reset"}, {"t_s": 2.0, "what": "reset"}]}
-    monkeypatch.setattr(figures, "label_lines", lambda _, y, *__, **___: said.append(y))
-    assert draw_fidelity(report, files, tmp_path / "both.png")
-    for row in report["fidelity"]["series"]:
-        row["lpips"] = None
-    assert draw_fidelity(report, files, tmp_path / "one.png")
-    assert said[1::2] == ["score", "SSIM (higher is better)"]
 
 
 def test_cameras_that_fall_silent_together_are_one_event() -> None:
@@ -141,13 +101,3 @@ def test_cameras_that_fall_silent_together_are_one_event() -> None:
     assert gone.t_s == pytest.approx(10.0, abs=0.01) and gone.what == "cam01, cam02, cam03 and 2 more: no further frame"
     (back,) = silences([AgesRow(row.t_s, {"cam01": row.age_ms["cam01"]}) for row in rows])
     assert back.what == "cam01: no frame for 5.9 s"
-
-
-@pytest.mark.stability
-def test_events_of_a_hostile_file_are_bounded(tmp_path: Path) -> None:
-    write_run(tmp_path, publications=2, ages=2)
-    events = [{"t_s": t_s, "what": "<b>"} for t_s in (-1.0, *range(3 * MOST))]
-    (tmp_path / "edge.json").write_text(json.dumps(EDGE | {"events": events}))
-    report, page = page_of(tmp_path)
-    assert len(report["events"]) == MOST and "<b>" not in page.split("Events")[1].split("</ol>")[0]
-    assert read_json((tmp_path / "report.json").read_text())

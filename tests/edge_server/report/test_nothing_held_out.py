@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
-from edge_server.experiments.fitting.evaluate import Scored
-from edge_server.experiments.fitting.fit_command import progress_line
-from edge_server.fidelity.scorer import SELECTED, Score
-from edge_server.page import markup, timelines
+from edge_server.fidelity.scorer import SELECTED
+from edge_server.page import markup
 from edge_server.report import figures
 from edge_server.report.build_report import assemble
 from edge_server.report.run_files import read_run_files
@@ -21,7 +16,7 @@ from freshfield.scenario import NOTHING_HELD_OUT
 from freshfield_up.status import _edge_line
 from freshfield_up.summary import summarize
 from tests.edge_server.page.test_markup import summary
-from tests.edge_server.report.sample_run import page_of, publication, write_run
+from tests.edge_server.report.sample_run import page_of, write_run
 
 
 def run_of(folder: Path, scored_on: str) -> Path:
@@ -41,16 +36,6 @@ def page_pair(folder: Path, on: str) -> str:
     return markup.comparison_caption("cam01", 20.0, 3, held_out=on != SELECTED)
 
 
-def page_chart(folder: Path, on: str) -> str:
-    drawn = []
-    charts = object.__new__(timelines.Timelines)
-    charts._age = charts._channel = SimpleNamespace(draw=lambda *_, **__: None)
-    charts._psnr = SimpleNamespace(title="", draw=lambda *_, **__: drawn.append(charts._psnr.title))
-    empty = SimpleNamespace(columns=lambda: (np.zeros(0),) * 4, state_names=[])
-    charts.refresh(empty, [replace(publication(0), psnr_db=20.0, scored_on=on)])
-    return drawn[0]
-
-
 def report_page(folder: Path, on: str) -> str:
     return page_of(run_of(folder, on))[1].split("<h2>Age")[0]
 
@@ -67,41 +52,7 @@ def console_table(folder: Path, on: str) -> str:
     return _edge_line({"updates": {"count": 3, "ms_p50": 9.0}, "scores": {"psnr_db": 20.0, "on": on}})
 
 
-def console_summary(folder: Path, on: str) -> str:
-    page_of(run_of(folder, on))
-    return summarize(folder)
-
-
-def metrics(folder: Path, on: str) -> str:
-    from edge_server.live.output.prometheus import EdgeCollector
-
-    newest = replace(publication(0), psnr_db=20.0, scored_on=on)
-    state = SimpleNamespace(cameras=list, newest=lambda scored=False: newest)
-    buffer = SimpleNamespace(shed=0)
-    ingest = SimpleNamespace(rejected={}, depth={}, buffer=buffer, check_ms=SimpleNamespace(percentile=lambda _: None))
-    found = EdgeCollector(state, ingest).collect()
-    return next(family.documentation for family in found if family.name == "freshfield_psnr_db")
-
-
-def fit_console(folder: Path, on: str) -> str:
-    scored = Scored(1.0, 1.0, 3, 0.1, Score("a", 0, 20.0, None, 0.5, None, None))
-    return progress_line(scored, None, held_out=on != SELECTED)
-
-
-PLACES = (
-    page_tile,
-    page_pair,
-    page_chart,
-    report_page,
-    report_figure,
-    console_table,
-    console_summary,
-    metrics,
-    fit_console,
-)
-
-
-@pytest.mark.parametrize("place", PLACES, ids=lambda place: place.__name__)
+@pytest.mark.parametrize("place", [page_tile, page_pair, report_page, report_figure, console_table])
 def test_a_score_on_training_views_is_called_what_it_is(place, tmp_path, monkeypatch):
     more = (monkeypatch,) if place is report_figure else ()
     selected, held_out = place(tmp_path / "a", SELECTED, *more), place(tmp_path / "b", "cam00", *more)

@@ -56,15 +56,6 @@ def test_a_set_is_the_same_one_while_the_field_trains_on():
     assert len(publisher.take(grown, 5.1).static.records) == 650  # also if nothing more is published
 
 
-def test_another_box_is_another_field():
-    publisher = Publisher(0)
-    fields = [
-        publisher.take(shown, 0.0).scene.field
-        for shown in (snapshot(), snapshot(movers=100), snapshot(box=replace(BOX, radius_m=3.0)), snapshot(movers=0))
-    ]
-    assert fields == [1, 1, 2, 3]  # the last: the first box again
-
-
 def test_a_still_field_and_one_without_gaussians():
     still = SplatSnapshot(BOX, Gaussians(gaussians(50, 0), 0), np.zeros(3, np.float32), snapshot().pool, 0)
     published = Publisher(5).take(still, 0.0)
@@ -73,3 +64,6 @@ def test_a_still_field_and_one_without_gaussians():
     assert Publisher(0).take(object(), 0.0) is None
     again = Publisher(0)
     assert again.take(still, 0.0) is again.take(still, 9.0)
+    # Another box is another field.
+    shown = (snapshot(), snapshot(movers=100), snapshot(box=replace(BOX, radius_m=3.0)))
+    assert [again.take(each, 9.0).scene.field for each in shown] == [1, 1, 2]

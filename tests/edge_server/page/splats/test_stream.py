@@ -2,26 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
 import base64
-import contextlib
 import json
-import queue
-import threading
 import time
-from collections.abc import Iterator
-from dataclasses import replace
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import websocket
 
-from channel_emu.live.proxy import ProxyOptions
-from channel_emu.live.tcp_proxy import TcpProxy
-from channel_emu.model.settings import channel_from_mapping
-from edge_server.fields.splat.layers.settings import MAX_AHEAD_S
 from edge_server.live.state import EdgeState, Publication
 from edge_server.page import Page, start_page
 from edge_server.page.splats.messages import StreamReader, read_saved
@@ -30,24 +19,16 @@ from freshfield.limits import MAX_VISITORS
 from freshfield.transport import Transport
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.page.browser import Browser
-from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, motion, snapshot
+from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, snapshot
 from tests.edge_server.page.test_access_guard import get, lines, login
 from tests.edge_server.page.test_page import bare_state
+from tests.edge_server.page.visitor import page_of
 from tests.role_table import TOKENS
 from tests.support import wait_until
 
 
 def publish(state: EdgeState, shown: object, number: int = 0) -> None:
     state.publish(Publication(number, 1.0, state.now_ns(), None, (), (), 0.0, 20.0), shown)
-
-
-@contextlib.contextmanager
-def page_of(state: EdgeState, transport: Transport | None = None) -> Iterator[Page]:
-    page = start_page(state, "127.0.0.1", 0, transport)
-    try:
-        yield page
-    finally:
-        page.stop()
 
 
 class Drawer:
@@ -84,17 +65,11 @@ def test_a_visitor_gets_everything_then_what_changes():
         assert drawer.reader.scene.radius_m == BOX.radius_m
         publish(state, snapshot(gaussians(500, 7), movers=0), 1)
         drawer.read_until(lambda: len(drawer.reader.at(NEWEST_S)) == 500)
+        publish(state, object(), 2)
+        drawer.read_until(lambda: "does not consist of Gaussians" in drawer.reader.status.get("line", ""))
         drawer.socket.close()
         wait_until(lambda: not page._splats._connected, "the end of the visit")
         assert page._splats._thread.is_alive()
-
-
-def test_a_field_of_another_kind_is_said():
-    state = bare_state()
-    with page_of(state) as page:
-        publish(state, object())
-        drawer = Drawer(page)
-        drawer.read_until(lambda: "does not consist of Gaussians" in drawer.reader.status.get("line", ""))
 
 
 @pytest.mark.stability
@@ -146,43 +121,6 @@ def test_the_rules_of_the_page_hold_for_the_stream():
             each.socket.close()
 
 
-def test_a_bad_last_mile_makes_it_less_and_later_but_breaks_nothing():
-    """Through the emulator's TCP proxy."""
-    state, shown = bare_state(), snapshot(gaussians(6000, 0))
-    section = {"service": {"law": "exponential", "mean_ms": 30.0}, "faults": {"loss": {"probability": 0.05}}}
-    with page_of(state) as page, proxied(page.port, section) as port:
-        publish(state, shown)
-        drawer = Drawer(SimpleNamespace(port=port))
-        drawer.read_until(lambda: len(drawer.reader.at(NEWEST_S)) == 6120)
-        link = drawer.reader.status["link"]
-        assert link["static"] == [6000, 6000] and link["round_trip_ms"] > 20.0
-        assert 0 < link["shortest_ms"] < link["round_trip_ms"]
-        drawer.socket.close()
-
-
-@contextlib.contextmanager
-def proxied(to: int, section: dict) -> Iterator[int]:
-    """The port of a TCP proxy before port ``to``, on a thread of its own."""
-    started: queue.Queue[tuple[int, asyncio.AbstractEventLoop, asyncio.Event]] = queue.Queue()
-
-    async def serve() -> None:
-        options = ProxyOptions("127.0.0.1:0", f"127.0.0.1:{to}", direction="both")
-        proxy, stop = TcpProxy(channel_from_mapping(section), 1, options), asyncio.Event()
-        await proxy.start()
-        started.put((proxy.port, asyncio.get_running_loop(), stop))
-        await stop.wait()
-        await proxy.stop()
-
-    thread = threading.Thread(target=lambda: asyncio.run(serve()), daemon=True)
-    thread.start()
-    port, loop, stop = started.get(timeout=20)
-    try:
-        yield port
-    finally:
-        loop.call_soon_threadsafe(stop.set)
-        thread.join(timeout=20)
-
-
 # --- a browser -------------------------------------------------------------------------------------
 
 # Draws at a fixed instant and returns the canvas.
@@ -212,16 +150,6 @@ def rendered(shown, instant_s: float) -> np.ndarray:
     return np.clip(shown.at(ORIGIN_NS + round(instant_s * 1e9)).render(POSE, LENS).color, 0, 1)
 
 
-# Displacements of the anchors at 60 instants a second, xyz and a fourth that is not used.
-MOVED = """
-(() => {
-  const { reader } = window.splats;
-  const out = new Float32Array(4 * reader.knots.anchors);
-  return Array.from({ length: 60 }, (_, k) => (reader.displacements(%f + k / 60, out), Array.from(out)));
-})()
-"""
-
-
 @pytest.mark.browser
 def test_the_browser_draws_what_the_edge_renders():
     state, shown = bare_state(), snapshot()
@@ -231,18 +159,11 @@ def test_the_browser_draws_what_the_edge_renders():
         browser.wait_for(lambda: browser.evaluate(arrived) == 820, "all Gaussians")
         assert browser.evaluate("splats.renderer.format === splats.renderer.gl.RGBA32F")
         # Last in half floats, as with a GPU.
-        for ahead_s, format_ in ((0.0, "RGBA32F"), (0.12, "RGBA32F"), (0.9, "RGBA16F")):
+        for ahead_s, format_ in ((-0.2, "RGBA32F"), (0.12, "RGBA32F"), (0.9, "RGBA16F")):
             browser.evaluate(f"splats.renderer.format = splats.renderer.gl.{format_}; splats.renderer.targetSize = ''")
             assert psnr(drawn(browser, NEWEST_S + ahead_s, state.start_ns), rendered(shown, NEWEST_S + ahead_s)) > 50.0
-        assert (
-            psnr(drawn(browser, NEWEST_S, state.start_ns), rendered(shown, NEWEST_S + 0.2)) < 40.0
-        )  # the test can fail
-        # Motion at each frame of a display, also past the newest frame, is the edge's spline.
-        instants = NEWEST_S - 0.2 + np.arange(60) / 60
-        moved = np.array(browser.evaluate(MOVED % (instants[0] + (ORIGIN_NS - state.start_ns) / 1e9)))
-        wanted = [motion().at(min(t, NEWEST_S + MAX_AHEAD_S)) for t in instants]
-        np.testing.assert_allclose(moved.reshape(60, -1, 4)[..., :3], wanted, atol=5e-5)
-        assert np.abs(np.diff(wanted, axis=0)).max() > 1e-3
+        other = rendered(shown, NEWEST_S + 0.2)
+        assert psnr(drawn(browser, NEWEST_S, state.start_ns), other) < 40.0, "the test can fail"
         # What no camera has seen is striped, darker.
         browser.evaluate("splats.reader.shown.unseen = new Uint8Array(700).fill(1)")
         browser.evaluate("splats.reader.shown.changed = [0, 700]")
@@ -261,17 +182,8 @@ def test_the_browser_draws_what_the_edge_renders():
         assert browser.errors == [] and all(f":{page.port}" in address for address in browser.requests)
 
 
-SAVED = """
-new Promise(resolve => {
-  const reader = new FileReader();
-  reader.onload = () => resolve(reader.result.split(",")[1]);
-  reader.readAsDataURL(splats.savedFile());
-})
-"""
-
-
 @pytest.mark.browser
-def test_a_saved_stream_is_played_back_without_the_edge():
+def test_a_stream_comes_back_when_it_broke_and_a_saved_one_is_played_without_the_edge():
     state, shown = bare_state(), snapshot()
     with Browser("about:blank", 640, 480) as browser:
         with page_of(state) as page:
@@ -279,7 +191,13 @@ def test_a_saved_stream_is_played_back_without_the_edge():
             browser.call("Page.navigate", url=page.url + "/splats/?full")
             arrived = "window.splats && splats.reader.moves && splats.reader.shown.total + splats.reader.moving.count"
             browser.wait_for(lambda: browser.evaluate(arrived) == 820, "all Gaussians")
-            data = base64.b64decode(browser.evaluate(SAVED))
+            data = bytes(browser.evaluate("splats.savedFile().arrayBuffer().then((b) => [...new Uint8Array(b)])"))
+        browser.wait_for_text("The connection broke")
+        again = start_page(state, "127.0.0.1", page.port)
+        publish(state, snapshot(gaussians(900, 3), movers=0), 1)
+        browser.wait_for(lambda: browser.evaluate("splats.reader.shown.total") == 900, "the stream again")
+        assert "broke" not in browser.text()
+        again.stop()
         reader, times = StreamReader(), []
         for came_s, message in read_saved(data):
             reader.read(message)
@@ -287,31 +205,9 @@ def test_a_saved_stream_is_played_back_without_the_edge():
         assert times == sorted(times) and times[0] == 0.0
         assert len(reader.at(NEWEST_S)) == 820
         assert len(list(read_saved(data[:-1]))) == len(times) - 1
-        bytes_ = f"Uint8Array.from(atob('{base64.b64encode(data).decode()}'), c => c.charCodeAt(0))"
-        browser.evaluate(f"splats.open(new File([{bytes_}], 'room.ffsplats'))")
+        browser.evaluate(f"splats.open(new File([Uint8Array.from({list(data)})], 'room.ffsplats'))")
         browser.wait_for(lambda: browser.evaluate("splats.reader.shown.total") == 700, "the file's Gaussians")
         browser.wait_for(lambda: browser.evaluate("splats.reader.moving?.count") == 120, "what moves")
         assert psnr(drawn(browser, NEWEST_S, state.start_ns), rendered(shown, NEWEST_S)) > 50.0
         browser.evaluate("splats.open(new File(['nothing'], 'x.ffsplats'))")
         browser.wait_for_text("x.ffsplats holds no messages")
-
-
-@pytest.mark.browser
-def test_the_page_says_what_is_wrong_and_comes_back():
-    state = bare_state()
-    page = start_page(state, "127.0.0.1", 0)
-    with Browser(page.url + "/splats/", 390, 700) as browser:
-        try:
-            publish(state, snapshot())
-            browser.wait_for_text("Gaussians,")
-        finally:
-            page.stop()
-        browser.wait_for_text("The connection broke")
-        again = start_page(state, "127.0.0.1", page.port)
-        try:
-            total = len(gaussians(900, 3))
-            publish(state, replace(snapshot(gaussians(total, 3), movers=0)), 1)
-            browser.wait_for(lambda: browser.evaluate("splats.reader.shown.total") == total, "the stream again")
-            assert "broke" not in browser.text()
-        finally:
-            again.stop()
