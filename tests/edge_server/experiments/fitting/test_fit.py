@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import freshfield as ff
-from edge_server.experiments.common.arguments import OptionError
 from edge_server.export import ExportError
 from freshfield.geometry import look_at
 from tests.edge_server.experiments.sets import write_photos
@@ -61,20 +60,3 @@ def test_what_is_no_camera_is_refused(made, camera):
         made[0].render(camera)
     with pytest.raises(ExportError, match="expected pixels"):
         made[0].render(np.eye(4), size=(0, 10**6))
-
-
-def test_arguments_that_say_nothing_are_refused(made):
-    with pytest.raises(OptionError, match="split already"):
-        ff.fit(made[0].data, holdout=2)
-    with pytest.raises(OptionError, match="expected more than 0"):
-        ff.fit(made[0].data, seconds=0.0)
-    with pytest.raises(OptionError, match="field 'nothing' is not known"):
-        ff.fit(made[0].data, field="nothing")
-
-
-def test_ctrl_c_returns_no_half_fit(made):
-    def press(row):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        ff.fit(made[0].data, seconds=0.2, field="splat", options=SMALL, progress=press)

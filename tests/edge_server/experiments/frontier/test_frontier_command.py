@@ -18,14 +18,11 @@ from edge_server.experiments.frontier.update_time import (
     mean_over_seeds,
     measure_compute,
     run_updates,
-    static_steps,
-    steps_for,
-    variants,
 )
 from edge_server.experiments.virtual import costs
 from edge_server.live.frontier import read_frontier
 from edge_server.settings import ComputeConfig
-from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
+from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS
 
 TINY = MovingScene(cameras=4, size=32)
 COMPUTE = ComputeConfig(ms_per_step=30.0, ms_per_update=10.0)
@@ -62,20 +59,6 @@ def test_the_front_is_what_nothing_beats_in_both():
     ]
     from_scratch.mark_front(rows)
     assert [row["on_front"] for row in rows] == [True, False, True, False, True]
-
-
-def test_steps_that_fit_into_an_update():
-    assert steps_for(1.0, COMPUTE) == 33
-    assert steps_for(0.001, COMPUTE) == 1
-    assert static_steps(0.02) == 5 and static_steps(0.001) == 1
-
-
-def test_layers_are_a_variant_of_fields_that_have_them():
-    found = variants(("splat", "ngp"), {"threads": 1})
-    assert [(v.field, v.layers) for v in found] == [("splat", True), ("splat", False), ("ngp", False)]
-    chosen = [TINY.scenario(1.0, v).edge for v in found[:2]]
-    assert [edge["field_options"] for edge in chosen] == [{"threads": 1, "layers": True}, {"threads": 1}]
-    assert [edge["updates"] for edge in chosen] == ["arrivals", "cycle"]
 
 
 def test_seeds_are_averaged_with_their_standard_error():
@@ -142,12 +125,3 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_sweep):
     again = (tmp_path / "results.jsonl").read_text().splitlines()
     assert again == lines, "virtual time gives the same point again"
     assert json.loads((tmp_path / "frontier.json").read_text())["updates"] == data["updates"]
-
-
-def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_sweep):
-    write_photos(tmp_path / "set", 5)
-    words = ["frontier", "--quick", "--scene", str(tmp_path / "set"), "--out", str(tmp_path / "out")]
-    assert edge_server([*words, *SMALL_WORDS]) == 0
-    said = capsys.readouterr().out
-    assert "figure 2 left out" in said and said.endswith("for this scene: update_ms: any\n")
-    assert (tmp_path / "out" / "frontier.png").exists() and not (tmp_path / "out" / "updates.png").exists()

@@ -38,12 +38,3 @@ def test_a_step_is_what_the_policy_of_its_action_gets():
     assert over and all(rewards)
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(1)
-
-
-def test_the_cameras_of_an_action_are_used_and_never_none():
-    env = make("Select")
-    env.reset(seed=1)
-    chosen = np.zeros(len(env.cameras), np.int8)
-    chosen[[2, 5]] = 1
-    assert env.step(chosen)[-1]["views"] == 2.0
-    assert env.step(np.zeros_like(chosen))[-1]["views"] == 1.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import logging
 import threading
 
 import pytest
@@ -34,13 +33,10 @@ def test_decisions_and_scores_are_json_that_keeps_its_schema(tmp_path):
         names = {m.name: m.metadata for m in make_reader(file).iter_metadata()}
     assert [(c.topic, m.log_time) for _, c, m in found] == [("/decisions", 10**9), ("/scores", 2 * 10**9)]
     assert names["session"] == {"scenario": "test"} and names["counts"] == {"messages": "2", "dropped": "0"}
-    for (schema, _, message), publication in zip(found, (PUBLICATION, None)):
-        values, kinds = json.loads(message.data), json.loads(schema.data)["properties"]
-        assert set(values) == set(kinds)
-        if publication is not None:
-            assert values == json.loads(json.dumps(dataclasses.asdict(publication)))
+    schema, _, message = found[0]
+    values, kinds = json.loads(message.data), json.loads(schema.data)["properties"]
+    assert set(values) == set(kinds) and values == json.loads(json.dumps(dataclasses.asdict(PUBLICATION)))
     assert kinds["number"] == {"type": "integer"} and kinds["selected"]["items"] == {"type": "string"}
-    assert kinds["ages_ms"] == {"type": "array", "items": {"type": "number"}}
 
 
 def test_what_finds_no_room_is_dropped_and_counted_and_nobody_waits(tmp_path, monkeypatch):
@@ -84,10 +80,9 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path, caplog):
 
     recorder._writer.frame = full  # type: ignore[method-assign]
     sent = list(requests(3))
-    with caplog.at_level(logging.ERROR):
-        for request, arrived_ns in sent:
-            recorder.frame(request, arrived_ns)
-        recorder.close()
+    for request, arrived_ns in sent:
+        recorder.frame(request, arrived_ns)
+    recorder.close()
     assert "recording ended: [Errno 28] No space left" in caplog.text
     assert recorder.status() == {"file": "a.mcap", "written": 0, "dropped": len(sent), "failed": True}
     recorder.published(PUBLICATION)
