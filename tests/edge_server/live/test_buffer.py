@@ -19,28 +19,21 @@ def test_age_is_now_minus_generation_on_the_edges_clock():
     assert buffer.ages_ms(200 * MS) == {"cam01": 120.0, "cam02": None}
 
 
-def test_a_late_older_frame_never_becomes_newest():
+@pytest.mark.parametrize(
+    ("first_ms", "then_ms", "newest_is_first"),
+    [
+        (60, 30, True),  # overtaken on its way
+        (400, 120, True),  # ahead of the edge's clock, within the tolerance
+        (1300, 120, False),  # a frame from the future gives way to any
+    ],
+)
+def test_which_of_two_frames_is_the_newest(first_ms, then_ms, newest_is_first):
     buffer = FrameBuffer(["cam01"])
-    buffer.put(frame(sequence=2, generated_ns=60 * MS), 70 * MS)
-    buffer.put(frame(sequence=1, generated_ns=30 * MS), 90 * MS)
-    assert buffer.newest()["cam01"].sequence == 2
-    assert (buffer.stale_on_arrival, buffer.arrivals) == (1, 2)
-
-
-def test_a_frame_from_the_future_gives_way_to_any():
-    buffer = FrameBuffer(["cam01"])
-    buffer.put(frame(sequence=1, generated_ns=1300 * MS), 100 * MS)
-    assert buffer.ages_ms(100 * MS) == {"cam01": -1200.0}
-    buffer.put(frame(sequence=2, generated_ns=120 * MS), 150 * MS)
-    assert buffer.newest()["cam01"].sequence == 2
-    assert buffer.ages_ms(150 * MS) == {"cam01": 30.0} and buffer.stale_on_arrival == 0
-
-
-def test_a_frame_ahead_within_the_tolerance_is_still_the_newest():
-    buffer = FrameBuffer(["cam01"])
-    buffer.put(frame(sequence=2, generated_ns=400 * MS), 150 * MS)
-    buffer.put(frame(sequence=1, generated_ns=120 * MS), 150 * MS)
-    assert buffer.newest()["cam01"].sequence == 2 and buffer.stale_on_arrival == 1
+    buffer.put(frame(sequence=2, generated_ns=first_ms * MS), 100 * MS)
+    assert buffer.ages_ms(100 * MS) == {"cam01": 100.0 - first_ms}
+    buffer.put(frame(sequence=1, generated_ns=then_ms * MS), 150 * MS)
+    assert buffer.newest()["cam01"].sequence == (2 if newest_is_first else 1)
+    assert (buffer.stale_on_arrival, buffer.arrivals) == (int(newest_is_first), 2)
 
 
 def test_wait_returns_on_arrival_and_on_timeout():

@@ -55,15 +55,6 @@ def test_depth_of_the_images_own_size_is_taken_as_it_is():
     np.testing.assert_allclose(depth_in_image(depth(counts), IMAGE, 0), counts * 0.001, rtol=1e-6)
 
 
-def test_registered_depth_of_another_size_gives_the_nearest_measurement():
-    fine = np.arange(96 * 128).reshape(96, 128)
-    found = depth_in_image(depth(fine), IMAGE, 0) / np.float32(0.001)
-    np.testing.assert_allclose(found, fine[1::2, 1::2], rtol=1e-6)
-    coarse = np.arange(24 * 32).reshape(24, 32) + 1
-    found = depth_in_image(depth(coarse), IMAGE, 0)
-    np.testing.assert_allclose(found, np.kron(coarse, np.ones((2, 2))) * 0.001, rtol=1e-6)
-
-
 def test_depth_of_a_lens_and_a_pose_of_its_own_is_moved_as_one_by_one():
     measured = depth(box_before_wall(SENSOR, BESIDE), intrinsics=SENSOR, to_camera=BESIDE)
     measured.counts[5:9, 50:60] = 0

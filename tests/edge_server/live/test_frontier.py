@@ -7,10 +7,8 @@ import json
 import pytest
 from msgspec.structs import replace
 
-from edge_server.live.frontier import best_point, open_frontier, read_frontier
+from edge_server.live.frontier import best_point, read_frontier
 from edge_server.run_records import FrontierPoint
-from edge_server.settings import read_config
-from freshfield.scenario import parse
 
 # Milliseconds an update, dB of the whole image and of what moves, meters a second.
 POINTS = [
@@ -52,19 +50,3 @@ def test_points_are_read_and_errors_say_what_to_do(tmp_path):
     (plain,), (layered,) = (read_frontier(tmp_path / "f.json", "splat", layers=known) for known in (False, True))
     assert plain.psnr_db == 25.0 and plain.mean_db == 20.0, "by what was shown"
     assert layered.psnr_db == 29.0
-
-
-def test_a_scenarios_own_frontier_is_read_beside_it_and_the_shipped_one_otherwise(tmp_path):
-    def opened(**edge):
-        data = {"cameras": {"count": 3}, "source": {"speed_m_per_s": 2.0}, "edge": {"field": "ngp", **edge}}
-        scenario = parse(data, tmp_path / "x.yaml")
-        return open_frontier(scenario, read_config(scenario))
-
-    shipped = opened()
-    assert shipped.points and shipped.about.startswith("the shipped frontier.json, of room, at ")
-    assert shipped.speed_m_per_s == 2.0 and len({p.speed_m_per_s for p in shipped.points}) == 1
-    with pytest.raises(ValueError, match=r"mine\.json"):
-        opened(frontier="mine.json")
-    row = {"field": "ngp", "options": {}, "speed_m_per_s": 1.0, "update_s": 0.1}
-    (tmp_path / "mine.json").write_text(json.dumps({"updates": [row | {"psnr_db": 30.0, "psnr_moving_db": 20.0}]}))
-    assert opened(frontier="mine.json").about == "mine.json, at 1 m/s, as published"

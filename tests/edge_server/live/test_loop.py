@@ -26,20 +26,6 @@ def updates(policy="all", value=None, cameras=("cam01", "cam02")) -> FieldUpdate
     return FieldUpdater(FrameBuffer(cameras), made, tiny_field(), start_ns=0)
 
 
-def test_an_update_in_virtual_time_is_charged_to_the_ages():
-    u = updates()
-    u.buffer.put(frame("cam01", generated_ns=100 * MS), 120 * MS)
-    u.buffer.put(frame("cam02", generated_ns=140 * MS), 150 * MS)
-    selection = u.select(u.plan(200 * MS), 200 * MS)
-    views, report = u.fit(selection, Budget(steps=2))
-    done = u.publication(selection, views, report, published_ns=500 * MS)
-    assert done.selected == ("cam01", "cam02")
-    # Fitting took 300 ms of virtual time, and the scene aged with it.
-    assert done.ages_ms == (400.0, 360.0)
-    assert (done.aaoi_ms, done.update_ms, done.t_s, done.steps) == (380.0, 300.0, 0.5, 2)
-    assert u.number == 1
-
-
 def test_on_arrivals_nothing_is_selected_twice_and_a_field_that_wants_it_gets_every_frame():
     made = make_policy("all", None, np.random.default_rng(0))
     field = tiny_field()
@@ -106,11 +92,6 @@ def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
     views, _ = u.fit(u.select(u.plan(61 * MS), 61 * MS, Budget(seconds=1e-3)), Budget(seconds=1e-3))
     assert len(decoded) == 18 and u.buffer.shed == 6  # and are taken although nothing has arrived since
     assert u.select(u.plan(62 * MS), 62 * MS, Budget(seconds=1e-3)) is None
-    u.on_arrivals = False
-    u.field.frame_s = None  # it wants the newest only, from now on
-    views, _ = u.fit(u.select(u.plan(70 * MS), 70 * MS, Budget(seconds=1e-3)), Budget(seconds=1e-3))
-    assert len(views) == 8
-    assert u.buffer._unselected is None
 
 
 class Running:

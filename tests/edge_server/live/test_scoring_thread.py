@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import time
 import weakref
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from edge_server.fidelity.scorer import Score, Scorer
-from edge_server.fidelity.so_far import MOST
 from edge_server.fields import Rendering, View
 from edge_server.live import scoring_thread
 from edge_server.live.scoring_thread import ScoringThread
@@ -95,20 +93,6 @@ def test_a_thread_that_falls_behind_keeps_no_snapshots() -> None:
     assert len(alive) == scoring_thread._WAITING_PUBLICATIONS
 
 
-def test_an_instant_whose_publication_went_by_unseen_is_not_scored(monkeypatch: Any) -> None:
-    shown: list[tuple[Score, Publication]] = []
-    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *of: shown.append(of))
-    monkeypatch.setattr(thread, "_affordable", lambda *_: True)
-    for k, at_ms in enumerate((10, 110, 120, 130)):  # that of 110 finds no room
-        thread.published(_publication(k, at_ms * MS), Brightness(at_ms * MS), [])
-    thread._score_later(_publication(0, 10 * MS), Brightness(10 * MS), [])
-    for k, at_ms in enumerate((50, 100, 115)):
-        thread._held_out["cam00"].take(frame := _frame(k, at_ms * MS))
-        thread._next_shown_ns["cam00"] = 0
-        thread._score_shown(frame)
-    assert [score.published_ns // MS for score, _ in shown] == [100]
-
-
 def test_what_is_shown_is_scored_as_often_as_its_share_affords_and_before_publications(monkeypatch: Any) -> None:
     monkeypatch.setattr(scoring_thread, "_SHOWN_SHARE", 0.5)
     scored: list[Publication] = []
@@ -131,32 +115,11 @@ def test_a_metric_that_cannot_be_loaded_costs_its_own_scores_alone(caplog: pytes
 
 
 def test_where_nothing_is_held_out_the_mean_color_is_that_of_the_views() -> None:
-    told: list[Publication] = []
-    thread = ScoringThread([], Scorer(), lambda of, *_: told.append(of), lambda *_: None)
+    told: list[tuple[Publication, bool]] = []
+    thread = ScoringThread([], Scorer(), lambda of, _, final: told.append((of, final)), lambda *_: None)
     images = [np.full((32, 32, 3), level, np.uint8) for level in (102, 153)]  # 0.4 and 0.6: 0.1 from their mean
     views = [View(f"cam{k}", image, np.eye(4), LENS) for k, image in enumerate(images)]
     thread._score_selected(_publication(3, 500 * MS), Brightness(500 * MS), views)
-    assert len(told) == 1 and thread.baselines.mean.nearest_view_db is None
-    np.testing.assert_allclose([told[0].psnr_db, thread.baselines.mean.mean_color_db], 20.0, atol=1e-3)
-
-
-def test_of_a_held_out_camera_that_moves_the_newest_frame_and_all_so_far_are_told_apart() -> None:
-    """The field knows how bright it is at half a second, and shows that everywhere."""
-    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
-    assert thread.so_far is None
-    for k in range(100):
-        pose = Pose((1.0, 0.0, 0.0, 0.0), (0.01 * k, 0.0, 0.0))
-        thread._held_out["cam00"].take(replace(_frame(k, 5 * k * MS), pose=pose))
-    thread._held_out["cam00"].take(replace(_frame(100, 500 * MS), payload=b"damaged"))
-    snapshot = Brightness(500 * MS)
-    thread._recent.append((_publication(0, 0), snapshot))
-    thread._look_back()  # the newest is damaged
-    thread._look_back()
-    assert thread.so_far is not None and thread.so_far.frames == 3  # two in turn, and the newest
-    thread._look_back(whole=True)
-    found = thread.so_far
-    assert MOST // 2 <= found.frames <= MOST and not found.refined  # spread over the run, the damaged one forgotten
-    assert found.now_psnr_db > 35.0 and 8.0 < found.all_psnr_db < 20.0
-    assert (
-        found.words() == f"now {found.now_psnr_db:.2f} dB, all {found.frames} frames so far {found.all_psnr_db:.2f} dB"
-    )
+    ((scored, final),) = told
+    assert final and thread.baselines.mean.nearest_view_db is None
+    np.testing.assert_allclose([scored.psnr_db, thread.baselines.mean.mean_color_db], 20.0, atol=1e-3)

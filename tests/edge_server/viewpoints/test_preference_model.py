@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from edge_server.viewpoints.candidates import half_hemisphere
-from edge_server.viewpoints.experts import TASTES, SimulatedExpert, judge
+from edge_server.viewpoints.experts import SimulatedExpert
 from edge_server.viewpoints.features import GEOMETRY, StepFeatures
 from edge_server.viewpoints.preference_model import Answer, fit_reward, next_pair
 from freshfield.geometry import Pinhole
@@ -81,19 +80,6 @@ def test_the_posterior_is_that_of_the_likelihood():
     differences = (features[first] - features[second]) / model.scale
     exact = best[1] @ (1 / (1 + np.exp(-w @ differences.T)))
     np.testing.assert_allclose(model.probability(features, first, second), exact, atol=0.08)
-
-
-@pytest.mark.parametrize("taste", TASTES)
-def test_tastes_prefer_the_better_picture_each_by_its_own_measure(taste):
-    rng = np.random.default_rng(0)
-    truth = np.full((32, 32, 3), 0.8, np.float32)
-    truth[8:24, 8:24] = rng.random((16, 16, 3))
-    inside, outside = truth.copy(), truth.copy()
-    inside[10:22, 10:22] += 0.2
-    outside[:6] -= 0.3
-    scores = {name: judge(taste, [p], [truth]) for name, p in (("same", truth), ("in", inside), ("out", outside))}
-    assert scores["same"] == 0.0 >= max(scores.values())
-    assert scores["in"] < 0.0 and (scores["out"] == 0.0) == (taste == "object")
 
 
 def test_features_of_a_trajectory_are_those_of_its_steps():

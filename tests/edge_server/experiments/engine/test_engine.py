@@ -49,26 +49,18 @@ def test_processes_compute_the_same_bit_for_bit(serial):
     assert repr(run(Engine(jobs=2), group=lambda p: p.scene, batch=3)) == repr(serial)
 
 
-@pytest.fixture(scope="module")
-def cluster():
-    """A Ray cluster of two nodes, each of one core."""
+@pytest.mark.slow
+@pytest.mark.alone
+def test_two_ray_nodes_compute_the_same_bit_for_bit_though_workers_are_lost(serial, tmp_path, request):
     ray = pytest.importorskip("ray", reason="needs Ray: pip install 'freshfield[cluster]'")
     from ray.cluster_utils import Cluster
 
-    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-    nodes.add_node(num_cpus=1)
-    yield nodes
-    ray.shutdown()
-    nodes.shutdown()
-
-
-@pytest.mark.slow
-@pytest.mark.alone
-def test_two_ray_nodes_compute_the_same_bit_for_bit_though_workers_are_lost(serial, cluster, tmp_path):
-    engine, work = (
-        Engine(tmp_path / "r.jsonl", ray=cluster.address, say=quiet),
-        partial(measure_on_ray, folder=tmp_path),
-    )
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    request.addfinalizer(cluster.shutdown)
+    request.addfinalizer(ray.shutdown)
+    cluster.add_node(num_cpus=1)
+    engine = Engine(tmp_path / "r.jsonl", ray=cluster.address, say=quiet)
+    work = partial(measure_on_ray, folder=tmp_path)
     assert repr(engine.run(work, POINTS, group=lambda p: p.scene, batch=1)) == repr(serial)
     calls = [path.name.split("-")[1:] for path in tmp_path.glob("call-*")]
     assert sorted(seed for seed, *_ in calls) == sorted([*"01233"] * 2), "each once, and those that ended their worker"
@@ -95,14 +87,6 @@ def test_what_is_known_is_not_computed_again_and_one_key_is_computed_once(tmp_pa
     assert line["inputs"] == {"seed": 0, "size": 100, "scene": "room"} and line["result"] == os.getpid()
 
 
-def test_a_group_stays_in_one_process_in_turn(tmp_path):
-    processes = run(Engine(jobs=2), partial(note, folder=tmp_path), group=lambda p: p.scene, batch=4)
-    assert len(set(processes[:4])) == len(set(processes[4:])) == 1
-    order = [path.stem.split("-")[1:] for path in sorted(tmp_path.iterdir())]
-    for scene in ("room", "tower"):
-        assert [seed for where, seed in order if where == scene] == ["0", "1", "2", "3"]
-
-
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_after_an_error_the_file_has_what_was_finished(jobs, tmp_path):
     engine = Engine(tmp_path / "r.jsonl", jobs=jobs)
@@ -126,11 +110,8 @@ Engine(folder / "r.jsonl", jobs=2).run(partial(sleep, folder=folder), [Point(see
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_however_it_ends_its_processes_end_too_and_what_was_finished_is_kept(how, tmp_path):
-    script = tmp_path / "parent.py"
-    script.write_text(PARENT)
-    parent = subprocess.Popen(
-        [sys.executable, str(script), str(tmp_path)], stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+    words = [sys.executable, "-c", PARENT, str(tmp_path)]
+    parent = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
     def workers() -> list[int]:
         return [int(path.name.split("-")[2]) for path in tmp_path.glob("started-[12]-*")]

@@ -36,23 +36,6 @@ def test_what_was_saved_loads_and_renders_the_same(made):
     assert fit.psnr.shape == (len(fit.rows), 2) and fit.psnr[-1, 0] == pytest.approx(1.0, rel=0.3)
 
 
-def test_a_held_out_camera_is_rendered_through_its_own_lens(made):
-    fit, _ = made
-    view = fit.data.held_out[1]
-    np.testing.assert_array_equal(fit.render(view.camera), fit.field.render(fit.pose(view), view.intrinsics).color)
-    assert fit.render(view.camera, size=(16, 16)).shape == (16, 16, 3)
-
-
-def test_it_is_exported_by_its_ending(made, tmp_path):
-    fit, _ = made
-    fit.export(tmp_path / "s.ply")
-    fit.export(tmp_path / "p.ply", "points")
-    assert b"f_dc_0" in (tmp_path / "s.ply").read_bytes()[:2000]
-    assert b"f_dc_0" not in (tmp_path / "p.ply").read_bytes()[:2000]
-    with pytest.raises(ExportError, match=r"\.obj: expected a file that ends in \.ply"):
-        fit.export(tmp_path / "s.obj")
-
-
 @pytest.mark.stability
 @pytest.mark.parametrize("camera", ["nobody", np.eye(3), np.full((4, 4), np.nan)])
 def test_what_is_no_camera_is_refused(made, camera):

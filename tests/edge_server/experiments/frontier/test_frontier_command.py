@@ -50,13 +50,8 @@ def test_a_cycle_is_charged_a_frame_of_each_camera_and_layers_every_frame(layers
 
 
 def test_the_front_is_what_nothing_beats_in_both():
-    rows = [
-        {"planned_s": 1.0, "psnr_db": 20.0},
-        {"planned_s": 2.0, "psnr_db": 19.0},
-        {"planned_s": 2.0, "psnr_db": 25.0},
-        {"planned_s": 3.0, "psnr_db": 25.0},
-        {"planned_s": 4.0, "psnr_db": 26.0},
-    ]
+    points = [(1.0, 20.0), (2.0, 19.0), (2.0, 25.0), (3.0, 25.0), (4.0, 26.0)]
+    rows = [{"planned_s": planned_s, "psnr_db": psnr_db} for planned_s, psnr_db in points]
     from_scratch.mark_front(rows)
     assert [row["on_front"] for row in rows] == [True, False, True, False, True]
 
@@ -73,14 +68,8 @@ def test_seeds_are_averaged_with_their_standard_error():
 
 def test_the_last_line_recommends_an_update_time_at_a_persons_speed():
     def row(speed, update_s, whole, moving):
-        return {
-            "field": "ngp",
-            "options": {},
-            "speed_m_per_s": speed,
-            "update_s": update_s,
-            "shown_psnr_db": whole,
-            "shown_psnr_moving_db": moving,
-        }
+        shown = {"shown_psnr_db": whole, "shown_psnr_moving_db": moving}
+        return {"field": "ngp", "options": {}, "speed_m_per_s": speed, "update_s": update_s, **shown}
 
     rows = [row(1.0, 0.1, 20, 18), row(1.0, 0.4, 22, 17), row(1.0, 2.0, 23, 15), row(3.0, 0.05, 30, 30)]
     assert recommendation(rows) == "for this scene: update_ms: 400"

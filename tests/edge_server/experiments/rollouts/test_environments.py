@@ -19,10 +19,9 @@ def make(name: str, **more):
     return gymnasium.make(f"freshfield/{name}-v0", scenario="room", **{**SMALL, **more}).unwrapped
 
 
-@pytest.mark.parametrize("name", ["Select", "Wait"])
-def test_gymnasiums_checker_finds_nothing(name):
+def test_gymnasiums_checker_finds_nothing():
     gymnasium.register_envs(freshfield.gym)
-    check_env(make(name), skip_render_check=True)
+    check_env(make("Select"), skip_render_check=True)
 
 
 def test_a_step_is_what_the_policy_of_its_action_gets():

@@ -14,7 +14,6 @@ from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fields.registry import make_field
-from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
@@ -89,17 +88,6 @@ def test_every_action_starts_from_the_same_field_whatever_was_evaluated_before(s
     backwards = [fresh.evaluate(*a) for a in reversed(asked)][::-1]
     assert forwards == backwards
     assert len({o["cam00"].psnr_db for o in forwards}) == len(forwards)
-
-
-def test_a_learned_policy_that_waits_for_a_first_frame_sees_the_state_of_that_instant():
-    factory = EpisodeFactory(setting({"preset": "ch5", "faults": {"blackout": {"windows_ms": [[0, 1500]]}}}), NOTHING)
-    learner = Learner(Spec("select", StateLayout(("age",)), hidden=8), seed=4)
-    policy = BanditPolicy(learner.actor, "learned", np.random.default_rng(0))
-    episode = factory.episode(2)
-    assert not episode.points[0].state.reported.any()
-    choice = choose(policy, episode, 0)
-    assert choice.cameras and choice.at_ns > episode.points[0].now_ns
-    assert policy.last_decision is not None and policy.last_decision.state.reported.sum() == len(choice.cameras)
 
 
 def test_seeds_of_two_purposes_or_runs_never_meet():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,11 @@ import pytest
 
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
-from edge_server.experiments.studies import learning
 from edge_server.experiments.studies.learned_schedulers import LEFT_OUT, WEIGHTED, WHICH_VIEWS
 from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT, TRAININGS
 from edge_server.experiments.studies.registry import LEARNING, STUDIES
-from edge_server.experiments.studies.study import StudyRequest, judge, run_study
+from edge_server.experiments.studies.study import StudyRequest, judge
 from edge_server.experiments.training.evaluation import BASELINE_POLICIES
-from tests.edge_server.experiments.rollouts.small import FIELD
 from tests.edge_server.experiments.studies.invented import answers
 
 FIXED = {"random": 0.0, "all": 0.5, "threshold:40": 0.4, "threshold:80": 0.6, "wait:0": 0.4, "wait:60": 0.6}
@@ -81,42 +78,3 @@ def test_claims_hold_if_and_only_if_what_was_learned_is_better(gain: float, said
     ):
         found = judge(STUDIES[name], table_of({**FIXED, **levels}, judged_by="moving"))
         assert answers(found, claim) == {said}, name
-
-
-def test_the_spread_of_repeated_trainings_is_part_of_an_interval():
-    """The mean gain is the same, and hardly differs between seeds; another training may come to anything."""
-    study = STUDIES["drift"]
-    alike = table_of({**FIXED, "learned before": 3.0, "learned afterwards": 3.2})
-    assert answers(judge(study, alike), "on the new channel") == {"holds"}
-    spread = {0: 0.7, 1: 0.2, 2: -0.3}
-    unlike = [
-        {**row, "reward": row["reward"] - 0.2 + spread[row["training"]]}
-        if row["policy"] == "learned afterwards"
-        else row
-        for row in alike.rows
-    ]
-    assert answers(judge(study, SeedTable(unlike)), "on the new channel") == {"undecided"}
-
-
-@pytest.mark.slow  # trainings and fits of some seconds
-def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(tmp_path: Path, monkeypatch):
-    name = "ppo-select"
-    usual = learning.Setting
-    small = {"steps": 3, "decisions": 1, "lead_ms": 1000.0, "span_ms": 400.0}
-    monkeypatch.setattr(learning, "Setting", lambda *a, **more: usual(*a, **{**more, **small}))
-    monkeypatch.setattr(learning, "SIZE", 24)
-    monkeypatch.setitem(learning.QUICK_FIELDS, "splat", FIELD)
-    monkeypatch.setitem(learning.TRAININGS, True, 2)
-    (tmp_path / "no weights").mkdir()  # images of 24 pixels are too small for LPIPS
-    request = StudyRequest(
-        True, tmp_path, Folders(lpips=tmp_path / "no weights"), seeds=2, cases=("priced",), episodes=3
-    )
-    first = run_study(STUDIES[name], request)
-    assert first and all(v.line() for v in first)
-    rows = list(csv.DictReader((tmp_path / f"{name}.csv").open()))
-    assert {row["training"] for row in rows} == {"", "0", "1"} and all(row["reward"] for row in rows)
-    assert {row["judged_from"] for row in rows} == {"elsewhere", "where it is rewarded"}
-    assert list(tmp_path.glob(f"{name}*.png"))
-    known = (tmp_path / f"results/{name}.jsonl").read_bytes()
-    assert run_study(STUDIES[name], request) == first
-    assert (tmp_path / f"results/{name}.jsonl").read_bytes() == known

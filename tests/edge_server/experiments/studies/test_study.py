@@ -93,14 +93,6 @@ def test_verdicts_are_corrected_for_their_number():
     assert [v.verdict for v in judge(study, SeedTable(rows[:2]))] == ["holds", "holds"]
 
 
-def test_a_claim_of_several_differences_is_as_sure_as_its_weakest_part():
-    sure, weak, below = Interval(1.0, 0.9, 1.1, 10), Interval(1.0, 0.1, 1.9, 10), Interval(-1.0, -1.9, -0.1, 10)
-    assert Finding("", (sure, weak)).above(0.0) is True
-    assert Finding("", (sure, weak)).p_value(0.0) == weak.p_value(0.0) > sure.p_value(0.0)
-    assert Finding("", (sure, below)).above(0.0) is False
-    assert Finding("", (sure, below)).p_value(0.0) == 2 * below.p_value(0.0)
-
-
 def test_a_study_writes_rows_verdicts_and_a_page(tmp_path: Path):
     assert main(["metrics", "--quick", "--seeds", "2", "--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "metrics.json").read_text())

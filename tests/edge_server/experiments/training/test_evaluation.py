@@ -64,12 +64,3 @@ def test_a_seed_that_lacks_a_value_is_not_counted_and_a_decision_that_nobody_has
     mine = table_of(found).values("reward", policy="learned")
     expected = [fit["cam00"].psnr_db for n in (0, 2, 3) for fit in found.fits[-1][3, n]]
     assert mine[3] == pytest.approx(np.mean(expected)) and mine[4] is None and mine[5] == whole[5]
-
-
-def test_the_best_fixed_value_is_chosen_on_seeds_that_it_is_not_measured_on():
-    rows = [
-        {"policy": "threshold", "value": value, "seed": s, "reward": 10.0 * (s % 2 == k)}
-        for k, value in enumerate((1.0, 2.0))
-        for s in range(6)
-    ]
-    assert SeedTable(rows).best_runs("reward", False, "value", policy="threshold") == [dict.fromkeys(range(6), 0.0)]

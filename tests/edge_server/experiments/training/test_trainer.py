@@ -23,7 +23,7 @@ from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
-from tests.edge_server.experiments.rollouts.small import NOTHING, RAW, scenario, setting, thresholds
+from tests.edge_server.experiments.rollouts.small import NOTHING, RAW, setting, thresholds
 
 REWARD = make_reward("set", distance=0.0)
 CONFIG = TrainingConfig(Spec("select", StateLayout(("age", "pose")), hidden=16), REWARD, episodes=6, batch=2)
@@ -39,13 +39,6 @@ def quiet(line: str) -> None:
 
 def trained(out: Path, of: Setting | None = None, config: TrainingConfig = CONFIG, say=quiet) -> Learner:
     return train(of or setting(), config, NOTHING, 1, out, say)
-
-
-def command_line(folder: Path, words: str, raw: dict = RAW) -> tuple[list[str], Path]:
-    """The words of a training of a small scenario, and its --out."""
-    (folder / "small.yaml").write_text(yaml.safe_dump(raw))
-    out = folder / "out"
-    return [str(folder / "small.yaml"), *words.split(), "--jobs", "1", "--out", str(out)], out
 
 
 def test_a_stopped_training_continues_bit_for_bit(tmp_path: Path):
@@ -149,8 +142,10 @@ def test_a_reward_that_cannot_be_had_is_refused_after_the_first_batch(tmp_path):
 
 
 def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, capsys):
-    asked = "--kind threshold --omegas 50,200 --episodes 2 --batch 1 --decisions 1 --fit-steps 2 --size 24"
-    words, out = command_line(tmp_path, asked)
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(RAW))
+    asked = "--kind threshold --omegas 50,200 --episodes 2 --batch 1 --decisions 1 --fit-steps 2 --size 24 --jobs 1"
+    out = tmp_path / "out"
+    words = [str(tmp_path / "small.yaml"), *asked.split(), "--out", str(out)]
     assert main(words) == 0
     text = capsys.readouterr().out
     assert "2/2 episodes" in text and "rewarded from cam00\n" in text
@@ -166,49 +161,15 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     assert (out / "policy.npz").exists()
 
 
-SELECT = Spec("select", StateLayout(("age", "pose")), hidden=8)
-WAIT = Spec("wait", StateLayout(("age",)), (0.0, 50.0, 150.0), hidden=8)
-NEVER = {"faults": {"loss": {"probability": 1.0}}}
-
-
-def config(spec: Spec = SELECT, reward: Reward = REWARD, **more) -> TrainingConfig:
-    return TrainingConfig(spec, reward, **{"episodes": 6, "batch": 3, **more})
-
-
-def weights_after(what: Setting, taught: TrainingConfig, out: Path) -> dict[str, np.ndarray]:
-    found = train(what, taught, NOTHING, 1, out, lambda line: None).actor.weights
-    assert all(np.isfinite(w).all() for w in found.values())
-    return found
-
-
-@pytest.mark.stability
-@pytest.mark.parametrize(("spec", "scratch"), [(SELECT, True), (WAIT, False)], ids=["select", "wait, warm"])
-def test_where_nothing_ever_arrives_training_says_so_instead_of_learning_nothing(spec, scratch, tmp_path):
-    silent = setting(NEVER, scratch=scratch)
-    with pytest.raises(TrainingError, match="nothing had arrived"):
-        weights_after(silent, config(spec), tmp_path)
-    assert not (tmp_path / "policy.npz").exists()
-    candidates = [*fixed_candidates([], ("random",)), *thresholds(50.0)]
-    found = evaluate(silent, NOTHING, Engine(threads=1, say=lambda line: None), seeds(0, "test", 2), candidates)
-    assert all(row["reward"] is None for row in found.rows(REWARD, ["cam00"]))
-
-
 @pytest.mark.stability
 def test_a_still_scene_has_no_moving_pixels_and_training_says_so(tmp_path):
     still = setting()
     source = {**still.scenario.source, "speed_m_per_s": 0.0}
     still = dataclasses.replace(still, scenario=dataclasses.replace(still.scenario, source=source))
     with pytest.raises(TrainingError, match=r"psnr_moving: nothing moves.*--on whole"):
-        weights_after(still, config(reward=make_reward("set", fidelity="moving", distance=0.0)), tmp_path)
-    weights_after(still, config(), tmp_path / "whole")
+        trained(
+            tmp_path, still, dataclasses.replace(CONFIG, reward=make_reward("set", fidelity="moving", distance=0.0))
+        )
+    learner = trained(tmp_path / "whole", still)
+    assert all(np.isfinite(w).all() for w in learner.actor.weights.values())
     assert all(row["reward"] is not None for row in read_log(tmp_path / "whole"))
-
-
-@pytest.mark.stability
-def test_one_camera_that_reports_and_one_that_rewards(tmp_path):
-    alone = Setting(
-        scenario(cameras={"count": 2, "held_out": ["cam00"]}), steps=3, decisions=2, lead_ms=800.0, span_ms=400.0
-    )
-    weights_after(alone, config(samples=2), tmp_path)
-    # There is one set, so that no try is better than another.
-    assert all(row["views"] == 1.0 for row in read_log(tmp_path))

@@ -1,10 +1,8 @@
 from __future__ import annotations
 
-import itertools
 import json
-from dataclasses import replace
 
-from edge_server.live.output.journal import LINE_EVERY_S, Journal
+from edge_server.live.output.journal import Journal
 from edge_server.live.state import Publication
 from tests.freshfield.test_files import no_file_longer_than
 
@@ -62,17 +60,3 @@ def test_a_full_disk_costs_lines_not_the_edge(tmp_path, caplog):
     journal.close()  # there is space again
     assert json.loads((tmp_path / "edge.json").read_text())["lines_lost"] == 57
     assert len(lines(tmp_path / "series.jsonl")) == 31
-
-
-def test_of_many_updates_a_second_those_without_scores_have_a_line_now_and_then(tmp_path):
-    journal = Journal(tmp_path, dict)
-    for i in range(300):
-        journal.published(replace(publication(i), t_s=i / 50))
-        if i % 7 == 0:
-            journal.scored(replace(publication(i, 20.0), t_s=i / 50), final=True)
-    journal.close()
-    series = lines(tmp_path / "series.jsonl")
-    assert [s["number"] for s in series if s["psnr_db"] is not None] == list(range(0, 300, 7))
-    assert all(a["t_s"] < b["t_s"] for a, b in itertools.pairwise(series))
-    apart_s = [round(b["t_s"] - a["t_s"], 6) for a, b in itertools.pairwise(series) if b["psnr_db"] is None]
-    assert apart_s and min(apart_s) >= LINE_EVERY_S

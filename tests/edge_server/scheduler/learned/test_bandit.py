@@ -106,19 +106,6 @@ def updates(p, embedder=None):
     return made
 
 
-def test_the_loop_shows_a_policy_the_state_of_its_buffer():
-    p = policy("select", parts=("age", "semantics"), dim=1)
-    u = updates(p, Brightness())
-    selection = u.select(u.plan(60 * MS), 60 * MS)
-    assert selection is not None and p.last_decision is not None
-    s = p.last_decision.state
-    np.testing.assert_array_equal(s.ages_ms, [60, np.nan, 50])
-    assert s.embeddings is not None and np.isnan(s.embeddings[1]).all()
-    assert 40 < s.embeddings[0, 0] < s.embeddings[2, 0] < 100  # frames grow brighter with their number
-    assert list(s.frames) == ["a", "c"]
-    assert s.cameras == ("a", "b", "c")
-
-
 def test_a_policy_is_refused_where_there_are_no_embeddings_or_others_than_it_was_taught_with():
     p = policy("select", parts=("semantics",), dim=1)
     u = updates(make_policy("all", None, np.random.default_rng(0)))

@@ -68,14 +68,6 @@ def test_a_run_that_begins_anew_in_the_same_folder_forgets_the_earlier_one(tmp_p
     assert read_decision(tmp_path).decision.number == 1
 
 
-def test_what_cannot_be_written_is_counted(tmp_path):
-    (tmp_path / FOLDER).write_text("a file where the folder should be")
-    record = DecisionWriter(tmp_path)
-    record.write(a_decision(0))
-    record.write(a_decision(1))
-    assert record.lost == 2
-
-
 def test_a_decision_that_is_held_is_that_of_later_updates_too(tmp_path):
     record = DecisionWriter(tmp_path)
     for number in (5, 9):

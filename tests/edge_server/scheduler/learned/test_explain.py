@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.scheduler.learned.explain import action_logit, explain, occlusion_map
+from edge_server.scheduler.learned.explain import action_logit, explain
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
@@ -51,20 +51,3 @@ def test_cameras_of_two_are_exact():
     only = np.stack([np.stack([x[0], usual[1]]), np.stack([usual[0], x[1]]), usual, x])
     a, b, none, both = action_logit(actor, only, chosen)
     np.testing.assert_allclose(found.cameras, [0.5 * (a - none + both - b), 0.5 * (b - none + both - a)])
-
-
-def brightness(images):
-    """Embeds a picture by how bright each color is on the whole: what a region adds is known."""
-    return np.array([image.mean(axis=(0, 1)) / 64.0 for image in images], np.float32)
-
-
-def test_the_region_that_differs_is_the_one_that_moved_it():
-    actor, s = untaught("wait"), state(4, np.random.default_rng(3), d=3)
-    image = np.full((48, 64, 3), 114, np.uint8)
-    image[30:36, 16:24] = 255  # row 5, column 2 of eight by eight
-    z = s.embeddings.copy()
-    z[1] = brightness([image])[0]
-    s = replace(s, embeddings=z)
-    found = occlusion_map(actor, s, actor.act([s])[0][0], 1, image, brightness)
-    assert np.unravel_index(np.abs(found).argmax(), found.shape) == (5, 2)
-    assert np.abs(np.delete(found.ravel(), 5 * 8 + 2)).max() == 0.0

@@ -63,21 +63,6 @@ def test_numpy_and_torch_compute_the_same(spec):
     np.testing.assert_allclose(networks.logits(np, spec, weights, x), found, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        ({"action": "skip"}, "choose one of select"),
-        ({"action": "select", "omegas_ms": (0.0,)}, "all but select need"),
-        ({"action": "wait", "omegas_ms": (50.0, 0.0)}, "rising"),
-        ({"action": "wait", "omegas_ms": (0.0, 1.0, 1e308)}, "from 0 to 3600000"),
-        ({"action": "select", "learning_rate": float("nan")}, "positive"),
-    ],
-)
-def test_what_cannot_be_learned_is_refused(words, says):
-    with pytest.raises(ValueError, match=says):
-        Spec(**words)
-
-
 def test_a_specification_survives_json():
     layout = StateLayout(("age", "semantics"), dim=2, center=(0.1, 0.2), spread=(1.0, 3.0))
     spec = Spec("threshold", layout, OMEGAS_MS, learning_rate=1e-4)

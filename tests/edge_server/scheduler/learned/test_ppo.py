@@ -98,6 +98,9 @@ LARGE = {"hidden": {"hidden": 30_000}, "dim": {"layout": {"parts": ["age", "sema
 WRONG = {
     "hidden is text": {"hidden": "64"},
     "minibatch is no whole number": {"minibatch": 1.5},
+    "omegas fall": {"action": "wait", "omegas_ms": [50.0, 0.0]},
+    "waits too long": {"action": "wait", "omegas_ms": [0.0, 1e308]},
+    "learning rate is no number": {"learning_rate": float("nan")},
     "center is infinite": {"layout": {"parts": ["semantics"], "dim": 1, "center": [np.inf], "spread": [1.0]}},
 }
 
