@@ -84,6 +84,7 @@ def test_a_lens_with_distortion_takes_in_only_what_it_sees():
     assert outside.any()
     found = depth_in_image(depth(np.where(outside, 500, 2000), intrinsics=wide), lens, 0)
     assert not (found == np.float32(0.5)).any() and (found == np.float32(2.0)).mean() > 0.5
+    assert module._reach(IMAGE) == pytest.approx(np.hypot(32.0 / IMAGE.fx, 24.0 / IMAGE.fy))
 
 
 @pytest.mark.stability

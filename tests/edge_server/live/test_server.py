@@ -24,8 +24,9 @@ from edge_server.fields.registry import make_field
 from edge_server.fields.splat.scan.carried_field import CarriedField
 from edge_server.live.loop import STOP_S, UpdateLoop
 from edge_server.live.server import EdgeServer, ServerOptions
+from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.decision_record import read_decision
-from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.networks import init_actor
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from edge_server.settings import SCAN, read_config
@@ -346,7 +347,8 @@ def test_a_learned_policy_decides_by_what_cameras_see_and_its_decisions_are_kept
     detector(tmp_path / "d.onnx")
     made = {}
     for dim in (2, CHANNELS):
-        Learner(Spec("select", StateLayout(("age", "semantics"), dim=dim)), 1).save(tmp_path / f"{dim}.npz")
+        spec = Spec("select", StateLayout(("age", "semantics"), dim=dim))
+        Actor(spec, init_actor(spec, np.random.default_rng(1))).save(tmp_path / f"{dim}.npz")
         edge = {"policy": {"name": f"bandit:{dim}.npz"}, "embedding": {"model": "d.onnx", "dim": CHANNELS}}
         made[dim] = tiny_scenario(tmp_path, **edge)
     with pytest.raises(scenario.ScenarioError, match="of 2 numbers"):

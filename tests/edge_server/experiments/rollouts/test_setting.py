@@ -32,17 +32,15 @@ def test_the_camera_that_reports_neither_rewards_nor_is_trained_on():
 
 def test_every_episode_has_a_motion_of_its_own_and_its_cameras_see_the_same_one():
     factory = EpisodeFactory(setting(motions=True), NOTHING)
-    images = {}
-    for seed in (1, 2, 2_000_001):
+    images = set()
+    for seed in (1, 2_000_001):  # of training and of testing
         stage = factory.stage(seed)
         params = {"count": 5, "width": 24, "height": 24, "supersample": 1, "speed_m_per_s": 2.0}
         scene = make_scene("room", {**params, "motion_seed": seed})
-        images[seed] = stage.truth.view("cam00", 10**9)[0]
-        assert np.array_equal(images[seed], scene.render("cam00", 1.0))
-        source = stage.cameras[0].source
-        assert np.array_equal(source.scene.render("cam01", 1.0), scene.render("cam01", 1.0))
-    assert len({image.tobytes() for image in images.values()}) == 3
-    # What it was: one walk for all seeds, of training and of testing.
+        images.add((image := stage.truth.view("cam00", 10**9)[0]).tobytes())
+        assert np.array_equal(image, scene.render("cam00", 1.0))
+        assert np.array_equal(stage.cameras[0].source.scene.render("cam01", 1.0), scene.render("cam01", 1.0))
+    assert len(images) == 2
     same = EpisodeFactory(setting(motions=False), NOTHING)
     assert same.stage(1) is same.stage(2_000_001)
 

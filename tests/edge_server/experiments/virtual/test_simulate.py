@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import yaml
 
-import freshfield as ff
 from edge_server.experiments.virtual import costs
 from edge_server.experiments.virtual.costs import fitted
 from edge_server.experiments.virtual.costs import main as costs_main
@@ -19,7 +18,6 @@ from edge_server.experiments.virtual.from_scenario import build_deployment, trai
 from edge_server.experiments.virtual.simulate import main
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.report.build_report import build_report
-from edge_server.scheduler.fixed import FreshestK
 from edge_server.scheduler.learned.decision_record import read_decision
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.settings import Spec
@@ -127,18 +125,6 @@ def test_cameras_that_are_seen_to_move_become_a_scan_and_the_reason_is_said(tmp_
     found = json.loads(capsys.readouterr().out)
     assert re.fullmatch(r"splat as a scan, updated in a cycle for 80 ms: cam0[123] moves", found["chosen"])
     assert found["steps"] == 8
-
-
-def test_a_policy_is_tried_by_name_or_as_an_object_as_the_command_runs_it(tmp_path: Path, capsys):
-    path = write(tmp_path)
-    expected = run(path, capsys, "--policy", "freshest-k:2", "--seed", "9")
-    for policy in ("freshest-k:2", FreshestK(2, np.random.default_rng(0))):
-        trial = ff.try_policy(policy, path, seconds=1.5, seed=9)
-        assert trial.summary["digest"] == expected["digest"] and trial.policy == "freshest-k"
-    assert trial.psnr_db == expected["shown"]["psnr_db"] and len(trial.shown) > 2
-    assert trial.ages_ms.shape == (len(trial.decisions), 2) and all(len(d.selected) <= 2 for d in trial.decisions)
-    with pytest.raises(ScenarioError, match="is not known"):
-        ff.try_policy("nothing", path)
 
 
 def test_newest_and_all_held_out_frames_are_scored_each_two_seconds_and_reported(tmp_path: Path, monkeypatch, capsys):

@@ -29,15 +29,6 @@ def features(n, silent=0, seed=0, batch=5):
     return LAYOUT.batch([state(n, rng, d=3, silent=silent) for _ in range(batch)])
 
 
-@pytest.mark.parametrize("spec", [SELECT, WAIT], ids=lambda s: s.action)
-@pytest.mark.parametrize("n", [1, 200])
-def test_one_set_of_weights_takes_any_number_of_cameras(spec, n):
-    found = networks.logits(np, spec, actor(spec), features(n))
-    assert found.shape == ((5, n) if spec.action == "select" else (5, len(OMEGAS_MS)))
-    assert np.isfinite(found).all()
-    assert networks.value(np, networks.init_value(spec, np.random.default_rng(0)), features(n)).shape == (5,)
-
-
 def test_cameras_have_no_order():
     x, order = features(7), np.random.default_rng(1).permutation(7)
     each = networks.logits(np, SELECT, actor(SELECT), x)

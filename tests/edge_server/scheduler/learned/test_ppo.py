@@ -54,16 +54,6 @@ def test_a_batch_of_one_decision_learns_against_the_value():
         assert better * (after[0, actions[0]] - before[0]) > 0.0
 
 
-def test_what_v_explained_is_a_share_of_variances():
-    learner = Learner(WAIT, 0)
-    states = [Waits().draw(k).state for k in range(8)]
-    actions, before = learner.act(states)
-    value, worth = learner.value(states), np.random.default_rng(0).standard_normal(8)
-    explained = learner.update(learner.batch(states, actions, before, worth)).explained
-    units = (worth - learner._rewards.mean) / learner._rewards.scale
-    assert explained == pytest.approx(1.0 - np.var(units - value) / np.var(units), rel=1e-3)
-
-
 def test_a_checkpoint_goes_on_bit_for_bit(tmp_path):
     through, stopped = Learner(select(), 3), Learner(select(), 3)
     teach(through, FreshOnes(), 4)

@@ -54,6 +54,7 @@ def test_standardised_embeddings_have_mean_zero_and_spread_one_over_the_cameras_
         ({"parts": ("color",)}, "color"),
         ({"parts": ("semantics",)}, "dim 0"),
         ({"parts": ("age",), "age_scale_ms": 0.0}, "positive"),
+        ({"parts": ("age",), "oldest_ms": np.inf}, "positive"),
         ({"parts": ("semantics",), "dim": 2, "center": (0.0,), "spread": (1.0,)}, "2 values"),
     ],
 )
