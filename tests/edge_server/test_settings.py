@@ -22,6 +22,7 @@ def scenario(edge=None, **source):
 def test_an_empty_section_works_in_layers_before_fixed_cameras_and_as_a_scan_before_moving_ones(edge):
     assert read_config(scenario(edge)) == STILL
     assert read_config(scenario(edge), moving=True) == MOVING
+    assert SCAN == {"scan": True, "refine": True, "carried": True, "gaussians": 60_000}
     assert read_config(parse({"cameras": {"count": 3}}, Path("x.yaml"))) == STILL
     for count, expected in ((MOST_CARRIED, MOVING), (MOST_CARRIED + 1, MANY_MOVING)):
         assert read_config(parse({"cameras": {"count": count}}, Path("x.yaml")), moving=True) == expected

@@ -19,7 +19,7 @@ def made(tmp_path_factory) -> tuple[ff.Fit, object]:
     write_photos(folder / "set", 9)
     seen = []
     data = ff.load(folder / "set", holdout=3, scale=2)
-    fit = ff.fit(data, seconds=1.0, field="splat", options=SMALL, seed=3, progress=seen.append)
+    fit = ff.fit(data, seconds=1.0, field="splat", options=SMALL, progress=seen.append)
     assert seen == fit.rows and len(data.held_out) == 3
     fit.save(folder / "out")
     return fit, folder
