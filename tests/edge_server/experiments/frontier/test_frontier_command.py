@@ -9,7 +9,7 @@ import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.frontier import from_scratch, frontier_command
-from edge_server.experiments.frontier.output import recommendation
+from edge_server.experiments.frontier.output import recommendation, table
 from edge_server.experiments.frontier.update_time import (
     Charged,
     MovingRun,
@@ -54,6 +54,8 @@ def test_the_front_is_what_nothing_beats_in_both():
     rows = [{"planned_s": planned_s, "psnr_db": psnr_db} for planned_s, psnr_db in points]
     from_scratch.mark_front(rows)
     assert [row["on_front"] for row in rows] == [True, False, True, False, True]
+    measured = {"field": "ngp", "seconds": 1.0, "steps": 3, "ms_per_step": 2.0, "ssim": 0.5, "lpips": None}
+    assert "| ngp | 1.00 | 3 | 2.00 | 20.00 | 0.500 | - | * |" in table([{**rows[0], **measured}])
 
 
 def test_seeds_are_averaged_with_their_standard_error():
