@@ -33,6 +33,7 @@ def test_what_was_saved_loads_and_renders_the_same(made):
     assert color.shape == (30, 40, 3) and color.dtype == np.float32 and 0.0 <= color.min() <= color.max() <= 1.0
     assert depth.shape == (30, 40) and depth.max() > 0.0
     np.testing.assert_array_equal(again.render(pose, size=(40, 30)), color)
+    assert fit.seed == ff.Fit(fit.data, "splat", SMALL).seed == 0
     assert fit.psnr.shape == (len(fit.rows), 2) and fit.psnr[-1, 0] == pytest.approx(1.0, rel=0.3)
 
 
