@@ -207,7 +207,7 @@ def test_outliers_are_judged_by_earlier_values_and_at_first_by_the_others():
 def test_a_minibatch_is_clipped_where_its_ratio_leaves_the_range():
     """Two actions, twice as probable as when they were taken: the gain is clipped at 1 + clip, the loss is not."""
     now = torch.log(torch.tensor([0.8, 0.8], dtype=torch.float64)).requires_grad_()
-    zeros = torch.zeros(2, dtype=torch.float64)
+    zeros, values = torch.zeros(2, dtype=torch.float64), torch.tensor([1.0, 1.0], dtype=torch.float64)
     acted = Acted(
         torch.log(torch.tensor([0.4, 0.4], dtype=torch.float64)),
         torch.tensor([1.0, -1.0], dtype=torch.float64),
@@ -216,7 +216,7 @@ def test_a_minibatch_is_clipped_where_its_ratio_leaves_the_range():
     spec = select(passes=1, clip=0.2, value=0.5, entropy=0.0)
     adam = torch.optim.Adam([now], lr=1e-9)
     rng = np.random.default_rng(0)
-    found = clipped_update(spec, lambda some: (now[some], zeros[some], zeros[some]), acted, [now], adam, rng)
-    assert found.policy_loss == pytest.approx(-(1.2 - 2.0) / 2) and found.value_loss == pytest.approx((9 + 1) / 2)
+    found = clipped_update(spec, lambda some: (now[some], zeros[some], values[some]), acted, [now], adam, rng)
+    assert found.policy_loss == pytest.approx(-(1.2 - 2.0) / 2) and found.value_loss == pytest.approx((4 + 4) / 2)
     assert found.moved == pytest.approx(2.0 - 1.0 - np.log(2.0)) and found.clipped == 1.0
     assert (found.steps, found.skipped) == (1, 0)
