@@ -9,7 +9,8 @@ import numpy as np
 from camera_node.synthetic import make_scene
 from edge_server.experiments.rollouts.episode import Choice, EpisodeFactory, Outcome
 from edge_server.experiments.rollouts.setting import Setting
-from tests.edge_server.experiments.rollouts.small import NOTHING, reported, setting
+from tests.edge_server.experiments.rollouts.small import NOTHING, reported, scenario, setting
+from tests.edge_server.experiments.sets import write_recording
 
 
 def one_of(what: Setting, seed: int = 5, camera: str = "cam00") -> Outcome:
@@ -43,6 +44,12 @@ def test_every_episode_has_a_motion_of_its_own_and_its_cameras_see_the_same_one(
     assert len(images) == 2
     same = EpisodeFactory(setting(motions=False), NOTHING)
     assert same.stage(1) is same.stage(2_000_001)
+
+
+def test_a_recording_has_no_motion_to_draw(tmp_path):
+    recorded = scenario(source={"kind": "transforms", "data": str(write_recording(tmp_path))})
+    factory = EpisodeFactory(dataclasses.replace(setting(motions=True), scenario=recorded), NOTHING)
+    assert "motion_seed" not in factory.scenario(3).source
 
 
 def test_pictures_of_one_episode_are_not_taken_for_those_of_another():
