@@ -54,7 +54,6 @@ _ALONE = (
     "edge_server/live/test_loop.py",
     "edge_server/live/test_scoring_thread.py",
     "edge_server/live/test_server.py",
-    "edge_server/live/test_server_learned.py",
     "edge_server/page/splats/test_stream.py",
     "edge_server/page/test_access_guard.py",
     "edge_server/page/test_browser.py",

@@ -1,3 +1,5 @@
+"""What a run was measured on, where the system tells it and where it does not."""
+
 from __future__ import annotations
 
 import os
@@ -5,14 +7,10 @@ import os
 from edge_server.machine import machine
 
 
-def test_machine_knows_itself():
-    found = machine()
-    assert found["cores"] == len(os.sched_getaffinity(0)) and found["memory_gb"] > 0
-
-
 def test_a_machine_without_proc_is_unknown_and_no_error(tmp_path):
     found = machine(tmp_path)
-    assert found["memory_gb"] is None and found["cores"] >= 1 and found["gpus"] == []
+    assert found["memory_gb"] is None and found["gpus"] == []
+    assert found["cores"] == len(os.sched_getaffinity(0))
 
 
 def test_gpus_are_named(tmp_path):

@@ -30,16 +30,6 @@ def test_a_pipe_is_told_of_long_work_alone(monkeypatch):
     assert out.getvalue() == "  sharpen: some 18 s\n"
 
 
-def test_what_is_left_falls_while_a_part_takes_longer(monkeypatch):
-    now, out = [0.0], Terminal()
-    monkeypatch.setattr("edge_server.progress.time.perf_counter", lambda: now[0])
-    line = ProgressLine(out)
-    for now[0], share in ((0.0, 0.0), (10.0, 0.5), (14.0, 0.5), (30.0, 0.5)):
-        line("compare", share)
-    told = [text.strip() for text in out.getvalue().split("\r") if text]
-    assert told == ["compare      0 s", *(f"compare     50 %, {left} s left" for left in (10, 6, 0))]
-
-
 def test_a_terminal_sees_the_time_spent_until_a_part_is_done_and_then_what_is_left(monkeypatch):
     monkeypatch.setattr("edge_server.progress.REDRAWN_S", 0.05)
     out = Terminal()

@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Sequence
 
-import numpy as np
 import pytest
 
 from edge_server.live.buffer import MOST_UNSELECTED, FrameBuffer
@@ -20,35 +19,21 @@ def test_age_is_now_minus_generation_on_the_edges_clock():
     assert buffer.ages_ms(200 * MS) == {"cam01": 120.0, "cam02": None}
 
 
-def test_a_late_older_frame_never_becomes_newest():
+@pytest.mark.parametrize(
+    ("first_ms", "then_ms", "newest_is_first"),
+    [
+        (60, 30, True),  # overtaken on its way
+        (400, 120, True),  # ahead of the edge's clock, within the tolerance
+        (1300, 120, False),  # a frame from the future gives way to any
+    ],
+)
+def test_which_of_two_frames_is_the_newest(first_ms, then_ms, newest_is_first):
     buffer = FrameBuffer(["cam01"])
-    buffer.put(frame(sequence=2, generated_ns=60 * MS), 70 * MS)
-    buffer.put(frame(sequence=1, generated_ns=30 * MS), 90 * MS)
-    assert buffer.newest()["cam01"].sequence == 2
-    assert (buffer.stale_on_arrival, buffer.arrivals) == (1, 2)
-
-
-def test_a_frame_from_the_future_gives_way_to_any():
-    buffer = FrameBuffer(["cam01"])
-    buffer.put(frame(sequence=1, generated_ns=1300 * MS), 100 * MS)
-    assert buffer.ages_ms(100 * MS) == {"cam01": -1200.0}
-    buffer.put(frame(sequence=2, generated_ns=120 * MS), 150 * MS)
-    assert buffer.newest()["cam01"].sequence == 2
-    assert buffer.ages_ms(150 * MS) == {"cam01": 30.0} and buffer.stale_on_arrival == 0
-
-
-def test_a_frame_ahead_within_the_tolerance_is_still_the_newest():
-    buffer = FrameBuffer(["cam01"])
-    buffer.put(frame(sequence=2, generated_ns=400 * MS), 150 * MS)
-    buffer.put(frame(sequence=1, generated_ns=120 * MS), 150 * MS)
-    assert buffer.newest()["cam01"].sequence == 2 and buffer.stale_on_arrival == 1
-
-
-def test_order_is_the_cameras_not_the_arrivals():
-    buffer = FrameBuffer(["b", "a"])
-    buffer.put(frame("a"), 0)
-    buffer.put(frame("b"), 0)
-    assert list(buffer.newest()) == ["b", "a"]
+    buffer.put(frame(sequence=2, generated_ns=first_ms * MS), 100 * MS)
+    assert buffer.ages_ms(100 * MS) == {"cam01": 100.0 - first_ms}
+    buffer.put(frame(sequence=1, generated_ns=then_ms * MS), 150 * MS)
+    assert buffer.newest()["cam01"].sequence == (2 if newest_is_first else 1)
+    assert (buffer.stale_on_arrival, buffer.arrivals) == (int(newest_is_first), 2)
 
 
 def test_wait_returns_on_arrival_and_on_timeout():
@@ -152,19 +137,6 @@ def test_of_equally_young_frames_those_of_who_has_waited_longest_are_taken():
     assert seen == dict.fromkeys(buffer.cameras, 4)
 
 
-def test_where_there_is_no_time_for_all_the_youngest_are_taken():
-    buffer = FrameBuffer([f"cam{k:02d}" for k in range(6)])
-    buffer.keep_every_frame(True)
-    rng = np.random.default_rng(3)
-    for sequence in range(10):
-        lags = dict(zip(buffer.cameras, rng.permutation(6)))
-        for camera, lag in lags.items():
-            at_ns = (1000 * sequence + 500) * MS
-            buffer.put(frame(camera, sequence=sequence, generated_ns=at_ns - int(lag) * 20 * MS), at_ns)
-        used, _ = buffer.take(list(buffer.newest().values()), most=2)
-        assert {lags[item.camera] for item in used} == {0, 1}
-
-
 @pytest.mark.parametrize(("most", "taken"), [(1, ["cam03"]), (2, ["cam01", "cam03"]), (3, ["cam00", "cam01", "cam03"])])
 def test_the_more_moves_before_a_camera_the_older_its_frame_may_be(most, taken):
     """By 28 ms for twice as much: 40 ms times the logarithm of 2. cam03, of which nothing is known, goes first."""
@@ -191,14 +163,3 @@ def test_a_camera_goes_first_in_the_seventeenth_take_after_its_last():
         used, _ = buffer.take(list(buffer.newest().values()), most=1)
         served += [(take, item.camera) for item in used if item.sequence == take]
     assert served == [(take, "cam00" if take == 18 else "cam01") for take in range(2, 20)]
-
-
-def test_who_came_first_in_a_take_has_waited_longest_in_the_next():
-    buffer = FrameBuffer(["cam00", "cam01"])
-    buffer.keep_every_frame(True)
-    for take, (first, second) in enumerate((("cam00", "cam01"), ("cam01", "cam00"))):
-        for k, camera in enumerate((first, second)):  # the second is younger, by less than counts
-            at_ns = 100 * take * MS + k * MS // 10
-            buffer.put(frame(camera, sequence=take, generated_ns=at_ns), at_ns)
-        used, _ = buffer.take(list(buffer.newest().values()), most=2 - take)
-    assert ("cam01", 1) in _sequences(used) and ("cam00", 1) not in _sequences(used)

@@ -55,50 +55,10 @@ def test_depth_of_the_images_own_size_is_taken_as_it_is():
     np.testing.assert_allclose(depth_in_image(depth(counts), IMAGE, 0), counts * 0.001, rtol=1e-6)
 
 
-def test_registered_depth_of_another_size_gives_the_nearest_measurement():
-    fine = np.arange(96 * 128).reshape(96, 128)
-    found = depth_in_image(depth(fine), IMAGE, 0) / np.float32(0.001)
-    np.testing.assert_allclose(found, fine[1::2, 1::2], rtol=1e-6)
-    coarse = np.arange(24 * 32).reshape(24, 32) + 1
-    found = depth_in_image(depth(coarse), IMAGE, 0)
-    np.testing.assert_allclose(found, np.kron(coarse, np.ones((2, 2))) * 0.001, rtol=1e-6)
-
-
-@pytest.mark.parametrize("halvings", [0, 1, 2, 3])
-@pytest.mark.parametrize("size", [(64, 48), (63, 47), (61, 50)])
-def test_halved_images_see_the_same_depth(size, halvings):
-    """A plane's depth is known at every pixel; odd sides are rounded up."""
-    lens = replace(IMAGE, width=size[0], height=size[1])
-    rays = lens.rays()
-    counts = np.round(2000 / (1 + 0.3 * rays[..., 0] / rays[..., 2]))
-    small = lens.halved(halvings)
-    found = depth_in_image(depth(counts), lens, halvings)
-    rays = small.rays()
-    assert found.shape == (small.height, small.width)
-    expected = 2.0 / (1 + 0.3 * rays[..., 0] / rays[..., 2])
-    assert np.abs(found / expected - 1)[:-1, :-1].max() < 0.011 * 2**halvings  # within half of its pixel
-
-
 def test_depth_of_a_lens_and_a_pose_of_its_own_is_moved_as_one_by_one():
     measured = depth(box_before_wall(SENSOR, BESIDE), intrinsics=SENSOR, to_camera=BESIDE)
     measured.counts[5:9, 50:60] = 0
     np.testing.assert_allclose(depth_in_image(measured, IMAGE, 0), moved_point_by_point(measured, IMAGE), rtol=1e-5)
-
-
-@pytest.mark.parametrize("halvings", [0, 1])
-@pytest.mark.parametrize(
-    ("sensor", "share"),
-    [(SENSOR, 0.6), (Pinhole.from_fov(160, 120, 75.0), 0.95), (Pinhole.from_fov(40, 30, 75.0), 0.95)],
-)
-def test_the_nearest_surface_wins_and_what_the_sensor_did_not_see_stays_open(sensor, share, halvings):
-    true = box_before_wall(IMAGE.halved(halvings), Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))) / 1000
-    measured = depth(box_before_wall(sensor, BESIDE), intrinsics=sensor, to_camera=BESIDE)
-    found = depth_in_image(measured, IMAGE, halvings)
-    seen = found > 0
-    right = np.abs(found - true) < 0.002
-    assert found.shape == true.shape and share < seen.mean() < 1.0  # its view ends, and the box hides wall from it
-    assert right[seen].mean() > 0.97, "all but the box's outline"
-    assert right[true == 1.5].mean() > 0.7
 
 
 @pytest.mark.stability
@@ -124,6 +84,7 @@ def test_a_lens_with_distortion_takes_in_only_what_it_sees():
     assert outside.any()
     found = depth_in_image(depth(np.where(outside, 500, 2000), intrinsics=wide), lens, 0)
     assert not (found == np.float32(0.5)).any() and (found == np.float32(2.0)).mean() > 0.5
+    assert module._reach(IMAGE) == pytest.approx(np.hypot(32.0 / IMAGE.fx, 24.0 / IMAGE.fy))
 
 
 @pytest.mark.stability
@@ -131,10 +92,8 @@ def test_a_lens_with_distortion_takes_in_only_what_it_sees():
     ("side", "width", "height", "fov_deg", "step", "moved"),
     [
         (128, 1280, 1280, 70.0, 0, 1.02 * MAX_DEPTH_POINTS * 128**2),  # about as many as a small image has pixels
-        (128, 1280, 1280, 100.0, 0, 1.02 * MAX_DEPTH_POINTS * 128**2),
         (128, 1280, 1280, 175.0, 0, 1.02 * MAX_DEPTH_POINTS * 128**2),
         (1200, 848, 480, 70.0, 1, 848 * 480),  # what sensors measure at this size is moved whole
-        (1200, 1280, 720, 70.0, 2, MOST_DEPTH_MOVED),
         (1200, 1280, 1280, 70.0, 2, MOST_DEPTH_MOVED),
     ],
 )

@@ -12,7 +12,7 @@ import pytest
 import zstandard
 
 from edge_server.live.buffer import FrameBuffer
-from edge_server.live.ingest import FrameAdmission, Ingest, RollingPercentiles
+from edge_server.live.ingest import FrameAdmission, Ingest
 from freshfield import access, payload
 from freshfield.clock import VirtualClock
 from freshfield.depth import DepthImage, EncodedDepth
@@ -39,14 +39,6 @@ def ingest(tmp_path):
 
 def good(sequence: int = 0, **other):
     return frame(sequence=sequence, generated_ns=NOW - 50 * MS + sequence, **other)
-
-
-def test_an_accepted_frame_is_buffered_and_written_down(ingest):
-    answer = ingest.take(to_request(good()))
-    assert (answer.outcome, answer.sequence) == (pb.OUTCOME_ACCEPTED, 0)
-    assert ingest.buffer.ages_ms(NOW)["cam01"] == pytest.approx(50.0)
-    (event,) = LedgerReader(ingest.test_ledger.path).events
-    assert (event.event, event.camera, event.sequence) == ("delivered", "cam01", 0)
 
 
 def test_held_out_frames_never_reach_the_training_buffer(ingest):
@@ -78,7 +70,6 @@ BAD: dict[str, dict[str, Any] | Callable[[pb.PushRequest], None]] = {
     "crc_mismatch": with_payload_damaged,
     "bad_pose": with_checksum(lambda header: setattr(header.pose, "qw", 7.0)),
     "unknown_codec": with_checksum(lambda header: setattr(header, "codec", -7)),  # an enum may be negative
-    "bad_header": with_checksum(lambda header: setattr(header, "role", -7)),
     "unknown_camera": {"camera": "cam77"},
     "too_large": {"intrinsics": LARGE, "payload": payload.encode(np.zeros((4096, 4096, 3), np.uint8))},
     "wrong_role": {"held_out": True},
@@ -128,19 +119,14 @@ def test_a_thousand_made_up_cameras_are_counted_as_one(ingest):
     assert {(e.camera, e.session) for e in LedgerReader(ingest.test_ledger.path).events} == {("?", "?")}
 
 
-@pytest.mark.parametrize("codec", [*payload.CODECS, None])
-def test_only_the_codec_that_the_scenario_names_is_taken(codec):
+def test_only_the_codec_that_the_scenario_names_is_taken():
     """A PNG costs its decoder more than a JPEG of as many bytes, so that a sender may not choose."""
-    admission = FrameAdmission(["cam01"], [], codec=codec)
-    image = np.zeros((24, 32, 3), np.uint8)
-    for sequence, sent in enumerate(payload.CODECS):
-        item = good(sequence, codec=sent, payload=payload.encode(image, sent))
-        if codec in (None, sent):
-            admission.admit(item, NOW)
-            continue
-        with pytest.raises(FrameRejected, match=f"a {sent}, where the scenario .* has {codec}") as refused:
-            admission.admit(item, NOW)
-        assert refused.value.reason == "unknown_codec"
+    item = good(codec="png", payload=payload.encode(np.zeros((24, 32, 3), np.uint8), "png"))
+    for codec in (None, "png"):
+        FrameAdmission(["cam01"], [], codec=codec).admit(item, NOW)
+    with pytest.raises(FrameRejected, match=r"a png, where the scenario .* has jpeg") as refused:
+        FrameAdmission(["cam01"], [], codec="jpeg").admit(item, NOW)
+    assert refused.value.reason == "unknown_codec"
 
 
 def depth(width: int = 32, height: int = 24, **other) -> EncodedDepth:
@@ -175,18 +161,6 @@ def test_a_bomb_of_depth_is_refused_and_loses_nothing_else(ingest):
     assert answer.reason == "depth_size_mismatch" and "depth: " in answer.detail
     assert ingest.take(to_request(good(1, depth=depth()))).outcome == pb.OUTCOME_ACCEPTED
     assert ingest.buffer.newest()["cam01"].depth == depth()
-
-
-def test_replay_and_reversed_time_are_refused_within_a_session_only():
-    admission = FrameAdmission(["cam01"], [])
-    admission.admit(good(sequence=3), NOW)
-    with pytest.raises(FrameRejected) as replay:
-        admission.admit(good(sequence=3), NOW)
-    assert replay.value.reason == "replayed_sequence"
-    with pytest.raises(FrameRejected) as reversed_time:
-        admission.admit(frame(sequence=4, generated_ns=NOW - 90 * MS), NOW)
-    assert reversed_time.value.reason == "time_reversed"
-    admission.admit(good(sequence=0, session="s2"), NOW)
 
 
 def test_another_stream_cannot_use_up_the_numbers_of_a_session(ingest):
@@ -241,26 +215,16 @@ def test_an_uncertain_clock_is_given_its_uncertainty_but_no_two_seconds():
         assert refused.value.reason == "from_future"
 
 
-def test_percentiles_are_of_the_last_values():
-    values = RollingPercentiles(4)
-    assert values.percentile(50) is None
-    for value in (9.0, 1.0, 4.0, 3.0, 2.0):  # the first is the one too many
-        values.add(value)
-    assert [values.percentile(p) for p in (0, 25, 50, 99, 100)] == [1.0, 2.0, 3.0, 4.0, 4.0]
-
-
 def test_after_a_restart_of_the_edge_no_frame_is_taken_again():
     before = FrameAdmission(["cam01", "cam02"], [])
     for sequence in (3, 4):
         before.admit(good(sequence), NOW)
     told = msgspec.json.decode(msgspec.json.encode(before.last_frames()), type=dict[str, dict[str, tuple[int, int]]])
     after = FrameAdmission(["cam01"], ["cam00"], known=told)
-    for sequence, reason in ((3, "replayed_sequence"), (4, "replayed_sequence")):
+    backwards = frame(sequence=5, generated_ns=NOW - 51 * MS)
+    for item, reason in ((good(3), "replayed_sequence"), (good(4), "replayed_sequence"), (backwards, "time_reversed")):
         with pytest.raises(FrameRejected) as refused:
-            after.admit(good(sequence), NOW)
+            after.admit(item, NOW)
         assert refused.value.reason == reason
-    with pytest.raises(FrameRejected) as refused:
-        after.admit(frame(sequence=5, generated_ns=NOW - 51 * MS), NOW)
-    assert refused.value.reason == "time_reversed"
     after.admit(good(5), NOW)
     after.admit(good(0, session="another"), NOW)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +16,7 @@ from edge_server.scheduler import make_policy
 from freshfield.clock import Clock, VirtualClock, WallClock
 from tests.edge_server.fields_for_tests import tiny_field
 from tests.edge_server.frames import frame
+from tests.support import wait_until
 
 MS = 1_000_000
 
@@ -25,30 +24,6 @@ MS = 1_000_000
 def updates(policy="all", value=None, cameras=("cam01", "cam02")) -> FieldUpdater:
     made = make_policy(policy, value, np.random.default_rng(0))
     return FieldUpdater(FrameBuffer(cameras), made, tiny_field(), start_ns=0)
-
-
-def test_an_update_in_virtual_time_is_charged_to_the_ages():
-    u = updates()
-    u.buffer.put(frame("cam01", generated_ns=100 * MS), 120 * MS)
-    u.buffer.put(frame("cam02", generated_ns=140 * MS), 150 * MS)
-    selection = u.select(u.plan(200 * MS), 200 * MS)
-    views, report = u.fit(selection, Budget(steps=2))
-    done = u.publication(selection, views, report, published_ns=500 * MS)
-    assert done.selected == ("cam01", "cam02")
-    # Fitting took 300 ms of virtual time, and the scene aged with it.
-    assert done.ages_ms == (400.0, 360.0)
-    assert (done.aaoi_ms, done.update_ms, done.t_s, done.steps) == (380.0, 300.0, 0.5, 2)
-    assert u.number == 1
-
-
-def test_wait_selects_nothing_before_its_horizon_and_goes_on_until_something_qualifies():
-    u = updates("wait", 60)
-    u.buffer.put(frame("cam01", generated_ns=90 * MS), 95 * MS)
-    plan = u.plan(100 * MS)
-    assert u.select(plan, 159 * MS) is None
-    assert u.select(plan, 160 * MS) is None  # the horizon is over, but nothing was generated in it
-    u.buffer.put(frame("cam01", sequence=1, generated_ns=170 * MS), 180 * MS)
-    assert [i.sequence for i in u.select(plan, 180 * MS).items] == [1]
 
 
 def test_on_arrivals_nothing_is_selected_twice_and_a_field_that_wants_it_gets_every_frame():
@@ -86,11 +61,7 @@ def test_a_frame_that_arrives_during_a_selection_is_used_by_the_next_one_and_onc
 
     monkeypatch.setattr(u, "_follow_field", meanwhile)
     found = [u.select(u.plan(30 * MS), 30 * MS) for _ in range(3)]
-    assert [selection and [(i.sequence, selection.arrivals) for i in selection.items] for selection in found] == [
-        [(0, 1)],
-        [(1, 1)],
-        None,
-    ]
+    assert [s and [(i.sequence, s.arrivals) for i in s.items] for s in found] == [[(0, 1)], [(1, 1)], None]
 
 
 def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
@@ -121,11 +92,6 @@ def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
     views, _ = u.fit(u.select(u.plan(61 * MS), 61 * MS, Budget(seconds=1e-3)), Budget(seconds=1e-3))
     assert len(decoded) == 18 and u.buffer.shed == 6  # and are taken although nothing has arrived since
     assert u.select(u.plan(62 * MS), 62 * MS, Budget(seconds=1e-3)) is None
-    u.on_arrivals = False
-    u.field.frame_s = None  # it wants the newest only, from now on
-    views, _ = u.fit(u.select(u.plan(70 * MS), 70 * MS, Budget(seconds=1e-3)), Budget(seconds=1e-3))
-    assert len(views) == 8
-    assert u.buffer._unselected is None
 
 
 class Running:
@@ -134,48 +100,20 @@ class Running:
     def __init__(
         self, u: FieldUpdater, grace_ms: float = 0.0, update_ms: float = 100.0, clock: Clock | None = None
     ) -> None:
-        self.published, self.lines, self.saved, self.events = [], [], [], []
+        self.published, self.lines, self.saved = [], [], []
         self.clock = clock or WallClock()
         self.controls = Controls(u.policy.name, u.policy.value)
-        self.loop = UpdateLoop(
-            u,
-            self.clock,
-            self.controls,
-            update_ms,
-            grace_ms,
-            lambda p, r, v: self.published.append((p, r)),
-            self.lines.append,
-            self.saved.append,
-            self.events.append,
-        )
+        told = (lambda p, r, v: self.published.append((p, r)), self.lines.append, self.saved.append, lambda event: None)
+        self.loop = UpdateLoop(u, self.clock, self.controls, update_ms, grace_ms, *told)
 
-    def until(self, condition, seconds: float = 60.0) -> None:
-        deadline = time.perf_counter() + seconds
-        while not condition():
-            assert time.perf_counter() < deadline, f"never happened; the loop said {self.lines[-3:]}"
-            assert self.loop.failure is None
-            time.sleep(0.01)
+    def until(self, condition) -> None:
+        wait_until(condition, lambda: f"never happened; the loop said {self.lines[-3:]}", 60.0)
 
 
-@pytest.fixture
-def running():
-    made: list[Running] = []
-
-    def start(u: FieldUpdater, **options) -> Running:
-        run = Running(u, **options)
-        made.append(run)
-        run.loop.start()
-        return run
-
-    yield start
-    for run in made:
-        run.loop.stop()
-        assert not run.loop.alive
-
-
-def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(running, tmp_path):
+def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(tmp_path):
     u = updates()
-    run = running(u, grace_ms=50.0)
+    run = Running(u, grace_ms=50.0)
+    run.loop.start()
     now = run.clock.now_ns()
     u.buffer.put(frame("cam01", generated_ns=now), now)
     run.until(lambda: len(run.published) >= 2)
@@ -197,28 +135,8 @@ def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(running, tm
     assert run.saved == [tmp_path / "field.npz"]
     run.until(lambda: len(run.published) > count)
     assert run.published[-1][0].omega_ms == 0.0 and not run.controls.reset_requested
-
-
-@pytest.mark.parametrize(("short", "warnings"), [(True, 1), (False, 0)])
-def test_updates_without_time_to_learn_are_warned_of_once(short, warnings, running, caplog):
-    """But not those that had nothing to learn."""
-    u = updates()
-    fit = u.fit  # no time at all, then some, then none again
-
-    def fitted(selection, _):
-        views, report = fit(selection, Budget(steps=1) if u.number == 4 else Budget(seconds=1e-6))
-        return views, replace(report, short=report.short and short)
-
-    u.fit = fitted
-    now = WallClock().now_ns()
-    u.buffer.put(frame("cam01", generated_ns=now), now)
-    run = running(u)
-    run.until(lambda: len(run.published) >= 8)
     run.loop.stop()
-    assert [publication.steps for publication, _ in run.published[:8]] == [0, 0, 0, 0, 1, 0, 0, 0]
-    assert run.loop.without_step >= 7 * short
-    told = [record.message for record in caplog.records if "made no step" in record.message]
-    assert len(told) == warnings and all("source.scale" in each and "edge.update_ms" in each for each in told)
+    assert not run.loop.alive
 
 
 def test_updates_without_time_to_learn_are_warned_of_again_every_half_minute(caplog):
@@ -231,16 +149,6 @@ def test_updates_without_time_to_learn_are_warned_of_again_every_half_minute(cap
         starved._warn_without_steps(FitReport(0, 0.1, 0.0, 0, 0, short=second != 20))
         told += [second] * (len(caplog.records) - len(told))
     assert told == [2, 32, 62]
-
-
-def test_a_camera_that_never_reports_does_not_hold_the_others_up(running):
-    u = updates()
-    run = running(u, grace_ms=100.0)
-    now = run.clock.now_ns()
-    threading.Timer(0.2, lambda: u.buffer.put(frame("cam02", generated_ns=now), now)).start()
-    run.until(lambda: run.published)
-    assert run.published[0][0].selected == ("cam02",)
-    assert any("1 of 2" in line for line in run.lines)
 
 
 @pytest.mark.parametrize("where", ["checkpoint", "fit"])

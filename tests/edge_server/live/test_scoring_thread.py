@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import time
 import weakref
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from edge_server.fidelity.scorer import Score, Scorer
-from edge_server.fidelity.so_far import MOST
 from edge_server.fields import Rendering, View
 from edge_server.live import scoring_thread
 from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import Publication
-from edge_server.run_records import Baseline
 from freshfield import payload
 from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose
@@ -84,10 +81,6 @@ def test_the_newest_publication_is_shown_carried_on_to_the_capture(monkeypatch: 
     assert len(set(gaps.tolist())) == len(gaps), "random instants"
 
 
-def test_nothing_was_shown_before_the_first_publication() -> None:
-    assert _run([500 * MS], [k * 10 * MS for k in range(50)]) == []
-
-
 def test_a_thread_that_falls_behind_keeps_no_snapshots() -> None:
     """Each is as large as the field."""
     alive = weakref.WeakSet[Brightness]()
@@ -98,37 +91,6 @@ def test_a_thread_that_falls_behind_keeps_no_snapshots() -> None:
         thread.published(_publication(k, snapshot.at_ns), snapshot, [])
     del snapshot
     assert len(alive) == scoring_thread._WAITING_PUBLICATIONS
-
-
-def test_snapshots_replaced_before_the_next_scored_capture_are_dropped() -> None:
-    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
-    thread._next_shown_ns["cam00"] = 500 * MS
-    for k in range(1, 30):
-        thread._score_later(_publication(k, k * 20 * MS), Brightness(k * 20 * MS), [])
-    assert [p.published_ns // MS for p, _ in thread._recent] == [500, 520, 540, 560, 580]
-
-
-def test_a_silent_held_out_camera_keeps_no_snapshots(monkeypatch: Any) -> None:
-    monkeypatch.setattr(scoring_thread, "_SILENT_NS", 100 * MS)
-    thread = ScoringThread(["cam00", "cam01"], Scorer(), lambda *_: None, lambda *_: None)
-    for k in range(1, 13):
-        thread._held_out["cam00"].take(_frame(k, k * 20 * MS))
-        thread._score_later(_publication(k, k * 20 * MS), Brightness(k * 20 * MS), [])
-    assert len(thread._recent) == 1
-
-
-def test_an_instant_whose_publication_went_by_unseen_is_not_scored(monkeypatch: Any) -> None:
-    shown: list[tuple[Score, Publication]] = []
-    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *of: shown.append(of))
-    monkeypatch.setattr(thread, "_affordable", lambda *_: True)
-    for k, at_ms in enumerate((10, 110, 120, 130)):  # that of 110 finds no room
-        thread.published(_publication(k, at_ms * MS), Brightness(at_ms * MS), [])
-    thread._score_later(_publication(0, 10 * MS), Brightness(10 * MS), [])
-    for k, at_ms in enumerate((50, 100, 115)):
-        thread._held_out["cam00"].take(frame := _frame(k, at_ms * MS))
-        thread._next_shown_ns["cam00"] = 0
-        thread._score_shown(frame)
-    assert [score.published_ns // MS for score, _ in shown] == [100]
 
 
 def test_what_is_shown_is_scored_as_often_as_its_share_affords_and_before_publications(monkeypatch: Any) -> None:
@@ -143,45 +105,6 @@ def test_what_is_shown_is_scored_as_often_as_its_share_affords_and_before_public
     assert len(_run([100 * MS, 350 * MS], frames, scored)) > 10 and not scored
 
 
-def test_time_that_was_not_used_is_no_credit_beyond_the_allowance(monkeypatch: Any) -> None:
-    now_s, used_s = [0.0], [0.0]
-    monkeypatch.setattr(scoring_thread.time, "monotonic", lambda: now_s[0])
-    monkeypatch.setattr(scoring_thread.time, "thread_time", lambda: used_s[0])
-    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
-    now_s[0] = 1000.0
-    assert thread._affordable()
-    used_s[0] = 1.1
-    assert not thread._affordable()
-    now_s[0] += 0.1 / (0.03 * scoring_thread.usable_cores()) + 1.0
-    assert thread._affordable() and not thread._affordable(0.1)
-
-
-def test_scoring_stays_within_its_share_of_the_machine(monkeypatch: Any) -> None:
-    monkeypatch.setattr(scoring_thread, "_FIRST_ALLOWANCE_S", 0.0)
-    monkeypatch.setattr(scoring_thread, "_SHARE", 0.0)
-    assert _run([100 * MS], [k * 10 * MS for k in range(60)]) == []
-
-
-class LoadsLong:
-    """A metric that computes for longer than the allowance before its first distance."""
-
-    minimum_side = 1
-    loaded = False
-
-    def __call__(self, a: Any, b: Any, mask: Any) -> float:
-        begun_s = time.thread_time()
-        while not self.loaded and time.thread_time() < begun_s + 0.2:
-            pass
-        self.loaded = True
-        return 0.0
-
-
-def test_what_a_metric_loads_is_not_charged(monkeypatch: Any) -> None:
-    monkeypatch.setattr(scoring_thread, "_FIRST_ALLOWANCE_S", 0.1)
-    monkeypatch.setattr(scoring_thread, "_SHARE", 0.0)
-    assert len(_run([100 * MS], [k * 10 * MS for k in range(60)], scorer=Scorer(LoadsLong()))) > 1
-
-
 def test_a_metric_that_cannot_be_loaded_costs_its_own_scores_alone(caplog: pytest.LogCaptureFixture) -> None:
     def broken(a: Any, b: Any, mask: Any) -> float:
         raise RuntimeError("no weights")
@@ -191,66 +114,12 @@ def test_a_metric_that_cannot_be_loaded_costs_its_own_scores_alone(caplog: pytes
     assert "a metric could not be loaded" in caplog.text
 
 
-def test_baselines_are_of_every_fifth_publication(monkeypatch: Any) -> None:
-    found: list[int] = []
-    monkeypatch.setattr(scoring_thread, "baseline", lambda views, *_: found.append(len(views)) or Baseline(1.0, 2.0))
-    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
-    monkeypatch.setattr(thread, "_affordable", lambda *_: True)
-    thread._held_out["cam00"].take(_frame(0, 0))
-    thread._held_out["cam00"].take(_frame(1, 10 * MS))
-    for number in range(3, 12):
-        thread._score_later(_publication(number, 10 * MS), Brightness(0), ["view"])  # type: ignore[list-item]
-    assert found == [1, 1] and thread.baselines.mean == Baseline(1.0, 2.0), "of 5 and 10"
-
-
 def test_where_nothing_is_held_out_the_mean_color_is_that_of_the_views() -> None:
-    told: list[Publication] = []
-    thread = ScoringThread([], Scorer(), lambda of, *_: told.append(of), lambda *_: None)
+    told: list[tuple[Publication, bool]] = []
+    thread = ScoringThread([], Scorer(), lambda of, _, final: told.append((of, final)), lambda *_: None)
     images = [np.full((32, 32, 3), level, np.uint8) for level in (102, 153)]  # 0.4 and 0.6: 0.1 from their mean
     views = [View(f"cam{k}", image, np.eye(4), LENS) for k, image in enumerate(images)]
     thread._score_selected(_publication(3, 500 * MS), Brightness(500 * MS), views)
-    assert len(told) == 1 and thread.baselines.mean.nearest_view_db is None
-    np.testing.assert_allclose([told[0].psnr_db, thread.baselines.mean.mean_color_db], 20.0, atol=1e-3)
-
-
-def test_where_nothing_is_held_out_each_view_is_compared_in_turn_every_fifth_time(monkeypatch: Any) -> None:
-    """Whatever the numbers of the publications that are scored: here each third."""
-    found: list[int] = []
-    monkeypatch.setattr(scoring_thread, "mean_color_db", lambda _, image: found.append(int(image[0, 0, 0])) or 20.0)
-    thread = ScoringThread([], Scorer(), lambda *_: None, lambda *_: None)
-    images = [np.full((32, 32, 3), level, np.uint8) for level in (10, 20, 30)]
-    views = [View(f"cam{k}", image, np.eye(4), LENS) for k, image in enumerate(images)]
-    for number in range(0, 60, 3):
-        thread._score_selected(_publication(number, 500 * MS), Brightness(500 * MS), views)
-    assert found == [10, 20, 30, 10]
-
-
-def test_of_a_held_out_camera_that_moves_the_newest_frame_and_all_so_far_are_told_apart() -> None:
-    """The field knows how bright it is at half a second, and shows that everywhere."""
-    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
-    assert thread.so_far is None
-    for k in range(100):
-        pose = Pose((1.0, 0.0, 0.0, 0.0), (0.01 * k, 0.0, 0.0))
-        thread._held_out["cam00"].take(replace(_frame(k, 5 * k * MS), pose=pose))
-    thread._held_out["cam00"].take(replace(_frame(100, 500 * MS), payload=b"damaged"))
-    snapshot = Brightness(500 * MS)
-    thread._recent.append((_publication(0, 0), snapshot))
-    thread._look_back()  # the newest is damaged
-    thread._look_back()
-    assert thread.so_far is not None and thread.so_far.frames == 3  # two in turn, and the newest
-    thread._look_back(whole=True)
-    found = thread.so_far
-    assert MOST // 2 <= found.frames <= MOST and not found.refined  # spread over the run, the damaged one forgotten
-    assert found.now_psnr_db > 35.0 and 8.0 < found.all_psnr_db < 20.0
-    assert (
-        found.words() == f"now {found.now_psnr_db:.2f} dB, all {found.frames} frames so far {found.all_psnr_db:.2f} dB"
-    )
-
-
-def test_a_held_out_camera_that_stands_still_has_no_earlier_places() -> None:
-    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
-    for k in range(5):
-        thread._held_out["cam00"].take(_frame(k, 5 * k * MS))
-    thread._recent.append((_publication(0, 0), Brightness(0)))
-    thread._look_back(whole=True)
-    assert thread.so_far is None
+    ((scored, final),) = told
+    assert final and thread.baselines.mean.nearest_view_db is None
+    np.testing.assert_allclose([scored.psnr_db, thread.baselines.mean.mean_color_db], 20.0, atol=1e-3)

@@ -30,20 +30,6 @@ def test_a_damaged_payload_is_counted_once_and_loses_nothing_else():
     assert decoder.undecodable == 1
 
 
-def test_memory_is_one_view_a_camera():
-    decoder = ViewDecoder()
-    for i in range(200):
-        decoder.views([frame(sequence=i, generated_ns=i, received_ns=i)])
-    assert len(decoder._views) == 1
-
-
-def test_another_size_is_decoded_anew():
-    decoder, item = ViewDecoder(), frame()
-    assert decoder.view(item).image.shape == (24, 32, 3)
-    decoder.take_at_most(767)
-    assert decoder.view(item).image.shape == (12, 16, 3)
-
-
 def test_a_large_image_is_decoded_smaller_and_whole_when_asked_for():
     item = frame()  # 32 x 24
     for most, size in ((768, (24, 32)), (767, (12, 16)), (1, (3, 4))):

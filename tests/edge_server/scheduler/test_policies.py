@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_server.scheduler import OFFERED, POLICIES, Epoch, LivePolicies, make_live_policy, make_policy, policy_help
+from edge_server.scheduler import OFFERED, POLICIES, Epoch, LivePolicies, make_policy, policy_help
 from tests.support import MOST_MS, work_ms
 
 MS = 1_000_000
@@ -20,27 +20,27 @@ def epoch(now_ms: float, **generated_ms: float) -> Epoch:
     return Epoch(round(now_ms * MS), 0, {c: round(g * MS) for c, g in generated_ms.items()})
 
 
-def choose(name, at, value=None, later=None):
-    """Plan at ``at`` and select at ``later`` (or at once)."""
+AT = epoch(200, a=190, b=80, c=150, d=10)  # ages: 10, 120, 50 and 190 ms
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "at", "chosen"),
+    [
+        ("all", None, AT, "abcd"),
+        ("threshold", 50, AT, "ac"),  # the age of exactly omega is included
+        ("threshold", 49.999, AT, "a"),
+        ("threshold", 5, AT, "a"),  # the freshest, where none is young enough
+        ("wait", 0, AT, "abcd"),
+        ("freshest-k", 2, AT, "ac"),
+        ("freshest-k", 2, epoch(9, a=5, b=5, c=5), "ab"),
+        ("freshest-k", 99, AT, "abcd"),
+        ("age-driven", None, AT, "a"),  # the least mean age
+        ("age-driven", None, epoch(9, a=5, b=3, c=5), "ac"),
+    ],
+)
+def test_which_cameras_a_policy_chooses(name, value, at, chosen):
     policy = make_policy(name, value, np.random.default_rng(3))
-    return policy.select(later or at, policy.plan(at))
-
-
-AT = epoch(200, a=190, b=80, c=150, d=10)
-
-
-def test_all_takes_everything():
-    assert choose("all", AT) == ("a", "b", "c", "d")
-
-
-def test_threshold_includes_the_age_of_exactly_omega():
-    assert [AT.age_ms(camera) for camera in "abcd"] == [10.0, 120.0, 50.0, 190.0]
-    assert choose("threshold", AT, 50) == ("a", "c")
-    assert choose("threshold", AT, 49.999) == ("a",)
-
-
-def test_threshold_takes_the_freshest_when_none_is_young_enough():
-    assert choose("threshold", AT, 5) == ("a",)
+    assert policy.select(at, policy.plan(at)) == tuple(chosen)
 
 
 def test_wait_counts_only_what_was_generated_after_the_decision():
@@ -57,22 +57,6 @@ def test_wait_arrived_counts_what_came_in_meanwhile_however_old():
     assert (window.wait_until_ns, window.generated_after_ns, window.received_after_ns) == (260 * MS, None, 200 * MS)
     at = replace(epoch(260, a=100, b=201, c=150), received_ns={"a": 220 * MS, "b": 230 * MS, "c": 200 * MS})
     assert policy.select(at, window) == ("a", "b")
-
-
-def test_wait_of_zero_uses_the_buffer_as_it_is():
-    assert choose("wait", AT, 0) == ("a", "b", "c", "d")
-    assert make_policy("wait", 0, np.random.default_rng(0)).plan(AT).omega_ms == 0.0
-
-
-def test_freshest_k_and_its_ties():
-    assert choose("freshest-k", AT, 2) == ("a", "c")
-    assert choose("freshest-k", epoch(9, a=5, b=5, c=5), 2) == ("a", "b")
-    assert choose("freshest-k", AT, 99) == ("a", "b", "c", "d")
-
-
-def test_age_driven_minimises_the_mean_age():
-    assert choose("age-driven", AT) == ("a",)
-    assert choose("age-driven", epoch(9, a=5, b=3, c=5)) == ("a", "c")
 
 
 def test_round_robin_gives_everybody_a_turn():
@@ -100,7 +84,7 @@ def test_random_is_uniform_over_non_empty_sets_and_repeats_with_its_seed():
 
 
 @pytest.mark.parametrize("name", POLICIES)
-@given(ages=st.lists(st.floats(0, 1e9), max_size=40), now=st.integers(0, 2**62))
+@given(ages=st.lists(st.floats(-1e4, 1e9), max_size=40), now=st.integers(0, 2**62))
 def test_every_policy_selects_known_cameras_once_and_at_least_one(name, ages, now):
     generated = {f"c{i}": now - round(a * MS) for i, a in enumerate(ages)}
     policy = make_policy(name, None, np.random.default_rng(0))
@@ -120,23 +104,13 @@ def test_every_policy_selects_known_cameras_once_and_at_least_one(name, ages, no
         ("wait", float("nan")),
         ("freshest-k", 0),
         ("round-robin", 2.5),
-        ("random", 0),
-        ("wait", 1e308),
-        ("wait-arrived", float("inf")),
         ("periodic", 3.7e6),
-        ("round-robin", float("inf")),
         ("random", float("nan")),
     ],
 )
 def test_a_value_out_of_range_is_refused_by_name(name, value):
     with pytest.raises(ValueError, match="expected"):
         make_policy(name, value, np.random.default_rng(0))
-
-
-@pytest.mark.parametrize(("value", "said"), [(3.0, "a learned policy has no value to set"), (None, "none.npz")])
-def test_a_learned_policy_takes_no_value(value, said):
-    with pytest.raises((ValueError, OSError), match=said):
-        make_policy("bandit:none.npz", value, np.random.default_rng(0))
 
 
 def test_an_unknown_policy_lists_the_known_ones():
@@ -146,24 +120,11 @@ def test_an_unknown_policy_lists_the_known_ones():
         assert policy_help(name) == ""
 
 
-def test_all_that_is_offered_can_be_made_live_and_has_help():
-    assert set(OFFERED) == set(POLICIES) - {"wait-flush"}
-    for name in OFFERED:
-        assert make_live_policy(name, None, np.random.default_rng(0)).name == name and policy_help(name)
-
-
 def test_flushing_is_asked_for_only_where_something_is_waited_for():
     at = Epoch(50 * MS, 0, {"a": 0})
     make = lambda name, value: make_policy(name, value, np.random.default_rng(0)).plan(at)  # noqa: E731
     assert make("wait-flush", 40.0).flush and make("wait-flush", 40.0).wait_until_ns == 90 * MS
     assert not make("wait-flush", 0.0).flush and not make("wait", 40.0).flush
-
-
-def test_a_live_edge_refuses_what_only_virtual_time_can_do():
-    rng = np.random.default_rng(0)
-    assert make_live_policy("wait", 40.0, rng).name == "wait"
-    with pytest.raises(ValueError, match="live, use wait"):
-        make_live_policy("wait-flush", 40.0, rng)
 
 
 def test_a_running_edge_offers_what_it_began_with_and_no_other_file():

@@ -71,38 +71,18 @@ def test_a_session_goes_on_where_its_file_ends():
     assert other.question == part.question and other.undone().question == part.undone().question
 
 
-def test_the_file_says_what_was_shown_and_who_answered():
-    simulated = PreferenceSession("tile", ORDERS, FEATURES, seed=3, by="simulated expert (edges)")
-    file = simulated.answered("neither").as_json()
-    assert (file["version"], file["scenario"], file["reconstructions"][3]) == (1, "tile", (3, 4))
-    assert by_taste(NEW, 1).as_json()["answers"][0]["by"] == "person"
-    assert file["answers"][0] == {
-        "left": NEW.question.left,
-        "right": NEW.question.right,
-        "choice": "neither",
-        "by": "simulated expert (edges)",
-        "repeats": None,
-    }
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         (lambda f: f.update(version=2), "version"),
-        (lambda f: f.update(kind="shopping list"), "kind"),
         (lambda f: f.update(more=1), "unknown field `more`"),
-        (lambda f: f.update(seed=-1), "below 0"),
         (lambda f: f.update(scenario="cell"), "other reconstructions"),
-        (lambda f: f["reconstructions"].pop(), "other reconstructions"),
         (lambda f: f.update(made_of="of other pictures"), "other reconstructions"),
         (lambda f: f["answers"][2].update(choice="both"), r"answers\[2\].choice"),
         (lambda f: f["answers"][2].update(left=20), "answer 2: 20 and"),
-        (lambda f: f["answers"][2].update(left=-1), "answer 2: -1 and"),
         (lambda f: f["answers"][2].update(left=1, right=1), "no pair"),
-        (lambda f: f["answers"][2].update(repeats=1), "answer 2: does not repeat answer 1"),
         (lambda f: f["answers"][2].update(repeats=2), "answer 2: does not repeat answer 2"),
         (lambda f: f["answers"][2].update(by="simulated expert (edges)"), "they are not mixed"),
-        (lambda f: f["answers"][2].pop("by"), "missing required field `by`"),
     ],
 )
 def test_bad_files_are_refused_in_one_sentence(change, said):
@@ -113,16 +93,10 @@ def test_bad_files_are_refused_in_one_sentence(change, said):
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("data", [b"", b"{", b"[]", b"\xff\xfe", b"[" * 100_000, b'{"kind": NaN}'])
+@pytest.mark.parametrize("data", [b"{", b"\xff\xfe", b"[" * 100_000])
 def test_what_is_no_file_of_answers_is_refused(data):
     with pytest.raises(ViewpointError, match="not a file of answers"):
         NEW.imported(data)
-
-
-def test_no_pair_to_ask():
-    for orders in ((), ((0, 1),), ((0, 1), (0, 1))):
-        with pytest.raises(ViewpointError, match="no pair to ask about"):
-            PreferenceSession("tile", orders, FEATURES[: len(orders)])
 
 
 def test_neither_is_half_a_vote_for_each():

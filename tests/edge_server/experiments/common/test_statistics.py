@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.common.statistics import (
-    FALSE_DISCOVERY_RATE,
     Interval,
     at_its_best,
     crossed,
@@ -19,13 +18,14 @@ from edge_server.experiments.common.statistics import (
 )
 
 
-def test_an_interval_covers_the_mean_in_95_of_100():
-    rng = np.random.default_rng(1)
-    covered = 0
-    for _ in range(2000):
-        found = interval(list(rng.normal(3.0, 2.0, 6)))
-        covered += found.low <= 3.0 <= found.high
-    assert 0.935 < covered / 2000 < 0.965
+def test_an_interval_is_students_t_of_the_differences_of_pairs():
+    common = {0: 10.0, 1: -20.0, 2: 5.0, 3: 0.0, 99: 5.0}
+    pairs = {seed: common[seed] + gain for seed, gain in enumerate((1.0, 2.0, 3.0, 4.0))}
+    found = paired(pairs, common)
+    half = 3.182446 * 1.290994 / 2.0  # t of 3 degrees of freedom, deviation, root of four
+    assert (found.mean, found.count) == (2.5, 4)
+    assert (found.low, found.high) == pytest.approx((2.5 - half, 2.5 + half), rel=1e-5)
+    assert found.p_value(found.low) == pytest.approx(0.05)
 
 
 def test_too_few_values_have_no_interval():
@@ -38,26 +38,10 @@ def test_too_few_values_have_no_interval():
     assert Interval(1.0, 1.0, 1.0, 9).above(1.0) is False  # all values alike
 
 
-def test_the_false_discovery_rate_is_the_share_of_wrong_verdicts_among_the_decided():
-    rng = np.random.default_rng(3)
-    wrong = []
-    for _ in range(500):  # 20 hypotheses that hold, then 20 that do not
-        p_values = [*rng.uniform(size=20).tolist(), *(1e-2 * rng.uniform(size=20)).tolist()]
-        found = discoveries(p_values)
-        wrong.append(sum(found[:20]) / max(sum(found), 1))
-        assert found == discoveries(p_values, FALSE_DISCOVERY_RATE)
-    # Of all hypotheses half hold, so that Benjamini and Hochberg's procedure keeps half of the rate.
-    assert np.mean(wrong) == pytest.approx(0.5 * FALSE_DISCOVERY_RATE, abs=0.005)
+def test_verdicts_are_decided_by_benjamini_and_hochbergs_procedure():
+    # Rejected are all up to the last p-value of rank k that is at most 0.05 k / 5: here .01, .02, .03.
+    assert discoveries([0.6, 0.03, 0.01, 0.045, 0.02]) == [False, True, True, False, True]
     assert discoveries([]) == []
-
-
-def test_pairing_takes_out_what_seeds_have_in_common():
-    rng = np.random.default_rng(2)
-    common = rng.normal(0, 10, 20)
-    a = {s: float(common[s] + 1.0 + 0.1 * rng.normal()) for s in range(20)}
-    b = {s: float(common[s]) for s in range(20)} | {99: 5.0}
-    found = paired(a, b)
-    assert found.count == 20 and 0.9 < found.low < 1.0 < found.high < 1.1
 
 
 def curve_of(shape, seeds=24, noise=0.5, seed=0):
@@ -74,12 +58,6 @@ def test_an_optimum_inside_is_found_and_one_at_the_end_is_not_called_inside():
     assert rising.x == 160.0 and rising.interior(0.1) is False
 
 
-def test_a_flat_curve_is_not_given_an_optimum():
-    """The best of five equal points, measured on the seeds that chose it, would look better than the ends."""
-    claimed = sum(optimum(curve_of(lambda x: 0.0, seed=s)).interior() is True for s in range(60))
-    assert claimed <= 6
-
-
 def test_a_best_point_is_measured_on_seeds_that_did_not_choose_it():
     """Even seeds have their best at 1, odd ones at 2: what one half prefers is the worse one for the
     other."""
@@ -91,30 +69,19 @@ def test_a_best_point_is_measured_on_seeds_that_did_not_choose_it():
     assert at_its_best({}) == at_its_best({1.0: {0: None}}) == {}
 
 
-def test_seeds_that_lack_a_point_are_left_out():
-    curve = curve_of(lambda x: -abs(math.log(x / 40.0)))
-    curve[10.0][3] = None
-    assert optimum(curve).over_last.count == 23
-    with pytest.raises(ValueError, match="no seed"):
-        optimum({1.0: {0: None}, 2.0: {0: 1.0}})
-
-
-@pytest.mark.parametrize("spread", [0.0, 0.3, 1.0])
-def test_an_interval_over_runs_and_seeds_covers_what_it_says(spread):
-    """Differences of three trainings that vary by ``spread``, tried on the same 60 seeds, whose mean is nought: pairing
-    has taken out what seeds have in common, which is where the interval is narrowest for what it holds."""
+def test_an_interval_over_runs_and_seeds_covers_what_it_says():
+    """Differences of three trainings that vary, tried on the same 60 seeds, whose mean is nought: pairing has taken out
+    what seeds have in common, which is where the interval is narrowest for what it holds."""
     rng = np.random.default_rng(3)
     covered = by_seeds = 0
-    for _ in range(1000):
-        table = spread * rng.normal(size=(3, 1)) + rng.normal(size=(3, 60))
+    for _ in range(500):
+        table = rng.normal(size=(3, 1)) + rng.normal(size=(3, 60))
         found = crossed([dict(enumerate(run)) for run in table.tolist()])
         alone = interval(table.mean(axis=0).tolist())
-        assert found.mean == pytest.approx(alone.mean)
         covered += found.low <= 0.0 <= found.high
         by_seeds += alone.low <= 0.0 <= alone.high
-    assert 930 <= covered <= 985
-    if spread == 1.0:  # the interval that leaves the trainings out
-        assert by_seeds < 500
+    assert 465 <= covered <= 493
+    assert by_seeds < 250, "the interval that leaves the trainings out"
 
 
 def test_runs_and_seeds_where_there_are_few_of_either():

@@ -13,7 +13,6 @@ from edge_server.experiments.engine import content_key
 from edge_server.experiments.engine.content_key import code_digest, content_digest, result_key
 from edge_server.experiments.engine.engine import ResultStore
 from edge_server.settings import ComputeConfig
-from freshfield import plugins
 from tests.edge_server.experiments.engine.jobs import Point, measure, note
 
 CODE = '''
@@ -48,14 +47,6 @@ def test_the_function_counts_and_what_is_bound_to_it_does_not():
     assert bound[0] == bound[1] == result_key(note, Point(1)) != result_key(measure, Point(1))
 
 
-def test_the_kind_of_processor_and_the_versions_count(monkeypatch):
-    key = result_key(measure, 1)
-    monkeypatch.setattr(content_key, "processor", lambda: "x86_64 haswell")
-    other = result_key(measure, 1)
-    monkeypatch.setattr(content_key, "_versions", lambda: {"numpy": "1.0"})
-    assert len({key, other, result_key(measure, 1)}) == 3
-
-
 def test_files_count_by_their_contents_not_by_their_place_or_time(tmp_path):
     for name, text in (("a/x.txt", "one"), ("b/x.txt", "one"), ("c/y.txt", "one"), ("d/x.txt", "two")):
         (tmp_path / name).parent.mkdir()
@@ -68,22 +59,6 @@ def test_files_count_by_their_contents_not_by_their_place_or_time(tmp_path):
     assert content_digest(tmp_path / "a") != a
     with pytest.raises(OSError):
         result_key(measure, 1, [tmp_path / "missing"])
-
-
-@pytest.mark.parametrize("name", ["{folder}/own_rule.py:Mine", "own_rule:Mine", "rules.first:Mine:3", "own_entry:3"])
-def test_classes_from_outside_count_with_what_they_import(name, tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(plugins, "_installed_modules", lambda: {"own_entry": "own_rule"})
-    (tmp_path / "rules").mkdir()
-    (tmp_path / "rules/__init__.py").touch()
-    (tmp_path / "rules/first.py").write_text("from rules import helper")
-    (tmp_path / "own_rule.py").write_text("import json, rules.first")
-    keys = set()
-    for text in ("A = 1", "A = 22"):
-        (tmp_path / "rules/helper.py").write_text(text)
-        (tmp_path / "unrelated.py").write_text(text)
-        keys |= {result_key(measure, {"policy": name.format(folder=tmp_path)}), result_key(measure, {"policy": "all"})}
-    assert len(keys) == 3
 
 
 @pytest.fixture

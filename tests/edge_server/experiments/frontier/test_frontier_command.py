@@ -9,7 +9,7 @@ import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.frontier import from_scratch, frontier_command
-from edge_server.experiments.frontier.output import recommendation
+from edge_server.experiments.frontier.output import recommendation, table
 from edge_server.experiments.frontier.update_time import (
     Charged,
     MovingRun,
@@ -18,14 +18,11 @@ from edge_server.experiments.frontier.update_time import (
     mean_over_seeds,
     measure_compute,
     run_updates,
-    static_steps,
-    steps_for,
-    variants,
 )
 from edge_server.experiments.virtual import costs
 from edge_server.live.frontier import read_frontier
 from edge_server.settings import ComputeConfig
-from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
+from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS
 
 TINY = MovingScene(cameras=4, size=32)
 COMPUTE = ComputeConfig(ms_per_step=30.0, ms_per_update=10.0)
@@ -53,29 +50,12 @@ def test_a_cycle_is_charged_a_frame_of_each_camera_and_layers_every_frame(layers
 
 
 def test_the_front_is_what_nothing_beats_in_both():
-    rows = [
-        {"planned_s": 1.0, "psnr_db": 20.0},
-        {"planned_s": 2.0, "psnr_db": 19.0},
-        {"planned_s": 2.0, "psnr_db": 25.0},
-        {"planned_s": 3.0, "psnr_db": 25.0},
-        {"planned_s": 4.0, "psnr_db": 26.0},
-    ]
+    points = [(1.0, 20.0), (2.0, 19.0), (2.0, 25.0), (3.0, 25.0), (4.0, 26.0)]
+    rows = [{"planned_s": planned_s, "psnr_db": psnr_db} for planned_s, psnr_db in points]
     from_scratch.mark_front(rows)
     assert [row["on_front"] for row in rows] == [True, False, True, False, True]
-
-
-def test_steps_that_fit_into_an_update():
-    assert steps_for(1.0, COMPUTE) == 33
-    assert steps_for(0.001, COMPUTE) == 1
-    assert static_steps(0.02) == 5 and static_steps(0.001) == 1
-
-
-def test_layers_are_a_variant_of_fields_that_have_them():
-    found = variants(("splat", "ngp"), {"threads": 1})
-    assert [(v.field, v.layers) for v in found] == [("splat", True), ("splat", False), ("ngp", False)]
-    chosen = [TINY.scenario(1.0, v).edge for v in found[:2]]
-    assert [edge["field_options"] for edge in chosen] == [{"threads": 1, "layers": True}, {"threads": 1}]
-    assert [edge["updates"] for edge in chosen] == ["arrivals", "cycle"]
+    measured = {"field": "ngp", "seconds": 1.0, "steps": 3, "ms_per_step": 2.0, "ssim": 0.5, "lpips": None}
+    assert "| ngp | 1.00 | 3 | 2.00 | 20.00 | 0.500 | - | * |" in table([{**rows[0], **measured}])
 
 
 def test_seeds_are_averaged_with_their_standard_error():
@@ -90,14 +70,8 @@ def test_seeds_are_averaged_with_their_standard_error():
 
 def test_the_last_line_recommends_an_update_time_at_a_persons_speed():
     def row(speed, update_s, whole, moving):
-        return {
-            "field": "ngp",
-            "options": {},
-            "speed_m_per_s": speed,
-            "update_s": update_s,
-            "shown_psnr_db": whole,
-            "shown_psnr_moving_db": moving,
-        }
+        shown = {"shown_psnr_db": whole, "shown_psnr_moving_db": moving}
+        return {"field": "ngp", "options": {}, "speed_m_per_s": speed, "update_s": update_s, **shown}
 
     rows = [row(1.0, 0.1, 20, 18), row(1.0, 0.4, 22, 17), row(1.0, 2.0, 23, 15), row(3.0, 0.05, 30, 30)]
     assert recommendation(rows) == "for this scene: update_ms: 400"
@@ -142,12 +116,3 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_sweep):
     again = (tmp_path / "results.jsonl").read_text().splitlines()
     assert again == lines, "virtual time gives the same point again"
     assert json.loads((tmp_path / "frontier.json").read_text())["updates"] == data["updates"]
-
-
-def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_sweep):
-    write_photos(tmp_path / "set", 5)
-    words = ["frontier", "--quick", "--scene", str(tmp_path / "set"), "--out", str(tmp_path / "out")]
-    assert edge_server([*words, *SMALL_WORDS]) == 0
-    said = capsys.readouterr().out
-    assert "figure 2 left out" in said and said.endswith("for this scene: update_ms: any\n")
-    assert (tmp_path / "out" / "frontier.png").exists() and not (tmp_path / "out" / "updates.png").exists()

@@ -6,7 +6,6 @@ import dataclasses
 import pickle
 from functools import partial
 
-import numpy as np
 import pytest
 
 from edge_server.experiments.engine import Engine
@@ -18,7 +17,7 @@ from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from edge_server.settings import ComputeConfig
-from tests.edge_server.experiments.rollouts.small import NOTHING, reported, setting
+from tests.edge_server.experiments.rollouts.small import NOTHING, setting
 
 SELECT = Spec("select", StateLayout(("age", "pose")), hidden=8)
 
@@ -62,17 +61,6 @@ def test_a_job_gives_the_same_wherever_and_after_whatever_it_is_computed(what: S
     assert [sent(job) for job in reversed(jobs)] == found[::-1]
 
 
-def test_repeats_have_fields_of_other_seeds_and_cameras_score_by_name():
-    engine = Engine(threads=1, say=lambda line: None)
-    found = run_rollouts(engine, reported(), NOTHING, [5], {"all": "all"}, repeats=2, cameras=("cam00", "cam04"))[
-        "all"
-    ][5]
-    outcomes = [repeat[0].decided[0].outcomes for repeat in found]
-    assert [set(of) for of in outcomes] == [{"cam00", "cam04"}] * 2
-    assert outcomes[0]["cam00"].psnr_db != outcomes[1]["cam00"].psnr_db
-    assert outcomes[0]["cam00"].aaoi_ms == outcomes[1]["cam04"].aaoi_ms
-
-
 def test_results_are_kept_by_weights_and_not_by_the_names_of_their_files(tmp_path):
     def known() -> int:
         return len((tmp_path / "known.jsonl").read_text().splitlines())
@@ -90,12 +78,3 @@ def test_results_are_kept_by_weights_and_not_by_the_names_of_their_files(tmp_pat
     Learner(SELECT, 1).actor.save(a)
     roll(a)
     assert known() == 2
-
-
-def test_a_running_deployment_is_scored_as_a_whole():
-    hold = dataclasses.replace(SELECT, hold_ms=300.0)
-    (run,) = rollout(EpisodeFactory(deployed(), NOTHING), 5, learned(Learner(hold, 0).actor))
-    assert run.decided == [] and run.whole is not None and run.whole.psnr_db > 5.0
-    (all_run,) = rollout(EpisodeFactory(deployed(), NOTHING), 5, named("all"))
-    assert all_run.whole is not None and np.isclose(all_run.whole.views, 4.0)
-    assert all_run.whole.psnr_db != run.whole.psnr_db

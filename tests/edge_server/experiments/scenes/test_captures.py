@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ import yaml
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.arguments import OptionError
-from edge_server.experiments.scenes.multiview_still import data_name, open_still
+from edge_server.experiments.scenes.multiview_still import open_still
 from tests.edge_server.experiments.sets import write_photos
 
 FRAMES = 20
@@ -48,12 +46,6 @@ def test_a_video_with_its_trajectory_is_a_scan_with_times(tmp_path):
     assert len(open_still(tmp_path / "film.yaml", "0").held_out) == 0
 
 
-@pytest.mark.parametrize(("fps", "times"), [(5, range(0, FRAMES, 2)), (20, range(FRAMES)), (0.01, [0])])
-def test_the_scenario_s_rate_chooses_the_frames(tmp_path, fps, times):
-    found = open_still(_video(tmp_path, fps=fps), "0")
-    assert [round(view.camera_to_world[0, 3]) for view in found.training] == list(times)
-
-
 def test_photos_have_no_times_and_bring_no_depth_unless_they_have_some(tmp_path):
     write_photos(tmp_path, 9)
     found = open_still(_scenario(tmp_path, kind="transforms", data="transforms_train.json"))
@@ -78,9 +70,3 @@ def test_what_cannot_be_used_is_said_and_costs_nothing_else(tmp_path):
         open_still(_scenario(tmp_path, kind="world", scene="room"))
     with pytest.raises(DatasetError, match=r"mine\.yaml"):
         open_still(_scenario(tmp_path, kind="video", data="none.mp4"))
-
-
-def test_a_shipped_scenario_is_found_by_its_name_and_hides_no_scene():
-    assert data_name(Path("redkitchen")) == "redkitchen" and data_name(Path("room")) == "room"
-    with pytest.raises(OptionError, match="are for data sets: redkitchen says its scale"):
-        open_still(Path("redkitchen"), scale=2.0)

@@ -49,15 +49,12 @@ def peak(at: float) -> Callable[[Any], dict[str, Any]]:
     return rule
 
 
-def table_of(name: str, tmp_path: Path, rule: Callable[[Any], dict[str, Any]], seeds: int = 6) -> SeedTable:
-    """The rows of a study of trials on ``room`` whose results follow a rule."""
+def verdicts(name: str, tmp_path: Path, rule: Callable[[Any], dict[str, Any]], seeds: int = 6) -> list[Verdict]:
+    """Of a study of trials on ``room`` whose results follow a rule."""
     points = STUDIES[name].cases(request(tmp_path, seeds=seeds, scenes=("room",)))
     rows = [{**p.labels, "seed": p.trial.seed, **rule(p.trial)} for p in points]
-    return SeedTable([{**row, "f_w": f_w(row), "f_w_corrected": f_w(row, corrected=True)} for row in rows])
-
-
-def verdicts(name: str, tmp_path: Path, rule: Callable[[Any], dict[str, Any]], seeds: int = 6) -> list[Verdict]:
-    return judge(STUDIES[name], table_of(name, tmp_path, rule, seeds))
+    table = SeedTable([{**row, "f_w": f_w(row), "f_w_corrected": f_w(row, corrected=True)} for row in rows])
+    return judge(STUDIES[name], table)
 
 
 def answers(found: list[Verdict], *words: str) -> set[str]:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from edge_server.experiments.common.drawn_images import draw_images
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.studies import drawing, metric_distortions
 from tests.edge_server.experiments.studies.invented import request
@@ -27,3 +29,9 @@ def test_distortions_are_drawn_as_bright_as_they_are(tmp_path: Path, monkeypatch
     metric_distortions._draw(request(tmp_path), SeedTable([]))
     assert [label for label, _ in drawn] == ["reference", *metric_distortions.THESIS]
     np.testing.assert_allclose(drawn[0][1], 255 * metric_distortions._reference(0), atol=1.0)
+
+
+def test_rows_of_one_image_each_are_drawn(tmp_path: Path) -> None:
+    black = np.zeros((4, 6, 3), np.uint8)
+    draw_images(tmp_path / "rows.png", [("room", [("reference", black)]), ("tower", [("reference", black)])])
+    assert (cv2.imread(str(tmp_path / "rows.png")) < 64).mean() > 0.25, "titles stand beside the images"

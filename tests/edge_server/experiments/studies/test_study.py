@@ -13,10 +13,10 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.common.statistics import Interval
 from edge_server.experiments.studies.registry import ON_A_CHANNEL, STUDIES
-from edge_server.experiments.studies.study import Claim, Finding, Study, StudyRequest, judge, run_study
+from edge_server.experiments.studies.study import Claim, Finding, Study, StudyRequest, judge
 from edge_server.experiments.studies.study_command import main
 from edge_server.scheduler import make_policy
-from tests.edge_server.experiments.studies.invented import answers, figures, noise, peak, request, verdicts
+from tests.edge_server.experiments.studies.invented import answers, figures, noise, peak, verdicts
 
 
 @pytest.mark.parametrize("name", ON_A_CHANNEL)
@@ -40,21 +40,6 @@ edge: {lpips: none}
 """
 
 
-@pytest.mark.parametrize("name", ON_A_CHANNEL)
-def test_a_study_takes_anybodys_channel_and_scene(name: str, tmp_path: Path):
-    scene = tmp_path / "mine.yaml"
-    scene.write_text(OWN_SCENE)
-    channel = {"service": {"law": "deterministic", "mean_ms": 77.0}, "discipline": "fcfs"}
-    asked = request(tmp_path, seeds=1, scenes=(str(scene),), channel=channel, channel_name="slow")
-    points = STUDIES[name].cases(asked)
-    used = [p for p in points if p.trial.channel != {"preset": "ideal"}]
-    assert used and {p.trial.channel["discipline"] for p in used} == {"fcfs"}
-    assert {p.labels["scene"] for p in points} == {"mine"}
-    assert {(s.cameras, s.held_out, s.source["fps"]) for s in (p.trial.scenario() for p in points[:3])} == {
-        (("cam00", "cam01", "cam02", "cam03"), ("cam03",), points[0].trial.scenario().source["fps"])
-    }
-
-
 @pytest.mark.slow  # some seconds of fits
 def test_figure_6_3_is_made_of_ones_own_channel_and_scene(tmp_path: Path, capsys, monkeypatch):
     monkeypatch.setattr("edge_server.experiments.studies.waiting_curves.QUICK_OMEGAS", (60.0, 120.0))
@@ -70,62 +55,9 @@ def test_figure_6_3_is_made_of_ones_own_channel_and_scene(tmp_path: Path, capsys
     assert (out / "results/trials.jsonl").read_bytes() == known
 
 
-def test_mat_finds_an_optimum_and_its_absence(tmp_path: Path):
-    assert answers(verdicts("mat", tmp_path, peak(80.0))) == {"holds"}
-    assert answers(verdicts("mat", tmp_path, peak(4000.0))) == {"does not hold"}
-
-
-def at_delay(peak_of):
-    """A rule whose best threshold follows the mean delay as ``peak_of`` says."""
-
-    def rule(trial):
-        return peak(peak_of(trial.channel.get("service", {"mean_ms": 60.0})["mean_ms"]))(trial)
-
-    return rule
-
-
-def test_mat_delay_finds_a_rising_best_threshold_and_no_other(tmp_path: Path):
-    assert answers(verdicts("mat-delay", tmp_path, at_delay(lambda delay: 60.0 + 1.5 * delay))) == {"holds"}
-    falling = verdicts("mat-delay", tmp_path, at_delay(lambda delay: 400.0 - 1.5 * delay))
-    assert answers(falling) == {"does not hold"}
-    assert "holds" not in answers(verdicts("mat-delay", tmp_path, at_delay(lambda delay: 150.0)))
-
-
-@pytest.mark.parametrize("top", [lambda delay: 2.0 * delay, lambda delay: 4.0 * delay])
-def test_a_curve_that_saturates_has_no_best_threshold_that_could_grow(tmp_path: Path, top):
-    """The larger the delay, the later all views are admitted: the highest of near-ties moves with that, no optimum
-    does."""
-
-    def rule(trial):
-        value, delay = trial.value or 1000.0, trial.channel.get("service", {"mean_ms": 60.0})["mean_ms"]
-        return figures(2.0 * min(value / top(delay), 1.0) + 0.2 * noise(trial.seed, value), value)
-
-    assert answers(verdicts("mat-delay", tmp_path, rule)) == {"does not hold"}
-
-
-@pytest.mark.parametrize("only", [lambda x: math.log(x), lambda x: -math.log(x), lambda x: 0.0])
-def test_mat_delay_claims_nothing_where_no_threshold_is_best(tmp_path: Path, only):
-    def rule(trial):
-        value = trial.value or 1000.0
-        return figures(only(value) + noise(trial.seed, value), value)
-
-    assert "holds" not in answers(verdicts("mat-delay", tmp_path, rule))
-
-
 @pytest.mark.parametrize("name", [n for n in ON_A_CHANNEL if n != "representations"])
 def test_one_seed_decides_nothing(name, tmp_path: Path):
     assert answers(verdicts(name, tmp_path, peak(90.0), seeds=1)) == {"undecided"}
-
-
-def test_lambda_moves_the_best_threshold_only_where_it_counts_used_views(tmp_path: Path):
-    def rule(trial):
-        row = peak(200.0)(trial)
-        return {**row, "age_sum_ms": 2000.0} if trial.policy == "threshold" else row
-
-    found = verdicts("lambda", tmp_path, rule)
-    assert answers(found, "threshold, all cameras (5.8)") == {"does not hold"}
-    assert answers(found, "threshold, used views (6.35)") == {"holds"}
-    assert answers(found, "wait, all cameras (5.8)") == {"holds"}
 
 
 def test_omega_tells_a_plateau_from_a_peak_and_from_a_curve_that_still_rises(tmp_path: Path):
@@ -146,30 +78,6 @@ def test_omega_tells_a_plateau_from_a_peak_and_from_a_curve_that_still_rises(tmp
     assert answers(rising, "high traffic, wait, PSNR (dB)", "plateau") == {"does not hold"}
 
 
-@pytest.mark.parametrize(("gain", "said"), [(0.5, "holds"), (-0.5, "does not hold")])
-def test_omega_compares_both_readings_of_wait(gain: float, said: str, tmp_path: Path):
-    def rule(trial):
-        better = gain * ((trial.policy == "wait-arrived") + 3.0 * (trial.policy == "threshold"))
-        return figures(2.0 + better + noise(trial.seed, 1.0), 50.0)
-
-    found = [v for v in verdicts("omega", tmp_path, rule) if "that arrive meanwhile" in v.claim]
-    assert answers(found) == {said} and len(found) == 8 * 3
-    assert all("wait-arrived" in v.about for v in found)
-
-
-def test_the_sign_of_ssim_in_f_w_can_turn_what_is_better(tmp_path: Path):
-    def rule(trial):
-        row = figures(noise(trial.seed, 1.0), 50.0)
-        return {**row, "ssim": 0.9 if trial.policy == "wait-arrived" else 0.5}
-
-    found = verdicts("omega", tmp_path, rule)
-    assert answers(found, "F_w (6.37)", "arrive meanwhile") == {"does not hold"}
-    assert answers(found, "F_w with w_s = -0.2", "arrive meanwhile") == {"holds"}
-
-
-# --- verdicts ------------------------------------------------------------------------------------------------
-
-
 def test_verdicts_are_corrected_for_their_number():
     """One in twenty comparisons of equals has an interval that leaves out 0: of a hundred none is decided, and what is
     certain stays so."""
@@ -185,14 +93,6 @@ def test_verdicts_are_corrected_for_their_number():
     assert [v.verdict for v in judge(study, SeedTable(rows[:2]))] == ["holds", "holds"]
 
 
-def test_a_claim_of_several_differences_is_as_sure_as_its_weakest_part():
-    sure, weak, below = Interval(1.0, 0.9, 1.1, 10), Interval(1.0, 0.1, 1.9, 10), Interval(-1.0, -1.9, -0.1, 10)
-    assert Finding("", (sure, weak)).above(0.0) is True
-    assert Finding("", (sure, weak)).p_value(0.0) == weak.p_value(0.0) > sure.p_value(0.0)
-    assert Finding("", (sure, below)).above(0.0) is False
-    assert Finding("", (sure, below)).p_value(0.0) == 2 * below.p_value(0.0)
-
-
 def test_a_study_writes_rows_verdicts_and_a_page(tmp_path: Path):
     assert main(["metrics", "--quick", "--seeds", "2", "--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "metrics.json").read_text())
@@ -202,9 +102,3 @@ def test_a_study_writes_rows_verdicts_and_a_page(tmp_path: Path):
     assert page.startswith("# What the three metrics say") and "2 seeds a point" in page
     assert "false discovery rate 5 %" in page and "![" in page and "local ghosting" in page
     assert {row["case"] for row in csv.DictReader((tmp_path / "metrics.csv").open())} >= {"Gaussian blur"}
-
-
-def test_a_study_without_rows_of_a_claim_says_nothing_of_it(tmp_path: Path):
-    study = STUDIES["images"]
-    empty = Study(study.name, study.title, lambda _: [], lambda cases, _: [], study.metrics, study.claims, study.panels)
-    assert run_study(empty, request(tmp_path)) == []

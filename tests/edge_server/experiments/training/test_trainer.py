@@ -12,26 +12,18 @@ import yaml
 
 from edge_server.experiments.common.seed_table import SeedTable, difference
 from edge_server.experiments.engine import Engine
-from edge_server.experiments.rollouts.episode import EpisodeFactory, Outcome
-from edge_server.experiments.rollouts.rollout import Decided, Run, named, rollout
-from edge_server.experiments.rollouts.setting import Setting, reward_of, seeds
+from edge_server.experiments.rollouts.episode import Outcome
+from edge_server.experiments.rollouts.rollout import Decided, Run
+from edge_server.experiments.rollouts.setting import Setting, seeds
 from edge_server.experiments.training.evaluation import Candidate, evaluate, fixed_candidates
-from edge_server.experiments.training.learning_curve import draw_curve
 from edge_server.experiments.training.train_command import main
-from edge_server.experiments.training.trainer import (
-    TrainingConfig,
-    TrainingError,
-    _progress_text,
-    read_log,
-    sibling_advantages,
-    train,
-)
+from edge_server.experiments.training.trainer import TrainingConfig, TrainingError, read_log, sibling_advantages, train
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
-from tests.edge_server.experiments.rollouts.small import NOTHING, RAW, scenario, setting, thresholds
+from tests.edge_server.experiments.rollouts.small import NOTHING, RAW, setting, thresholds
 
 REWARD = make_reward("set", distance=0.0)
 CONFIG = TrainingConfig(Spec("select", StateLayout(("age", "pose")), hidden=16), REWARD, episodes=6, batch=2)
@@ -47,18 +39,6 @@ def quiet(line: str) -> None:
 
 def trained(out: Path, of: Setting | None = None, config: TrainingConfig = CONFIG, say=quiet) -> Learner:
     return train(of or setting(), config, NOTHING, 1, out, say)
-
-
-def command_line(folder: Path, words: str, raw: dict = RAW) -> tuple[list[str], Path]:
-    """The words of a training of a small scenario, and its --out."""
-    (folder / "small.yaml").write_text(yaml.safe_dump(raw))
-    out = folder / "out"
-    return [str(folder / "small.yaml"), *words.split(), "--jobs", "1", "--out", str(out)], out
-
-
-def test_progress_has_as_many_decimals_as_it_needs():
-    row = {"episodes": 4, "reward": 0.12344, "views": 2.26, "omega_ms": 19.6}
-    assert _progress_text(CONFIG, row) == "4/6 episodes: reward 0.1234, 2.3 views, omega 20 ms"
 
 
 def test_a_stopped_training_continues_bit_for_bit(tmp_path: Path):
@@ -161,28 +141,11 @@ def test_a_reward_that_cannot_be_had_is_refused_after_the_first_batch(tmp_path):
         trained(tmp_path, config=dataclasses.replace(CONFIG, reward=make_reward("set")))
 
 
-def test_the_distance_of_a_reward_follows_from_the_scenario_and_from_what_is_asked(tmp_path: Path):
-    for name in ("alexnet_features.npz", "lin_alex_v0.1.npz"):
-        (tmp_path / name).write_bytes(b"no weights")
-    reward, missing = reward_of("set", "whole", tmp_path, "none")
-    assert reward.distance == 0.0 and "edge.lpips is none" in missing
-    reward, missing = reward_of("set", "whole", tmp_path, "alex")
-    assert (reward.distance == 0.0 and "alexnet_features.npz" in missing) or "cannot be used" in missing
-    assert reward_of("set", "whole", None, "alex", "none") == (make_reward("set", distance=0.0), None)
-
-
-def test_the_curve_is_drawn_with_gaps(tmp_path: Path):
-    rows = [
-        {"episodes": 10 * k, "reward": None if k == 2 else 0.1 * k, "term_psnr": 0.3, "term_age": None}
-        for k in range(5)
-    ]
-    draw_curve(tmp_path / "curve.png", rows)
-    assert (tmp_path / "curve.png").stat().st_size > 5_000
-
-
 def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, capsys):
-    asked = "--kind threshold --omegas 50,200 --episodes 2 --batch 1 --decisions 1 --fit-steps 2 --size 24"
-    words, out = command_line(tmp_path, asked)
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(RAW))
+    asked = "--kind threshold --omegas 50,200 --episodes 2 --batch 1 --decisions 1 --fit-steps 2 --size 24 --jobs 1"
+    out = tmp_path / "out"
+    words = [str(tmp_path / "small.yaml"), *asked.split(), "--out", str(out)]
     assert main(words) == 0
     text = capsys.readouterr().out
     assert "2/2 episodes" in text and "rewarded from cam00\n" in text
@@ -198,72 +161,15 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     assert (out / "policy.npz").exists()
 
 
-SELECT = Spec("select", StateLayout(("age", "pose")), hidden=8)
-WAIT = Spec("wait", StateLayout(("age",)), (0.0, 50.0, 150.0), hidden=8)
-NEVER = {"faults": {"loss": {"probability": 1.0}}}
-
-
-def config(spec: Spec = SELECT, reward: Reward = REWARD, **more) -> TrainingConfig:
-    return TrainingConfig(spec, reward, **{"episodes": 6, "batch": 3, **more})
-
-
-def weights_after(what: Setting, taught: TrainingConfig, out: Path) -> dict[str, np.ndarray]:
-    found = train(what, taught, NOTHING, 1, out, lambda line: None).actor.weights
-    assert all(np.isfinite(w).all() for w in found.values())
-    return found
-
-
-@pytest.mark.stability
-@pytest.mark.parametrize(("spec", "scratch"), [(SELECT, True), (WAIT, False)], ids=["select", "wait, warm"])
-def test_where_nothing_ever_arrives_training_says_so_instead_of_learning_nothing(spec, scratch, tmp_path):
-    silent = setting(NEVER, scratch=scratch)
-    with pytest.raises(TrainingError, match="nothing had arrived"):
-        weights_after(silent, config(spec), tmp_path)
-    assert not (tmp_path / "policy.npz").exists()
-    candidates = [*fixed_candidates([], ("random",)), *thresholds(50.0)]
-    found = evaluate(silent, NOTHING, Engine(threads=1, say=lambda line: None), seeds(0, "test", 2), candidates)
-    assert all(row["reward"] is None for row in found.rows(REWARD, ["cam00"]))
-
-
 @pytest.mark.stability
 def test_a_still_scene_has_no_moving_pixels_and_training_says_so(tmp_path):
     still = setting()
     source = {**still.scenario.source, "speed_m_per_s": 0.0}
     still = dataclasses.replace(still, scenario=dataclasses.replace(still.scenario, source=source))
     with pytest.raises(TrainingError, match=r"psnr_moving: nothing moves.*--on whole"):
-        weights_after(still, config(reward=make_reward("set", fidelity="moving", distance=0.0)), tmp_path)
-    weights_after(still, config(), tmp_path / "whole")
+        trained(
+            tmp_path, still, dataclasses.replace(CONFIG, reward=make_reward("set", fidelity="moving", distance=0.0))
+        )
+    learner = trained(tmp_path / "whole", still)
+    assert all(np.isfinite(w).all() for w in learner.actor.weights.values())
     assert all(row["reward"] is not None for row in read_log(tmp_path / "whole"))
-
-
-@pytest.mark.stability
-def test_damaged_late_and_doubled_frames(tmp_path):
-    channel = {
-        "preset": "ch6",
-        "faults": {
-            "corruption": {"probability": 0.3},
-            "duplication": {"probability": 0.3},
-            "blackout": {"windows_ms": [[0.0, 1000.0]]},
-        },
-    }
-    weights_after(setting(channel), config(WAIT), tmp_path)
-    assert all(row["reward"] is not None for row in read_log(tmp_path))
-
-
-@pytest.mark.stability
-def test_one_camera_that_reports_and_one_that_rewards(tmp_path):
-    alone = Setting(
-        scenario(cameras={"count": 2, "held_out": ["cam00"]}), steps=3, decisions=2, lead_ms=800.0, span_ms=400.0
-    )
-    weights_after(alone, config(samples=2), tmp_path)
-    # There is one set, so that no try is better than another.
-    assert all(row["views"] == 1.0 for row in read_log(tmp_path))
-
-
-@pytest.mark.stability
-def test_a_decision_of_nobody_is_an_outcome_without_scores():
-    factory = EpisodeFactory(setting(NEVER), NOTHING)
-    for name in ("all", "threshold:50", "wait:50", "random"):
-        for decided in rollout(factory, 3, named(name))[0].decided:
-            (outcome,) = decided.outcomes.values()
-            assert outcome.psnr_db is None and outcome.views == 0.0 and np.isfinite(outcome.wait_ms)

@@ -1,12 +1,8 @@
 from __future__ import annotations
 
-import itertools
 import json
-from dataclasses import replace
 
-import numpy as np
-
-from edge_server.live.output.journal import LINE_EVERY_S, Journal
+from edge_server.live.output.journal import Journal
 from edge_server.live.state import Publication
 from tests.freshfield.test_files import no_file_longer_than
 
@@ -50,17 +46,6 @@ def test_status_and_ages_are_json_with_nulls_not_nan(tmp_path):
     assert with_depth == {"t_s": 0.5, "age_ms": {"cam01": 12.0}, "depth_age_ms": {"cam01": 212.346}}
 
 
-def test_a_second_process_adds_to_what_the_first_wrote(tmp_path):
-    for start in (0, 3):
-        journal = Journal(tmp_path, dict)
-        for i in range(start, start + 3):
-            journal.published(publication(i))
-        journal.ages(1.0, {"cam01": 1.0})
-        journal.close()
-    assert [s["number"] for s in lines(tmp_path / "series.jsonl")] == list(range(6))
-    assert len(lines(tmp_path / "ages.jsonl")) == 2
-
-
 def test_a_full_disk_costs_lines_not_the_edge(tmp_path, caplog):
     journal = Journal(tmp_path, lambda: {"filling": "x" * 1000, "lines_lost": journal.lines_lost})
     with no_file_longer_than(0):
@@ -75,30 +60,3 @@ def test_a_full_disk_costs_lines_not_the_edge(tmp_path, caplog):
     journal.close()  # there is space again
     assert json.loads((tmp_path / "edge.json").read_text())["lines_lost"] == 57
     assert len(lines(tmp_path / "series.jsonl")) == 31
-
-
-def test_of_many_updates_a_second_those_without_scores_have_a_line_now_and_then(tmp_path):
-    journal = Journal(tmp_path, dict)
-    for i in range(300):
-        journal.published(replace(publication(i), t_s=i / 50))
-        if i % 7 == 0:
-            journal.scored(replace(publication(i, 20.0), t_s=i / 50), final=True)
-    journal.close()
-    series = lines(tmp_path / "series.jsonl")
-    assert [s["number"] for s in series if s["psnr_db"] is not None] == list(range(0, 300, 7))
-    assert all(a["t_s"] < b["t_s"] for a, b in itertools.pairwise(series))
-    apart_s = [round(b["t_s"] - a["t_s"], 6) for a, b in itertools.pairwise(series) if b["psnr_db"] is None]
-    assert apart_s and min(apart_s) >= LINE_EVERY_S
-
-
-def test_updates_that_end_a_long_gap_have_no_more_lines_than_others(tmp_path):
-    journal, t_s = Journal(tmp_path, dict), 0.0
-    long = np.random.default_rng(0).random(2000) < 0.1
-    for i in range(2000):
-        update_ms = 200.0 if long[i] else 20.0
-        t_s += update_ms / 1e3
-        journal.published(replace(publication(i), t_s=t_s, update_ms=update_ms))
-    journal.close()
-    spent = [line["update_ms"] for line in lines(tmp_path / "series.jsonl")]
-    assert 500 < len(spent) < 1200
-    assert 0.07 < sum(ms == 200.0 for ms in spent) / len(spent) < 0.13

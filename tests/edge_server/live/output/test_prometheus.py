@@ -39,15 +39,6 @@ def test_a_reason_that_comes_while_metrics_are_read_does_not_fail_them():
     assert not any("depth" in name for name in found)
 
 
-def test_depth_has_metrics_where_a_camera_sends_it():
-    state = bare_state()
-    depth = {"cam01": DepthArrivals(3, 2500, state.now_ns() - 10**9)}
-    found = {m.name: m.samples[0] for m in EdgeCollector(state, ingest({}, depth)).collect() if "depth" in m.name}
-    assert {name: sample.labels for name, sample in found.items()} == {name: {"camera": "cam01"} for name in found}
-    assert found["freshfield_depth_frames"].value == 3 and found["freshfield_depth_bytes"].value == 2500
-    assert 1.0 <= found["freshfield_depth_age_seconds"].value < 30.0
-
-
 def test_every_query_of_the_dashboard_names_a_metric_that_the_edge_exports():
     state = bare_state()
     state.cameras = lambda: [CameraView("cam01", False, None, 12.0, 3, 0)]
@@ -82,10 +73,8 @@ def test_grafana_reads_all_of_the_dashboard():
     from grafana_foundation_sdk.cog.encoder import JSONEncoder
 
     dashboard = json.loads((ROOT / "deploy/grafana.json").read_text())
-    for wrong in ({}, {"width": 12}):
-        dashboard["panels"][0]["gridPos"] |= wrong
-        read = json.loads(json.dumps(models.Dashboard.from_json(dashboard), cls=JSONEncoder))
-        assert lost(dashboard, read) == ["/__inputs", *(f"/panels/0/gridPos/{key}" for key in wrong)]
+    read = json.loads(json.dumps(models.Dashboard.from_json(dashboard), cls=JSONEncoder))
+    assert lost(dashboard, read) == ["/__inputs"]
 
 
 def lost(sent: Any, read: Any, where: str = "") -> list[str]:

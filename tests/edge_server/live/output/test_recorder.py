@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
-import logging
 import threading
 
 import pytest
@@ -16,31 +13,10 @@ from tests.freshfield.test_session import requests
 
 pytest.importorskip("mcap", reason="MCAP is not installed (extra mcap)")
 
-from mcap.reader import make_reader
 
 from freshfield.session.reader import Session
 
 PUBLICATION = Publication(3, 1.5, 10**9, None, ("cam01", "cam02"), (10.0, 20.0), 15.0, 5.0, 7, 0.25)
-
-
-def test_decisions_and_scores_are_json_that_keeps_its_schema(tmp_path):
-    recorder = Recorder(tmp_path / "deep/a.mcap", "test")
-    recorder.published(PUBLICATION)
-    recorder.scored(dataclasses.replace(PUBLICATION, psnr_db=21.5, scored_on="cam00"), 2 * 10**9)
-    recorder.close()
-    with (tmp_path / "deep/a.mcap").open("rb") as file:
-        found = list(make_reader(file).iter_messages())
-        file.seek(0)
-        names = {m.name: m.metadata for m in make_reader(file).iter_metadata()}
-    assert [(c.topic, m.log_time) for _, c, m in found] == [("/decisions", 10**9), ("/scores", 2 * 10**9)]
-    assert names["session"] == {"scenario": "test"} and names["counts"] == {"messages": "2", "dropped": "0"}
-    for (schema, _, message), publication in zip(found, (PUBLICATION, None)):
-        values, kinds = json.loads(message.data), json.loads(schema.data)["properties"]
-        assert set(values) == set(kinds)
-        if publication is not None:
-            assert values == json.loads(json.dumps(dataclasses.asdict(publication)))
-    assert kinds["number"] == {"type": "integer"} and kinds["selected"]["items"] == {"type": "string"}
-    assert kinds["ages_ms"] == {"type": "array", "items": {"type": "number"}}
 
 
 def test_what_finds_no_room_is_dropped_and_counted_and_nobody_waits(tmp_path, monkeypatch):
@@ -68,14 +44,6 @@ def test_what_finds_no_room_is_dropped_and_counted_and_nobody_waits(tmp_path, mo
     assert left == [(t, r.payload) for r, t in sent[:11]]
 
 
-def test_bytes_are_bounded_too(tmp_path, monkeypatch):
-    monkeypatch.setattr("edge_server.live.output.recorder._MAX_QUEUE_BYTES", 500)
-    recorder = Recorder(tmp_path / "a.mcap", "test")
-    recorder.frame(*next(iter(requests(1))))
-    recorder.close()
-    assert (recorder.dropped, recorder.written) == (1, 0)
-
-
 def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path, caplog):
     recorder = Recorder(tmp_path / "a.mcap", "test")
 
@@ -84,10 +52,9 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path, caplog):
 
     recorder._writer.frame = full  # type: ignore[method-assign]
     sent = list(requests(3))
-    with caplog.at_level(logging.ERROR):
-        for request, arrived_ns in sent:
-            recorder.frame(request, arrived_ns)
-        recorder.close()
+    for request, arrived_ns in sent:
+        recorder.frame(request, arrived_ns)
+    recorder.close()
     assert "recording ended: [Errno 28] No space left" in caplog.text
     assert recorder.status() == {"file": "a.mcap", "written": 0, "dropped": len(sent), "failed": True}
     recorder.published(PUBLICATION)

@@ -53,41 +53,30 @@ class FreshOnes:
     youngest one where none is."""
 
     cameras: int = 6
-    silent: int = 0
     layout = StateLayout(("age",))
 
     def draw(self, seed: int) -> Drawn:
         rng = np.random.default_rng([1, seed])
-        s = state(self.cameras, rng, silent=self.silent)
-        worth = np.where(s.reported, 1.0 - np.nan_to_num(s.ages_ms) / WORTH_MS, 0.0) / self.cameras
-        best = (worth > 0) & s.reported
-        if not best.any():
-            best[np.argmax(np.where(s.reported, worth, -np.inf))] = True
+        s = state(self.cameras, rng)
+        worth = (1.0 - s.ages_ms / WORTH_MS) / self.cameras
+        best = worth > 0
+        best[np.argmax(worth)] = True
         return Drawn(s, best, lambda a: (worth * a).sum(), 0.1 * rng.standard_normal())
 
 
 @dataclass(frozen=True)
 class Waits:
     """Omegas: the older the cameras are on average, the longer it pays to wait; the best is in a closed
-    form of the mean age. semantic: the first number of an embedding decides instead, ages say nothing."""
+    form of the mean age."""
 
     cameras: int = 6
-    semantic: bool = False
-
-    @property
-    def layout(self) -> StateLayout:
-        return StateLayout(("age", "semantics"), dim=4) if self.semantic else StateLayout(("age",))
+    layout = StateLayout(("age",))
 
     def draw(self, seed: int) -> Drawn:
         rng = np.random.default_rng([2, seed])
-        s = state(self.cameras, rng, d=4 if self.semantic else 0)
-        if self.semantic:
-            assert s.embeddings is not None
-            s.embeddings[:, 0] += (wanted := float(rng.integers(0, 2)) * 2.0 - 1.0) * 2.0
-            target = 3.0 if wanted > 0 else 0.0
-        else:
-            s.ages_ms[:] *= rng.uniform(0.2, 2.0)
-            target = float(np.clip(s.ages_ms.mean() / 40.0, 0.0, 3.0))
+        s = state(self.cameras, rng)
+        s.ages_ms[:] *= rng.uniform(0.2, 2.0)
+        target = float(np.clip(s.ages_ms.mean() / 40.0, 0.0, 3.0))
         return Drawn(s, round(target), lambda k: -0.1 * abs(target - k), 0.1 * rng.standard_normal())
 
 

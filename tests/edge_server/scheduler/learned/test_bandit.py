@@ -9,7 +9,7 @@ import pytest
 
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
-from edge_server.scheduler import Epoch, make_live_policy, make_policy, parse_policy, policy_help
+from edge_server.scheduler import Epoch, make_live_policy, make_policy, parse_policy
 from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.settings import Spec
@@ -72,34 +72,6 @@ def test_a_set_is_chosen_when_views_are_selected_and_is_never_empty():
     assert p.last_decision is not None and p.last_decision.now_ns == 100 * MS and p.last_decision.number == 7
 
 
-def test_nothing_is_selected_while_nothing_is_there():
-    for action in ("select", "wait", "threshold"):
-        p = policy(action)
-        assert p.select(epoch(100), p.plan(epoch(100))) == ()
-
-
-def test_it_is_made_by_name(tmp_path):
-    Learner(Spec("select", StateLayout(("age",))), 1).save(tmp_path / "p.npz")
-    name = f"bandit:{tmp_path / 'p.npz'}"
-    for make in (make_policy, make_live_policy):
-        assert make(name, None, np.random.default_rng(0)).name == name
-    assert "learned" in policy_help(name)
-    with pytest.raises(ValueError, match="no value"):
-        make_policy(name, 3.0, np.random.default_rng(0))
-    with pytest.raises(ValueError, match="no such"):
-        make_policy("bandit:nowhere.npz", None, np.random.default_rng(0))
-
-
-def test_a_file_is_relative_to_where_it_is_named(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert parse_policy("bandit:runs/p.npz") == (f"bandit:{tmp_path}/runs/p.npz", None)
-    assert parse_policy("bandit:/a:b.npz") == ("bandit:/a:b.npz", None)
-    assert parse_policy("threshold:120") == ("threshold", 120.0)
-    data = {"name": "tiny", "seed": 3, "cameras": {"count": 3}, "edge": {"policy": {"name": "bandit:p.npz"}}}
-    made = scenario.parse(data, tmp_path / "there" / "tiny.yaml")
-    assert read_config(made).policy.name == f"bandit:{tmp_path}/there/p.npz"
-
-
 def test_the_shipped_policy_has_a_name_that_a_file_of_ones_own_takes_over(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shipped = f"bandit:{scenario.SCENARIO_FOLDER / 'card/policy.npz'}"
@@ -112,9 +84,6 @@ def test_the_shipped_policy_has_a_name_that_a_file_of_ones_own_takes_over(tmp_pa
     (own := tmp_path / "card/policy.npz").write_bytes(b"")
     assert parse_policy("bandit:card/policy.npz") == (f"bandit:{own}", None)
     assert read_config(made).policy.name == f"bandit:{own}"
-
-
-# --- in the loop ------------------------------------------------------------------------------------
 
 
 class Brightness:
@@ -137,38 +106,12 @@ def updates(p, embedder=None):
     return made
 
 
-def test_the_loop_shows_a_policy_the_state_of_its_buffer():
-    p = policy("select", parts=("age", "semantics"), dim=1)
-    u = updates(p, Brightness())
-    selection = u.select(u.plan(60 * MS), 60 * MS)
-    assert selection is not None and p.last_decision is not None
-    s = p.last_decision.state
-    np.testing.assert_array_equal(s.ages_ms, [60, np.nan, 50])
-    assert s.embeddings is not None and np.isnan(s.embeddings[1]).all()
-    assert 40 < s.embeddings[0, 0] < s.embeddings[2, 0] < 100  # frames grow brighter with their number
-    assert list(s.frames) == ["a", "c"]
-    assert s.cameras == ("a", "b", "c")
-
-
-def test_nothing_is_embedded_where_no_decision_needs_it():
-    embedder = Brightness()
-    for p in (policy("select", parts=("age", "pose")), make_policy("all", None, np.random.default_rng(0))):
-        u = updates(p, embedder)
-        u.select(u.plan(60 * MS), 60 * MS)
-    assert embedder.asked == 0
-
-
-def test_a_policy_that_needs_embeddings_is_refused_where_there_are_none():
+def test_a_policy_is_refused_where_there_are_no_embeddings_or_others_than_it_was_taught_with():
     p = policy("select", parts=("semantics",), dim=1)
-    with pytest.raises(ValueError, match=r"edge\.embedding"):
-        updates(p)
     u = updates(make_policy("all", None, np.random.default_rng(0)))
     with pytest.raises(ValueError, match=r"edge\.embedding"):
         u.policy = p
     assert u.policy.name == "all"
-
-
-def test_a_policy_that_was_taught_with_other_embeddings_is_refused():
     with pytest.raises(ValueError, match=r"embeddings of 2 numbers, .* brightness of 1"):
         updates(policy("select", parts=("semantics",), dim=2), Brightness())
     other = policy("select", parts=("semantics",), dim=1, embedding="color")

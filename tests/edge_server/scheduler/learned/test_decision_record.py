@@ -60,32 +60,12 @@ def test_the_oldest_make_room_and_with_them_policies_that_nobody_needs(tmp_path)
 
 
 def test_a_run_that_begins_anew_in_the_same_folder_forgets_the_earlier_one(tmp_path):
-    first = DecisionWriter(tmp_path, max_decisions=4)
-    for number in range(4):
-        first.write(a_decision(number))
-    again = DecisionWriter(tmp_path, max_decisions=4)
-    again.write(a_decision(0, seed=1))
-    again.write(a_decision(1, seed=1))
+    for seed, numbers in ((0, range(4)), (1, range(2))):
+        writer = DecisionWriter(tmp_path, max_decisions=4)
+        for number in numbers:
+            writer.write(a_decision(number, seed=seed))
     assert names(tmp_path / FOLDER, "0*") == ["000000.npz", "000001.npz"]
-    newest, other = read_decision(tmp_path).decision, a_decision(1, seed=1)
-    assert newest.number == 1
-    np.testing.assert_array_equal(newest.actor.weights["in"], other.actor.weights["in"])
-
-
-def test_what_cannot_be_written_is_counted(tmp_path):
-    (tmp_path / FOLDER).write_text("a file where the folder should be")
-    record = DecisionWriter(tmp_path)
-    record.write(a_decision(0))
-    record.write(a_decision(1))
-    assert record.lost == 2
-
-
-def test_what_is_not_there_is_said(tmp_path):
-    with pytest.raises(ValueError, match=r"no decisions are recorded: .*simulate .*bandit:FILE"):
-        read_decision(tmp_path)
-    DecisionWriter(tmp_path).write(a_decision(5))
-    with pytest.raises(ValueError, match="decision of update 4 is not kept; the oldest kept is 5"):
-        read_decision(tmp_path, 4)
+    assert read_decision(tmp_path).decision.number == 1
 
 
 def test_a_decision_that_is_held_is_that_of_later_updates_too(tmp_path):

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.scheduler.learned.explain import action_logit, explain, occlusion_map
+from edge_server.scheduler.learned.explain import action_logit, explain
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
-from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, FreshOnes, state
+from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, state
 
 LAYOUT = StateLayout(("age", "pose", "semantics"), dim=3)
 
@@ -28,7 +28,7 @@ def untaught(action, seed=0):
 
 
 @pytest.mark.parametrize("action", ["select", "wait", "threshold"])
-@pytest.mark.parametrize(("n", "silent"), [(1, 0), (2, 0), (7, 2), (30, 0)])
+@pytest.mark.parametrize(("n", "silent"), [(1, 0), (7, 2)])
 def test_shares_sum_to_the_whole(action, n, silent):
     actor, s = untaught(action), state(n, np.random.default_rng(n), d=3, silent=silent)
     chosen = actor.act([s])[0][0]
@@ -38,17 +38,6 @@ def test_shares_sum_to_the_whole(action, n, silent):
     assert set(found.parts) == {"age", "pose", "semantics"}
     assert not found.cameras[n - silent :].any()
     assert abs(found.logit - found.baseline_logit) > 1e-3
-
-
-def test_the_logit_explained_is_that_of_the_action():
-    actor, s = untaught("wait"), state(5, np.random.default_rng(0), d=3)
-    x = LAYOUT.features(s)[None]
-    (best,), (logp,) = actor.act([s])
-    assert action_logit(actor, x, best)[0] == pytest.approx(np.log(np.exp(logp) / (1 - np.exp(logp))))
-    chooser = untaught("select")
-    own = chooser.logits(x)
-    assert action_logit(chooser, x, own[0] > 0)[0] == pytest.approx(np.abs(own).sum())
-    assert action_logit(chooser, x, own[0] < 0)[0] == pytest.approx(-np.abs(own).sum())
 
 
 def test_cameras_of_two_are_exact():
@@ -62,30 +51,3 @@ def test_cameras_of_two_are_exact():
     only = np.stack([np.stack([x[0], usual[1]]), np.stack([usual[0], x[1]]), usual, x])
     a, b, none, both = action_logit(actor, only, chosen)
     np.testing.assert_allclose(found.cameras, [0.5 * (a - none + both - b), 0.5 * (b - none + both - a)])
-
-
-# --- regions ----------------------------------------------------------------------------------------
-
-
-def brightness(images):
-    """Embeds a picture by how bright each color is on the whole: what a region adds is known."""
-    return np.array([image.mean(axis=(0, 1)) / 64.0 for image in images], np.float32)
-
-
-def test_the_region_that_differs_is_the_one_that_moved_it():
-    actor, s = untaught("wait"), state(4, np.random.default_rng(3), d=3)
-    image = np.full((48, 64, 3), 114, np.uint8)
-    image[30:36, 16:24] = 255  # row 5, column 2 of eight by eight
-    z = s.embeddings.copy()
-    z[1] = brightness([image])[0]
-    s = replace(s, embeddings=z)
-    found = occlusion_map(actor, s, actor.act([s])[0][0], 1, image, brightness)
-    assert np.unravel_index(np.abs(found).argmax(), found.shape) == (5, 2)
-    assert np.abs(np.delete(found.ravel(), 5 * 8 + 2)).max() == 0.0
-
-
-def test_a_policy_that_looks_at_no_pictures_says_so():
-    learner = Learner(Spec("select", FreshOnes.layout), 0)
-    s = state(3, np.random.default_rng(0))
-    with pytest.raises(ValueError, match="no pictures"):
-        occlusion_map(learner.actor, s, learner.actor.act([s])[0][0], 0, np.zeros((8, 8, 3), np.uint8), brightness)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -25,15 +27,6 @@ def actor(spec, seed=0):
 def features(n, silent=0, seed=0, batch=5):
     rng = np.random.default_rng(seed)
     return LAYOUT.batch([state(n, rng, d=3, silent=silent) for _ in range(batch)])
-
-
-@pytest.mark.parametrize("spec", [SELECT, WAIT], ids=lambda s: s.action)
-@pytest.mark.parametrize("n", [1, 2, 18, 200])
-def test_one_set_of_weights_takes_any_number_of_cameras(spec, n):
-    found = networks.logits(np, spec, actor(spec), features(n))
-    assert found.shape == ((5, n) if spec.action == "select" else (5, len(OMEGAS_MS)))
-    assert np.isfinite(found).all()
-    assert networks.value(np, networks.init_value(spec, np.random.default_rng(0)), features(n)).shape == (5,)
 
 
 def test_cameras_have_no_order():
@@ -61,37 +54,12 @@ def test_numpy_and_torch_compute_the_same(spec):
     np.testing.assert_allclose(networks.logits(np, spec, weights, x), found, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        ({"action": "skip"}, "choose one of select"),
-        ({"action": "select", "omegas_ms": (0.0,)}, "all but select need"),
-        ({"action": "wait"}, "all but select need"),
-        ({"action": "wait", "omegas_ms": (50.0, 0.0)}, "rising"),
-        ({"action": "wait", "omegas_ms": (0.0, float("inf"))}, "from 0 to 3600000"),
-        ({"action": "wait", "omegas_ms": (0.0, 1.0, 1e308)}, "from 0 to 3600000"),
-        ({"action": "threshold", "omegas_ms": (float("nan"),)}, "from 0 to 3600000"),
-        ({"action": "select", "passes": 0}, "whole number"),
-        ({"action": "select", "learning_rate": float("nan")}, "positive"),
-        ({"action": "select", "entropy": -1.0}, "not negative"),
-    ],
-)
-def test_what_cannot_be_learned_is_refused(words, says):
-    with pytest.raises(ValueError, match=says):
-        Spec(**words)
-
-
 def test_a_specification_survives_json():
-    import json
-
     layout = StateLayout(("age", "semantics"), dim=2, center=(0.1, 0.2), spread=(1.0, 3.0))
     spec = Spec("threshold", layout, OMEGAS_MS, learning_rate=1e-4)
     assert Spec.from_json(json.loads(json.dumps(spec.as_json()))) == spec
     assert Spec.from_json({**spec.as_json(), "network": "pooled", "cameras": None, "start": 0.5}) == spec
     with pytest.raises(ValueError, match="network: only pooled is read"):
         Spec.from_json({**spec.as_json(), "network": "flat", "cameras": 4})
-    for damage in ({"layout": None}, {"hold_ms": 10**400}, {"omegas_ms": [0, 10**400]}):
-        with pytest.raises(ValueError, match=r"specification|omegas_ms"):
-            Spec.from_json({**spec.as_json(), **damage})
     with pytest.raises(ValueError, match="specification"):
-        Spec.from_json({"action": "select"})
+        Spec.from_json({**spec.as_json(), "hold_ms": 10**400})
