@@ -246,6 +246,20 @@ async def test_what_is_inside_the_links_is_bounded_in_bytes(tmp_path: Path, monk
     frame_account(tmp_path)
 
 
+async def test_a_message_that_cannot_be_damaged_does_not_end_the_emulator(tmp_path: Path) -> None:
+    """Field number 0: to be found before the link decides to flip its bytes."""
+    async with emulate(tmp_path, {"faults": {"corruption": {"probability": 1.0}}}) as r:
+        good = to_request(frame_of("cam00", "s", 1, r.proxy.clock.now_ns())).SerializeToString()
+        async with r.stranger() as channel:
+            call = channel.stream_stream(PUSH)()
+            for raw in (good + b"\0\0", good):
+                await call.write(raw)
+                await call.read()
+        await r.settled()
+        r.proxy.check()
+        assert r.edge.ingest.rejected == {"crc_mismatch": 1}
+
+
 async def test_the_token_is_demanded_and_passed_on(tmp_path: Path) -> None:
     async with emulate(tmp_path, {}, transport=Transport(tokens={"camera:*": "open sesame"})) as r:
         await r.cameras["cam00"].stream(5, 0.002)

@@ -34,7 +34,7 @@ from freshfield import scenario
 from freshfield.frame import to_request
 from freshfield.geometry import Pose, look_at
 from freshfield.ledger import read_all
-from freshfield.limits import MAX_SCRAPES, MAX_SNAPSHOTS
+from freshfield.limits import MAX_SCRAPES, MAX_SNAPSHOTS, MAX_WATCHERS
 from freshfield.transport import Transport, TransportError
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2_grpc
 from freshfield_up.processes import GRACE_S
@@ -239,6 +239,16 @@ def test_metrics_hold_few_connections_and_answer_beside_half_requests(serve):
     until(lambda: sum("process_request" in t.name for t in threading.enumerate()) <= MAX_SCRAPES, 2.0)
     for connection in half:
         connection.close()
+
+
+def test_watchers_are_few_and_a_new_one_always_finds_a_place(serve):
+    with Transport().channel(f"127.0.0.1:{serve().port}") as channel:
+        grpc.channel_ready_future(channel).result(30)
+        edge = edge_pb2_grpc.EdgeServiceStub(channel)
+        watching = [edge.WatchDecisions(edge_pb2.WatchDecisionsRequest()) for _ in range(MAX_WATCHERS + 20)]
+        until(lambda: sum(call.done() for call in watching) == 20)
+        assert watching[0].code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert not watching[-1].done()
 
 
 def test_snapshots_do_not_fill_the_disk(serve, tmp_path):

@@ -172,7 +172,7 @@ class ScanField(StillField):
         for view in self._sweep_views():
             shown = self._look(view)
             _, there = self._as_rendered(view)
-            new.append(np.count_nonzero(there & (shown.opacity < tuned.COVERED)) / max(np.count_nonzero(there), 1))
+            new.append(float((there & (shown.opacity < tuned.COVERED)).sum() / max(there.sum(), 1)))
             self._add(self._seeds_of(view, shown, nearer=False))
             swept.append(view)
             if len(new) >= tuned.SWEPT_LAST and np.mean(new[-tuned.SWEPT_LAST :]) < tuned.SWEPT_NEW:
