@@ -14,7 +14,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -323,10 +322,8 @@ class LayeredField:
         if self.origin_ns is None:
             self.origin_ns = min(view.generated_ns for view in views)
         news = {(v.generated_ns, v.camera): v for v in views if not self._has_seen(v)}
-        # A frame is hundreds of short calls, each of which would wait for Python's lock and for a core.
-        with self.static.paused() if self.supervision.layers_shown else nullcontext():
-            for _, view in sorted(news.items()):
-                self._take(view)
+        for _, view in sorted(news.items()):
+            self._take(view)
         if news:
             self._frame_time.add((self.now() - begun) / len(news))
         if len(self.observations):

@@ -8,8 +8,7 @@ again.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -55,8 +54,6 @@ class StaticLayer:
         self.field = field
         self._thread: threading.Thread | None = None
         self._stopping = False
-        self._may_step = threading.Event()
-        self._may_step.set()
         self._failure: BaseException | None = None
         self.forget()
 
@@ -146,7 +143,7 @@ class StaticLayer:
         pixels, and pairs of a Gaussian and a tile."""
         losses: list[float] = []
         rays = samples = 0
-        while not self.finished and self._may_step.wait() and pace.begin_step(self.field.step_time) is not None:
+        while not self.finished and pace.begin_step(self.field.step_time) is not None:
             left = self.grows_until - self.field.step
             progress = 1.0 - left / tuned.SCHEDULE if left > 0 else self._round_step / tuned.ROUND
             loss, seen, pairs = self.field.train_step(progress, grow=left > 0)
@@ -196,15 +193,6 @@ class StaticLayer:
         if self._thread is not None:
             self._thread.join(max(seconds, 0.0))
 
-    @contextmanager
-    def paused(self) -> Iterator[None]:
-        """Have the thread begin no step meanwhile, unless it is stopped."""
-        self._may_step.clear()
-        try:
-            yield
-        finally:
-            self._may_step.set()
-
     def end_soon(self) -> None:
         """Have the thread end after a few steps."""
         self._stopping = True
@@ -212,7 +200,6 @@ class StaticLayer:
     def stop(self) -> None:
         """End the thread after a few steps, and wait for it. Raises what ended it early."""
         self._stopping = True
-        self._may_step.set()
         if self._thread is not None:
             self._thread.join()
         self._thread = None
