@@ -9,9 +9,6 @@ thread that computes wakes at most two others first, and the caller computes its
 higher than the workers'. Of a pool that is to leave all workers but one idle (``Pool.spare``) each caller computes
 itself, whatever its priority. Callers may then compute at once, each as worker 0: what kernels index by their worker
 belongs to one caller.
-
-To wake a worker may take longer than a small kernel. A worker that has not begun once another finds no task left is
-not waited for: it finds the job closed. So a kernel has to draw all that it does as tasks.
 """
 
 from __future__ import annotations
@@ -53,58 +50,23 @@ def default_threads() -> int:
 
 
 class _Job:
-    """A kernel to be run, the tasks drawn so far, and who is at work on it.
-
-    Single operations on sets, each atomic, and no lock: an interrupt may leave one locked.
-    """
+    """A kernel to be run, the tasks drawn so far, and which workers have finished it."""
 
     def __init__(self, kernel: Callable[..., Any], args: tuple[Any, ...], threads: int) -> None:
-        self.kernel, self.args, self.threads = kernel, args, threads
+        self.kernel, self.args = kernel, args
         self.counter = np.zeros(COUNTER * threads, np.int64)
-        self._may_begin, self._at_work = set(range(threads)), set[int]()
+        self.finished = bytearray(threads)
         # A queue, not a semaphore: that is Python code, which an interrupt may leave locked.
-        self._ended = SimpleQueue[None]()
+        self.over = SimpleQueue[None]()
         self.error: BaseException | None = None
-
-    def work(self, worker: int) -> None:
-        """Compute as ``worker``, unless it has begun already or no task is left."""
-        self._at_work.add(worker)
-        try:
-            if self._begin(worker):
-                self.kernel(self.counter, worker, *self.args)
-                self._may_begin.clear()  # it found no task left
-        except BaseException as error:  # handed to the caller of run()
-            self.error = self.error or error
-        self.leave(worker)
-
-    def waits_for(self, worker: int) -> bool:
-        """Whether ``worker`` is still to begin."""
-        return worker in self._may_begin
-
-    def leave(self, worker: int) -> None:
-        """``worker`` has ended, or will not begin."""
-        self._may_begin.discard(worker)
-        self._at_work.discard(worker)
-        if self._is_over():
-            self._ended.put(None)
-
-    def _begin(self, worker: int) -> bool:
-        try:
-            self._may_begin.remove(worker)
-        except KeyError:
-            return False
-        return True
-
-    def _is_over(self) -> bool:
-        return not (self._may_begin or self._at_work)
 
     def wait(self) -> None:
         """Wait for all workers; an interrupted caller does so too, because the arrays are the caller's."""
         try:
-            if not self._is_over():
-                self._ended.get()
+            if not all(self.finished):
+                self.over.get()
         except BaseException:
-            while not self._is_over():
+            while not all(self.finished):
                 time.sleep(1e-3)
             raise
 
@@ -177,7 +139,7 @@ class Pool:
             self._work(job, 0)
         except BaseException:  # of an interrupt: perhaps not all were woken
             self._wake_others(0, job)
-            job.leave(0)
+            job.finished[0] = 1
             raise
         finally:
             job.wait()
@@ -185,17 +147,23 @@ class Pool:
     def _serve(self, worker: int) -> None:
         lower_priority(self.nice)
         while (job := self._inboxes[worker].get()) is not None:
-            if job.waits_for(worker):
+            if not job.finished[worker]:
                 self._work(job, worker)
             del job  # or the last job's arrays would live until the next one comes
         self._wake_others(worker, None)
 
     def _work(self, job: _Job, worker: int) -> None:
         self._wake_others(worker, job)
-        job.work(worker)
+        try:
+            job.kernel(job.counter, worker, *job.args)
+        except BaseException as error:  # handed to the caller of run()
+            job.error = job.error or error
+        job.finished[worker] = 1
+        if all(job.finished):
+            job.over.put(None)
 
     def _wake_others(self, worker: int, job: _Job | None) -> None:
-        count = self.threads if job is None else job.threads
+        count = self.threads if job is None else len(job.finished)
         for other in (2 * worker + 1, 2 * worker + 2):
             if other < count:
                 self._inboxes[other].put(job)

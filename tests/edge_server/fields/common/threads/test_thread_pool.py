@@ -28,16 +28,10 @@ def _share(counter, worker, done):
         done[task] += 1
 
 
-def _engaged(pool: Pool, count: int) -> list[int]:
-    """The workers that a job engages, which wait for each other until there are ``count``."""
+def _engaged(pool: Pool) -> list[int]:
+    """The workers that a job engages."""
     seen: list[int] = []
-    together = threading.Barrier(count)
-
-    def meet(counter, worker):
-        together.wait(10)
-        seen.append(worker)
-
-    pool.run(meet)
+    pool.run(lambda counter, worker: seen.append(worker))
     return sorted(seen)
 
 
@@ -72,7 +66,7 @@ def test_workers_that_are_spared_stay_idle_and_callers_of_the_last_compute_side_
     pool, done = Pool(3, nice), np.zeros(1000, np.int64)
     for spared, engaged in ((1, [0, 1]), (0, [0, 1, 2]), (9, [0])):
         pool.spare(spared)
-        assert _engaged(pool, len(engaged)) == engaged
+        assert _engaged(pool) == engaged
         pool.run(_share, done)
     assert (done == 3).all()
     together, seen = threading.Barrier(2), []
@@ -103,21 +97,7 @@ def test_an_error_reaches_the_caller_after_all_are_done_and_the_pool_lives_on(ni
 
     with pytest.raises(RuntimeError, match="worker 0"):
         pool.run(fails_first)
-    assert done == [1] and _engaged(pool, 2) == [0, 1]
-    pool.close()
-
-
-def test_a_worker_that_has_not_begun_is_not_waited_for_once_no_task_is_left(monkeypatch) -> None:
-    """To wake one takes longer than a small kernel; the one that wakes too late finds the job closed."""
-    pool, done, jobs = Pool(2), np.zeros(100, np.int64), []
-    monkeypatch.setattr(pool, "_wake_others", lambda worker, job: jobs.append(job))
-    pool.run(_share, done)
-    (job,) = jobs
-    assert (done == 1).all() and not job.waits_for(1)
-    job.kernel = None  # must not be called
-    job.work(1)
-    assert job.error is None
-    monkeypatch.undo()
+    assert done == [1] and _engaged(pool) == [0, 1]
     pool.close()
 
 
@@ -137,11 +117,9 @@ def test_the_number_of_threads_is_that_of_the_cores_the_environment_or_the_calle
 @pytest.mark.skipif(os.uname().sysname != "Linux", reason="priorities of single threads: Linux only")
 def test_a_caller_works_along_unless_it_is_to_go_first() -> None:
     def look(counter, worker):
-        together.wait(10)
         seen[worker] = threading.get_ident(), os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
 
     mine = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
-    together = threading.Barrier(2)
     for nice in (0, 4):
         pool, seen = Pool(2, nice), {}
         pool.run(look)
@@ -149,7 +127,7 @@ def test_a_caller_works_along_unless_it_is_to_go_first() -> None:
         assert (seen[0][0] == threading.get_ident()) is (nice == 0) and seen[1][0] != seen[0][0]
         assert [seen[worker][1] for worker in (0, 1)] == [max(mine, nice)] * 2
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == mine
-    together, seen = threading.Barrier(1), {}
+    seen = {}
     CallerPool().run(look)
     assert seen == {0: (threading.get_ident(), mine)}
 
@@ -157,10 +135,9 @@ def test_a_caller_works_along_unless_it_is_to_go_first() -> None:
 @either_priority
 def test_a_caller_that_is_interrupted_waits_for_what_it_has_begun(nice: int) -> None:
     """Else others would write to arrays that are the caller's."""
-    pool, seen, together = Pool(3, nice), [], threading.Barrier(3)
+    pool, seen = Pool(3, nice), []
 
     def slow(counter, worker):
-        together.wait(10)
         if worker == 1:
             time.sleep(0.3)
             seen.append("slow")
@@ -173,7 +150,7 @@ def test_a_caller_that_is_interrupted_waits_for_what_it_has_begun(nice: int) -> 
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
-    assert seen == ["slow"] and _engaged(pool, 3) == [0, 1, 2]
+    assert seen == ["slow"] and _engaged(pool) == [0, 1, 2]
     pool.close()
 
 
@@ -188,7 +165,7 @@ def test_a_caller_interrupted_before_it_has_woken_all_workers_loses_no_task(monk
     monkeypatch.setattr(pool, "_wake_others", interrupted)
     with pytest.raises(KeyboardInterrupt):
         pool.run(_share, done)
-    assert (done == 1).all() and _engaged(pool, 3) == [0, 1, 2]
+    assert (done == 1).all() and _engaged(pool) == [0, 1, 2]
     pool.close()
 
 
