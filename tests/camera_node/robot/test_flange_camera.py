@@ -21,7 +21,7 @@ from camera_node.synthetic.depth import DepthRenderer
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario, load
-from tests.camera_node.robot.arm.simulated import own_address, simulated_arm
+from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
 
 CELL = load("cell")
 LOOKING = (-95.90, 9.29, -109.38, 0.72, 262.47, 38.48)  # degrees, from a viewpoint of the cell's tour
@@ -77,11 +77,15 @@ def test_the_truth_of_another_instant_is_not_taken(host):
             assert len(list(threads.map(truth.joints, 5 * instants))) == 200
 
 
-def test_without_an_arm_one_line_says_what_to_start_and_fixed_cameras_need_none():
-    scenario = at(own_address())
-    begin = time.monotonic()
+def test_without_an_arm_one_line_says_what_to_start():
+    require_ur_rtde()
+    scenario, begin = at(own_address()), time.monotonic()
     with pytest.raises(ArmError, match=r"no answer on port 30004 \(Connection refused\).*camera-node simulate-arm"):
         build_cameras(scenario, source_config(scenario), scenario.cameras)
     assert time.monotonic() - begin < 3.0
+
+
+def test_fixed_cameras_of_the_scenario_need_no_arm():
+    scenario = at(own_address())
     (camera,) = build_cameras(scenario, source_config(scenario), ["cam00"])
     assert len(camera.capture(0).payload) > 100

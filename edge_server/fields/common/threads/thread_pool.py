@@ -179,7 +179,8 @@ def compile_kernels(run_kernels: Callable[[Pool], None]) -> float:
 
 
 class CallerPool(Pool):
-    """Runs kernels in the calling thread alone, at its own priority; several callers do not wait for each other."""
+    """Runs kernels in the calling thread alone, at its own priority. It has nothing to close, and callers do not wait
+    for each other: each needs memory of its own."""
 
     def __init__(self) -> None:
         super().__init__(threads=1)

@@ -323,7 +323,8 @@ class CarriedField(ScanField):
         """Find the first Gaussians from all keyframes so far: without depth, the first few say little, and a field that
         was fitted to them is not mended by later ones. The depth that is found also serves the box and the poses: steps
         that take the scene for farther than it is overshoot. Where none is found, the box stays."""
-        swept = {view.camera: view for view in self._swept()}
+        swept = {view.camera: view for view in self._sweep_views()}
+        self._learn_distance(list(swept.values()))
         views, kept = [swept.get(v.camera, v) for v in self._views], {name: getattr(self, name) for name in _OF_CAMERAS}
         due = self._due_before + self.step // tuned.STEPS_A_KEYFRAME
         turns, leaps = self._own.unturned, self._poses.leaps

@@ -155,8 +155,8 @@ class ScanField(StillField):
     # --- Gaussians ----------------------------------------------------------------------------
 
     def _seed(self) -> None:
-        """Seed on measured depth, in the order of the views; without any, on what a plane sweep finds; without that
-        either, where the cameras agree on colors."""
+        """Seed on measured depth, in the order of the views; without any, on what a plane sweep finds, views spread
+        over all first; without that either, where the cameras agree on colors."""
         measured = [view for view in self._views if view.depth is not None]
         if measured:
             self._seed_on(_some(measured, tuned.SEED_VIEWS), nearer=True)
@@ -164,8 +164,8 @@ class ScanField(StillField):
             super()._seed()
 
     def _seed_swept(self) -> bool:
-        """Seed on depth that views tell of each other, until further views show hardly anything new: to sweep all of
-        them takes seconds before the first step. Returns False if poses tell no depth."""
+        """Seed on depth that views tell of each other, until further views show hardly anything new or there is no room
+        for more: to sweep all of them takes seconds before the first step. Returns False if poses tell no depth."""
         self.cloud = GaussianCloud.empty(self.settings)
         swept: list[View] = []
         new: list[float] = []
@@ -175,22 +175,17 @@ class ScanField(StillField):
             new.append(float((there & (shown.opacity < tuned.COVERED)).sum() / max(there.sum(), 1)))
             self._add(self._seeds_of(view, shown, nearer=False))
             swept.append(view)
-            if len(new) >= tuned.SWEPT_LAST and np.mean(new[-tuned.SWEPT_LAST :]) < tuned.SWEPT_NEW:
+            settled = len(new) >= tuned.SWEPT_LAST and np.mean(new[-tuned.SWEPT_LAST :]) < tuned.SWEPT_NEW
+            if settled or len(self.cloud) >= self._most():
                 break
         self._learn_distance(swept)
-        return bool(swept)
+        return len(self.cloud) > 0
 
     def _seed_on(self, views: Sequence[View], nearer: bool) -> None:
         """Replace the Gaussians by seeds on the depth of ``views``. nearer: see ``_seeds_of``."""
         self.cloud = GaussianCloud.empty(self.settings)
         for view in views:
             self._add(self._seeds_of(view, nearer=nearer))
-
-    def _swept(self) -> list[View]:
-        """All that ``_sweep_views`` finds. Also learns how far away is what cameras see."""
-        swept = list(self._sweep_views())
-        self._learn_distance(swept)
-        return swept
 
     def _sweep_views(self) -> Iterator[View]:
         """Views, spread ones first, with depth that others tell, see ``sweep_depth``: none where poses tell nothing.
@@ -316,7 +311,7 @@ def _spread_first(count: int) -> list[int]:
     """0 to ``count`` - 1, in an order whose every beginning is spread (van der Corput's)."""
     bits = max(count - 1, 0).bit_length()
     reversed_bits = (sum((k >> bit & 1) << (bits - 1 - bit) for bit in range(bits)) for k in range(1 << bits))
-    return list(dict.fromkeys(count * k >> bits for k in reversed_bits))[:count]
+    return list(dict.fromkeys(count * k >> bits for k in reversed_bits)) if count else []
 
 
 def aim_of(view: View, seen_m: float) -> tuple[NDArray[np.float64], float]:

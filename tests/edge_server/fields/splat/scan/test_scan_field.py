@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 from numpy.typing import NDArray
 
 from edge_server.experiments.fitting.misfits import misfits
@@ -20,6 +21,7 @@ from edge_server.fields.splat.scan import scan_field
 from edge_server.fields.splat.scan.scan_field import ScanField
 from edge_server.fields.splat.scan.sweep import sweep_depth
 from edge_server.fields.splat.settings import SplatSettings
+from freshfield.geometry import so3_exp
 from tests.edge_server.fields.scenes import BALL_M, RADIUS_M
 from tests.edge_server.fields.small import same_state
 from tests.edge_server.fields.splat.scan.walk import WALK, spoiled, walk
@@ -80,6 +82,25 @@ def test_views_are_swept_until_further_ones_show_hardly_anything_new(monkeypatch
     field.fit(WITHOUT, Budget(steps=0))
     assert swept[:4] == [0, 40, 20, 60] and 8 <= len(swept) < 20
     assert field._seen_m == pytest.approx(2.07, abs=0.1)
+    swept.clear()
+    ScanField(structs.replace(_settings(refine=False), gaussians=200)).fit(WITHOUT, Budget(steps=0))
+    assert len(swept) < 8, "there is no room for more"
+    for count in range(70):
+        assert sorted(scan_field._spread_first(count)) == list(range(count))
+
+
+def test_where_poses_tell_no_depth_first_gaussians_lie_where_colors_agree() -> None:
+    turned = [replace(view, camera_to_world=_turned(k)) for k, view in enumerate(WITHOUT[:8])]
+    for views in (WITHOUT[:1], turned):
+        field = ScanField(_settings(refine=False))
+        field.fit(views, Budget(steps=0))
+        assert len(field.cloud) > 0 and field._seen_m == 0.0
+
+
+def _turned(k: int) -> NDArray[np.float64]:
+    pose = WITHOUT[0].camera_to_world.copy()
+    pose[:3, :3] = pose[:3, :3] @ so3_exp(np.deg2rad([0.0, 5.0 * k, 0.0]))
+    return pose
 
 
 def test_what_is_transparent_goes_every_hundredth_step() -> None:
@@ -102,6 +123,12 @@ def test_poses_and_exposures_are_refined_and_held_out_frames_take_their_neighbor
     assert one is not None and dark is not None
     np.testing.assert_array_equal(one.camera_to_world, dark.camera_to_world)  # the image is not looked at
     np.testing.assert_array_equal(one.gain, dark.gain)
+
+
+def test_exact_poses_are_hardly_spoiled_however_long_they_are_refined() -> None:
+    """With steps that never get shorter they lose 2 dB."""
+    plain_db, refined_db = _fit(WALK, 1200)[1], _fit(WALK, 1200, refine=True)[2]
+    assert refined_db is not None and refined_db > plain_db - 0.3
 
 
 @pytest.mark.parametrize("footage", [WITH_DEPTH, WITHOUT])
