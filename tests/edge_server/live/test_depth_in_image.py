@@ -55,6 +55,25 @@ def test_depth_of_the_images_own_size_is_taken_as_it_is():
     np.testing.assert_allclose(depth_in_image(depth(counts), IMAGE, 0), counts * 0.001, rtol=1e-6)
 
 
+def test_registered_depth_of_another_size_gives_the_nearest_measurement():
+    fine = np.arange(96 * 128).reshape(96, 128)
+    np.testing.assert_allclose(depth_in_image(depth(fine), IMAGE, 0), fine[1::2, 1::2] * 0.001, rtol=1e-6)
+    coarse = np.arange(24 * 32).reshape(24, 32) + 1
+    expected = np.kron(coarse, np.ones((2, 2))) * 0.001
+    np.testing.assert_allclose(depth_in_image(depth(coarse), IMAGE, 0), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("halvings", [1, 3])
+def test_halved_images_see_the_same_depth(halvings):
+    """A plane's depth is known at every pixel; odd sides are rounded up."""
+    lens = replace(IMAGE, width=63, height=47)
+    small = lens.halved(halvings)
+    large_m, small_m = (2 / (1 + 0.3 * rays[..., 0] / rays[..., 2]) for rays in (lens.rays(), small.rays()))
+    found = depth_in_image(depth(np.round(1000 * large_m)), lens, halvings)
+    assert found.shape == (small.height, small.width)
+    assert np.abs(found / small_m - 1)[:-1, :-1].max() < 0.011 * 2**halvings  # within half of its pixel
+
+
 def test_depth_of_a_lens_and_a_pose_of_its_own_is_moved_as_one_by_one():
     measured = depth(box_before_wall(SENSOR, BESIDE), intrinsics=SENSOR, to_camera=BESIDE)
     measured.counts[5:9, 50:60] = 0

@@ -228,3 +228,32 @@ def test_after_a_restart_of_the_edge_no_frame_is_taken_again():
         assert refused.value.reason == reason
     after.admit(good(5), NOW)
     after.admit(good(0, session="another"), NOW)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("restarts", [False, True])
+def test_ages_are_right_again_with_the_first_frame_after_a_jump(restarts):
+    """A node's own clock jumps, which begins a new session, or its clock runs on and the estimated offset jumps."""
+    # The clock's error in ms, by time in ms: ahead within what an unknown clock is given, far behind, ahead by a day.
+    jumps = {0: 0, 2000: 1100, 4000: 0, 6000: -20 * 60_000, 8000: 0, 9000: 86_400_000, 10_000: 0}
+    gate, buffer = FrameAdmission(["cam01"], []), FrameBuffer(["cam01", "never"])
+    ages, refused = {}, []
+    for number, at_ms in enumerate(range(0, 12_000, 50)):
+        captured_ns, now_ns = NOW + at_ms * MS, NOW + (at_ms + 20) * MS
+        jumped_ms = max(t for t in jumps if t <= at_ms)
+        wrong_ns = jumps[jumped_ms] * MS
+        told = {"generated_ns": captured_ns, "clock_offset_ns": wrong_ns}
+        if restarts:
+            told = {"generated_ns": captured_ns + wrong_ns, "session": f"s{jumped_ms}"}
+        made = frame(sequence=number, clock_uncertainty_ns=3600 * 10**9, **told)
+        try:
+            gate.admit(made, now_ns)
+            buffer.put(made, now_ns)
+        except FrameRejected as error:
+            refused.append(error.reason)
+        ages[at_ms] = buffer.ages_ms(now_ns)["cam01"]
+        assert wrong_ns or ages[at_ms] == 20, at_ms
+    # Ahead within the tolerance is believed; behind, the last good frame grows old; a day ahead is refused.
+    assert ages[3000] == 20 - 1100 and ages[7950] == 20 + 2000
+    assert refused == ["from_future"] * 20 and buffer.stale_on_arrival == 40
+    assert buffer.ages_ms(now_ns)["never"] is None

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import stat
 
 import grpc
 import grpc.aio
 import pytest
+from grpc_health.v1 import health, health_pb2_grpc
 
 from edge_server.cli import main
 from edge_server.live.keys import make_keys
 from freshfield.transport import Transport, TransportError, add_arguments, from_arguments
+from tests.deploy.test_healthy import healthy
 from tests.freshfield.test_access import Every
 
 
@@ -55,6 +58,18 @@ async def test_a_certificate_lets_its_process_do_its_own_part(keys):
     await server.stop(None)
     assert found == {"cam00": "forbidden_camera", "emulator": "taken", "viewer": "looks", "edge": "looks"}
     assert tokens.keys() == {"operator", "viewer"} and len(set(tokens.values())) == 2
+
+
+async def test_the_health_check_passes_mutual_tls(keys):
+    emulator = of(keys / "emulator")
+    server = emulator.aio_server()
+    health_pb2_grpc.add_HealthServicer_to_server(health.aio.HealthServicer(), server)
+    serving = ("--serving", f"127.0.0.1:{emulator.bind(server, '127.0.0.1:0')}")
+    await server.start()
+    files = [f"--tls-{part}={keys / 'emulator' / part}.pem" for part in ("cert", "key", "ca")]
+    found = [await asyncio.to_thread(healthy, *serving, *more) for more in (files, [])]
+    await server.stop(None)
+    assert found == [True, False]
 
 
 def test_keys_are_their_owners_alone_and_never_overwritten(keys, tmp_path, capsys):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 import weakref
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from edge_server.fidelity.scorer import Score, Scorer
+from edge_server.fidelity.so_far import MOST
 from edge_server.fields import Rendering, View
 from edge_server.live import scoring_thread
 from edge_server.live.scoring_thread import ScoringThread
@@ -93,6 +95,23 @@ def test_a_thread_that_falls_behind_keeps_no_snapshots() -> None:
     assert len(alive) == scoring_thread._WAITING_PUBLICATIONS
 
 
+def test_snapshots_replaced_before_the_next_scored_capture_are_dropped() -> None:
+    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
+    thread._next_shown_ns["cam00"] = 500 * MS
+    for k in range(1, 30):
+        thread._score_later(_publication(k, k * 20 * MS), Brightness(k * 20 * MS), [])
+    assert [p.published_ns // MS for p, _ in thread._recent] == [500, 520, 540, 560, 580]
+
+
+def test_a_silent_held_out_camera_keeps_no_snapshots(monkeypatch: Any) -> None:
+    monkeypatch.setattr(scoring_thread, "_SILENT_NS", 100 * MS)
+    thread = ScoringThread(["cam00", "cam01"], Scorer(), lambda *_: None, lambda *_: None)
+    for k in range(1, 13):
+        thread._held_out["cam00"].take(_frame(k, k * 20 * MS))
+        thread._score_later(_publication(k, k * 20 * MS), Brightness(k * 20 * MS), [])
+    assert len(thread._recent) == 1
+
+
 def test_what_is_shown_is_scored_as_often_as_its_share_affords_and_before_publications(monkeypatch: Any) -> None:
     monkeypatch.setattr(scoring_thread, "_SHOWN_SHARE", 0.5)
     scored: list[Publication] = []
@@ -103,6 +122,19 @@ def test_what_is_shown_is_scored_as_often_as_its_share_affords_and_before_public
     monkeypatch.setattr(scoring_thread, "_RESERVE_S", scoring_thread._ALLOWANCE_S)
     scored.clear()
     assert len(_run([100 * MS, 350 * MS], frames, scored)) > 10 and not scored
+
+
+def test_time_that_was_not_used_is_no_credit_beyond_the_allowance(monkeypatch: Any) -> None:
+    now_s, used_s = [0.0], [0.0]
+    monkeypatch.setattr(scoring_thread.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(scoring_thread.time, "thread_time", lambda: used_s[0])
+    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
+    now_s[0] = 1000.0
+    assert thread._affordable()
+    used_s[0] = 1.1
+    assert not thread._affordable()
+    now_s[0] += 0.1 / (0.03 * scoring_thread.usable_cores()) + 1.0
+    assert thread._affordable() and not thread._affordable(0.1)
 
 
 def test_a_metric_that_cannot_be_loaded_costs_its_own_scores_alone(caplog: pytest.LogCaptureFixture) -> None:
@@ -123,3 +155,22 @@ def test_where_nothing_is_held_out_the_mean_color_is_that_of_the_views() -> None
     ((scored, final),) = told
     assert final and thread.baselines.mean.nearest_view_db is None
     np.testing.assert_allclose([scored.psnr_db, thread.baselines.mean.mean_color_db], 20.0, atol=1e-3)
+
+
+def test_of_a_held_out_camera_that_moves_the_newest_frame_and_all_so_far_are_told_apart() -> None:
+    """The field knows how bright it is at half a second, and shows that everywhere."""
+    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
+    for k in range(100):
+        pose = Pose((1.0, 0.0, 0.0, 0.0), (0.01 * k, 0.0, 0.0))
+        thread._held_out["cam00"].take(replace(_frame(k, 5 * k * MS), pose=pose))
+    thread._held_out["cam00"].take(replace(_frame(100, 500 * MS), payload=b"damaged"))
+    thread._recent.append((_publication(0, 0), Brightness(500 * MS)))
+    thread._look_back()  # the newest is damaged
+    thread._look_back()
+    assert thread.so_far is not None and thread.so_far.frames == 3  # two in turn, and the newest
+    thread._look_back(whole=True)
+    found = thread.so_far
+    assert MOST // 2 <= found.frames <= MOST and not found.refined  # spread over the run, the damaged one forgotten
+    assert found.now_psnr_db > 35.0 and 8.0 < found.all_psnr_db < 20.0
+    words = f"now {found.now_psnr_db:.2f} dB, all {found.frames} frames so far {found.all_psnr_db:.2f} dB"
+    assert found.words() == words

@@ -36,7 +36,7 @@ from freshfield.geometry import Pose, look_at
 from freshfield.ledger import read_all
 from freshfield.limits import MAX_SCRAPES, MAX_SNAPSHOTS, MAX_WATCHERS
 from freshfield.transport import Transport, TransportError
-from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2_grpc
+from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2, frames_pb2_grpc
 from freshfield_up.processes import GRACE_S
 from tests.edge_server.fields_for_tests import TINY
 from tests.edge_server.frames import frame
@@ -142,7 +142,7 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
     assert {c for s in series for c in s["selected"]} == {"cam01", "cam02"}  # never the held-out one
     status = json.loads((out / "edge.json").read_text())
     assert status["updates"]["count"] == len(series)
-    assert status["baseline"]["mean_color_db"] > 0
+    assert status["baseline"]["mean_color_db"] > 5
     assert (out / "truth.png").exists() and (out / "rendered.png").exists()
     (ledger,) = read_all(out)
     delivered = [e for e in ledger.events if e.event == "delivered"]
@@ -278,6 +278,17 @@ def test_a_final_checkpoint_that_is_not_written_is_said(serve, tmp_path, monkeyp
     goes_on.set()
     assert not (tmp_path / "out" / "field.npz").exists()
     assert "field.npz: not written: the last update did not end" in caplog.text
+
+
+def test_a_token_is_demanded_and_honoured(serve):
+    secured = Transport(tokens={"camera:*": "open sesame"})
+    with Transport().channel(f"127.0.0.1:{serve(transport=secured).port}") as channel:
+        grpc.channel_ready_future(channel).result(30)
+        push, sent = frames_pb2_grpc.FrameStreamServiceStub(channel).Push, to_request(frame("cam01", 0, time.time_ns()))
+        with pytest.raises(grpc.RpcError) as refused:
+            next(push(iter([sent])))
+        assert refused.value.code() == grpc.StatusCode.UNAUTHENTICATED
+        assert next(push(iter([sent]), metadata=secured.metadata())).outcome == frames_pb2.OUTCOME_ACCEPTED
 
 
 def test_every_port_beyond_this_machine_is_protected_or_named(tmp_path):

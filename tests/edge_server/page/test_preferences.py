@@ -92,6 +92,7 @@ def test_answers_are_of_the_pair_that_was_shown_written_and_nothing_is_answered_
 def test_bad_requests_change_nothing(asked, body, status):
     _, url, kept = asked
     assert request(url, "POST", "/answer", {"choice": "left"}, Origin="http://evil.example")[0] == 403
+    assert request(url, "GET", "/state", Host="evil.example:80")[0] == 403
     policy = request(url, "GET", "/")[2].getheader("Content-Security-Policy")
     assert "frame-ancestors 'none'" in policy and "default-src 'none'" in policy
     found, text, _ = request(url, "POST", "/answer", body)

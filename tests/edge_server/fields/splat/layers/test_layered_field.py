@@ -178,13 +178,14 @@ def test_in_seconds_what_moves_is_followed_once_anything_is_shown_of_it() -> Non
     """Until then the still field has the processor."""
     field = resumed_field(known_plates(5))
     assert field.tracker is not None and not field.supervision.layers_shown
-    followed, frame = field.tracker.fits, 17
-    while True:
+    followed = field.tracker.fits
+    for frame in range(17, 1000):
         report = _fitted_in_seconds(field, frame)
         if field.supervision.layers_shown:
             break
         assert field.tracker.fits == followed and not report.short
-        frame += 1
+    else:
+        pytest.fail("nothing was shown of what moves")
     assert field.static.ready
     for _ in range(4):
         frame += 1

@@ -120,13 +120,16 @@ def test_depth_of_another_size_is_refused() -> None:
         LayeredField(SMALL).fit([view], Budget(steps=1))
 
 
-_RNG = np.random.default_rng(5)
+def _noise(camera: int, frame: int, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.random.default_rng([5, camera, frame]).uniform(0.1, 9.0, depth.shape).astype(np.float32)
+
+
 _SPOILED: dict[str, Spoil] = {
     "holes, NaN, infinite": lambda camera, frame, depth: np.full_like(depth, (0.0, np.nan, np.inf)[camera]),
     "constant": lambda camera, frame, depth: np.full_like(depth, 1.0),
     "inverted": lambda camera, frame, depth: np.where(depth > 0, 1.0 / np.maximum(depth, 1e-3), 0).astype(np.float32),
     "millimeters": lambda camera, frame, depth: depth * np.float32(1000.0),
-    "noise": lambda camera, frame, depth: _RNG.uniform(0.1, 9.0, depth.shape).astype(np.float32),
+    "noise": _noise,
     "one camera ten times too far": lambda camera, frame, depth: depth * np.float32(10.0 if camera == 0 else 1.0),
     "ten times too far, later": lambda camera, frame, depth: depth * np.float32(10.0 if frame > 20 else 1.0),
     "half of the image": lambda camera, frame, depth: np.where(np.arange(48) < 24, depth, 0).astype(np.float32),
