@@ -1,4 +1,4 @@
-"""The compose file: what it promises about networks, checked as data and, where an engine runs, for real."""
+"""The compose file: what it promises about networks, checked as data."""
 
 from __future__ import annotations
 

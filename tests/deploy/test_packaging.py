@@ -67,6 +67,13 @@ def test_an_image_installs_all_that_the_project_and_its_packages_ask_for(locks: 
     assert ("torch" in locked) == ("edge" in locks)
 
 
+def test_every_locked_wheel_has_its_hash() -> None:
+    for file in (ROOT / "deploy" / "locks").glob("*.txt"):
+        for line in file.read_text().replace("\\\n", "").splitlines():
+            if not line.startswith("#"):
+                assert re.fullmatch(r"[a-z0-9.-]+={2,3}[\w.+]+( +--hash=sha256:[0-9a-f]{64})+", line), line
+
+
 @pytest.mark.parametrize(
     ("image", "locks"), [("camera", {"build", "camera"}), ("edge", {"build", "edge", "torch-$TORCH"})]
 )

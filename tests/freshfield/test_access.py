@@ -121,7 +121,7 @@ def test_a_name_says_role_and_cameras() -> None:
             Caller.named(wrong)
 
 
-def test_a_browsers_login_is_the_token_as_password():
+def test_a_browsers_login_is_the_token_as_password() -> None:
     access = Access(TOKENS, certificates=False)
     for name, token in TOKENS.items():
         basic = base64.b64encode(f"whoever:{token}".encode()).decode()
@@ -136,7 +136,7 @@ def test_a_browsers_login_is_the_token_as_password():
         assert HttpDoor(Access({}, certificates), "127.0.0.1").caller(None) == ANYBODY
 
 
-def test_a_page_answers_its_own_names_and_origins_alone():
+def test_a_page_answers_its_own_names_and_origins_alone() -> None:
     door = HttpDoor(Access({}, certificates=False), "127.0.0.1")
     for host in ("localhost", "localhost:9090", "127.0.0.1:1", "[::1]:80", "192.0.2.7"):
         door.check_origin(host, None)

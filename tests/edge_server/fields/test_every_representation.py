@@ -11,6 +11,7 @@ import pytest
 
 from edge_server.fields import Budget
 from edge_server.fields.common.cameras import settings as refinement
+from edge_server.fields.common.kernels.volume_rendering import Weights
 from edge_server.fields.common.supervision import pack_cameras
 from tests.edge_server.fields.small import (
     HELD,
@@ -41,6 +42,16 @@ def test_it_learns_a_view_it_has_not_seen_and_depth_in_meters(name: str) -> None
     # Gaussians are soft: the mean of a pixel's depths lies somewhat behind the surface.
     low, high = (-0.1, 0.4) if name == "splat" else (-0.25, 0.25)
     assert low < np.median(depth) - expected < high
+
+
+@pytest.mark.parametrize("name", ["ngp", "nerfacto", "tensorf"])
+def test_shipped_settings_regularize(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    field, given = small(name), []
+    run = field.pool.run
+    monkeypatch.setattr(field.pool, "run", lambda kernel, *args: given.extend(args) or run(kernel, *args))
+    field.fit(SEEN, Budget(steps=1))
+    weights = next(arg for arg in given if isinstance(arg, Weights))
+    assert weights.distortion == np.float32(0.01) and weights.guide == np.float32(0.1)
 
 
 @every_field

@@ -6,9 +6,11 @@ import json
 import re
 import struct
 from collections.abc import Iterator
+from dataclasses import is_dataclass
 from importlib import import_module
 from itertools import count
-from types import SimpleNamespace
+from types import SimpleNamespace, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import cv2
 import numpy as np
@@ -17,6 +19,8 @@ import websocket
 
 pytest.importorskip("foxglove", reason="needs the extra foxglove")
 pytest.importorskip("foxglove_schemas_protobuf", reason="needs the extra mcap")
+
+from foxglove import layouts
 
 from edge_server.cli import main as edge_server
 from edge_server.fields.common.scene_box import SceneBox
@@ -149,6 +153,33 @@ def test_the_layout_shows_topics_and_values_that_are_served(served):
         topic, _, value = name.partition(".")
         assert topic in client.channels, name
         assert not value or value in json.loads(client.channels[topic]["schema"])["properties"], name
+
+
+def fits(value: Any, wanted: Any) -> bool:
+    """Whether a part of a layout has the keys and values that a type of ``foxglove.layouts`` has."""
+    kind, options = get_origin(wanted), get_args(wanted)
+    if is_dataclass(wanted):
+        hints = {re.sub("_(.)", lambda m: m[1].upper(), k): hint for k, hint in get_type_hints(wanted).items()}
+        return isinstance(value, dict) and all(k in hints and fits(each, hints[k]) for k, each in value.items())
+    if kind in (Union, UnionType):
+        return any(fits(value, option) for option in options)
+    if kind is Literal:
+        return value in options
+    if kind in (list, dict):
+        children = value.values() if isinstance(value, dict) else value
+        return isinstance(value, kind) and all(fits(each, options[-1]) for each in children)
+    return isinstance(value, (int, float) if wanted is float else wanted)
+
+
+def test_panels_of_the_layout_have_the_keys_that_foxglove_knows():
+    """``foxglove.layouts`` is generated from the app's own schema."""
+    types = {"3D": layouts.ThreeDeeConfig, "Image": layouts.ImageConfig, "Plot": layouts.PlotConfig}
+    types["RawMessages"] = layouts.RawMessagesConfig
+    for name, config in json.loads((ROOT / "deploy/foxglove-layout.json").read_text())["configById"].items():
+        kind = types[name.partition("!")[0]]
+        config.pop("foxglovePanelTitle", None)  # of any panel
+        assert fits(config, kind), name
+        assert not fits(config | {"title": "a key of no panel"}, kind)
 
 
 def test_it_is_refused_beside_a_login_which_it_would_go_around(tmp_path, capsys):

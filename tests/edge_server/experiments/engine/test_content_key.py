@@ -47,6 +47,14 @@ def test_the_function_counts_and_what_is_bound_to_it_does_not():
     assert bound[0] == bound[1] == result_key(note, Point(1)) != result_key(measure, Point(1))
 
 
+def test_the_kind_of_processor_and_the_versions_count(monkeypatch):
+    key = result_key(measure, 1)
+    monkeypatch.setattr(content_key, "processor", lambda: "x86_64 haswell")
+    other = result_key(measure, 1)
+    monkeypatch.setattr(content_key, "_versions", lambda: {"numpy": "1.0"})
+    assert len({key, other, result_key(measure, 1)}) == 3
+
+
 def test_files_count_by_their_contents_not_by_their_place_or_time(tmp_path):
     for name, text in (("a/x.txt", "one"), ("b/x.txt", "one"), ("c/y.txt", "one"), ("d/x.txt", "two")):
         (tmp_path / name).parent.mkdir()

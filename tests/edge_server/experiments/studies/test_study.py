@@ -55,6 +55,43 @@ def test_figure_6_3_is_made_of_ones_own_channel_and_scene(tmp_path: Path, capsys
     assert (out / "results/trials.jsonl").read_bytes() == known
 
 
+def at_delay(peak_of):
+    """A rule whose best threshold follows the mean delay as ``peak_of`` says."""
+
+    def rule(trial):
+        return peak(peak_of(trial.channel.get("service", {"mean_ms": 60.0})["mean_ms"]))(trial)
+
+    return rule
+
+
+@pytest.mark.parametrize(
+    ("name", "rule", "said"),
+    [
+        ("mat", peak(80.0), {"holds"}),
+        ("mat", peak(4000.0), {"does not hold"}),
+        ("mat-delay", at_delay(lambda delay: 60.0 + 1.5 * delay), {"holds"}),
+        ("mat-delay", at_delay(lambda delay: 400.0 - 1.5 * delay), {"does not hold"}),
+    ],
+)
+def test_mat_finds_a_best_threshold_that_rises_with_the_delay_and_their_absence(name, rule, said, tmp_path: Path):
+    assert answers(verdicts(name, tmp_path, rule)) == said
+
+
+def test_a_best_threshold_that_is_the_same_at_every_delay_does_not_rise(tmp_path: Path):
+    assert "holds" not in answers(verdicts("mat-delay", tmp_path, at_delay(lambda delay: 150.0)))
+
+
+def test_lambda_moves_the_best_threshold_only_where_it_counts_used_views(tmp_path: Path):
+    def rule(trial):
+        row = peak(200.0)(trial)
+        return {**row, "age_sum_ms": 2000.0} if trial.policy == "threshold" else row
+
+    found = verdicts("lambda", tmp_path, rule)
+    assert answers(found, "threshold, all cameras (5.8)") == {"does not hold"}
+    assert answers(found, "threshold, used views (6.35)") == {"holds"}
+    assert answers(found, "wait, all cameras (5.8)") == {"holds"}
+
+
 @pytest.mark.parametrize("name", [n for n in ON_A_CHANNEL if n != "representations"])
 def test_one_seed_decides_nothing(name, tmp_path: Path):
     assert answers(verdicts(name, tmp_path, peak(90.0), seeds=1)) == {"undecided"}
@@ -91,6 +128,14 @@ def test_verdicts_are_corrected_for_their_number():
     rows = [{"scene": k, "seed": 0, "reward": row} for k, row in enumerate([lucky, certain, *[equal] * 98])]
     assert [v.verdict for v in judge(study, SeedTable(rows))] == ["undecided", "holds", *["undecided"] * 98]
     assert [v.verdict for v in judge(study, SeedTable(rows[:2]))] == ["holds", "holds"]
+
+
+def test_a_claim_of_several_differences_is_as_sure_as_its_weakest_part():
+    sure, weak, below = Interval(1.0, 0.9, 1.1, 10), Interval(1.0, 0.1, 1.9, 10), Interval(-1.0, -1.9, -0.1, 10)
+    assert Finding("", (sure, weak)).above(0.0) is True
+    assert Finding("", (sure, weak)).p_value(0.0) == weak.p_value(0.0) > sure.p_value(0.0)
+    assert Finding("", (sure, below)).above(0.0) is False
+    assert Finding("", (sure, below)).p_value(0.0) == 2 * below.p_value(0.0)
 
 
 def test_a_study_writes_rows_verdicts_and_a_page(tmp_path: Path):

@@ -84,6 +84,29 @@ def _edited(change):
     return edit
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: path.write_bytes(path.read_bytes()[:-200]),
+        lambda path: checkpoint.save(path, {"a": np.zeros(3)}),
+        _edited(lambda arrays, about: arrays["actor.in"].__setitem__((0, 0), np.nan)),
+        _edited(lambda arrays, about: arrays.update({"actor.in": arrays["actor.in"][:, 1:]})),
+        _edited(lambda arrays, about: arrays.update({"actor.in": arrays["actor.in"].astype(str)})),
+        _edited(lambda arrays, about: arrays.pop("actor.out")),
+        _edited(lambda arrays, about: about["spec"].update(action="guess")),
+        _edited(lambda arrays, about: about["spec"].update(depth=3)),
+    ],
+    ids=["cut", "field", "nan", "shape", "words", "lacks", "action", "key"],
+)
+def test_a_file_that_is_no_whole_checkpoint_is_refused_in_one_line(tmp_path, damage):
+    path = save(Learner(select(), 0), tmp_path / "policy.npz")
+    damage(path)
+    for load in (Learner.load, Actor.load):
+        with pytest.raises(checkpoint.CheckpointError) as refused:
+            load(path)
+        assert str(refused.value).startswith(str(path)) and "\n" not in str(refused.value)
+
+
 LARGE = {"hidden": {"hidden": 30_000}, "dim": {"layout": {"parts": ["age", "semantics"], "dim": 10**9}}}
 WRONG = {
     "hidden is text": {"hidden": "64"},
@@ -128,7 +151,6 @@ def _filled(name, value):
 @pytest.mark.parametrize(
     "change",
     [
-        lambda arrays, about: arrays.pop("actor.out"),
         _cut("adam.3.exp_avg_sq"),
         _cut("usual"),
         _cut("value.mid"),

@@ -76,12 +76,14 @@ def test_the_flanges_residual_is_the_motion_from_the_reported_to_the_predicted_p
 
 def test_with_noise_on_the_arm_the_refinement_is_as_exact_as_can_be_and_says_so():
     """15 poses, arm noise .5 mm and .002 rad an axis. The Cramer-Rao bound is .0768 degrees, .410 mm."""
-    refined = [refine(noisy_samples(15, np.random.default_rng([7, trial]))) for trial in range(24)]
-    off = [(angle_deg(each.x, X), distance_mm(each.x, X)) for each in refined]
+    trials = [noisy_samples(15, np.random.default_rng([7, trial])) for trial in range(24)]
+    refined = [refine(samples) for samples in trials]
+    found = ([each.x for each in refined], [solve(samples, "tsai") for samples in trials])
+    off, off_tsai = ([(angle_deg(x, X), distance_mm(x, X)) for x in each] for each in found)
     said = [(each.std_deg, each.std_mm) for each in refined]
-    rms, rms_said = (np.sqrt(np.mean(np.square(v), axis=0)) for v in (off, said))
+    rms, rms_tsai, rms_said = (np.sqrt(np.mean(np.square(v), axis=0)) for v in (off, off_tsai, said))
     bound = np.array([0.0768, 0.410])
-    assert np.all(rms < 1.25 * bound) and np.all(rms > 0.75 * bound)
+    assert np.all(rms < 1.25 * bound) and np.all(rms > 0.75 * bound) and np.all(rms < rms_tsai)
     np.testing.assert_allclose(rms, rms_said, rtol=0.35)
     noise = [(each.arm_noise_rad, each.arm_noise_m) for each in refined]
     np.testing.assert_allclose(np.mean(noise, axis=0), [0.002, 0.0005], rtol=0.1)

@@ -57,6 +57,20 @@ def test_a_frame_is_taken_once_and_not_before_its_turn() -> None:
         assert len(field.views) == expected, k
 
 
+def test_each_moving_camera_has_corrections_of_its_own() -> None:
+    """One is mounted 1.5 degrees askew, the other is not."""
+    field, askew = carried_field(), se3(so3_exp(np.array([0.0, np.deg2rad(1.5), 0.0])), np.zeros(3))
+    turned: dict[str, list[np.ndarray]] = {"left": [], "right": []}
+    for view in WALK[1:30]:
+        field.fit([replace(view, camera="left")], Budget(steps=24))
+        field.fit([replace(view, camera="right", camera_to_world=view.camera_to_world @ askew)], Budget(steps=24))
+    for name, known in field._poses.known.items():
+        assert known.track == name.partition("#")[0]
+        turned[known.track].append(known.given[:3, :3].T @ known.rotation)
+    apart_deg = np.rad2deg(np.mean(turned["right"], axis=0) - np.mean(turned["left"], axis=0))
+    assert -1.9 < apart_deg[1] < -0.75 and np.abs(apart_deg[[0, 2]]).max() < 0.4
+
+
 def test_keyframes_taken_near_each_other_go_first_and_memory_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tuned, "KEPT_PIXELS", 0)
     monkeypatch.setattr(tuned, "LEAST_KEPT", 20)
