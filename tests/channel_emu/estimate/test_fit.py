@@ -191,7 +191,7 @@ def test_the_command_writes_a_scenario_and_a_picture(tmp_path: Path, capsys) -> 
 
 
 @pytest.mark.stability
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [*range(3), *(pytest.param(k, marks=pytest.mark.slow) for k in range(3, 8))])
 def test_odd_recordings_give_finite_figures_or_one_line(tmp_path: Path, seed: int) -> None:
     """Frames in one instant or in bursts, delays over sixteen decades, of two values, or of none; nine in ten
     lost. Nothing overflows on the way, and what comes out is a channel."""

@@ -33,6 +33,7 @@ def test_zero_delays_deliver_everything_and_huge_ones_saturate(discipline: str) 
     assert found["offered"] == found["in_flight"] + found["dropped_busy"] + found["superseded"]
 
 
+@pytest.mark.slow
 def test_a_chain_that_always_switches() -> None:
     """40 switches a millisecond: the channel is its average."""
     section = {

@@ -47,7 +47,10 @@ def test_samples_have_actions_of_their_own_and_share_the_episode():
     assert fixed[0].features is None and fixed[0].outcomes["cam00"].views >= 3.0
 
 
-@pytest.mark.parametrize("what", [setting(), deployed()], ids=["single decisions", "deployed"])
+@pytest.mark.parametrize(
+    "what",
+    [pytest.param(setting(), id="single decisions"), pytest.param(deployed(), id="deployed", marks=pytest.mark.slow)],
+)
 def test_a_job_gives_the_same_wherever_and_after_whatever_it_is_computed(what: Setting, monkeypatch):
     """As processes have it: each job is sent to one, which has computed other jobs before, or none."""
     actor = Learner(dataclasses.replace(SELECT, hold_ms=300.0 * what.deployed), 0).actor

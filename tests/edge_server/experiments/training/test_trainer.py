@@ -72,6 +72,7 @@ def test_a_training_with_damaged_files_is_refused_in_one_line(damage: str, tmp_p
             trained(tmp_path)
 
 
+@pytest.mark.slow
 def test_it_learns_to_use_fresh_views_where_only_age_counts(tmp_path: Path):
     omegas = (30.0, 100.0, 400.0)
     spec = Spec("threshold", StateLayout(("age",)), omegas, hidden=16, learning_rate=1e-2)

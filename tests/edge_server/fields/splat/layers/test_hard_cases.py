@@ -277,6 +277,11 @@ LONG = (
     "a burst after a blackout",
     "a wall fills an image",
     "one camera only, with depth",
+    "a light on one side",
+    "a camera is knocked",
+    "out of order by a second",
+    "depth with holes on what moves",
+    "depth that lags by 100 ms",
 )
 
 

@@ -145,6 +145,7 @@ def test_a_refused_state_changes_nothing_and_reset_forgets() -> None:
     same_state(field, LayeredField(SMALL))
 
 
+@pytest.mark.slow
 def test_warming_up_compiles_every_kernel() -> None:
     """Nothing is left to compile when a body moves: in a process of its own."""
     code = """

@@ -182,6 +182,7 @@ def _small(camera: int, frame: int) -> View:
     return replace(whole, image=image, intrinsics=whole.intrinsics.halved(1), whole=lambda: whole)
 
 
+@pytest.mark.slow
 def test_fine_plates_are_collected_in_each_fit_until_they_are_known_and_then_less_often() -> None:
     """Four whole frames a fit, of the cameras that have the fewest, until there are four of each."""
     field, taken = LayeredField(SMALL), []

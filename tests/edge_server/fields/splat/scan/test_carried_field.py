@@ -57,6 +57,7 @@ def test_a_frame_is_taken_once_and_not_before_its_turn() -> None:
         assert len(field.views) == expected, k
 
 
+@pytest.mark.slow
 def test_each_moving_camera_has_corrections_of_its_own() -> None:
     """One is mounted 1.5 degrees askew, the other is not."""
     field, askew = carried_field(), se3(so3_exp(np.array([0.0, np.deg2rad(1.5), 0.0])), np.zeros(3))
@@ -145,7 +146,7 @@ def _blurred(view: View) -> View:
 @pytest.mark.parametrize(
     ("spoil", "frames", "said", "depth", "least_db", "lost_db"),
     [
-        (_other, 6, True, True, 20.8, 1.0),
+        slow(_other, 6, True, True, 20.8, 1.0),
         slow(_other, 6, True, False, 21.8, 1.0),
         (_leaping, 3, True, True, 21.0, 1.0),
         slow(_leaping, 3, True, False, 21.6, 1.0),

@@ -125,6 +125,7 @@ def test_poses_and_exposures_are_refined_and_held_out_frames_take_their_neighbor
     np.testing.assert_array_equal(one.gain, dark.gain)
 
 
+@pytest.mark.slow
 def test_exact_poses_are_hardly_spoiled_however_long_they_are_refined() -> None:
     """With steps that never get shorter they lose 2 dB."""
     plain_db, refined_db = _fit(WALK, 1200)[1], _fit(WALK, 1200, refine=True)[2]

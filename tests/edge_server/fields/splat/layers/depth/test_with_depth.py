@@ -141,7 +141,7 @@ _NAMED = {
     "one camera ten times too far": ("cam00",),
 }
 # The others are refused or believed by the rules that ``test_surfaces`` and ``test_depth_plate`` hold.
-_QUICK = ("holes, NaN, infinite", "noise", "one camera ten times too far")
+_QUICK = ("holes, NaN, infinite", "one camera ten times too far")
 
 
 @pytest.mark.stability
