@@ -59,7 +59,7 @@ endef
 BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrome 2>/dev/null))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test docs lint format types figures mutants proto proto-check lock images clean
+.PHONY: help demo test docs lint format types bench figures mutants proto proto-check lock images clean
 
 help:  ## what there is to make
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 22
@@ -94,6 +94,10 @@ format: .venv/.ok-test  ## ruff: apply the format and the safe fixes
 types: .venv/.ok-test  ## mypy
 	$(PY) -m mypy
 	MYPYPATH=proto:deploy $(PY) -m mypy deploy/freshfield_up
+
+bench: .venv/.ok-test  ## what a frame costs emulator and ingest, by the number of cameras: runs/bench.json
+	@mkdir -p runs
+	$(PY) -m tests.tools.scale --json runs/bench.json
 
 figures: .venv/.ok-test  ## the thesis's figures, hours to days: docs/results/thesis; DATA=FOLDER JOBS=2 STUDY=--quick
 	for name in $(FIGURES); do \
