@@ -9,6 +9,10 @@ thread that computes wakes at most two others first, and the caller computes its
 higher than the workers'. Of a pool that is to leave all workers but one idle (``Pool.spare``) each caller computes
 itself, whatever its priority. Callers may then compute at once, each as worker 0: what kernels index by their worker
 belongs to one caller.
+
+Where the caller is worker 0, it and the workers wait for each other without sleeping for some 80 us (``brief_wait``):
+a step of training is a row of small kernels, and to wake for each took a tenth to a fifth of it. In a server, whose
+workers have a low priority, nobody waits so: cameras' frames need the cores.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from edge_server.fields.common.kernels.simd import COUNTER
+from edge_server.fields.common.threads.brief_wait import await_next_job, await_workers
 
 # Environment variable: threads of a pool, for users who run several processes side by side.
 THREADS_VARIABLE = "FRESHFIELD_THREADS"
@@ -50,12 +55,11 @@ def default_threads() -> int:
 
 
 class _Job:
-    """A kernel to be run, the tasks drawn so far, and which workers have finished it."""
+    """A kernel to be run, the tasks drawn so far (a cache line for each worker), and which workers have finished it."""
 
-    def __init__(self, kernel: Callable[..., Any], args: tuple[Any, ...], threads: int) -> None:
-        self.kernel, self.args = kernel, args
-        self.counter = np.zeros(COUNTER * threads, np.int64)
-        self.finished = bytearray(threads)
+    def __init__(self, kernel: Callable[..., Any], args: tuple[Any, ...], counter: np.ndarray) -> None:
+        self.kernel, self.args, self.counter = kernel, args, counter
+        self.finished = bytearray(len(counter) // COUNTER)
         # A queue, not a semaphore: that is Python code, which an interrupt may leave locked.
         self.over = SimpleQueue[None]()
         self.error: BaseException | None = None
@@ -90,6 +94,8 @@ class Pool:
         self.nice, self._engaged = nice, self.threads
         self._inboxes: list[SimpleQueue[_Job | None]] = [SimpleQueue() for _ in range(self.threads)]
         self._turn, self._closed = threading.Lock(), False
+        # Of the job that a caller leads: tasks drawn; in its first element, how many workers are done.
+        self._drawn, self._done = np.zeros(COUNTER * self.threads, np.int64), np.zeros(COUNTER, np.int64)
         for worker in range(0 if nice else 1, self.threads):
             name = f"field-worker-{worker}"
             threading.Thread(target=self._serve, args=(worker,), name=name, daemon=True).start()
@@ -101,13 +107,14 @@ class Pool:
         if engaged == 1 < self.threads and not self._closed:
             kernel(np.zeros(COUNTER, np.int64), 0, *args)
             return
-        job = _Job(kernel, args, engaged)
         with self._turn:
             if self._closed:
                 raise RuntimeError("the pool is closed")
             if self.nice:
+                job = _Job(kernel, args, np.zeros(COUNTER * engaged, np.int64))
                 self._inboxes[0].put(job)
             else:
+                job = _Job(kernel, args, self._drawn[: COUNTER * engaged])
                 self._lead(job)
         job.wait()
         if (error := job.error) is not None:
@@ -135,14 +142,17 @@ class Pool:
 
     def _lead(self, job: _Job) -> None:
         """For a caller that is worker 0: do its share of a job and wait for the others."""
+        self._done[0] = 0
         try:
             self._work(job, 0)
+            await_workers(self._done, len(job.finished) - 1)
         except BaseException:  # of an interrupt: perhaps not all were woken
             self._wake_others(0, job)
             job.finished[0] = 1
             raise
         finally:
             job.wait()
+            self._drawn[:] = 0
 
     def _serve(self, worker: int) -> None:
         lower_priority(self.nice)
@@ -150,6 +160,8 @@ class Pool:
             if not job.finished[worker]:
                 self._work(job, worker)
             del job  # or the last job's arrays would live until the next one comes
+            if not self.nice:
+                await_next_job(self._done, self._drawn)
         self._wake_others(worker, None)
 
     def _work(self, job: _Job, worker: int) -> None:

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from edge_server.fields.common.kernels.simd import draw
+from edge_server.fields.common.kernels.simd import COUNTER, draw
+from edge_server.fields.common.threads.brief_wait import await_next_job, await_workers
 from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
 
 # With a nice of 0 the caller is a worker itself.
@@ -180,4 +181,24 @@ def test_a_pool_that_rests_keeps_no_arrays(nice: int) -> None:
     while alive() is not None and time.monotonic() < deadline:
         time.sleep(0.005)
     assert alive() is None
+    pool.close()
+
+
+def test_a_wait_without_sleeping_ends_with_the_others_sign_or_gives_up() -> None:
+    done, drawn = np.zeros(COUNTER, np.int64), np.zeros(COUNTER, np.int64)
+    await_workers(done, 1)  # nobody is done: given up, or this would not end
+    await_next_job(done, drawn)  # the same, for a kernel
+    assert done[0] == 1
+    drawn[0] = 1  # of the job before, which is never reset
+    await_next_job(done, drawn)
+    assert done[0] == 2
+
+
+def test_workers_without_work_sleep() -> None:
+    pool, done = Pool(3), np.zeros(30, np.int64)
+    pool.run(_share, done)
+    time.sleep(0.05)
+    before_s = time.process_time()
+    time.sleep(0.2)
+    assert time.process_time() - before_s < 0.1  # two that went on looking: 0.4
     pool.close()
