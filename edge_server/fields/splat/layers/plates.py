@@ -18,16 +18,7 @@ from edge_server.fields import View
 from edge_server.fields.common.field_state import give_attributes, take_attributes
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.layers import settings as tuned
-from edge_server.fields.splat.layers.kernels.plates import (
-    CHANGING,
-    FOREGROUND,
-    LIKE_STATIC,
-    MODES,
-    PlateArrays,
-    compare_with_plate,
-    count_exposure,
-    vote,
-)
+from edge_server.fields.splat.layers.kernels.plates import MODES, PlateArrays, compare_with_plate, count_exposure, vote
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray]
@@ -62,11 +53,11 @@ class Plate:
         # The latest frames, a ring: as taken, their gains since, and blurred.
         self._frames = np.zeros((max(tuned.LAGS), height, width, 3), np.uint8)
         self._gains = np.ones((max(tuned.LAGS), 3), np.float32)
-        self._recent = np.zeros(self._frames.shape, np.float32)
+        self._recent, self._blurred = [zeros(3) for _ in self._frames], zeros(3)
         self._held: NDArray[Any] = np.zeros((height, width), np.uint8)
         self._static, self._has_static = zeros(3), False
         self._static_blurred: NDArray[Any] = zeros(3)
-        self._difference, self._flags = zeros(), np.zeros((height, width), np.uint8)
+        self._difference, self._flags = zeros(), np.zeros((height, -(-width // 8) * 8), np.uint8)
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -105,38 +96,38 @@ class Plate:
         """
         before = dict(vars(self))
         self._follow_exposure(image)
-        blurred = cv2.boxFilter(image, cv2.CV_32F, (3, 3))
-        earlier = [self._recent[(self.count - lag) % len(self._recent)] for lag in tuned.LAGS if lag <= self.count]
-        earlier_frames = np.stack(earlier or [blurred])
+        earlier = [self._recent[(self.count - lag) % len(self._recent)] for lag in tuned.LAGS]
+        foreground, changing = masks = np.empty((2, *self.known.shape), np.uint8)
+        counts = np.zeros(2, np.int64)
         self.pool.run(
             compare_with_plate,
-            blurred,
+            image,
+            self._blurred,
             self.arrays,
-            earlier_frames,
-            len(earlier),
-            self._static_blurred[None],
+            tuple(earlier),
+            sum(lag <= self.count for lag in tuned.LAGS),
+            self._static_blurred,
             self._has_static,
             self._difference,
             self._flags,
+            self._flags.view(np.uint64),
+            masks,
+            counts,
         )
-        foreground = np.zeros_like(self._flags)
-        votes = np.ones_like(foreground)
-        if self.count > 0:
-            foreground = clean_mask(self._flags & np.uint8(FOREGROUND))
-            if may_refuse and cv2.countNonZero(foreground) > tuned.REFUSED_SHARE * foreground.size:
-                vars(self).update(before)  # what ``_scale`` has replaced
-                return None
-            changing = clean_mask(self._flags & np.uint8(CHANGING)) if self.count > 1 else foreground
-            votes = changing == 0
-            if not by_itself:
-                votes |= (self._flags & LIKE_STATIC > 0) & (foreground == 0)
+        if self.count == 0:
+            masks[:] = 0
+        elif may_refuse and counts[0] > tuned.REFUSED_SHARE * foreground.size:
+            vars(self).update(before)  # what ``_scale`` has replaced
+            return None
         self.pool.run(
             vote,
             image,
-            blurred,
+            self._blurred,
             self._difference,
+            self._flags,
             foreground,
-            votes.astype(np.uint8),
+            changing if self.count > 1 else foreground,
+            not by_itself,
             np.zeros_like(self._held) if by_itself else self._held,
             self.arrays,
             self._static,
@@ -144,7 +135,8 @@ class Plate:
             self.picture,
         )
         slot = self.count % len(self._recent)
-        self._frames[slot], self._gains[slot], self._recent[slot] = image, 1.0, blurred
+        self._frames[slot], self._gains[slot] = image, 1.0
+        self._recent[slot], self._blurred = self._blurred, self._recent[slot]
         self.count += 1
         return foreground > 0
 
@@ -172,8 +164,10 @@ class Plate:
     def _blur(self) -> None:
         """What follows from the static field's rendering and the latest frames."""
         self._static_blurred = cv2.blur(self._static, (3, 3))
-        self._recent = np.stack([cv2.boxFilter(frame, cv2.CV_32F, (3, 3)) for frame in self._frames])
-        self._recent *= self._gains[:, None, None]
+        self._recent = [
+            cv2.boxFilter(frame, cv2.CV_32F, (3, 3)) * gain
+            for frame, gain in zip(self._frames, self._gains, strict=True)
+        ]
 
     def _fill(self) -> None:
         """The picture, as ``vote`` leaves it."""
@@ -266,40 +260,6 @@ class FinePlate:
         fine = FinePlate(replace(view, image=np.zeros((height, width, 3), np.uint8), intrinsics=lens))
         give_attributes(fine, ("color", "frames", "count"), state)
         return fine
-
-
-def clean_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Remove specks of fewer than SPECK pixels, close gaps of CLOSE pixels, fill holes of up to HOLE of the
-    image. mask: uint8 (H, W), 0 or not. Returns 0 or 1."""
-    height, width = mask.shape
-    x, y, w, h = cv2.boundingRect(mask)
-    out = np.zeros_like(mask)
-    if w == 0:
-        return out
-    left, top, right, bottom = max(x - 2, 0), max(y - 2, 0), min(x + w + 2, width), min(y + h + 2, height)
-    part: NDArray[Any] = (mask[top:bottom, left:right] > 0).astype(np.uint8)
-    part = cv2.morphologyEx(part, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    _, label, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=8)
-    keep = (stats[:, cv2.CC_STAT_AREA] >= tuned.SPECK).astype(np.uint8)
-    keep[0] = 0
-    by = tuned.CLOSE
-    kept = keep.take(np.asarray(label, np.int32))
-    part = cv2.copyMakeBorder(kept, by, by, by, by, cv2.BORDER_CONSTANT, value=0)
-    ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (by, by))
-    part = cv2.morphologyEx(part, cv2.MORPH_CLOSE, ellipse)[by:-by, by:-by]
-    _, label, stats, _ = cv2.connectedComponentsWithStats(1 - part, connectivity=4)
-    x0, y0 = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
-    x1, y1 = x0 + stats[:, cv2.CC_STAT_WIDTH], y0 + stats[:, cv2.CC_STAT_HEIGHT]
-    goes_on = (  # beyond the bounding box: no hole
-        ((x0 == 0) & (left > 0))
-        | ((y0 == 0) & (top > 0))
-        | ((x1 == right - left) & (right < width))
-        | ((y1 == bottom - top) & (bottom < height))
-    )
-    fill = ((stats[:, cv2.CC_STAT_AREA] <= tuned.HOLE * mask.size) & ~goes_on).astype(np.uint8)
-    fill[0] = 0
-    out[top:bottom, left:right] = part | fill.take(np.asarray(label, np.int32))
-    return out
 
 
 def plain_share(colors: Sequence[NDArray[np.float32]]) -> float:

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import fetch_add
 from edge_server.fields.splat.layers import settings as tuned
+from edge_server.fields.splat.layers.kernels.masks import clean_mask
 
 MODES = 3  # colors a pixel remembers
 
-# Bits that ``compare_with_plate`` writes.
+# Bits that ``compare_with_plate`` writes, the first two in the order of its masks.
 FOREGROUND, CHANGING, LIKE_STATIC = 1, 2, 4
 
-_ROWS = 16  # rows of pixels a task
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
@@ -50,38 +50,84 @@ def _difference(a, b, k, y, x):
     return max(d0, max(d1, d2))
 
 
-@kernel
-def compare_with_plate(counter, worker, blurred, plate, earlier, earlier_count, static, has_static, difference, flags):
-    """Compare a blurred frame with the plate and with earlier frames. Tasks are runs of rows.
+@device_function
+def _differences(a, b, scratch, out):
+    """``_difference`` of a row's pixels, float32 (W, 3) each, written to float32 (W,). scratch: float32 (3 W,)."""
+    left, right = a.reshape(-1), b.reshape(-1)
+    for j in range(scratch.size):
+        scratch[j] = abs(left[j] - right[j])
+    for x in range(out.size):
+        out[x] = max(scratch[3 * x], max(scratch[3 * x + 1], scratch[3 * x + 2]))
 
-    blurred: float32 (H, W, 3). plate: ``PlateArrays``.
-    earlier: float32 (2, H, W, 3), blurred earlier frames, of which the first ``earlier_count`` count.
-    static: float32 (1, H, W, 3), the static field's rendering, blurred; read if ``has_static``.
+
+@device_function
+def _blur(image, blurred):
+    """Means of 3 x 3 pixels; beyond the image is what is as far within it, without the border itself."""
+    height, size = image.shape[0], 3 * image.shape[1]
+    sums, ninth = np.empty(size, np.int32), np.float32(1.0 / 9.0)
+    for y in range(height):
+        above, below = min(abs(y - 1), height - 1), y + 1 if y + 1 < height else max(y - 1, 0)
+        over, here, under, row = (
+            image[above].reshape(-1),
+            image[y].reshape(-1),
+            image[below].reshape(-1),
+            blurred[y].reshape(-1),
+        )
+        for j in range(size):
+            sums[j] = np.int32(over[j]) + np.int32(here[j]) + np.int32(under[j])
+        left, right, between = sums[:-6], sums[6:], row[3:-3]
+        for j in range(size - 6):
+            between[j] = np.float32(left[j] + sums[j + 3] + right[j]) * ninth
+        for c in range(3):
+            first, last = min(c + 3, size - 3 + c), size - 3 + c
+            row[c] = np.float32(sums[c] + 2 * sums[first]) * ninth
+            if last > c:
+                row[last] = np.float32(sums[last] + 2 * sums[last - 3]) * ninth
+
+
+@kernel
+def compare_with_plate(
+    counter, worker, image, blurred, plate, earlier, lags, static, has_static, difference, flags, eights, masks, counts
+):
+    """Blur a frame, compare it with the plate and with earlier frames, and clean what differs.
+
+    image: uint8 (H, W, 3). blurred: float32 (H, W, 3), written.
+    plate: ``PlateArrays``.
+    earlier: two of float32 (H, W, 3), blurred earlier frames, of which the first ``lags`` count.
+    static: float32 (H, W, 3), the static field's rendering, blurred; read if ``has_static``.
     difference: float32 (H, W), written: difference from the plate, of the worst channel.
-    flags: uint8 (H, W), written: FOREGROUND, CHANGING (differs from an earlier frame) and LIKE_STATIC.
+    flags: uint8 (H, W rounded up to a multiple of 8), written: FOREGROUND, CHANGING (differs from an earlier frame) and
+        LIKE_STATIC. eights: the same as uint64.
+    masks: uint8 (2, H, W), written: foreground and what changes, see ``clean_mask``. counts: int64 (2,), written: how
+        many pixels of each.
     """
     height, width = difference.shape
     least, beyond = np.float32(tuned.THRESHOLD), np.float32(tuned.THRESHOLD_UNKNOWN)
-    while True:
-        top = fetch_add(counter, 1) * _ROWS
-        if top >= height:
-            return
-        for y in range(top, min(top + _ROWS, height)):
+    change, off, other = np.zeros(width, np.float32), np.zeros(width, np.float32), np.zeros(width, np.float32)
+    scratch = np.empty(3 * width, np.float32)
+    _blur(image, blurred)
+    for y in range(height):
+        _differences(blurred[y], plate.blurred[0, y], scratch, difference[y])
+        if lags > 0:
+            _differences(blurred[y], earlier[0][y], scratch, change)
+        if lags > 1:
+            _differences(blurred[y], earlier[1][y], scratch, other)
             for x in range(width):
-                d = _difference(blurred, plate.blurred, 0, y, x)
-                limit = max(least, np.float32(tuned.DEVIATIONS) * plate.deviation[y, x])
-                change = _F0
-                for k in range(earlier_count):
-                    change = max(change, _difference(blurred, earlier, k, y, x))
-                changing = change > limit
-                off = _difference(blurred, static, 0, y, x) if has_static else _F0
-                unknown = off > beyond if has_static else changing
-                foreground = d > limit if plate.known[y, x] else unknown
-                like = has_static & (off <= least)
-                difference[y, x] = d
-                flags[y, x] = (
-                    np.uint8(foreground) * FOREGROUND + np.uint8(changing) * CHANGING + np.uint8(like) * LIKE_STATIC
-                )
+                change[x] = max(change[x], other[x])
+        if has_static:
+            _differences(blurred[y], static[y], scratch, off)
+        for x in range(width):
+            d = difference[y, x]
+            limit = max(least, np.float32(tuned.DEVIATIONS) * plate.deviation[y, x])
+            changing = change[x] > limit
+            unknown = off[x] > beyond if has_static else changing
+            foreground = d > limit if plate.known[y, x] else unknown
+            like = has_static & (off[x] <= least)
+            flags[y, x] = (
+                np.uint8(foreground) * FOREGROUND + np.uint8(changing) * CHANGING + np.uint8(like) * LIKE_STATIC
+            )
+    for k in range(2):
+        counts[k] = clean_mask(eights, k, masks[k])
 
 
 @device_function
@@ -126,14 +172,11 @@ def _join(plate, y, x, image, blurred):
 
 
 @device_function
-def _join_plate(plate, y, x, image, blurred):
-    """Add a vote to the plate, where there is no other mode: the usual case."""
-    weight = plate.weight[0, y, x] + _F1
-    rate = max(_F1 / weight, np.float32(tuned.SLOWEST_RATE))
-    plate.weight[0, y, x], plate.run[y, x] = weight, 0
-    for c in range(3):
-        plate.means[0, y, x, c] += rate * (np.float32(image[y, x, c]) - plate.means[0, y, x, c])
-        plate.blurred[0, y, x, c] += rate * (blurred[y, x, c] - plate.blurred[0, y, x, c])
+def _learn(rates, seen, means):
+    """Move the means of a row, (W, 3), towards what is seen by ``rates``, (3 W,)."""
+    to, what = seen.reshape(-1), means.reshape(-1)
+    for j in range(what.size):
+        what[j] += rates[j] * (np.float32(to[j]) - what[j])
 
 
 @device_function
@@ -144,48 +187,83 @@ def _is_known(weight, total):
 
 
 @kernel
-def vote(counter, worker, image, blurred, difference, foreground, votes, held, plate, static, has_static, picture):
-    """Update the plate by a frame. Tasks are runs of rows.
+def vote(
+    counter,
+    worker,
+    image,
+    blurred,
+    difference,
+    flags,
+    foreground,
+    changing,
+    trusts,
+    held,
+    plate,
+    static,
+    has_static,
+    picture,
+):
+    """Update the plate by a frame.
 
-    image: uint8 (H, W, 3). blurred, difference: as in ``compare_with_plate``.
+    image: uint8 (H, W, 3). blurred, difference, flags: as in ``compare_with_plate``.
     foreground: uint8 (H, W), pixels that are not the plate: they do not count for its deviation.
-    votes: uint8 (H, W), pixels that may be background.
+    changing: uint8 (H, W), pixels that do not vote; unless ``trusts``, and they are like the static field.
     held: uint8 (H, W), pixels that neither vote nor forget.
     plate: ``PlateArrays``, updated.
     static: float32 (H, W, 3), the static field's rendering; read if ``has_static``.
     picture: float32 (H, W, 3), written: the plate; where that is unknown, the static field.
     """
     height, width = difference.shape
-    decay, rate = np.float32(1.0 - 1.0 / tuned.MEMORY), np.float32(tuned.DEVIATION_RATE)
-    while True:
-        top = fetch_add(counter, 1) * _ROWS
-        if top >= height:
-            return
-        for y in range(top, min(top + _ROWS, height)):
+    decay, learning = np.float32(1.0 - 1.0 / tuned.MEMORY), np.float32(tuned.DEVIATION_RATE)
+    least, near = np.float32(tuned.LEAST_WEIGHT), np.float32(tuned.THRESHOLD)
+    rates, votes, joins_another = np.empty(width, np.float32), np.empty(width, np.bool_), np.empty(width, np.bool_)
+    by = np.empty(3 * width, np.float32)
+    for y in range(height):
+        # Row by row, in loops so small that they are vectorized.
+        deviation, total, known, fixed = plate.deviation[y], plate.total[y], plate.known[y], held[y] > 0
+        for x in range(width):
+            d, old = difference[y, x], deviation[x]
+            limit = max(near, np.float32(tuned.DEVIATIONS) * old)
+            shows = (not fixed[x]) & (foreground[y, x] == 0) & known[x] & (d < np.float32(3.0) * limit)
+            deviation[x] = old + (d - old) * learning if shows else old
+        for x in range(width):
+            total[x] = total[x] if fixed[x] else total[x] * decay + _F1
+        for k in range(MODES):
+            weight = plate.weight[k, y]
+            for x in range(width):  # what is forgotten becomes 0: a processor is slow with subnormal numbers
+                kept = weight[x] * decay
+                kept = kept if kept > least else _F0
+                weight[x] = weight[x] if fixed[x] else kept
+        first, second, third, run = plate.weight[0, y], plate.weight[1, y], plate.weight[2, y], plate.run[y]
+        for x in range(width):
+            like = trusts & (foreground[y, x] == 0) & ((flags[y, x] & LIKE_STATIC) != 0)
+            votes[x] = (not fixed[x]) & ((changing[y, x] == 0) | like)
+        for x in range(width):
+            alone = (second[x] <= least) & (third[x] <= least)
+            joins = votes[x] & alone & (difference[y, x] <= near) & (first[x] > least)
+            first[x] = first[x] + _F1 if joins else first[x]
+            rates[x] = max(_F1 / first[x], np.float32(tuned.SLOWEST_RATE)) if joins else _F0
+            joins_another[x] = votes[x] & (not joins)
+        for x in range(width):
+            run[x] = run[x] if joins_another[x] else 0
+        for x in range(width):
+            for c in range(3):
+                by[3 * x + c] = rates[x]
+        _learn(by, image[y], plate.means[0, y])
+        _learn(by, blurred[y], plate.blurred[0, y])
+        for x in range(width):
+            if joins_another[x]:
+                _join(plate, y, x, image, blurred)
+        for x in range(width):
+            known[x] = known[x] if fixed[x] else _is_known(first[x], total[x])
+        shown, color, still = picture[y].reshape(-1), plate.means[0, y].reshape(-1), static[y].reshape(-1)
+        for j in range(shown.size):
+            shown[j] = color[j]
+        if has_static:
             for x in range(width):
-                if held[y, x]:
-                    plate.run[y, x] = 0
-                else:
-                    d, old = difference[y, x], plate.deviation[y, x]
-                    limit = max(np.float32(tuned.THRESHOLD), np.float32(tuned.DEVIATIONS) * old)
-                    if (foreground[y, x] == 0) & plate.known[y, x] & (d < np.float32(3.0) * limit):
-                        plate.deviation[y, x] = old + (d - old) * rate
-                    plate.total[y, x] = plate.total[y, x] * decay + _F1
-                    least = np.float32(tuned.LEAST_WEIGHT)
-                    for k in range(MODES):  # what is forgotten becomes 0: a processor is slow with subnormal numbers
-                        weight = plate.weight[k, y, x] * decay
-                        plate.weight[k, y, x] = weight if weight > least else _F0
-                    alone = (plate.weight[1, y, x] <= least) & (plate.weight[2, y, x] <= least)
-                    if votes[y, x] and alone and d <= np.float32(tuned.THRESHOLD) and plate.weight[0, y, x] > least:
-                        _join_plate(plate, y, x, image, blurred)
-                    elif votes[y, x]:
-                        _join(plate, y, x, image, blurred)
-                    else:
-                        plate.run[y, x] = 0
-                    plate.known[y, x] = _is_known(plate.weight[0, y, x], plate.total[y, x])
-                for c in range(3):
-                    shows_plate = plate.known[y, x] | (not has_static)
-                    picture[y, x, c] = plate.means[0, y, x, c] if shows_plate else static[y, x, c]
+                if not known[x]:
+                    for c in range(3):
+                        shown[3 * x + c] = still[3 * x + c]
 
 
 @kernel

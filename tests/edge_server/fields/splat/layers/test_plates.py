@@ -8,8 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_server.fields.common.threads.thread_pool import CallerPool
-from edge_server.fields.splat.layers.plates import FinePlate, Plate, clean_mask, plain_share
-from edge_server.fields.splat.layers.settings import CLOSE, HOLE, SPECK
+from edge_server.fields.splat.layers.plates import FinePlate, Plate, plain_share
 from tests.edge_server.fields.scenes import ring
 
 SIZE = 48
@@ -100,31 +99,6 @@ def test_a_fine_plate_is_at_the_common_exposure_and_leaves_out_what_moves() -> N
     before = fine.color[20:].copy()
     take(180, 1.0)  # counts for a sixteenth
     np.testing.assert_allclose(fine.color[20:], before + (180 - before) / 16, rtol=1e-5)
-
-
-def _cleaned_whole(mask: np.ndarray) -> np.ndarray:
-    """``clean_mask`` without cutting out what is not empty."""
-    part = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    _, label, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=8)
-    keep = stats[:, 4] >= SPECK
-    keep[0] = False
-    part = cv2.copyMakeBorder(keep[label].astype(np.uint8), *[CLOSE] * 4, cv2.BORDER_CONSTANT, value=0)
-    part = cv2.morphologyEx(part, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (CLOSE, CLOSE)))
-    part = np.ascontiguousarray(part[CLOSE:-CLOSE, CLOSE:-CLOSE])
-    _, label, stats, _ = cv2.connectedComponentsWithStats(1 - part, connectivity=4)
-    fill = stats[:, 4] <= HOLE * mask.size
-    fill[0] = False
-    return part | fill[label]
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_a_mask_is_cleaned_as_a_whole(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    mask = np.zeros((40, 52), np.uint8)
-    y, x = rng.integers(3, 10, 2)
-    mask[y : y + 22, x : x + 26] = cv2.resize(rng.random((8, 9)), (26, 22)) > 0.45
-    np.testing.assert_array_equal(clean_mask(mask), _cleaned_whole(mask))
-    assert not clean_mask(np.zeros((9, 9), np.uint8)).any()
 
 
 def test_plain_is_what_changes_by_less_than_two_steps_within_nine_pixels() -> None:

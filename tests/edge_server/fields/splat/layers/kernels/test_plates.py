@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
+import pytest
 
-from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
+from edge_server.fields.common.kernels.jit import kernel
+from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.splat.layers.kernels.plates import (
     CHANGING,
     FOREGROUND,
     LIKE_STATIC,
     MODES,
     PlateArrays,
+    _blur,
     compare_with_plate,
     count_exposure,
     vote,
 )
+from tests.edge_server.fields.splat.layers.kernels.test_masks import cleaned
 
-H, W = 37, 11  # more rows than a task has
+H, W = 37, 11
 # In numbers, so that a change of them is seen.
 THRESHOLD, THRESHOLD_UNKNOWN, DEVIATIONS = 10.0, 20.0, 3.5
 MEMORY, RUN, SLOWEST_RATE = 60, 12, 1.0 / 24.0
@@ -45,29 +50,51 @@ def _frames(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     return image, blurred, rng.uniform(80, 100, (2, H, W, 3)).astype(np.float32), static
 
 
+def _masks() -> np.ndarray:
+    return np.empty((2, H, W), np.uint8)
+
+
+@kernel
+def _blur_alone(image, blurred):
+    _blur(image, blurred)
+
+
 def _off(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.abs(a - b).max(axis=-1)
 
 
 def test_a_frame_is_compared_with_plate_earlier_frames_and_static_field() -> None:
-    plate, (_, blurred, earlier, static) = _plate(0), _frames(1)
+    plate, (image, _, earlier, static) = _plate(0), _frames(1)
+    blurred, difference, masks = np.empty((H, W, 3), np.float32), np.empty((H, W), np.float32), _masks()
+    flags, counts = np.zeros((H, -(-W // 8) * 8), np.uint8), np.zeros(2, np.int64)
     limit = np.maximum(np.float32(THRESHOLD), np.float32(DEVIATIONS) * plate.deviation)
     for count in (0, 1, 2):
         for has_static in (False, True):
-            difference, flags = np.empty((H, W), np.float32), np.empty((H, W), np.uint8)
-            Pool(2, 0).run(
-                compare_with_plate, blurred, plate, earlier, count, static[None], has_static, difference, flags
-            )
+            given = (image, blurred, plate, tuple(earlier), count, static, has_static, difference)
+            CallerPool().run(compare_with_plate, *given, flags, flags.view(np.uint64), masks, counts)
+            np.testing.assert_allclose(blurred, cv2.boxFilter(image, cv2.CV_32F, (3, 3)), rtol=1e-6)
             changing = np.zeros((H, W), bool)
             for k in range(count):
                 changing |= _off(blurred, earlier[k]) > limit
             beyond = _off(blurred, static)
             unknown = beyond > THRESHOLD_UNKNOWN if has_static else changing
             expected = _off(blurred, plate.blurred[0])
+            found = flags[:, :W]
             np.testing.assert_allclose(difference, expected, rtol=1e-6)
-            np.testing.assert_array_equal(flags & FOREGROUND > 0, np.where(plate.known, expected > limit, unknown))
-            np.testing.assert_array_equal(flags & CHANGING > 0, changing)
-            np.testing.assert_array_equal(flags & LIKE_STATIC > 0, has_static & (beyond <= THRESHOLD))
+            np.testing.assert_array_equal(found & FOREGROUND > 0, np.where(plate.known, expected > limit, unknown))
+            np.testing.assert_array_equal(found & CHANGING > 0, changing)
+            np.testing.assert_array_equal(found & LIKE_STATIC > 0, has_static & (beyond <= THRESHOLD))
+            for flag, mask in ((FOREGROUND, masks[0]), (CHANGING, masks[1])):
+                np.testing.assert_array_equal(mask, cleaned(found & flag > 0))
+            assert counts.tolist() == [masks[0].sum(), masks[1].sum()]
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (5, 1), (2, 2), (3, 70)])
+def test_frames_of_any_size_are_blurred(shape: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
+    blurred = np.empty((*shape, 3), np.float32)
+    _blur_alone(image, blurred)
+    np.testing.assert_allclose(blurred, cv2.boxFilter(image, cv2.CV_32F, (3, 3)), rtol=1e-6)
 
 
 def _vote_plainly(p: PlateArrays, y: int, x: int, image: np.ndarray, blurred: np.ndarray) -> None:
@@ -96,14 +123,19 @@ def _vote_plainly(p: PlateArrays, y: int, x: int, image: np.ndarray, blurred: np
         p.weight[k, y, x], p.means[k, y, x], p.blurred[k, y, x] = m["w"], m["m"], m["b"]
 
 
-def test_votes() -> None:
+@pytest.mark.parametrize("trusts", [False, True])
+def test_votes(trusts: bool) -> None:
     rng = np.random.default_rng(3)
     image, blurred, _, static = _frames(2)
     found, plain = _plate(4), _plate(4)
     difference = _off(blurred, plain.blurred[0]).astype(np.float32)
-    foreground, votes, held = ((rng.random((H, W)) < share).astype(np.uint8) for share in (0.3, 0.8, 0.2))
-    picture = np.empty((H, W, 3), np.float32)
-    Pool(2, 0).run(vote, image, blurred, difference, foreground, votes, held, found, static, True, picture)
+    foreground, changing, held = ((rng.random((H, W)) < share).astype(np.uint8) for share in (0.3, 0.4, 0.2))
+    flags, picture = rng.integers(0, 8, (H, W), np.uint8), np.empty((H, W, 3), np.float32)
+    votes = changing == 0
+    if trusts:
+        votes |= (flags & LIKE_STATIC > 0) & (foreground == 0)
+    frame = (image, blurred, difference, flags, foreground, changing)
+    CallerPool().run(vote, *frame, trusts, held, found, static, True, picture)
     for y in range(H):
         for x in range(W):
             if held[y, x]:
