@@ -61,7 +61,7 @@ def test_sizes_of_specks_and_holes() -> None:
     kept = np.zeros((40, 70), bool)
     kept[6:8, 61:66] = True  # as by OpenCV's opening, one pixel further down and to the right
     np.testing.assert_array_equal(found(mask), kept)
-    for rows, filled in ((7, True), (8, False)):  # without its corners of 52 and 60 pixels; a fiftieth of 2800 is 56
+    for rows, filled in ((8, True), (9, False)):  # without its corners of 52 and 60 pixels; a fiftieth of 2800 is 56
         ring = np.zeros((40, 70), bool)
         ring[10 : 14 + rows, 10:22] = True
         ring[12 : 12 + rows, 12:20] = False
