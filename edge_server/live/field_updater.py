@@ -35,7 +35,7 @@ if TYPE_CHECKING:  # imported at run time only where a policy is learned, or a s
 
 log = logging.getLogger(__name__)
 
-INTAKE_SHARE = 0.4  # share of a budget in seconds for taking in new frames, if the field wants every frame
+INTAKE_SHARE = 0.6  # share of a budget in seconds for taking in new frames, if the field wants every frame
 LEAST_TAKEN = 4  # fewest new frames to take in, however short the budget is
 
 

@@ -143,6 +143,8 @@ class MotionTracker:
             samples += moving.train(frame, self.cameras[frame.camera], parameters)
             rays, steps = rays + frame.foreground.size, steps + 1
             self._step_time.add(self.times.now() - step_begun)
+        if not steps and moving.alive:
+            self._step_time.drop_longest()  # slow ones may be over; without a step nothing would tell
         self.times.add("appearance", begun)
         return steps, rays, samples
 
