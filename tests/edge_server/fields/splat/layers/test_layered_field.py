@@ -16,6 +16,7 @@ import pytest
 from msgspec import structs
 
 from edge_server.fields import Budget, View
+from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.layers import settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
@@ -198,6 +199,16 @@ def test_in_seconds_what_moves_is_followed_once_anything_is_shown_of_it() -> Non
         assert field.moving.alive or not report.short, "there was nothing to learn"
     assert _fitted_in_seconds(field, frame + 1, 1e-4).short
     field.static.stop()
+
+
+def test_slow_steps_that_are_over_do_not_end_the_learning_of_what_moves() -> None:
+    field = resumed_field()
+    tracker, parameters = field.tracker, field.still.adam_parameters(0.3)
+    assert tracker is not None and field.moving is not None and field.moving.alive
+    for _ in range(5):
+        tracker._step_time.add(1.0)  # another process had the core
+    made = [tracker.follow(StepBudget(Budget(seconds=0.02), lambda: 0.0), parameters)[0] for _ in range(6)]
+    assert made[0] == 0 and made[-1] > 0
 
 
 @pytest.mark.parametrize(("threads", "seconds", "follows"), [(2, 1, 1), (3, 0, 1)])
