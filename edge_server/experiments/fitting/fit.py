@@ -35,17 +35,6 @@ from freshfield.machine_load import LoadMeter, outside_cores
 
 # Number of training views that are scored if no view is held out.
 _SCORED_OF_TRAINING = 8
-SAVED = (
-    "field",
-    "series.jsonl",
-    "processes.jsonl",
-    "edge.json",
-    "truth.png",
-    "rendered.png",
-    "report.json",
-    "report.html",
-)
-"""What ``Fit.save`` writes, in this order, besides the report's figures."""
 
 
 class Fit(ViewedField):

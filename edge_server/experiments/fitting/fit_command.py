@@ -14,7 +14,7 @@ from edge_server.command import command_parser, run_command
 from edge_server.experiments.common.arguments import OptionError, add_lpips, at_least, parse_options
 from edge_server.experiments.fitting import ctrl_c
 from edge_server.experiments.fitting.evaluate import Scored
-from edge_server.experiments.fitting.fit import SAVED, Fit, check_seconds
+from edge_server.experiments.fitting.fit import Fit, check_seconds
 from edge_server.experiments.scenes.multiview_still import data_name, open_still
 from edge_server.experiments.scenes.recorded import MultiviewStill
 from edge_server.fields.registry import FIELD, field_names
@@ -117,29 +117,13 @@ def run(request: argparse.Namespace) -> dict[str, Any]:
             )
         for line in fit.findings():
             _say(line)
-        report = _save(fit, request.out)
+        try:
+            report = fit.save(request.out)
+        except KeyboardInterrupt:
+            partly = f"{request.out} is written in part; edge-server report {request.out} writes a report of it"
+            raise KeyboardInterrupt(partly) from None
         _say(str(request.out / "report.html"))
     return report
-
-
-def _save(fit: Fit, out: Path) -> dict[str, Any]:
-    """``Fit.save``. Raises KeyboardInterrupt, which says what is written and what is not."""
-    before = _written(out)
-    try:
-        return fit.save(out)
-    except KeyboardInterrupt:
-        now = _written(out)
-        new = [name for name in SAVED if now[name] != before[name]]
-        left = [name for name in SAVED if name not in new]
-        told = f"{out}: written: {', '.join(new) or 'nothing'}; not written: {', '.join(left) or 'nothing'}"
-        if "edge.json" in new and left:
-            told += f" (edge-server report {out} writes the report)"
-        raise KeyboardInterrupt(told) from None
-
-
-def _written(out: Path) -> dict[str, int | None]:
-    """When each of SAVED was written, ns; None: it is not there."""
-    return {name: (out / name).stat().st_mtime_ns if (out / name).exists() else None for name in SAVED}
 
 
 def _say(line: str) -> None:
