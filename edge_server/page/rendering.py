@@ -54,7 +54,7 @@ LEVELS = (DetailLevel(0.08, 0.5, 64, 240), DetailLevel(0.20, 0.2, 120, 480), Det
 # Shortest budget for the image of a new publication: at a share of .2 that is seven pictures a second.
 LEAST_S = 0.03
 BAND_S = 0.1
-MIN_GAP_S = 0.05
+MIN_GAP_S = IDLE_S = 0.05
 SETTLE_S = 0.25
 STRIPE_PX, SHADE = 6, 0.7  # width and brightness of the stripes over what no camera has seen
 COARSE = 4  # that is asked at so many times fewer pixels a side: it takes a few milliseconds then
@@ -136,22 +136,10 @@ class RenderLoop(PageThread):
 
     # --- the thread -----------------------------------------------------------------------------
 
-    def _run(self) -> None:
-        while True:
-            with self._wake:
-                if self._stopped:
-                    return
-            try:
-                worked = self._step(perf_counter())
-            except Exception as error:  # the page must never stop the server
-                self._log_error(error)
-                worked = False
-            if not worked:
-                with self._wake:
-                    if not self._stopped:
-                        self._wake.wait(0.05 if self._visitors else 0.5)
+    def _step(self) -> float:
+        return 0.0 if self._work(perf_counter()) else IDLE_S if self._visitors else 0.5
 
-    def _step(self, now: float) -> bool:
+    def _work(self, now: float) -> bool:
         """Do the most urgent work; False if nothing is due."""
         renderer = self._state.renderer
         with self._wake:
@@ -266,12 +254,6 @@ class RenderLoop(PageThread):
                 return None
             parts.append(renderer.render(pose, row_band(camera, int(top), int(bottom - top))))
         return Rendering(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("color", "depth", "opacity")))
-
-    def _log_error(self, error: Exception) -> None:
-        """Log an error once, not at every frame, and pause for a second."""
-        self._say(error)
-        until = perf_counter() + 1.0
-        self._not_before = [max(t, until) for t in self._not_before]
 
 
 def hatched(image: NDArray[np.float32], unseen: NDArray[np.bool_] | None) -> NDArray[np.float32]:

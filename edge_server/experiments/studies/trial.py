@@ -7,7 +7,6 @@ and repeated bit for bit. Trials that differ only in policy share decision insta
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -28,6 +27,7 @@ from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.images import to_bytes
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SHOWN, Scorer
+from edge_server.fields.registry import make_field
 from edge_server.live.state import Publication
 from edge_server.scheduler.learned.rewards import f_w
 from freshfield.scenario import Scenario, ScenarioError, load, parse, seed_sequence
@@ -267,7 +267,7 @@ def _decided(trial: Trial, folders: Folders, look: Callable[[Publication, Virtua
     deployment = build_deployment(
         scenario,
         trial.run_settings(),
-        field=_field(trial),
+        field=make_field(trial.field, trial.field_options, seed=0),
         cameras=stage.cameras,
         data=folders.data,
         on_published=published,
@@ -324,22 +324,6 @@ def _stage(stage: tuple[Any, ...], lpips: bool, folders: Folders) -> Stage:
     trial = Trial(scene, 0, {"preset": "ideal"}, size=size, scale=scale, cameras=cameras, speed_m_per_s=speed)
     scenario = trial.scenario()
     return open_stage(scenario, Scorer(open_lpips(folders.lpips)[0] if lpips else None), folders)
-
-
-_FIELDS: dict[str, Any] = {}
-
-
-def _field(trial: Trial) -> Any:
-    """A new field with the trial's settings; the object is reused within a process, for its memory."""
-    from edge_server.fields.registry import make_field
-
-    key = json.dumps([trial.field, trial.field_options], sort_keys=True)
-    if key not in _FIELDS:
-        _FIELDS.clear()
-        _FIELDS[key] = make_field(trial.field, trial.field_options, seed=0)
-    made = _FIELDS[key]
-    made.reset()
-    return made
 
 
 def _rendered(

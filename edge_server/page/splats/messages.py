@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,8 +22,6 @@ from edge_server.page.splats.settings import MOST_ANCHORS, VERSION
 HEAD = struct.Struct("<Id")
 BLOCK = struct.Struct("<II")
 SAVED = struct.Struct("<Id")
-SCENE, STATIC, MOVING, KNOTS, STATUS, UNSEEN = range(1, 7)
-
 _SCENE = struct.Struct("<II3fff3f")
 _STATIC = struct.Struct("<IIII2f")
 _MOVING = struct.Struct("<II2f")
@@ -51,6 +49,21 @@ class SceneBlock:
     near: float
     background: tuple[float, float, float]
 
+    def content(self) -> bytes:
+        numbers = (*self.center_m, self.radius_m, self.near, *self.background)
+        return _SCENE.pack(VERSION, self.field, *numbers)
+
+    @classmethod
+    def read(cls, content: bytes) -> SceneBlock:
+        version, field, *numbers = _SCENE.unpack_from(content)
+        if version != VERSION:
+            raise MessageError(f"version {version} of the stream; this reader knows {VERSION}")
+        _check_finite(*numbers)
+        x, y, z, radius_m, near, red, green, blue = numbers
+        if radius_m <= 0.0:
+            raise MessageError("a scene unit has no length")
+        return cls(field, (x, y, z), radius_m, near, (red, green, blue))
+
 
 @dataclass(frozen=True)
 class StaticBlock:
@@ -66,6 +79,19 @@ class StaticBlock:
     scales: tuple[float, float]
     records: NDArray[np.void]
 
+    def content(self) -> bytes:
+        head = self.set_number, self.total, self.first, len(self.records)
+        return _STATIC.pack(*head, *self.scales) + self.records.tobytes()
+
+    @classmethod
+    def read(cls, content: bytes) -> StaticBlock:
+        number, total, first, count, low, high = _STATIC.unpack_from(content)
+        if total > MOST_GAUSSIANS or first + count > total:
+            raise MessageError(f"Gaussians {first} to {first + count} of {total}")
+        _check_finite(low, high)
+        _check_length(content, _STATIC.size + RECORD.itemsize * count)
+        return cls(number, total, first, (low, high), np.frombuffer(content, RECORD, count, _STATIC.size))
+
 
 @dataclass(frozen=True)
 class MovingBlock:
@@ -78,6 +104,23 @@ class MovingBlock:
     anchor: NDArray[np.uint8]
     share: NDArray[np.uint8]
 
+    def content(self) -> bytes:
+        parts = self.records.tobytes(), self.anchor.tobytes(), self.share.tobytes()
+        return _MOVING.pack(self.anchors, len(self.records), *self.scales) + b"".join(parts)
+
+    @classmethod
+    def read(cls, content: bytes) -> MovingBlock:
+        anchors, count, low, high = _MOVING.unpack_from(content)
+        if count > MOST_GAUSSIANS:
+            raise MessageError(f"{count} Gaussians")
+        _check_finite(low, high)
+        end = _MOVING.size + RECORD.itemsize * count
+        _check_length(content, end + 5 * count)
+        records = np.frombuffer(content, RECORD, count, _MOVING.size)
+        anchor = np.frombuffer(content, np.uint8, 3 * count, end).reshape(count, 3)
+        share = np.frombuffer(content, np.uint8, 2 * count, end + 3 * count).reshape(count, 2)
+        return cls(anchors, (low, high), records, anchor, share)
+
 
 @dataclass(frozen=True)
 class KnotsBlock:
@@ -86,7 +129,7 @@ class KnotsBlock:
     anchors: number of the set of anchors: moving sets with another number are not moved by these.
     first_s: instant of the first knot; those that follow are 1 / knots_per_s apart. newest_s: instant of the newest
     frame; nothing is shown more than ahead_s after it. Instants are seconds since the run began.
-    displacements: float32 (K, A, 3), scene units.
+    displacements: float32 (K, A, 3), scene units; sent as 16 bits of the largest one.
     """
 
     anchors: int
@@ -96,6 +139,41 @@ class KnotsBlock:
     ahead_s: float
     displacements: NDArray[np.float32]
 
+    def content(self) -> bytes:
+        count, anchors = self.displacements.shape[:2]
+        unit = max(float(np.abs(self.displacements).max(initial=0.0)), 1e-6) / 32767
+        head = self.anchors, self.first_s, self.newest_s, self.knots_per_s, self.ahead_s, unit, count, anchors
+        return _KNOTS.pack(*head) + np.rint(self.displacements / unit).astype("<i2").tobytes()
+
+    @classmethod
+    def read(cls, content: bytes) -> KnotsBlock:
+        set_number, first_s, newest_s, rate, ahead_s, unit, count, anchors = _KNOTS.unpack_from(content)
+        if not (4 <= count <= MOST_KNOTS and 0 <= anchors <= MOST_ANCHORS):
+            raise MessageError(f"{count} knots of {anchors} anchors")
+        _check_finite(first_s, rate, newest_s, ahead_s, unit)
+        if rate <= 0.0:
+            raise MessageError(f"{rate} knots a second")
+        _check_length(content, _KNOTS.size + 6 * count * anchors)
+        values = np.frombuffer(content, "<i2", 3 * count * anchors, _KNOTS.size).reshape(count, anchors, 3)
+        return cls(set_number, first_s, rate, newest_s, ahead_s, values.astype(np.float32) * np.float32(unit))
+
+
+@dataclass(frozen=True)
+class StatusBlock:
+    """Cameras, ages, the visitor's link: see docs/splat-stream.md."""
+
+    status: dict[str, Any]
+
+    def content(self) -> bytes:
+        return json.dumps(self.status, separators=(",", ":")).encode()
+
+    @classmethod
+    def read(cls, content: bytes) -> StatusBlock:
+        found = json.loads(content)
+        if not isinstance(found, dict):
+            raise MessageError("a status is a JSON object")
+        return cls(found)
+
 
 @dataclass(frozen=True)
 class UnseenBlock:
@@ -104,15 +182,29 @@ class UnseenBlock:
     set_number: int
     bits: NDArray[np.bool_]
 
+    def content(self) -> bytes:
+        return _UNSEEN.pack(self.set_number, len(self.bits)) + np.packbits(self.bits, bitorder="little").tobytes()
 
-@dataclass(frozen=True)
-class StatusBlock:
-    """Cameras, ages, the visitor's link: see docs/splat-stream.md."""
+    @classmethod
+    def read(cls, content: bytes) -> UnseenBlock:
+        number, count = _UNSEEN.unpack_from(content)
+        if count > MOST_GAUSSIANS:
+            raise MessageError(f"{count} Gaussians")
+        _check_length(content, _UNSEEN.size + -(-count // 8))
+        bits = np.unpackbits(np.frombuffer(content, np.uint8, offset=_UNSEEN.size), count=count, bitorder="little")
+        return cls(number, bits.astype(np.bool_))
 
-    content: dict[str, Any]
 
-
-Block = SceneBlock | StaticBlock | MovingBlock | KnotsBlock | UnseenBlock | StatusBlock
+Block = SceneBlock | StaticBlock | MovingBlock | KnotsBlock | StatusBlock | UnseenBlock
+KINDS: dict[type[Block], int] = {
+    SceneBlock: 1,
+    StaticBlock: 2,
+    MovingBlock: 3,
+    KnotsBlock: 4,
+    StatusBlock: 5,
+    UnseenBlock: 6,
+}
+_READERS = {number: kind.read for kind, number in KINDS.items()}
 
 
 def write_message(number: int, instant_s: float, blocks: list[Block]) -> bytes:
@@ -127,34 +219,8 @@ def join_blocks(number: int, instant_s: float, blocks: Iterable[bytes]) -> bytes
 
 def write_block(block: Block) -> bytes:
     """A block with its head."""
-    kind, content = _content(block)
-    return BLOCK.pack(kind, len(content)) + content + bytes(-len(content) % 4)
-
-
-def _content(block: Block) -> tuple[int, bytes]:
-    if isinstance(block, SceneBlock):
-        numbers = (*block.center_m, block.radius_m, block.near, *block.background)
-        return SCENE, _SCENE.pack(VERSION, block.field, *numbers)
-    if isinstance(block, StaticBlock):
-        head = block.set_number, block.total, block.first, len(block.records)
-        return STATIC, _STATIC.pack(*head, *block.scales) + block.records.tobytes()
-    if isinstance(block, MovingBlock):
-        parts = block.records.tobytes(), block.anchor.tobytes(), block.share.tobytes()
-        return MOVING, _MOVING.pack(block.anchors, len(block.records), *block.scales) + b"".join(parts)
-    if isinstance(block, KnotsBlock):
-        return KNOTS, _knots(block)
-    if isinstance(block, UnseenBlock):
-        bits = np.packbits(block.bits, bitorder="little").tobytes()
-        return UNSEEN, _UNSEEN.pack(block.set_number, len(block.bits)) + bits
-    return STATUS, json.dumps(block.content, separators=(",", ":")).encode()
-
-
-def _knots(block: KnotsBlock) -> bytes:
-    """Displacements as 16 bits of the largest one."""
-    count, anchors = block.displacements.shape[:2]
-    unit = max(float(np.abs(block.displacements).max(initial=0.0)), 1e-6) / 32767
-    head = block.anchors, block.first_s, block.newest_s, block.knots_per_s, block.ahead_s, unit, count, anchors
-    return _KNOTS.pack(*head) + np.rint(block.displacements / unit).astype("<i2").tobytes()
+    content = block.content()
+    return BLOCK.pack(KINDS[type(block)], len(content)) + content + bytes(-len(content) % 4)
 
 
 def read_message(data: bytes) -> tuple[int, float, list[Block]]:
@@ -164,11 +230,7 @@ def read_message(data: bytes) -> tuple[int, float, list[Block]]:
     number, instant_s = HEAD.unpack_from(data)
     if not np.isfinite(instant_s):
         raise MessageError("the instant is not finite")
-    return number, instant_s, [block for block in _blocks(data) if block is not None]
-
-
-def _blocks(data: bytes) -> Iterator[Block | None]:
-    at = HEAD.size
+    blocks, at = list[Block](), HEAD.size
     while at < len(data):
         if len(data) - at < BLOCK.size:
             raise MessageError("a block's head is cut off")
@@ -176,91 +238,21 @@ def _blocks(data: bytes) -> Iterator[Block | None]:
         at += BLOCK.size
         if length > len(data) - at:
             raise MessageError(f"a block of kind {kind} is cut off")
-        try:
-            yield _read_block(kind, data[at : at + length])
-        except (struct.error, ValueError) as error:
-            raise MessageError(f"a block of kind {kind}: {error}") from None
+        if kind in _READERS:
+            try:
+                blocks.append(_READERS[kind](data[at : at + length]))
+            except (struct.error, ValueError) as error:
+                raise MessageError(f"a block of kind {kind}: {error}") from None
         at += length + -length % 4
+    return number, instant_s, blocks
 
 
-def _read_block(kind: int, content: bytes) -> Block | None:
-    readers: dict[int, Callable[[bytes], Block]] = {
-        SCENE: _scene,
-        STATIC: _static,
-        MOVING: _moving,
-        KNOTS: _read_knots,
-        STATUS: _status,
-        UNSEEN: _unseen,
-    }
-    return readers[kind](content) if kind in readers else None
-
-
-def _scene(content: bytes) -> SceneBlock:
-    version, field, *numbers = _SCENE.unpack_from(content)
-    if version != VERSION:
-        raise MessageError(f"version {version} of the stream; this reader knows {VERSION}")
-    _finite(*numbers)
-    if numbers[3] <= 0.0:
-        raise MessageError("a scene unit has no length")
-    return SceneBlock(field, (numbers[0], numbers[1], numbers[2]), numbers[3], numbers[4], tuple(numbers[5:8]))  # type: ignore[arg-type]
-
-
-def _static(content: bytes) -> StaticBlock:
-    number, total, first, count, low, high = _STATIC.unpack_from(content)
-    if total > MOST_GAUSSIANS or first + count > total:
-        raise MessageError(f"Gaussians {first} to {first + count} of {total}")
-    _finite(low, high)
-    _length(content, _STATIC.size + RECORD.itemsize * count)
-    return StaticBlock(number, total, first, (low, high), np.frombuffer(content, RECORD, count, _STATIC.size))
-
-
-def _moving(content: bytes) -> MovingBlock:
-    anchors, count, low, high = _MOVING.unpack_from(content)
-    if count > MOST_GAUSSIANS:
-        raise MessageError(f"{count} Gaussians")
-    _finite(low, high)
-    end = _MOVING.size + RECORD.itemsize * count
-    _length(content, end + 5 * count)
-    records = np.frombuffer(content, RECORD, count, _MOVING.size)
-    anchor = np.frombuffer(content, np.uint8, 3 * count, end).reshape(count, 3)
-    share = np.frombuffer(content, np.uint8, 2 * count, end + 3 * count).reshape(count, 2)
-    return MovingBlock(anchors, (low, high), records, anchor, share)
-
-
-def _read_knots(content: bytes) -> KnotsBlock:
-    set_number, first_s, newest_s, rate, ahead_s, unit, count, anchors = _KNOTS.unpack_from(content)
-    if not (4 <= count <= MOST_KNOTS and 0 <= anchors <= MOST_ANCHORS):
-        raise MessageError(f"{count} knots of {anchors} anchors")
-    _finite(first_s, rate, newest_s, ahead_s, unit)
-    if rate <= 0.0:
-        raise MessageError(f"{rate} knots a second")
-    _length(content, _KNOTS.size + 6 * count * anchors)
-    values = np.frombuffer(content, "<i2", 3 * count * anchors, _KNOTS.size).reshape(count, anchors, 3)
-    return KnotsBlock(set_number, first_s, rate, newest_s, ahead_s, values.astype(np.float32) * np.float32(unit))
-
-
-def _unseen(content: bytes) -> UnseenBlock:
-    number, count = _UNSEEN.unpack_from(content)
-    if count > MOST_GAUSSIANS:
-        raise MessageError(f"{count} Gaussians")
-    _length(content, _UNSEEN.size + -(-count // 8))
-    bits = np.unpackbits(np.frombuffer(content, np.uint8, offset=_UNSEEN.size), count=count, bitorder="little")
-    return UnseenBlock(number, bits.astype(np.bool_))
-
-
-def _status(content: bytes) -> StatusBlock:
-    found = json.loads(content)
-    if not isinstance(found, dict):
-        raise MessageError("a status is a JSON object")
-    return StatusBlock(found)
-
-
-def _finite(*numbers: float) -> None:
+def _check_finite(*numbers: float) -> None:
     if not np.isfinite(numbers).all():
         raise MessageError(f"numbers that are not finite: {numbers}")
 
 
-def _length(content: bytes, wanted: int) -> None:
+def _check_length(content: bytes, wanted: int) -> None:
     if len(content) != wanted:
         raise MessageError(f"{len(content)} bytes instead of {wanted}")
 
@@ -309,7 +301,7 @@ class StreamReader:
             elif isinstance(block, KnotsBlock):
                 self._knots = block
             elif isinstance(block, StatusBlock):
-                self.status = block.content
+                self.status = block.status
 
     def _take_static(self, block: StaticBlock) -> None:
         target = self._shown if block.set_number == self._shown.number else self._pending

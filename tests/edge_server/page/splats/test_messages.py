@@ -88,7 +88,7 @@ def lying(block, *numbers):
         lying(BLOCKS[3], (8, 3)),
         lying(BLOCKS[3], (5, 0)),  # no knots a second
         lying(BLOCKS[4], (1, 2**31)),
-        write_message(0, 0.0, []) + struct.pack("<II", messages.STATUS, 4) + b"[1] ",
+        write_message(0, 0.0, []) + struct.pack("<II", messages.KINDS[StatusBlock], 4) + b"[1] ",
         write_message(0, float("nan"), []),
     ],
 )

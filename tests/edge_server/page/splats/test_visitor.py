@@ -260,7 +260,7 @@ def test_numbers_that_were_not_sent_change_nothing():
 def test_before_there_is_a_field_the_status_says_so():
     visitor = Visitor()
     data = visitor.message(None, 0.3, {"line": "compiling"}, 0.0)
-    assert read_message(data)[2][0].content["line"] == "compiling"
+    assert read_message(data)[2][0].status["line"] == "compiling"
     assert [visitor.message(None, 0.3, {}, now_s) is not None for now_s in (0.1, 0.5)] == [False, True]
     assert not visitor.link.short, "there was no more to send"
 
