@@ -164,12 +164,6 @@ class _History:
             **counts, incomplete=self.incomplete | (set() if complete else {role}), last_file=last[0], last_role=last[1]
         )
 
-    @property
-    def key(self) -> tuple[Any, ...]:
-        """Equal for equal histories, and hashable."""
-        counts = (tuple(getattr(self, name).items()) for name in _ROLES)  # in order: the first end counts
-        return (*counts, self.incomplete, self.last_file, self.last_role)
-
 
 class _Histories:
     """Every different history, by number; 0 is the empty one. A hundred thousand frames share a few dozen, so
@@ -177,7 +171,6 @@ class _Histories:
 
     def __init__(self) -> None:
         self.all = [_History()]
-        self._numbers = {self.all[0].key: 0}
         self._transitions: dict[tuple[int, int, str], int] = {}
 
     def after(self, number: int, role: str, event: str, file: int, complete: bool) -> int:
@@ -185,11 +178,8 @@ class _Histories:
         transition = (number, file, event)
         result = self._transitions.get(transition)
         if result is None:
-            history = self.all[number].after(role, event, file, complete)
-            result = self._numbers.setdefault(history.key, len(self.all))
-            if result == len(self.all):
-                self.all.append(history)
-            self._transitions[transition] = result
+            result = self._transitions[transition] = len(self.all)
+            self.all.append(self.all[number].after(role, event, file, complete))
         return result
 
 

@@ -12,20 +12,23 @@ from edge_server.page.splats import messages
 from edge_server.page.splats.messages import (
     HEAD,
     KnotsBlock,
-    MessageError,
     MovingBlock,
     SceneBlock,
     StaticBlock,
     StatusBlock,
-    StreamReader,
     UnseenBlock,
-    displacements_at,
-    read_message,
     write_block,
     write_message,
 )
-from edge_server.page.splats.records import from_records, to_records
+from edge_server.page.splats.records import to_records
 from tests.edge_server.page.splats.gaussians import gaussians, motion
+from tests.edge_server.page.splats.stream_reader import (
+    MessageError,
+    StreamReader,
+    displacements_at,
+    from_records,
+    read_message,
+)
 
 SCALES = (-5.0, -2.0)
 RECORDS = to_records(gaussians(40, 0), SCALES)

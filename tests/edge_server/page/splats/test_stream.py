@@ -13,13 +13,13 @@ import websocket
 
 from edge_server.live.state import EdgeState, Publication
 from edge_server.page import Page, start_page
-from edge_server.page.splats.messages import StreamReader, read_saved
 from edge_server.page.splats.stream import STREAM
 from freshfield.limits import MAX_VISITORS
 from freshfield.transport import Transport
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.page.browser import Browser
 from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, snapshot
+from tests.edge_server.page.splats.stream_reader import StreamReader, read_saved
 from tests.edge_server.page.test_access_guard import get, lines, login
 from tests.edge_server.page.test_page import bare_state
 from tests.edge_server.page.visitor import page_of

@@ -11,18 +11,11 @@ import pytest
 
 from channel_emu.live.tcp_proxy import PIECE_BYTES, TIMEOUT_S
 from edge_server.page.splats import settings as tuned
-from edge_server.page.splats.messages import (
-    KnotsBlock,
-    MovingBlock,
-    StaticBlock,
-    StreamReader,
-    UnseenBlock,
-    read_message,
-)
+from edge_server.page.splats.messages import KnotsBlock, MovingBlock, StaticBlock, UnseenBlock
 from edge_server.page.splats.published import Published, Publisher
-from edge_server.page.splats.records import from_records
 from edge_server.page.splats.visitor import LinkWindow, Visitor
 from tests.edge_server.page.splats.gaussians import NEWEST_S, gaussians, motion, snapshot
+from tests.edge_server.page.splats.stream_reader import StreamReader, from_records, read_message
 
 COUNT = 6000
 
