@@ -23,8 +23,8 @@ from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.rollouts.setting import GRID_MS, Setting
 from edge_server.experiments.virtual.from_scenario import build_deployment, build_truth, exact_scene, training_cameras
 from edge_server.experiments.virtual.run_settings import RunSettings
-from edge_server.experiments.virtual.truth import ExactTruth
-from edge_server.experiments.virtual.virtual_deployment import Truth, VirtualDeployment
+from edge_server.experiments.virtual.truth import ExactTruth, Truth
+from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, Field, View
@@ -288,7 +288,7 @@ class Episode:
         found = {}
         for camera in cameras:
             score = truth.of((camera,)).score(snapshot, published_ns)
-            scores = {name: None if score is None else getattr(score, name) for name in SCORES}
+            scores = {name: getattr(score, name) for name in SCORES}
             found[camera] = Outcome(**scores, aaoi_ms=aaoi_ms, views=float(len(views)), wait_ms=wait_ms)
         return found
 

@@ -108,6 +108,10 @@ class CapturedTruth:
         return mean_score(scores)
 
 
+Truth = ExactTruth | CapturedTruth
+"""Scores renders of the field at the present."""
+
+
 def _score(
     scorer: Scorer, field: Any, view: View, present_ns: int, earlier: list[NDArray[np.uint8]], bound: float = BOUND
 ) -> Score:
