@@ -60,11 +60,15 @@ STRIPE_PX, SHADE = 6, 0.7  # width and brightness of the stripes over what no ca
 COARSE = 4  # that is asked at so many times fewer pixels a side: it takes a few milliseconds then
 
 
+BrowserView = tuple[NDArray[np.float64], NDArray[np.float64], float, int, int]
+"""Position (3,), wxyz (4,), vertical field of view, canvas size."""
+
+
 @dataclass
 class ClientState:
     """A connected browser.
 
-    viewpoint: position (3,), wxyz (4,), vertical field of view, canvas size; moved_at: when it changed.
+    viewpoint: where it looks from; moved_at: when that changed.
     serial: number of viewpoints so far.
     level: the finest of LEVELS sent for this viewpoint and ``renderer``, -1 for none.
     sent: number of images since the last blank background.
@@ -72,7 +76,7 @@ class ClientState:
     """
 
     client: Any
-    viewpoint: tuple[NDArray[np.float64], NDArray[np.float64], float, int, int] | None = None
+    viewpoint: BrowserView | None = None
     moved_at: float = 0.0
     serial: int = 0
     renderer: Snapshot | Comparison | None = None
@@ -180,7 +184,7 @@ class RenderLoop(PageThread):
         with self._wake:
             viewpoint, serial = visitor.viewpoint, visitor.serial
         assert viewpoint is not None
-        began, levels = perf_counter(), (level,)
+        began, levels = perf_counter(), [level]
         try:
             if isinstance(shown, Comparison):
                 _, camera = visitor_camera(*viewpoint, rows=LEVELS[-1].max_rows)
@@ -188,7 +192,7 @@ class RenderLoop(PageThread):
                     shown, camera.width, camera.height, visitor.view == views.ERROR
                 )
                 # A visitor who drags sees it anew, as one who moves; nothing finer will follow.
-                level, levels = len(LEVELS) - 1, (MOVING, NEWER)
+                level, levels = len(LEVELS) - 1, [MOVING, NEWER]
             else:
                 image = self._rendered(visitor, shown, level, viewpoint, serial)
         finally:
@@ -205,7 +209,7 @@ class RenderLoop(PageThread):
                 visitor.level, visitor.renderer = level, shown
 
     def _rendered(
-        self, visitor: ClientState, renderer: Snapshot, level: int, viewpoint: Any, serial: int
+        self, visitor: ClientState, renderer: Snapshot, level: int, viewpoint: BrowserView, serial: int
     ) -> NDArray[np.float32] | None:
         """What a visitor looks at, from the field as it is now; None if they have moved meanwhile."""
         pose, camera = visitor_camera(*viewpoint, rows=round(self._rows[level]))

@@ -45,8 +45,8 @@ from freshfield.ledger import LedgerReader
 # Ends that the emulator's link gives a frame. ``broken`` is not one: a later process may know better.
 LINK_ENDS = ("skipped", "dropped_busy", "superseded", "lost", "in_flight")
 ENDS = (*LINK_ENDS, "broken", "delivered", "rejected", "cut_off")
-_STATES = ("captured", "replaced", "waiting", "sent", *LINK_ENDS[:4], "broken", "duplicated", "delivered", "rejected")
-_STATES += ("in_flight", "cut_off")
+_ON_THE_WAY = ("captured", "replaced", "waiting", "sent", "skipped", "dropped_busy", "superseded", "lost", "broken")
+_STATES = (*_ON_THE_WAY, "duplicated", "delivered", "rejected", "in_flight", "cut_off")
 # A killed process takes with it the frames that it wrote about in its last moments. The thesis's links hold a
 # frame for a second or two; a frame without a line this near to the end was lost by something else.
 CUT_OFF_NS = 10 * 10**9
@@ -80,8 +80,8 @@ class FrameCounts(Counter[str]):
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, in the order in which a frame passes the states; ``rejected`` by reason."""
-        rejected = {state.partition(":")[2]: n for state, n in sorted(self.items()) if state.startswith("rejected")}
-        return {**{state: self[state] for state in _STATES}, "rejected": {why: n for why, n in rejected.items() if n}}
+        ends = sorted((state.partition(":")[2], n) for state, n in self.items() if state.startswith("rejected:") and n)
+        return {**{state: self[state] for state in _STATES}, "rejected": dict(ends)}
 
 
 @dataclass
