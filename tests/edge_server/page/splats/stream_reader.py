@@ -4,8 +4,6 @@ also bounds what it reads. Blocks of a kind that it does not know are left out."
 from __future__ import annotations
 
 import json
-import struct
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -31,8 +29,6 @@ from edge_server.page.splats.messages import (
 )
 from edge_server.page.splats.records import PLACE_STEP, RECORD, TURN_STEP, ZONE
 from edge_server.page.splats.settings import COLOR_LOW, COLOR_STEP, VERSION
-
-SAVED = struct.Struct("<Id")  # before each message of a saved stream: its length, and the second at which it came
 
 
 def _scene(content: bytes) -> SceneBlock:
@@ -88,18 +84,6 @@ def read_message(data: bytes) -> tuple[int, float, list[Block]]:
             blocks.append(_READERS[kind](data[at : at + length]))
         at += length + -length % 4
     return number, instant_s, blocks
-
-
-def read_saved(data: bytes) -> Iterator[tuple[float, bytes]]:
-    """The messages of a saved stream, each with the second at which it came. Ends where the file is cut off."""
-    at = 0
-    while at + SAVED.size <= len(data):
-        size, came_s = SAVED.unpack_from(data, at)
-        at += SAVED.size
-        if size > len(data) - at:
-            return
-        yield came_s, data[at : at + size]
-        at += size
 
 
 class StreamReader:
