@@ -6,9 +6,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from edge_server.export import ExportError
@@ -80,57 +82,47 @@ def looking(eye: Sequence[float], target: Sequence[float], fov_deg: float) -> li
         raise ExportError(f"--pose: {error}") from None
 
 
+_Side = Annotated[int, Meta(ge=2, le=MAX_IMAGE_SIDE_PX)]
+
+
+class _Pose(msgspec.Struct):
+    camera_to_world: Annotated[list[float], Meta(min_length=16, max_length=16)]
+    fov: Annotated[float, Meta(ge=1.0, le=170.0)] = 50.0
+
+
+class _CameraPath(msgspec.Struct):
+    """What is read of a ``camera_path.json``."""
+
+    render_width: _Side
+    render_height: _Side
+    camera_path: Annotated[list[_Pose], Meta(min_length=1, max_length=MOST_FRAMES)]
+    camera_type: Literal["perspective"] = "perspective"
+    fps: Annotated[float, Meta(ge=0.1, le=240.0)] | None = None
+    seconds: float = 1.0
+
+
 def read_nerfstudio(file: Path) -> tuple[list[Step], float, tuple[int, int]]:
     """A ``camera_path.json`` of nerfstudio's viewer: its steps, frames a second, width and height.
 
     Its poses are read as being in the run's own world. ExportError names the key that is wrong.
     """
     try:
-        data = read_json(read_text(file))
+        path = msgspec.convert(read_json(read_text(file)), _CameraPath)
+        fps = path.fps or len(path.camera_path) / max(path.seconds, 1e-3)
+        if not 0.1 <= fps <= 240.0:
+            raise ValueError(f"seconds: expected enough for 0.1 to 240 poses a second, got {path.seconds:g}")
+        steps = [_step(pose, f"camera_path[{k}]") for k, pose in enumerate(path.camera_path)]
+        return steps, fps, (path.render_width, path.render_height)
     except (OSError, UntrustedError, ValueError) as error:
         raise ExportError(f"--path {file}: {error}") from None
-    try:
-        if not isinstance(data, dict):
-            raise ValueError("expected an object")
-        kind = data.get("camera_type", "perspective")
-        if kind != "perspective":
-            raise ValueError(f"camera_type: expected perspective, got {kind!r}")
-        size = tuple(_whole(data, key) for key in ("render_width", "render_height"))
-        entries = data.get("camera_path")
-        if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_FRAMES:
-            raise ValueError(f"camera_path: expected a list of 1 to {MOST_FRAMES} poses")
-        if "fps" not in data:
-            data["fps"] = len(entries) / _number(data.get("seconds", 1), "seconds", 1e-3, 1e5)
-        fps = _number(data["fps"], "fps", 0.1, 240)
-        return [_step(entry, f"camera_path[{k}]") for k, entry in enumerate(entries)], fps, (size[0], size[1])
-    except ValueError as error:
-        raise ExportError(f"--path {file}: {error}") from None
 
 
-def _step(entry: Any, where: str) -> Step:
-    if not isinstance(entry, dict):
-        raise ValueError(f"{where}: expected an object")
-    try:
-        matrix = np.array(entry.get("camera_to_world"), np.float64).reshape(4, 4)
-    except (TypeError, ValueError):
-        raise ValueError(f"{where}.camera_to_world: expected 16 numbers") from None
+def _step(pose: _Pose, where: str) -> Step:
+    matrix = np.array(pose.camera_to_world, np.float64).reshape(4, 4)
     turn = matrix[:3, :3]
     if not np.isfinite(matrix).all() or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
         raise ValueError(f"{where}.camera_to_world: expected a rotation and a translation")
-    return Step(matrix @ _OPENGL, _number(entry.get("fov", 50.0), f"{where}.fov", 1.0, 170.0))
-
-
-def _whole(data: dict[str, Any], key: str) -> int:
-    value = data.get(key)
-    if type(value) is not int or not 2 <= value <= MAX_IMAGE_SIDE_PX:
-        raise ValueError(f"{key}: expected 2 to {MAX_IMAGE_SIDE_PX}, got {value!r}")
-    return value
-
-
-def _number(value: Any, key: str, lowest: float, highest: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not lowest <= value <= highest:
-        raise ValueError(f"{key}: expected {lowest:g} to {highest:g}, got {value!r}")
-    return float(value)
+    return Step(matrix @ _OPENGL, pose.fov)
 
 
 def _sweep(azimuths: Matrix, count: int) -> Matrix:

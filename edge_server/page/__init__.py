@@ -133,19 +133,8 @@ class _Refresher(PageThread):
         self._server, self._state, self._scene, self._panel = server, state, scene, panel
         self._history = History()
 
-    def _run(self) -> None:
-        while not self._stopped:
-            began = perf_counter()
-            try:
-                self._refresh()
-            except Exception as error:  # the page must never stop the server
-                self._say(error)
-            # A slow refresh (a busy machine) is followed by an equally long pause.
-            spent = perf_counter() - began
-            self._pause(max(REFRESH_S - spent, spent))
-
-    def _refresh(self) -> None:
-        state = self._state
+    def _step(self) -> float:
+        began, state = perf_counter(), self._state
         cameras = state.cameras()
         channel = state.channel()
         channel = channel if isinstance(channel, dict) else None
@@ -154,6 +143,9 @@ class _Refresher(PageThread):
         self._scene.refresh(cameras, watched)
         if watched:
             self._panel.refresh(cameras, self._history, state.publications(), channel)
+        # A slow refresh (a busy machine) is followed by an equally long pause.
+        spent = perf_counter() - began
+        return max(REFRESH_S - spent, spent)
 
 
 def page_url(host: str, port: int, tls: bool = False) -> str:

@@ -6,7 +6,7 @@ decades, and what matters is whether an age is tens, hundreds or thousands of mi
 
 from __future__ import annotations
 
-import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,19 +30,9 @@ PRESENT: RGB = (213, 94, 0)
 STEPS = 24
 
 
-def age_fraction(age_ms: float) -> float:
-    """Position of an age on the scale, 0 fresh to 1 stale, clamped; NaN counts as stale."""
-    if math.isnan(age_ms):
-        return 1.0
-    fraction = math.log(max(age_ms, FRESH_MS) / FRESH_MS) / math.log(STALE_MS / FRESH_MS)
-    return min(1.0, fraction)
-
-
 def age_color(age_ms: float | None) -> RGB:
-    """Color of an age in milliseconds; gray for None."""
-    if age_ms is None:
-        return UNKNOWN
-    return scale_color(round(age_fraction(age_ms) * STEPS) / STEPS)
+    """Color of an age in milliseconds, NaN like what is stale; gray for None."""
+    return UNKNOWN if age_ms is None else _SCALE[int(_steps(np.float64(age_ms)))]
 
 
 def scale_color(fraction: float) -> RGB:
@@ -53,9 +43,16 @@ def scale_color(fraction: float) -> RGB:
 
 def age_colors(ages_ms: NDArray[np.float64]) -> NDArray[np.float32]:
     """``age_color`` of many ages (N,), in [0, 1], (N, 3)."""
-    scale = np.array([scale_color(step / STEPS) for step in range(STEPS + 1)], np.float32) / 255
-    fractions = np.log(np.maximum(ages_ms, FRESH_MS) / FRESH_MS) / np.log(STALE_MS / FRESH_MS)
-    return scale[np.round(np.minimum(fractions, 1.0) * STEPS).astype(int)]
+    return (np.array(_SCALE, np.float32) / 255)[_steps(ages_ms)]
+
+
+_SCALE = [scale_color(step / STEPS) for step in range(STEPS + 1)]
+
+
+def _steps(ages_ms: Any) -> Any:
+    """Positions of ages on the scale: 0 fresh to STEPS stale, clamped."""
+    ages_ms = np.clip(np.nan_to_num(ages_ms, nan=STALE_MS), FRESH_MS, STALE_MS)
+    return np.round(np.log(ages_ms / FRESH_MS) / np.log(STALE_MS / FRESH_MS) * STEPS).astype(int)
 
 
 def css(color: RGB) -> str:

@@ -1,4 +1,4 @@
-"""A thread of the page: it ends when told to, and its errors are logged without ending it or the server."""
+"""A thread of the page: it repeats a step until told to end; errors are logged and end neither it nor the server."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import threading
 
 log = logging.getLogger(__name__)
 
+AFTER_ERROR_S = 1.0
+
 
 class PageThread:
-    """Base of the page's threads; a subclass implements ``_run``, which returns once ``_stopped``.
+    """Base of the page's threads; a subclass implements ``_step``, which returns the seconds until the next one.
 
-    name: of the thread. what: names its work in log lines.
+    name: of the thread. what: names its work in log lines. ``_wake``, notified, begins the next step at once.
     """
 
     def __init__(self, name: str, what: str) -> None:
@@ -31,13 +33,21 @@ class PageThread:
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
 
-    def _run(self) -> None:
+    def _step(self) -> float:
         raise NotImplementedError
 
-    def _pause(self, seconds: float) -> None:
-        """Wait so long, or until the end."""
-        with self._wake:
-            self._wake.wait_for(lambda: self._stopped, seconds)
+    def _run(self) -> None:
+        while not self._stopped:
+            try:
+                seconds = self._step()
+            except Exception as error:  # the page must never stop the server
+                self._say(error)
+                with self._wake:
+                    self._wake.wait_for(lambda: self._stopped, AFTER_ERROR_S)
+                continue
+            with self._wake:
+                if seconds > 0.0 and not self._stopped:
+                    self._wake.wait(seconds)
 
     def _say(self, error: Exception) -> None:
         """Log an error, but not again until another one came."""

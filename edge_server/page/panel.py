@@ -7,16 +7,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 from weakref import WeakSet
 
-import cv2
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from edge_server.live.state import CameraView, Comparison, EdgeState, Publication
-from edge_server.page import markup
+from edge_server.page import markup, views
 from edge_server.page.controls import ControlPanel
 from edge_server.page.diagnosis import poor_picture
 from edge_server.page.network_control import EmulatorControl, NetworkControl
+from edge_server.page.rendering import browser_image
 from edge_server.page.settings import AGE_PARTS_OF, LEAST_SCENE_PX, POSE_NOISE
 from edge_server.page.timelines import History, Timelines
 from edge_server.run_records import age_parts_ms
@@ -24,10 +23,7 @@ from freshfield import coverage
 
 MAIN_WIDTH = 372
 SIDE_WIDTH = 356
-# Width of two images and the gap between them, in pixels.
-PAIR_WIDTH = 640
-GAP = 8
-PANEL_COLOR = (36, 36, 36)
+PAIR_WIDTH = 640  # pixels of two images beside each other
 
 
 class Panel:
@@ -139,7 +135,9 @@ class Panel:
         self._caption.content = markup.comparison_caption(
             comparison.camera, scored.psnr_db if scored else None, comparison.number, held_out
         )
-        pair = side_by_side(comparison.truth, comparison.rendered)
+        rows, columns = comparison.truth.shape[:2]
+        height = max(1, round(PAIR_WIDTH / 2 * rows / columns))
+        pair = browser_image(views.compared(comparison, PAIR_WIDTH, height, error=False))
         if self._pair is None:
             order = self._caption.order + 0.5  # below its caption
             self._pair = self._gui.add_image(pair, format="jpeg", jpeg_quality=88, order=order)
@@ -178,16 +176,3 @@ def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publ
         t_s=state.now_s(),
         age_parts_ms=age_parts_ms(publications[-AGE_PARTS_OF:], state.now_s()),
     )
-
-
-def side_by_side(truth: NDArray[np.uint8], rendered: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Two images of any size as one (H, PAIR_WIDTH, 3), with a gap in the panel's color."""
-    width = (PAIR_WIDTH - GAP) // 2
-    height = max(1, round(width * truth.shape[0] / max(1, truth.shape[1])))
-    out = np.empty((height, PAIR_WIDTH, 3), np.uint8)
-    out[:] = PANEL_COLOR
-    for image, left in ((truth, 0), (rendered, PAIR_WIDTH - width)):
-        pixels = np.ascontiguousarray(image[..., :3])
-        how = cv2.INTER_AREA if pixels.shape[1] > width else cv2.INTER_NEAREST
-        out[:, left : left + width] = cv2.resize(pixels, (width, height), interpolation=how)
-    return out

@@ -54,17 +54,21 @@ LEVELS = (DetailLevel(0.08, 0.5, 64, 240), DetailLevel(0.20, 0.2, 120, 480), Det
 # Shortest budget for the image of a new publication: at a share of .2 that is seven pictures a second.
 LEAST_S = 0.03
 BAND_S = 0.1
-MIN_GAP_S = 0.05
+MIN_GAP_S = IDLE_S = 0.05
 SETTLE_S = 0.25
 STRIPE_PX, SHADE = 6, 0.7  # width and brightness of the stripes over what no camera has seen
 COARSE = 4  # that is asked at so many times fewer pixels a side: it takes a few milliseconds then
+
+
+BrowserView = tuple[NDArray[np.float64], NDArray[np.float64], float, int, int]
+"""Position (3,), wxyz (4,), vertical field of view, canvas size."""
 
 
 @dataclass
 class ClientState:
     """A connected browser.
 
-    viewpoint: position (3,), wxyz (4,), vertical field of view, canvas size; moved_at: when it changed.
+    viewpoint: where it looks from; moved_at: when that changed.
     serial: number of viewpoints so far.
     level: the finest of LEVELS sent for this viewpoint and ``renderer``, -1 for none.
     sent: number of images since the last blank background.
@@ -72,7 +76,7 @@ class ClientState:
     """
 
     client: Any
-    viewpoint: tuple[NDArray[np.float64], NDArray[np.float64], float, int, int] | None = None
+    viewpoint: BrowserView | None = None
     moved_at: float = 0.0
     serial: int = 0
     renderer: Snapshot | Comparison | None = None
@@ -136,22 +140,10 @@ class RenderLoop(PageThread):
 
     # --- the thread -----------------------------------------------------------------------------
 
-    def _run(self) -> None:
-        while True:
-            with self._wake:
-                if self._stopped:
-                    return
-            try:
-                worked = self._step(perf_counter())
-            except Exception as error:  # the page must never stop the server
-                self._log_error(error)
-                worked = False
-            if not worked:
-                with self._wake:
-                    if not self._stopped:
-                        self._wake.wait(0.05 if self._visitors else 0.5)
+    def _step(self) -> float:
+        return 0.0 if self._work(perf_counter()) else IDLE_S if self._visitors else 0.5
 
-    def _step(self, now: float) -> bool:
+    def _work(self, now: float) -> bool:
         """Do the most urgent work; False if nothing is due."""
         renderer = self._state.renderer
         with self._wake:
@@ -166,36 +158,12 @@ class RenderLoop(PageThread):
         if not due:
             return False
         level, _, visitor = min(due, key=lambda item: item[:2])
-        comparison = self._compared(visitor)
-        if comparison is None:
-            self._render_and_send(visitor, renderer, level)
-        else:
-            self._send_comparison(visitor, comparison)
+        self._serve(visitor, self._compared(visitor) or renderer, level)
         return True
 
     def _compared(self, visitor: ClientState) -> Comparison | None:
         """What a visitor who looks at truth or error sees; None for another view, and before there is a truth."""
         return self._state.comparison if visitor.view in (views.TRUTH, views.ERROR) else None
-
-    def _send_comparison(self, visitor: ClientState, comparison: Comparison) -> None:
-        with self._wake:
-            viewpoint, serial = visitor.viewpoint, visitor.serial
-        assert viewpoint is not None
-        began = perf_counter()
-        _, camera = visitor_camera(*viewpoint, rows=LEVELS[-1].max_rows)
-        image = views.compared(comparison, camera.width, camera.height, visitor.view == views.ERROR)
-        self._send(visitor, image)
-        spent = perf_counter() - began
-        for level in (MOVING, NEWER):  # a visitor who drags sees it anew, as one who moves
-            self._not_before[level] = began + max(spent / LEVELS[level].max_share, MIN_GAP_S)
-        with self._wake:
-            if visitor.serial == serial:  # nothing finer will follow
-                visitor.level, visitor.renderer = len(LEVELS) - 1, comparison
-
-    def _send(self, visitor: ClientState, image: NDArray[np.float32]) -> None:
-        if visitor.client.client_id in self._visitors:  # has not left meanwhile
-            visitor.client.scene.set_background_image(browser_image(image), format="jpeg", jpeg_quality=85)
-            visitor.sent += 1
 
     def _next_level(self, visitor: ClientState, renderer: Snapshot | Comparison, now: float) -> int | None:
         """The level to render next for a visitor; None if it has the finest or must wait."""
@@ -211,33 +179,53 @@ class RenderLoop(PageThread):
             return None
         return level
 
-    def _render_and_send(self, visitor: ClientState, renderer: Snapshot, level: int) -> None:
+    def _serve(self, visitor: ClientState, shown: Snapshot | Comparison, level: int) -> None:
+        """Send a visitor an image of ``shown``, unless they move meanwhile."""
         with self._wake:
             viewpoint, serial = visitor.viewpoint, visitor.serial
         assert viewpoint is not None
-        pose, camera = visitor_camera(*viewpoint, rows=round(self._rows[level]))
-        began = perf_counter()
+        began, levels = perf_counter(), [level]
         try:
-            shown = renderer.at(self._state.now_ns())
-            rendering = self._render(shown, pose, camera, visitor, serial, level)
+            if isinstance(shown, Comparison):
+                _, camera = visitor_camera(*viewpoint, rows=LEVELS[-1].max_rows)
+                image: NDArray[np.float32] | None = views.compared(
+                    shown, camera.width, camera.height, visitor.view == views.ERROR
+                )
+                # A visitor who drags sees it anew, as one who moves; nothing finer will follow.
+                level, levels = len(LEVELS) - 1, [MOVING, NEWER]
+            else:
+                image = self._rendered(visitor, shown, level, viewpoint, serial)
         finally:
             spent = perf_counter() - began
-            # The second bound matters if rendering is cheap: it spares the network and the browser.
-            self._not_before[level] = began + max(spent / LEVELS[level].max_share, MIN_GAP_S)
-        if rendering is None:
+            for each in levels:  # the second bound matters if rendering is cheap: it spares network and browser
+                self._not_before[each] = began + max(spent / LEVELS[each].max_share, MIN_GAP_S)
+        if image is None:
             return
-        self._adapt(level, spent)
-        image = rendering.color
-        if visitor.view == views.DEPTH:
-            image = views.depth_view(rendering)
-        elif visitor.view == views.AGE:
-            image = views.age_view(rendering, pose, camera, self._state.cameras())
-        elif level and isinstance(shown, TellsUnseen):
-            image = hatched(image, shown.unseen(pose, camera.scaled(1.0 / COARSE)))
-        self._send(visitor, image)
+        if visitor.client.client_id in self._visitors:  # has not left meanwhile
+            visitor.client.scene.set_background_image(browser_image(image), format="jpeg", jpeg_quality=85)
+            visitor.sent += 1
         with self._wake:
             if visitor.serial == serial:
-                visitor.level, visitor.renderer = level, renderer
+                visitor.level, visitor.renderer = level, shown
+
+    def _rendered(
+        self, visitor: ClientState, renderer: Snapshot, level: int, viewpoint: BrowserView, serial: int
+    ) -> NDArray[np.float32] | None:
+        """What a visitor looks at, from the field as it is now; None if they have moved meanwhile."""
+        pose, camera = visitor_camera(*viewpoint, rows=round(self._rows[level]))
+        began = perf_counter()
+        shown = renderer.at(self._state.now_ns())
+        rendering = self._render(shown, pose, camera, visitor, serial, level)
+        if rendering is None:
+            return None
+        self._adapt(level, perf_counter() - began)
+        if visitor.view == views.DEPTH:
+            return views.depth_view(rendering)
+        if visitor.view == views.AGE:
+            return views.age_view(rendering, pose, camera, self._state.cameras())
+        if level and isinstance(shown, TellsUnseen):
+            return hatched(rendering.color, shown.unseen(pose, camera.scaled(1.0 / COARSE)))
+        return rendering.color
 
     def _budget_s(self, number: int) -> float:
         """Time for an image of a level. The image of a new publication may take its share of an update: where
@@ -266,12 +254,6 @@ class RenderLoop(PageThread):
                 return None
             parts.append(renderer.render(pose, row_band(camera, int(top), int(bottom - top))))
         return Rendering(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("color", "depth", "opacity")))
-
-    def _log_error(self, error: Exception) -> None:
-        """Log an error once, not at every frame, and pause for a second."""
-        self._say(error)
-        until = perf_counter() + 1.0
-        self._not_before = [max(t, until) for t in self._not_before]
 
 
 def hatched(image: NDArray[np.float32], unseen: NDArray[np.bool_] | None) -> NDArray[np.float32]:

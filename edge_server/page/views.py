@@ -80,7 +80,7 @@ def compared(comparison: Comparison, width: int, height: int, error: bool) -> Im
 
     shown = max(row, column, key=scale_of)
     size = [max(1, int(side * scale_of(shown))) for side in shown.shape[1::-1]]
-    large = cv2.resize(shown, size, interpolation=cv2.INTER_NEAREST)
+    large = cv2.resize(shown, size, interpolation=cv2.INTER_AREA if scale_of(shown) < 1 else cv2.INTER_NEAREST)
     for number, words in enumerate(("error",) if error else ("truth", "what the field renders")):
         x, y = (number * size[0] // 2, 0) if shown is row else (0, number * size[1] // 2)
         for color, thickness in ((0.0, 4), (1.0, 1)):  # an outline, so that it is read on any image

@@ -35,7 +35,7 @@ frames share a few dozen different histories, each of which is evaluated once.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,8 @@ from freshfield.ledger import LedgerReader
 # Ends that the emulator's link gives a frame. ``broken`` is not one: a later process may know better.
 LINK_ENDS = ("skipped", "dropped_busy", "superseded", "lost", "in_flight")
 ENDS = (*LINK_ENDS, "broken", "delivered", "rejected", "cut_off")
+_ON_THE_WAY = ("captured", "replaced", "waiting", "sent", "skipped", "dropped_busy", "superseded", "lost", "broken")
+_STATES = (*_ON_THE_WAY, "duplicated", "delivered", "rejected", "in_flight", "cut_off")
 # A killed process takes with it the frames that it wrote about in its last moments. The thesis's links hold a
 # frame for a second or two; a frame without a line this near to the end was lost by something else.
 CUT_OFF_NS = 10 * 10**9
@@ -60,54 +62,26 @@ _GARBLED = "?"
 _MAX_LISTED = 20
 
 
-@dataclass
-class FrameCounts:
-    """Counts of frames and copies by state; ``rejected`` by reason."""
+class FrameCounts(Counter[str]):
+    """Counts of frames and copies by state; of a rejection by ``rejected:reason``."""
 
-    captured: int = 0
-    replaced: int = 0
-    waiting: int = 0
-    sent: int = 0
-    skipped: int = 0
-    dropped_busy: int = 0
-    superseded: int = 0
-    lost: int = 0
-    broken: int = 0
-    duplicated: int = 0
-    delivered: int = 0
-    rejected: Counter[str] = field(default_factory=Counter)
-    in_flight: int = 0
-    cut_off: int = 0
-
-    def count_end(self, state: str, copies: int = 1) -> None:
-        """Count copies that ended in ``state``; a rejection is written ``rejected:reason``."""
-        name, _, reason = state.partition(":")
-        if not copies:
-            return  # the report lists no reason for which nothing was rejected
-        if name == "rejected":
-            self.rejected[reason or "unknown"] += copies
-        else:
-            setattr(self, name, getattr(self, name) + copies)
-
-    def add(self, other: FrameCounts, times: int = 1) -> None:
+    def add(self, other: Mapping[str, int], times: int = 1) -> None:
         """Add ``other`` to these counts, ``times`` times."""
-        for name, value in vars(other).items():
-            if name == "rejected":
-                for reason, copies in value.items():
-                    self.rejected[reason] += copies * times
-            else:
-                setattr(self, name, getattr(self, name) + value * times)
+        for state, count in other.items():
+            self[state] += count * times
 
     @property
     def without_end(self) -> tuple[int, int]:
         """Frames captured and copies sent that have no end by the sums of the module's docstring: both 0
         where the sums hold, negative where more ended than there were."""
-        ended = sum(getattr(self, name) for name in ENDS if name != "rejected") + self.rejected.total()
-        return (self.captured - self.replaced - self.waiting - self.sent, self.sent + self.duplicated - ended)
+        ended = sum(count for state, count in self.items() if state.partition(":")[0] in ENDS)
+        unsent = self["captured"] - self["replaced"] - self["waiting"] - self["sent"]
+        return unsent, self["sent"] + self["duplicated"] - ended
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, in the order in which a frame passes the states."""
-        return {**vars(self), "rejected": dict(sorted(self.rejected.items()))}
+        """Plain numbers, in the order in which a frame passes the states; ``rejected`` by reason."""
+        ends = sorted((state.partition(":")[2], n) for state, n in self.items() if state.startswith("rejected:") and n)
+        return {**{state: self[state] for state in _STATES}, "rejected": dict(ends)}
 
 
 @dataclass
@@ -190,12 +164,6 @@ class _History:
             **counts, incomplete=self.incomplete | (set() if complete else {role}), last_file=last[0], last_role=last[1]
         )
 
-    @property
-    def key(self) -> tuple[Any, ...]:
-        """Equal for equal histories, and hashable."""
-        counts = (tuple(getattr(self, name).items()) for name in _ROLES)  # in order: the first end counts
-        return (*counts, self.incomplete, self.last_file, self.last_role)
-
 
 class _Histories:
     """Every different history, by number; 0 is the empty one. A hundred thousand frames share a few dozen, so
@@ -203,7 +171,6 @@ class _Histories:
 
     def __init__(self) -> None:
         self.all = [_History()]
-        self._numbers = {self.all[0].key: 0}
         self._transitions: dict[tuple[int, int, str], int] = {}
 
     def after(self, number: int, role: str, event: str, file: int, complete: bool) -> int:
@@ -211,11 +178,8 @@ class _Histories:
         transition = (number, file, event)
         result = self._transitions.get(transition)
         if result is None:
-            history = self.all[number].after(role, event, file, complete)
-            result = self._numbers.setdefault(history.key, len(self.all))
-            if result == len(self.all):
-                self.all.append(history)
-            self._transitions[transition] = result
+            result = self._transitions[transition] = len(self.all)
+            self.all.append(self.all[number].after(role, event, file, complete))
         return result
 
 
@@ -276,7 +240,7 @@ def account_frames(out: Path) -> FrameAccounting:
                 without_node += count
                 if node_wrote:
                     contradictions = [*contradictions, "arrived, but its node wrote nothing about it"]
-            open_at["in_flight"][history.last_file] += counts.in_flight * count
+            open_at["in_flight"][history.last_file] += counts["in_flight"] * count
             if contradictions:
                 contradicting |= dict.fromkeys((s for s, other in frames.items() if other == number), contradictions)
             unsent, copies = counts.without_end
@@ -304,7 +268,8 @@ def account_frames(out: Path) -> FrameAccounting:
             accounting.unknown_origin.update(refusals)
         else:
             count = refusals.total()
-            accounting.add(camera, FrameCounts(captured=count, sent=count, rejected=refusals))
+            rejected = {f"rejected:{reason}": copies for reason, copies in refusals.items()}
+            accounting.add(camera, FrameCounts({"captured": count, "sent": count, **rejected}))
             without_node += count
     if ledgers and not any(ledger.role == "edge" for ledger in ledgers):
         notes.append("no edge's ledger here: what the edge took has no end")
@@ -416,11 +381,12 @@ def _evaluate(history: _History) -> tuple[FrameCounts, list[str]]:
     arrived, forwarded = edge.total(), emulator["forwarded"]
     if node:
         handed = node["sent"]
-        counts = FrameCounts(node["captured"], node["replaced"], node["waiting"], min(1, handed))
+        counts.update({state: node[state] for state in ("captured", "replaced", "waiting")}, sent=min(1, handed))
     else:
         # No ledger here says how often it was sent: each arrival at the first known hop counts as one.
-        handed = counts.captured = counts.sent = emulator["received"] or (1 if emulator else arrived)
-    counts.duplicated = handed - counts.sent + emulator["duplicated"]
+        handed = emulator["received"] or (1 if emulator else arrived)
+        counts.update(captured=handed, sent=handed)
+    counts["duplicated"] = handed - counts["sent"] + emulator["duplicated"]
     copies = handed + emulator["duplicated"]
     if arrived > copies:
         contradictions.append(f"reached the edge {arrived} times but only {copies} copies were made")
@@ -431,13 +397,12 @@ def _evaluate(history: _History) -> tuple[FrameCounts, list[str]]:
     ends = {e: n for e, n in emulator.items() if _is_end(e)}
     if forwarded + sum(ends.values()) > copies:
         contradictions.append(f"{copies} copies, but {forwarded} forwarded and {sum(ends.values())} ended before")
-    for end, count in [*edge.items(), *ends.items()]:
-        counts.count_end(end, count)
+    counts.add(edge)
+    counts.add(ends)
     for answer, count in answers.items():
         if _is_end(answer):
-            counts.count_end(answer, min(count, max(0, counts.without_end[1])))
-    broken = emulator["broken"] or node["broken"]
-    counts.count_end("broken", min(broken, max(0, counts.without_end[1])))
+            counts[answer if answer != "rejected" else "rejected:unknown"] += min(count, max(0, counts.without_end[1]))
+    counts["broken"] += min(emulator["broken"] or node["broken"], max(0, counts.without_end[1]))
     if (excess := -counts.without_end[1]) > 0 and not contradictions:
         contradictions.append(f"{excess} ends more than copies")
     return counts, contradictions

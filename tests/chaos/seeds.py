@@ -79,9 +79,7 @@ def accounting(deployment: ChaosDeployment, account: Any) -> Iterator[str]:
     if account.contradictions:
         yield f"contradiction: {account.contradictions[0]}"
     yield from account.doubts
-    truth = FrameCounts()
-    for what, count in deployment.really.items():
-        truth.count_end(what, count)
+    truth = FrameCounts(deployment.really)
     if truth.as_dict() != account.total.as_dict():
         wrong = [k for k, v in truth.as_dict().items() if v != account.total.as_dict()[k]]
         about = ", ".join(f"{k} {account.total.as_dict()[k]} (really {truth.as_dict()[k]})" for k in wrong)

@@ -4,7 +4,9 @@ library."""
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.arguments import OptionError
-from edge_server.experiments.fitting.evaluate import Scored, fit_in_slices, marks_s
+from edge_server.experiments.fitting import ctrl_c
 from edge_server.experiments.fitting.misfits import misfits
 from edge_server.experiments.scenes.multiview_still import WHITE, mean_baselines, open_still, score_views
 from edge_server.experiments.scenes.recorded import MultiviewStill
@@ -24,8 +26,8 @@ from edge_server.export.run_source import Source, holds_checkpoint, open_source
 from edge_server.export.viewed_field import ViewedField
 from edge_server.fidelity.images import to_bytes, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.scorer import SELECTED, Score, Scorer
-from edge_server.fields import RefinesCameras, checkpoint
+from edge_server.fidelity.scorer import SELECTED, Scorer
+from edge_server.fields import Budget, FitReport, RefinesCameras, checkpoint
 from edge_server.fields.registry import FIELD, make_field, option_help
 from edge_server.fields.splat.scan.settings import scan_options
 from edge_server.machine import run_facts
@@ -33,19 +35,12 @@ from edge_server.run_records import UpdateRow
 from freshfield.files import write_json
 from freshfield.machine_load import LoadMeter, outside_cores
 
+# Seconds after which to evaluate: dense while a field learns fastest, then every 30 s. The last slice is at least this
+# share of the whole: the learning rate falls within a slice, and a field needs a long one to converge.
+_MARKS_S, _THEN_EVERY_S, _LAST_SHARE = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0), 30.0, 0.4
+_SHORTEST_S = 0.05  # of a slice
 # Number of training views that are scored if no view is held out.
 _SCORED_OF_TRAINING = 8
-SAVED = (
-    "field",
-    "series.jsonl",
-    "processes.jsonl",
-    "edge.json",
-    "truth.png",
-    "rendered.png",
-    "report.json",
-    "report.html",
-)
-"""What ``Fit.save`` writes, in this order, besides the report's figures."""
 
 
 class Fit(ViewedField):
@@ -118,54 +113,53 @@ class Fit(ViewedField):
         rows = [(row.t_s, row.psnr_db if row.psnr_refined_db is None else row.psnr_refined_db) for row in self.rows]
         return np.array(rows, np.float64).reshape(-1, 2)
 
-    def run(self, until_s: float, on_scored: Callable[[Scored], None] | None = None) -> bool:
+    def run(self, until_s: float, progress: Callable[[UpdateRow], None] | None = None) -> bool:
         """Fit until ``until_s`` seconds in total and score on the way. Returns False if Ctrl-C ended it early.
 
-        on_scored: called after each evaluation. Raises OptionError for a time out of range.
+        progress: called with each evaluation. Raises OptionError for a time out of range.
         """
         check_seconds(until_s)
-
-        def scored(at: Scored) -> None:
-            self._keep(at)
-            if on_scored is not None:
-                on_scored(at)
-
-        marks = marks_s(until_s)
         try:
-            return fit_in_slices(
-                self.field, self.data.training, self._score, marks, scored, self.spent_s, self.spent_steps
-            )
+            for mark_s in marks_s(until_s):
+                if mark_s - self.spent_s >= _SHORTEST_S and not self._run_slice(mark_s, progress):
+                    return False
         except KeyboardInterrupt:  # during an evaluation: the last complete one is kept
             return False
+        return True
 
-    def _score(self) -> Score:
-        self._processes.append(self._load_meter.row(0.0))
+    def _run_slice(self, until_s: float, progress: Callable[[UpdateRow], None] | None) -> bool:
+        """Fit until then, and score. Returns False if Ctrl-C was pressed meanwhile: the parameters, those of the last
+        step, are scored all the same."""
+        began_s = time.perf_counter()
+        report: FitReport | None = None
+        with ctrl_c.noted() as pressed, suppress(KeyboardInterrupt):
+            report = self.field.fit(self.data.training, Budget(seconds=until_s - self.spent_s))
+        slice_s = time.perf_counter() - began_s
+        usage = self._load_meter.row(0.0)
         score, self._shown = score_views(self.field, self._scored_views, self._scorer)
-        return score
-
-    def _keep(self, at: Scored) -> None:
-        score = at.score
-        self.spent_s = at.seconds
-        self.spent_steps = at.steps if at.steps is not None else self.spent_steps
-        self._processes[-1]["t_s"] = round(at.seconds, 3)
-        self.outside = outside_cores(self._processes[-1])
+        self.spent_s += slice_s
+        self.spent_steps += report.steps if report else 0
+        self._processes.append(usage | {"t_s": round(self.spent_s, 3)})
+        self.outside = outside_cores(usage)
         self._load_meter.row(0.0)  # the evaluation is not measured
-        self.rows.append(
-            UpdateRow(
-                number=len(self.rows),
-                t_s=at.seconds,
-                psnr_db=score.psnr_db,
-                ssim=score.ssim,
-                lpips=score.lpips,
-                psnr_refined_db=score.psnr_refined_db,
-                ssim_refined=score.ssim_refined,
-                selected=len(self.data.training),
-                update_ms=at.slice_s * 1e3,
-                steps=at.steps,
-                loss=at.loss,
-                scored_on=f"{len(self.data.held_out)} views" if self.data.held_out else SELECTED,
-            )
+        row = UpdateRow(
+            number=len(self.rows),
+            t_s=self.spent_s,
+            psnr_db=score.psnr_db,
+            ssim=score.ssim,
+            lpips=score.lpips,
+            psnr_refined_db=score.psnr_refined_db,
+            ssim_refined=score.ssim_refined,
+            selected=len(self.data.training),
+            update_ms=slice_s * 1e3,
+            steps=self.spent_steps if report else None,
+            loss=report.loss if report else None,
+            scored_on=f"{len(self.data.held_out)} views" if self.data.held_out else SELECTED,
         )
+        self.rows.append(row)
+        if progress is not None:
+            progress(row)
+        return report is not None and not pressed.is_set()
 
     def resume(self, folder: Path, until_s: float) -> None:
         """Go on from what ``save`` wrote. Raises OptionError if there is nothing, or it has been fitted for
@@ -178,7 +172,7 @@ class Fit(ViewedField):
             self._processes = _read_lines(folder / "processes.jsonl")
         except (OSError, ValueError, KeyError) as error:
             raise OptionError(f"--resume: {folder} holds no fit to go on from: {error}") from None
-        if self.spent_s >= until_s - 0.05:
+        if self.spent_s > until_s - _SHORTEST_S:
             raise OptionError(
                 f"--resume: {folder} has been fitted for {self.spent_s:.1f} s already: give more --seconds"
             )
@@ -301,10 +295,16 @@ def fit(
     check_seconds(seconds)
     made = Fit(data, field, options, seed=seed)
     made.field.warm_up()
-    if not made.run(seconds, None if progress is None else lambda at: progress(made.rows[-1])):
+    if not made.run(seconds, progress):
         raise KeyboardInterrupt
     made.findings()
     return made
+
+
+def marks_s(total_s: float) -> list[float]:
+    """Seconds of fitting after which to evaluate, the last being ``total_s``."""
+    later = np.arange(_MARKS_S[-1] + _THEN_EVERY_S, total_s, _THEN_EVERY_S)
+    return [m for m in (*_MARKS_S, *map(float, later)) if m <= (1.0 - _LAST_SHARE) * total_s] + [total_s]
 
 
 def check_seconds(seconds: float) -> None:

@@ -13,11 +13,11 @@ from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, run_command
 from edge_server.experiments.common.arguments import OptionError, add_lpips, at_least, parse_options
 from edge_server.experiments.fitting import ctrl_c
-from edge_server.experiments.fitting.evaluate import Scored
-from edge_server.experiments.fitting.fit import SAVED, Fit, check_seconds
+from edge_server.experiments.fitting.fit import Fit, check_seconds
 from edge_server.experiments.scenes.multiview_still import data_name, open_still
 from edge_server.experiments.scenes.recorded import MultiviewStill
 from edge_server.fields.registry import FIELD, field_names
+from edge_server.run_records import UpdateRow
 from freshfield.files import out_folder
 from freshfield.scenario import NOTHING_HELD_OUT
 
@@ -117,29 +117,13 @@ def run(request: argparse.Namespace) -> dict[str, Any]:
             )
         for line in fit.findings():
             _say(line)
-        report = _save(fit, request.out)
+        try:
+            report = fit.save(request.out)
+        except KeyboardInterrupt:
+            partly = f"{request.out} is written in part; edge-server report {request.out} writes a report of it"
+            raise KeyboardInterrupt(partly) from None
         _say(str(request.out / "report.html"))
     return report
-
-
-def _save(fit: Fit, out: Path) -> dict[str, Any]:
-    """``Fit.save``. Raises KeyboardInterrupt, which says what is written and what is not."""
-    before = _written(out)
-    try:
-        return fit.save(out)
-    except KeyboardInterrupt:
-        now = _written(out)
-        new = [name for name in SAVED if now[name] != before[name]]
-        left = [name for name in SAVED if name not in new]
-        told = f"{out}: written: {', '.join(new) or 'nothing'}; not written: {', '.join(left) or 'nothing'}"
-        if "edge.json" in new and left:
-            told += f" (edge-server report {out} writes the report)"
-        raise KeyboardInterrupt(told) from None
-
-
-def _written(out: Path) -> dict[str, int | None]:
-    """When each of SAVED was written, ns; None: it is not there."""
-    return {name: (out / name).stat().st_mtime_ns if (out / name).exists() else None for name in SAVED}
 
 
 def _say(line: str) -> None:
@@ -155,15 +139,14 @@ def _headline(data: MultiviewStill) -> str:
     return f"{notes}{data.file}: {len(data.training)} views of {sizes}{instant}, {held_out}"
 
 
-def progress_line(at: Scored, outside: float | None, held_out: bool = True) -> str:
+def progress_line(at: UpdateRow, outside: float | None, held_out: bool = True) -> str:
     """A line of text: time, steps, scores and how many cores other processes used."""
-    score = at.score
-    words = [f"{at.seconds:7.1f} s {'-' if at.steps is None else at.steps:>7} steps"]
-    words.append(f"PSNR {score.psnr_db:5.2f} dB" + (f" on {NOTHING_HELD_OUT}" if not held_out else ""))
-    words += [f"SSIM {score.ssim:.3f}"] if score.ssim is not None else []
-    if score.psnr_refined_db is not None:
-        words.append(f"at refined poses {score.psnr_refined_db:5.2f} dB")
-        words += [f"SSIM {score.ssim_refined:.3f}"] if score.ssim_refined is not None else []
-    words += [f"LPIPS {score.lpips:.3f}"] if score.lpips is not None else []
+    words = [f"{at.t_s:7.1f} s {'-' if at.steps is None else at.steps:>7} steps"]
+    words.append(f"PSNR {at.psnr_db:5.2f} dB" + (f" on {NOTHING_HELD_OUT}" if not held_out else ""))
+    words += [f"SSIM {at.ssim:.3f}"] if at.ssim is not None else []
+    if at.psnr_refined_db is not None:
+        words.append(f"at refined poses {at.psnr_refined_db:5.2f} dB")
+        words += [f"SSIM {at.ssim_refined:.3f}"] if at.ssim_refined is not None else []
+    words += [f"LPIPS {at.lpips:.3f}"] if at.lpips is not None else []
     words += [f"(others used {outside:.1f} cores)"] if outside is not None else []
     return "  ".join(words)

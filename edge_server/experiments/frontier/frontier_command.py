@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,15 @@ from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.frontier import from_scratch, update_time
 from edge_server.experiments.frontier.from_scratch import Fit, Still
 from edge_server.experiments.frontier.output import recommendation, write_output
-from edge_server.experiments.frontier.update_time import CHANNEL, POLICY, Charged, MovingRun, MovingScene, variants
+from edge_server.experiments.frontier.update_time import (
+    CHANNEL,
+    POLICY,
+    Charged,
+    MovingRun,
+    MovingScene,
+    field_label,
+    variants,
+)
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import FIELD, field_names, make_field
 from edge_server.machine import machine, versions
@@ -85,41 +92,32 @@ QUICK = Sweep(
     size=128,
     moving=MovingScene(cameras=13, size=64),
 )
+# Unlike QUICK, it measures the cost of a step with as many and as large views as the runs have.
 FULL = Sweep(
     seeds=3,
-    planned_s=(0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0),
+    planned_s=(0.5, 1.0, 2.0, 4.0, 8.0),
     speeds=(0.3, 1.0, 3.0),
-    update_s=(0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0),
-    run_s=20.0,
+    update_s=(0.05, 0.1, 0.2, 0.5, 1.0, 2.0),
+    run_s=8.0,
     size=128,
     moving=MovingScene(cameras=19, size=128),
 )
 
 LAYERS_S = 0.02  # shortest update time of layers, as used in scenarios with layers
 
-# The sweep of the shipped points, for scenarios without a frontier of their own. Unlike --quick, it measures
-# the cost of a step with as many and as large views as the runs have.
-SHIPPED = replace(FULL, planned_s=(0.5, 1.0, 2.0, 4.0, 8.0), update_s=(0.05, 0.1, 0.2, 0.5, 1.0, 2.0), run_s=8.0)
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
-    try:
-        frontier = _frontier(args, QUICK if args.quick else SHIPPED if args.shipped else FULL)
-    except (DatasetError, EngineError, ScenarioError, ValueError) as error:
-        print(f"edge-server frontier: {error}", file=sys.stderr)
-        return 2
+    errors = (DatasetError, EngineError, ScenarioError, ValueError)
     stopped = f"what was measured is in {args.out}: run the same command again to resume"
-    return run_command("edge-server frontier", frontier.run, (EngineError,), stopped)
+    return run_command("edge-server frontier", lambda: _run(args), errors, stopped)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser("edge-server frontier", DESCRIPTION)
     add = parser.add_argument
-    size = parser.add_mutually_exclusive_group().add_argument
-    size("--quick", action="store_true", help="a smaller sweep: four minutes on two cores, not one to two hours")
-    size("--shipped", action="store_true", help="the sweep that is shipped, with --field all")
+    add("--quick", action="store_true", help="a smaller sweep: four minutes on two cores, not half an hour")
     add("--scene", default="room", metavar="NAME|DATA", help="scene: room, tile or a data set [%(default)s]")
     add("--holdout", default="8", metavar="K|NAME,...", help="views of a data set to test on, as in fit [%(default)s]")
     add("--scale", type=float, default=1.0, metavar="K", help="divide image sizes of a data set by K [%(default)g]")
@@ -139,7 +137,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
+def _run(args: argparse.Namespace) -> None:
+    """Measure the missing points, then write tables and figures."""
+    sweep = QUICK if args.quick else FULL
     if args.seeds is not None:
         if args.seeds < 1:
             raise ValueError(f"--seeds {args.seeds}: expected 1 or more")
@@ -148,104 +148,78 @@ def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
     options = parse_options(args.option)
     for field in fields:
         make_field(field, options)  # rejects wrong options now, not between two measurements
-    still = Still(args.scene, sweep.size, args.holdout, args.scale, args.frame)
-    from_scratch.views_of(still)
-    weights = weights_folder(args.lpips)
+    scene = Still(args.scene, sweep.size, args.holdout, args.scale, args.frame)
+    begun, still = time.perf_counter(), from_scratch.views_of(scene)
     lpips, missing = open_lpips(args.lpips)
-    engine = Engine(args.out / "results.jsonl")
-    workers = Engine(args.out / "results.jsonl", args.jobs, args.ray, threads=1)
-    seeds = range(sweep.seeds)
-    found = weights if lpips is not None else None
-    return Frontier(args.out, engine, workers, sweep, still, fields, options, seeds, found, missing)
+    weights = None if lpips is None else weights_folder(args.lpips)
+    print(f"{still.describe()}, {len(still.held_out)} held out", flush=True)
+    results = args.out / "results.jsonl"
+    # Times are measured one after another in this process; runs in virtual time are shared out.
+    with Engine(results) as engine, Engine(results, args.jobs, args.ray, threads=1) as workers:
+        rows = _from_scratch(engine, sweep, scene, fields, options, weights)
+        moves = args.scene == "room"
+        charged, updates = _live(engine, workers, sweep, fields, options, weights) if moves else ({}, [])
+    if not moves:
+        why = "it needs the exact truth at any instant, which only a synthetic scene has (--scene room)"
+        if args.scene in SCENES:
+            why = f"nothing moves in {args.scene}"
+        print(f"figure 2 left out: {why}", flush=True)
+    data = {
+        "scene": still.describe(),
+        "policy": POLICY,
+        "channel": CHANNEL,
+        "machine": machine(),
+        "versions": versions(),
+        "fields": list(fields),
+        "lpips_network": "alex" if weights else None,
+        "lpips_missing": missing,
+        "ms_per_step": from_scratch.costs(rows),
+        "charged": charged,
+        "from_scratch": rows,
+        "updates": updates,
+    }
+    write_json(args.out / "frontier.json", data)
+    print(write_output(args.out, data), flush=True)
+    print(f"{args.out / 'frontier.json'} ({time.perf_counter() - begun:.0f} s)", flush=True)
+    print(recommendation(updates), flush=True)
 
 
-@dataclass
-class Frontier:
-    """A run of the command: measures the missing points, then writes tables and figures.
+def _from_scratch(
+    engine: Engine, sweep: Sweep, scene: Still, fields: Sequence[str], options: Row, weights: Path | None
+) -> list[Row]:
+    """Rows of figure 1."""
+    every = product(range(sweep.seeds), fields, sweep.planned_s)
+    fits = [Fit(scene, field, seconds, seed, options) for seed, field, seconds in every]
+    points = engine.run(
+        partial(from_scratch.fit_from_scratch, weights=weights),
+        fits,
+        "from scratch",
+        files=lambda fit: [*fit.still.files, weights],
+    )
+    return from_scratch.curves(fits, points)
 
-    engine: measures times, one after another in this process. workers: runs in virtual time, from ``--jobs`` and
-        ``--ray``; with the same file of results.
-    weights, lpips_missing: folder of LPIPS weights, or why there are none.
-    """
 
-    out: Path
-    engine: Engine
-    workers: Engine
-    sweep: Sweep
-    still: Still
-    fields: tuple[str, ...]
-    options: dict[str, Any]
-    seeds: range
-    weights: Path | None
-    lpips_missing: str | None
-
-    def run(self) -> None:
-        """Measure and write everything."""
-        begun, still = time.perf_counter(), from_scratch.views_of(self.still)
-        print(f"{still.describe()}, {len(still.held_out)} held out", flush=True)
-        with self.engine:
-            rows = self._from_scratch()
-            charged, updates = self._live() if self.still.scene == "room" else ({}, [])
-        if self.still.scene != "room":
-            why = "it needs the exact truth at any instant, which only a synthetic scene has (--scene room)"
-            if self.still.scene in SCENES:
-                why = f"nothing moves in {self.still.scene}"
-            print(f"figure 2 left out: {why}", flush=True)
-        data = {
-            "scene": still.describe(),
-            "policy": POLICY,
-            "channel": CHANNEL,
-            "machine": machine(),
-            "versions": versions(),
-            "fields": list(self.fields),
-            "lpips_network": "alex" if self.weights else None,
-            "lpips_missing": self.lpips_missing,
-            "ms_per_step": from_scratch.costs(rows),
-            "charged": charged,
-            "from_scratch": rows,
-            "updates": updates,
-        }
-        write_json(self.out / "frontier.json", data)
-        print(write_output(self.out, data), flush=True)
-        print(f"{self.out / 'frontier.json'} ({time.perf_counter() - begun:.0f} s)", flush=True)
-        print(recommendation(updates), flush=True)
-
-    def _from_scratch(self) -> list[Row]:
-        """Rows of figure 1."""
-        every = product(self.seeds, self.fields, self.sweep.planned_s)
-        fits = [Fit(self.still, field, seconds, seed, self.options) for seed, field, seconds in every]
-        points = self.engine.run(
-            partial(from_scratch.fit_from_scratch, weights=self.weights),
-            fits,
-            "from scratch",
-            files=lambda fit: [*fit.still.files, self.weights],
-        )
-        return from_scratch.curves(fits, points)
-
-    def _live(self) -> tuple[Row, list[Row]]:
-        """What updates are charged, and the rows of figure 2 as means over the seeds."""
-        sweep, measured_of = self.sweep, variants(self.fields, self.options)
-        # With the number of images of the moving scene and the image size of figure 1.
-        moving, speed = replace(sweep.moving, size=sweep.size), sweep.speeds[len(sweep.speeds) // 2]
-        asked = [Charged(moving, speed, variant) for variant in measured_of]
-        measured = self.engine.run(update_time.measure_compute, asked, "cost of updates")
-        runs = []
-        for (variant, row), speed, seed in product(zip(measured_of, measured), sweep.speeds, self.seeds):
-            times = (LAYERS_S, *sweep.update_s) if variant.layers else sweep.update_s
-            compute = ComputeConfig(**row)
-            runs += [
-                MovingRun(sweep.moving, speed, variant, seed, s, max(sweep.run_s, 6.0 * s), compute) for s in times
-            ]
-        with self.workers:
-            points = self.workers.run(
-                partial(update_time.run_updates, weights=self.weights),
-                runs,
-                "updates",
-                files=lambda run: [self.weights],
-                group=lambda run: (run.variant.field, run.variant.layers, run.speed),  # they share their renderings
-            )
-        rows = [{**point, **run.facts()} for run, point in zip(runs, points)]
-        charged = {
-            update_time.field_label(variant.field, variant.layers): row for variant, row in zip(measured_of, measured)
-        }
-        return charged, update_time.mean_over_seeds(rows)
+def _live(
+    engine: Engine, workers: Engine, sweep: Sweep, fields: Sequence[str], options: Row, weights: Path | None
+) -> tuple[Row, list[Row]]:
+    """What updates are charged, and the rows of figure 2 as means over the seeds."""
+    measured_of = variants(fields, options)
+    # With the number of images of the moving scene and the image size of figure 1.
+    moving, speed = replace(sweep.moving, size=sweep.size), sweep.speeds[len(sweep.speeds) // 2]
+    asked = [Charged(moving, speed, variant) for variant in measured_of]
+    measured = engine.run(update_time.measure_compute, asked, "cost of updates")
+    runs = []
+    for (variant, row), speed, seed in product(zip(measured_of, measured), sweep.speeds, range(sweep.seeds)):
+        times = (LAYERS_S, *sweep.update_s) if variant.layers else sweep.update_s
+        compute = ComputeConfig(**row)
+        runs += [MovingRun(sweep.moving, speed, variant, seed, s, max(sweep.run_s, 6.0 * s), compute) for s in times]
+    points = workers.run(
+        partial(update_time.run_updates, weights=weights),
+        runs,
+        "updates",
+        files=lambda run: [weights],
+        group=lambda run: (run.variant.field, run.variant.layers, run.speed),  # they share their renderings
+    )
+    rows = [{**point, **run.facts()} for run, point in zip(runs, points)]
+    charged = {field_label(variant.field, variant.layers): row for variant, row in zip(measured_of, measured)}
+    return charged, update_time.mean_over_seeds(rows)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,8 +23,8 @@ from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.rollouts.setting import GRID_MS, Setting
 from edge_server.experiments.virtual.from_scenario import build_deployment, build_truth, exact_scene, training_cameras
 from edge_server.experiments.virtual.run_settings import RunSettings
-from edge_server.experiments.virtual.truth import ExactTruth
-from edge_server.experiments.virtual.virtual_deployment import Truth, VirtualDeployment
+from edge_server.experiments.virtual.truth import ExactTruth, Truth
+from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, Field, View
@@ -167,29 +167,29 @@ class EpisodeFactory:
         lpips = None if edge.lpips == "none" else open_lpips(folders.lpips)[0]
         self._scorer = Scorer(lpips)
         self.setting, self.folders = setting, folders
-        self._shared = None if self._moving else self._stage(scenario)
-        self._last: tuple[int, Stage] | None = None
-        self._field: tuple[int, Field] | None = None
+        # Of each the last is kept, with its images.
+        self._stage_of, self._field_of = lru_cache(1)(self._open_stage), lru_cache(1)(self._make_field)
+        self.episode = lru_cache(1)(partial(Episode, self))
+        if not self._moving:
+            self.stage(0)  # what is wrong with it is said now
         self.embedder: Embedder | None = None
         if "semantics" in setting.parts:
             # Loaded only where the state includes semantics.
             from edge_server.embed import EmbeddingConfig, make_embedder
 
             self.embedder = make_embedder(edge.embedding or EmbeddingConfig())
-        self._episode: Episode | None = None
 
     def scenario(self, seed: int) -> Scenario:
         """The deployment of an episode."""
         return self.setting.seeded(seed, self._moving)
 
     def stage(self, seed: int) -> Stage:
-        """Truth and training cameras of an episode; those of the last episode are cached with their
-        images."""
-        if self._shared is not None:
-            return self._shared
-        if self._last is None or self._last[0] != seed:
-            self._last = seed, self._stage(self.scenario(seed))
-        return self._last[1]
+        """Truth and training cameras of an episode."""
+        return self._stage_of(seed if self._moving else None)
+
+    def _open_stage(self, seed: int | None) -> Stage:
+        scenario = self.setting.scenario if seed is None else self.scenario(seed)
+        return open_stage(scenario, self._scorer, self.folders, self._period_ns)
 
     def embeddings(self) -> FrameEmbeddings | None:
         """A new cache for one episode: frame numbers repeat across episodes with different images."""
@@ -201,23 +201,13 @@ class EpisodeFactory:
 
     def field(self, seed: int) -> Field:
         """The field of an episode, in any state: the caller must reset or load it."""
-        seed = self.setting.field_seed(seed)
-        if self._field is None or self._field[0] != seed:
-            options = {**self._edge.field_options, "threads": 1}
-            try:
-                self._field = seed, make_field(self._edge.field, options, seed=seed)
-            except ValueError as error:
-                raise ScenarioError(f"{self.setting.scenario.path}: edge: {error}") from None
-        return self._field[1]
+        return self._field_of(self.setting.field_seed(seed))
 
-    def _stage(self, scenario: Scenario) -> Stage:
-        return open_stage(scenario, self._scorer, self.folders, self._period_ns)
-
-    def episode(self, seed: int) -> Episode:
-        """The episode of a seed; the last one is kept."""
-        if self._episode is None or self._episode.seed != seed:
-            self._episode = Episode(self, seed)
-        return self._episode
+    def _make_field(self, seed: int) -> Field:
+        try:
+            return make_field(self._edge.field, {**self._edge.field_options, "threads": 1}, seed=seed)
+        except ValueError as error:
+            raise ScenarioError(f"{self.setting.scenario.path}: edge: {error}") from None
 
 
 class Episode:
@@ -288,7 +278,7 @@ class Episode:
         found = {}
         for camera in cameras:
             score = truth.of((camera,)).score(snapshot, published_ns)
-            scores = {name: None if score is None else getattr(score, name) for name in SCORES}
+            scores = {name: getattr(score, name) for name in SCORES}
             found[camera] = Outcome(**scores, aaoi_ms=aaoi_ms, views=float(len(views)), wait_ms=wait_ms)
         return found
 

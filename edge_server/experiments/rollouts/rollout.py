@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import msgspec
@@ -25,15 +25,12 @@ from edge_server.experiments.rollouts.setting import Setting
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.scheduler import BANDIT, Epoch, Policy, make_policy, parse_policy
-from edge_server.scheduler.learned.actor import Actor, Decision
+from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.settings import read_config
 
 # Period of the instants at which the shown image is scored, in a running deployment.
 SHOWN_EVERY_MS = 125.0
-# Number of settings whose images a process keeps.
-_FACTORIES_KEPT = 3
-_FACTORIES: dict[tuple[str, Folders], EpisodeFactory] = {}
 
 PolicyMaker = Callable[[np.random.Generator], Policy]
 
@@ -53,14 +50,6 @@ class Decided:
     features: list[list[float]] | None = None
     action: Any = None
     logp: float = 0.0
-
-    @staticmethod
-    def of_policy(slot: int, outcomes: dict[str, Outcome], decision: Decision | None) -> Decided:
-        """With the last decision of a learned policy; None: of another one."""
-        if decision is None:
-            return Decided(slot, outcomes)
-        features = decision.actor.spec.layout.features(decision.state)
-        return Decided(slot, outcomes, features.tolist(), decision.action.tolist(), decision.logp)
 
 
 @dataclass(frozen=True)
@@ -92,7 +81,10 @@ def _single_decisions(factory: EpisodeFactory, seed: int, policy: Policy, camera
     decided = []
     for number in range(len(episode.points)):
         outcomes = episode.evaluate(number, choose(policy, episode, number), cameras)
-        decided.append(Decided.of_policy(number, outcomes, policy.last_decision))
+        seen: tuple[Any, ...] = ()
+        if (last := policy.last_decision) is not None:  # of a learned policy
+            seen = last.actor.spec.layout.features(last.state).tolist(), last.action.tolist(), last.logp
+        decided.append(Decided(number, outcomes, *seen))
     return Run(decided)
 
 
@@ -251,13 +243,8 @@ def embeddings_seen(seed: int, *, setting: Setting, folders: Folders) -> list[li
     return [row for s in states if s.embeddings is not None for row in s.embeddings[s.reported].tolist()]
 
 
-def _factory(setting: Setting, folders: Folders) -> EpisodeFactory:
-    at = (setting.key, folders)
-    if at not in _FACTORIES:
-        while len(_FACTORIES) >= _FACTORIES_KEPT:
-            _FACTORIES.pop(next(iter(_FACTORIES)))
-        _FACTORIES[at] = EpisodeFactory(setting, folders)
-    return _FACTORIES[at]
+# A process keeps the images of a few settings.
+_factory = lru_cache(3)(EpisodeFactory)
 
 
 def _loaded(who: str | Actor) -> str | Actor:

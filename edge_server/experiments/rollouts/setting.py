@@ -93,6 +93,9 @@ class Setting:
                 "less than lead_ms"
             )
 
+    def __hash__(self) -> int:
+        return hash(self.key)
+
     @property
     def draws_motions(self) -> bool:
         """Whether each episode has its own motion; a recording has only one."""

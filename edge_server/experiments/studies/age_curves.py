@@ -9,7 +9,7 @@ import numpy as np
 
 from edge_server.experiments.common.seed_table import Curve, Row, SeedTable
 from edge_server.experiments.common.statistics import optimum
-from edge_server.experiments.studies.drawing import curves, draw_curve, instants, several
+from edge_server.experiments.studies.drawing import curves, draw_curve, instants
 from edge_server.experiments.studies.findings import interior, optimum_falls, optimum_grows
 from edge_server.experiments.studies.study import METRICS, Claim, Study, StudyRequest
 from edge_server.experiments.studies.trial import Point, recording, run_points, scenes_here, sweep
@@ -51,7 +51,7 @@ MAT = Study(
         ),
     ),
     ("scene", "channel"),
-    several(
+    (
         curves("mat", "gamma_ms", "maximum age (ms)", MAT_METRICS, "channel", policy="threshold"),
         instants("mat", ("room", "kitchen"), "threshold", SHOWN, {"preset": "ch5"}),
     ),
@@ -120,7 +120,7 @@ MAT_DELAY = Study(
             where={"policy": "threshold"},
         ),
     ),
-    draw=_draw_delay,
+    draw=(_draw_delay,),
 )
 
 # --- equation 5.8 --------------------------------------------------------------------------------------------
@@ -195,5 +195,5 @@ LAMBDA = Study(
         for policy, ages in product(("threshold", "wait"), SUMS)
     ),
     ("scene", "channel"),
-    _draw_lambda,
+    (_draw_lambda,),
 )

@@ -106,13 +106,3 @@ def instants(
         draw_images(request.out / f"{name}-pictures.png", shown)
 
     return draw
-
-
-def several(*drawings: Draw) -> Draw:
-    """Makes a drawing of all of them."""
-
-    def draw(request: StudyRequest, table: SeedTable) -> None:
-        for one in drawings:
-            one(request, table)
-
-    return draw

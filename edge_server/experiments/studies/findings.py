@@ -147,11 +147,8 @@ def better(mine: Row, other: Row) -> Statistic:
     the other half of the seeds. Repeated trainings count with their spread."""
 
     def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
-        _, lower, digits, _ = METRICS[metric]
-        ours, theirs = (table.best_runs(metric, lower, **{**labels, **of}) for of in (mine, other))
-        if not (ours and theirs):
-            return None
-        gap = difference(theirs, ours) if lower else difference(ours, theirs)
+        digits = METRICS[metric].digits
+        gap, theirs = _better_by(table, metric, labels, mine, other)
         if not gap.count:
             return None
         same = ": it does the very same" if gap.low == gap.high == 0.0 else ""
@@ -168,12 +165,10 @@ def better_than_all(mine: Row, others: Sequence[Row], worse: bool = False) -> St
     """``mine`` is better than each of ``others``. worse: each of ``others`` is better than ``mine``."""
 
     def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
-        _, lower, digits, _ = METRICS[metric]
+        digits = METRICS[metric].digits
         gaps: dict[str, Interval] = {}
         for other in others:
-            pair = (other, mine) if worse else (mine, other)
-            ours, theirs = (table.best_runs(metric, lower, **{**labels, **of}) for of in pair)
-            gap = difference(theirs, ours) if lower else difference(ours, theirs)
+            gap, _ = _better_by(table, metric, labels, *((other, mine) if worse else (mine, other)))
             if gap.count:
                 gaps[" ".join(str(v) for k, v in other.items() if k != "best")] = gap
         if not gaps:
@@ -204,11 +199,11 @@ def no_worse(mine: Row, other: Row) -> Statistic:
     negative share. None where that is too near its zero for a percentage."""
 
     def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
-        _, lower, digits, _ = METRICS[metric]
-        ours, theirs = (table.best_runs(metric, lower, **{**labels, **of}) for of in (mine, other))
-        if not (ours and theirs and _far_from_zero(theirs)):
+        digits = METRICS[metric].digits
+        gap, theirs = _better_by(table, metric, labels, mine, other)
+        if not (gap.count and _far_from_zero(theirs)):
             return None
-        gap, base = difference(ours, theirs), abs(crossed(theirs).mean)
+        base = abs(crossed(theirs).mean)
         share = dataclasses.replace(gap, mean=gap.mean / base, low=gap.low / base, high=gap.high / base)
         counted = _counted(table, {**labels, **mine}, gap)
         return Finding(f"{gap.text(digits)}, that is {100 * share.mean:+.2f} %, over {counted}.", (share,))
@@ -231,6 +226,13 @@ def half_way(mine: Row, base: Row, limit: Row) -> Statistic:
         return Finding(f"{above.text(digits)} beyond half of a way of {way}, over {counted}.", (above,))
 
     return found
+
+
+def _better_by(table: SeedTable, metric: str, labels: Row, mine: Row, other: Row) -> tuple[Interval, list[PerSeed]]:
+    """By how much ``mine`` beats ``other``, of no values where one was not measured; and the latter's runs."""
+    lower = METRICS[metric].lower
+    ours, theirs = (table.best_runs(metric, lower, **{**labels, **of}) for of in (mine, other))
+    return difference(theirs, ours) if lower else difference(ours, theirs), theirs
 
 
 def _counted(table: SeedTable, labels: Row, gap: Interval) -> str:

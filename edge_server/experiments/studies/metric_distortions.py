@@ -123,6 +123,6 @@ METRIC_DISTORTIONS = Study(
         Claim("brightness shift < ghosting (figure 3.6's table).", better(SHIFT, GHOST), metrics=("lpips",)),
         Claim("ghosting < blur (figure 3.6's table).", better(GHOST, BLUR), metrics=("lpips",)),
     ),
-    draw=_draw,
+    draw=(_draw,),
     tables=_table,
 )

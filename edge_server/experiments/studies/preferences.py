@@ -16,7 +16,16 @@ from edge_server.experiments.studies.drawing import draw_curve
 from edge_server.experiments.studies.findings import better, level
 from edge_server.experiments.studies.study import Claim, Study, StudyRequest, open_engine
 from edge_server.experiments.studies.trial import scene_label, scenes_here
-from edge_server.experiments.studies.viewpoints import JUDGED, SCENES, Workload, files_of, plan, stage_of, workload
+from edge_server.experiments.studies.viewpoints import (
+    JUDGED,
+    SCENES,
+    Workload,
+    files_of,
+    measured,
+    plan,
+    stage_of,
+    workload,
+)
 from edge_server.experiments.viewpoints.reconstructions import taste_score, varied_plan
 from edge_server.experiments.viewpoints.stage import Stage, open_embedder
 from edge_server.fidelity.scorer import Scorer
@@ -159,7 +168,7 @@ def captured(one: Taught, *, folders: Folders, pool: Sequence[Any]) -> Row:
     stage = stage_of(one.scene, one.work, folders)
     if one.pool is None:
         made = plan(stage, one.arm, one.seed, JUDGED, one.work)
-        return {"returns": [], "capture": _measured(stage, made, one.work, one.seed)}
+        return {"returns": [], "capture": _capture(stage, made, one)}
     features, scores = _pool_features(stage, pool[: one.pool])
     expert = SimulatedExpert(one.taste, scores[one.taste], np.random.default_rng(one.seed), wrong=0.1)
     model = ask(expert, features, ASKED[-1])
@@ -168,26 +177,18 @@ def captured(one: Taught, *, folders: Folders, pool: Sequence[Any]) -> Row:
     policy, returns = train_policy(stage.candidates, model.reward, config, one.seed, seen, embed)
     # The seed draws the same first view as for the others.
     made = plan_capture(stage.candidates, policy, Budget(views=JUDGED), stage.take, seed=one.seed)
-    return {"returns": returns, "capture": _measured(stage, made, one.work, one.seed)}
+    return {"returns": returns, "capture": _capture(stage, made, one)}
+
+
+def _capture(stage: Stage, made: Plan, one: Taught) -> Row:
+    """What was measured of a capture, and the score of each taste."""
+    field = stage.fit(made.views, one.work.steps, one.seed)
+    return {**measured(stage, field, made.stops, Scorer(background=stage.background)), **_tastes(stage, field)}
 
 
 def _tastes(stage: Stage, field: Field) -> Row:
     """The score of each taste."""
     return {taste: taste_score(stage, field, taste) for taste in TASTES}
-
-
-def _measured(stage: Stage, made: Plan, work: Workload, seed: int) -> Row:
-    """Quality on the views held out, path, milliseconds of a choice, and the score of each taste."""
-    field = stage.fit(made.views, work.steps, seed)
-    score = stage.score(field, Scorer(background=stage.background))
-    choice_ms = 1e3 * float(np.mean([stop.seconds for stop in made.stops[1:]]))
-    return {
-        "psnr_db": score.psnr_db,
-        "ssim": score.ssim,
-        "path_m": made.path_m,
-        "choice_ms": choice_ms,
-        **_tastes(stage, field),
-    }
 
 
 def ask(expert: SimulatedExpert, features: np.ndarray, answers: int) -> RewardModel:
@@ -312,6 +313,6 @@ PREFERENCES = Study(
             for m, better_at in (("psnr_db", "better views"), ("path_m", "a shorter path"))
         ),
     ),
-    draw=_draw,
+    draw=(_draw,),
     tables=_tables,
 )

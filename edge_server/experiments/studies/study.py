@@ -49,7 +49,6 @@ METRICS = {
     "aaoi_ms": Metric("mean age of used views (ms)", True, 1, 0.0),
     "f_w": Metric("F_w (6.37)", True, 3, 0.01),
     "f_w_corrected": Metric(f"F_w with w_s = {-W_S:g}", True, 3, 0.01),
-    "kilobytes_per_s": Metric("kilobytes a second, all cameras", True, 0, 0.0),
     "reward": Metric("reward", False, 4, 0.0),
     "path_m": Metric("path (m)", True, 2, 0.0),
     "does_not_know": Metric("share of cases", False, 2, 0.0),
@@ -197,7 +196,7 @@ class Study:
     cases: what is measured, for a request.
     measure: the rows of the cases, one for each seed.
     panels: labels that tell verdicts apart; a claim is judged once for each of their combinations and metric.
-    draw: draws the figures into the request's folder.
+    draw: each draws figures into the request's folder.
     tables: Markdown below the verdicts.
     """
 
@@ -208,7 +207,7 @@ class Study:
     metrics: tuple[str, ...]
     claims: tuple[Claim, ...]
     panels: tuple[str, ...] = ("scene",)
-    draw: Callable[[StudyRequest, SeedTable], None] | None = None
+    draw: tuple[Callable[[StudyRequest, SeedTable], None], ...] = ()
     tables: Callable[[SeedTable], str] | None = None
 
 
@@ -219,9 +218,9 @@ def run_study(study: Study, request: StudyRequest) -> list[Verdict]:
     rows = study.measure(study.cases(request), request)
     write_csv(request.out / f"{study.name}.csv", rows)
     table = SeedTable(rows)
-    if study.draw is not None:
-        with ProgressLine(sys.stderr).running("figures"):
-            study.draw(request, table)
+    with ProgressLine(sys.stderr).running("figures" if study.draw else None):
+        for draw in study.draw:
+            draw(request, table)
     verdicts = judge(study, table)
     write_text(request.out / f"{study.name}.md", markdown(study, request, table, verdicts))
     found = {

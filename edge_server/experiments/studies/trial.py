@@ -7,7 +7,6 @@ and repeated bit for bit. Trials that differ only in policy share decision insta
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -28,6 +27,7 @@ from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.images import to_bytes
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SHOWN, Scorer
+from edge_server.fields.registry import make_field
 from edge_server.live.state import Publication
 from edge_server.scheduler.learned.rewards import f_w
 from freshfield.scenario import Scenario, ScenarioError, load, parse, seed_sequence
@@ -250,7 +250,11 @@ def last_images(trial: Trial, folders: Folders) -> tuple[NDArray[np.uint8], NDAr
     """(truth, rendering, figures) of the trial's decision on the held-out camera, uint8 (H, W, 3)."""
 
     def look(publication: Publication, deployment: VirtualDeployment) -> Any:
-        return *_rendered(trial, deployment, publication.published_ns), _row(publication, deployment)
+        present_ns, truth = publication.published_ns, deployment.truth
+        assert truth is not None  # of ``open_stage``
+        image, lens, pose = truth.view(trial.scenario().held_out[0], present_ns)
+        color = deployment.updates.field.snapshot(present_ns).render(pose, lens).color
+        return image, to_bytes(color), _row(publication, deployment)
 
     return _decided(trial, folders, look)
 
@@ -267,7 +271,7 @@ def _decided(trial: Trial, folders: Folders, look: Callable[[Publication, Virtua
     deployment = build_deployment(
         scenario,
         trial.run_settings(),
-        field=_field(trial),
+        field=make_field(trial.field, trial.field_options, seed=0),
         cameras=stage.cameras,
         data=folders.data,
         on_published=published,
@@ -315,7 +319,7 @@ def _shown_scores(publication: Publication, deployment: VirtualDeployment, rng: 
     for k, random in enumerate(rng.random(_SHOWN_INSTANTS)):
         at_ns = max(truth.nearest_ns(began_ns + round((k + random) / _SHOWN_INSTANTS * lasts_ns)), began_ns)
         scores.append(truth.score(snapshot.at(at_ns), at_ns))
-    return {f"shown_{name}": mean_or_none([getattr(s, name) for s in scores if s]) for name in SHOWN}
+    return {f"shown_{name}": mean_or_none([getattr(s, name) for s in scores]) for name in SHOWN}
 
 
 @lru_cache(4)  # a process keeps a few, because trials come grouped by their images
@@ -324,29 +328,3 @@ def _stage(stage: tuple[Any, ...], lpips: bool, folders: Folders) -> Stage:
     trial = Trial(scene, 0, {"preset": "ideal"}, size=size, scale=scale, cameras=cameras, speed_m_per_s=speed)
     scenario = trial.scenario()
     return open_stage(scenario, Scorer(open_lpips(folders.lpips)[0] if lpips else None), folders)
-
-
-_FIELDS: dict[str, Any] = {}
-
-
-def _field(trial: Trial) -> Any:
-    """A new field with the trial's settings; the object is reused within a process, for its memory."""
-    from edge_server.fields.registry import make_field
-
-    key = json.dumps([trial.field, trial.field_options], sort_keys=True)
-    if key not in _FIELDS:
-        _FIELDS.clear()
-        _FIELDS[key] = make_field(trial.field, trial.field_options, seed=0)
-    made = _FIELDS[key]
-    made.reset()
-    return made
-
-
-def _rendered(
-    trial: Trial, deployment: VirtualDeployment, present_ns: int
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """The held-out camera's true image and the field's rendering of it, uint8 (H, W, 3)."""
-    assert deployment.truth is not None  # of ``open_stage``
-    image, lens, pose = deployment.truth.view(trial.scenario().held_out[0], present_ns)
-    color = deployment.updates.field.snapshot(present_ns).render(pose, lens).color
-    return image, to_bytes(color)

@@ -23,8 +23,9 @@ from edge_server.experiments.viewpoints.stage import Stage, open_stage
 from edge_server.fidelity.images import to_bytes
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
+from edge_server.fields import Field
 from edge_server.report.style import figure, label_lines
-from edge_server.viewpoints.capture_planner import Budget, Plan, plan_capture
+from edge_server.viewpoints.capture_planner import Budget, Plan, Stop, plan_capture
 from edge_server.viewpoints.registry import make_selector
 
 # label -> (selector, weight of the way)
@@ -128,19 +129,21 @@ def capture(case: Capture, *, folders: Folders) -> list[Row]:
     made = plan(stage, case.arm, case.seed, counts[-1], work)
     rows = []
     for count in counts:
-        score = stage.score(stage.fit(made.views[:count], work.steps, case.seed), scorer)
-        stops = made.stops[:count]
-        rows.append(
-            {
-                "views": len(stops),
-                "psnr_db": score.psnr_db,
-                "ssim": score.ssim,
-                "lpips": score.lpips,
-                "path_m": sum(s.travel_m for s in stops),
-                "choice_ms": 1e3 * float(np.mean([s.seconds for s in stops[1:]])),
-            }
-        )
+        field, stops = stage.fit(made.views[:count], work.steps, case.seed), made.stops[:count]
+        rows.append({"views": len(stops), **measured(stage, field, stops, scorer)})
     return rows
+
+
+def measured(stage: Stage, field: Field, stops: Sequence[Stop], scorer: Scorer) -> Row:
+    """Quality on the views held out, path, and milliseconds of a choice."""
+    score = stage.score(field, scorer)
+    return {
+        "psnr_db": score.psnr_db,
+        "ssim": score.ssim,
+        "lpips": score.lpips,
+        "path_m": sum(stop.travel_m for stop in stops),
+        "choice_ms": 1e3 * float(np.mean([stop.seconds for stop in stops[1:]])),
+    }
 
 
 def _draw(request: StudyRequest, table: SeedTable) -> None:
@@ -229,6 +232,6 @@ VIEWPOINTS = Study(
             metrics=("path_m",),
         ),
     ),
-    draw=_draw,
+    draw=(_draw,),
     tables=_tables,
 )

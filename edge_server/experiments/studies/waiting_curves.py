@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from edge_server.experiments.common.seed_table import Row, SeedTable
-from edge_server.experiments.studies.drawing import curves, instants, several
+from edge_server.experiments.studies.drawing import curves, instants
 from edge_server.experiments.studies.findings import better, interior, plateau, trend
 from edge_server.experiments.studies.study import Claim, Study, StudyRequest
 from edge_server.experiments.studies.trial import Point, recording, run_points, scenes_here, sweep, usual_trial
@@ -100,7 +100,7 @@ OMEGA = Study(
         ),
     ),
     ("scene", "channel"),
-    several(
+    (
         curves("omega", "omega_ms", "omega (ms)", (*NEAR, *FRESHNESS), "policy", ("scene", "channel")),
         *(
             instants(f"omega-{policy}", ("room", "kitchen"), policy, SHOWN, {"preset": "ch6-high"}, every_ms=2400.0)
@@ -161,7 +161,7 @@ IMAGES = Study(
         ),
     ),
     ("scene", "field", "channel"),
-    curves("images", "images", "images, the freshest", (*IMAGE_METRICS, "ssim"), "policy"),
+    (curves("images", "images", "images, the freshest", (*IMAGE_METRICS, "ssim"), "policy"),),
 )
 
 # --- figure 6.7 ----------------------------------------------------------------------------------------------
@@ -199,5 +199,5 @@ REPRESENTATIONS = Study(
         for policy in ("threshold", "wait")
     ),
     ("scene", "field"),
-    curves("representations", "omega_ms", "omega (ms)", FIELD_METRICS, "field", ("scene", "policy")),
+    (curves("representations", "omega_ms", "omega (ms)", FIELD_METRICS, "field", ("scene", "policy")),),
 )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
-import sys
 from collections.abc import Sequence
 from functools import partial
 
@@ -61,25 +60,15 @@ on. After Ctrl-C the same command continues, bit for bit, whatever --jobs and --
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
-    folders = folders_of(args)
-    try:
-        setting = setting_of(args, load(args.scenario))
-        config = _config(args, setting, folders)
-    except (ScenarioError, DatasetError, ValueError) as error:
-        print(f"edge-server train-scheduler: {error}", file=sys.stderr)
-        return 2
-
-    def work() -> None:
-        args.out.mkdir(parents=True, exist_ok=True)  # first, so that an error does not waste the work
-        _train(args, setting, config, folders)
-
+    errors = (ScenarioError, DatasetError, EngineError, ValueError)
     stopped = f"what is finished is in {args.out}: run the same command again to resume"
-    return run_command(
-        "edge-server train-scheduler", work, (ScenarioError, DatasetError, EngineError, TrainingError), stopped
-    )
+    return run_command("edge-server train-scheduler", lambda: _train(args), errors, stopped)
 
 
-def _train(args: argparse.Namespace, setting: Setting, config: TrainingConfig, folders: Folders) -> None:
+def _train(args: argparse.Namespace) -> None:
+    folders, setting = folders_of(args), setting_of(args, load(args.scenario))
+    config = _config(args, setting, folders)
+    args.out.mkdir(parents=True, exist_ok=True)  # first, so that an error does not waste the work
     print(f"  rewarded from {', '.join(setting.rewarding)}")
     if config.reward.fidelity == "whole" and not config.reward.age:
         print(

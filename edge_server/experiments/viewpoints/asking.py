@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,6 @@ from edge_server.experiments.viewpoints.reconstructions import (
 from edge_server.experiments.viewpoints.stage import Stage
 from edge_server.progress import ProgressLine
 from edge_server.viewpoints.candidates import ViewpointError
-from edge_server.viewpoints.capture_planner import Plan
 from edge_server.viewpoints.experts import SimulatedExpert
 from edge_server.viewpoints.features import StepFeatures
 from edge_server.viewpoints.policy import CandidatePolicy, PolicyConfig, train_policy
@@ -36,54 +34,58 @@ ShowPlan = Callable[[list[str], bytes], None]
 VIEWS = 8  # views of a reconstruction, if the budget is only in meters
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """A comparison of reconstructions.
-
-    views: number of views of each reconstruction.
-    count: number of reconstructions.
-    questions: number of questions.
-    steps: optimizer steps of each fit.
-    out: output folder.
-    """
-
-    views: int
-    count: int
-    questions: int
-    steps: int
-    seed: int
-    out: Path
-
-
 def compare(
-    stage: Stage, about: Comparison, who: str, page: tuple[str, int], transport: Transport
+    stage: Stage,
+    who: str,
+    *,
+    views: int,
+    count: int,
+    questions: int,
+    steps: int,
+    seed: int,
+    out: Path,
+    page: tuple[str, int],
+    transport: Transport,
 ) -> tuple[PreferenceSession, ShowPlan | None]:
     """Run a session until it is finished; returns it and, with a page, the function that shows the plan
     there. It continues from OUT/answers.json, which is written after each answer.
 
     who: PERSON, or the taste of a simulated expert.
+    views: number of views of each reconstruction. count: number of reconstructions. questions: their number.
+    steps: optimizer steps of each fit.
     page: host and port.
     Raises ViewpointError for answers of another session, and OptionError or TransportError if the page cannot
     be served.
     """
-    plans = varied_plans(stage, about.count, about.views, about.seed)
-    steps = StepFeatures(stage.candidates)
+    plans = varied_plans(stage, count, views, seed)
+    features_of = StepFeatures(stage.candidates)
     orders = tuple(tuple(plan.order) for plan in plans)
-    features = np.array([steps.trajectory(order) for order in orders])
+    features = np.array([features_of.trajectory(order) for order in orders])
     by = PERSON if who == PERSON else SimulatedExpert(who, np.zeros(0), np.random.default_rng()).label
-    made_of = identity(stage, plans, about.steps, about.seed)
-    session = PreferenceSession(stage.name, orders, features, about.questions, about.seed, by, made_of=made_of)
-    path = about.out / ANSWERS
+    made_of = identity(stage, plans, steps, seed)
+    session = PreferenceSession(stage.name, orders, features, questions, seed, by, made_of=made_of)
+    path = out / ANSWERS
     if path.exists():
         try:
             session = session.imported(read_bytes(path))
         except (OSError, ViewpointError) as error:
             raise ViewpointError(f"{path}: {error}; move it away, or name another --out") from None
     if who == PERSON:
-        return _on_the_page(stage, about, plans, session, page, transport)
+        transport.guard(page[0], "preference page", http=True)  # before the fits, which take minutes
+        progress = ProgressLine(sys.stderr)
+        with progress.running("reconstructions"):
+            made = sprites(
+                stage,
+                plans,
+                steps,
+                seed,
+                out / "reconstructions",
+                lambda k: progress("reconstructions", (k + 1) / len(plans)),
+            )
+        return _on_the_page(session, made, path, page, transport)
     print(f"{len(plans)} reconstructions are made and compared by a {by}", flush=True)
-    scores = [taste_score(stage, stage.fit(plan.views, about.steps, about.seed), who) for plan in plans]
-    expert = SimulatedExpert(who, np.array(scores), np.random.default_rng(about.seed))
+    scores = [taste_score(stage, stage.fit(plan.views, steps, seed), who) for plan in plans]
+    expert = SimulatedExpert(who, np.array(scores), np.random.default_rng(seed))
     while (asked := session.question) is not None:
         first = expert.answer(asked.left, asked.right).prefers_first
         session = session.answered("left" if first else "right")
@@ -92,28 +94,11 @@ def compare(
 
 
 def _on_the_page(
-    stage: Stage,
-    about: Comparison,
-    plans: list[Plan],
-    session: PreferenceSession,
-    page: tuple[str, int],
-    transport: Transport,
+    session: PreferenceSession, made: list[bytes], path: Path, page: tuple[str, int], transport: Transport
 ) -> tuple[PreferenceSession, ShowPlan]:
+    """made: pictures of the reconstructions. path: of the answers."""
     from edge_server.page.preferences import PageError, PreferencePage
 
-    transport.guard(page[0], "preference page", http=True)  # before the fits, which take minutes
-
-    progress = ProgressLine(sys.stderr)
-    with progress.running("reconstructions"):
-        made = sprites(
-            stage,
-            plans,
-            about.steps,
-            about.seed,
-            about.out / "reconstructions",
-            lambda k: progress("reconstructions", (k + 1) / len(plans)),
-        )
-    path = about.out / ANSWERS
     asking = PreferencePage(session, made, FRAMES, COLUMNS, lambda s: write_json(path, s.as_json()))
     try:
         url, close = asking.serve(*page, transport)

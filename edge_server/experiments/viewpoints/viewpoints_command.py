@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, run_command
 from edge_server.experiments.common.arguments import OptionError, add_folders, at_least, folders_of
-from edge_server.experiments.viewpoints.asking import ANSWERS, VIEWS, Comparison, compare, learn
+from edge_server.experiments.viewpoints.asking import ANSWERS, VIEWS, compare, learn
 from edge_server.experiments.viewpoints.drawing import draw_plan
 from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
 from edge_server.fidelity.lpips_weights import open_lpips
@@ -68,9 +68,18 @@ def _run(args: argparse.Namespace) -> None:
     if args.ask:
         args.out.mkdir(parents=True, exist_ok=True)
         views = min(budget.views or VIEWS, int(stage.candidates.reachable.sum()))
-        page = (args.page_host, args.page_port)
-        comparison = Comparison(views, args.reconstructions, args.questions, args.steps, args.seed, args.out)
-        session, show = compare(stage, comparison, args.ask, page, transport.from_arguments(args))
+        session, show = compare(
+            stage,
+            args.ask,
+            views=views,
+            count=args.reconstructions,
+            questions=args.questions,
+            steps=args.steps,
+            seed=args.seed,
+            out=args.out,
+            page=(args.page_host, args.page_port),
+            transport=transport.from_arguments(args),
+        )
         agreed, repeated = session.agreement
         print(f"answered by {session.by}: {session.model.says()}; repeated pairs alike: {agreed} of {repeated}")
         if session.model.knows:

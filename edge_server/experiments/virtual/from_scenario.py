@@ -12,8 +12,8 @@ from camera_node.settings import SourceConfig, WorldConfig, errors_of, source_co
 from camera_node.synthetic import Scene, make_scene
 from channel_emu.model.settings import channel_from_mapping
 from edge_server.experiments.virtual.run_settings import RunSettings
-from edge_server.experiments.virtual.truth import CapturedTruth, ExactTruth
-from edge_server.experiments.virtual.virtual_deployment import Truth, VirtualDeployment
+from edge_server.experiments.virtual.truth import CapturedTruth, ExactTruth, Truth
+from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Field
 from edge_server.live.field_updater import open_updater

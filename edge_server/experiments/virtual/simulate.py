@@ -19,7 +19,7 @@ from msgspec.structs import asdict
 from camera_node.capture import build_cameras
 from camera_node.settings import source_config
 from edge_server.command import command_parser, run_command
-from edge_server.experiments.common.arguments import add_folders, folders_of
+from edge_server.experiments.common.arguments import add_folders, at_least, folders_of
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none, number
 from edge_server.experiments.engine import processor
@@ -305,11 +305,12 @@ def check_seconds(seconds: float) -> None:
 
 
 def usual_settings(config: EdgeConfig) -> RunSettings:
-    """What an ``edge:`` section says of a run, scored at random instants."""
+    """What an ``edge:`` section says of a run, scored at random instants. Two decisions are a live update's time apart
+    if updates follow arrivals, else at most _CYCLE_MS."""
     return RunSettings(
         steps=config.steps,
         compute=config.compute,
-        epoch_ms=_epoch_ms(config),
+        epoch_ms=config.update_ms if config.updates == "arrivals" else min(config.update_ms, _CYCLE_MS),
         grace_ms=config.grace_ms,
         score_every_ms=_SCORED_EVERY_MS,
         shown_every_ms=_SCORED_EVERY_MS,
@@ -319,11 +320,6 @@ def usual_settings(config: EdgeConfig) -> RunSettings:
 def _settings(config: EdgeConfig, args: argparse.Namespace) -> RunSettings:
     found = usual_settings(config)
     return found if args.steps is None else dataclasses.replace(found, steps=args.steps)
-
-
-def _epoch_ms(config: EdgeConfig) -> float:
-    """Least time between two decisions: a live update's time if updates follow arrivals, else at most _CYCLE_MS."""
-    return config.update_ms if config.updates == "arrivals" else min(config.update_ms, _CYCLE_MS)
 
 
 def _compute(text: str) -> ComputeConfig:
@@ -348,7 +344,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME[:VALUE]",
         help="in place of the scenario's: all, threshold:120, bandit:FILE, FILE.py:CLASS (docs/scheduling.md)",
     )
-    add("--steps", type=int, metavar="N", help="optimizer steps of an update [edge.steps, else 100]")
+    add("--steps", type=at_least(1), metavar="N", help="optimizer steps of an update [edge.steps, else 100]")
     add("--compute", metavar="zero|MS:MS", help="ms per step and ms per update [edge.compute, else zero]")
     add_folders(parser)
     add(

@@ -57,10 +57,8 @@ class ExactTruth:
         for camera, (intrinsics, pose) in self.cameras.items():
             truth = self.image(camera, present_ns / 1e9)
             earlier = [self.image(camera, (present_ns - lag) / 1e9) for lag in lags_ns]
-            shown = field.render(pose, intrinsics).color
-            score = self.scorer.score(camera, shown, present_ns, truth, present_ns, earlier)
             view = View(camera, truth, pose, intrinsics, present_ns)
-            scores.append(with_refined(score, render_refined(field, view), view, self.scorer))
+            scores.append(_score(self.scorer, field, view, present_ns, earlier))
         return mean_score(scores)
 
 
@@ -105,12 +103,21 @@ class CapturedTruth:
             lags = [ticks[i] for i in frames_at_lags(times, times[-1])]
             before = [camera.capture(k) for k in lags]
             earlier = [_image(camera, b) for b in before if b.pose == shot.pose]
-            shown = field.render(shot.pose.matrix(), shot.intrinsics).color
-            image, bound = _image(camera, shot), self._bounds[camera.name]
-            score = self._scorer.score(camera.name, shown, present_ns, image, times[-1], earlier, bound)
-            view = View(camera.name, image, shot.pose.matrix(), shot.intrinsics, times[-1])
-            scores.append(with_refined(score, render_refined(field, view), view, self._scorer))
+            view = View(camera.name, _image(camera, shot), shot.pose.matrix(), shot.intrinsics, times[-1])
+            scores.append(_score(self._scorer, field, view, present_ns, earlier, self._bounds[camera.name]))
         return mean_score(scores)
+
+
+Truth = ExactTruth | CapturedTruth
+"""Scores renders of the field at the present."""
+
+
+def _score(
+    scorer: Scorer, field: Any, view: View, present_ns: int, earlier: list[NDArray[np.uint8]], bound: float = BOUND
+) -> Score:
+    shown = field.render(view.camera_to_world, view.intrinsics).color
+    score = scorer.score(view.camera, shown, present_ns, view.image, view.generated_ns, earlier, bound)
+    return with_refined(score, render_refined(field, view), view, scorer)
 
 
 def _nearest(camera: Camera, at_ns: int) -> int:

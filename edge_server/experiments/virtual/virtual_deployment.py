@@ -13,7 +13,7 @@ import heapq
 import itertools
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,9 +23,10 @@ from channel_emu.model.link import Event, EventKind, Link
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.settings import ChannelConfig
 from edge_server.experiments.virtual.run_settings import RunSettings
+from edge_server.experiments.virtual.truth import Truth
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Budget, Snapshot
-from edge_server.live.field_updater import FieldUpdater, Selection
+from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.ingest import FrameAdmission
 from edge_server.live.state import Publication
 from edge_server.scheduler.policy import Policy
@@ -47,24 +48,6 @@ class WakeCondition(NamedTuple):
 
 
 _AT_ARRIVAL = WakeCondition(on_arrival=True)
-
-
-class Truth(Protocol):
-    """Scores renders of the field at the present. See ``experiments.virtual.truth``."""
-
-    def of(self, cameras: Sequence[str]) -> Truth:
-        """The truth of some of the held-out cameras."""
-        ...
-
-    def nearest_ns(self, present_ns: int) -> int:
-        """The instant nearest to ``present_ns`` of which the truth is known."""
-        ...
-
-    def score(self, field: Any, present_ns: int) -> Score | None: ...
-
-    def view(self, camera: str, present_ns: int) -> tuple[Any, Any, Any]:
-        """Image, intrinsics and pose of a held-out camera at an instant."""
-        ...
 
 
 class VirtualDeployment:
@@ -212,6 +195,7 @@ class VirtualDeployment:
                 EventKind.SUPERSEDED,
                 EventKind.LOST,
                 EventKind.BROKEN,
+                EventKind.DUPLICATED,
             )
         }
         return {
@@ -220,7 +204,6 @@ class VirtualDeployment:
             "waiting": 0,
             "sent": sent,
             **ends,
-            "duplicated": sum(link.counts[EventKind.DUPLICATED] for link in self._links.values()),
             "delivered": sum(self.delivered.values()),
             "rejected": dict(self.rejected),
             "in_flight": sum(link.in_flight for link in self._links.values()),
@@ -342,7 +325,9 @@ class VirtualDeployment:
                 yield WakeCondition(plan.wait_until_ns) if waits else _AT_ARRIVAL
             if settings.scratch:
                 updates.field.reset()
-            fitted = updates.fit(self._selection_with_images(selection), Budget(steps=settings.steps))
+            others, items = self.with_images(selection.others), self.with_images(selection.items)
+            pictured = dataclasses.replace(selection, others=others, items=items)
+            fitted = updates.fit(pictured, Budget(steps=settings.steps))
             if fitted is None:
                 yield _AT_ARRIVAL  # every selected frame is damaged: newer ones will come
                 continue
@@ -366,12 +351,6 @@ class VirtualDeployment:
         while len(buffer.newest()) < len(self._cameras) and self.clock.now_ns() < until_ns:
             yield WakeCondition(until_ns, on_arrival=True)
 
-    def _selection_with_images(self, selection: Selection) -> Selection:
-        """The selection with images."""
-        return dataclasses.replace(
-            selection, others=self.with_images(selection.others), items=self.with_images(selection.items)
-        )
-
     def _publish(self, publication: Publication) -> None:
         publication = self._with_score(publication)
         self.publications.append(publication)
@@ -386,11 +365,8 @@ class VirtualDeployment:
             return publication
         if self._scored_ns is not None and present_ns - self._scored_ns < every_ms * 1e6:
             return publication
-        score = self.truth.score(self.updates.field.snapshot(present_ns), present_ns)
-        if score is None:
-            return publication
         self._scored_ns = present_ns
-        return publication.scored(score)
+        return publication.scored(self.truth.score(self.updates.field.snapshot(present_ns), present_ns))
 
     def _shown_instants(self, seed: int) -> Iterator[int]:
         """Seeded random instants, independent of the cameras' phase."""
@@ -408,9 +384,6 @@ class VirtualDeployment:
     def _score_shown(self, now_ns: int) -> None:
         self._show_ns = next(self._instants)
         shown = self.shown_now()
-        if shown is None:
-            return
-        assert self.truth is not None
-        score = self.truth.score(shown, now_ns)
-        if score is not None:
-            self.shown.append(score)
+        if shown is not None:
+            assert self.truth is not None
+            self.shown.append(self.truth.score(shown, now_ns))

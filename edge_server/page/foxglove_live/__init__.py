@@ -120,15 +120,11 @@ class FoxgloveServer(PageThread):
         super().stop()
         self._server.stop()
 
-    def _run(self) -> None:
-        while not self._stopped:
-            watched = any(channel.has_sinks() for channel in self._all)
-            try:
-                if watched:
-                    self._send()
-            except Exception as error:  # a viewer must never stop the server
-                self._say(error)
-            self._pause(TICK_S if watched else IDLE_S)
+    def _step(self) -> float:
+        if not any(channel.has_sinks() for channel in self._all):
+            return IDLE_S
+        self._send()
+        return TICK_S
 
     def _send(self) -> None:
         """Send what is new on the topics that somebody has subscribed to."""

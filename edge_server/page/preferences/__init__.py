@@ -11,6 +11,7 @@ import re
 import secrets
 import threading
 from collections.abc import Callable, Iterable, Sequence
+from http import HTTPStatus
 from importlib.resources import files
 from typing import Any
 
@@ -31,15 +32,6 @@ _HEADERS = [
         "'unsafe-inline'; script-src 'unsafe-inline'; frame-ancestors 'none'",
     ),
 ]
-_REASONS = {
-    200: "OK",
-    400: "Bad Request",
-    403: "Forbidden",
-    404: "Not Found",
-    409: "Conflict",
-    413: "Too Large",
-    507: "Not Kept",
-}
 
 
 class _Refused(Exception):
@@ -99,7 +91,7 @@ class PreferencePage:
         except _Refused as error:
             status, kind, body = error.status, "text/plain; charset=utf-8", str(error).encode()
         about = [("Content-Type", kind), ("Content-Length", str(len(body)))]
-        start_response(f"{status} {_REASONS[status]}", [*about, *_HEADERS])
+        start_response(f"{status} {HTTPStatus(status).phrase}", [*about, *_HEADERS])
         return [body]
 
     def _look(self, path: str, may_change: bool) -> tuple[str, bytes]:

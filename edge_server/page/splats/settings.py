@@ -16,6 +16,8 @@ KNOTS_SENT = 6
 
 TICK_S = 0.03
 """Between two looks at what the field has published, while somebody watches."""
+IDLE_S = 0.5
+"""The same while nobody does; whoever comes ends it."""
 STATUS_EVERY_S = 0.5
 """Cameras, ages and the line of text."""
 MOVING_EVERY_S = 0.1

@@ -24,7 +24,7 @@ from websockets.http11 import Response
 from edge_server.live.state import CameraView, EdgeState
 from edge_server.page.colors import HELD_OUT, age_color
 from edge_server.page.page_thread import PageThread
-from edge_server.page.splats.settings import TICK_S
+from edge_server.page.splats.settings import IDLE_S, TICK_S
 from edge_server.page.viewpoint import VERTICAL_FOV_RAD, Viewpoint
 
 if TYPE_CHECKING:  # with the kernels of Gaussians, which another field does not need
@@ -113,21 +113,15 @@ class SplatStream(PageThread):
             with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
                 await sending
 
-    def _run(self) -> None:
-        while True:
-            with self._wake:
-                while not self._connected and not self._stopped:
-                    self._wake.wait()
-                if self._stopped:
-                    return
-                connected = list(self._connected)
-            began = perf_counter()
-            try:
-                self._tick(connected)
-            except Exception as error:  # the page must never stop the server
-                self._say(error)
-            spent = perf_counter() - began
-            self._pause(max(TICK_S - spent, spent))
+    def _step(self) -> float:
+        with self._wake:
+            connected = list(self._connected)
+        if not connected:
+            return IDLE_S
+        began = perf_counter()
+        self._tick(connected)
+        spent = perf_counter() - began
+        return max(TICK_S - spent, spent)
 
     def _tick(self, connected: list[_Connected]) -> None:
         from edge_server.page.splats.published import Publisher

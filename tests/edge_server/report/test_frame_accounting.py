@@ -180,7 +180,7 @@ def test_an_old_frame_without_an_end_is_no_excuse_of_a_kill(tmp_path):
     with path.open("a") as file:
         file.write(f"0\ta\ts\t0\treceived\t\n{60 * 10**9}\ta\ts\t1\treceived\t\n")
     found = account_frames(tmp_path)
-    assert found.total.cut_off == 1 and found.total.without_end == (0, 1)
+    assert found.total["cut_off"] == 1 and found.total.without_end == (0, 1)
     assert found.contradictions == ["a s 0: the end of 1 sent copies is in no ledger"]
 
 
@@ -228,7 +228,7 @@ def test_a_long_run_is_joined_in_little_memory(tmp_path):
     accounting = account_frames(tmp_path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert accounting.total.delivered == accounting.total.captured == frames
+    assert accounting.total["delivered"] == accounting.total["captured"] == frames
     assert accounting.contradictions == []
     assert peak < 300 * frames, f"{peak / frames:.0f} bytes a frame"
 

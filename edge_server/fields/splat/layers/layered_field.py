@@ -449,7 +449,9 @@ class LayeredField:
         shown = MovingSnapshot.of(moving, self.origin_ns, self.observations.newest_s) if moving.alive else None
         exposed = self._at_present_exposure(still)
         depth = self.supervision.depth
-        self._published = LayeredSnapshot.of(still, exposed, shown, None if depth is None else depth.scene)
+        parts = still.box, exposed, still.background, still.pool, still.step, still.planar
+        surfaces = None if depth is None else depth.scene
+        self._published = LayeredSnapshot(*parts, static=exposed.params, moving=shown, surfaces=surfaces)
         self.part_s.add("publication", begun)
 
     def _at_present_exposure(self, shown: SplatSnapshot) -> Gaussians:

@@ -66,13 +66,11 @@ class MovingSet:
     def bind(self, cameras: int) -> None:
         """Choose how motion is bound, by the number of cameras."""
         self.few = cameras <= tuned.FEW_CAMERAS
+        bounds = tuned.ACCELERATION_M_PER_S2, tuned.NEIGHBOR_M_PER_S
         if self.few:
-            far_m = self.box.distance_m
-            self.motion.acceleration_m_per_s2 = min(tuned.FEW_ACCELERATION_M_PER_S2, far_m)
-            self.motion.neighbor_m_per_s = min(tuned.FEW_NEIGHBOR_M_PER_S, far_m)
-        else:
-            self.motion.acceleration_m_per_s2 = tuned.ACCELERATION_M_PER_S2
-            self.motion.neighbor_m_per_s = tuned.NEIGHBOR_M_PER_S
+            few = tuned.FEW_ACCELERATION_M_PER_S2, tuned.FEW_NEIGHBOR_M_PER_S
+            bounds = min(few[0], self.box.distance_m), min(few[1], self.box.distance_m)
+        self.motion.acceleration_m_per_s2, self.motion.neighbor_m_per_s = bounds
 
     # --- at an instant ------------------------------------------------------------------------
 

@@ -66,19 +66,6 @@ class LayeredSnapshot(SplatSnapshot):
     moving: MovingSnapshot | None = None
     surfaces: SurfaceScene | None = None
 
-    @classmethod
-    def of(
-        cls,
-        still: SplatSnapshot,
-        exposed: Gaussians,
-        moving: MovingSnapshot | None,
-        surfaces: SurfaceScene | None = None,
-    ) -> LayeredSnapshot:
-        """A snapshot of the newest frame's instant. still: what the static field shows. exposed: its Gaussians at the
-        exposure to show."""
-        parts = still.box, exposed, still.background, still.pool, still.step
-        return cls(*parts, planar=still.planar, static=exposed.params, moving=moving, surfaces=surfaces)
-
     def unseen(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> NDArray[np.bool_] | None:
         """The pixels of a rendering whose background no camera has measured, bool (H, W); None without depth. What is
         shown there is a guess. Distortion is ignored. Takes some milliseconds."""

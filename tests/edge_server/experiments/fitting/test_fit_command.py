@@ -11,12 +11,12 @@ from contextlib import suppress
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.experiments.fitting.evaluate import fit_in_slices, marks_s
+from edge_server.experiments.fitting.fit import Fit, marks_s
 from edge_server.experiments.scenes.multiview_still import WHITE, mean_baselines, open_still
 from edge_server.fidelity.images import BLACK
 from edge_server.fields import FitReport, checkpoint
 from edge_server.report.build_report import build_report
-from tests.edge_server.experiments.sets import SMALL_WORDS, write_photos
+from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
 
 
 def fit(data, out, *words: str) -> int:
@@ -77,23 +77,19 @@ def test_one_carried_camera_is_a_scan_and_frames_with_times_are_refined(tmp_path
     assert json.loads(str(state["meta"]))["settings"]["gaussians"] == 8192
 
 
-def test_ctrl_c_where_python_cannot_raise_it_is_not_lost():
-    class Deaf:
-        """A field whose fits swallow it, as a callback of the garbage collector does."""
+def test_ctrl_c_where_python_cannot_raise_it_is_not_lost(tmp_path, monkeypatch):
+    """As in a callback of the garbage collector."""
 
-        fits = 0
+    def deaf(views, budget):
+        with suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.2)
+        return FitReport(1, 0.2, 0.0, 1, 1)
 
-        def fit(self, views, budget):
-            self.fits += 1
-            with suppress(KeyboardInterrupt):
-                os.kill(os.getpid(), signal.SIGINT)
-                time.sleep(0.2)
-            return FitReport(1, 0.2, 0.0, 1, 1)
-
-    field, scored, before = Deaf(), [], signal.getsignal(signal.SIGINT)
-    score = object()
-    assert fit_in_slices(field, [], lambda: score, (1.0, 2.0, 9.0), scored.append) is False
-    assert field.fits == len(scored) == 1 and scored[0].score is score
+    write_photos(tmp_path / "set", 5)
+    made, before = Fit(open_still(tmp_path / "set"), "ngp", SMALL), signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(made.field, "fit", deaf)
+    assert made.run(9.0) is False and len(made.rows) == 1 and made.rows[0].psnr_db is not None
     assert signal.getsignal(signal.SIGINT) is before
 
 
@@ -115,8 +111,7 @@ def test_the_first_ctrl_c_while_it_saves_lets_it_finish(tmp_path, capsys, monkey
     if presses == 1:
         assert status == 0 and said.out.rstrip().endswith("report.html") and "stopped" not in said.out
     else:
-        assert status == 130 and f"stopped; {out}: written: field, series.jsonl, " in said.out
-        assert "not written: report.json, report.html (edge-server report" in said.out
+        assert status == 130 and f"stopped; {out} is written in part; edge-server report {out}" in said.out
         assert not (out / "report.json").exists()
         assert edge_server(["report", str(out)]) == 0
     assert report_of(out)["seconds"] > 0.0 and (out / "report.html").exists()

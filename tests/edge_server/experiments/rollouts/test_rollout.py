@@ -51,7 +51,7 @@ def test_samples_have_actions_of_their_own_and_share_the_episode():
     "what",
     [pytest.param(setting(), id="single decisions"), pytest.param(deployed(), id="deployed", marks=pytest.mark.slow)],
 )
-def test_a_job_gives_the_same_wherever_and_after_whatever_it_is_computed(what: Setting, monkeypatch):
+def test_a_job_gives_the_same_wherever_and_after_whatever_it_is_computed(what: Setting):
     """As processes have it: each job is sent to one, which has computed other jobs before, or none."""
     actor = Learner(dataclasses.replace(SELECT, hold_ms=300.0 * what.deployed), 0).actor
     makers = {"random": named("random"), "learned": learned(actor, explore=True)}
@@ -59,7 +59,7 @@ def test_a_job_gives_the_same_wherever_and_after_whatever_it_is_computed(what: S
     jobs = [Job(what.key, seed, name, samples=2) for seed in seeds(0, "test", 2) for name in makers]
     found = [work(job) for job in jobs]
     assert len({str(one) for one in found}) == len(jobs)
-    monkeypatch.setattr(rollout_module, "_FACTORIES", {})
+    rollout_module._factory.cache_clear()
     sent = pickle.loads(pickle.dumps(work))
     assert [sent(job) for job in reversed(jobs)] == found[::-1]
 

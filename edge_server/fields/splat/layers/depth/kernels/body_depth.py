@@ -9,26 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, lens_terms, load_camera, rotate_to_camera
-from edge_server.fields.common.kernels.jit import device_function, kernel
+from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.simd import draw
 from edge_server.fields.splat.layers.depth import settings as tuned
-from edge_server.fields.splat.layers.depth.kernels.depth_plate import pixel_median
+from edge_server.fields.splat.layers.depth.kernels.depth_plate import insert_sorted, pixel_median
 
 _WINDOW = (2 * tuned.BODY_RADIUS_PX + 1) ** 2
 _NEAREST_M, _FARTHEST_M = np.float32(1e-3), np.float32(1e6)  # no sensor measures beyond these: what does is none
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
-
-
-@device_function
-def _median(values, count):
-    """The upper median of the first ``count`` of ``values``, which are sorted."""
-    for i in range(1, count):
-        value, j = values[i], i
-        while j > 0 and values[j - 1] > value:
-            values[j] = values[j - 1]
-            j -= 1
-        values[j] = value
-    return values[count // 2]
 
 
 @kernel
@@ -69,9 +57,9 @@ def measure_body(counter, worker, depth, foreground, image, plate, samples, coun
             for j in range(max(y - tuned.BODY_RADIUS_PX, 0), min(y + tuned.BODY_RADIUS_PX + 1, height)):
                 for i in range(max(x - tuned.BODY_RADIUS_PX, 0), min(x + tuned.BODY_RADIUS_PX + 1, width)):
                     if inverse[j, i] > _F0:
-                        near[many] = inverse[j, i]
+                        insert_sorted(near, many, inverse[j, i])
                         many += 1
-            median = _median(near, many)
+            median = near[many // 2]
             if many < tuned.BODY_LEAST or abs(inverse[y, x] - median) >= np.float32(tuned.BODY_FLYING):
                 continue
             total, used = _F0, _F0

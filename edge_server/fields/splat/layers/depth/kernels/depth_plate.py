@@ -38,18 +38,23 @@ def remember_depths(counter, worker, depth, foreground, samples, count):
 
 
 @device_function
+def insert_sorted(ranked, count, value):
+    """Put a value in its place among the first ``count`` of ``ranked``, which are sorted."""
+    while count > 0 and ranked[count - 1] > value:
+        ranked[count] = ranked[count - 1]
+        count -= 1
+    ranked[count] = value
+
+
+@device_function
 def pixel_median(samples, count, y, x, ranked):
     """The median of a pixel's depths, 1 / m; 0 if it has too few, or many of them are not alike. ranked: float32
     (KEPT,), scratch."""
     n = min(count[y, x], samples.shape[2])
     if n < tuned.LEAST:
         return _F0
-    for k in range(n):  # insertion sort
-        value, i = samples[y, x, k], k
-        while i > 0 and ranked[i - 1] > value:
-            ranked[i] = ranked[i - 1]
-            i -= 1
-        ranked[i] = value
+    for k in range(n):
+        insert_sorted(ranked, k, samples[y, x, k])
     median = np.float32(0.5) * (ranked[(n - 1) // 2] + ranked[n // 2])
     near = 0
     for k in range(n):
@@ -91,14 +96,9 @@ def _local_median(inverse, y, x, near):
     n = 0
     for j in range(max(y - 1, 0), min(y + 2, height)):
         for i in range(max(x - 1, 0), min(x + 2, width)):
-            value, k = inverse[j, i], n
-            if value <= _F0:
-                continue
-            while k > 0 and near[k - 1] > value:
-                near[k] = near[k - 1]
-                k -= 1
-            near[k] = value
-            n += 1
+            if inverse[j, i] > _F0:
+                insert_sorted(near, n, inverse[j, i])
+                n += 1
     return np.float32(0.5) * (near[(n - 1) // 2] + near[n // 2]), n
 
 
