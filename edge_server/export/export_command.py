@@ -17,6 +17,8 @@ from edge_server.surface import SurfaceError
 from edge_server.surface.settings import MeshSettings
 from freshfield.files import out_file, out_folder
 
+SAVED_STREAM = ".ffsplats"
+
 DESCRIPTION = """\
 Write the results of a run or fit as files for other programs. RUN is its folder, or a checkpoint in it.
 
@@ -24,10 +26,12 @@ Write the results of a run or fit as files for other programs. RUN is its folder
   edge-server export runs/fit-tile --mesh tile.glb --voxel 1
   edge-server export runs/demo/snapshot-000120.npz --splats tile.ply
   edge-server export runs/demo --colmap out/colmap --transforms out/nerf
+  edge-server export room.ffsplats --splats room.ply    a saved splat stream: room-0000.ply and so on
 
 --mesh         triangles with colors: .ply or .glb (pip install 'freshfield[surface]')
 --splats       the Gaussians of a splat field, in the layout that splat viewers open (.ply), or a quarter as
-               large (.spz: pip install 'freshfield[spz]')
+               large (.spz: pip install 'freshfield[spz]'); of a stream that the page /splats/ saved,
+               a sequence of 30 files a second
 --points       surface points with colors (.ply)
 --colmap       DIR/images, under the pictures' own names, and a model in DIR/sparse/0, as text
 --transforms   DIR/transforms.json, DIR/images and DIR/points.ply, for nerfstudio and others
@@ -51,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser("edge-server export", DESCRIPTION)
     add = parser.add_argument
-    add("run", type=Path, metavar="RUN", help="folder of a run or fit (its --out), or a checkpoint")
+    add("run", type=Path, metavar="RUN", help="folder of a run or fit (its --out), a checkpoint, or .ffsplats")
     add("--mesh", type=out_file, metavar="FILE", help="mesh: .ply or .glb")
     add("--splats", type=out_file, metavar="FILE", help="Gaussians: .ply or .spz")
     add("--points", type=out_file, metavar="FILE", help="surface points: .ply")
@@ -89,6 +93,14 @@ def _parser() -> argparse.ArgumentParser:
 def _export(args: argparse.Namespace, files: dict[str, Path]) -> None:
     """Check all options, then write every file. Raises ExportError, SurfaceError."""
     check(files, args.count)
+    if args.run.suffix == SAVED_STREAM:
+        from edge_server.export.splat_sequence import write_sequence
+
+        if set(files) != {"splats"}:
+            raise ExportError(f"{args.run}: a saved stream has Gaussians alone: give --splats FILE.ply only")
+        check_installed(files)
+        print(f"{args.run}: {write_sequence(files['splats'], args.run)} frames", flush=True)
+        return
     settings = _mesh_settings(args)
     check_installed(files)  # after the options: what is written wrong is told also where it is missing
     source = open_source(args.run, args.allow_plugins)

@@ -12,6 +12,11 @@ DEFAULT_HEIGHT_PX = 480
 MOST_NAMED = 20
 """Cameras in an error."""
 
+FRAMES_PER_S = 30
+"""At which players show a sequence, unless told otherwise."""
+GAP_S = 5.0
+"""Longer pauses between messages of a saved stream are left out."""
+
 SPZ_BITS = 12
 """Of a position behind the binary point, as others write it."""
 SPZ_WHOLE_BITS = 23

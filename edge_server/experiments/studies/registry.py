@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from edge_server.experiments.studies.age_curves import LAMBDA, MAT, MAT_DELAY
+from edge_server.experiments.studies.depth_rate import DEPTH
 from edge_server.experiments.studies.learned_schedulers import ABLATION, DRIFT, PPO_SELECT, PPO_WAIT, WEIGHTS
 from edge_server.experiments.studies.metric_distortions import METRIC_DISTORTIONS
 from edge_server.experiments.studies.preferences import PREFERENCES
@@ -14,7 +15,7 @@ _OF_TRIALS = (MAT, MAT_DELAY, LAMBDA, OMEGA, IMAGES, REPRESENTATIONS)
 _OF_CAPTURES = (VIEWPOINTS, PREFERENCES)
 _OF_LEARNING = (PPO_SELECT, PPO_WAIT, ABLATION, WEIGHTS, DRIFT)
 STUDIES: dict[str, Study] = {
-    study.name: study for study in (METRIC_DISTORTIONS, *_OF_TRIALS, *_OF_CAPTURES, *_OF_LEARNING)
+    study.name: study for study in (METRIC_DISTORTIONS, *_OF_TRIALS, DEPTH, *_OF_CAPTURES, *_OF_LEARNING)
 }
 # Studies of trials on a channel, which --channel replaces.
 ON_A_CHANNEL = tuple(study.name for study in _OF_TRIALS)
@@ -22,5 +23,7 @@ ON_A_CHANNEL = tuple(study.name for study in _OF_TRIALS)
 CAPTURING = tuple(study.name for study in _OF_CAPTURES)
 # Studies that train: they take long and are not part of "all" either.
 LEARNING = tuple(study.name for study in _OF_LEARNING)
+# Studies of whole deployments, whose fields learn for seconds: not part of "all" either.
+DEPLOYED = (DEPTH.name,)
 # Studies that consist of cases: --case selects some of them.
 CASED = tuple(name for name in LEARNING if name != WEIGHTS.name)

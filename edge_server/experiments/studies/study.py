@@ -49,6 +49,7 @@ METRICS = {
     "aaoi_ms": Metric("mean age of used views (ms)", True, 1, 0.0),
     "f_w": Metric("F_w (6.37)", True, 3, 0.01),
     "f_w_corrected": Metric(f"F_w with w_s = {-W_S:g}", True, 3, 0.01),
+    "kilobytes_per_s": Metric("kilobytes a second, all cameras", True, 0, 0.0),
     "reward": Metric("reward", False, 4, 0.0),
     "path_m": Metric("path (m)", True, 2, 0.0),
     "does_not_know": Metric("share of cases", False, 2, 0.0),

@@ -13,7 +13,7 @@ from edge_server.experiments.common.arguments import add_folders, add_workers, f
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.engine import EngineError
 from edge_server.experiments.rollouts.setting import SEEDS_A_PURPOSE
-from edge_server.experiments.studies.registry import CAPTURING, CASED, LEARNING, ON_A_CHANNEL, STUDIES
+from edge_server.experiments.studies.registry import CAPTURING, CASED, DEPLOYED, LEARNING, ON_A_CHANNEL, STUDIES
 from edge_server.experiments.studies.study import StudyError, StudyRequest, run_study
 from edge_server.experiments.studies.trial import scenario_of
 from edge_server.experiments.training.trainer import TrainingError
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             cases=tuple(args.case),
             episodes=args.episodes,
         )
-        names = {"all": [n for n in STUDIES if n not in (*CAPTURING, *LEARNING)], "learning": list(LEARNING)}
+        names = {"all": [n for n in STUDIES if n not in (*CAPTURING, *LEARNING, *DEPLOYED)], "learning": list(LEARNING)}
         for name in checked(names.get(args.study, [args.study]), request):
             study, began = STUDIES[name], time.monotonic()
             print(f"== {name}: {study.title}", flush=True)

@@ -27,6 +27,12 @@ def contract(points: NDArray) -> NDArray:
     return np.where(far, np.sign(points) * (2.0 - 1.0 / np.where(far, np.abs(points), 1.0)), points)
 
 
+def expand(places: NDArray) -> NDArray:
+    """The inverse of ``contract``."""
+    far = np.abs(places) > 1.0
+    return np.where(far, np.sign(places) / np.maximum(2.0 - np.abs(places), 1e-6), places)
+
+
 def scale_range(params: NDArray[np.float32]) -> tuple[float, float]:
     """Lowest and highest log scale of Gaussians (N, >= 14), as far as they are drawn; a range that is not empty."""
     scales = params[:, SCALE:QUATERNION]
@@ -50,6 +56,21 @@ def to_records(params: NDArray[np.float32], scales: tuple[float, float]) -> NDAr
     out["turn"] = _bytes((vector + ZONE) / TURN_STEP)
     out["color"] = _bytes((params[:, COLOR:BASE] - COLOR_LOW) / COLOR_STEP)
     out["alpha"] = _bytes(255.0 / (1.0 + np.exp(-raw))) * sound
+    return out
+
+
+def from_records(records: NDArray[np.void], scales: tuple[float, float]) -> NDArray[np.float32]:
+    """Gaussians, float32 (N, 14), that draw as the records do: the inverse of ``to_records`` up to rounding and the
+    names of axes."""
+    out = np.zeros((len(records), BASE), np.float32)
+    low, high = scales
+    out[:, POSITION:SCALE] = expand(records["place"] * PLACE_STEP - 2.0)
+    out[:, SCALE:QUATERNION] = low + records["scale"] * ((high - low) / 255.0)
+    out[:, QUATERNION] = 1.0
+    out[:, QUATERNION + 1 : OPACITY] = records["turn"] * TURN_STEP - ZONE
+    alpha = np.clip(records["alpha"] / 255.0, 1e-4, 1.0 - 1e-4)
+    out[:, OPACITY] = np.log(alpha / (1.0 - alpha))
+    out[:, COLOR:BASE] = COLOR_LOW + records["color"] * COLOR_STEP
     return out
 
 

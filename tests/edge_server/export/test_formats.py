@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from edge_server.cli import main as edge_server
 from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.export import PosedImage, file_names, ply
 from edge_server.export.colmap import Cloud, write_model
@@ -21,7 +22,10 @@ from edge_server.fields import View
 from edge_server.fields.common.kernels.volume_rendering import harmonic
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.kernels.project import Gaussians
+from edge_server.page.splats.messages import HEAD, SAVED, StaticBlock, write_message
+from edge_server.page.splats.published import Publisher
 from freshfield.geometry import se3_inverse
+from tests.edge_server.page.splats.gaussians import BOX, NEWEST_S, ORIGIN_NS, snapshot
 from tests.edge_server.surface.ball import DISTORTED_LENS, LENS, ball_maps
 
 RNG = np.random.default_rng(5)
@@ -138,6 +142,38 @@ def test_splats_come_back_from_spz(tmp_path, sh_degree, radius_m, off_m):
     for c in range(3 * bool(sh_degree)):
         rest = np.clip(wanted("f_rest", range(3 * c, 3 * c + 3)), -1, 127 / 128)
         assert np.abs(found.shN[:, :, c] - rest).max() <= 0.51 / 128
+
+
+def test_a_saved_stream_becomes_a_sequence_of_what_a_visitor_saw(tmp_path, capsys):
+    shown, messages = snapshot(), []
+    published = Publisher(ORIGIN_NS).take(shown, 0.0)
+    whole = StaticBlock(1, 700, 0, published.static.scales, published.static.records)
+    for number, ahead_s in enumerate((-0.2, 0.0, 0.11, 1e9)):  # a pause at the end
+        blocks = [published.scene, *([whole, published.moving, published.knots] if number else [])]
+        message = write_message(number, NEWEST_S + ahead_s, blocks)
+        messages.append(SAVED.pack(len(message), 0.1 * number) + message)
+    stream, out = tmp_path / "room.ffsplats", tmp_path / "new" / "room.ply"
+    stream.write_bytes(b"".join(messages))
+    assert edge_server(["export", str(stream), "--splats", str(out)]) == 0
+    assert "5 frames" in capsys.readouterr().out
+    assert sorted(path.name for path in out.parent.iterdir()) == [f"room-{k:04d}.ply" for k in range(5)]
+    for k in (0, 3):
+        got = read_floats(out.with_stem(f"room-{k:04d}"))
+        moved = shown.moving.params_at(k / 30)[:, :3] * BOX.radius_m + np.array(BOX.center_m)
+        got_places = np.stack([got[n] for n in "xyz"], axis=-1)[700:]
+        assert np.linalg.norm(got_places[:, None] - moved, axis=-1).min(axis=0).max() < 2e-3  # meters; order is another
+
+
+@pytest.mark.stability
+def test_a_stream_that_cannot_be_read_is_said(tmp_path, capsys):
+    stream = tmp_path / "a.ffsplats"
+    lies = SAVED.pack(12, 0.0) + HEAD.pack(0, np.nan)
+    for content, words in ((b"", "holds no Gaussians"), (lies, "message 0: the instant")):
+        stream.write_bytes(content)
+        assert edge_server(["export", str(stream), "--splats", str(tmp_path / "a.ply")]) == 2
+        assert words in capsys.readouterr().err
+    assert edge_server(["export", str(stream), "--mesh", str(tmp_path / "a.ply")]) == 2
+    assert "Gaussians alone" in capsys.readouterr().err
 
 
 def read_floats(path: Path) -> dict[str, np.ndarray]:

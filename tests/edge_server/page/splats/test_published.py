@@ -8,11 +8,10 @@ import numpy as np
 
 from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.snapshot import SplatSnapshot
-from edge_server.page.splats.messages import StaticBlock, write_message
+from edge_server.page.splats.messages import StaticBlock, StreamReader, write_message
 from edge_server.page.splats.published import Published, Publisher
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, snapshot
-from tests.edge_server.page.splats.stream_reader import StreamReader
 
 START_NS, BEGIN_S = ORIGIN_NS - 3_500_000_000, 3.5  # the run began before the field's motion
 

@@ -5,10 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge_server.page.splats.records import RECORD, ZONE, contract, noticeable, scale_range, to_records, weights
+from edge_server.page.splats.records import (
+    RECORD,
+    ZONE,
+    contract,
+    expand,
+    from_records,
+    noticeable,
+    scale_range,
+    to_records,
+    weights,
+)
 from freshfield.geometry import quaternion_to_matrix
 from tests.edge_server.page.splats.gaussians import gaussians
-from tests.edge_server.page.splats.stream_reader import expand, from_records
 
 
 def covariances(params):

@@ -13,13 +13,13 @@ import websocket
 
 from edge_server.live.state import EdgeState, Publication
 from edge_server.page import Page, start_page
+from edge_server.page.splats.messages import StreamReader, read_saved
 from edge_server.page.splats.stream import STREAM
 from freshfield.limits import MAX_VISITORS
 from freshfield.transport import Transport
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.page.browser import Browser
 from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, snapshot
-from tests.edge_server.page.splats.stream_reader import StreamReader
 from tests.edge_server.page.test_access_guard import get, lines, login
 from tests.edge_server.page.test_page import bare_state
 from tests.edge_server.page.visitor import page_of
@@ -198,6 +198,13 @@ def test_a_stream_comes_back_when_it_broke_and_a_saved_one_is_played_without_the
         browser.wait_for(lambda: browser.evaluate("splats.reader.shown.total") == 900, "the stream again")
         assert "broke" not in browser.text()
         again.stop()
+        reader, times = StreamReader(), []
+        for came_s, message in read_saved(data):
+            reader.read(message)
+            times.append(came_s)
+        assert times == sorted(times) and times[0] == 0.0
+        assert len(reader.at(NEWEST_S)) == 820
+        assert len(list(read_saved(data[:-1]))) == len(times) - 1
         browser.evaluate(f"splats.open(new File([Uint8Array.from({list(data)})], 'room.ffsplats'))")
         browser.wait_for(lambda: browser.evaluate("splats.reader.shown.total") == 700, "the file's Gaussians")
         browser.wait_for(lambda: browser.evaluate("splats.reader.moving?.count") == 120, "what moves")

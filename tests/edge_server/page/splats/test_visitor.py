@@ -11,11 +11,18 @@ import pytest
 
 from channel_emu.live.tcp_proxy import PIECE_BYTES, TIMEOUT_S
 from edge_server.page.splats import settings as tuned
-from edge_server.page.splats.messages import KnotsBlock, MovingBlock, StaticBlock, UnseenBlock
+from edge_server.page.splats.messages import (
+    KnotsBlock,
+    MovingBlock,
+    StaticBlock,
+    StreamReader,
+    UnseenBlock,
+    read_message,
+)
 from edge_server.page.splats.published import Published, Publisher
+from edge_server.page.splats.records import from_records
 from edge_server.page.splats.visitor import LinkWindow, Visitor
 from tests.edge_server.page.splats.gaussians import NEWEST_S, gaussians, motion, snapshot
-from tests.edge_server.page.splats.stream_reader import StreamReader, from_records, read_message
 
 COUNT = 6000
 
@@ -253,7 +260,7 @@ def test_numbers_that_were_not_sent_change_nothing():
 def test_before_there_is_a_field_the_status_says_so():
     visitor = Visitor()
     data = visitor.message(None, 0.3, {"line": "compiling"}, 0.0)
-    assert read_message(data)[2][0].status["line"] == "compiling"
+    assert read_message(data)[2][0].content["line"] == "compiling"
     assert [visitor.message(None, 0.3, {}, now_s) is not None for now_s in (0.1, 0.5)] == [False, True]
     assert not visitor.link.short, "there was no more to send"
 
