@@ -5,7 +5,7 @@ and joins it with a finer one. So the backbone ends at the input of the first en
 YOLOv8 (module 9), YOLO11 (module 10), quantized files and files whose nodes an optimizer has renamed. Neck
 and head are not loaded.
 
-The file may come from anywhere: it is checked before anything in it is run or allocated.
+The file may come from anywhere: it is checked, and what it asks for is bounded (``embedder.open_session``).
 """
 
 from __future__ import annotations
@@ -13,9 +13,10 @@ from __future__ import annotations
 import ast
 import base64
 import hashlib
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -30,8 +31,6 @@ from freshfield.untrusted import read_bytes
 OUTPUT = "pooled"
 # Twice the largest detectors of the family, 230 MB.
 MAX_FILE_BYTES = 512 * 2**20
-# Largest tensor per image, elements: six times the largest of YOLO11x at 640 pixels.
-MAX_ELEMENTS = 2**26
 MAX_SIDE = 2048
 # Three times the largest of the family, quantized. ONNX Runtime takes 1 s to load a chain of so many, 12 s of 30,000.
 MAX_NODES = 10_000
@@ -43,68 +42,7 @@ PROJECTION_KEY = "freshfield.projection"
 _ENLARGE = ("Resize", "Upsample")
 _PER_IMAGE = "DynamicQuantizeLinear"
 _CONVOLVE = ("Conv", "ConvInteger", "QLinearConv")
-# Operators of backbones. Those whose output size is in their data (Expand, Tile, ConstantOfShape, Range,
-# loops) are missing: a few bytes could request any amount of memory.
-_KNOWN = frozenset(
-    [
-        "Abs",
-        "Add",
-        "AveragePool",
-        "BatchNormalization",
-        "Cast",
-        "Clip",
-        "Concat",
-        "Constant",
-        "Conv",
-        "ConvInteger",
-        "DequantizeLinear",
-        "Div",
-        "DynamicQuantizeLinear",
-        "Elu",
-        "Exp",
-        "Flatten",
-        "Gather",
-        "GlobalAveragePool",
-        "HardSigmoid",
-        "HardSwish",
-        "Identity",
-        "LeakyRelu",
-        "MatMul",
-        "MatMulInteger",
-        "MaxPool",
-        "Mish",
-        "Mul",
-        "PRelu",
-        "Pow",
-        "QLinearConv",
-        "QuantizeLinear",
-        "ReduceMean",
-        "ReduceMax",
-        "Relu",
-        "Reshape",
-        "Shape",
-        "Sigmoid",
-        "Slice",
-        "Softmax",
-        "Softplus",
-        "Split",
-        "Sqrt",
-        "Squeeze",
-        "Sub",
-        "Tanh",
-        "Transpose",
-        "Unsqueeze",
-    ]
-)
 _TYPES: dict[int, type[np.floating]] = {TensorProto.FLOAT: np.float32, TensorProto.FLOAT16: np.float16}
-
-
-@dataclass(frozen=True)
-class Projection:
-    """A model's learned projection: embeddings are (features - mean) @ axes. mean: (C,). axes: (C, K)."""
-
-    mean: NDArray[np.float32]
-    axes: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -116,6 +54,7 @@ class Backbone:
     tap: the tensor that is pooled.
     batch: images per run; None: any number.
     digest: start of the source file's SHA-256.
+    projection: float32 (C + C K,), a model's own mean (C,) and axes (C, K): embeddings are (features - mean) @ axes.
     """
 
     name: str
@@ -123,12 +62,11 @@ class Backbone:
     input: str
     dtype: type[np.floating]
     tap: str
-    channels: int
     batch: int | None
     height: int
     width: int
     digest: str
-    projection: Projection | None = None
+    projection: NDArray[np.float32] | None = None
 
 
 def load_backbone(path: Path) -> Backbone:
@@ -139,20 +77,19 @@ def load_backbone(path: Path) -> Backbone:
     image = _image_input(model, path)
     at = _find_end(model, path)
     cut = _cut(model, image.name, at, path)
-    batch, (height, width) = _shape_of(cut, meta, path)
-    channels = _check_shapes(cut, batch or 1, height, width, path)
+    batch, _, *sides = (d.dim_value for d in cut.graph.input[0].type.tensor_type.shape.dim)
+    height, width = input_size(sides, meta, path)
     return Backbone(
         name=path.stem,
         model=cut.SerializeToString(),
         input=image.name,
         dtype=_TYPES[image.type.tensor_type.elem_type],
         tap=at,
-        channels=channels,
-        batch=batch,
+        batch=batch or None,
         height=height,
         width=width,
         digest=hashlib.sha256(data).hexdigest()[:8],
-        projection=_projection(meta, channels, path),
+        projection=_projection(meta, path),
     )
 
 
@@ -249,11 +186,6 @@ def _cut(model: onnx.ModelProto, image: str, tap: str, path: Path) -> onnx.Model
         cut = Extractor(model).extract_model([image], [tap])
     except (ValueError, AssertionError) as error:
         raise EmbeddingError(f"{path}: the backbone cannot be cut out: {error}") from None
-    unknown = sorted({node.op_type for node in cut.graph.node} - _KNOWN)
-    if unknown or cut.functions:
-        raise EmbeddingError(
-            f"{path}: the backbone holds {', '.join(unknown) or 'functions'}, which no YOLO backbone does"
-        )
     if any(node.op_type == _PER_IMAGE and tap in node.output for node in cut.graph.node):
         raise EmbeddingError(
             f"{path}: {tap} is quantised with another scale for every image: export the model without that"
@@ -274,59 +206,31 @@ def _cut(model: onnx.ModelProto, image: str, tap: str, path: Path) -> onnx.Model
     return cut
 
 
-def _shape_of(cut: onnx.ModelProto, meta: dict[str, str], path: Path) -> tuple[int | None, tuple[int, int]]:
-    """(fixed batch or None, (height, width)) of the model's input."""
-    batch, _, height, width = (d.dim_value for d in cut.graph.input[0].type.tensor_type.shape.dim)
+def input_size(sides: Sequence[Any], meta: dict[str, str], path: Path) -> tuple[int, int]:
+    """(height, width) of a model's input. Raises EmbeddingError.
+
+    sides: as the model has them; a name or 0 where any will do: then those in the exporter's metadata, such as
+        ``[640, 640]``, else USUAL_SIDE.
+    """
+    height, width = (side if isinstance(side, int) else 0 for side in sides)
     if not (height and width):
-        height, width = exported_size(meta)
+        try:
+            height, width = (int(side) for side in ast.literal_eval(meta["imgsz"]))
+        except (KeyError, ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+            height = width = USUAL_SIDE
     if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE):
         raise EmbeddingError(f"{path}: images of {width} x {height} are not within 1 to {MAX_SIDE} a side")
-    return batch or None, (height, width)
+    return height, width
 
 
-def exported_size(meta: dict[str, str]) -> tuple[int, int]:
-    """(height, width) in the exporter's metadata, such as ``[640, 640]``, else USUAL_SIDE."""
-    try:
-        height, width = (int(side) for side in ast.literal_eval(meta["imgsz"]))
-        return height, width
-    except (KeyError, ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
-        return USUAL_SIDE, USUAL_SIDE
-
-
-def _check_shapes(cut: onnx.ModelProto, batch: int, height: int, width: int, path: Path) -> int:
-    """Number of channels of the tap. EmbeddingError: a tensor is larger than in any YOLO backbone."""
-    fed = onnx.ModelProto()
-    fed.CopyFrom(cut)
-    for dim, value in zip(fed.graph.input[0].type.tensor_type.shape.dim, (batch, 3, height, width)):
-        dim.Clear()
-        dim.dim_value = value
-    try:
-        known = onnx.shape_inference.infer_shapes(fed, data_prop=True)
-    except (onnx.shape_inference.InferenceError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:160]
-        raise EmbeddingError(f"{path}: takes no images of {width} x {height}: {reason}") from None
-    shapes = {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in known.graph.value_info}
-    shapes |= {t.name: list(t.dims) for t in cut.graph.initializer}
-    for name, shape in shapes.items():
-        if math.prod(max(d, 1) for d in shape) > MAX_ELEMENTS * batch:
-            raise EmbeddingError(f"{path}: the tensor {name} of shape {shape} is larger than any backbone's")
-    pooled = shapes.get("pooled.float", [])
-    if len(pooled) != 4 or pooled[1] < 1:
-        raise EmbeddingError(
-            f"{path}: the backbone's end is not a feature map (n, channels, height, width) but {pooled or 'unknown'}"
-        )
-    return int(pooled[1])
-
-
-def _projection(meta: dict[str, str], channels: int, path: Path) -> Projection | None:
+def _projection(meta: dict[str, str], path: Path) -> NDArray[np.float32] | None:
     """The projection that a model of ours carries in its metadata; None without one."""
     if PROJECTION_KEY not in meta:
         return None
     try:
         values = np.frombuffer(base64.b64decode(meta[PROJECTION_KEY], validate=True), "<f4")
-        mean, axes = values[:channels], values[channels:].reshape(channels, -1)
     except ValueError:
-        raise EmbeddingError(f"{path}: its projection is damaged: fetch the file again") from None
-    if len(mean) != channels or not np.isfinite(values).all():
+        values = np.full(1, np.nan)
+    if not np.isfinite(values).all():
         raise EmbeddingError(f"{path}: its projection is damaged: fetch the file again")
-    return Projection(mean.astype(np.float32), axes.astype(np.float32))
+    return values.astype(np.float32)

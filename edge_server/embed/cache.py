@@ -43,20 +43,15 @@ class EmbeddingCache:
         """
         keys = [(frame.camera, frame.session, frame.sequence) for frame in frames]
         missing = {key: frame for key, frame in zip(keys, frames) if key not in self._rows}
-        # Collected before anything is evicted: a decision may be larger than the cache.
-        found = {key: self._rows[key] for key in keys if key in self._rows} | self._embed(missing)
+        self._rows |= self._embed(missing)
         for key in keys:
-            self._rows[key] = found[key]
             self._rows.move_to_end(key)
+        rows = [self._rows[key] for key in keys]  # before anything is evicted: a decision may be larger than the cache
         while len(self._rows) > self._capacity:
             self._rows.popitem(last=False)
-        out = np.zeros((len(keys), self._embedder.dim), dtype=np.float32)
-        ok = np.zeros(len(keys), dtype=np.bool_)
-        for k, key in enumerate(keys):
-            row = found[key]
-            if row is not None:
-                out[k], ok[k] = row, True
-        return out, ok
+        zeros = np.zeros(self._embedder.dim, np.float32)
+        out = np.array([zeros if row is None else row for row in rows], np.float32).reshape(-1, self._embedder.dim)
+        return out, np.array([row is not None for row in rows], np.bool_)
 
     def _embed(self, missing: dict[_Key, Frame]) -> dict[_Key, _Row]:
         found: dict[_Key, _Row] = dict.fromkeys(missing)

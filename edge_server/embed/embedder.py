@@ -37,14 +37,14 @@ class Embedder:
         """dim: as in ``EmbeddingConfig``. Raises EmbeddingError if ``dim`` exceeds the backbone's channels,
         or the model does not run."""
         self.backbone, self.dim = backbone, dim
-        self._mean, self._axes = _projection(backbone, dim)
         self.failed = 0
         self.name = f"{backbone.name}-{backbone.digest} {backbone.tap} {backbone.width}x{backbone.height} d{dim}"
         self._session = open_session(backbone.model, backbone.name)
         self.step = backbone.batch or _BATCH
         """Images per run."""
         # A model that cannot run fails here, not at the first decision.
-        self.pooled([np.full((8, 8, 3), GRAY, np.uint8)])
+        channels = self.pooled([np.full((8, 8, 3), GRAY, np.uint8)]).shape[1]
+        self._mean, self._axes = _projection(backbone, channels, dim)
 
     def embed(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """Embeddings (n, dim), finite, of uint8 RGB images (H, W, 3) of any size; RGBA is composited over
@@ -66,15 +66,14 @@ class Embedder:
         """Features (n, channels): means over each image of the backbone's last feature map."""
         whole = [checked(image, number) for number, image in enumerate(images)]
         b = self.backbone
-        out = np.empty((len(whole), b.channels), dtype=np.float32)
-        step = self.step
-        for first in range(0, len(whole), step):
-            part = blob(whole[first : first + step], b.height, b.width, b.dtype)
+        out = []
+        for first in range(0, len(whole), self.step):
+            part = blob(whole[first : first + self.step], b.height, b.width, b.dtype)
             n = len(part)
             if b.batch is not None and n < b.batch:
                 part = np.concatenate([part, np.zeros((b.batch - n, *part.shape[1:]), part.dtype)])
-            out[first : first + n] = self.run(part)[:n]
-        return out
+            out.append(self.run(part)[:n])
+        return np.concatenate(out) if out else np.zeros((0, len(self._mean)), np.float32)
 
     def run(self, part: NDArray[np.floating]) -> NDArray[np.float32]:
         """Run the model once on prepared input (n, 3, height, width). Returns features (n, channels). Raises
@@ -83,11 +82,8 @@ class Embedder:
             found = np.asarray(self._session.run([OUTPUT], {self.backbone.input: part})[0])
         except Exception as error:  # ONNX Runtime's exceptions share no base class
             raise EmbeddingError(f"{self.backbone.name}: {reason_of(error)}") from None
-        if found.shape != (len(part), self.backbone.channels):
-            raise EmbeddingError(
-                f"{self.backbone.name}: {len(part)} images gave features of shape {found.shape}, expected "
-                f"({len(part)}, {self.backbone.channels})"
-            )
+        if found.ndim != 2 or len(found) != len(part):
+            raise EmbeddingError(f"{self.backbone.name}: {len(part)} images gave features of shape {found.shape}")
         return found
 
 
@@ -141,12 +137,14 @@ def reason_of(error: Exception, doing: str = "run") -> str:
     return f"ONNX Runtime cannot {doing} it: {text[:200]}"
 
 
-def _projection(backbone: Backbone, dim: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _projection(backbone: Backbone, channels: int, dim: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean (C,) and axes (C, dim): the model's own, else fixed, random and orthonormal, which keeps distances
     as well as any projection that ignores the data."""
-    channels = backbone.channels
     if backbone.projection is not None:
-        mean, axes = backbone.projection.mean, backbone.projection.axes
+        mean, axes = backbone.projection[:channels], backbone.projection[channels:]
+        if len(mean) != channels or axes.size % channels:
+            raise EmbeddingError(f"{backbone.name}: its projection is damaged: fetch the file again")
+        axes = axes.reshape(channels, -1)
         if dim > axes.shape[1]:
             raise EmbeddingError(f"dim: {backbone.name} has {axes.shape[1]} axes, {dim} were asked for")
         return mean, np.ascontiguousarray(axes[:, :dim])

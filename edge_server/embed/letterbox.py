@@ -13,21 +13,26 @@ from edge_server.embed import EmbeddingError
 GRAY = 114  # YOLO's padding
 
 
-def letterbox(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """``image`` (H, W, 3) scaled to fit and centered on gray: (height, width, 3). Each side has at least one
-    pixel at any aspect ratio."""
-    h, w = image.shape[:2]
-    if (h, w) == (height, width):
-        return image
+def placed(shape: tuple[int, int], height: int, width: int) -> tuple[float, tuple[int, int], tuple[int, int]]:
+    """Where an image of a shape (H, W) lies in a letterboxed input: its scale, its width and height of at least one
+    pixel each, its left upper corner."""
+    h, w = shape
     scale = min(height / h, width / w)
-    size = (max(1, round(w * scale)), max(1, round(h * scale)))
+    size = max(1, round(w * scale)), max(1, round(h * scale))
+    return scale, size, ((width - size[0]) // 2, (height - size[1]) // 2)
+
+
+def letterbox(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    """``image`` (H, W, 3) scaled to fit and centered on gray: (height, width, 3)."""
+    if image.shape[:2] == (height, width):
+        return image
+    scale, size, (left, top) = placed(image.shape[:2], height, width)
     # YOLO interpolates linearly both ways; averaging keeps a shrunk image from flickering with aliasing.
     how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
     fitted = cv2.resize(image, size, interpolation=how)
     if size == (width, height):
         return np.asarray(fitted, dtype=np.uint8)
     out = np.full((height, width, 3), GRAY, dtype=np.uint8)
-    top, left = (height - size[1]) // 2, (width - size[0]) // 2
     out[top : top + size[1], left : left + size[0]] = fitted
     return out
 

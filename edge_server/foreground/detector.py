@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError
-from edge_server.embed.backbone import MAX_SIDE, exported_size
+from edge_server.embed.backbone import input_size
 from edge_server.embed.embedder import INPUT_TYPES, open_model, reason_of
-from edge_server.embed.letterbox import blob, checked
+from edge_server.embed.letterbox import blob, checked, placed
 from edge_server.foreground import MODELS, SHIPPED, ForegroundError
 
 Array = NDArray[np.float64]
@@ -60,7 +60,10 @@ class Detector:
             raise ForegroundError(f"{file}: expected a model of images (n, 3, height, width)")
         self._input, self._dtype = image.name, INPUT_TYPES[image.type]
         meta = self._session.get_modelmeta().custom_metadata_map
-        self.height, self.width = _size(image.shape, meta, file)
+        try:
+            self.height, self.width = input_size(image.shape[2:], meta, file)
+        except EmbeddingError as error:
+            raise ForegroundError(str(error)) from None
         self.kinds = _kinds(meta)
         outputs = sorted(self._session.get_outputs(), key=lambda output: len(output.shape))
         task = meta.get("task", "segment")
@@ -85,7 +88,7 @@ class Detector:
             raise ForegroundError(f"{self.name}: gives {prototypes.shape}, not masks (1, n, height, width)")
         rows = decode(out, confidence, self.name, prototypes.shape[1], len(self.kinds), self._end_to_end)
         h, w = whole.shape[:2]
-        scale, _, (left, top) = self._placed((h, w))
+        scale, _, (left, top) = placed((h, w), self.height, self.width)
         found = []
         for x0, y0, x1, y1, score, kind, *weights in rows:
             box = ((x0 - left) / scale, (y0 - top) / scale, (x1 - left) / scale, (y1 - top) / scale)
@@ -93,18 +96,11 @@ class Detector:
             found.append(Detection(box, score, self.kinds.get(int(kind), str(int(kind))), mask))
         return found
 
-    def _placed(self, shape: tuple[int, int]) -> tuple[float, tuple[int, int], tuple[int, int]]:
-        """Scale of an image in the letterboxed input, and its size and left upper corner there."""
-        h, w = shape
-        scale = min(self.height / h, self.width / w)
-        size = max(1, round(w * scale)), max(1, round(h * scale))
-        return scale, size, ((self.width - size[0]) // 2, (self.height - size[1]) // 2)
-
     def _mask(self, weights: list[float], prototypes: Array, shape: tuple[int, int]) -> NDArray[np.bool_]:
         """Where the weighted sum of prototypes (n, h, w) is positive, as a mask of the image's ``shape``. The
         prototypes cover the model's input."""
         h, w = shape
-        _, size, (left, top) = self._placed(shape)
+        _, size, (left, top) = placed(shape, self.height, self.width)
         logits = np.tensordot(np.asarray(weights, np.float32), prototypes.astype(np.float32), 1)
         logits = np.nan_to_num(logits, nan=-1.0)
         whole = cv2.resize(logits, (self.width, self.height), interpolation=cv2.INTER_LINEAR)
@@ -192,16 +188,6 @@ def _end_to_end(meta: dict[str, str]) -> bool | None:
     if not any(each is not None for each in says):
         return None
     return any(str(each).lower() == "true" for each in says)
-
-
-def _size(shape: list[Any], meta: dict[str, str], file: Path) -> tuple[int, int]:
-    """(height, width) of the input: fixed by the model, else those of ``exported_size``."""
-    height, width = (side if isinstance(side, int) else 0 for side in shape[2:])
-    if not (height and width):
-        height, width = exported_size(meta)
-    if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE):
-        raise ForegroundError(f"{file}: images of {width} x {height} are not within 1 to {MAX_SIDE} a side")
-    return height, width
 
 
 def _kinds(meta: dict[str, str]) -> dict[int, str]:
