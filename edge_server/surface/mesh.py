@@ -17,9 +17,9 @@ if TYPE_CHECKING:  # of the extra surface
 
 Floats = NDArray[np.float32]
 
-MOST_VOXELS = 1 << 27  # of the box around the blocks: 512 MB of distances, and about as much for each step
 LEAST = 1e-3  # voxels; a distance of exactly 0 puts a vertex on a voxel and makes degenerate triangles
 KEEP_SHARE = 0.002  # share of the largest component's area; smaller components are removed
+NO_SURFACE = "the depth maps hold no surface within the bounds"
 INSTALL = "a mesh needs scikit-image and trimesh: pip install 'freshfield[surface]'"
 
 
@@ -28,7 +28,7 @@ def extract_mesh(volume: Volume, min_weight: float = 0.0) -> Trimesh:
     faces counter-clockwise seen from outside, with colors of vertices.
 
     min_weight: voxels need more fused weight than this to be known; faces connect only known voxels.
-    SurfaceError: scikit-image or trimesh is missing, there is no surface, or the box has more than ``MOST_VOXELS``.
+    SurfaceError: scikit-image or trimesh is missing, or there is no surface.
     """
     marching_cubes = import_marching_cubes()
     from trimesh import Trimesh
@@ -37,10 +37,11 @@ def extract_mesh(volume: Volume, min_weight: float = 0.0) -> Trimesh:
     distance, known = dense.distances()
     # scikit-image reads a cell's mask at its upper corner.
     cells = np.zeros(known.shape, np.bool_)
-    cells[1:, 1:, 1:] = _all_corners(known) & _crosses_surface(distance)
-    if not cells.any():
-        raise SurfaceError("the depth maps hold no surface within the bounds")
-    points, faces, *_ = marching_cubes(distance, 0.0, mask=cells)
+    cells[1:, 1:, 1:] = _all_corners(known)
+    try:
+        points, faces, *_ = marching_cubes(distance, 0.0, mask=cells)
+    except (RuntimeError, ValueError):  # no cell, or none that the surface crosses
+        raise SurfaceError(NO_SURFACE) from None
     index = points.astype(np.float64)
     vertices = dense.meters(index).astype(np.float32)  # as files have them: what they merge has no area
     return remove_degenerate(Trimesh(vertices, faces, vertex_colors=dense.colors(index), process=False))
@@ -64,18 +65,6 @@ def _all_corners(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return found
 
 
-def _crosses_surface(distance: Floats) -> NDArray[np.bool_]:
-    """Whether the surface passes through each cell (X - 1, Y - 1, Z - 1)."""
-    inside = distance < 0
-    some, every = inside, inside
-    for axis in range(3):
-        a, b = [slice(None)] * 3, [slice(None)] * 3
-        a[axis], b[axis] = slice(1, None), slice(None, -1)
-        some = some[tuple(a)] | some[tuple(b)]
-        every = every[tuple(a)] & every[tuple(b)]
-    return some & ~every
-
-
 class _Dense:
     """A volume as dense arrays. Indices start at the first voxel of block ``low``."""
 
@@ -83,16 +72,9 @@ class _Dense:
         self.volume, self.min_weight = volume, min_weight
         place = volume.blocks.place
         if not len(place):
-            raise SurfaceError("the depth maps hold no surface within the bounds")
+            raise SurfaceError(NO_SURFACE)
         low, high = place.min(axis=0), place.max(axis=0) + 1
         self.low, self.high = low.astype(np.int64), high.astype(np.int64)
-        voxels = int(np.prod((self.high - self.low) * SIDE))
-        if voxels > MOST_VOXELS:
-            least_m = volume.grid.voxel_m * (voxels / MOST_VOXELS) ** (1 / 3)
-            raise SurfaceError(
-                f"a mesh at {1e3 * volume.grid.voxel_m:g} mm has too many voxels: take {1e3 * least_m:.2g} mm "
-                "or more, or smaller bounds"
-            )
 
     def distances(self) -> tuple[Floats, NDArray[np.bool_]]:
         """Distances of all voxels (X, Y, Z), meters, and whether each is known."""

@@ -11,35 +11,28 @@ The fitted distances replace those of a fused volume; its weights and colors are
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.surface import SurfaceError
+from edge_server.surface import SurfaceError, settings
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.fuse import CELLS, SIDE
-from edge_server.surface.settings import SdfSettings
 from edge_server.surface.volume import Grid, Volume, fuse_maps
 
 MAX_NODES = 1 << 24
 
 
-def fit_sdf(
-    grid: Grid,
-    maps: Sequence[DepthMap],
-    say: Callable[[str, float], None] | None = None,
-    settings: SdfSettings | None = None,
-) -> Volume:
+def fit_sdf(grid: Grid, maps: Sequence[DepthMap], say: Callable[[str, float], None] | None = None) -> Volume:
     """Fit a function to ``maps`` and return its distances as a volume.
 
     say: called with the stage and its completed share.
     Raises SurfaceError if torch is missing, the grid is too fine, or there is nothing to fit.
     """
-    settings = settings or SdfSettings()
     volume = fuse_maps(grid, maps)
-    samples = _Samples.of(maps, grid)
-    if not len(samples.points):
+    samples = _samples(grid, maps)
+    if not len(samples[0]):
         raise SurfaceError("no camera sees anything solid within the bounds")
     nodes = int(np.prod(grid.blocks * SIDE))
     if nodes > MAX_NODES:
@@ -48,74 +41,60 @@ def fit_sdf(
             f"a distance function at {1e3 * grid.voxel_m:g} mm has too many nodes: take {1e3 * least:.2g} mm "
             "or more, smaller bounds, or method tsdf"
         )
-    distance = _optimize(grid, samples, settings, say)
+    distance = _optimize(grid, samples, say)
     x, y, z = grid.blocks
     blocked = distance.reshape(x, SIDE, y, SIDE, z, SIDE).transpose(0, 2, 4, 1, 3, 5).reshape(x, y, z, CELLS)
     clipped = np.clip(blocked[tuple(volume.blocks.place.T)], -grid.band_m, grid.band_m)
     return replace(volume, blocks=volume.blocks._replace(distance=clipped.astype(np.float32)))
 
 
-@dataclass(frozen=True)
-class _Samples:
-    """points: float32 (N, 3), on the surface, meters from the grid's lower corner. rays: (N, 3), directions
-    away from the camera. cosine, trust: (N,)."""
-
-    points: NDArray[np.float32]
-    rays: NDArray[np.float32]
-    cosine: NDArray[np.float32]
-    trust: NDArray[np.float32]
-
-    @classmethod
-    def of(cls, maps: Sequence[DepthMap], grid: Grid) -> _Samples:
-        points, rays, cosine, trust = [], [], [], []
-        for m in maps:
-            at = m.points() - np.array(grid.lower)
-            inside = ((at > 0) & (at < np.subtract(grid.upper, grid.lower))).all(axis=1)
-            points.append(at[inside])
-            rays.append((m.intrinsics.rays()[m.seen] @ m.camera_to_world[:3, :3].T)[inside])
-            cosine.append(m.cosine[m.seen][inside])
-            trust.append(m.trust[m.seen][inside])
-        every = (np.concatenate(part).astype(np.float32) for part in (points, rays, cosine, trust))
-        return cls(*every)
+def _samples(grid: Grid, maps: Sequence[DepthMap]) -> tuple[NDArray[np.float32], ...]:
+    """Of pixels that see a surface within the grid: points (N, 3), meters from the grid's lower corner, rays (N, 3),
+    away from the camera, and cosine and trust (N,)."""
+    found = []
+    for m in maps:
+        at = m.points() - np.array(grid.lower)
+        inside = ((at > 0) & (at < np.subtract(grid.upper, grid.lower))).all(axis=1)
+        rays = m.intrinsics.rays()[m.seen] @ m.camera_to_world[:3, :3].T
+        found.append([part[inside] for part in (at, rays, m.cosine[m.seen], m.trust[m.seen])])
+    return tuple(np.concatenate(part).astype(np.float32) for part in zip(*found))
 
 
 def _optimize(
-    grid: Grid, samples: _Samples, s: SdfSettings, say: Callable[[str, float], None] | None
+    grid: Grid, samples: tuple[NDArray[np.float32], ...], say: Callable[[str, float], None] | None
 ) -> NDArray[np.float32]:
-    """Distances (X, Y, Z) at the grid's voxels, meters."""
+    """Distances (X, Y, Z) at the grid's voxels, meters. samples: see ``_samples``."""
     try:
         import torch
         from torch.nn.functional import interpolate
     except ImportError:
         raise SurfaceError("method sdf needs torch: pip install 'freshfield[edge]'") from None
-    generator = torch.Generator().manual_seed(s.seed)
-    points, rays = torch.from_numpy(samples.points), torch.from_numpy(samples.rays)
-    cosine, trust = torch.from_numpy(samples.cosine), torch.from_numpy(samples.trust)
+    generator = torch.Generator().manual_seed(0)
+    points, rays, cosine, trust = map(torch.from_numpy, samples)
     chances = (trust.double() / trust.double().sum()).cumsum(0)
     size = tuple(int(n) for n in grid.blocks * SIDE)
     # All distances start slightly positive; the sides term and the surface points make the inside negative.
-    values = torch.full((1, 1, *_coarse_shape(size, s.levels - 1)), 0.5 * grid.band_m)
-    for level in range(s.levels):
-        scale = 2 ** (s.levels - 1 - level)
+    values = torch.full((1, 1, *_coarse_shape(size, settings.SDF_LEVELS - 1)), 0.5 * grid.band_m)
+    for level in range(settings.SDF_LEVELS):
+        scale = 2 ** (settings.SDF_LEVELS - 1 - level)
         voxel = grid.voxel_m * scale
-        shape = _coarse_shape(size, s.levels - 1 - level)
+        shape = _coarse_shape(size, settings.SDF_LEVELS - 1 - level)
         if level:
             values = interpolate(values, size=shape, mode="trilinear", align_corners=True)
         values = values.detach().clone().requires_grad_()
         extent = torch.tensor([(n - 1) * voxel for n in shape])
-        optimizer = torch.optim.Adam([values], lr=s.rate * voxel, betas=(0.9, 0.95))
-        for step in range(s.steps):
+        optimizer = torch.optim.Adam([values], lr=settings.SDF_RATE * voxel, betas=(0.9, 0.95))
+        for step in range(settings.SDF_STEPS):
             # Sample by trust; searchsorted does what multinomial would, without its limit of 2^24.
-            drawn = torch.searchsorted(chances, torch.rand(s.points, generator=generator, dtype=torch.float64)).clamp_(
-                max=len(chances) - 1
-            )
-            loss = _loss(values, extent, voxel, grid.band_m, points[drawn], rays[drawn], cosine[drawn], s, generator)
-            optimizer.param_groups[0]["lr"] = s.rate * voxel * 0.1 ** (step / s.steps)
+            tickets = torch.rand(settings.SDF_POINTS, generator=generator, dtype=torch.float64)
+            drawn = torch.searchsorted(chances, tickets).clamp_(max=len(chances) - 1)
+            loss = _loss(values, extent, voxel, grid.band_m, points[drawn], rays[drawn], cosine[drawn], generator)
+            optimizer.param_groups[0]["lr"] = settings.SDF_RATE * voxel * 0.1 ** (step / settings.SDF_STEPS)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
             if say is not None and (step + 1) % 20 == 0:
-                say("sdf", (level + (step + 1) / s.steps) / s.levels)
+                say("sdf", (level + (step + 1) / settings.SDF_STEPS) / settings.SDF_LEVELS)
     found: NDArray[np.float32] = values.detach().numpy()[0, 0]
     return found
 
@@ -124,7 +103,7 @@ def _coarse_shape(size: tuple[int, ...], halvings: int) -> tuple[int, ...]:
     return tuple(max(2, -(-n // 2**halvings)) for n in size)
 
 
-def _loss(values, extent, voxel, band, points, rays, cosine, s, generator):
+def _loss(values, extent, voxel, band, points, rays, cosine, generator):
     """(3.15) plus the sides term, on distances in voxels, so that its scale is the same on every level."""
     import torch
 
@@ -146,7 +125,7 @@ def _loss(values, extent, voxel, band, points, rays, cosine, s, generator):
     domain = torch.cat([points, before, behind])[torch.randperm(3 * len(points), generator=generator)[: len(points)]]
     steep = gradient_norm(values, domain, extent, voxel)
     eikonal = ((steep - 1.0) ** 2).mean()
-    return on.abs().mean() / voxel + s.sides * sides / voxel + s.eikonal * eikonal
+    return on.abs().mean() / voxel + settings.SDF_SIDES * sides / voxel + settings.SDF_EIKONAL * eikonal
 
 
 def sample_grid(values, points, extent):

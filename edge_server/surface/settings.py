@@ -1,4 +1,4 @@
-"""Settings of meshes and of the distance function."""
+"""Settings of meshes, and numbers of the distance function."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ from edge_server.surface import SurfaceError
 
 METHODS = ("tsdf", "sdf")
 MIN_WEIGHT = 0.2  # of a known voxel; a camera at normal incidence counts 1
-MEMORY_MB = 2048.0  # largest size of a volume
+MOST_VOXELS = 1 << 27  # of the box around the blocks: 512 MB of distances, and about as much for each step
 SHARPENED_PIXELS = 10_000_000  # of all maps that are sharpened: seven minutes of processor time, 41 s a million
 COVERING_POINTS = 200  # of a map, by which is chosen what to sharpen
+# The distance function: grids, each twice as fine as the last; Adam's steps and samples of each kind on each of them,
+# and its learning rate in voxels; lambda of (3.15), and the weight of the third term.
+SDF_LEVELS, SDF_STEPS, SDF_POINTS, SDF_RATE = 3, 60, 20_000, 0.1
+SDF_EIKONAL, SDF_SIDES = 0.1, 1.0
 Corner = tuple[float, float, float]
 
 
@@ -33,22 +37,3 @@ class MeshSettings:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise SurfaceError(f"method must be one of {', '.join(METHODS)}, not {self.method!r}")
-
-
-@dataclass(frozen=True)
-class SdfSettings:
-    """How a distance function is fitted.
-
-    levels: number of grids, each twice as fine as the last. steps: Adam steps per level.
-    points: samples of each kind per step.
-    eikonal: lambda of (3.15). sides: weight of the third term.
-    rate: Adam's learning rate, in voxels of the level.
-    """
-
-    levels: int = 3
-    steps: int = 60
-    points: int = 20_000
-    eikonal: float = 0.1
-    sides: float = 1.0
-    rate: float = 0.1
-    seed: int = 0

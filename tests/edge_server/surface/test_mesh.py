@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.surface import SurfaceError
-from edge_server.surface import mesh as mesh_module
+from edge_server.surface import SurfaceError, settings
+from edge_server.surface import volume as volume_module
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels.fuse import SIDE
 from edge_server.surface.mesh import extract_mesh, remove_degenerate, remove_small_components
 from edge_server.surface.reconstruct import mesh_from_depth_maps
 from edge_server.surface.sdf import fit_sdf, gradient_norm, sample_grid
-from edge_server.surface.settings import MeshSettings, SdfSettings
+from edge_server.surface.settings import MeshSettings
 from edge_server.surface.volume import Grid, bounding_box, fuse_maps
 from tests.edge_server.surface.ball import (
     DISTORTED_LENS,
@@ -53,11 +53,10 @@ def test_the_number_of_threads_changes_no_bit_of_a_volume():
         np.testing.assert_array_equal(a, b)
 
 
-def test_too_fine_a_grid_says_what_would_do():
-    maps = ball_maps(4)
-    needs = r"2 mm voxels need \d+ MB, more than the 5 allowed: take [\d.]+ mm"
-    with pytest.raises(SurfaceError, match=needs):
-        fuse_maps(Grid((-0.13,) * 3, (0.13,) * 3, 0.002, 0.008), maps, memory_mb=5)
+def test_too_fine_a_grid_says_what_would_do(monkeypatch):
+    monkeypatch.setattr(volume_module, "MOST_VOXELS", 50_000)
+    with pytest.raises(SurfaceError, match=r"5 mm has too many voxels: take [\d.]+ mm or more"):
+        fuse_maps(GRID, ball_maps(4))
     for grid, said in (
         (((-50.0,) * 3, (50.0,) * 3, 0.001, 0.004), "voxels are too many"),
         (((0, 0, 0), (1, 1, 1), 0.1, 0.05), "at least one voxel"),
@@ -72,8 +71,10 @@ def test_bounds_are_those_of_what_is_seen():
     assert np.allclose(low, -0.11, atol=0.006) and np.allclose(high, 0.11, atol=0.006)
 
 
-def test_distances_are_those_of_the_ball_with_a_slope_of_one():
-    volume = fit_sdf(COARSE, ball_maps(16), settings=SdfSettings(levels=2, steps=60, points=4000, eikonal=0.3))
+def test_distances_are_those_of_the_ball_with_a_slope_of_one(monkeypatch):
+    for name, value in (("LEVELS", 2), ("POINTS", 4000), ("EIKONAL", 0.3)):
+        monkeypatch.setattr(settings, f"SDF_{name}", value)
+    volume = fit_sdf(COARSE, ball_maps(16))
     truth = np.linalg.norm(voxel_points(volume), axis=-1) - RADIUS_M
     assert np.abs(volume.blocks.distance - truth)[np.abs(truth) < 0.01].mean() < 0.0015
     radius = np.linalg.norm(remove_small_components(extract_mesh(volume)).vertices, axis=1)
@@ -93,13 +94,15 @@ def test_values_between_nodes_and_their_slope():
     torch.testing.assert_close(gradient_norm(plane, points, extent, 0.5), torch.ones(2))
 
 
-def test_the_number_of_threads_changes_no_bit_of_a_distance_function():
+def test_the_number_of_threads_changes_no_bit_of_a_distance_function(monkeypatch):
+    for name, value in (("LEVELS", 2), ("STEPS", 10), ("POINTS", 2000)):
+        monkeypatch.setattr(settings, f"SDF_{name}", value)
     maps, before = ball_maps(4), torch.get_num_threads()
     found = []
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            volume = fit_sdf(COARSE, maps, settings=SdfSettings(levels=2, steps=10, points=2000))
+            volume = fit_sdf(COARSE, maps)
             found.append(volume.blocks.distance)
     finally:
         torch.set_num_threads(before)
@@ -123,12 +126,9 @@ def test_a_ball_comes_out_as_a_ball(ball):
     assert np.abs(top.astype(int) - (200, 20, 20)).mean() < 6 and np.abs(bottom.astype(int) - 90).mean() < 6
 
 
-def test_a_mesh_beyond_memory_or_without_a_surface_is_refused(ball, monkeypatch):
+def test_a_mesh_without_a_surface_is_refused(ball):
     with pytest.raises(SurfaceError, match="no surface"):
         extract_mesh(ball, min_weight=1e9)
-    monkeypatch.setattr(mesh_module, "MOST_VOXELS", 50_000)
-    with pytest.raises(SurfaceError, match=r"5 mm has too many voxels: take [\d.]+ mm or more"):
-        extract_mesh(ball)
 
 
 def test_what_nobody_saw_stays_open():
