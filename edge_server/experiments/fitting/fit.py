@@ -25,7 +25,7 @@ from edge_server.export.viewed_field import ViewedField
 from edge_server.fidelity.images import to_bytes, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Score, Scorer
-from edge_server.fields import RefinesCameras, checkpoint
+from edge_server.fields import checkpoint
 from edge_server.fields.registry import FIELD, make_field, option_help
 from edge_server.fields.splat.scan.settings import scan_options
 from edge_server.machine import run_facts
@@ -184,20 +184,11 @@ class Fit(ViewedField):
             )
 
     def findings(self) -> list[str]:
-        """What a fit found out about a carried camera, a line each: what the corrections of its poses have in common,
-        and which training views do not fit the others. They become notes."""
+        """What a fit found out about a carried camera, a line each: which training views do not fit the others. They
+        become notes."""
         if not self.data.carried:
             return []
-        found = []
-        if isinstance(self.field, RefinesCameras):
-            from edge_server.fields.common.cameras.constant_correction import constant_correction
-
-            refined = [(v, c) for v in self.data.training if (c := self.field.correction(v)) is not None]
-            common = constant_correction(
-                [v.camera_to_world for v, _ in refined], [c.camera_to_world for _, c in refined]
-            )
-            found += [] if common is None else [common.words]
-        found += misfits(self.field, self.data.training, Scorer(None, background=WHITE))
+        found = misfits(self.field, self.data.training, Scorer(None, background=WHITE))
         self.notes += found
         return found
 

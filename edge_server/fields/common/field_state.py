@@ -92,6 +92,16 @@ def load_arrays(wanted: Arrays, state: Arrays) -> None:
         mine[...] = state[name]
 
 
+def to_json(value: Any) -> Any:
+    """A value of numbers, texts, arrays, structs and collections of them, exact and ready for JSON."""
+    return msgspec.to_builtins(value, enc_hook=lambda array: array.tolist())
+
+
+def from_json(value: Any, kind: Any) -> Any:
+    """The value of a type that ``to_json`` made; arrays are of float64. ValueError: it is none."""
+    return msgspec.convert(value, kind, dec_hook=lambda kind, numbers: np.array(numbers, dtype=np.float64))
+
+
 def take_attributes(owner: Any, names: tuple[str, ...]) -> Arrays:
     """Copies of attributes that are arrays or numbers, by name."""
     return {name: np.array(getattr(owner, name)) for name in names}

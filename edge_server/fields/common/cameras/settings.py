@@ -19,21 +19,6 @@ DAMPING, USUAL = 1e-3, np.array([0.03] * 3 + [0.02] * 3)
 SPREAD, REACH = 0.8, 8
 SAME_POSE = 1e-3  # of all numbers of a matrix: another pose is another place, whose correction is not known
 
-# --- what all corrections of a camera have in common ---
-PARTS = 8  # of the path, each left out in turn (jackknife)
-LEAST_POSES = 2 * PARTS
-# Standard errors, and root mean square errors of single poses, from which on a hint is given: refined in tiny images,
-# exact poses have as much in common as they scatter by.
-SURE, STANDS_OUT = 2.0, 1.5
-# Distances at which a turn and a shift may undo each other, meters, and the share of the shift that may be left: drift
-# of 60 s and 270 s of `redkitchen` cancels 2.0 to 2.2 m ahead, and leaves .18 to .31.
-CANCELS_M, CANCELS = (0.3, 20.0), 0.5
-# Least variance of directions as the camera sees them, of all axes, from which on a correction of the camera is told
-# from one of the world: .1 are turns of 18 degrees to either side, about two axes. `redkitchen` after 8 s has .006,
-# and its corrections are split into 2.2 degrees of the camera and 1.5 back of the world.
-TOLD = 0.1
-COMMON_PRIOR = 0.01  # share of the largest singular value added for the camera: what is not told is left to the world
-
 # --- poses and appearances of fields that render rays ---
 START = 40  # steps before anything is corrected: first the scene must take shape
 EVERY = 2  # steps between corrections of a pose, of one camera after the other

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import SEPARATOR, View
 from edge_server.fields.common.camera_rows import camera_rows
+from edge_server.fields.common.field_state import from_json
 from edge_server.fields.common.kernels.camera import CAMERA
 from edge_server.fields.common.supervision import CameraMemory, check_view
 from edge_server.fields.common.view_store import Arrays
@@ -24,7 +25,7 @@ from edge_server.fields.splat.kernels.rasterize import EXPOSURE, Targets
 from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.discs import usable_depth
 from edge_server.fields.splat.scan.own_motion import OwnMotion, search
-from edge_server.fields.splat.scan.plausibility import agreeing, flat, moved_in, troubles, unturned
+from edge_server.fields.splat.scan.plausibility import agreeing, flat, moved_in, troubles
 from edge_server.fields.splat.scan.scan_field import ScanField, Shown, aim_of
 from edge_server.fields.splat.scan.sweep import sweep_depth
 from edge_server.fields.splat.scan.tracking import Alignment, Rendered, align, gray
@@ -32,9 +33,14 @@ from edge_server.fields.splat.scan.tracking import Alignment, Rendered, align, g
 # What a field that begins anew, which no depth was measured for, still knows of its cameras and their frames.
 _OF_CAMERAS = ("_pixels", "_taken", "_blind", "_bare", "_seen", "_seen_m", "_left_out", "_in_a_row")
 
-_BY_CAMERA = ("left_out", "in_a_row")  # counts that a state keeps
+# What a state keeps.
+_KEPT: dict[str, Any] = dict.fromkeys(("taken", "blind", "took_at", "due_before", "pixels"), int)
+_KEPT |= {"bare": bool, "measured": bool, "left_out": dict[str, int], "in_a_row": dict[str, int]}
 
-_NO_DEPTH = "its frames tell no depth (it only turns, or sees plain walls): distances are guessed, move it sideways"
+_NO_DEPTH = (
+    "its frames tell no depth (it only turns, sees plain walls, or its poses lack rotation: ask camera-node doctor): "
+    "distances are guessed, move it sideways"
+)
 
 
 class CarriedField(ScanField):
@@ -122,9 +128,6 @@ class CarriedField(ScanField):
         """Make a view a keyframe."""
         given = self._poses.taken_back(reported, reported.camera)
         view = replace(given, camera=f"{given.camera}{SEPARATOR}{self._taken}", depth=usable_depth(given.depth))
-        last = self._seen.get(given.camera)
-        if last is not None and not self._measured:
-            self._own.compare_turns(given.camera, unturned(last, given))
         self._seen[given.camera] = given
         self._follow(view)
         shown = self._look(view)
@@ -315,8 +318,7 @@ class CarriedField(ScanField):
             located = self._own.troubles()
             poses = troubles(self._poses) if self._rigid is not None else []
             guessed = self._taken > tuned.BEGINS[-1] and not self._founded
-            blind = [camera for camera in self._seen if guessed and not self._own.has_no_rotation(camera)]
-            unknown = [f"{camera}: {_NO_DEPTH}" for camera in blind]
+            unknown = [f"{camera}: {_NO_DEPTH}" for camera in self._seen if guessed]
         return (*left_out, *located, *moving, *poses, *unknown)
 
     def _begin_anew(self) -> None:
@@ -327,9 +329,9 @@ class CarriedField(ScanField):
         self._learn_distance(list(swept.values()))
         views, kept = [swept.get(v.camera, v) for v in self._views], {name: getattr(self, name) for name in _OF_CAMERAS}
         due = self._due_before + self.step // tuned.STEPS_A_KEYFRAME
-        turns, leaps = self._own.unturned, self._poses.leaps
+        leaps = self._poses.leaps
         self._begin(views)
-        self._own.unturned, self._poses.leaps = turns, leaps
+        self._poses.leaps = leaps
         for name, value in kept.items():
             setattr(self, name, value)
         self._due_before = due
@@ -449,8 +451,7 @@ class CarriedField(ScanField):
             self.cloud.keep(kept)
 
     def _counters(self) -> dict[str, Any]:
-        names = ("taken", "blind", "bare", "took_at", "due_before", "pixels", "measured", *_BY_CAMERA)
-        own = {name: getattr(self, f"_{name}") for name in names}
+        own = {name: getattr(self, f"_{name}") for name in _KEPT}
         own |= {"own_motion": self._own.meta(), "depths": {camera: view.camera for camera, view in self._kept_depths()}}
         return {**super()._counters(), **own}
 
@@ -464,11 +465,8 @@ class CarriedField(ScanField):
 
     def _load(self, meta: dict[str, Any], state: Arrays) -> None:
         super()._load(meta, state)
-        self._taken, self._took_at, self._pixels = (int(meta[name]) for name in ("taken", "took_at", "pixels"))
-        self._due_before, self._measured = int(meta["due_before"]), bool(meta["measured"])
-        self._blind, self._bare = int(meta["blind"]), bool(meta["bare"])
-        for name in _BY_CAMERA:
-            setattr(self, f"_{name}", {str(camera): int(count) for camera, count in meta[name].items()})
+        for name, kind in _KEPT.items():
+            setattr(self, f"_{name}", from_json(meta[name], kind))
         self._own.load(meta["own_motion"])
         self._clear_views()
         views, aims = self.view_store.views, np.asarray(state["aims"], np.float64)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common.field_state import to_json
 from edge_server.fields.splat.kernels.rasterize import EXPOSURE
 from edge_server.fields.splat.scan import settings as tuned
 
@@ -74,7 +75,7 @@ class Exposures:
 
     def meta(self) -> dict[str, Any]:
         """What a state keeps: exact, ready for JSON."""
-        return {name: known.tolist() for name, known in self.known.items()}
+        return to_json(self.known)
 
     def load(self, meta: dict[str, Any]) -> None:
         """Restore what ``meta`` returned."""

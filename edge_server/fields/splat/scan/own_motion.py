@@ -11,15 +11,16 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.cameras.pose_corrections import Leap, PoseCorrection, PoseCorrections
+from edge_server.fields.common.field_state import from_json, to_json
 from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.tracking import Gray, Rendered, align, align_from, gray
 from freshfield.geometry import se3, se3_inverse, so3_exp, so3_log
 
 Array = NDArray[np.float64]
 
-_COUNTS = ("doubts", "fits", "missed", "replaced", "unturned")  # that a state keeps
-
-UNITS = {"millimeters": 1000.0, "centimeters": 100.0, "inches": 39.37, "feet": 3.281, "kilometers": 0.001}
+# What a state keeps by camera, beside the leaps.
+_KEPT = {name: dict[str, int] for name in ("doubts", "fits", "missed", "replaced")}
+_KEPT |= {"suggested": dict[str, tuple[Leap, int]], "reported_m": dict[str, NDArray[np.float64]]}
 
 
 class OwnMotion:
@@ -35,9 +36,8 @@ class OwnMotion:
         self.fits: dict[str, int] = {}  # keyframes in a row of a camera astray that fit near where it reports them
         self.missed: dict[str, int] = {}  # frames in a row of a camera astray that were not found
         self.replaced: dict[str, int] = {}
-        self.unturned: dict[str, int] = {}  # see ``compare_turns``
-        self._suggested: dict[str, tuple[Leap, int]] = {}  # a leap that may be, and how many views fit to it
-        self._reported_m: dict[str, Array] = {}  # position of a camera's newest view, (3,)
+        self.suggested: dict[str, tuple[Leap, int]] = {}  # a leap that may be, and how many views fit to it
+        self.reported_m: dict[str, Array] = {}  # position of a camera's newest view, (3,)
 
     def astray(self, camera: str) -> bool:
         """Whether reported poses of a camera are not believed."""
@@ -45,7 +45,7 @@ class OwnMotion:
 
     def doubted(self, camera: str) -> bool:
         """Whether the next view of a camera has to be looked for."""
-        return self.astray(camera) or camera in self._suggested
+        return self.astray(camera) or camera in self.suggested
 
     def doubt(self, camera: str) -> None:
         """Note that a view fits better elsewhere than where reported motion leads."""
@@ -64,15 +64,6 @@ class OwnMotion:
         self.trust(camera)
         return True
 
-    def compare_turns(self, camera: str, contradicted: bool) -> None:
-        """Note whether a picture contradicts that its camera has not turned."""
-        count = self.unturned.get(camera, 0) + (1 if contradicted else -1)
-        self.unturned[camera] = min(max(count, 0), 2 * tuned.UNTURNED)
-
-    def has_no_rotation(self, camera: str) -> bool:
-        """Whether a camera turns while the rotation that it reports stays, as far as is known without depth."""
-        return self.unturned.get(camera, 0) >= tuned.UNTURNED
-
     def before(self, view: View, camera: str) -> list[PoseCorrection]:
         """Corrections of the newest keyframes of a view's camera that were taken before it, in the order of time."""
         newest = self._poses.newest(camera, tuned.JUDGED)
@@ -82,8 +73,8 @@ class OwnMotion:
         """Whether a view is reported farther from the one before than a camera can have moved. A tracker that loses
         its place leaps once; in another unit each view leaps. A quick turn is none."""
         here = view.camera_to_world[:3, 3]
-        before = self._reported_m.get(camera, here)
-        self._reported_m[camera] = here
+        before = self.reported_m.get(camera, here)
+        self.reported_m[camera] = here
         return bool(np.linalg.norm(here - before) > tuned.FARTHEST * self._poses.most_m)
 
     def suggest_leap(self, view: View, camera: str, begun: Array, found: Array) -> bool:
@@ -108,22 +99,22 @@ class OwnMotion:
         if self._poses.within(reported, found, 1.0):
             back = np.eye(4)  # an earlier leap has ended
         shift_m = float(np.linalg.norm((back @ reported - reported)[:3, 3]))
-        self._suggested[camera] = Leap(before[-1].at_ns, view.generated_ns, back, shift_m), 0
+        self.suggested[camera] = Leap(before[-1].at_ns, view.generated_ns, back, shift_m), 0
         return True
 
     def after_leap(self, view: View, camera: str) -> View | None:
         """A view where it is if poses of its camera have leapt as is suggested; None: nothing is."""
-        if camera not in self._suggested:
+        if camera not in self.suggested:
             return None
-        return replace(view, camera_to_world=self._suggested[camera][0].back @ self._as_reported(view, camera))
+        return replace(view, camera_to_world=self.suggested[camera][0].back @ self._as_reported(view, camera))
 
     def try_leap(self, camera: str, fits: bool) -> bool:
         """Note whether a view fits to the leap that is suggested. Returns whether so many did that it is believed."""
-        leap, count = self._suggested.pop(camera)
+        leap, count = self.suggested.pop(camera)
         if not fits:
             return False
         if count + 1 < tuned.LEAPT:
-            self._suggested[camera] = leap, count + 1
+            self.suggested[camera] = leap, count + 1
             return False
         self._poses.leaps[camera] = (*self._poses.leaps.get(camera, ()), leap)[-tuned.KEPT_CORRECTIONS :]
         self.trust(camera)
@@ -155,15 +146,15 @@ class OwnMotion:
         before = self.before(view, camera)
         if before and not measured:
             scale = shift_scale(before)
-            return self.located(view, camera, replace(before[-1], scale=scale).moved(view.camera_to_world), scale)
+            return self.located(view, camera, before[-1].moved(view.camera_to_world, scale), scale)
         missed = self.missed[camera] = self.missed.get(camera, 0) + 1
         return self.located(view, camera, before[-1].pose, 0.0) if missed > tuned.LOST and before else None
 
     def troubles(self) -> list[str]:
         """What is wrong with the cameras' reported poses, for people."""
         replaced = [
-            f"{camera}: {count} reported poses do not fit its pictures and were replaced by what the pictures show"
-            + misfit(self._poses.newest(camera, tuned.JUDGED))
+            f"{camera}: {count} reported poses do not fit its pictures and were replaced by what the pictures show: "
+            "camera-node doctor says whether they lack the rotation or have another unit"
             for camera, count in self.replaced.items()
         ]
         leapt = [
@@ -171,30 +162,17 @@ class OwnMotion:
             for camera, leaps in self._poses.leaps.items()
             if not np.array_equal(leaps[-1].back, np.eye(4))
         ]
-        unturned = [
-            f"{camera}: reported poses have no rotation, but its pictures turn: look at how they are exported and read"
-            for camera in self.unturned
-            if self.has_no_rotation(camera)
-        ]
-        return [*replaced, *leapt, *unturned]
+        return [*replaced, *leapt]
 
     def meta(self) -> dict[str, Any]:
         """What a state keeps, ready for JSON."""
-        places = {camera: place.tolist() for camera, place in self._reported_m.items()}
-        leaps = {camera: [_as_list(leap) for leap in leaps] for camera, leaps in self._poses.leaps.items()}
-        suggested = {camera: (_as_list(leap), count) for camera, (leap, count) in self._suggested.items()}
-        counts = {name: getattr(self, name) for name in _COUNTS}
-        return {**counts, "reported_m": places, "leaps": leaps, "suggested": suggested}
+        return to_json({"leaps": self._poses.leaps, **{name: getattr(self, name) for name in _KEPT}})
 
     def load(self, meta: dict[str, Any]) -> None:
         """Restore what ``meta`` returned."""
-        for name in _COUNTS:
-            setattr(self, name, {str(camera): int(count) for camera, count in meta[name].items()})
-        self._reported_m = {str(camera): np.array(place) for camera, place in meta["reported_m"].items()}
-        self._poses.leaps = {str(camera): tuple(map(_leap, leaps)) for camera, leaps in meta["leaps"].items()}
-        self._suggested = {
-            str(camera): (_leap(leap), int(count)) for camera, (leap, count) in meta["suggested"].items()
-        }
+        self._poses.leaps = from_json(meta["leaps"], dict[str, tuple[Leap, ...]])
+        for name, kind in _KEPT.items():
+            setattr(self, name, from_json(meta[name], kind))
 
 
 def search(
@@ -232,7 +210,7 @@ def guessed_poses(view: View, before: Sequence[PoseCorrection]) -> list[Array]:
     """
     last = before[-1]
     scales = (1.0, shift_scale(before), 0.0)
-    poses = [*(replace(last, scale=scale).moved(view.camera_to_world) for scale in scales), last.pose]
+    poses = [*(last.moved(view.camera_to_world, scale) for scale in scales), last.pose]
     led = moved_on(view, before, tuned.FASTEST)
     return poses if led is None else [*poses, led]
 
@@ -256,7 +234,7 @@ def shift_scale(known: Sequence[PoseCorrection]) -> float:
         for poses in ([_reported(each) for each in known], [each.pose for each in known])
     )
     told = reported > 0.0
-    return float(np.median(own[told] / reported[told])) if told.sum() >= tuned.ASTRAY_FOR else 1.0
+    return float(np.median(own[told] / reported[told])) if told.sum() >= tuned.TOLD_BY else 1.0
 
 
 def followed_scale(
@@ -269,40 +247,11 @@ def followed_scale(
     best: the largest share of pixels that look as expected, see ``Alignment``.
     """
     for scale in (1.0, shift_scale(before)):
-        pose = replace(before[-1], scale=scale).moved(reported)
+        pose = before[-1].moved(reported, scale)
         if align(kept, frame, pose, pose, ((1, 1),)).agreeing >= best - tuned.FOLLOWED:
             return scale
     return 0.0
 
 
-def misfit(known: Sequence[PoseCorrection]) -> str:
-    """What is wrong with the reported poses of a camera that is located by its pictures, in words; empty if not known.
-
-    known: corrections of its newest views, in the order of time.
-    """
-    if sum(each.reported is not None for each in known) < tuned.ASTRAY_FOR:
-        return ""
-    turned, turns = (
-        np.ptp([pose[:3, :3] for pose in poses], axis=0).max()
-        for poses in ([_reported(each) for each in known], [each.pose for each in known])
-    )
-    if turned < tuned.SAME_TURN and turns > tuned.TURNED:
-        return ": reported poses have no rotation"
-    scale = 1.0 / max(shift_scale(known), 1e-12)
-    if 1.0 / tuned.OTHER_UNIT < scale < tuned.OTHER_UNIT:
-        return ""
-    named = next((f", as in {name}" for name, size in UNITS.items() if abs(np.log(scale / size)) < tuned.UNIT_LOG), "")
-    about = f"{float(f'{scale:.2g}'):g}"
-    return f": reported positions are some {about} times as far apart as meters are{named}"
-
-
 def _reported(known: PoseCorrection) -> Array:
     return known.given if known.reported is None else known.reported
-
-
-def _as_list(leap: Leap) -> list[Any]:
-    return [*leap[:2], leap.back.tolist(), leap.shift_m]
-
-
-def _leap(told: Sequence[Any]) -> Leap:
-    return Leap(int(told[0]), int(told[1]), np.array(told[2], dtype=np.float64), float(told[3]))

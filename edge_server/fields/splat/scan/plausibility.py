@@ -1,20 +1,17 @@
-"""What cannot be right of a carried camera's frames: things that move, and poses that are late."""
+"""What cannot be right of a carried camera's frames: things that move, a covered lens, and poses that drift."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common.cameras.constant_correction import constant_correction
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
 from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.scan_field import Shown
 from edge_server.fields.splat.scan.tracking import gray
-from freshfield.geometry import se3_inverse, so3_log
+from freshfield.geometry import se3_inverse
 
 Array = NDArray[np.float64]
 
@@ -63,30 +60,6 @@ def flat(view: View, shown: Shown) -> bool:
     return contrast < tuned.FLAT * expected
 
 
-def unturned(before: View, now: View) -> bool:
-    """Whether two views of a camera are reported with the same rotation, and their pictures contradict that: most
-    corners do not move as the reported shift moves them, whatever their depth."""
-    turned = np.abs(now.camera_to_world[:3, :3] - before.camera_to_world[:3, :3]).max()
-    if turned > tuned.SAME_TURN or before.image.shape != now.image.shape:
-        return False
-    shift = now.camera_to_world[:3, :3].T @ (now.camera_to_world - before.camera_to_world)[:3, 3]
-    first, second = (cv2.cvtColor(np.ascontiguousarray(v.image[..., :3]), cv2.COLOR_RGB2GRAY) for v in (before, now))
-    corners = cv2.goodFeaturesToTrack(first, tuned.CORNERS, 0.01, tuned.CORNERS_APART_PX)
-    if corners is None or second.std() < 255.0 * tuned.BARE:
-        return False
-    found, known, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, np.zeros_like(corners))
-    here, there = (each[known.ravel() == 1].reshape(-1, 2).astype(np.float64) + 0.5 for each in (corners, found))
-    if len(here) < tuned.LEAST_CORNERS:
-        return False
-    rays, others = before.intrinsics.rays(here), now.intrinsics.rays(there)
-    at, flow = rays[:, :2] / rays[:, 2:], others[:, :2] / others[:, 2:] - rays[:, :2] / rays[:, 2:]
-    way = at * shift[2] - shift[:2]  # away from where the camera moves to, the farther the nearer a corner is
-    way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
-    beside = flow - np.maximum((flow * way).sum(axis=1, keepdims=True), 0.0) * way
-    moved_px, beside_px = (now.intrinsics.fx * np.median(np.linalg.norm(each, axis=1)) for each in (flow, beside))
-    return bool(beside_px > max(tuned.BESIDE_PX, tuned.BESIDE_SHARE * moved_px))
-
-
 def troubles(poses: PoseCorrections) -> list[str]:
     """What corrections of poses say that is wrong with them, a line each."""
     found = []
@@ -94,43 +67,9 @@ def troubles(poses: PoseCorrections) -> list[str]:
         newest = poses.newest(track, tuned.JUDGED)
         if len(newest) < tuned.JUDGED:
             continue
-        late_s = _lateness_s(newest)
-        if late_s is not None:
-            word = "late" if late_s > 0 else "early"
-            least = f"by some {1e3 * abs(late_s):.0f} ms or more"  # corrections follow a part of a delay
-            found.append(f"{track}: its poses are {word} {least}: camera-node doctor measures it in a recording")
         shift_m = float(np.median([np.linalg.norm(c.shift_m) for c in newest]))
         turn_rad = float(np.median([np.linalg.norm(c.rotation) for c in newest]))
         if shift_m > tuned.DRIFT_SHARE * poses.most_m or turn_rad > tuned.DRIFT_SHARE * poses.most_rad:
             off = f"{100 * shift_m:.1f} cm and {np.rad2deg(turn_rad):.1f} degrees"
-            found.append(f"{track}: its poses drift: the picture asks for {off} (median)")
-        path = poses.newest(track, tuned.MOUNT_POSES)
-        mount = constant_correction([c.given for c in path], [c.pose for c in path])
-        if mount is not None and mount.sure and late_s is None:
-            found.append(f"{track}: {mount.words}")
+            found.append(f"{track}: its poses drift: the picture asks for {off} (median); ask camera-node doctor")
     return found
-
-
-def _lateness_s(views: Sequence) -> float | None:
-    """By how much poses lag behind images, if that explains their corrections; None if not. views: corrections in the
-    order of time."""
-    moves, corrections = [], []
-    scale = np.array([1.0 / tuned.PRIOR_RAD] * 3 + [1.0 / tuned.PRIOR_M] * 3)
-    for before, now, after in zip(views, views[1:], views[2:]):
-        seconds = (after.at_ns - before.at_ns) / 1e9
-        if not 0.0 < seconds < tuned.LONGEST_GAP_S:
-            continue
-        axes = now.given[:3, :3]
-        turn = so3_log(before.given[:3, :3].T @ after.given[:3, :3])
-        shift = axes.T @ (after.given[:3, 3] - before.given[:3, 3])
-        moves.append(np.concatenate([turn, shift]) * scale / seconds)
-        corrections.append(np.concatenate([axes.T @ now.rotation, axes.T @ now.shift_m]) * scale)
-    if len(moves) < tuned.JUDGED // 2:
-        return None
-    v, c = np.stack(moves), np.stack(corrections)
-    v, c = v - v.mean(axis=0), c - c.mean(axis=0)  # what is constant is a calibration's
-    if not (v * v).sum() > 0.0:
-        return None
-    late_s = float((v * c).sum() / (v * v).sum())
-    explained = 1.0 - float(((c - late_s * v) ** 2).sum()) / max(float((c * c).sum()), 1e-12)
-    return late_s if explained > tuned.LATE_EXPLAINS and abs(late_s) > tuned.LATE_S else None

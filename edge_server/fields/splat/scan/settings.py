@@ -100,15 +100,7 @@ FARTHEST = 6.0  # largest corrections, that a camera may move between two keyfra
 LOST = 1  # frames in a row that are not found, after which one is taken where the one before was
 DOUBTS = 2  # keyframes in a row for which another place fits better, from which on reports are not believed
 LEAPT = 2  # further keyframes that fit where a leap of reported poses leads, from which on it is believed
-ASTRAY_FOR = 4  # keyframes from which on it is said why reported poses do not fit
-SAME_TURN, TURNED = 1e-6, 0.05  # of matrices' numbers: a tracker's noise is more; a camera that turns
-CORNERS, LEAST_CORNERS, CORNERS_APART_PX = 200, 8, 3  # of a picture, followed to the next keyframe
-# Median by which they move elsewhere than reported, pixels and share of the way. Keyframes of `redkitchen`, .3 s apart,
-# have a share of more than .2 in one of ten pairs once their turns are taken out, in three of four as they are.
-BESIDE_PX, BESIDE_SHARE = 1.0, 0.25
-UNTURNED = 6  # by so many pairs of keyframes contradict reported poses more than agree: then no rotation is said
-OTHER_UNIT = 2.5  # ratio of distances that is no error of single poses: feet in meters are 3.3
-UNIT_LOG = 0.45  # deviation of its logarithm, up to which it is that of two units
+TOLD_BY = 4  # shifts from view to view by which the scale of reported ones is told
 FOLLOWED = 0.1  # share of pixels by which fewer may look as expected where reported motion leads than at best
 # Between two keyframes, for a leap: later the camera may be anywhere, and what fits where it was tells no leap.
 LONGEST_LEAP_S = 1.0
@@ -122,10 +114,7 @@ MOVED_EVERY = 4  # pixels between those that are tested
 MOVED_SHARE, MOVED_M = 0.1, 0.05  # an earlier frame saw further by more: nothing was there
 MOVED_LEAST = 0.005  # share of an image: less is noise of depth
 JUDGED = 24  # newest keyframes of a camera by which its poses are judged
-MOUNT_POSES = 256  # newest ones by which an error of the mount is told: 15 ms
 DRIFT_SHARE = 0.6  # of the largest correction, above which poses drift
-LATE_S, LATE_EXPLAINS = 0.03, 0.4  # least delay of poses that is said, and share of the corrections that it explains
-LONGEST_GAP_S = 1.5  # between two keyframes, for a velocity
 
 
 def scan_options(pixels: int, tracked: bool) -> dict[str, Any]:

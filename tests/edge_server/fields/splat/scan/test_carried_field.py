@@ -11,11 +11,10 @@ import pytest
 from edge_server.fields import Budget, View
 from edge_server.fields.splat.scan import settings as tuned
 from freshfield.geometry import look_at, se3, so3_exp
-from tests.edge_server.fields.scenes import seen
 from tests.edge_server.fields.small import same_state
 from tests.edge_server.fields.splat.scan import carried
 from tests.edge_server.fields.splat.scan.carried import BAD_FROM, SEEDS, carried_field, given, slow, undisturbed
-from tests.edge_server.fields.splat.scan.walk import LENS, WALK, at, spoiled, walk
+from tests.edge_server.fields.splat.scan.walk import WALK, at, spoiled, walk
 
 
 def test_frames_become_keyframes_and_held_out_ones_take_their_neighbors_corrections() -> None:
@@ -261,14 +260,9 @@ def _without_rotation(k: int, view: View) -> View:
 @pytest.mark.slow  # that pictures take over, and resume, is held below
 @pytest.mark.stability
 @pytest.mark.parametrize(
-    ("spoil", "words", "lost_db"),
-    [
-        (_in_unit(1000.0), "times as far apart as meters are", 2.3),
-        (_in_unit(0.001), "times as far apart as meters are", 4.0),
-        (_without_rotation, "no rotation", 3.6),
-    ],
+    ("spoil", "lost_db"), [(_in_unit(1000.0), 2.3), (_in_unit(0.001), 4.0), (_without_rotation, 3.6)]
 )
-def test_poses_that_never_fit_give_way_to_pictures_where_depth_is_measured(spoil, words: str, lost_db: float) -> None:
+def test_poses_that_never_fit_give_way_to_pictures_where_depth_is_measured(spoil, lost_db: float) -> None:
     """lost_db: at most, against right poses, at each of five instants from the fourth second on, on average over three
     trainings; as they are, such poses cost up to 11 dB for as long as was looked. The walk takes a keyframe each 4
     degrees and 15 cm, which 48 x 40 pixels show coarsely."""
@@ -277,27 +271,9 @@ def test_poses_that_never_fit_give_way_to_pictures_where_depth_is_measured(spoil
         field = carried_field(seed=seed)
         found_db = carried.by_seconds(views, views, field)
         assert len(field.views) > 60
-        assert any("reported poses do not fit" in line and words in line for line in field.troubles)
+        assert any("reported poses do not fit" in line for line in field.troubles)
         lost.append((np.array(undisturbed(True, seed)) - found_db)[2:])
     assert np.mean(lost, axis=0).max() < lost_db
-
-
-@pytest.mark.stability
-@pytest.mark.parametrize("turns", [True, False])
-def test_without_depth_it_is_said_that_poses_have_no_rotation(turns: bool) -> None:
-    """A camera that slides along the scene without turning is not accused. In pictures of the walk, half as large, a
-    keyframe moves corners by less than a pixel."""
-    lens, views = LENS.scaled(2.0), []
-    for k in range(20):
-        pose = WALK[0].camera_to_world.copy()
-        pose[:3, 3] += (0.04 * k - 0.4) * pose[:3, 0]
-        if turns:
-            pose[:3, :3] = pose[:3, :3] @ so3_exp(np.deg2rad([6.0 * np.sin(0.5 * k), 12.0 * np.cos(0.5 * k), 0.0]))
-        view = View("hand", seen(lens, pose)[0], pose, lens, 100_000_000 * k)
-        views.append(_without_rotation(k, view))
-    field = given(carried_field(), views)
-    assert any("hand: reported poses have no rotation" in line for line in field.troubles) is turns
-    assert carried.resumed_from(field.state()).troubles == field.troubles
 
 
 @pytest.mark.stability
@@ -306,7 +282,7 @@ def test_without_depth_any_unit_of_poses_is_as_good() -> None:
     views = [_in_unit(1000.0)(k, view) for k, view in enumerate(walk(depth=False)[:30])]
     field = carried.played(views)
     assert carried.scored_db(field, views)[1] > carried.begun(False)[1][1] - 1.0
-    assert not any("tell no depth" in line or "hand-eye" in line for line in field.troubles)
+    assert not any("tell no depth" in line for line in field.troubles)
 
 
 @pytest.mark.stability

@@ -11,10 +11,9 @@ import pytest
 from edge_server.fields import View
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
 from edge_server.fields.splat.scan import settings as tuned
-from edge_server.fields.splat.scan.plausibility import moved_in, troubles, unturned
+from edge_server.fields.splat.scan.plausibility import moved_in, troubles
 from edge_server.fields.splat.scan.tracking import Rendered, align, gray
 from freshfield.geometry import Pinhole, se3_inverse, so3_exp
-from tests.edge_server.fields.common.cameras.test_constant_correction import arm_poses
 from tests.edge_server.fields.splat.scan.walk import LENS
 
 WALL = Pinhole.from_fov(160, 120, 60.0)
@@ -87,58 +86,18 @@ def test_what_has_come_is_told_from_what_was_not_seen_before() -> None:
     assert not moved_in(now, there, replace(before, depth=depth), np.eye(4))[:, :40].any()
 
 
-@pytest.mark.stability
-@pytest.mark.parametrize(
-    ("turn_deg", "shift_m", "reported_m", "contradicted"),
-    [
-        ([0.0, -8.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.0, 0.0], True),  # along the shift, but against its direction
-        ([4.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.0, 0.0], True),
-        ([0.0, 4.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], True),
-        ([0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.0, 0.0], False),  # it slides, whatever the unit of its poses
-        ([0.0, 0.0, 0.0], [0.0, -0.1, 0.05], [0.0, -100.0, 50.0], False),
-        ([0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.02, 0.0], False),  # as a tracker errs
-        ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], False),
-    ],
-)
-def test_pictures_contradict_poses_without_rotation_and_no_camera_that_slides(
-    turn_deg, shift_m, reported_m, contradicted: bool
-) -> None:
-    true, reported = np.eye(4), np.eye(4)
-    true[:3, :3], true[:3, 3], reported[:3, 3] = so3_exp(np.deg2rad(turn_deg)), shift_m, reported_m
-    images = [np.repeat((255 * _wall(pose)[0][..., None]).astype(np.uint8), 3, axis=2) for pose in (np.eye(4), true)]
-    before, now = (View("hand", each, pose, WALL) for each, pose in zip(images, (np.eye(4), reported)))
-    assert unturned(before, now) is contradicted
-    assert not unturned(before, replace(now, camera_to_world=true)) or not any(turn_deg), "it reports that it turns"
-    assert not unturned(before, replace(now, image=np.full_like(images[0], 90))), "nothing to follow"
-
-
-def test_late_and_drifting_poses_are_said() -> None:
-    times, moves = np.arange(40) / 5.0, np.random.default_rng(3).normal(0.0, 0.15, (40, 3)).cumsum(axis=0)
-    smooth = np.stack([np.convolve(m, np.ones(5) / 5, "same") for m in moves.T], axis=1)
-    for late_s, drift_m, words in ((0.1, 0.0, "late by some 100 ms or more"), (0.0, 0.0, None), (0.0, 0.4, "drift")):
-        poses, speed = PoseCorrections(0.5, 5.0), np.gradient(smooth, times, axis=0)
-        for k, t in enumerate(times):
+def test_drifting_poses_are_said() -> None:
+    for drift_m, said in ((0.0, []), (0.4, ["drift"])):
+        poses = PoseCorrections(0.5, 5.0)
+        for k in range(40):
             pose = np.eye(4)
-            pose[:3, 3] = smooth[k]
-            view = View(f"hand#{k}", np.zeros((4, 4, 3), np.uint8), pose, LENS, round(t * 1e9))
+            pose[0, 3] = 0.05 * k
+            view = View(f"hand#{k}", np.zeros((4, 4, 3), np.uint8), pose, LENS, 200_000_000 * k)
             poses.begin(view, "hand")
             right = pose.copy()
-            right[:3, 3] += late_s * speed[k] + np.array([drift_m, 0.0, 0.0])
+            right[0, 3] += drift_m
             poses.set_pose(view, right)
-        found = troubles(poses)
-        assert (words is None and not found) or (words is not None and words in found[0]), found
-
-
-def test_a_mount_that_is_off_is_said_live() -> None:
-    mount, poses, still = np.eye(4), PoseCorrections(0.5, 5.0), PoseCorrections(0.5, 5.0)
-    mount[:3, :3], mount[:3, 3] = so3_exp(np.deg2rad([0.0, 1.0, 0.0])), [0.0, 0.02, 0.0]
-    for k, given in enumerate(arm_poses()):
-        view = View(f"hand#{k}", np.zeros((4, 4, 3), np.uint8), given, LENS, k * 10**8)
-        for each, error in ((poses, mount), (still, np.eye(4))):
-            each.begin(view, "hand")
-            each.set_pose(view, given @ error)
-    (said,) = troubles(poses)
-    assert "in common 1.0" in said and said.endswith("hand-eye calibration is off") and not troubles(still)
+        assert [word for word in said if word in str(troubles(poses))] == said and len(troubles(poses)) == len(said)
 
 
 def test_gray_is_that_of_opencv() -> None:
