@@ -45,7 +45,7 @@ def distance(
             if shares is None:
                 total += float(values.mean())
             else:
-                cells = F.adaptive_avg_pool2d(shares, values.shape[1:])
+                cells = F.adaptive_avg_pool2d(shares, (values.shape[1], values.shape[2]))
                 total += float((values * cells).sum() / cells.sum())
     return total
 

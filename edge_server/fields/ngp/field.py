@@ -23,7 +23,7 @@ assert SEGMENT * FEATURES == DIRTY, "scatter and adam must use the same segments
 class NgpField(TrainedField):
     """A multiresolution hash grid and a small network. See ``fields.Field`` for the protocol."""
 
-    Settings = NgpSettings
+    Settings: ClassVar[type] = NgpSettings
     shape: ClassVar[tuple[str, ...]] = STATE_SHAPE
 
     def _make(self, rng: np.random.Generator) -> tuple[Any, Net]:

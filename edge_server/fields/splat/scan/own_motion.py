@@ -19,7 +19,7 @@ from freshfield.geometry import se3, se3_inverse, so3_exp, so3_log
 Array = NDArray[np.float64]
 
 # What a state keeps by camera, beside the leaps.
-_KEPT = {name: dict[str, int] for name in ("doubts", "fits", "missed", "replaced")}
+_KEPT: dict[str, Any] = {name: dict[str, int] for name in ("doubts", "fits", "missed", "replaced")}
 _KEPT |= {"suggested": dict[str, tuple[Leap, int]], "reported_m": dict[str, NDArray[np.float64]]}
 
 
