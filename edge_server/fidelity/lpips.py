@@ -11,17 +11,12 @@ of the mask in its cells as weights (mLPIPS of Gao et al., 2022, which enlarges 
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fidelity.images import ImageError, same_size, to_unit
-
-if TYPE_CHECKING:
-    from edge_server.fidelity.lpips_network import Network
 
 MINIMUM_SIDE = 31  # smaller images leave a pooling layer of AlexNet without input
 # AlexNet's convolutions: channels out and in, and side of the kernel.
@@ -43,8 +38,6 @@ class Lpips:
         lins = _arrays(lin)
         self._lin = [lins[f"lin{i}"].reshape(-1) for i in range(len(lins))]
         self._check()
-        self._lock = threading.Lock()
-        self._loaded: Network | None = None
 
     def __call__(self, rendering: NDArray, truth: NDArray, mask: NDArray[np.bool_] | None = None) -> float:
         """Distance of two images as ``images.to_unit`` takes them: 0 for equal ones, about 1 for unrelated
@@ -55,34 +48,14 @@ class Lpips:
         """
         a, b = to_unit(rendering, "rendering"), to_unit(truth, "truth")
         same_size(a, b)
-        return float(self.batch(a[None], b[None], None if mask is None else mask[None])[0])
-
-    def batch(
-        self, renderings: NDArray, truths: NDArray, masks: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.float64]:
-        """Distances (N,) of image pairs (N, H, W, 3), floating in [0, 1], finite; masks: (N, H, W). Raises ImageError
-        for other shapes, a side shorter than ``minimum_side``, or a distance that is not finite."""
-        if renderings.shape != truths.shape or renderings.ndim != 4 or renderings.shape[3] != 3:
-            raise ImageError(f"expected two (N, H, W, 3) stacks, got {renderings.shape} and {truths.shape}")
-        height, width = renderings.shape[1:3]
+        height, width = a.shape[:2]
         if min(height, width) < MINIMUM_SIDE:
             raise ImageError(
                 f"LPIPS needs images of at least {MINIMUM_SIDE} x {MINIMUM_SIDE} pixels, got {width} x {height}"
             )
-        if masks is not None:
-            renderings, truths = renderings * masks[..., None], truths * masks[..., None]
-        distances = self._network().distances(renderings, truths, masks)
-        if not np.isfinite(distances).all():
-            raise ImageError("LPIPS is not finite: an image holds NaN, infinity or values far outside [0, 1]")
-        return distances
+        from edge_server.fidelity.lpips_network import distance
 
-    def _network(self) -> Network:
-        with self._lock:
-            if self._loaded is None:
-                from edge_server.fidelity.lpips_network import Network
-
-                self._loaded = Network(self._parameters, self._lin)
-            return self._loaded
+        return distance(self._parameters, self._lin, a, b, mask)
 
     def _check(self) -> None:
         """Find missing and misshapen arrays before the first score."""

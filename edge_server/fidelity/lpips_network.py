@@ -18,49 +18,39 @@ SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 EPSILON = 1e-10
 
-Parameters = dict[str, Tensor]
 
+def distance(
+    parameters: Mapping[str, NDArray[np.float32]],
+    lins: Sequence[NDArray[np.float32]],
+    rendering: NDArray,
+    truth: NDArray,
+    mask: NDArray[np.bool_] | None = None,
+) -> float:
+    """Distance of two images (H, W, 3), floating in [0, 1].
 
-class Network:
-    """Distances by AlexNet. Stateless once built, so that threads may share it.
-
-    parameters: its arrays by name.
-    lin: one vector of channel weights (C,) per slice.
+    parameters: AlexNet's arrays by name. lins: a vector of channel weights (C,) per slice.
+    mask: (H, W), outside which both are black, and by whose share in each cell it counts; None: all count the same.
     """
-
-    def __init__(self, parameters: Mapping[str, NDArray[np.float32]], lin: Sequence[NDArray[np.float32]]) -> None:
-        self._parameters = {key: torch.from_numpy(array) for key, array in parameters.items()}
-        self._lin = [torch.from_numpy(each) for each in lin]
-
-    def distances(
-        self, renderings: NDArray, truths: NDArray, masks: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.float64]:
-        """Distances (N,) of image pairs (N, H, W, 3), floating in [0, 1]. masks: (N, H, W), the weights of pixels in
-        the averages; None: all weigh the same."""
-        n = len(renderings)
-        with torch.inference_mode(), one_torch_thread():
-            x = np.concatenate([renderings, truths]).astype(np.float32).transpose(0, 3, 1, 2)
-            pixels = torch.from_numpy(np.ascontiguousarray(x)) * 2.0 - 1.0
-            pixels = (pixels - torch.tensor(SHIFT).view(1, 3, 1, 1)) / torch.tensor(SCALE).view(1, 3, 1, 1)
-            total = torch.zeros(n, dtype=torch.float64)
-            for features, lin in zip(_slices(self._parameters, pixels), self._lin):
-                unit = features / (features.square().sum(1, keepdim=True).sqrt() + EPSILON)
-                weighted = (unit[:n] - unit[n:]).square() * lin.view(1, -1, 1, 1)
-                total += _mean(weighted.double().sum(1), masks)
-        found: NDArray[np.float64] = total.numpy()
-        return found
+    pair = np.stack([rendering, truth])
+    with torch.inference_mode(), one_torch_thread():
+        shares = None if mask is None else torch.from_numpy(mask[None].astype(np.float64))
+        x = (pair if mask is None else pair * mask[..., None]).astype(np.float32).transpose(0, 3, 1, 2)
+        pixels = torch.from_numpy(np.ascontiguousarray(x)) * 2.0 - 1.0
+        pixels = (pixels - torch.tensor(SHIFT).view(1, 3, 1, 1)) / torch.tensor(SCALE).view(1, 3, 1, 1)
+        total = 0.0
+        for features, lin in zip(_slices({k: torch.from_numpy(v) for k, v in parameters.items()}, pixels), lins):
+            unit = features / (features.square().sum(1, keepdim=True).sqrt() + EPSILON)
+            weighted = (unit[:1] - unit[1:]).square() * torch.from_numpy(lin).view(1, -1, 1, 1)
+            values = weighted.double().sum(1)
+            if shares is None:
+                total += float(values.mean())
+            else:
+                cells = F.adaptive_avg_pool2d(shares, (values.shape[1], values.shape[2]))
+                total += float((values * cells).sum() / cells.sum())
+    return total
 
 
-def _mean(values: Tensor, masks: NDArray[np.bool_] | None) -> Tensor:
-    """Mean (N,) of ``values`` (N, h, w), weighted by the share of ``masks`` (N, H, W) in each cell."""
-    if masks is None:
-        return values.mean((1, 2))
-    _, height, width = values.shape
-    shares = F.adaptive_avg_pool2d(torch.from_numpy(masks.astype(np.float64)), (height, width))
-    return (values * shares).sum((1, 2)) / shares.sum((1, 2))
-
-
-def _slices(p: Parameters, x: Tensor) -> list[Tensor]:
+def _slices(p: Mapping[str, Tensor], x: Tensor) -> list[Tensor]:
     """AlexNet after each of its five rectified convolutions; x (N, 3, H, W)."""
 
     def conv(name: str, x: Tensor, stride: int, padding: int) -> Tensor:

@@ -21,36 +21,24 @@ USUAL = "once a machine: usually 90 to 180 functions in 20 to 50 s"
 20 s on a fast core; 35 s on a slow one, 46 with the kernels of depth."""
 LOG_EVERY_S = 10.0
 """Between two lines of the log: a long compilation shows that it goes on, and a short one is a single line."""
-PAUSE_S = 5.0
-"""Without a compilation: the next one counts anew. Kernels of depth or of a mesh may come minutes after the first."""
 
 
 class Teller(event.Listener):
-    """Says how many functions were compiled so far, and in what time, at most once every ``every_s`` seconds."""
+    """Says how many functions were compiled so far, at most once every ``every_s`` seconds."""
 
     def __init__(self, say: Callable[[str], None], every_s: float) -> None:
-        self._say = say
-        self._every_s = every_s
-        self._count = 0
-        self._began_s = 0.0
-        self._said_s = -every_s
-        self._ended_s = -PAUSE_S
-        self._within = 0  # one compilation may need another
+        self._say, self._every_s = say, every_s
+        self._count, self._said_s = 0, -every_s
 
     def on_start(self, event: event.Event) -> None:
-        now_s = time.perf_counter()
-        if now_s - self._ended_s >= PAUSE_S and not self._within:
-            self._began_s, self._count = now_s, 0
-        self._within += 1
         self._count += 1
+        now_s = time.perf_counter()
         if now_s - self._said_s >= self._every_s:
             self._said_s = now_s
-            passed_s = now_s - self._began_s
-            self._say(f"compiling the field's kernels ({USUAL}): number {self._count} after {passed_s:.0f} s")
+            self._say(f"compiling the field's kernels ({USUAL}): number {self._count}")
 
     def on_end(self, event: event.Event) -> None:
-        self._within -= 1
-        self._ended_s = time.perf_counter()
+        """One compilation may need another: what ends says nothing."""
 
 
 @contextmanager

@@ -17,7 +17,6 @@ if TYPE_CHECKING:  # of the extra surface
 
 Floats = NDArray[np.float32]
 
-MOST_VOXELS = 1 << 27  # of the box around the blocks: 512 MB of distances, and about as much for each step
 LEAST = 1e-3  # voxels; a distance of exactly 0 puts a vertex on a voxel and makes degenerate triangles
 KEEP_SHARE = 0.002  # share of the largest component's area; smaller components are removed
 NO_SURFACE = "the depth maps hold no surface within the bounds"
@@ -29,7 +28,7 @@ def extract_mesh(volume: Volume, min_weight: float = 0.0) -> Trimesh:
     faces counter-clockwise seen from outside, with colors of vertices.
 
     min_weight: voxels need more fused weight than this to be known; faces connect only known voxels.
-    SurfaceError: scikit-image or trimesh is missing, there is no surface, or the box has more than ``MOST_VOXELS``.
+    SurfaceError: scikit-image or trimesh is missing, or there is no surface.
     """
     marching_cubes = import_marching_cubes()
     from trimesh import Trimesh
@@ -76,13 +75,6 @@ class _Dense:
             raise SurfaceError(NO_SURFACE)
         low, high = place.min(axis=0), place.max(axis=0) + 1
         self.low, self.high = low.astype(np.int64), high.astype(np.int64)
-        voxels = int(np.prod((self.high - self.low) * SIDE))
-        if voxels > MOST_VOXELS:
-            least_m = volume.grid.voxel_m * (voxels / MOST_VOXELS) ** (1 / 3)
-            raise SurfaceError(
-                f"a mesh at {1e3 * volume.grid.voxel_m:g} mm has too many voxels: take {1e3 * least_m:.2g} mm "
-                "or more, or smaller bounds"
-            )
 
     def distances(self) -> tuple[Floats, NDArray[np.bool_]]:
         """Distances of all voxels (X, Y, Z), meters, and whether each is known."""

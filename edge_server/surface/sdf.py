@@ -11,7 +11,7 @@ The fitted distances replace those of a fused volume; its weights and colors are
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +31,8 @@ def fit_sdf(grid: Grid, maps: Sequence[DepthMap], say: Callable[[str, float], No
     Raises SurfaceError if torch is missing, the grid is too fine, or there is nothing to fit.
     """
     volume = fuse_maps(grid, maps)
-    samples = _Samples.of(maps, grid)
-    if not len(samples.points):
+    samples = _samples(grid, maps)
+    if not len(samples[0]):
         raise SurfaceError("no camera sees anything solid within the bounds")
     nodes = int(np.prod(grid.blocks * SIDE))
     if nodes > MAX_NODES:
@@ -48,40 +48,29 @@ def fit_sdf(grid: Grid, maps: Sequence[DepthMap], say: Callable[[str, float], No
     return replace(volume, blocks=volume.blocks._replace(distance=clipped.astype(np.float32)))
 
 
-@dataclass(frozen=True)
-class _Samples:
-    """points: float32 (N, 3), on the surface, meters from the grid's lower corner. rays: (N, 3), directions
-    away from the camera. cosine, trust: (N,)."""
-
-    points: NDArray[np.float32]
-    rays: NDArray[np.float32]
-    cosine: NDArray[np.float32]
-    trust: NDArray[np.float32]
-
-    @classmethod
-    def of(cls, maps: Sequence[DepthMap], grid: Grid) -> _Samples:
-        points, rays, cosine, trust = [], [], [], []
-        for m in maps:
-            at = m.points() - np.array(grid.lower)
-            inside = ((at > 0) & (at < np.subtract(grid.upper, grid.lower))).all(axis=1)
-            points.append(at[inside])
-            rays.append((m.intrinsics.rays()[m.seen] @ m.camera_to_world[:3, :3].T)[inside])
-            cosine.append(m.cosine[m.seen][inside])
-            trust.append(m.trust[m.seen][inside])
-        every = (np.concatenate(part).astype(np.float32) for part in (points, rays, cosine, trust))
-        return cls(*every)
+def _samples(grid: Grid, maps: Sequence[DepthMap]) -> tuple[NDArray[np.float32], ...]:
+    """Of pixels that see a surface within the grid: points (N, 3), meters from the grid's lower corner, rays (N, 3),
+    away from the camera, and cosine and trust (N,)."""
+    found = []
+    for m in maps:
+        at = m.points() - np.array(grid.lower)
+        inside = ((at > 0) & (at < np.subtract(grid.upper, grid.lower))).all(axis=1)
+        rays = m.intrinsics.rays()[m.seen] @ m.camera_to_world[:3, :3].T
+        found.append([part[inside] for part in (at, rays, m.cosine[m.seen], m.trust[m.seen])])
+    return tuple(np.concatenate(part).astype(np.float32) for part in zip(*found))
 
 
-def _optimize(grid: Grid, samples: _Samples, say: Callable[[str, float], None] | None) -> NDArray[np.float32]:
-    """Distances (X, Y, Z) at the grid's voxels, meters."""
+def _optimize(
+    grid: Grid, samples: tuple[NDArray[np.float32], ...], say: Callable[[str, float], None] | None
+) -> NDArray[np.float32]:
+    """Distances (X, Y, Z) at the grid's voxels, meters. samples: see ``_samples``."""
     try:
         import torch
         from torch.nn.functional import interpolate
     except ImportError:
         raise SurfaceError("method sdf needs torch: pip install 'freshfield[edge]'") from None
     generator = torch.Generator().manual_seed(0)
-    points, rays = torch.from_numpy(samples.points), torch.from_numpy(samples.rays)
-    cosine, trust = torch.from_numpy(samples.cosine), torch.from_numpy(samples.trust)
+    points, rays, cosine, trust = map(torch.from_numpy, samples)
     chances = (trust.double() / trust.double().sum()).cumsum(0)
     size = tuple(int(n) for n in grid.blocks * SIDE)
     # All distances start slightly positive; the sides term and the surface points make the inside negative.
@@ -97,9 +86,8 @@ def _optimize(grid: Grid, samples: _Samples, say: Callable[[str, float], None] |
         optimizer = torch.optim.Adam([values], lr=settings.SDF_RATE * voxel, betas=(0.9, 0.95))
         for step in range(settings.SDF_STEPS):
             # Sample by trust; searchsorted does what multinomial would, without its limit of 2^24.
-            drawn = torch.searchsorted(
-                chances, torch.rand(settings.SDF_POINTS, generator=generator, dtype=torch.float64)
-            ).clamp_(max=len(chances) - 1)
+            tickets = torch.rand(settings.SDF_POINTS, generator=generator, dtype=torch.float64)
+            drawn = torch.searchsorted(chances, tickets).clamp_(max=len(chances) - 1)
             loss = _loss(values, extent, voxel, grid.band_m, points[drawn], rays[drawn], cosine[drawn], generator)
             optimizer.param_groups[0]["lr"] = settings.SDF_RATE * voxel * 0.1 ** (step / settings.SDF_STEPS)
             optimizer.zero_grad(set_to_none=True)

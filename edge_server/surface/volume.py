@@ -18,9 +18,8 @@ from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.fuse import CELLS, FAR, SIDE, Blocks, KernelDepth, fuse
-from edge_server.surface.settings import MEMORY_MB
+from edge_server.surface.settings import MOST_VOXELS
 
-BLOCK_BYTES = CELLS * 4 * (1 + 1 + 4)  # per block
 MAX_BLOCKS = 1 << 24  # in the table of blocks: 24 bytes each during fusion
 TRUNCATION = 4.0  # voxels
 OUTLIERS = 0.002  # share of points at each end of each axis
@@ -91,25 +90,20 @@ def bounding_box(
 
 
 def fuse_maps(
-    grid: Grid,
-    maps: Iterable[DepthMap],
-    memory_mb: float = MEMORY_MB,
-    pool: Pool | None = None,
-    on_map: Callable[[int], None] | None = None,
+    grid: Grid, maps: Iterable[DepthMap], pool: Pool | None = None, on_map: Callable[[int], None] | None = None
 ) -> Volume:
-    """Fuse ``maps`` in order. on_map: called with the count done. Raises SurfaceError if the volume needs
-    more than ``memory_mb`` megabytes."""
+    """Fuse ``maps`` in order. on_map: called with the count done. Raises SurfaceError if the box around what is near
+    a surface has more than ``MOST_VOXELS``."""
     maps = list(maps)
     pool = pool or shared_pool()
     table = np.full(tuple(grid.blocks), -1, np.int32)
     place = np.argwhere(blocks_near_surfaces(grid, maps)).astype(np.int32)
-    needed_mb = len(place) * BLOCK_BYTES / 1e6
-    if needed_mb > memory_mb:
-        # The number of blocks near a surface grows with the square of the resolution.
-        least_m = grid.voxel_m * np.sqrt(needed_mb / memory_mb)
+    voxels = float(np.prod((np.ptp(place, axis=0) + 1.0) * SIDE)) if len(place) else 0.0
+    if voxels > MOST_VOXELS:
+        least_m = grid.voxel_m * (voxels / MOST_VOXELS) ** (1 / 3)
         raise SurfaceError(
-            f"{1e3 * grid.voxel_m:g} mm voxels need {needed_mb:.0f} MB, more than the {memory_mb:.0f} "
-            f"allowed: take {1e3 * least_m:.2g} mm or more, or smaller bounds"
+            f"a mesh at {1e3 * grid.voxel_m:g} mm has too many voxels: take {1e3 * least_m:.2g} mm or more, or smaller "
+            "bounds"
         )
     table[tuple(place.T)] = np.arange(len(place), dtype=np.int32)
     blocks = Blocks(

@@ -47,20 +47,21 @@ class SteppedField(ABC, Generic[S]):
     ``fit`` belongs to one thread; ``render`` and ``snapshot`` may be called from others meanwhile: they
     wait for the end of the present step, some milliseconds.
 
-    name: of the representation. shape: options in which a state and the field that loads it must agree.
+    Settings: the class of its settings. shape: options in which a state and the field that loads it must agree.
     """
 
     frame_s: float | None = None
     most_pixels = None
 
-    name: ClassVar[str]
     shape: ClassVar[tuple[str, ...]]
+    Settings: ClassVar[type]
     step: int
     _step_time: StepTimer
     _snapshot: S | None  # identified by its step alone
 
-    def __init__(self, settings: Any, pool: Pool | None = None) -> None:
-        self.settings = settings
+    def __init__(self, settings: Any = None, pool: Pool | None = None) -> None:
+        """settings: of ``Settings``; None: the defaults."""
+        self.settings = settings or self.Settings()
         self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
         self._lock = FairLock()
         self.now = time.perf_counter  # the clock of budgets in seconds
@@ -125,12 +126,12 @@ class SteppedField(ABC, Generic[S]):
     def state(self) -> Arrays:
         """Everything needed to go on bit for bit: what was learned, moments, cameras, counters."""
         with self._lock:
-            return pack_state(self.name, self.settings, self.view_store, self._counters(), self._arrays())
+            return pack_state(self.settings.name, self.settings, self.view_store, self._counters(), self._arrays())
 
     def load_state(self, state: Arrays) -> None:
         """Continue from ``state``. ValueError: it is not the state of a field of this shape."""
         with self._lock, all_or_nothing(self):
-            meta = unpack_meta(self.settings, state, self.name, self.shape)
+            meta = unpack_meta(self.settings, state, self.settings.name, self.shape)
             self.view_store = ViewStore(self.settings)
             self.view_store.load(meta, state)
             self._forget_parameters()

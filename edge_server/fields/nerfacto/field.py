@@ -11,11 +11,10 @@ from typing import ClassVar
 import msgspec
 import numpy as np
 
-from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid
+from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.train import CHUNK_RAYS
 from edge_server.fields.common.model_layout import init_net, make_grid
-from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.nerfacto.kernels.proposal import ProposalGrid, ProposalSampling
 from edge_server.fields.nerfacto.kernels.train import ProposalBins, scatter_proposal
 from edge_server.fields.nerfacto.settings import NerfactoSettings
@@ -26,7 +25,7 @@ from edge_server.fields.ngp.settings import STATE_SHAPE
 class NerfactoField(NgpField):
     """The hash grid of ``NgpField``, and a proposal. See ``fields.Field`` for the protocol."""
 
-    name = NerfactoSettings.name
+    Settings = NerfactoSettings
     shape: ClassVar[tuple[str, ...]] = (
         *(option for option in STATE_SHAPE if option != "samples"),
         "proposal_cells",
@@ -34,13 +33,6 @@ class NerfactoField(NgpField):
     )
 
     _bins: ProposalBins
-
-    def __init__(self, settings: NerfactoSettings | None = None, pool: Pool | None = None) -> None:
-        super().__init__(settings or NerfactoSettings(), pool)
-
-    def _grid(self) -> Grid:
-        e = self._encoding
-        return Grid(e.resolution, e.first, e.dense, e.table)
 
     def _make(self, rng: np.random.Generator) -> tuple[ProposalGrid, Net]:
         s = self.settings

@@ -10,10 +10,9 @@ from typing import Any, ClassVar
 import msgspec
 import numpy as np
 
-from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter
+from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, scatter
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.model_layout import init_net, make_grid
-from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.trained_field import DIRTY, TINY, TrainedField
 from edge_server.fields.common.training_schedule import active_levels
 from edge_server.fields.ngp.settings import STATE_SHAPE, NgpSettings
@@ -24,16 +23,8 @@ assert SEGMENT * FEATURES == DIRTY, "scatter and adam must use the same segments
 class NgpField(TrainedField):
     """A multiresolution hash grid and a small network. See ``fields.Field`` for the protocol."""
 
-    name = NgpSettings.name
+    Settings: ClassVar[type] = NgpSettings
     shape: ClassVar[tuple[str, ...]] = STATE_SHAPE
-    settings: Any
-
-    def __init__(self, settings: Any = None, pool: Pool | None = None) -> None:
-        super().__init__(settings or NgpSettings(), pool)
-
-    def _grid(self) -> Grid:
-        grid: Grid = self._encoding
-        return grid
 
     def _make(self, rng: np.random.Generator) -> tuple[Any, Net]:
         inputs = FEATURES * self.settings.levels
@@ -46,8 +37,8 @@ class NgpField(TrainedField):
         return active_levels(self.settings, self.step)
 
     def _gather(self, levels: int) -> None:
-        batch, grid = self._batch, self._grid()
-        self.pool.run(scatter, grid, levels, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty)
+        batch, to = self._batch, (self._table_g, self._dirty)
+        self.pool.run(scatter, self._encoding, levels, batch.x, batch.d_features, batch.columns, *to)
 
 
 make = NgpField

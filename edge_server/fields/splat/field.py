@@ -23,7 +23,6 @@ from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.fields.common.stepped_field import Step, SteppedField
 from edge_server.fields.common.supervision import supervising_views
-from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.common.view_store import Arrays, same_views
 from edge_server.fields.splat.buffers import RasterBuffers
@@ -33,7 +32,6 @@ from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATE
 from edge_server.fields.splat.kernels.rasterize import LOSSES, Targets
 from edge_server.fields.splat.seeding import seed_gaussians
 from edge_server.fields.splat.settings import (
-    ALIGN_EVERY,
     RATE_COLOR,
     RATE_OPACITY,
     RATE_POSITION,
@@ -51,13 +49,10 @@ class StillField(SteppedField[SplatSnapshot]):
     Where things move, it learns what the newest view of each camera shows.
     """
 
-    name = "splat"
+    Settings = SplatSettings
     shape = ("sh_degree",)
     settings: SplatSettings
     _rigid: NDArray[np.float64] | None = None  # (6,): steps write force and torque here, see ``RasterBuffers.step``
-
-    def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
-        super().__init__(settings or SplatSettings(), pool)
 
     # --- the protocol -------------------------------------------------------------------------
 
@@ -210,7 +205,9 @@ class StillField(SteppedField[SplatSnapshot]):
         dropped = raster.step(camera, gaussians, cloud.optimizer_state(), self.adam_parameters(progress), self._rigid)
         self._learn_camera(view, losses)
         if self.settings.planar:
-            self._planar_step(view)
+            from edge_server.fields.splat.planar import flatten  # compiled only where it is used
+
+            flatten(cloud, self.settings.flatten)
         square, broken = losses.sum(axis=0)[:LOSSES].tolist()
         if broken:
             self._repair()
@@ -224,17 +221,6 @@ class StillField(SteppedField[SplatSnapshot]):
     def _compare(self, view: int) -> NDArray[np.float64]:
         """Compare a view with what its camera sees, and find the gradients. Returns ``losses``, see ``train_tiles``."""
         return self._raster.train(self._targets, view)
-
-    def _planar_step(self, view: int) -> None:
-        """Flatten the Gaussians, and align them with the normals that ``view`` shows."""
-        from edge_server.fields.splat.planar import align, flatten
-
-        s = self.settings
-        flatten(self.cloud, s.flatten)
-        if s.align and self.step % ALIGN_EVERY == 0:
-            camera = self._cams[[view]]
-            self._render_raster.project_and_bin(camera, self.cloud.gaussians())
-            align(self.cloud, s.align, self._render_raster, camera[0], self._views[view].intrinsics)
 
     def adam_parameters(self, progress: float) -> AdamParameters:
         """Parameters of an optimizer step at ``progress``, in [0, 1], of a fit."""

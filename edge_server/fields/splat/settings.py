@@ -46,8 +46,6 @@ SWEEP_SMALL, SWEEP_LARGE = 0.03, 8.0  # penalties of one step of depth between n
 SWEEP_EDGE = 10.0  # the latter falls to half at a change of gray of the inverse of this
 SWEEP_DISTINCT = 0.02  # cost, in the same unit, by which depths must be better than others: walls of one color are not
 
-ALIGN_EVERY = 5  # steps between two alignments with the rendered normals
-
 
 class SplatSettings(FieldSettings, frozen=True):
     """The options of a Gaussian field. Lengths in meters; None means: found from the cameras."""
@@ -64,9 +62,6 @@ class SplatSettings(FieldSettings, frozen=True):
     ] = 50
     flatten: Annotated[
         float, within(0, 1, "decrease a step of each Gaussian's smallest log scale, for surfaces (.02); 0: none")
-    ] = 0.0
-    align: Annotated[
-        float, within(0, 1, "share by which Gaussians turn to the normals of the rendered depth, for surfaces (.3)")
     ] = 0.0
     layers: Annotated[
         bool, about("background plates, a still field and a moving set instead of one field, where cameras stand still")
@@ -93,7 +88,7 @@ class SplatSettings(FieldSettings, frozen=True):
     @property
     def planar(self) -> bool:
         """Whether Gaussians are made flat, so that depth is rendered from their planes."""
-        return self.flatten > 0.0 or self.align > 0.0
+        return self.flatten > 0.0
 
 
 SETTINGS = SplatSettings

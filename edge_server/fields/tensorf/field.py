@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.model_layout import FIRST_DENSITY, init_net
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.trained_field import DIRTY, TrainedField
 from edge_server.fields.tensorf.kernels.vector_matrix import CHANNELS, MODES, ROWS, Planes, scatter_planes
 from edge_server.fields.tensorf.settings import TensorfSettings
@@ -25,7 +24,7 @@ FINEST = 256  # vertices a side by default: finer planes outgrow the second-leve
 class TensorfField(TrainedField):
     """Planes, lines and a small network for color. See ``fields.Field`` for the protocol."""
 
-    name = "tensorf"
+    Settings = TensorfSettings
     shape = (
         "density_rank",
         "color_rank",
@@ -39,9 +38,6 @@ class TensorfField(TrainedField):
         "samples",
     )
     settings: TensorfSettings
-
-    def __init__(self, settings: TensorfSettings | None = None, pool: Pool | None = None) -> None:
-        super().__init__(settings or TensorfSettings(), pool)
 
     def _make(self, rng: np.random.Generator) -> tuple[Planes, Net]:
         s = self.settings

@@ -48,10 +48,10 @@ def test_a_mask_blackens_the_rest_and_weighs_each_cell_of_a_slice_by_its_share()
     distance, black = lpips(a, b, mask), (a * mask[..., None], b * mask[..., None])
     assert distance == lpips(*black, mask) != pytest.approx(lpips(*black), rel=0.01)
     assert lpips(a, b, np.ones_like(mask)) == pytest.approx(lpips(a, b), abs=1e-12)
-    network, expected = lpips._network(), 0.0
+    parameters, expected = {name: torch.from_numpy(array) for name, array in lpips._parameters.items()}, 0.0
     x = torch.from_numpy(np.stack(black).astype(np.float32).transpose(0, 3, 1, 2)) * 2 - 1
     x = (x - torch.tensor(lpips_network.SHIFT).view(3, 1, 1)) / torch.tensor(lpips_network.SCALE).view(3, 1, 1)
-    for found, weights in zip(lpips_network._slices(network._parameters, x), lpips._lin):
+    for found, weights in zip(lpips_network._slices(parameters, x), lpips._lin):
         unit = (found / found.norm(dim=1, keepdim=True).clamp_min(1e-9)).double().numpy()
         map_ = ((unit[0] - unit[1]) ** 2 * weights[:, None, None]).sum(0)
         share = adaptive_avg_pool2d(torch.from_numpy(mask.astype(float))[None], map_.shape)[0].numpy()

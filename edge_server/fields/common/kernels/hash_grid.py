@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.mlp import backward, forward
-from edge_server.fields.common.kernels.radiance_model import is_a, query_backward, query_color, query_density
+from edge_server.fields.common.kernels.radiance_model import has, query_backward, query_color, query_density
 from edge_server.fields.common.kernels.simd import fetch_add
 
 FEATURES = 2  # a vertex; one 64-bit load
@@ -175,7 +175,7 @@ def scatter(counter, worker, grid, levels, x, d_features, counts, gradient, dirt
 
 @overload(query_density)
 def _query_density(encoding, levels, net, x, start, end, acts):
-    if not is_a(encoding, Grid):
+    if not has(encoding, "resolution"):
         return None
 
     def run(encoding, levels, net, x, start, end, acts):
@@ -192,12 +192,12 @@ def _query_density(encoding, levels, net, x, start, end, acts):
 @overload(query_color)
 def _query_color(encoding, levels, net, x, start, end, acts):
     """``query_density`` has done it already."""
-    return (lambda encoding, levels, net, x, start, end, acts: None) if is_a(encoding, Grid) else None
+    return (lambda encoding, levels, net, x, start, end, acts: None) if has(encoding, "resolution") else None
 
 
 @overload(query_backward)
 def _query_backward(encoding, net, acts, d_acts, n, d_params, d_features):
-    if not is_a(encoding, Grid):
+    if not has(encoding, "resolution"):
         return None
 
     def run(encoding, net, acts, d_acts, n, d_params, d_features):

@@ -17,14 +17,9 @@ from typing import Any
 from numba import types
 
 
-def is_a(encoding: Any, kind: type) -> bool:
-    """Whether numba's type ``encoding`` is that of named tuple ``kind``: for use in overloads."""
-    return isinstance(encoding, types.BaseNamedTuple) and encoding.instance_class is kind
-
-
-def has_own_sampling(encoding: Any) -> bool:
-    """Whether an encoding of numba's type ``encoding`` says where samples lie."""
-    return isinstance(encoding, types.BaseNamedTuple) and "sampling" in encoding.fields
+def has(encoding: Any, field: str) -> bool:
+    """Whether numba's type ``encoding`` is that of a named tuple with this field: for use in overloads."""
+    return isinstance(encoding, types.BaseNamedTuple) and field in encoding.fields
 
 
 def query_density(encoding, levels, net, x, start, end, acts):  # type: ignore[no-untyped-def]

@@ -6,7 +6,7 @@ import numpy as np
 from numba.extending import overload
 
 from edge_server.fields.common.kernels.jit import kernel
-from edge_server.fields.common.kernels.radiance_model import has_own_sampling, query_color, query_density, sample_rays
+from edge_server.fields.common.kernels.radiance_model import has, query_color, query_density, sample_rays
 from edge_server.fields.common.kernels.rays import NEVER, interval, march, pixel_direction
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite
 from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, activate, add_harmonics
@@ -20,7 +20,7 @@ _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 @overload(sample_rays)
 def _march(encoding, space, o, travel, active, count, x, line, first):
-    if has_own_sampling(encoding):
+    if has(encoding, "sampling"):
         return None
 
     def run(encoding, space, o, travel, active, count, x, line, first):

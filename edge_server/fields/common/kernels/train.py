@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.radiance_model import (
     fill_chunk,
-    has_own_sampling,
+    has,
     learn_sampling,
     query_backward,
     query_color,
@@ -240,7 +240,7 @@ def _march_chunk(views, ray_sampling, space, encoding, net, chunk, x, line, acts
 
 @overload(fill_chunk)
 def _fill_chunk(encoding, views, ray_sampling, space, net, chunk, worker, x, line, acts, ray, travel, span, bins):
-    if has_own_sampling(encoding):
+    if has(encoding, "sampling"):
         return None
 
     def run(encoding, views, ray_sampling, space, net, chunk, worker, x, line, acts, ray, travel, span, bins):
@@ -255,7 +255,7 @@ def _fill_chunk(encoding, views, ray_sampling, space, net, chunk, worker, x, lin
 @overload(learn_sampling)
 def _learn_sampling(encoding, bins, chunk, worker, r, w, line, a, b, good):
     """Nothing to learn."""
-    if has_own_sampling(encoding):
+    if has(encoding, "sampling"):
         return None
     return lambda encoding, bins, chunk, worker, r, w, line, a, b, good: None
 

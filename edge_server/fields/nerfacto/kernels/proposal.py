@@ -17,15 +17,8 @@ import numpy as np
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.hash_grid import Grid
 from edge_server.fields.common.kernels.jit import device_function
-from edge_server.fields.common.kernels.radiance_model import (
-    is_a,
-    query_backward,
-    query_color,
-    query_density,
-    sample_rays,
-)
+from edge_server.fields.common.kernels.radiance_model import has, sample_rays
 from edge_server.fields.common.kernels.rays import interval, slab, unit_cube
 from edge_server.fields.common.kernels.simd import exp32, is_finite
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
@@ -275,7 +268,7 @@ def sample_ray(space, encoding, o, d, shift, within, bins, first, scratch, n, x,
 @overload(sample_rays)
 def _sample_rays(encoding, space, o, travel, active, count, x, line, first):
     """All samples of a ray at once, from the middle of the raster's places."""
-    if not is_a(encoding, ProposalGrid):
+    if not has(encoding, "sampling"):
         return None
 
     def run(encoding, space, o, travel, active, count, x, line, first):
@@ -289,38 +282,5 @@ def _sample_rays(encoding, space, o, travel, active, count, x, line, first):
             _, _, n = sample_ray(space, encoding, o, d, _HALF, _HALF, bins, zero, scratch, n, x, line)
             travel[r, 3], first[k + 1] = travel[r, 4], n
         return count
-
-    return run
-
-
-@device_function
-def _grid(e):
-    return Grid(e.resolution, e.first, e.dense, e.table)
-
-
-@overload(query_density)
-def _query_density(encoding, levels, net, x, start, end, acts):
-    if not is_a(encoding, ProposalGrid):
-        return None
-
-    def run(encoding, levels, net, x, start, end, acts):
-        query_density(_grid(encoding), levels, net, x, start, end, acts)
-
-    return run
-
-
-@overload(query_color)
-def _query_color(encoding, levels, net, x, start, end, acts):
-    """Nothing to do: ``query_density`` has evaluated the whole network."""
-    return (lambda encoding, levels, net, x, start, end, acts: None) if is_a(encoding, ProposalGrid) else None
-
-
-@overload(query_backward)
-def _query_backward(encoding, net, acts, d_acts, n, d_params, d_features):
-    if not is_a(encoding, ProposalGrid):
-        return None
-
-    def run(encoding, net, acts, d_acts, n, d_params, d_features):
-        query_backward(_grid(encoding), net, acts, d_acts, n, d_params, d_features)
 
     return run

@@ -10,19 +10,12 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT
 from edge_server.fields.common.kernels.jit import device_function, kernel
-from edge_server.fields.common.kernels.radiance_model import fill_chunk, is_a, learn_sampling, query_density
+from edge_server.fields.common.kernels.radiance_model import fill_chunk, has, learn_sampling, query_density
 from edge_server.fields.common.kernels.rays import origin_of
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, uniform
 from edge_server.fields.common.kernels.train import AT, CHUNK, CHUNK_RAYS, LEAVE, draw_ray
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW, activate_density, samples_until_opaque
-from edge_server.fields.nerfacto.kernels.proposal import (
-    RAW_GAIN,
-    RAW_START,
-    ProposalGrid,
-    bin_scratch,
-    proposal_cells_of,
-    sample_ray,
-)
+from edge_server.fields.nerfacto.kernels.proposal import RAW_GAIN, RAW_START, bin_scratch, proposal_cells_of, sample_ray
 
 SCATTER_TASKS = 8  # tasks of the kernel that adds up the gradient of the grid
 WEIGHT_FLOOR = 1e-3  # in the interlevel loss's denominator, so that a weight of 0 does not divide
@@ -105,7 +98,7 @@ def _sample_chunk(views, ray_sampling, space, encoding, net, chunk, worker, x, l
 
 @overload(fill_chunk)
 def _fill_chunk(encoding, views, ray_sampling, space, net, chunk, worker, x, line, acts, ray, travel, span, bins):
-    if not is_a(encoding, ProposalGrid):
+    if not has(encoding, "sampling"):
         return None
 
     def run(encoding, views, ray_sampling, space, net, chunk, worker, x, line, acts, ray, travel, span, bins):
@@ -160,7 +153,7 @@ def interlevel_loss(encoding, cell, depth, weight, group, first, count, w, group
 
 @overload(learn_sampling)
 def _learn_sampling(encoding, bins, chunk, worker, r, w, line, a, b, good):
-    if not is_a(encoding, ProposalGrid):
+    if not has(encoding, "sampling"):
         return None
 
     def run(encoding, bins, chunk, worker, r, w, line, a, b, good):

@@ -132,9 +132,9 @@ def composite_strips(raster, strip_pairs, count, x0, y0, s, store, size, step, c
 
 
 @device_function
-def composite_strips_backward(raster, begin, end, strip_pairs, composited, x0, y0, slopes, first, store, size, sums):
+def _composite_strips_backward(raster, begin, end, strip_pairs, composited, x0, y0, s, store, size, sums):
     """``composite_backward`` all strips of a tile, whose list goes from ``begin`` to ``end``: writes the rows of its
-    pairs in ``sums``, float32 (B, P, SUMS). first: where the rows of ``slopes`` begin."""
+    pairs in ``sums``, float32 (B, P, SUMS). s: the tile's memory, from ER on the slopes."""
     for j in range(begin, end):
         rest = sums[0, raster.lists.pair[0, j]]
         for k in range(SUMS):
@@ -147,8 +147,8 @@ def composite_strips_backward(raster, begin, end, strip_pairs, composited, x0, y
             raster.projected[0],
             np.float32(x0),
             np.float32(y0 + 2 * n),
-            slopes,
-            first + n * STRIP,
+            s,
+            _ER + n * STRIP,
             store[n * size : (n + 1) * size],
             sums[0],
         )
@@ -282,7 +282,7 @@ def train_tiles(counter, worker, raster, targets, view, sums, losses):
         losses[t, 0], losses[t, 1] = square if finite else 0.0, 0.0 if finite else 1.0
         if not finite:
             composited[0] = composited[1] = composited[2] = composited[3] = 0
-        composite_strips_backward(raster, begin, end, strip_pairs, composited, x0, y0, s, _ER, store, size, sums)
+        _composite_strips_backward(raster, begin, end, strip_pairs, composited, x0, y0, s, store, size, sums)
 
 
 @kernel

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.mlp import backward, forward
-from edge_server.fields.common.kernels.radiance_model import is_a, query_backward, query_color, query_density
+from edge_server.fields.common.kernels.radiance_model import has, query_backward, query_color, query_density
 from edge_server.fields.common.kernels.simd import fetch_add
 from edge_server.fields.common.kernels.simd_vectors import Vector
 
@@ -242,7 +242,7 @@ def scatter_planes(counter, worker, planes, x, d_features, counts, gradient, dir
 
 @overload(query_density)
 def _query_density(encoding, levels, net, x, start, end, acts):
-    if not is_a(encoding, Planes):
+    if not has(encoding, "density_groups"):
         return None
 
     def run(encoding, levels, net, x, start, end, acts):
@@ -253,7 +253,7 @@ def _query_density(encoding, levels, net, x, start, end, acts):
 
 @overload(query_color)
 def _query_color(encoding, levels, net, x, start, end, acts):
-    if not is_a(encoding, Planes):
+    if not has(encoding, "density_groups"):
         return None
 
     def run(encoding, levels, net, x, start, end, acts):
@@ -270,7 +270,7 @@ def _query_color(encoding, levels, net, x, start, end, acts):
 
 @overload(query_backward)
 def _query_backward(encoding, net, acts, d_acts, n, d_params, d_features):
-    if not is_a(encoding, Planes):
+    if not has(encoding, "density_groups"):
         return None
 
     def run(encoding, net, acts, d_acts, n, d_params, d_features):

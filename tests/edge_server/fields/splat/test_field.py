@@ -74,7 +74,7 @@ from edge_server.fields import Budget
 from tests.edge_server.fields.splat.test_field import TINY, TINY_VIEWS, StillField
 bent = [replace(v, intrinsics=replace(v.intrinsics, distortion=(-.1, .01, .002, .001))) for v in TINY_VIEWS]
 for extra, views in (({}, TINY_VIEWS), ({"sh_degree": 1, "contracted": True}, bent),
-                     ({"flatten": 0.1, "align": 0.05}, bent)):
+                     ({"flatten": 0.1}, bent)):
     field = StillField(structs.replace(TINY, **extra))
     field.fit(views, Budget(steps=25))
     out = field.render(TINY_VIEWS[0].camera_to_world, replace(TINY_VIEWS[0].intrinsics, width=37, height=19))
