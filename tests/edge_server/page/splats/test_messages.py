@@ -1,13 +1,15 @@
-"""Messages are read as they were written; what is no message is refused and changes nothing."""
+"""What the field publishes, as records in messages: the same picture; what is no message is refused."""
 
 from __future__ import annotations
 
 import struct
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
+from edge_server.fields.splat.kernels.project import Gaussians
+from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.page.splats import messages
 from edge_server.page.splats.messages import (
     HEAD,
@@ -24,8 +26,21 @@ from edge_server.page.splats.messages import (
     write_block,
     write_message,
 )
-from edge_server.page.splats.records import from_records, to_records
-from tests.edge_server.page.splats.gaussians import gaussians, motion
+from edge_server.page.splats.published import Published, Publisher
+from edge_server.page.splats.records import (
+    RECORD,
+    ZONE,
+    contract,
+    expand,
+    from_records,
+    noticeable,
+    scale_range,
+    to_records,
+    weights,
+)
+from freshfield.geometry import quaternion_to_matrix
+from tests.edge_server.fields.scenes import psnr
+from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, motion, snapshot
 
 SCALES = (-5.0, -2.0)
 RECORDS = to_records(gaussians(40, 0), SCALES)
@@ -138,3 +153,137 @@ def test_a_moving_set_waits_for_knots_of_its_own_and_another_field_forgets_it():
     np.testing.assert_array_equal(reader.at(10.75), reader.at(99.0))  # no farther ahead than motion is known
     reader.read(write_message(2, 0.0, [SceneBlock(4, (0.0, 0.0, 0.0), 1.0, 0.1, (0.0, 0.0, 0.0))]))
     assert len(reader.at(10.5)) == 0
+
+
+def covariances(params):
+    turns = np.stack([quaternion_to_matrix(q / np.linalg.norm(q)) for q in params[:, 6:10].astype(float)])
+    axes = turns * np.exp(params[:, None, 3:6].astype(float))
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def test_a_record_is_the_same_ellipsoid():
+    params = gaussians(500, 3)
+    scales = scale_range(params)
+    records = to_records(params, scales)
+    assert records.itemsize == RECORD.itemsize == 16
+    again = from_records(records, scales)
+    np.testing.assert_allclose(again[:, :3], params[:, :3], atol=4 * 2.0**-16 * 4)
+    wanted, found = covariances(params), covariances(again)
+    off = np.linalg.norm(wanted - found, axis=(1, 2)) / np.linalg.norm(wanted, axis=(1, 2))
+    assert np.median(off) < 0.01 and off.max() < 0.03
+    np.testing.assert_allclose(again[:, 11:14], params[:, 11:14], atol=0.0041)
+    alpha = lambda p: 1 / (1 + np.exp(-p[:, 10]))  # noqa: E731
+    np.testing.assert_allclose(alpha(again), alpha(params), atol=0.0021)
+
+
+def test_far_places_are_contracted_and_come_back():
+    there = contract(places := np.array([-100.0, -1.0, -0.3, 0.0, 1.0, 1.5, 20.0]))
+    assert np.abs(there).max() < 2.0
+    np.testing.assert_allclose(expand(there), places, rtol=1e-12)
+
+
+def test_turns_fill_the_zone_and_no_more():
+    turn = to_records(gaussians(20_000, 4), (-5.0, -2.0))["turn"]
+    assert turn.min() == 0 and turn.max() == 255  # bytes are neither wasted nor clipped
+    quarter = np.tile(np.array([0, 0, 0, -3, -4, -5, 1, 1, 0, 0, 0, 0, 0, 0], np.float32), (1, 1))
+    record = to_records(quarter, (-5.0, -3.0))
+    np.testing.assert_array_equal(np.abs(record["turn"].astype(float) * 2 * ZONE / 255 - ZONE) < 0.01, True)
+    assert sorted(record["scale"][0]) == [0, 128, 255]  # axes took new names instead
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    "column, value",
+    [(0, np.nan), (1, np.inf), (4, np.nan), (3, 1e30), (7, np.nan), (10, np.inf), (12, -np.inf), (2, 1e30)],
+)
+def test_what_cannot_be_drawn_is_not_drawn_and_spoils_nothing(column, value):
+    params = gaussians(20, 5).copy()
+    params[7, column] = value
+    scales = scale_range(params)
+    records = to_records(params, scales)
+    assert np.isfinite(scales).all() and scales[0] < scales[1]
+    assert np.isfinite(from_records(records, scales)).all()
+    assert np.isfinite(value) or records["alpha"][7] == 0
+    others = np.arange(20) != 7
+    kept = to_records(params[others], scales)
+    np.testing.assert_array_equal(records[others], kept)
+    found = weights(params)
+    assert np.isfinite(found).all() and (np.isfinite(value) or found[7] == 0)
+    low, high = scale_range(params[:0])
+    assert low < high and len(to_records(params[:0], (low, high))) == 0
+
+
+def test_larger_nearer_and_denser_ones_weigh_more():
+    one = np.array([[0, 0, 0, -3, -3, -3, 1, 0, 0, 0, 0, 0, 0, 0]], np.float32)
+    others = np.tile(one, (4, 1))
+    others[[0, 1, 2, 3], [3, 10, 0, 0]] = -2.0, 2.0, 0.9, 4.0  # larger, denser, within the unit, far
+    larger, denser, within, far = weights(others) / weights(one)
+    assert larger > 2.0 and denser > 1.0 and within == 1.0 and far == pytest.approx(1 / 16)
+
+
+def test_what_is_noticed():
+    before = to_records(gaussians(6, 6), (-5.0, -2.0))
+    now = before.copy()
+    for row, (name, step) in enumerate([("place", 3), ("scale", 3), ("turn", 6), ("color", 2)]):
+        now[name][row, 1] += step
+    now["alpha"][4] -= 3
+    assert not noticeable(before, now).any()
+    now["color"][3, 1] += 1
+    now["alpha"][4] -= 1
+    np.testing.assert_array_equal(noticeable(before, now), [False, False, False, True, True, False])
+
+
+START_NS, BEGIN_S = ORIGIN_NS - 3_500_000_000, 3.5  # the run began before the field's motion
+
+
+def read(published: Published, instant_s: float):
+    """What a visitor draws who has all of a publication."""
+    static = published.static
+    whole = StaticBlock(1, len(static.records), 0, static.scales, static.records)
+    moving = [block for block in (published.knots, published.moving) if block is not None]
+    reader = StreamReader()
+    reader.read(write_message(0, instant_s, [published.scene, whole, *moving]))
+    return reader.at(instant_s)
+
+
+def test_the_visitor_sees_what_the_edge_renders():
+    shown = snapshot()
+    published = Publisher(START_NS).take(shown, 0.0)
+    assert published is not None
+    for ahead_s in (-0.2, 0.0, 0.13, 0.5):
+        wanted = shown.at(ORIGIN_NS + round((NEWEST_S + ahead_s) * 1e9))
+        got = replace(shown, gaussians=Gaussians(read(published, BEGIN_S + NEWEST_S + ahead_s), 0))
+        one, two = (each.render(POSE, LENS).color for each in (wanted, got))
+        assert psnr(one, two) > 50.0 and one.std() > 0.1
+
+
+def test_a_set_is_the_same_one_while_the_field_trains_on():
+    publisher, params = Publisher(0), gaussians(700, 0)
+    first = publisher.take(snapshot(params), 0.0)
+    trained = publisher.take(snapshot(params + np.float32(0.003)), 0.6)
+    assert first.static.number == trained.static.number and trained.static.version > first.static.version
+    np.testing.assert_array_equal(np.sort(-first.static.weight), -first.static.weight)
+    np.testing.assert_allclose(read(trained, 0.0)[:700, 11:], read(first, 0.0)[:700, 11:] + 0.003, atol=0.009)
+    soon = publisher.take(snapshot(params), 0.7)
+    assert soon.static is trained.static and soon.serial == trained.serial + 1  # not made anew so soon
+    shuffled = publisher.take(snapshot(params[::-1].copy()), 2.0)
+    fewer = publisher.take(snapshot(params[:600]), 4.0)
+    assert [each.static.number for each in (trained, shuffled, fewer)] == [1, 2, 3]
+    grown = snapshot(params[:650])
+    growing = publisher.take(grown, 4.7)
+    assert growing.static is fewer.static  # a new set a second at most
+    assert publisher.take(grown, 4.9) is growing
+    assert len(publisher.take(grown, 5.1).static.records) == 650  # also if nothing more is published
+
+
+def test_a_still_field_and_one_without_gaussians():
+    still = SplatSnapshot(BOX, Gaussians(gaussians(50, 0), 0), np.zeros(3, np.float32), snapshot().pool, 0)
+    published = Publisher(5).take(still, 0.0)
+    assert (published.moving, published.knots) == (None, None)
+    assert len(published.static.records) == 50
+    assert Publisher(0).take(object(), 0.0) is None
+    again = Publisher(0)
+    assert again.take(still, 0.0) is again.take(still, 9.0)
+    # Another box is another field.
+    shown = (snapshot(), snapshot(movers=100), snapshot(box=replace(BOX, radius_m=3.0)))
+    assert [again.take(each, 9.0).scene.field for each in shown] == [1, 1, 2]

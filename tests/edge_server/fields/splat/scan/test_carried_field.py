@@ -14,12 +14,11 @@ from freshfield.geometry import look_at, se3, so3_exp
 from tests.edge_server.fields.scenes import seen
 from tests.edge_server.fields.small import same_state
 from tests.edge_server.fields.splat.scan import carried
-from tests.edge_server.fields.splat.scan.carried import BAD_FROM, SEEDS, carried_field, given, slow, undisturbed
-from tests.edge_server.fields.splat.scan.walk import LENS, WALK, at, spoiled, walk
+from tests.edge_server.fields.splat.scan.carried import BAD_FROM, LENS, SEEDS, WALK, carried_field, given, slow, walk
 
 
 def test_frames_become_keyframes_and_held_out_ones_take_their_neighbors_corrections() -> None:
-    views = spoiled(WALK)
+    views = carried.spoiled(WALK)
     field = carried.played(views)
     assert len(field.views) == len(views) - len(views[:: carried.HELD])
     raw_db, refined_db = carried.scored_db(field, views)
@@ -45,7 +44,7 @@ def test_without_depth_it_begins_anew_until_it_has_seen_enough(monkeypatch: pyte
     # The depth that was found serves the box, and each keyframe's own the steps of its pose.
     box, pixels_m = field.view_store.box, [pixel_m for _, pixel_m in field._aims[: tuned.BEGINS[-1]]]
     assert box is not None and box.distance_m == pytest.approx(field._seen_m) and len(set(pixels_m)) == len(pixels_m)
-    assert undisturbed(False)[-1] > 18.0
+    assert carried.undisturbed(False)[-1] > 18.0
 
 
 def test_a_frame_is_taken_once_and_not_before_its_turn() -> None:
@@ -85,7 +84,7 @@ def test_keyframes_taken_near_each_other_go_first_and_memory_stays(monkeypatch: 
 
 
 def test_it_resumes_bit_for_bit_whatever_the_number_of_threads() -> None:
-    views = spoiled(WALK)
+    views = carried.spoiled(WALK)
     one, two = (given(carried_field(threads), views[:20]) for threads in (2, 1))
     three = carried.resumed_from(one.state())
     for field in (one, two, three):
@@ -126,14 +125,14 @@ def _turning(view: View, place: View = WALK[BAD_FROM]) -> View:
     """It looks about from one place."""
     pose = view.camera_to_world.copy()
     pose[:3, 3] = place.camera_to_world[:3, 3]
-    return at(pose, view)
+    return carried.at(pose, view)
 
 
 def _turned(view: View, radians: float) -> View:
     """What it sees where it turns about its vertical axis."""
     pose = view.camera_to_world.copy()
     pose[:3, :3] = pose[:3, :3] @ so3_exp(np.array([0.0, radians, 0.0]))
-    return at(pose, view)
+    return carried.at(pose, view)
 
 
 def _blurred(view: View) -> View:
@@ -173,7 +172,7 @@ def test_after_a_bad_second_the_picture_recovers_within_one(
     field, found_db = carried.gone_on([*clean[: bad.start], *map(spoil, clean[bad]), *clean[bad.stop :]], clean)
     assert any("left out" in line for line in field.troubles) or not said
     assert found_db[-1] > least_db
-    lost = (np.array(undisturbed(depth)) - found_db)[3:]
+    lost = (np.array(carried.undisturbed(depth)) - found_db)[3:]
     assert lost.mean() < lost_db and lost.max() < lost_db + 1.0
 
 
@@ -229,7 +228,7 @@ def test_a_bad_beginning_is_forgotten_within_two_seconds(begin, depth: bool, los
     views = [replace(view, generated_ns=view.generated_ns + 2_000_000_000) for view in clean]
     for seed in SEEDS:
         found_db = carried.by_seconds(views, views, given(carried_field(seed=seed), bad))
-        lost.append(np.array(undisturbed(depth, seed))[:4] - found_db)
+        lost.append(np.array(carried.undisturbed(depth, seed))[:4] - found_db)
     assert np.mean(lost, axis=0).max() < lost_db
 
 
@@ -239,7 +238,7 @@ def test_gaussians_that_fall_into_a_point_are_grown_again_within_two_seconds(mon
     field = carried.played(WALK[:BAD_FROM])
     field.cloud.params[:, :3] = field.cloud.params[0, :3]
     carried.played(WALK[BAD_FROM : BAD_FROM + 20], field)
-    assert carried.scored_db(field, WALK[: BAD_FROM + 20])[1] > undisturbed(True)[4] - 3.0
+    assert carried.scored_db(field, WALK[: BAD_FROM + 20])[1] > carried.undisturbed(True)[4] - 3.0
 
 
 # --- poses in another unit, without rotation, or that leap ------------------------------------------
@@ -278,7 +277,7 @@ def test_poses_that_never_fit_give_way_to_pictures_where_depth_is_measured(spoil
         found_db = carried.by_seconds(views, views, field)
         assert len(field.views) > 60
         assert any("reported poses do not fit" in line and words in line for line in field.troubles)
-        lost.append((np.array(undisturbed(True, seed)) - found_db)[2:])
+        lost.append((np.array(carried.undisturbed(True, seed)) - found_db)[2:])
     assert np.mean(lost, axis=0).max() < lost_db
 
 
@@ -333,7 +332,7 @@ def test_poses_that_leap_and_stay_so_are_taken_back(depth: bool) -> None:
     views, lost = [_relocalized(k, view) for k, view in enumerate(walk(depth=depth))], []
     for seed in SEEDS:
         field, found_db = carried.gone_on(views, views, seed)
-        lost.append((np.array(undisturbed(depth, seed)) - found_db)[3:])
+        lost.append((np.array(carried.undisturbed(depth, seed)) - found_db)[3:])
         (said,) = (line for line in field.troubles if line.startswith("hand: its poses leapt by 1."))
         assert 17 <= int(said.split(" degrees")[0].split()[-1]) <= 23, said
     assert np.mean(lost) < 0.6  # measured: .1 each, single trainings -.2 to .3

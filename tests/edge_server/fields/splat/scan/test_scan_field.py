@@ -24,7 +24,7 @@ from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import so3_exp
 from tests.edge_server.fields.scenes import BALL_M, RADIUS_M
 from tests.edge_server.fields.small import same_state
-from tests.edge_server.fields.splat.scan.walk import WALK, spoiled, walk
+from tests.edge_server.fields.splat.scan.carried import WALK, spoiled, walk
 
 Spoil = Callable[[list[View]], list[View]]
 WITH_DEPTH, WITHOUT = WALK, walk(depth=False)

@@ -22,7 +22,7 @@ from edge_server.fields import Budget, View
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from freshfield.geometry import world_rays
 from tests.edge_server.fields.scenes import psnr, ring, seen
-from tests.edge_server.fields.splat.layers.depth.moving_ball import FRAME_S, SMALL, measured, place_m
+from tests.edge_server.fields.splat.layers.ball import FRAME_S, SMALL, measured, place_m
 
 pytestmark = [pytest.mark.stability, pytest.mark.usefixtures("shown_soon")]
 RIG = ring(9)

@@ -17,7 +17,7 @@ from edge_server.fields.splat.layers.depth import settings as depth_settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from tests.edge_server.fields.scenes import seen
 from tests.edge_server.fields.small import same_state
-from tests.edge_server.fields.splat.layers.depth.moving_ball import SMALL, Rig
+from tests.edge_server.fields.splat.layers.ball import SMALL, Rig
 
 RIG = Rig((0, 2, 4), held=1)
 WITHOUT = Rig((0, 1, 3), held=2, size=64, depth=False)
