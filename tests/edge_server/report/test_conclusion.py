@@ -63,9 +63,7 @@ def test_three_sentences_say_what_was_shown_its_age_and_its_limit(tmp_path: Path
         ({"updates.shed": 70}, 2, "92% of those delivered were left out for lack of time"),
     ],
 )
-def test_the_conclusion_follows_the_figures(
-    report: dict[str, Any], changes: dict[str, Any], sentence: int, words: str
-) -> None:
+def test_the_conclusion_follows_the_figures(report, changes, sentence, words) -> None:
     for path, value in changes.items():
         change(report, path, value)
     assert words in conclusion(report)[sentence]

@@ -201,9 +201,7 @@ def test_in_seconds_what_moves_is_followed_once_anything_is_shown_of_it() -> Non
 
 
 @pytest.mark.parametrize(("threads", "seconds", "follows"), [(2, 1, 1), (3, 0, 1)])
-def test_the_pool_leaves_a_worker_to_a_thread_that_computes_beside_it(
-    monkeypatch: pytest.MonkeyPatch, threads: int, seconds: int, follows: int
-) -> None:
+def test_the_pool_leaves_a_worker_to_a_thread_that_computes_beside_it(monkeypatch, threads, seconds, follows) -> None:
     """And of two always, where budgets are in seconds: a kernel of both would wait for the one that others hold up."""
     field, spared = LayeredField(structs.replace(SMALL, threads=threads)), list[int]()
     spare = field.pool.spare

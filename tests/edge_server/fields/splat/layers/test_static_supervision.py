@@ -57,9 +57,7 @@ def test_cameras_of_different_exposures_agree_on_one(monkeypatch: pytest.MonkeyP
     assert score(differing) > score(begun()) + (1.5 if level < 1.0 else -0.5)
 
 
-def test_layers_begin_before_plates_are_certain_and_the_still_field_anew_when_they_are(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_layers_begin_before_plates_are_certain_and_the_still_field_anew_when_they_are(monkeypatch) -> None:
     """It goes on from the views with the plates known so far; what it shows stays until the one that begins anew is
     better."""
     monkeypatch.setattr(settings, "EARLY_S", 0.6)
@@ -104,9 +102,7 @@ def test_rates_fall_once_over_the_first_schedule(monkeypatch: pytest.MonkeyPatch
     assert not any(grow for _, grow in asked[200:])
 
 
-def test_a_still_field_that_began_anew_is_shown_once_it_fits_as_well_as_what_it_replaces(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_still_field_that_began_anew_is_shown_once_it_fits_as_well_as_what_it_replaces(monkeypatch) -> None:
     field = LayeredField(SMALL)
     played(field, range(24), moves=False, steps=35)
     static, plates = field.static, [camera.plate_image(fine=False) for camera in field.cameras.values()]
@@ -132,9 +128,7 @@ def test_a_still_field_that_began_anew_is_shown_once_it_fits_as_well_as_what_it_
 
 
 @pytest.mark.parametrize(("shown_after", "anew_s"), [(20, 1.2), (10_000, 2.0)])
-def test_in_seconds_the_still_field_begins_anew_after_it_was_shown_or_late(
-    monkeypatch: pytest.MonkeyPatch, shown_after: int, anew_s: float
-) -> None:
+def test_in_seconds_the_still_field_begins_anew_after_it_was_shown_or_late(monkeypatch, shown_after, anew_s) -> None:
     """Else nobody would ever see what a slow machine learns before plates are certain."""
     for name, value in {"EARLY_S": 0.6, "PLATE_S": 1.2, "PLATES_SURE_S": 2.0, "EARLY_SHOWN_AFTER": shown_after}.items():
         monkeypatch.setattr(settings, name, value)

@@ -161,9 +161,7 @@ def _blurred(view: View) -> View:
         (_blurred, 6, False, False, 21.2, 1.0),
     ],
 )
-def test_after_a_bad_second_the_picture_recovers_within_one(
-    spoil, frames: int, said: bool, depth: bool, least_db: float, lost_db: float
-) -> None:
+def test_after_a_bad_second_the_picture_recovers_within_one(spoil, frames, said, depth, least_db, lost_db) -> None:
     """least_db: of all held-out frames at the end. lost_db: against a walk without bad frames, on average over four
     instants, a second after the first bad frame (half a second after the last) and each second later. At one instant
     two such runs differ by .4 dB for nothing: another scipy moves it as much, so a single one may lose 1 dB more.

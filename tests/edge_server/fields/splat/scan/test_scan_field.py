@@ -181,9 +181,7 @@ def _another_camera(views: list[View]) -> list[View]:
         (_senseless_depth, WITH_DEPTH, 17.0),
     ],
 )
-def test_hard_footage_leaves_a_finite_field_that_shows_what_it_learned(
-    spoil: Spoil, footage: list[View], least_db: float
-) -> None:
+def test_hard_footage_leaves_a_finite_field_that_shows_what_it_learned(spoil, footage, least_db) -> None:
     """least_db: of frames that were learned, at their corrections. ``test_carried_field`` has what else befalls one."""
     footage = spoil(footage[::2])
     field = ScanField(_settings())

@@ -174,9 +174,7 @@ def test_stereo_shows_what_is_between_few_cameras(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize(("plain_rows", "plain"), [(0, False), (14, True), (64, False)])
-def test_with_more_cameras_stereo_is_used_where_some_of_the_plates_is_plain(
-    plain_rows: int, plain: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_with_more_cameras_stereo_is_used_where_some_of_the_plates_is_plain(plain_rows, plain, monkeypatch) -> None:
     """Of the images the uppermost rows show a plain sky, which the others would, too, but for a grain."""
     monkeypatch.setattr(layer_settings, "STEREO_CAMERAS", 2)
     monkeypatch.setattr(layer_settings, "PLAIN_CAMERAS", 3)
