@@ -24,7 +24,7 @@ from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from edge_server.settings import ComputeConfig
 from freshfield.scenario import ScenarioError
-from tests.edge_server.experiments.rollouts.small import FIELD, NOTHING, reported, scenario, setting
+from tests.edge_server.experiments.rollouts.small import FIELD, NOTHING, scenario, setting
 from tests.edge_server.experiments.sets import write_recording
 
 
@@ -36,7 +36,8 @@ def one_of(what: Setting, seed: int = 5, camera: str = "cam00") -> Outcome:
 
 
 def test_the_camera_that_reports_neither_rewards_nor_is_trained_on():
-    what = reported()
+    apart = scenario(cameras={"count": 5, "held_out": ["cam00", "cam04"]})
+    what = dataclasses.replace(setting(), scenario=apart, report=("cam04",))
     assert what.rewarding == ("cam00",) and what.judging == ("cam04",)
     point = EpisodeFactory(what, NOTHING).episode(5).points[0]
     assert point.cameras == ("cam01", "cam02", "cam03")
@@ -121,8 +122,7 @@ def test_the_buffer_at_any_instant_is_the_one_of_the_deployment(channel):
 @pytest.mark.parametrize("policy", ["threshold:70", "wait-arrived:60", "periodic:400", "bandit:"])
 def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
     if policy.startswith("bandit:"):
-        learner = Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), seed=4)
-        learner.save(tmp_path / "policy.npz")
+        Learner(SELECT, seed=4).save(tmp_path / "policy.npz")
         policy = f"bandit:{tmp_path / 'policy.npz'}"
     factory = EpisodeFactory(setting(compute=ComputeConfig(5.0)), NOTHING)
     episode = factory.episode(5)
@@ -134,12 +134,9 @@ def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
     live.run(point.now_ns / 1e9 + 1.0)
     expected = live.publications[0]
     assert set(expected.selected) == set(choice.cameras)
-    assert (found.psnr_db, found.psnr_moving_db, found.ssim) == (
-        expected.psnr_db,
-        expected.psnr_moving_db,
-        expected.ssim,
-    )
-    assert found.aaoi_ms == expected.aaoi_ms and found.views == len(expected.selected)
+    for name in ("psnr_db", "psnr_moving_db", "ssim", "aaoi_ms"):
+        assert getattr(found, name) == getattr(expected, name), name
+    assert found.views == len(expected.selected)
     assert point.now_ns + round(found.wait_ms * 1e6) == expected.published_ns
 
 
@@ -195,15 +192,10 @@ def test_samples_have_actions_of_their_own_and_share_the_episode():
     assert fixed[0].features is None and fixed[0].outcomes["cam00"].views >= 3.0
 
 
-@pytest.mark.parametrize(
-    "what",
-    [
-        pytest.param(setting(), id="single decisions"),
-        pytest.param(following_arrivals(), id="deployed", marks=pytest.mark.slow),
-    ],
-)
-def test_a_job_gives_the_same_wherever_and_after_whatever_it_is_computed(what: Setting, monkeypatch):
+@pytest.mark.parametrize("deployed", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_job_gives_the_same_wherever_and_after_whatever_it_is_computed(deployed: bool, monkeypatch):
     """As processes have it: each job is sent to one, which has computed other jobs before, or none."""
+    what = following_arrivals() if deployed else setting()
     actor = Learner(dataclasses.replace(SELECT, hold_ms=300.0 * what.deployed), 0).actor
     makers = {"random": named("random"), "learned": learned(actor, explore=True)}
     work = partial(rollout_module._carry_out, setting=what, folders=NOTHING, makers=makers)

@@ -18,12 +18,12 @@ from edge_server.experiments.common.drawn_images import draw_images
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.common.statistics import Interval
-from edge_server.experiments.studies import drawing, metric_distortions
+from edge_server.experiments.studies import drawing, metric_distortions, preferences, viewpoints
 from edge_server.experiments.studies import trial as trial_module
 from edge_server.experiments.studies.learned_schedulers import LEFT_OUT, WEIGHTED, WHICH_VIEWS
 from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT, TRAININGS
 from edge_server.experiments.studies.registry import LEARNING, ON_A_CHANNEL, STUDIES
-from edge_server.experiments.studies.study import Claim, Finding, Study, StudyRequest, judge
+from edge_server.experiments.studies.study import Claim, Finding, Study, StudyRequest, judge, run_study
 from edge_server.experiments.studies.study_command import main
 from edge_server.experiments.studies.trial import Point, Trial, run_points, run_trial
 from edge_server.experiments.training.evaluation import BASELINE_POLICIES
@@ -179,10 +179,8 @@ def test_a_trial_repeats_bit_for_bit_whatever_ran_before_it():
 def test_the_three_readings_of_wait_differ_in_what_was_on_its_way():
     """Frames that were on their way block the links for up to 200 ms: none of their successors is in time. Broken off,
     the cameras' next frames are there when the wait ends."""
-    found = {
-        p: run_trial(replace(TRIAL, channel=SLOW, policy=p, value=240.0, seed=4), NO_DATA)
-        for p in ("wait", "wait-arrived", "wait-flush")
-    }
+    slow = replace(TRIAL, channel=SLOW, value=240.0, seed=4)
+    found = {p: run_trial(replace(slow, policy=p), NO_DATA) for p in ("wait", "wait-arrived", "wait-flush")}
     assert found["wait-arrived"]["wait_ms"] == pytest.approx(240.0) and found["wait-arrived"]["views"] == 4.0
     assert found["wait"]["wait_ms"] > 300.0 and found["wait-arrived"]["aaoi_ms"] > 200.0
     assert found["wait-flush"]["wait_ms"] == pytest.approx(240.0) and found["wait-flush"]["views"] == 4.0
@@ -241,14 +239,10 @@ def table_of(levels: Mapping[str, float], trainings: int = 3, seeds: int = 12, *
         for run in runs:
             for seed in range(seeds):
                 reward = 5.0 + level + shared[seed] + 0.01 * rng.normal()
-                rows.append({"policy": policy, **run, **labels, "seed": seed, "reward": reward})
-    return SeedTable(
-        [
-            {"case": "a case", "judged_by": "its reward", "judged_from": place, **row}
-            for row in rows
-            for place in ("elsewhere", "where it is rewarded")
-        ]
-    )
+                row = {"case": "a case", "judged_by": "its reward", "policy": policy, **run, **labels, "seed": seed}
+                places = ("elsewhere", "where it is rewarded")
+                rows += [{**row, "judged_from": place, "reward": reward} for place in places]
+    return SeedTable(rows)
 
 
 def test_cases_judge_by_cameras_that_neither_reward_nor_train(tmp_path: Path):
@@ -284,3 +278,34 @@ def test_claims_hold_if_and_only_if_what_was_learned_is_better(gain: float, said
     ):
         found = judge(STUDIES[name], table_of({**FIXED, **levels}, judged_by="moving"))
         assert answers(found, claim) == {said}, name
+
+
+FEW_VIEWS, SOME = viewpoints.Workload((3, 8), 16, 3, 24), ("random", "coverage, short way")
+
+
+@pytest.mark.slow
+def test_both_studies_run_whole(tmp_path, monkeypatch):
+    """With few arms, tastes and habits: the others differ in what they choose."""
+    monkeypatch.setattr(viewpoints, "QUICK", FEW_VIEWS)
+    monkeypatch.setattr(viewpoints, "ARMS", {arm: viewpoints.ARMS[arm] for arm in SOME})
+    monkeypatch.setattr(viewpoints, "_SHOWN", SOME[:1])
+    monkeypatch.setattr(preferences, "_POOL", {True: 9})
+    monkeypatch.setattr(preferences, "_UPDATES", {True: 1})
+    monkeypatch.setattr(preferences, "ASKED", (2, 4))
+    monkeypatch.setattr(preferences, "_ARMS", SOME[:1])
+    monkeypatch.setattr(preferences, "TASTES", {"edges": preferences.TASTES["edges"]})
+    request = StudyRequest(True, tmp_path, Folders(), seeds=2)
+    for study in (viewpoints.VIEWPOINTS, preferences.PREFERENCES):
+        assert run_study(study, request)
+    assert "Simulated experts only" in (tmp_path / "preferences.md").read_text()
+    table = list(csv.DictReader((tmp_path / "viewpoints.csv").open()))
+    assert {r["arm"] for r in table} == set(SOME) and len(table) == len(SOME) * 2 * 2
+    first = {r["seed"]: r["psnr_db"] for r in table if r["arm"] == "coverage, short way" and r["views"] == "3"}
+    assert len(set(first.values())) == 2 and np.isfinite([float(v) for v in first.values()]).all()
+    assert (tmp_path / "viewpoints-tile-paths.png").exists() and (tmp_path / "preferences-tile.png").exists()
+
+    # The same command again finds everything done: not even a policy is trained.
+    before = (tmp_path / "preferences.csv").read_bytes()
+    monkeypatch.setattr(preferences, "train_policy", None)
+    run_study(preferences.PREFERENCES, request)
+    assert (tmp_path / "preferences.csv").read_bytes() == before

@@ -32,7 +32,7 @@ def features(n, silent=0, seed=0, batch=5):
     return LAYOUT.batch([state(n, rng, d=3, silent=silent) for _ in range(batch)])
 
 
-def test_cameras_have_no_order():
+def test_cameras_have_no_order_and_what_never_reported_changes_nothing():
     x, order = features(7), np.random.default_rng(1).permutation(7)
     each = networks.logits(np, SELECT, actor(SELECT), x)
     np.testing.assert_allclose(
@@ -40,9 +40,6 @@ def test_cameras_have_no_order():
     )
     whole = networks.logits(np, WAIT, actor(WAIT), x)
     np.testing.assert_allclose(networks.logits(np, WAIT, actor(WAIT), x[:, order]), whole, rtol=1e-9, atol=1e-12)
-
-
-def test_what_never_reported_changes_nothing_for_the_others():
     x = features(6, silent=2)
     for spec, keep in ((SELECT, np.s_[:, :4]), (WAIT, np.s_[:])):
         all_rows = networks.logits(np, spec, actor(spec), x)[keep]

@@ -177,7 +177,7 @@ def test_density_of_cells_is_the_oracles(contracted: bool, phase: int) -> None:
     np.testing.assert_array_equal(cell @ [1, FEW_CELLS, FEW_CELLS**2], looked)
     apart = places * FEW_CELLS - cell
     assert apart.min() < 0.1 and apart.max() > 0.9 and abs(apart.mean() - 0.5) < 0.1
-    grid = to_torch(field._encoding, dtype=torch.float64)
+    grid = to_torch(field._encoding)
     params = torch.as_tensor(field._net.params, dtype=torch.float64)
     raw = mlp(field._net.widths.tolist(), params, encode(grid, SETTINGS.levels, torch.as_tensor(places)))
     sigma = raw[:, 0].clamp(RAW_LOW, RAW_HIGH).exp().numpy() * _centers(FEW_CELLS, contracted)[1][looked]

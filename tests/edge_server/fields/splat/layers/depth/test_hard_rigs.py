@@ -39,10 +39,6 @@ World = Callable[[View, Array], View]
 """What a camera sees, with depth, where the ball is at a place."""
 
 
-def _plain(view: View, ball_m: Array) -> View:
-    return measured(view, *seen(view.intrinsics, view.camera_to_world, ball_m))
-
-
 def _in_plane(view: View, y: float) -> Array:
     """Distance to a pane of 1.6 m x 1 m in the plane of this y, (H, W); inf beside it."""
     origin, rays = world_rays(view.intrinsics, view.camera_to_world)
@@ -88,7 +84,7 @@ class Case:
 
     recovers_s: float
 
-    world: World = _plain
+    world: World = lambda view, ball_m: measured(view, *seen(view.intrinsics, view.camera_to_world, ball_m))
     placed: Callable[[int, View], View] = lambda k, view: view
     told: Callable[[int, int, View], View] = lambda k, frame, view: view
     gains_db: float | None = None

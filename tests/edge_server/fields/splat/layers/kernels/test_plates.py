@@ -5,16 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
-from edge_server.fields.splat.layers.kernels.plates import (
-    CHANGING,
-    FOREGROUND,
-    LIKE_STATIC,
-    MODES,
-    PlateArrays,
-    compare_with_plate,
-    count_exposure,
-    vote,
-)
+from edge_server.fields.splat.layers.kernels import plates
 
 H, W = 37, 11  # more rows than a task has
 # In numbers, so that a change of them is seen.
@@ -22,13 +13,13 @@ THRESHOLD, THRESHOLD_UNKNOWN, DEVIATIONS = 10.0, 20.0, 3.5
 MEMORY, RUN, SLOWEST_RATE = 60, 12, 1.0 / 24.0
 
 
-def _plate(seed: int) -> PlateArrays:
+def _plate(seed: int) -> plates.PlateArrays:
     rng = np.random.default_rng(seed)
-    weight = np.sort(rng.uniform(0, 12, (MODES, H, W)), axis=0)[::-1]
+    weight = np.sort(rng.uniform(0, 12, (plates.MODES, H, W)), axis=0)[::-1]
     weight[2] *= rng.random((H, W)) < 0.5
-    return PlateArrays(
-        rng.uniform(60, 120, (MODES, H, W, 3)).astype(np.float32),
-        rng.uniform(60, 120, (MODES, H, W, 3)).astype(np.float32),
+    return plates.PlateArrays(
+        rng.uniform(60, 120, (plates.MODES, H, W, 3)).astype(np.float32),
+        rng.uniform(60, 120, (plates.MODES, H, W, 3)).astype(np.float32),
         np.ascontiguousarray(weight, np.float32),
         rng.uniform(10, 30, (H, W)).astype(np.float32),
         rng.integers(0, RUN + 2, (H, W)).astype(np.int32),
@@ -56,7 +47,7 @@ def test_a_frame_is_compared_with_plate_earlier_frames_and_static_field() -> Non
         for has_static in (False, True):
             difference, flags = np.empty((H, W), np.float32), np.empty((H, W), np.uint8)
             Pool(2, 0).run(
-                compare_with_plate, blurred, plate, earlier, count, static[None], has_static, difference, flags
+                plates.compare_with_plate, blurred, plate, earlier, count, static[None], has_static, difference, flags
             )
             changing = np.zeros((H, W), bool)
             for k in range(count):
@@ -65,16 +56,18 @@ def test_a_frame_is_compared_with_plate_earlier_frames_and_static_field() -> Non
             unknown = beyond > THRESHOLD_UNKNOWN if has_static else changing
             expected = _off(blurred, plate.blurred[0])
             np.testing.assert_allclose(difference, expected, rtol=1e-6)
-            np.testing.assert_array_equal(flags & FOREGROUND > 0, np.where(plate.known, expected > limit, unknown))
-            np.testing.assert_array_equal(flags & CHANGING > 0, changing)
-            np.testing.assert_array_equal(flags & LIKE_STATIC > 0, has_static & (beyond <= THRESHOLD))
+            np.testing.assert_array_equal(
+                flags & plates.FOREGROUND > 0, np.where(plate.known, expected > limit, unknown)
+            )
+            np.testing.assert_array_equal(flags & plates.CHANGING > 0, changing)
+            np.testing.assert_array_equal(flags & plates.LIKE_STATIC > 0, has_static & (beyond <= THRESHOLD))
 
 
-def _vote_plainly(p: PlateArrays, y: int, x: int, image: np.ndarray, blurred: np.ndarray) -> None:
+def _vote_plainly(p: plates.PlateArrays, y: int, x: int, image: np.ndarray, blurred: np.ndarray) -> None:
     """One pixel that votes, by the rules of the module."""
     modes = [
         {"w": p.weight[k, y, x], "m": p.means[k, y, x].copy(), "b": p.blurred[k, y, x].copy(), "first": k == 0}
-        for k in range(MODES)
+        for k in range(plates.MODES)
     ]
     alive = [m for m in modes if m["w"] > 0.05]
     joined = min(alive, key=lambda m: _off(m["b"], blurred[y, x]), default=None)
@@ -103,7 +96,7 @@ def test_votes() -> None:
     difference = _off(blurred, plain.blurred[0]).astype(np.float32)
     foreground, votes, held = ((rng.random((H, W)) < share).astype(np.uint8) for share in (0.3, 0.8, 0.2))
     picture = np.empty((H, W, 3), np.float32)
-    Pool(2, 0).run(vote, image, blurred, difference, foreground, votes, held, found, static, True, picture)
+    Pool(2, 0).run(plates.vote, image, blurred, difference, foreground, votes, held, found, static, True, picture)
     for y in range(H):
         for x in range(W):
             if held[y, x]:
@@ -121,7 +114,7 @@ def test_votes() -> None:
                 plain.run[y, x] = 0
             w, total = plain.weight[0, y, x], plain.total[y, x]
             plain.known[y, x] = w >= min(8, 0.9 * total) and w >= 0.3 * total
-    for name, mine, theirs in zip(PlateArrays._fields, found, plain, strict=True):
+    for name, mine, theirs in zip(plates.PlateArrays._fields, found, plain, strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-5, err_msg=name)
     np.testing.assert_array_equal(picture, np.where(found.known[..., None], found.means[0], static))
 
@@ -130,6 +123,6 @@ def test_exposure_is_counted_where_the_plate_tells_it() -> None:
     plate, counts = _plate(5), np.zeros((3, 3), np.int64)
     plate.means[:, :10] = 10.0  # too dark
     image = np.clip(plate.means[0] * [1.0, 1.1, 0.9] + 0.5, 0, 255).astype(np.uint8)
-    CallerPool().run(count_exposure, image, plate, counts)
+    CallerPool().run(plates.count_exposure, image, plate, counts)
     used = plate.known[::2, ::2][5:].sum()
     np.testing.assert_array_equal(counts, [[used, 0, 0], [used, used, 0], [used, 0, used]])
