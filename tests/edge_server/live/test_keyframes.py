@@ -52,6 +52,11 @@ def test_a_place_seen_again_is_seen_anew():
     assert names(given) == ["hand", "hand#1"] and len(kept) == 2
     given = kept.with_earlier([view("hand", 40, 3)])
     assert [v.image[0, 0, 0] for v in given[1:]] == [2, 1]
+    for degrees, places in ((7.9, 1), (8.1, 2)):
+        kept = Keyframes(KeyframesConfig(apart_m=1.0, apart_deg=8.0))
+        for t_ms, turned in enumerate((0, degrees)):
+            kept.with_earlier([view("hand", turned, t_ms)])
+        assert len(kept) == places
 
 
 @pytest.mark.parametrize("step_deg", [0.3, 4.0])

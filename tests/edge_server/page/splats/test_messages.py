@@ -197,13 +197,15 @@ def test_larger_nearer_and_denser_ones_weigh_more():
 def test_what_is_noticed():
     before = packing.to_records(gaussians(6, 6), (-5.0, -2.0))
     now = before.copy()
-    for row, (name, step) in enumerate([("place", 3), ("scale", 3), ("turn", 6), ("color", 2)]):
+    steps = {"place": 3, "scale": 3, "turn": 6, "color": 2}
+    for row, (name, step) in enumerate(steps.items()):
         now[name][row, 1] += step
     now["alpha"][4] -= 3
     assert not packing.noticeable(before, now).any()
-    now["color"][3, 1] += 1
+    for row, name in enumerate(steps):
+        now[name][row, 1] += 1
     now["alpha"][4] -= 1
-    np.testing.assert_array_equal(packing.noticeable(before, now), [False, False, False, True, True, False])
+    np.testing.assert_array_equal(packing.noticeable(before, now), [True] * 5 + [False])
 
 
 START_NS, BEGIN_S = ORIGIN_NS - 3_500_000_000, 3.5  # the run began before the field's motion
@@ -228,6 +230,13 @@ def test_the_visitor_sees_what_the_edge_renders():
         got = replace(shown, gaussians=Gaussians(read(published, BEGIN_S + NEWEST_S + ahead_s), 0))
         one, two = (each.render(POSE, LENS).color for each in (wanted, got))
         assert psnr(one, two) > 50.0 and one.std() > 0.1
+
+
+def test_shares_of_anchors_that_are_rounded_up_exceed_no_whole():
+    shown = snapshot()
+    halves = np.tile(np.float32([0.5, 0.5, 0.0]), (len(shown.moving.share), 1))
+    published = Publisher(START_NS).take(replace(shown, moving=replace(shown.moving, share=halves)), 0.0)
+    np.testing.assert_array_equal(published.moving.share, [[128, 127]] * len(halves))
 
 
 def test_a_set_is_the_same_one_while_the_field_trains_on():

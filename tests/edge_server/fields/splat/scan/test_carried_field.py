@@ -207,7 +207,7 @@ MOST_LOST = {_looks_about: (1.0, 1.0), _at_a_wall: (1.2, 1.0), _under_a_hand: (1
 
 @pytest.mark.slow  # 20 s each
 @pytest.mark.stability
-@pytest.mark.parametrize(("begin", "depth"), product(MOST_LOST, (True, False)))
+@pytest.mark.parametrize(("begin", "depth"), [*product(MOST_LOST, (True, False))])
 def test_a_bad_beginning_is_forgotten_within_two_seconds(begin, depth: bool) -> None:
     """Lost at most, against a walk without that beginning, at each of four instants, on average over three trainings.
     What a camera that only turns, or sees nothing, guesses of the scene cost up to 11 dB for as long as it was kept."""
