@@ -154,6 +154,10 @@ def test_the_oldest_make_room_and_with_them_policies_that_nobody_needs(tmp_path)
     again = DecisionWriter(tmp_path, max_decisions=3)  # another process of the same run goes on
     again.write(a_decision(6))
     assert names(folder, "0*") == ["000004.npz", "000005.npz", "000006.npz"]
+    large = DecisionWriter(tmp_path / "large", max_bytes=1)
+    for number in range(2):
+        large.write(a_decision(number))
+        assert names(tmp_path / "large" / FOLDER, "0*") == [f"{number:06d}.npz"]  # the newest, however large
 
 
 def test_a_run_that_begins_anew_in_the_same_folder_forgets_the_earlier_one(tmp_path):
