@@ -137,6 +137,8 @@ def test_what_is_no_picture_is_refused_by_number(shipped):
             shipped.embed([HARD["black"], bad])
     clear, gray = shipped.embed([HARD["transparent"], np.full((40, 40, 3), GRAY, np.uint8)])
     assert (clear == gray).all(), "alpha is laid over gray"
+    opaque, white = shipped.embed([np.full((40, 40, n), 255, np.uint8) for n in (4, 3)])
+    assert (opaque == white).all()
 
 
 @pytest.mark.stability
