@@ -197,4 +197,4 @@ def test_neither_is_half_a_vote_for_each():
     both = fit_reward(FEATURES, [Answer(0, 1, True), Answer(0, 1, False)] * 4)
     np.testing.assert_allclose(nothing.mean, 0.0, atol=1e-9)
     np.testing.assert_allclose(nothing.covariance, both.covariance, rtol=1e-6)
-    assert nothing.odds < 1.0
+    assert nothing.odds < 1.0 < lean.odds

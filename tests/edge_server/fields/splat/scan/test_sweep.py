@@ -63,6 +63,7 @@ def test_neighbors_see_the_same_from_elsewhere_and_the_best_come_first() -> None
 
     others = [beside(0.1), beside(2.0), beside(45.0), beside(5.0), beside(5.0, 60.0), beside(-8.0), beside(20.0)]
     assert neighbors(here, others, 2.0) == [3, 5, 1, 6]
+    assert neighbors(here, [beside(5.0, 20.0), beside(5.0)], 2.0) == [1, 0], "what faces the same way"
     assert len(neighbors(here, others * 3, 2.0)) == tuned.SWEPT_WITH
     assert neighbors(here, [], 2.0) == neighbors(here, [here], 2.0) == []
 
