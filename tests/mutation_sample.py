@@ -1,7 +1,6 @@
 """Draw careless edits from a seed, and see whether the nearest quick tests notice.
 
     python -m tests.mutation_sample --seed 1 --count 200                 # resumes; hours on two cores
-    python -m tests.mutation_sample --seed 1 --count 200 --only 7,31
 
 cosmic-ray makes the edits (operators, comparisons, numbers, conditions, loops); this draws a sample of them, spread
 over the rooms by lines, and runs for each the tests nearest to the file, for 40 processor seconds: those of its name,
@@ -338,21 +337,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("--seed", type=int, default=1, help="seed of the sample [%(default)s]")
     add("--count", type=int, default=200, help="number of edits [%(default)s]")
-    add("--only", type=lambda text: [int(n) for n in text.split(",")], metavar="K,...", help="only these of them")
-    add("--list", action="store_true", help="print the sample, and run nothing")
     add("--json", type=Path, metavar="FILE", help="file to write the counts and the survivors to")
     add("--out", type=Path, default="runs/mutants.jsonl", metavar="FILE", help="where results are kept [%(default)s]")
     args = parser.parse_args(argv)
-    sample = [
-        (number, edit)
-        for number, edit in enumerate(drawn(args.seed, args.count))
-        if args.only is None or number in args.only
-    ]
-    if args.list:
-        print("\n".join(f"{number:3} {edit.text()}" for number, edit in sample))
-        return 0
     store, outcomes, runner = ResultStore(args.out), [], None
-    for number, edit in sample:
+    for number, edit in enumerate(drawn(args.seed, args.count)):
         source = hashlib.sha256((ROOT / edit.file).read_bytes()).hexdigest()[:16]
         key = f"{source} {edit.file} {edit.operator} {edit.occurrence}"
         if key not in store.results:

@@ -41,65 +41,60 @@ EMULATOR = """
 import channel_emu.cli, channel_emu.live.frame_proxy, channel_emu.testing
 import channel_emu.virtual.simulate, channel_emu.estimate
 """
-LIBRARY = "import freshfield as ff"
 CHANNEL = """
 import freshfield as ff
 ff.Channel("ch5", cameras=2).ages(1.0)
 """
 
 
-PYTEST = "import channel_emu.pytest_plugin"
-
-
 UNASKED = {
-    PYTEST: ("numpy", "grpc", "yaml", "msgspec", "channel_emu.testing", "channel_emu.live", "channel_emu.model"),
-    EDGE: (
+    "pytest": (
+        *("import channel_emu.pytest_plugin", "numpy", "grpc", "yaml", "msgspec"),
+        *("channel_emu.testing", "channel_emu.live", "channel_emu.model"),
+    ),
+    "edge": (
+        EDGE,
         *(
             f"edge_server.{room}"
             for room in ("embed", "foreground", "live.depth_in_image", "live.keyframes", "surface")
         ),
         *("edge_server.fields.splat.planar", "onnx", "skimage", "matplotlib", "mcap", "rosbags", "foxglove", "torch"),
     ),
-    NODE: (
+    "node": (
+        NODE,
         *("camera_node.robot.teleop", "camera_node.robot.calibration.hand_eye.samples", "scipy", "mcap", "rosbags"),
         *("torch", "numba", "matplotlib", "edge_server", "channel_emu", "depthai", "pyrealsense2", "rtde"),
     ),
-    NODE_WITHOUT_ARM: (
-        *(f"camera_node.{room}" for room in ("pose", "robot.flange_camera", "sources.devices.live")),
+    "node without an arm": (
+        *(NODE_WITHOUT_ARM, "camera_node.pose", "camera_node.robot.flange_camera", "camera_node.sources.devices.live"),
         *("rtde", "depthai"),
     ),
-    TILE: (
-        *("camera_node.synthetic.effects.", "camera_node.synthetic.depth", "camera_node.synthetic.scenes.room"),
-        *("camera_node.synthetic.person", "torch", "numba"),
-        *("edge_server", "channel_emu", "scipy", "matplotlib"),
+    "tile": (
+        *(TILE, "camera_node.synthetic.effects.", "camera_node.synthetic.depth", "camera_node.synthetic.scenes.room"),
+        *("camera_node.synthetic.person", "torch", "numba", "edge_server", "channel_emu", "scipy", "matplotlib"),
     ),
-    FEW_CAMERAS: ("edge_server.fields.splat.layers.depth.network_depth", "edge_server.embed", "onnx"),
-    WARM_UP: ("grpc", "zstandard", "google", "torch"),  # ``make`` compiles while it installs them
-    LIBRARY: ("numpy", "grpc", "edge_server", "camera_node", "channel_emu", "freshfield_up"),
-    CHANNEL: (
-        *("channel_emu.model.faults.", "channel_emu.live", "torch", "numba", "camera_node", "edge_server"),
+    "few cameras": (FEW_CAMERAS, "edge_server.fields.splat.layers.depth.network_depth", "edge_server.embed", "onnx"),
+    "warm-up": (WARM_UP, "grpc", "zstandard", "google", "torch"),  # ``make`` compiles while it installs them
+    "library": (
+        "import freshfield as ff",
+        "numpy",
+        "grpc",
+        "edge_server",
+        "camera_node",
+        "channel_emu",
         "freshfield_up",
     ),
-    EMULATOR: ("torch", "numba", "cv2", "scipy", "matplotlib", "camera_node", "edge_server"),
-}
-
-
-@pytest.mark.parametrize(
-    ("program", "unasked"),
-    UNASKED.items(),
-    ids=(
-        "pytest",
-        "edge",
-        "node",
-        "node without an arm",
-        "tile",
-        "few cameras",
-        "warm-up",
-        "library",
-        "channel",
-        "emulator",
+    "channel": (
+        *(CHANNEL, "channel_emu.model.faults.", "channel_emu.live", "torch", "numba", "camera_node", "edge_server"),
+        "freshfield_up",
     ),
-)
-def test_what_nobody_asks_for_is_not_imported(program: str, unasked: tuple[str, ...]) -> None:
-    code = f"{program}\nimport sys\nprint([name for name in sys.modules if name.startswith({unasked})])"
+    "emulator": (EMULATOR, "torch", "numba", "cv2", "scipy", "matplotlib", "camera_node", "edge_server"),
+}
+"""A program, and the modules that it does not import."""
+
+
+@pytest.mark.parametrize("name", UNASKED)
+def test_what_nobody_asks_for_is_not_imported(name: str) -> None:
+    program, *unasked = UNASKED[name]
+    code = f"{program}\nimport sys\nprint([name for name in sys.modules if name.startswith({tuple(unasked)})])"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"

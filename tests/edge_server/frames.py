@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from freshfield import payload
@@ -15,17 +17,9 @@ def frame(camera: str = "cam01", sequence: int = 0, generated_ns: int = 0, **oth
     """A 32 x 24 JPEG frame of ``camera``; ``other`` overrides any field of Frame."""
     image = np.full((24, 32, 3), 40 + 10 * (sequence % 20), np.uint8)
     image[4:12, 6:20, 0] = 220
-    values = {
-        "camera": camera,
-        "session": "s1",
-        "sequence": sequence,
-        "generated_ns": generated_ns,
-        "pose": Pose.from_matrix(look_at([2.0, 0.0, 1.0], [0.0, 0.0, 0.0])),
-        "intrinsics": CAMERA,
-        "codec": "jpeg",
-        "payload": payload.encode(image),
-    }
-    return Frame(**{**values, **other})
+    pose = Pose.from_matrix(look_at([2.0, 0.0, 1.0], [0.0, 0.0, 0.0]))
+    taken = Frame(camera, "s1", sequence, generated_ns, pose, CAMERA, "jpeg", payload.encode(image))
+    return replace(taken, **other)
 
 
 def damaged_frame(camera: str = "cam01", **other) -> Frame:

@@ -7,13 +7,10 @@ import os
 from edge_server.machine import machine
 
 
-def test_a_machine_without_proc_is_unknown_and_no_error(tmp_path):
+def test_gpus_are_named_and_a_machine_without_proc_is_unknown(tmp_path):
     found = machine(tmp_path)
     assert found["memory_gb"] is None and found["gpus"] == []
     assert found["cores"] == len(os.sched_getaffinity(0))
-
-
-def test_gpus_are_named(tmp_path):
     gpu = tmp_path / "driver/nvidia/gpus/0000:01:00.0/information"
     gpu.parent.mkdir(parents=True)
     gpu.write_text("Model: \t\t NVIDIA H100 80GB HBM3\nIRQ:   \t\t 42\n")

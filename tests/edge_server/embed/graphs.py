@@ -42,6 +42,11 @@ def save(
     return path
 
 
+def convolutions() -> list[np.ndarray]:
+    rng = np.random.default_rng(7)
+    return [rng.normal(0, 0.3, shape).astype(np.float32) for shape in ((4, 3, 3, 3), (CHANNELS, 4, 3, 3))]
+
+
 def detector(
     path: Path,
     size: int | None = 32,
@@ -57,9 +62,7 @@ def detector(
     size, batch: None makes them free. gain: factor on the second map. extra: nodes behind the backbone's
     end, which is called ``end``. Weights are the same in every file.
     """
-    rng = np.random.default_rng(7)
-    first = rng.normal(0, 0.3, (4, 3, 3, 3)).astype(np.float32)
-    second = rng.normal(0, 0.3, (CHANNELS, 4, 3, 3)).astype(np.float32)
+    first, second = convolutions()
     nodes = [
         helper.make_node("Conv", ["images", "a"], ["c0"], strides=[2, 2], pads=[1] * 4, name="/model.0/Conv"),
         helper.make_node("Relu", ["c0"], ["fine"], name="/model.0/Relu"),
@@ -75,22 +78,14 @@ def detector(
             # A head that cannot run shows that it is not run.
             helper.make_node("Reshape", ["joined", "impossible"], ["output0"], name="/model.4/Reshape"),
         ]
-    constants = {
-        "a": first,
-        "b": second,
-        "gain": np.float32(gain),
-        "scales": np.array([1, 1, 2, 2], np.float32),
-        "impossible": np.array([7, 11, 13], np.int64),
-    }
+    constants = {"a": first, "b": second, "gain": np.float32(gain), "scales": np.array([1, 1, 2, 2], np.float32)}
+    constants["impossible"] = np.array([7, 11, 13], np.int64)
     images, output = [batch or "n", 3, size or "h", size or "w"], "output0" if neck else last
     return save(path, nodes, images, (output, None), constants, weights, meta=meta)
 
 
 def expected(images: np.ndarray) -> np.ndarray:
     """The pooled features (n, CHANNELS) of ready-made input (n, 3, H, W), by torch."""
-    rng = np.random.default_rng(7)
-    first, second = (
-        torch.from_numpy(rng.normal(0, 0.3, s).astype(np.float32)) for s in ((4, 3, 3, 3), (CHANNELS, 4, 3, 3))
-    )
+    first, second = map(torch.from_numpy, convolutions())
     fine = conv2d(torch.from_numpy(images).float(), first, stride=2, padding=1).relu()
     return conv2d(fine, second, stride=2, padding=1).mean(dim=(2, 3)).numpy()

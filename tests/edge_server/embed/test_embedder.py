@@ -1,7 +1,8 @@
-"""Any detector of the family becomes an embedder, and what cameras should not send stays finite, bounded, isolated."""
+"""Any detector becomes an embedder; a file that is none is refused in one line; what is no picture stays isolated."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,11 @@ import pytest
 pytest.importorskip("onnxruntime", reason="the extra embed is not installed")
 pytest.importorskip("onnx", reason="the extra embed is not installed")
 
-from onnx import helper, numpy_helper
+import onnx
+from onnx import TensorProto, helper, numpy_helper
 
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
+from edge_server.embed.backbone import MAX_NODES
 from edge_server.embed.cache import EmbeddingCache
 from edge_server.embed.letterbox import GRAY
 from edge_server.live.view_decoder import ViewDecoder
@@ -134,6 +137,8 @@ def test_what_is_no_picture_is_refused_by_number(shipped):
             shipped.embed([HARD["black"], bad])
     clear, gray = shipped.embed([HARD["transparent"], np.full((40, 40, 3), GRAY, np.uint8)])
     assert (clear == gray).all(), "alpha is laid over gray"
+    opaque, white = shipped.embed([np.full((40, 40, n), 255, np.uint8) for n in (4, 3)])
+    assert (opaque == white).all()
 
 
 @pytest.mark.stability
@@ -156,3 +161,91 @@ def test_a_nan_of_one_frame_costs_no_other_frame_of_its_batch(tmp_path):
         rows, ok = cache.of(items)
         assert ok.tolist() == [True, False, True] and np.isfinite(rows).all() and not rows[1].any()
     assert cache.failed == 1, "counted once"
+
+
+def node(kind: str, read: list[str], write: str, **attributes):
+    return helper.make_node(kind, read, [write], name=f"/model.1/{write}", **attributes)
+
+
+def joined_with_nothing(path: Path) -> None:
+    model = onnx.load(str(detector(path)))
+    model.graph.node[5].CopyFrom(node("Relu", ["large"], "joined"))  # enlarged, but joined with nothing
+    onnx.save(model, str(path))
+
+
+def another_input(path: Path, shape: list[int], kind: int = TensorProto.FLOAT) -> None:
+    model = onnx.load(str(detector(path)))
+    model.graph.input[0].CopyFrom(helper.make_tensor_value_info("images", kind, shape))
+    onnx.save(model, str(path))
+
+
+def memory_from_nothing(path: Path) -> None:
+    huge = numpy_helper.from_array(np.array([1, 1, 200_000, 200_000], np.int64), "huge")
+    detector(path, extra=(node("Expand", ["end", "huge"], "big"),), weights=(huge,))
+
+
+def joined_with_themselves(path: Path) -> None:
+    nodes = tuple(node("Concat", [f"t{k}" if k else "end"] * 2, f"t{k + 1}", axis=1) for k in range(40))
+    detector(path, extra=nodes)
+
+
+def long_chain(path: Path) -> None:
+    detector(path, extra=tuple(node("Relu", [f"t{k}" if k else "end"], f"t{k + 1}") for k in range(MAX_NODES)))
+
+
+def empty_claims(path: Path, dims: tuple[int, ...]) -> None:
+    claims = TensorProto(name="k", data_type=TensorProto.FLOAT, dims=dims, raw_data=b"\0" * 8)
+    detector(path, extra=(node("Mul", ["end", "k"], "big"),), weights=(claims,))
+
+
+def beyond(path: Path) -> None:
+    channels = numpy_helper.from_array(np.array([0, 1, 2, 99], np.int64), "beyond")
+    detector(path, extra=(node("Gather", ["end", "beyond"], "some", axis=1),), weights=(channels,))
+
+
+# What is no detector, or would take more memory than there is, and how it is refused.
+WRONG = {
+    "missing": (lambda path: None, "b.onnx: cannot be read: No such file"),
+    "empty": (lambda path: path.write_bytes(b""), "b.onnx: not an ONNX"),
+    "no ONNX": (lambda path: path.write_bytes(b"\xff" * 64), "b.onnx: not an ONNX"),
+    "classifier": (partial(detector, neck=False), "not a YOLO detection model"),
+    "enlargement": (joined_with_nothing, "not a YOLO detection model"),
+    "no image": (partial(another_input, shape=[1, 3, 32]), "input images is not"),
+    "whole numbers": (partial(another_input, shape=[1, 3, 32, 32], kind=TensorProto.INT64), "input images is not"),
+    "expand": (memory_from_nothing, "backbone holds Expand, which no YOLO backbone does"),
+    "concat": (joined_with_themselves, "larger than any backbone's"),
+    "chain": (long_chain, "10007 nodes, more than any network of images"),
+    "claims": (partial(empty_claims, dims=(2**20, 2**20)), "larger than any backbone's"),
+    "small claims": (partial(empty_claims, dims=(1, 6, 8, 8)), "cannot load it"),
+    "part of it": (partial(detector, meta={"freshfield.projection": "AAAAAAAA" * 11}), "projection is damaged"),
+    "breaks when it is run": (beyond, "ONNX Runtime cannot run it"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_file_is_refused_in_one_line_and_by_us(tmp_path, capfd, name):
+    """ONNX Runtime would print, in red, what it then raises."""
+    make, match = WRONG[name]
+    make(tmp_path / "b.onnx")
+    with pytest.raises(EmbeddingError, match=match) as caught:
+        make_embedder(EmbeddingConfig(model=str(tmp_path / "b.onnx"), dim=4))
+    assert "\n" not in str(caught.value) and capfd.readouterr() == ("", "")
+
+
+def test_every_kind_of_damage_ends_in_one_line(tmp_path):
+    whole = detector(tmp_path / "whole.onnx").read_bytes()
+    rng = np.random.default_rng(5)
+    path, refusals = tmp_path / "damaged.onnx", 0
+    for _ in range(150):
+        data = bytearray(whole)
+        for at in rng.integers(0, len(data), 3):
+            data[at] = rng.integers(0, 256)
+        path.write_bytes(data)
+        try:
+            rows = make_embedder(EmbeddingConfig(str(path), 4)).embed([np.zeros((9, 9, 3), np.uint8)])
+        except EmbeddingError as error:
+            assert "\n" not in str(error)
+            refusals += 1
+        else:
+            assert np.isfinite(rows).all(), "damage in a weight is no damage to the format"
+    assert refusals > 20

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,11 @@ SMALL: dict[str, Any] = {"levels": 4, "log2_table": 12, "batch_samples": 8192, "
 SMALL_WORDS = ["--field", "ngp"] + [word for key, value in SMALL.items() for word in ("--option", f"{key}={value}")]
 
 
-def write_photos(folder: Path, count: int = 9, size: int = 32, alpha: bool = False) -> Path:
-    """Photos of scene ``tile`` as a NeRF-synthetic folder: images/NNN.png and transforms_train.json."""
+def write_photos(
+    folder: Path, count: int = 9, size: int = 32, alpha: bool = False, more: Callable[[int], dict] = lambda k: {}
+) -> Path:
+    """Photos of scene ``tile`` as a NeRF-synthetic folder: images/NNN.png and transforms_train.json, where frame k has
+    ``more`` keys."""
     scene = make_scene("tile", {"count": count, "width": size, "height": size, "supersample": 1})
     frames = []
     for k, (camera, (_, pose)) in enumerate(scene.cameras.items()):
@@ -27,7 +31,7 @@ def write_photos(folder: Path, count: int = 9, size: int = 32, alpha: bool = Fal
             mask = (np.indices(image.shape[:2]).sum(0) > size // 2).astype(np.uint8) * 255
             image = np.dstack([image, mask])
         _write(folder / "images" / f"{k:03d}.png", image)
-        frames.append({"file_path": f"./images/{k:03d}", "transform_matrix": _opengl(pose)})
+        frames.append({"file_path": f"./images/{k:03d}", "transform_matrix": _opengl(pose), **more(k)})
     return _save(folder / "transforms_train.json", scene.cameras["cam00"][0], frames)
 
 

@@ -16,17 +16,11 @@ from tests.edge_server.experiments.rollouts.small import RAW
 
 
 def table_of(gain: float, spread: float) -> SeedTable:
-    rows = [
-        {
-            "policy": policy,
-            "seed": seed,
-            "psnr_db": 20.0 + seed + (policy != "all") * (gain + spread * (-1) ** seed),
-            "psnr_moving_db": 15.0 + seed,
-            "views": 4.0,
-        }
-        for policy in ("all", "wait:60")
-        for seed in range(6)
-    ]
+    rows = []
+    for seed in range(6):
+        for policy, psnr_db in (("all", 20.0 + seed), ("wait:60", 20.0 + seed + gain + spread * (-1) ** seed)):
+            figures = {"psnr_db": psnr_db, "psnr_moving_db": 15.0 + seed, "views": 4.0}
+            rows.append({"policy": policy, "seed": seed, **figures})
     return SeedTable(rows)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import yaml
 
@@ -64,9 +62,7 @@ QUICK = {"fit": SMALL_WORDS, "frontier": ["--quick"], "study": ["--quick"]}
 @pytest.mark.parametrize(
     ("command", "words", "said"), [(command, *row) for command, rows in REFUSED.items() for row in rows]
 )
-def test_what_cannot_be_done_is_refused_in_one_line(
-    command: str, words: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_done_is_refused_in_one_line(command: str, words: str, said: str, tmp_path, capsys) -> None:
     (tmp_path / "small.yaml").write_text(yaml.safe_dump(RAW))
     if "SET" in words:
         write_photos(tmp_path / "set", 3)

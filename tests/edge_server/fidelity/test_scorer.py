@@ -1,3 +1,5 @@
+"""Scores of images: PSNR, SSIM, moving pixels, baselines, and what is no image."""
+
 from __future__ import annotations
 
 import itertools
@@ -8,6 +10,7 @@ import pytest
 from edge_server.fidelity.baselines import BaselineMean, baseline, mean_color_db, nearest_view, view_db
 from edge_server.fidelity.images import ImageError
 from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fidelity.moving_pixels import BOUND, NoiseEstimate, frames_at_lags, moving_mask, pair_noise
 from edge_server.fidelity.psnr import PSNR_CEILING_DB, psnr
 from edge_server.fidelity.scorer import Scorer, mean_score
 from edge_server.fidelity.ssim import ssim
@@ -15,6 +18,136 @@ from edge_server.fields import View
 from edge_server.run_records import Baseline
 from freshfield.geometry import Pinhole, look_at
 from tests.conftest import data_dir
+
+MS = 1_000_000
+
+
+def test_a_pixel_moves_if_any_channel_of_any_earlier_frame_differs():
+    now = np.full((4, 4, 3), 0.5)
+    one, two = now.copy(), now.copy()
+    one[0, 0, 2] += 1.1 * BOUND
+    two[3, 3, 1] -= 1.1 * BOUND
+    two[1, 1] += 0.9 * BOUND
+    assert list(zip(*np.nonzero(moving_mask(now, [one, two])))) == [(0, 0), (3, 3)]
+    assert not moving_mask(now, []).any(), "without earlier frames nothing is known to move"
+
+
+def test_frames_are_chosen_nearest_to_their_lags_without_repeats():
+    times = [i * 100 * MS for i in range(11)]  # ten frames a second, present at 1000 ms
+    assert frames_at_lags(times, 1000 * MS) == [9, 8, 7]  # 60 and 120 ms ago share the frame of 900 ms
+    assert frames_at_lags(times, 0) == []
+    assert frames_at_lags([0], 5 * MS) == [0]
+
+
+@pytest.mark.parametrize("sigma", [0.001, 0.004, 0.02])
+def test_noise_is_measured_through_8_bits_and_a_moving_third(sigma):
+    rng = np.random.default_rng(3)
+    scene = np.clip(rng.random((12, 16, 3)).repeat(8, 0).repeat(8, 1), 0.2, 0.8)
+    estimate = NoiseEstimate()
+    frames = []
+    for i in range(6):
+        moved = scene.copy()
+        moved[:, :40] = np.roll(scene[:, :40], i * 5, axis=0)
+        noisy = moved + rng.normal(0, sigma, scene.shape)
+        frames.append(np.round(noisy * 255).astype(np.uint8))
+    for a, b in itertools.pairwise(frames):
+        estimate.add(a, b)
+    # Rounding to 8 bits is noise too: 1/sqrt(12) of a step, though none where noise is far below a step.
+    upper = np.hypot(sigma, 1 / 255 / np.sqrt(12))
+    assert 0.6 * sigma <= estimate.sigma <= 1.05 * upper
+    assert estimate.bound == max(BOUND, 4 * estimate.sigma)
+
+
+def test_black_and_saturated_blocks_have_no_vote_and_noise_has_a_bound():
+    rng = np.random.default_rng(6)
+    a, b = np.zeros((64, 64, 3)), np.zeros((64, 64, 3))
+    assert pair_noise(a, b) is None
+    a[:16], b[:16] = 0.5 + rng.normal(0, 0.01, (2, 16, 64, 3))
+    assert pair_noise(a, b) == pytest.approx(0.01, rel=0.1)
+    a, b = rng.uniform(0.1, 0.9, (2, 32, 32, 3))
+    estimate = NoiseEstimate()
+    assert estimate.bound == BOUND
+    estimate.add(a, b)
+    assert estimate.bound == pytest.approx(0.2), "a moving camera does not pass for infinite noise"
+    assert pair_noise(np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 0.6)) is None, "smaller than a block"
+
+
+RNG = np.random.default_rng(5)
+
+
+def test_a_known_error_gives_the_value_of_3_31():
+    truth = np.full((9, 7, 3), 100, np.uint8)
+    rendering = np.full((9, 7, 3), 110, np.uint8)
+    assert psnr(rendering, truth) == pytest.approx(10 * np.log10(255**2 / 100), abs=1e-9)
+
+
+def test_8_bit_floating_and_transparent_images_agree():
+    truth = RNG.integers(0, 256, (12, 12, 3), dtype=np.uint8)
+    rendering = RNG.integers(0, 256, (12, 12, 3), dtype=np.uint8)
+    assert psnr((rendering / 255).astype(np.float32), truth) == pytest.approx(psnr(rendering, truth), abs=1e-4)
+    rgba = np.zeros((4, 4, 4), np.uint8)
+    rgba[..., 0] = 255
+    assert psnr(rgba, np.zeros((4, 4, 3))) == PSNR_CEILING_DB  # transparent red on black is black
+    assert psnr(np.full((4, 4, 3), 1.7), np.ones((4, 4, 3))) == PSNR_CEILING_DB  # clipped, as a screen does
+
+
+def test_a_mask_restricts_the_mean_and_an_empty_one_gives_nothing():
+    truth = np.zeros((4, 4, 3))
+    rendering = truth.copy()
+    rendering[0, 0] = 0.1
+    mask = np.zeros((4, 4), bool)
+    assert psnr(rendering, truth, mask) is None
+    mask[0, 0] = True
+    assert psnr(rendering, truth, mask) == pytest.approx(20.0)
+    mask[1, 1] = True
+    assert psnr(rendering, truth, mask) == pytest.approx(20.0 + 10 * np.log10(2))
+
+
+def test_what_is_no_image_is_refused_by_name():
+    wrong = [(np.zeros(shape), "rendering.*shape") for shape in ((4, 4), (0, 4, 3), (4, 4, 2))]
+    wrong += [(np.zeros((4, 4, 3), np.int32), "rendering.*int32"), (np.zeros((4, 5, 3)), "5 x 4.*4 x 4")]
+    for image, said in wrong:
+        with pytest.raises(ImageError, match=said):
+            psnr(image, np.zeros((4, 4, 3)))
+
+
+def reference_ssim(a, b, mask=None):
+    """(3.33) window by window, with an explicit 11 x 11 Gaussian: slow, and nothing to get wrong."""
+    x = np.arange(-5, 6)
+    w = np.exp(-(x[:, None] ** 2 + x[None, :] ** 2) / (2 * 1.5**2))
+    w /= w.sum()
+    values = []
+    for channel in range(3):
+        for row in range(a.shape[0] - 10):
+            for column in range(a.shape[1] - 10):
+                if mask is not None and not mask[row : row + 11, column : column + 11].all():
+                    continue
+                p = a[row : row + 11, column : column + 11, channel]
+                q = b[row : row + 11, column : column + 11, channel]
+                mp, mq = (w * p).sum(), (w * q).sum()
+                vp, vq = (w * (p - mp) ** 2).sum(), (w * (q - mq) ** 2).sum()
+                cov = (w * (p - mp) * (q - mq)).sum()
+                c1, c2 = 0.01**2, 0.03**2
+                values.append((2 * mp * mq + c1) * (2 * cov + c2) / ((mp**2 + mq**2 + c1) * (vp + vq + c2)))
+    return float(np.mean(values))
+
+
+def test_it_equals_the_definition_and_a_mask_leaves_the_windows_that_lie_wholly_within_it():
+    rng = np.random.default_rng(5)
+    a, b = rng.random((2, 40, 37, 3))
+    assert ssim(a, b) == pytest.approx(reference_ssim(a, b), abs=1e-9)
+    assert ssim(a[:11, :11], b[:11, :11]) == pytest.approx(reference_ssim(a[:11, :11], b[:11, :11]), abs=1e-9)
+    mask = np.ones((40, 37), bool)
+    mask[:9, 3] = mask[30, :20] = mask[39, 36] = False
+    assert ssim(a, b, mask) == pytest.approx(reference_ssim(a, b, mask), abs=1e-9)
+    assert ssim(a, b, np.ones_like(mask)) == ssim(a, b)
+    mask[:] = False
+    mask[4:15, 20:31] = True
+    assert ssim(a, b, mask) == pytest.approx(reference_ssim(a[4:15, 20:31], b[4:15, 20:31]), abs=1e-9)
+    mask[4, 20] = False
+    assert ssim(a, b, mask) is None
+    with pytest.raises(ImageError, match="at least 11 x 11"):
+        ssim(a[:10], b[:10])
 
 
 def test_a_score_has_every_metric_of_the_whole_image_and_of_its_parts():
@@ -103,11 +236,7 @@ def test_both_together_and_none_without_views():
     assert (empty.mean_color_db, empty.nearest_view_db) == (None, None)
 
 
-RNG = np.random.default_rng(9)
-HARD = {
-    "black": np.zeros((40, 40, 3)),
-    "white": np.ones((40, 40, 3)),
-    "subnormal": np.full((40, 40, 3), 5e-324),
+HARD = {name: np.full((40, 40, 3), v) for name, v in (("black", 0.0), ("white", 1.0), ("subnormal", 5e-324))} | {
     "one pixel": np.pad(np.ones((1, 1, 3)), ((20, 19), (20, 19), (0, 0))),
     "checkers": np.indices((40, 40)).sum(0)[..., None].repeat(3, 2) % 2 * 1.0,
     "noise": RNG.random((40, 40, 3)),

@@ -51,9 +51,7 @@ def test_compiling_is_told_and_loading_is_not(tmp_path: Path) -> None:
         (["handheld"], [(CarriedField, 1)]),
     ],
 )
-def test_warm_up_compiles_what_is_used(
-    words: list[str], expected: list[tuple[type, int]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_warm_up_compiles_what_is_used(words: list[str], expected: list[tuple[type, int]], monkeypatch) -> None:
     found: list[tuple[type, int]] = []
     for kind in (LayeredField, CarriedField, NgpField):
         monkeypatch.setattr(kind, "warm_up", lambda field, cameras: found.append((type(field), cameras)) or 0.0)

@@ -1,51 +1,38 @@
-"""The hash-grid field in plain torch: the reference for the kernels, and what ``torch_field`` runs on CUDA.
+"""The hash-grid field in plain torch: the reference for the kernels.
 
-Parameters, layout and formulas are those of ``kernels``; autograd computes the gradients. Functions take
-tensors on any device.
+Parameters, layout and formulas are those of ``kernels``; autograd computes the gradients.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from edge_server.fields.common.kernels.hash_grid import FEATURES, Grid
+from edge_server.fields.common.kernels.hash_grid import FEATURES
 from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, RAW_HIGH, RAW_LOW
 
 PRIMES = (1, 2654435761, 805459861)
 
 
-@dataclass(frozen=True)
-class TorchGrid:
-    """``hash_grid.Grid`` as tensors: table (vertices, 2) float."""
-
-    resolution: list[int]
-    first: list[int]
-    dense: list[bool]
-    table: Tensor
+def to_torch(grid: Any) -> Any:
+    """The grid, whatever it has beside a table, with that (vertices, 2) as a tensor of float64."""
+    return grid._replace(table=torch.as_tensor(grid.table, dtype=torch.float64).clone())
 
 
-def to_torch(grid: Grid, device: str = "cpu", dtype: torch.dtype = torch.float32) -> TorchGrid:
-    """A copy of a grid on a torch device."""
-    table = torch.as_tensor(grid.table, dtype=dtype, device=device).clone()
-    return TorchGrid(grid.resolution.tolist(), grid.first.tolist(), grid.dense.tolist(), table)
-
-
-def encode(grid: TorchGrid, levels: int, x: Tensor) -> Tensor:
+def encode(grid: Any, levels: int, x: Tensor) -> Tensor:
     """Points (N, 3) in the unit cube -> features (N, 2 L); levels from ``levels`` on are 0. Eq. 3.23."""
-    res = torch.tensor(grid.resolution[:levels], dtype=torch.long, device=x.device)[:, None]  # (l, 1)
-    first = torch.tensor(grid.first[: levels + 1], device=x.device)
-    dense = torch.tensor(grid.dense[:levels], dtype=torch.bool, device=x.device)[:, None]
+    res, first, dense = map(torch.as_tensor, (grid.resolution[:levels], grid.first[: levels + 1], grid.dense[:levels]))
+    res, dense = res.long()[:, None], dense[:, None]  # (l, 1)
     scaled = x[:, None, :] * res  # (N, l, 3)
     cell = torch.minimum(scaled.floor().clamp(min=0), (res - 1).to(x.dtype))
     part = scaled - cell
     weight = _corners(torch.mul, torch.stack([1 - part, part], dim=-1))
     strides = torch.cat([torch.ones_like(res), res + 1, (res + 1) ** 2], dim=-1)
-    factor = torch.where(dense, strides, torch.tensor(PRIMES, device=x.device))  # (l, 3)
+    factor = torch.where(dense, strides, torch.tensor(PRIMES))  # (l, 3)
     near = cell.long() * factor
     sides = torch.stack([near, near + factor], dim=-1)
     hashed = (_corners(torch.bitwise_xor, sides) & 0xFFFFFFFF) % first.diff()[:, None]

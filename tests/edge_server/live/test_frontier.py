@@ -21,12 +21,9 @@ POINTS = [
 ]
 
 
-def test_the_best_point_of_the_nearest_speed_is_chosen():
+def test_of_points_that_seeds_cannot_tell_apart_the_quickest_is_chosen():
     assert best_point(POINTS, 1.0) == POINTS[2], "longer updates show an older world"
     assert best_point(POINTS, 3.0) == POINTS[4], "the speed nearest in ratio"
-
-
-def test_of_points_that_seeds_cannot_tell_apart_the_quickest_is_chosen():
     unsure = [replace(p, error_db=1.0) for p in POINTS]  # the best leads by 1.5, of which 1.4 may be chance
     assert best_point(unsure, 1.0) == unsure[2]
     unsure = [replace(p, error_db=1.2) for p in POINTS]

@@ -77,14 +77,11 @@ def test_a_publication_is_scored_against_the_capture_nearest_to_the_present(pres
     assert found.publication.number == present_ms and found.rendered.shape == (SIDE, SIDE, 3)
 
 
-def test_no_capture_within_half_a_period_means_no_score():
+def test_without_a_capture_within_half_a_period_there_is_no_score_and_nothing_piles_up():
     held_out = camera(400)
     held_out.publish(publication(500), shows(0))
     assert held_out.take(frame(600)) == []
     assert held_out.publish(publication(600), shows(600)), "the one that follows has one"
-
-
-def test_renderings_that_never_find_a_truth_do_not_pile_up():
     held_out, shown = camera(400), shows(0)
     for k in range(100):
         held_out.publish(publication(401 + k), shown)

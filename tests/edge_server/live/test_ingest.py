@@ -28,11 +28,9 @@ MS = 1_000_000
 
 @pytest.fixture
 def ingest(tmp_path):
-    clock = VirtualClock(NOW)
-    held = []
-    ledger = Ledger(tmp_path, "edge", "edge", NOW)
-    made = Ingest(clock, FrameBuffer(["cam01"]), ["cam00"], ledger, held.append, max_side_px=128)
-    made.test_clock, made.test_held, made.test_ledger = clock, held, ledger
+    held, ledger = [], Ledger(tmp_path, "edge", "edge", NOW)
+    made = Ingest(VirtualClock(NOW), FrameBuffer(["cam01"]), ["cam00"], ledger, held.append, max_side_px=128)
+    made.test_held, made.test_ledger = held, ledger
     yield made
     ledger.close(NOW)
 
@@ -48,51 +46,41 @@ def test_held_out_frames_never_reach_the_training_buffer(ingest):
     assert ingest.buffer.newest() == {}
 
 
-def with_payload_damaged(request: pb.PushRequest) -> None:
+def sent(change: Callable[[pb.FrameHeader], None] = lambda header: None, **wrong: Any) -> pb.PushRequest:
+    """A frame that is wrong, or whose header is changed, with a checksum that fits."""
+    request = to_request(good(sequence=5, **wrong) if "generated_ns" not in wrong else frame(sequence=5, **wrong))
+    change(request.header)
+    request.crc32c = checksum(request)
+    return request
+
+
+def with_payload_damaged(request: pb.PushRequest) -> pb.PushRequest:
     damaged = bytearray(request.payload)
     damaged[len(damaged) // 2] ^= 1
     request.payload = bytes(damaged)
-
-
-def with_checksum(change: Callable[[pb.FrameHeader], None]) -> Callable[[pb.PushRequest], None]:
-    """A change of the header with a checksum that fits."""
-
-    def changed(request: pb.PushRequest) -> None:
-        change(request.header)
-        request.crc32c = checksum(request)
-
-    return changed
+    return request
 
 
 LARGE = Pinhole.from_fov(4096, 4096, 60.0)
-# By reason: what is wrong of the frame, or a change of its message.
-BAD: dict[str, dict[str, Any] | Callable[[pb.PushRequest], None]] = {
-    "crc_mismatch": with_payload_damaged,
-    "bad_pose": with_checksum(lambda header: setattr(header.pose, "qw", 7.0)),
-    "unknown_codec": with_checksum(lambda header: setattr(header, "codec", -7)),  # an enum may be negative
-    "unknown_camera": {"camera": "cam77"},
-    "too_large": {"intrinsics": LARGE, "payload": payload.encode(np.zeros((4096, 4096, 3), np.uint8))},
-    "wrong_role": {"held_out": True},
-    "bad_id": {"camera": "../../etc"},
-    "from_future": {"generated_ns": NOW + 3600 * 10**9},
-    "too_old": {"generated_ns": NOW - 2 * 3600 * 10**9},
-    "size_mismatch": {"intrinsics": dataclasses.replace(frame().intrinsics, width=64)},
-    "bad_payload": {"payload": b"not an image"},
-    "bad_intrinsics": {"intrinsics": dataclasses.replace(frame().intrinsics, fx=float("nan"))},
+BAD = {
+    "crc_mismatch": with_payload_damaged(sent()),
+    "bad_pose": sent(lambda header: setattr(header.pose, "qw", 7.0)),
+    "unknown_codec": sent(lambda header: setattr(header, "codec", -7)),  # an enum may be negative
+    "unknown_camera": sent(camera="cam77"),
+    "too_large": sent(intrinsics=LARGE, payload=payload.encode(np.zeros((4096, 4096, 3), np.uint8))),
+    "wrong_role": sent(held_out=True),
+    "bad_id": sent(camera="../../etc"),
+    "from_future": sent(generated_ns=NOW + 3600 * 10**9),
+    "too_old": sent(generated_ns=NOW - 2 * 3600 * 10**9),
+    "size_mismatch": sent(intrinsics=dataclasses.replace(frame().intrinsics, width=64)),
+    "bad_payload": sent(payload=b"not an image"),
+    "bad_intrinsics": sent(intrinsics=dataclasses.replace(frame().intrinsics, fx=float("nan"))),
 }
-
-
-def bad(kind: str) -> pb.PushRequest:
-    wrong, base = BAD[kind], good(sequence=5)
-    if isinstance(wrong, dict):
-        return to_request(dataclasses.replace(base, **wrong))
-    wrong(request := to_request(base))
-    return request
 
 
 @pytest.mark.parametrize("kind", BAD)
 def test_a_refusal_is_named_counted_and_loses_nothing_else(ingest, kind):
-    answer = ingest.take(bad(kind))
+    answer = ingest.take(BAD[kind])
     assert (answer.outcome, answer.reason) == (pb.OUTCOME_REJECTED, kind)
     assert answer.detail
     assert ingest.rejected == {kind: 1}
@@ -221,11 +209,11 @@ def test_after_a_restart_of_the_edge_no_frame_is_taken_again():
         before.admit(good(sequence), NOW)
     told = msgspec.json.decode(msgspec.json.encode(before.last_frames()), type=dict[str, dict[str, tuple[int, int]]])
     after = FrameAdmission(["cam01"], ["cam00"], known=told)
-    backwards = frame(sequence=5, generated_ns=NOW - 51 * MS)
-    for item, reason in ((good(3), "replayed_sequence"), (good(4), "replayed_sequence"), (backwards, "time_reversed")):
+    no_later = [frame(sequence=5, generated_ns=at_ns) for at_ns in (NOW - 51 * MS, good(4).generated_ns)]
+    for item in (good(3), good(4), *no_later):
         with pytest.raises(FrameRejected) as refused:
             after.admit(item, NOW)
-        assert refused.value.reason == reason
+        assert refused.value.reason == ("time_reversed" if item in no_later else "replayed_sequence")
     after.admit(good(5), NOW)
     after.admit(good(0, session="another"), NOW)
 

@@ -1,4 +1,4 @@
-"""Earlier viewpoints of cameras that move."""
+"""Cameras that move: when one is seen to, and its earlier viewpoints."""
 
 from __future__ import annotations
 
@@ -6,16 +6,18 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from edge_server.fields import Budget, View
 from edge_server.live.buffer import FrameBuffer
+from edge_server.live.camera_motion import CameraMotion, pose_distance
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.keyframes import Keyframes
 from edge_server.scheduler import make_policy
 from edge_server.settings import KeyframesConfig
 from freshfield.geometry import Pinhole, Pose, look_at
 from tests.edge_server.fields_for_tests import tiny_field
-from tests.edge_server.frames import frame
+from tests.edge_server.frames import CAMERA, frame
 
 LENS = Pinhole.from_fov(8, 8, 60.0)
 
@@ -50,6 +52,11 @@ def test_a_place_seen_again_is_seen_anew():
     assert names(given) == ["hand", "hand#1"] and len(kept) == 2
     given = kept.with_earlier([view("hand", 40, 3)])
     assert [v.image[0, 0, 0] for v in given[1:]] == [2, 1]
+    for degrees, places in ((7.9, 1), (8.1, 2)):
+        kept = Keyframes(KeyframesConfig(apart_m=1.0, apart_deg=8.0))
+        for t_ms, turned in enumerate((0, degrees)):
+            kept.with_earlier([view("hand", turned, t_ms)])
+        assert len(kept) == places
 
 
 @pytest.mark.parametrize("step_deg", [0.3, 4.0])
@@ -115,3 +122,50 @@ def _update(u, k):
     views, report = u.fit(u.select(u.plan(k * 10**9), k * 10**9), Budget(steps=1))
     assert report.refused == ("hand",)  # without "hand#0", an earlier viewpoint
     return views
+
+
+def placed(number: int, x_m: float = 0.0, turned_deg: float = 0.0, camera: str = "cam01") -> View:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("y", turned_deg, degrees=True).as_matrix()
+    pose[0, 3] = x_m
+    return View(camera, np.zeros((24, 32, 3), np.uint8), pose, CAMERA, number * 10**8)
+
+
+def first_seen(places_m) -> int | None:
+    """Number of the frame with which the camera is seen to move; its frames are taken at ``places_m``."""
+    motion = CameraMotion()
+    for number, x_m in enumerate(places_m):
+        if motion.moving([placed(number, camera="cam00"), placed(number, x_m)]) is not None:
+            return number
+    return None
+
+
+def test_a_camera_that_moves_on_is_seen_to_move_with_its_fifth_frame_and_a_slow_one_later():
+    assert first_seen([0.0, 0.1, 0.2, 0.3, 0.4, 0.5]) == 4
+    motion = CameraMotion()
+    assert [motion.moving([placed(n, 0.0, 6.0 * n)]) for n in range(5)] == [None, None, None, None, "cam01"]
+    assert first_seen([0.0] * 50 + [0.004 * k for k in range(60)]) == 50 + 18
+
+
+def test_what_is_no_motion():
+    for places_m in (
+        [0.0] * 100,
+        [0.0] * 20 + [0.5] * 200,  # knocked, or calibrated anew
+        [0.0, 0.0, 9.0, 0.0, 0.0, 9.0, 0.0, 9.0, 0.0],  # single wrong poses
+        [0.03 * (k % 2) for k in range(100)],
+        np.random.default_rng(4).normal(0.0, 0.005, 2000),
+    ):
+        assert first_seen(places_m) is None
+
+
+def test_a_frame_that_is_used_again_and_one_that_was_overtaken_do_not_count():
+    motion = CameraMotion()
+    assert motion.moving([placed(0)]) is None
+    for number, x_m in ((5, 1.0), (5, 1.0), (3, 2.0), (5, 1.0), (1, 3.0), (6, 0.0)):
+        assert motion.moving([placed(number, x_m)]) is None
+
+
+def test_the_distance_of_poses_is_in_meters_and_degrees():
+    assert pose_distance(placed(0).camera_to_world, placed(1, 0.25, 30.0).camera_to_world) == pytest.approx(
+        (0.25, 30.0)
+    )

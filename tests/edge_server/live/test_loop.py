@@ -21,19 +21,24 @@ from tests.support import wait_until
 MS = 1_000_000
 
 
-def updates(policy="all", value=None, cameras=("cam01", "cam02")) -> FieldUpdater:
-    made = make_policy(policy, value, np.random.default_rng(0))
-    return FieldUpdater(FrameBuffer(cameras), made, tiny_field(), start_ns=0)
+def updates(cameras=("cam01", "cam02"), field=None, **more) -> FieldUpdater:
+    made = make_policy("all", None, np.random.default_rng(0))
+    return FieldUpdater(FrameBuffer(cameras), made, field or tiny_field(), start_ns=0, **more)
+
+
+def fed_to(u: FieldUpdater) -> list[list[tuple[str, int]]]:
+    """What the field is given at each fit instead of learning: cameras and milliseconds."""
+    fed = []
+    u.field.fit = lambda views, budget: fed.append([(v.camera, v.generated_ns // MS) for v in views])
+    return fed
 
 
 def test_on_arrivals_nothing_is_selected_twice_and_a_field_that_wants_it_gets_every_frame():
-    made = make_policy("all", None, np.random.default_rng(0))
     field = tiny_field()
     field.frame_s, field.most_pixels = 0.0, 1001
-    u = FieldUpdater(FrameBuffer(("cam01", "cam02")), made, field, start_ns=0, on_arrivals=True)
+    u = updates(field=field, on_arrivals=True)
     assert u.decoder.most_pixels == 500  # of each camera
-    fed = []
-    field.fit = lambda views, budget: fed.append([(v.camera, v.generated_ns // MS) for v in views])
+    fed = fed_to(u)
     for at in (10, 20, 30):
         u.buffer.put(frame("cam01", sequence=at, generated_ns=at * MS), at * MS)
     u.buffer.put(frame("cam02", generated_ns=25 * MS), 31 * MS)
@@ -69,8 +74,7 @@ def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
     u = updates(cameras=cameras)
     u.field.frame_s = 0.01
     u.buffer.keep_every_frame(True)
-    fed = []
-    u.field.fit = lambda views, budget: fed.append([(v.camera, v.generated_ns // MS) for v in views])
+    fed = fed_to(u)
     for at in (10, 20):
         for camera in cameras:
             u.buffer.put(frame(camera, sequence=at, generated_ns=at * MS), at * MS)
@@ -97,14 +101,12 @@ def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
 class Running:
     """A loop on the wall clock, with what it published and its status lines."""
 
-    def __init__(
-        self, u: FieldUpdater, grace_ms: float = 0.0, update_ms: float = 100.0, clock: Clock | None = None
-    ) -> None:
+    def __init__(self, u: FieldUpdater, grace_ms: float = 0.0, clock: Clock | None = None) -> None:
         self.published, self.lines, self.saved = [], [], []
         self.clock = clock or WallClock()
         self.controls = Controls(u.policy.name, u.policy.value)
         told = (lambda p, r, v: self.published.append((p, r)), self.lines.append, self.saved.append, lambda event: None)
-        self.loop = UpdateLoop(u, self.clock, self.controls, update_ms, grace_ms, *told)
+        self.loop = UpdateLoop(u, self.clock, self.controls, 100.0, grace_ms, *told)
 
     def until(self, condition) -> None:
         wait_until(condition, lambda: f"never happened; the loop said {self.lines[-3:]}", 60.0)

@@ -54,8 +54,7 @@ def _run(
 ) -> list[tuple[Score, Publication]]:
     """Scores of what was shown, of publications and held-out frames at given instants in ns. scored: takes
     publications with their scores."""
-    shown: list[tuple[Score, Publication]] = []
-    taken = [] if scored is None else scored
+    shown, taken = [], [] if scored is None else scored
     thread = ScoringThread(["cam00"], scorer or Scorer(), lambda of, *_: taken.append(of), lambda *of: shown.append(of))
     events = [(at, 0, n) for n, at in enumerate(publications)] + [(at, 1, n) for n, at in enumerate(frames)]
     thread.load()
@@ -83,11 +82,14 @@ def test_the_newest_publication_is_shown_carried_on_to_the_capture(monkeypatch: 
     assert len(set(gaps.tolist())) == len(gaps), "random instants"
 
 
+def _thread(*cameras: str) -> ScoringThread:
+    """Which tells its scores to nobody, and is not started."""
+    return ScoringThread(cameras or ("cam00",), Scorer(), lambda *_: None, lambda *_: None)
+
+
 def test_a_thread_that_falls_behind_keeps_no_snapshots() -> None:
     """Each is as large as the field."""
-    alive = weakref.WeakSet[Brightness]()
-    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
-
+    alive, thread = weakref.WeakSet[Brightness](), _thread()
     for k in range(100):
         alive.add(snapshot := Brightness(k * 20 * MS))
         thread.published(_publication(k, snapshot.at_ns), snapshot, [])
@@ -96,7 +98,7 @@ def test_a_thread_that_falls_behind_keeps_no_snapshots() -> None:
 
 
 def test_snapshots_replaced_before_the_next_scored_capture_are_dropped() -> None:
-    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
+    thread = _thread()
     thread._next_shown_ns["cam00"] = 500 * MS
     for k in range(1, 30):
         thread._score_later(_publication(k, k * 20 * MS), Brightness(k * 20 * MS), [])
@@ -105,7 +107,7 @@ def test_snapshots_replaced_before_the_next_scored_capture_are_dropped() -> None
 
 def test_a_silent_held_out_camera_keeps_no_snapshots(monkeypatch: Any) -> None:
     monkeypatch.setattr(scoring_thread, "_SILENT_NS", 100 * MS)
-    thread = ScoringThread(["cam00", "cam01"], Scorer(), lambda *_: None, lambda *_: None)
+    thread = _thread("cam00", "cam01")
     for k in range(1, 13):
         thread._held_out["cam00"].take(_frame(k, k * 20 * MS))
         thread._score_later(_publication(k, k * 20 * MS), Brightness(k * 20 * MS), [])
@@ -128,7 +130,7 @@ def test_time_that_was_not_used_is_no_credit_beyond_the_allowance(monkeypatch: A
     now_s, used_s = [0.0], [0.0]
     monkeypatch.setattr(scoring_thread.time, "monotonic", lambda: now_s[0])
     monkeypatch.setattr(scoring_thread.time, "thread_time", lambda: used_s[0])
-    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
+    thread = _thread()
     now_s[0] = 1000.0
     assert thread._affordable()
     used_s[0] = 1.1
@@ -159,7 +161,7 @@ def test_where_nothing_is_held_out_the_mean_color_is_that_of_the_views() -> None
 
 def test_of_a_held_out_camera_that_moves_the_newest_frame_and_all_so_far_are_told_apart() -> None:
     """The field knows how bright it is at half a second, and shows that everywhere."""
-    thread = ScoringThread(["cam00"], Scorer(), lambda *_: None, lambda *_: None)
+    thread = _thread()
     for k in range(100):
         pose = Pose((1.0, 0.0, 0.0, 0.0), (0.01 * k, 0.0, 0.0))
         thread._held_out["cam00"].take(replace(_frame(k, 5 * k * MS), pose=pose))

@@ -121,6 +121,12 @@ def serve(tmp_path):
         run.end()
 
 
+def connected(run: Run) -> grpc.Channel:
+    channel = Transport().channel(f"127.0.0.1:{run.port}")
+    grpc.channel_ready_future(channel).result(30)
+    return channel
+
+
 def until(condition, seconds=60.0):
     wait_until(condition, "it never happened", seconds)
 
@@ -162,8 +168,7 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
 
 def test_operators_see_and_change_a_running_server(serve):
     run = serve()
-    server, channel = run.server, Transport().channel(f"127.0.0.1:{run.port}")
-    grpc.channel_ready_future(channel).result(30)
+    server, channel = run.server, connected(run)
     edge = edge_pb2_grpc.EdgeServiceStub(channel)
     with pytest.raises(grpc.RpcError) as early:
         edge.SaveSnapshot(edge_pb2.SaveSnapshotRequest())
@@ -242,8 +247,7 @@ def test_metrics_hold_few_connections_and_answer_beside_half_requests(serve):
 
 
 def test_watchers_are_few_and_a_new_one_always_finds_a_place(serve):
-    with Transport().channel(f"127.0.0.1:{serve().port}") as channel:
-        grpc.channel_ready_future(channel).result(30)
+    with connected(serve()) as channel:
         edge = edge_pb2_grpc.EdgeServiceStub(channel)
         watching = [edge.WatchDecisions(edge_pb2.WatchDecisionsRequest()) for _ in range(MAX_WATCHERS + 20)]
         until(lambda: sum(call.done() for call in watching) == 20)
@@ -282,8 +286,7 @@ def test_a_final_checkpoint_that_is_not_written_is_said(serve, tmp_path, monkeyp
 
 def test_a_token_is_demanded_and_honoured(serve):
     secured = Transport(tokens={"camera:*": "open sesame"})
-    with Transport().channel(f"127.0.0.1:{serve(transport=secured).port}") as channel:
-        grpc.channel_ready_future(channel).result(30)
+    with connected(serve(transport=secured)) as channel:
         push, sent = frames_pb2_grpc.FrameStreamServiceStub(channel).Push, to_request(frame("cam01", 0, time.time_ns()))
         with pytest.raises(grpc.RpcError) as refused:
             next(push(iter([sent])))

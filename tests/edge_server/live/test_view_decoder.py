@@ -1,3 +1,5 @@
+"""Frames as views: decoded once, with depth at the image's pixels."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -5,9 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edge_server.live import depth_in_image as module
+from edge_server.live.depth_in_image import depth_in_image
 from edge_server.live.view_decoder import ViewDecoder
 from freshfield import payload
 from freshfield.depth import DepthImage
+from freshfield.geometry import Pinhole, Pose
+from freshfield.limits import MAX_DEPTH_POINTS, MOST_DEPTH_MOVED
 from tests.edge_server.frames import damaged_frame, frame
 
 
@@ -81,3 +87,133 @@ def test_a_damaged_png_writes_nothing_to_the_log(capfd):
         for data in (whole[:k], whole[:k] + b"\xff\xd0\x00\x11" + whole[k + 4 :], whole[:k] + whole[k + 1 :]):
             assert ViewDecoder().views([frame(codec="png", payload=data)]) == []
     assert capfd.readouterr() == ("", "")
+
+
+IMAGE = Pinhole.from_fov(64, 48, 70.0)
+SENSOR = Pinhole(80, 60, 70.0, 70.0, 41.0, 29.0)
+BESIDE = Pose((1.0, 0.0, 0.0, 0.0), (0.06, -0.01, 0.02))  # of the sensor, right of the camera
+
+
+def depth(counts, **other) -> DepthImage:
+    return DepthImage(np.asarray(counts, np.uint16), 0.001, **other)
+
+
+def box_before_wall(sensor: Pinhole, pose: Pose) -> np.ndarray:
+    """Millimeters that a sensor measures of a wall at 3 m and a square of 60 cm at 1.5 m, camera axes."""
+    rays = sensor.rays() @ pose.matrix()[:3, :3].T
+    at = np.array(pose.translation_m)
+    reached = {}
+    for z in (1.5, 3.0):
+        scale = (z - at[2]) / rays[..., 2]
+        reached[z] = at + rays * scale[..., None]
+    on_box = np.abs(reached[1.5][..., :2]).max(-1) < 0.3
+    z = np.where(on_box, 1.5, 3.0) - at[2]  # the axes are parallel
+    return np.round(1000 * z)
+
+
+def moved_point_by_point(measured: DepthImage, image: Pinhole) -> np.ndarray:
+    """The reference: each measured pixel at a time, the nearest wins."""
+    out = np.zeros((image.height, image.width))
+    rays = measured.intrinsics.rays()
+    for row, column in np.argwhere(measured.counts > 0):
+        ray = rays[row, column]
+        point = ray / ray[2] * measured.counts[row, column] * measured.meters_per_count
+        world = measured.to_camera.matrix() @ [*point, 1.0]
+        u, v = np.floor(image.project(world[:3]))
+        if 0 <= u < image.width and 0 <= v < image.height:
+            old = out[int(v), int(u)]
+            out[int(v), int(u)] = world[2] if old == 0 else min(old, world[2])
+    return out
+
+
+def test_registered_depth_is_taken_as_it_is_or_the_nearest_of_another_size():
+    counts = np.arange(48 * 64).reshape(48, 64)
+    np.testing.assert_allclose(depth_in_image(depth(counts), IMAGE, 0), counts * 0.001, rtol=1e-6)
+    fine = np.arange(96 * 128).reshape(96, 128)
+    np.testing.assert_allclose(depth_in_image(depth(fine), IMAGE, 0), fine[1::2, 1::2] * 0.001, rtol=1e-6)
+    coarse = np.arange(24 * 32).reshape(24, 32) + 1
+    expected = np.kron(coarse, np.ones((2, 2))) * 0.001
+    np.testing.assert_allclose(depth_in_image(depth(coarse), IMAGE, 0), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("halvings", [1, 3])
+def test_halved_images_see_the_same_depth(halvings):
+    """A plane's depth is known at every pixel; odd sides are rounded up."""
+    lens = replace(IMAGE, width=63, height=47)
+    small = lens.halved(halvings)
+    large_m, small_m = (2 / (1 + rays @ [0.3, 0.2, 0.0] / rays[..., 2]) for rays in (lens.rays(), small.rays()))
+    found = depth_in_image(depth(np.round(1000 * large_m)), lens, halvings)
+    assert found.shape == (small.height, small.width)
+    assert np.abs(found / small_m - 1)[:-1, :-1].max() < 0.009  # half a measured pixel
+
+
+def test_depth_of_a_lens_and_a_pose_of_its_own_is_moved_as_one_by_one():
+    measured = depth(box_before_wall(SENSOR, BESIDE), intrinsics=SENSOR, to_camera=BESIDE)
+    measured.counts[5:9, 50:60] = 0
+    np.testing.assert_allclose(depth_in_image(measured, IMAGE, 0), moved_point_by_point(measured, IMAGE), rtol=1e-5)
+
+
+@pytest.mark.stability
+def test_hard_depth_gives_holes_and_no_warning():
+    behind = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -100.0))
+    turned = Pose((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0))  # looks back
+    far = np.full((60, 80), 65535)
+    for counts, pose in ((np.zeros((60, 80)), BESIDE), (far, behind), (far, turned), (np.ones((60, 80)), behind)):
+        with np.errstate(all="raise"):
+            found = depth_in_image(depth(counts, intrinsics=SENSOR, to_camera=pose), IMAGE, 1)
+        assert found.shape == (24, 32) and not found.any()
+    found = depth_in_image(depth(far, intrinsics=SENSOR), IMAGE, 0)
+    assert np.isfinite(found).all() and found.max() == np.float32(65.535)
+
+
+@pytest.mark.stability
+def test_a_lens_with_distortion_takes_in_only_what_it_sees():
+    """Beyond its image this lens's model leads back into it: a wide sensor's points must not land there."""
+    lens = replace(IMAGE, distortion=(-0.28, 0.07, 0.0, 0.0))
+    wide = Pinhole.from_fov(200, 150, 150.0)
+    rays = wide.rays()
+    outside = np.hypot(rays[..., 0], rays[..., 1]) / rays[..., 2] > 1.5
+    assert outside.any()
+    found = depth_in_image(depth(np.where(outside, 500, 2000), intrinsics=wide), lens, 0)
+    assert not (found == np.float32(0.5)).any() and (found == np.float32(2.0)).mean() > 0.5
+    assert module._reach(IMAGE) == pytest.approx(np.hypot(32.0 / IMAGE.fx, 24.0 / IMAGE.fy))
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    ("side", "width", "height", "fov_deg", "step", "moved"),
+    [
+        (128, 1280, 1280, 70.0, 0, 1.02 * MAX_DEPTH_POINTS * 128**2),  # about as many as a small image has pixels
+        (128, 1280, 1280, 175.0, 0, 1.02 * MAX_DEPTH_POINTS * 128**2),
+        (1200, 848, 480, 70.0, 1, 848 * 480),  # what sensors measure at this size is moved whole
+        (1200, 1280, 1280, 70.0, 2, MOST_DEPTH_MOVED),
+    ],
+)
+def test_of_large_depth_few_points_are_moved_and_they_leave_no_gaps(side, width, height, fov_deg, step, moved):
+    image, sensor = Pinhole.from_fov(side, side, 60.0), Pinhole.from_fov(width, height, fov_deg)
+    module._kept.clear()
+    found = depth_in_image(depth(np.full((height, width), 2000), intrinsics=sensor), image, 0)
+    (rays,) = module._kept.values()
+    assert 0.2 * moved < rays[..., 0].size <= moved
+    inside = found[side // 3 : 2 * side // 3, side // 4 : 3 * side // 4]
+    if side == 1200:
+        assert rays.shape[:2] == (height // step, width // step)
+        assert (inside == np.float32(2.0)).all()
+    assert (inside == np.float32(2.0)).mean() > 0.97
+
+
+@pytest.mark.stability
+def test_lenses_that_differ_in_each_frame_do_not_fill_the_memory(monkeypatch):
+    counts = np.full((60, 80), 2000)
+    rays_bytes = 60 * 80 * 12
+    monkeypatch.setattr(module, "MAX_DEPTH_RAYS_BYTES", 3 * rays_bytes)
+    module._kept.clear()
+    lenses = [replace(SENSOR, cx=40.0 + 0.01 * k) for k in range(9)]
+    for lens in lenses:
+        for each in (lens, lenses[0]):  # the first is used all the time, and stays
+            assert (depth_in_image(depth(counts, intrinsics=each), IMAGE, 0) > 0).mean() > 0.6
+    kept = [lens for lens, _, _ in module._kept]
+    assert kept == [*lenses[-2:], lenses[0]]
+    monkeypatch.setattr(module, "MAX_DEPTH_RAYS_BYTES", rays_bytes - 1)
+    assert (depth_in_image(depth(counts, intrinsics=lenses[1]), IMAGE, 0) > 0).mean() > 0.6
+    assert not module._kept

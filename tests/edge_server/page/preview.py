@@ -7,7 +7,9 @@ update: what a perfect field would show. Only learning and network are left out.
 from __future__ import annotations
 
 import threading
-from pathlib import Path
+import time
+from dataclasses import replace
+from unittest.mock import MagicMock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +28,23 @@ BALL_RADIUS_M = 0.55
 ORBIT_RADIUS_M = 0.6
 PERIOD_S = 6.0
 UPDATE_S = 0.8
+
+
+def bare_state(cameras: list[CameraView] | None = None) -> EdgeState:
+    return EdgeState(
+        scenario="bare",
+        policies=(),
+        controls=Controls("all", None),
+        cameras=lambda: cameras or [],
+        start_ns=0,
+        now_ns=time.monotonic_ns,
+        set_policy=MagicMock(side_effect=ValueError("no policies here")),
+        save_snapshot=MagicMock(side_effect=OSError("full")),
+    )
+
+
+def publication(number: int) -> Publication:
+    return Publication(number, float(number), 0, None, (), (), float("nan"), 1.0)
 
 
 class BallScene:
@@ -57,17 +76,9 @@ class Preview:
         self._held_out = self.names[CAMERAS // 2]
         self._poses = {name: _arc(i) for i, name in enumerate(self.names)}
         self._newest: dict[str, Frame] = {}
-        self.state = EdgeState(
-            scenario="preview",
-            policies=("all", "threshold"),
-            controls=Controls("threshold", 600.0),
-            cameras=self.cameras,
-            start_ns=self._clock.now_ns(),
-            now_ns=self._clock.now_ns,
-            set_policy=lambda name, value: None,
-            save_snapshot=lambda: Path("none"),
-            field_name="analytic",
-        )
+        self.state = replace(bare_state(), controls=Controls("threshold", 600.0), cameras=self.cameras)
+        self.state.policies, self.state.field_name = ("all", "threshold"), "analytic"
+        self.state.start_ns, self.state.now_ns = self._clock.now_ns(), self._clock.now_ns
         self._thread = threading.Thread(target=self._update, name="preview", daemon=True)
 
     def start(self) -> None:
@@ -90,9 +101,8 @@ class Preview:
             for name in self._reporting:
                 image, pose = _uint8(scene.render(self._poses[name], LENS)), Pose.from_matrix(self._poses[name])
                 held_out = name == self._held_out
-                self._newest[name] = Frame(
-                    name, "preview", number, now_ns, pose, LENS, "jpeg", payload.encode(image), held_out=held_out
-                )
+                taken = Frame(name, "preview", number, now_ns, pose, LENS, "jpeg", payload.encode(image))
+                self._newest[name] = replace(taken, held_out=held_out)
             truth = _uint8(scene.render(self._poses[self._held_out], LENS))
             used = tuple(name for name in self._reporting if name != self._held_out)
             found = {"psnr_db": 30.0, "scored_on": self._held_out}

@@ -24,9 +24,8 @@ from edge_server.page.access_guard import AccessGuard
 from freshfield.access import HttpDoor
 from freshfield.limits import MAX_SCRAPES, MAX_VISITOR_MESSAGE_BYTES
 from freshfield.transport import Transport, TransportError
-from tests.edge_server.page.preview import BallScene
-from tests.edge_server.page.test_page import bare_state, publication
-from tests.edge_server.page.visitor import Visitor, page_of
+from tests.edge_server.page.preview import BallScene, bare_state, publication
+from tests.edge_server.page.visitor import CAMERA, Visitor, page_of
 from tests.role_table import TOKENS, cells_of
 from tests.support import free_port, wait_until
 
@@ -64,6 +63,12 @@ def guard_of(page: Page) -> AccessGuard:
     return next(iter(page._server._websock_server._live_connections.values()))._guard
 
 
+def has_come(page: Page, visitor: Visitor, count: int = 1) -> AccessGuard:
+    """The guard, once there are so many visitors."""
+    visitor.wait_for(lambda: len(page._server.get_clients()) == count, "a visitor")
+    return guard_of(page)
+
+
 @pytest.mark.parametrize(("what", "who", "may"), [*cells_of("page: look"), *cells_of("metrics")])
 def test_who_may_look(what: str, who: str, may: bool) -> None:
     port = free_port()
@@ -90,7 +95,7 @@ def test_who_may_change(what: str, who: str, may: bool) -> None:
             assert not may
             return
         with visitor:
-            visitor.wait_for(lambda: page._server.get_clients(), "the visitor")
+            has_come(page, visitor)
             press(visitor, page, "pause")
             if may:
                 visitor.wait_for(lambda: state.controls.paused, "the pause")
@@ -204,8 +209,7 @@ def test_a_flood_of_refused_requests_and_visitors_is_counted_and_said_once_a_min
         return {what: count for what, count in guard.refused.items() if any(kind in what for kind in kinds)}
 
     with page_of(bare_state(), LOGIN, "0.0.0.0") as page, Visitor(page.port, headers=login_of) as visitor:
-        wait_until(lambda: page._server.get_clients(), "the visitor")
-        guard = guard_of(page)
+        guard = has_come(page, visitor)
         for _ in range(10):
             assert get(page.port)[0] == 401
             assert get(page.port, Origin="http://evil.example", **login("viewer"))[0] == 403
@@ -234,21 +238,15 @@ def test_a_visitor_sets_values_of_controls_and_nothing_else() -> None:
     state = bare_state()
     state.policies, state.set_policy = ("all", "threshold"), lambda name, _: setattr(state.controls, "policy", name)
     with page_of(state) as page, Visitor(page.port) as visitor, Visitor(page.port) as other:
-        other.wait_for(lambda: len(page._server.get_clients()) == 2, "both")
+        has_come(page, other, 2)
         time.sleep(0.7)  # a refresh
         handles = {label: control(page, label) for label in ("field", "policy", "value")}
         before = {label: (h.value, h.disabled) for label, h in handles.items()}
         told = other.counts["GuiUpdateMessage"]
-        for label, updates in (
-            ("field", {"visible": False}),
-            ("field", {"disabled": True}),
-            ("field", {"value": "pause", "visible": False}),
-            ("field", {"value": "format the disk"}),
-            ("policy", {"value": "<script>"}),
-            ("policy", {"value": ["all"]}),
-            ("value", {"value": float("nan")}),
-            ("field", {}),
-        ):
+        not_values = [{"visible": False}, {"disabled": True}, {"value": "pause", "visible": False}, {}]
+        odd = [("field", "format the disk"), ("policy", "<script>"), ("policy", ["all"]), ("value", float("nan"))]
+        sent = [("field", each) for each in not_values] + [(label, {"value": value}) for label, value in odd]
+        for label, updates in sent:
             visitor.send("GuiUpdateMessage", uuid=handles[label]._impl.uuid, updates=updates)
             time.sleep(0.06)
         visitor.send("GuiUpdateMessage", uuid="another", updates={"value": True})
@@ -270,23 +268,12 @@ def test_a_visitor_sets_values_of_controls_and_nothing_else() -> None:
         assert visitor.counts["NotificationShowMessage"] < 100
 
 
-CAMERA = {"type": "ViewerCameraMessage", "wxyz": [1.0, 0, 0, 0], "position": [0.0, 0, 1], "fov": 0.9, "near": 0.01}
-CAMERA |= {"far": 1e3, "image_height": 600, "image_width": 800, "look_at": [0.0] * 3, "up_direction": [0.0, 0, 1]}
+NOBODYS = [{"image_width": 10**9}, {"image_height": 0}, {"fov": 4.0}, {"wxyz": [0.0, 0, 0, 0]}]
+NOBODYS += [{"position": [float("nan"), 0, 0]}, {"type": "RunJavascriptMessage", "source": "x"}]
 
 
-@pytest.mark.parametrize(
-    ("change", "taken"),
-    [
-        ({}, True),
-        ({"zoom": 2}, True),  # a later viser may add fields
-        ({"image_width": 10**9}, False),
-        ({"image_height": 0}, False),
-        ({"fov": 4.0}, False),
-        ({"wxyz": [0.0, 0, 0, 0]}, False),
-        ({"position": [float("nan"), 0, 0]}, False),
-        ({"type": "RunJavascriptMessage", "source": "x"}, False),
-    ],
-)
+# A later viser may add fields.
+@pytest.mark.parametrize(("change", "taken"), [({}, True), ({"zoom": 2}, True), *((each, False) for each in NOBODYS)])
 def test_viewpoints_that_nobody_can_have_are_not_taken(change: dict, taken: bool) -> None:
     guard = AccessGuard(HttpDoor(Transport().access, "127.0.0.1"), None)
     assert guard.takes(None, msgspec.msgpack.encode(CAMERA | change)) == taken
@@ -295,13 +282,11 @@ def test_viewpoints_that_nobody_can_have_are_not_taken(change: dict, taken: bool
 
 def test_nothing_is_uploaded() -> None:
     with page_of(bare_state()) as page, Visitor(page.port) as visitor:
-        visitor.wait_for(lambda: page._server.get_clients(), "the visitor")
-        uuid = control(page, "field")._impl.uuid
-        upload = {"source_component_uuid": uuid, "transfer_uuid": "t"}
+        at = has_come(page, visitor)
+        upload = {"source_component_uuid": control(page, "field")._impl.uuid, "transfer_uuid": "t"}
         file = {"filename": "f", "mime_type": "x", "part_count": 2, "size_bytes": 3 * 10**8}
         visitor.send("FileTransferStartUpload", **upload, **file)
         visitor.send("FileTransferPart", **upload, part=0, content=bytes(1000))
-        at = guard_of(page)
         wait_until(lambda: sum(at.refused.values()) == 2, "they were not refused")
         assert not page._server.gui._current_file_upload_states
         with contextlib.suppress(OSError):
@@ -333,10 +318,9 @@ def test_half_requests_end_for_new_ones(monkeypatch) -> None:
 
 def test_a_connection_without_its_tls_handshake_ends(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(access_guard, "TLS_HANDSHAKE_TIMEOUT_S", 1.0)
-    with (
-        page_of(bare_state(), Transport(**tls_of(tmp_path), tokens=TOKENS), "0.0.0.0") as page,
-        socket.create_connection(("127.0.0.1", page.port), timeout=4.0) as silent,
-    ):
+    transport = Transport(**tls_of(tmp_path), tokens=TOKENS)
+    with page_of(bare_state(), transport, "0.0.0.0") as page, contextlib.ExitStack() as open_:
+        silent = open_.enter_context(socket.create_connection(("127.0.0.1", page.port), timeout=4.0))
         assert silent.recv(1) == b""
 
 
@@ -359,11 +343,9 @@ def test_unfinished_handshakes_are_few_and_shut_nobody_out(tmp_path, monkeypatch
 def test_who_does_not_read_is_sent_away_and_what_was_held_with_them(monkeypatch) -> None:
     monkeypatch.setattr(access_guard, "VISITOR_TIMEOUT_S", 2.0)
     with page_of(bare_state()) as page, Visitor(page.port) as reader:
-        reader.wait_for(lambda: page._server.get_clients(), "the visitor")
-        stuck = [Visitor(page.port, reads=False) for _ in range(3)]
-        wait_until(lambda: len(page._server.get_clients()) == 4, "not all came")
-        at = guard_of(page)
-        held = []
+        has_come(page, reader)
+        stuck, held = [Visitor(page.port, reads=False) for _ in range(3)], []
+        at = has_come(page, reader, 4)
         for k in range(20):
             page._server.scene.add_point_cloud(f"/{k % 4}", POINTS, POINTS)
             time.sleep(0.05)

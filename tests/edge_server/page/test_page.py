@@ -16,7 +16,7 @@ import pytest
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Rendering
 from edge_server.fields.common.scene_box import UNIT_BOX
-from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication
+from edge_server.live.state import CameraView, Comparison, EdgeState
 from edge_server.page import PageError, page_url, panel, start_page, views
 from edge_server.page.controls import ControlPanel
 from edge_server.page.rendering import LEVELS, MOVING, NEWER, ClientState, RenderLoop, browser_image, hatched
@@ -25,7 +25,7 @@ from edge_server.page.viewpoint import initial_viewpoint
 from freshfield import coverage
 from freshfield.geometry import Pinhole, Pose, look_at
 from tests.edge_server.frames import frame
-from tests.edge_server.page.preview import LENS, BallScene
+from tests.edge_server.page.preview import LENS, BallScene, bare_state, publication
 from tests.edge_server.page.visitor import Visitor, page_of
 from tests.support import wait_until
 
@@ -45,23 +45,6 @@ class Broken:
             raise FloatingPointError("no such density")
         depth = np.full((intrinsics.height, intrinsics.width), np.nan, np.float32)
         return Rendering(np.stack([depth] * 3, axis=-1), depth, depth)
-
-
-def bare_state(cameras: list[CameraView] | None = None) -> EdgeState:
-    return EdgeState(
-        scenario="bare",
-        policies=(),
-        controls=Controls("all", None),
-        cameras=lambda: cameras or [],
-        start_ns=0,
-        now_ns=time.monotonic_ns,
-        set_policy=MagicMock(side_effect=ValueError("no policies here")),
-        save_snapshot=MagicMock(side_effect=OSError("full")),
-    )
-
-
-def publication(number: int) -> Publication:
-    return Publication(number, float(number), 0, None, (), (), float("nan"), 1.0)
 
 
 def test_what_is_not_finite_shows_the_backdrop_and_the_rest_its_color():
@@ -218,11 +201,8 @@ def test_the_present_point_is_the_mean_of_the_last_instants_and_updates():
 
 def shown_to(loop: RenderLoop) -> MagicMock:
     """A visitor of the loop."""
-    client = MagicMock(client_id=1)
-    client.camera = SimpleNamespace(
-        position=(4.0, 0.0, 3.0), wxyz=(1.0, 0, 0, 0), fov=0.9, image_width=80, image_height=60
-    )
-    loop.add_client(client)
+    at = {"position": (4.0, 0.0, 3.0), "wxyz": (1.0, 0, 0, 0), "fov": 0.9, "image_width": 80, "image_height": 60}
+    loop.add_client(client := MagicMock(client_id=1, camera=SimpleNamespace(**at)))
     return client
 
 
@@ -267,7 +247,7 @@ def test_the_page_outlives_a_broken_field_and_stops_at_once(raises, capfd):
         state.scored(replace(publication(7), psnr_db=float("inf")), Comparison("never", black, black, 7))
         wait_until(lambda: field.renders > 0, "nothing was rendered")
         state.publish(publication(8), BallScene(0.0))  # it has recovered
-        visitor.wait_for(lambda: visitor.image is not None and decoded(visitor.image).std() > 20, "the ball")
+        visitor.wait_for(lambda: visitor.image is not None and spread(visitor.image) > 20, "the ball")
         with pytest.raises(PageError, match="--page-port"):
             start_page(bare_state(), "127.0.0.1", page.port)
     page.stop()  # twice is once
@@ -278,8 +258,8 @@ def test_the_page_outlives_a_broken_field_and_stops_at_once(raises, capfd):
     assert "viser" not in capfd.readouterr().out  # no banner of a library on the operator's terminal
 
 
-def decoded(image: bytes) -> np.ndarray:
-    return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
+def spread(image: bytes) -> float:
+    return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR).std()
 
 
 def test_a_state_that_fails_to_answer_is_reported_once_and_survived(caplog):

@@ -20,6 +20,9 @@ from edge_server.page import Page, start_page
 from freshfield.transport import Transport
 from tests.support import wait_until
 
+CAMERA = {"type": "ViewerCameraMessage", "wxyz": [1.0, 0, 0, 0], "position": [0.0, 0, 1], "fov": 0.9, "near": 0.01}
+CAMERA |= {"far": 1e3, "image_height": 600, "image_width": 800, "look_at": [0.0] * 3, "up_direction": [0.0, 0, 1]}
+
 
 @contextlib.contextmanager
 def page_of(state: EdgeState, transport: Transport | None = None, host: str = "127.0.0.1") -> Iterator[Page]:
@@ -71,22 +74,11 @@ class Visitor:
         right = np.cross(forward, (0.0, 0.0, 1.0))
         right /= np.linalg.norm(right)
         axes = np.stack([right, np.cross(forward, right), forward], axis=1)
-        self.send(
-            "ViewerCameraMessage",
-            wxyz=list(viser.transforms.SO3.from_matrix(axes).wxyz),
-            position=list(p),
-            fov=0.9,
-            near=0.01,
-            far=1000.0,
-            image_width=800,
-            image_height=600,
-            look_at=[0.0, 0.0, 0.0],
-            up_direction=[0.0, 0.0, 1.0],
-        )
+        turn = viser.transforms.SO3.from_matrix(axes)
+        self.send(**{**CAMERA, "wxyz": list(turn.wxyz), "position": list(p)})
 
-    def send(self, kind: str, **fields: Any) -> None:
-        data = msgspec.msgpack.encode(fields | {"type": kind}, enc_hook=float)
-        self._socket.send_binary(data)
+    def send(self, type: str, **fields: Any) -> None:
+        self._socket.send_binary(msgspec.msgpack.encode({**fields, "type": type}, enc_hook=float))
 
     def wait_for(self, wanted: Callable[[], bool], what: str, timeout_s: float = 30.0) -> None:
         wait_until(wanted, lambda: f"{what} did not happen; received {dict(self.counts)}", timeout_s)

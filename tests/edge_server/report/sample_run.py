@@ -17,7 +17,7 @@ from edge_server.report.build_report import assemble
 from edge_server.report.report_page import render_page
 from edge_server.report.run_files import read_run_files
 from freshfield.files import write_json
-from tests.edge_server.report.ledgers import write
+from freshfield.ledger import Ledger
 
 CAMERAS = ("cam00", "cam01", "cam02", "cam03")
 SECONDS = 40.0
@@ -56,27 +56,15 @@ SHOWN = Score("cam00", 0, 24.0, 17.0, 0.8, None, 0.0, psnr_still_db=26.0)
 
 def publication(number: int) -> Publication:
     """Fidelity rises to 26 dB; every tenth publication found no truth; cam03 moves nothing."""
-    t_s = 3.1 + 0.75 * number
-    scored = number % 10 != 9
-    psnr = 26.0 - 10.0 * 0.9**number
-    return Publication(
-        number=number,
-        t_s=t_s,
-        published_ns=round(t_s * 1e9),
-        omega_ms=120.0,
-        selected=CAMERAS[: 2 + number % 3],
-        ages_ms=(80.0,) * (2 + number % 3),
-        aaoi_ms=80.0 + number % 7,
-        steps=40,
-        update_ms=740.0 + 3 * (number % 11),
-        psnr_db=psnr if scored else None,
-        psnr_moving_db=psnr - 4 if scored else None,
-        ssim=psnr / 30 if scored else None,
-        lpips=0.6 - psnr / 60 if scored else None,
-        truth_gap_ms=3.0 if scored else None,
-        scored_on="cam00" if scored else None,
-        refused=("cam02",) if number % 20 == 5 else (),
-    )
+    t_s, used, psnr = 3.1 + 0.75 * number, 2 + number % 3, 26.0 - 10.0 * 0.9**number
+    ages_ms, aaoi_ms, update_ms = (80.0,) * used, 80.0 + number % 7, 740.0 + 3 * (number % 11)
+    made = Publication(number, t_s, round(t_s * 1e9), 120.0, CAMERAS[:used], ages_ms, aaoi_ms, update_ms, 40)
+    if number % 20 == 5:
+        made = replace(made, refused=("cam02",))
+    if number % 10 == 9:
+        return made
+    fidelity = {"psnr_db": psnr, "psnr_moving_db": psnr - 4, "ssim": psnr / 30, "lpips": 0.6 - psnr / 60}
+    return replace(made, **fidelity, truth_gap_ms=3.0, scored_on="cam00")
 
 
 def page_of(out: Path) -> tuple[dict, str]:
@@ -84,6 +72,20 @@ def page_of(out: Path) -> tuple[dict, str]:
     report = assemble(read_run_files(out))
     write_json(out / "report.json", report)
     return report, render_page(report, {})
+
+
+def write(out: Path, role: str, lines, name: str = "x", start_ns: int = 1, closed: bool = True) -> Path:
+    """A real ledger. lines: (sequence, event[, detail]) of camera "a", session "s", or (camera, session, sequence,
+    event[, detail])."""
+    ledger = Ledger(out, role, name, start_ns)
+    for t_ns, line in enumerate(lines):
+        camera, session, sequence, event, *detail = ("a", "s", *line) if isinstance(line[0], int) else line
+        ledger.write(t_ns, camera, session, sequence, event, *detail)
+    if closed:
+        ledger.close(len(lines))
+    else:
+        ledger._lines.close()  # as a killed process: without the line ``closed``
+    return ledger.path
 
 
 def write_run(out: Path, publications: int = 49, ages: int = 200) -> None:
@@ -117,10 +119,7 @@ def write_run(out: Path, publications: int = 49, ages: int = 200) -> None:
     write(out, "node", node)
     write(out, "emulator", emulator)
     write(out, "edge", edge)
-    rows = [
-        {"t_s": 2.0 * i}
-        | {"edge": {"rss_mb": 600.0 + i, "cpu": 1.4, "pid": 2}, "emulator": {"rss_mb": 60.0, "cpu": 0.1, "pid": 3}}
-        | {f"node-{c}": {"rss_mb": 90.0, "cpu": 0.02, "pid": 4} for c in CAMERAS}
-        for i in range(20)
-    ]
+    nodes = {f"node-{c}": {"rss_mb": 90.0, "cpu": 0.02, "pid": 4} for c in CAMERAS}
+    others = nodes | {"emulator": {"rss_mb": 60.0, "cpu": 0.1, "pid": 3}}
+    rows = [others | {"t_s": 2.0 * i, "edge": {"rss_mb": 600.0 + i, "cpu": 1.4, "pid": 2}} for i in range(20)]
     (out / "processes.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))

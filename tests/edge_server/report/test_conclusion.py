@@ -1,19 +1,27 @@
-"""The conclusion says what was measured, and names what limited it; events are found and marked."""
+"""The conclusion says what was measured, and what of it is no held-out view; events are found and marked."""
 
 from __future__ import annotations
 
 import json
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from edge_server.fidelity.scorer import SELECTED
+from edge_server.page import markup
+from edge_server.report import figures
 from edge_server.report.build_report import assemble
 from edge_server.report.conclusion import conclusion
 from edge_server.report.events import silences
 from edge_server.report.run_files import read_run_files
 from edge_server.run_records import AgesRow
+from freshfield.scenario import NOTHING_HELD_OUT
+from freshfield_up.status import _edge_line
+from freshfield_up.summary import summarize
+from tests.edge_server.page.test_markup import summary
 from tests.edge_server.report.sample_run import CHANNEL, EDGE, page_of, write_run
 
 SO_FAR = {"now_psnr_db": 20.0, "all_psnr_db": 23.0, "frames": 9}
@@ -24,13 +32,6 @@ TRAINED_ON = {"fidelity.scored_on": ["selected"], "fidelity.final.psnr_db": 17.4
 def report(tmp_path: Path) -> dict[str, Any]:
     write_run(tmp_path, ages=20)
     return assemble(read_run_files(tmp_path))
-
-
-def change(report: dict[str, Any], path: str, value: Any) -> None:
-    *parents, last = path.split(".")
-    for name in parents:
-        report = report[name]
-    report[last] = value
 
 
 def test_three_sentences_say_what_was_shown_its_age_and_its_limit(tmp_path: Path) -> None:
@@ -63,11 +64,10 @@ def test_three_sentences_say_what_was_shown_its_age_and_its_limit(tmp_path: Path
         ({"updates.shed": 70}, 2, "92% of those delivered were left out for lack of time"),
     ],
 )
-def test_the_conclusion_follows_the_figures(
-    report: dict[str, Any], changes: dict[str, Any], sentence: int, words: str
-) -> None:
+def test_the_conclusion_follows_the_figures(report, changes, sentence, words) -> None:
     for path, value in changes.items():
-        change(report, path, value)
+        *parents, last = path.split(".")
+        reduce(dict.__getitem__, parents, report)[last] = value
     assert words in conclusion(report)[sentence]
 
 
@@ -101,3 +101,49 @@ def test_cameras_that_fall_silent_together_are_one_event() -> None:
     assert gone.t_s == pytest.approx(10.0, abs=0.01) and gone.what == "cam01, cam02, cam03 and 2 more: no further frame"
     (back,) = silences([AgesRow(row.t_s, {"cam01": row.age_ms["cam01"]}) for row in rows])
     assert back.what == "cam01: no frame for 5.9 s"
+
+
+def run_of(folder: Path, scored_on: str) -> Path:
+    """A run's folder in which every score is on ``scored_on``."""
+    write_run(folder)
+    lines = (json.loads(line) for line in (folder / "series.jsonl").read_text().splitlines())
+    on = [line | {"scored_on": line["scored_on"] and scored_on} for line in lines]
+    (folder / "series.jsonl").write_text("".join(json.dumps(line) + "\n" for line in on))
+    return folder
+
+
+def told(folder: Path, on: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """What each place that shows a fidelity says of it, where every score is on ``on``."""
+    titles: list[str] = []
+    monkeypatch.setattr(figures, "label_lines", lambda *_, title="", **__: titles.append(title))
+    report, page = page_of(run_of(folder, on))
+    figures.draw_fidelity(report, read_run_files(folder), folder / "fidelity.png")
+    status = {"updates": {"count": 3, "ms_p50": 9.0}, "scores": {"psnr_db": 20.0, "on": on}}
+    return {
+        "page's tile": markup.status(summary(scored_on=on)),
+        "page's pair": markup.comparison_caption("cam01", 20.0, 3, held_out=on != SELECTED),
+        "report": page.split("<h2>Age")[0],
+        "report's figure": titles[0],
+        "console": _edge_line(status),
+    }
+
+
+def test_a_score_on_training_views_is_called_what_it_is(tmp_path, monkeypatch):
+    selected, held_out = (told(tmp_path / name, name, monkeypatch) for name in (SELECTED, "cam00"))
+    for place, words in selected.items():
+        assert NOTHING_HELD_OUT in words and "present" not in words.lower(), place
+        assert NOTHING_HELD_OUT not in held_out[place], place
+
+
+def test_the_age_of_what_was_shown_is_told_without_a_held_out_camera(tmp_path):
+    folder = run_of(tmp_path, SELECTED)
+    (folder / "shown.jsonl").unlink()
+    lines = [json.loads(line) | {"network_ms": 50.0} for line in (folder / "series.jsonl").read_text().splitlines()]
+    (folder / "series.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    report, page = page_of(folder)
+    age = report["fidelity"]["shown"]["age_ms"]
+    # Updates of some 745 ms follow each other: an image is shown for 750, and counts as old as it is in the middle.
+    assert age["network"] == 50.0 and age["computing"] == pytest.approx(757, abs=20)
+    assert age["display"] == pytest.approx(375, abs=40)
+    assert "(50 ms network, " in summarize(folder)
+    assert "ms network" in page

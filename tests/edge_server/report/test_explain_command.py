@@ -16,11 +16,11 @@ from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, state
-from tests.edge_server.scheduler.learned.test_decision_record import a_decision
+from tests.edge_server.scheduler.learned.test_bandit import a_decision
 
-NEEDS_ONNX = pytest.mark.skipif(
-    not (find_spec("onnx") and find_spec("onnxruntime")), reason="the extra embed is not installed"
-)
+HAS_ONNX = find_spec("onnx") and find_spec("onnxruntime")
+NEEDS_ONNX = pytest.mark.skipif(not HAS_ONNX, reason="the extra embed is not installed")
+NOWHERE = {"model": "/nowhere/d.onnx", "dim": 3}
 
 
 def ages_only(run):
@@ -54,11 +54,14 @@ def test_regions_are_found_with_what_embedded_the_frames(tmp_path, capsys):
     assert abs(float(said[1])) > 0
 
 
-@NEEDS_ONNX
-@pytest.mark.parametrize(
-    ("embedding", "says"),
-    [({"model": "/nowhere/d.onnx", "dim": 3}, "No such file"), (None, "does not say what embedded its frames")],
+NO_EMBEDDER = (
+    ({"model": "/nowhere/d.onnx", "dim": 3}, "No such file"),
+    (None, "does not say what embedded its frames"),
 )
+
+
+@NEEDS_ONNX
+@pytest.mark.parametrize(("embedding", "says"), [(NOWHERE, "No such file"), (None, "does not say what embedded")])
 def test_where_frames_cannot_be_embedded_again_the_rest_is_told(embedding, says, tmp_path, capsys):
     DecisionWriter(tmp_path, embedding).write(a_decision(2))
     assert main([str(tmp_path)]) == 0

@@ -31,9 +31,11 @@ def run(tmp_path_factory):
     return out, build_report(out)
 
 
-def words_of(page: str) -> str:
-    """What a page shows."""
-    return re.sub(r"\s+", " ", re.sub(r"<style>.*?</style>|<[^>]*>", " ", page))
+def assert_says(page: str, *expected: str) -> None:
+    """In what it shows."""
+    text = re.sub(r"\s+", " ", re.sub(r"<style>.*?</style>|<[^>]*>", " ", page))
+    for words in expected:
+        assert words in text, words
 
 
 def edit_edge(out, **more):
@@ -131,8 +133,8 @@ def test_every_figure_is_drawn_and_inside_a_page_that_loads_nothing(run):
 
 
 def test_the_page_says_what_the_report_holds(run):
-    text = words_of((run[0] / "report.html").read_text())
-    for words in (
+    assert_says(
+        (run[0] / "report.html").read_text(),
         "40 s · seed 7 · field ngp · policy threshold 120",
         "24.0 dB PSNR of what was shown, last fifth of the run 17.0 dB",
         "800 ms median of 50 updates 76 frames delivered of 200 captured",
@@ -146,8 +148,7 @@ def test_the_page_says_what_the_report_holds(run):
         "rejected 4 crc 4",
         "cam01 50 10 40 0 20 0 0 0 19 0 0 1",
         "drawn delay (ms) delay error (ms) mean 60.20 – 50 % 41.00 0.10 95 % 180.00 – 99 % – 1.20 largest – 4.00",
-    ):
-        assert words in text, words
+    )
 
 
 def test_a_killed_run_is_reported_with_notes_on_what_is_torn(tmp_path, capsys):
@@ -200,14 +201,13 @@ def test_a_held_out_camera_that_moves_is_drawn_and_tabled_at_refined_poses(tmp_p
     monkeypatch.setattr(figures, "label_lines", lambda axes, *_, **__: lines.append(len(axes.lines)))
     assert draw_fidelity(report, read_run_files(tmp_path), tmp_path / "figure.png")
     assert lines == [4, 2], "now and so far; two levels to compare with"
-    text = words_of(page)
-    for words in (
+    assert_says(
+        page,
         "0.812 SSIM of the same",
         "newest held-out frame, at refined poses 23.50 0.7900",
         "9 held-out frames so far, at refined poses 24.70 0.8125",
         "shown, last fifth of the run, at given poses 24.00 17.00",
-    ):
-        assert words in text, words
+    )
 
 
 def test_the_band_of_ages_reaches_from_the_youngest_camera_to_the_oldest(run, tmp_path, monkeypatch) -> None:

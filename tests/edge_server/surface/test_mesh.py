@@ -16,15 +16,7 @@ from edge_server.surface.reconstruct import mesh_from_depth_maps
 from edge_server.surface.sdf import fit_sdf, gradient_norm, sample_grid
 from edge_server.surface.settings import MeshSettings
 from edge_server.surface.volume import Grid, bounding_box, fuse_maps
-from tests.edge_server.surface.ball import (
-    DISTORTED_LENS,
-    LENS,
-    RADIUS_M,
-    TILTED_LENS,
-    ball_maps,
-    plain_fuse,
-    voxel_points,
-)
+from tests.edge_server.surface import ball as balls
 
 pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
 trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed (extra surface)")
@@ -34,20 +26,20 @@ COARSE = Grid((-0.13,) * 3, (0.13,) * 3, 0.008, 0.032)
 RNG = np.random.default_rng(11)
 
 
-@pytest.mark.parametrize("camera", [LENS, DISTORTED_LENS, TILTED_LENS])
+@pytest.mark.parametrize("camera", [balls.LENS, balls.DISTORTED_LENS, balls.TILTED_LENS])
 def test_the_kernel_fuses_as_the_equations_say(camera):
-    maps = ball_maps(5, camera)
+    maps = balls.ball_maps(5, camera)
     volume = fuse_maps(COARSE, maps)
     rng = np.random.default_rng(0)
     number, cell = rng.integers(0, len(volume.blocks.place), 400), rng.integers(0, SIDE**3, 400)
-    distance, weight = plain_fuse(COARSE, maps, voxel_points(volume)[number, cell])
+    distance, weight = balls.plain_fuse(COARSE, maps, balls.voxel_points(volume)[number, cell])
     assert (weight > 0).mean() > 0.3
     np.testing.assert_allclose(volume.blocks.weight[number, cell], weight, atol=2e-5)
     np.testing.assert_allclose(volume.blocks.distance[number, cell], distance, atol=1e-6)
 
 
 def test_the_number_of_threads_changes_no_bit_of_a_volume():
-    maps = ball_maps(6)
+    maps = balls.ball_maps(6)
     one, three = (fuse_maps(COARSE, maps, pool=pool) for pool in (Pool(1, nice=0), Pool(3, nice=0)))
     for a, b in zip(one.blocks, three.blocks):
         np.testing.assert_array_equal(a, b)
@@ -56,7 +48,7 @@ def test_the_number_of_threads_changes_no_bit_of_a_volume():
 def test_too_fine_a_grid_says_what_would_do(monkeypatch):
     monkeypatch.setattr(volume_module, "MOST_VOXELS", 50_000)
     with pytest.raises(SurfaceError, match=r"5 mm has too many voxels: take [\d.]+ mm or more"):
-        fuse_maps(GRID, ball_maps(4))
+        fuse_maps(GRID, balls.ball_maps(4))
     for grid, said in (
         (((-50.0,) * 3, (50.0,) * 3, 0.001, 0.004), "voxels are too many"),
         (((0, 0, 0), (1, 1, 1), 0.1, 0.05), "at least one voxel"),
@@ -67,18 +59,18 @@ def test_too_fine_a_grid_says_what_would_do(monkeypatch):
 
 
 def test_bounds_are_those_of_what_is_seen():
-    low, high = bounding_box(ball_maps(), 0.01)
+    low, high = bounding_box(balls.ball_maps(), 0.01)
     assert np.allclose(low, -0.11, atol=0.006) and np.allclose(high, 0.11, atol=0.006)
 
 
 def test_distances_are_those_of_the_ball_with_a_slope_of_one(monkeypatch):
     for name, value in (("LEVELS", 2), ("POINTS", 4000), ("EIKONAL", 0.3)):
         monkeypatch.setattr(settings, f"SDF_{name}", value)
-    volume = fit_sdf(COARSE, ball_maps(16))
-    truth = np.linalg.norm(voxel_points(volume), axis=-1) - RADIUS_M
+    volume = fit_sdf(COARSE, balls.ball_maps(16))
+    truth = np.linalg.norm(balls.voxel_points(volume), axis=-1) - balls.RADIUS_M
     assert np.abs(volume.blocks.distance - truth)[np.abs(truth) < 0.01].mean() < 0.0015
     radius = np.linalg.norm(remove_small_components(extract_mesh(volume)).vertices, axis=1)
-    assert abs(radius.mean() - RADIUS_M) < 0.0007
+    assert abs(radius.mean() - balls.RADIUS_M) < 0.0007
     distance = volume.blocks.distance.reshape(-1, SIDE, SIDE, SIDE)
     known = (np.abs(truth) < 0.02).reshape(distance.shape)[:, 1:-1, 1:-1, 1:-1]
     parts = [np.gradient(distance, COARSE.voxel_m, axis=k)[:, 1:-1, 1:-1, 1:-1] for k in (1, 2, 3)]
@@ -97,7 +89,7 @@ def test_values_between_nodes_and_their_slope():
 def test_the_number_of_threads_changes_no_bit_of_a_distance_function(monkeypatch):
     for name, value in (("LEVELS", 2), ("STEPS", 10), ("POINTS", 2000)):
         monkeypatch.setattr(settings, f"SDF_{name}", value)
-    maps, before = ball_maps(4), torch.get_num_threads()
+    maps, before = balls.ball_maps(4), torch.get_num_threads()
     found = []
     try:
         for threads in (1, 2):
@@ -111,15 +103,15 @@ def test_the_number_of_threads_changes_no_bit_of_a_distance_function(monkeypatch
 
 @pytest.fixture(scope="module")
 def ball():
-    return fuse_maps(GRID, ball_maps(24))
+    return fuse_maps(GRID, balls.ball_maps(24))
 
 
 def test_a_ball_comes_out_as_a_ball(ball):
     mesh = remove_small_components(extract_mesh(ball))
     radius = np.linalg.norm(mesh.vertices, axis=1)
-    assert abs(radius.mean() - RADIUS_M) < 3e-4 and np.abs(radius - RADIUS_M).max() < 0.003
+    assert abs(radius.mean() - balls.RADIUS_M) < 3e-4 and np.abs(radius - balls.RADIUS_M).max() < 0.003
     # Faces look outwards, so the volume is positive.
-    assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS_M**3, rel=0.02)
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * balls.RADIUS_M**3, rel=0.02)
     top, bottom = (
         mesh.visual.vertex_colors[side, :3] for side in (mesh.vertices[:, 2] > 0.01, mesh.vertices[:, 2] < -0.01)
     )
@@ -132,7 +124,7 @@ def test_a_mesh_without_a_surface_is_refused(ball):
 
 
 def test_what_nobody_saw_stays_open():
-    seen_from_above = fuse_maps(GRID, [m for m in ball_maps(40) if m.camera_to_world[2, 3] > 0.1])
+    seen_from_above = fuse_maps(GRID, [m for m in balls.ball_maps(40) if m.camera_to_world[2, 3] > 0.1])
     assert extract_mesh(seen_from_above).vertices[:, 2].min() > -0.09  # the ball's lower end is missing
 
 
@@ -160,7 +152,7 @@ def radii(maps) -> np.ndarray:
 @pytest.mark.stability
 @pytest.mark.parametrize("value", [-1.0, np.nan, np.inf, 1e30, 1e-30])
 def test_depth_that_is_nothing_gives_no_surface_and_says_so(value):
-    maps = [with_depth(m, np.full((64, 64), value)) for m in ball_maps(3)]
+    maps = [with_depth(m, np.full((64, 64), value)) for m in balls.ball_maps(3)]
     volume = fuse_maps(GRID, maps)
     for array in (volume.blocks.distance, volume.blocks.weight, volume.blocks.color):
         assert np.isfinite(array).all()
@@ -173,20 +165,20 @@ def test_depth_that_is_nothing_gives_no_surface_and_says_so(value):
 
 @pytest.mark.stability
 def test_one_camera_that_contradicts_all_others_is_outvoted():
-    maps = ball_maps(30)
+    maps = balls.ball_maps(30)
     liar = with_depth(maps[7], np.where(maps[7].seen, maps[7].depth - 0.06, maps[7].depth))
     found = radii([*maps[:7], liar, *maps[8:]])
-    assert np.percentile(np.abs(found - RADIUS_M), 99) < 0.004
+    assert np.percentile(np.abs(found - balls.RADIUS_M), 99) < 0.004
 
 
 @pytest.mark.stability
 def test_noise_averages_out_and_single_pixels_of_nonsense_do_not_spread():
     maps = []
-    for m in ball_maps(30):
+    for m in balls.ball_maps(30):
         depth = m.depth + RNG.normal(0, 0.002, m.depth.shape)
         depth[RNG.random(depth.shape) < 0.05] = RNG.choice([np.nan, -3.0, 0.0, 1e20])
         maps.append(with_depth(m, depth))
     found = radii(maps)
     # 2 mm of noise a pixel; a voxel hears of some dozens of them.
-    assert abs(np.median(found) - RADIUS_M) < 0.001
-    assert np.percentile(np.abs(found - RADIUS_M), 95) < 0.003
+    assert abs(np.median(found) - balls.RADIUS_M) < 0.001
+    assert np.percentile(np.abs(found - balls.RADIUS_M), 95) < 0.003

@@ -7,21 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from edge_server.experiments.common.statistics import (
-    Interval,
-    at_its_best,
-    crossed,
-    discoveries,
-    interval,
-    optimum,
-    paired,
-)
+from edge_server.experiments.common import statistics
+from edge_server.experiments.common.statistics import Interval, at_its_best, crossed, interval, optimum
 
 
 def test_an_interval_is_students_t_of_the_differences_of_pairs():
     common = {0: 10.0, 1: -20.0, 2: 5.0, 3: 0.0, 99: 5.0}
     pairs = {seed: common[seed] + gain for seed, gain in enumerate((1.0, 2.0, 3.0, 4.0))}
-    found = paired(pairs, common)
+    found = statistics.paired(pairs, common)
     half = 3.182446 * 1.290994 / 2.0  # t of 3 degrees of freedom, deviation, root of four
     assert (found.mean, found.count) == (2.5, 4)
     assert (found.low, found.high) == pytest.approx((2.5 - half, 2.5 + half), rel=1e-5)
@@ -40,8 +33,8 @@ def test_too_few_values_have_no_interval():
 
 def test_verdicts_are_decided_by_benjamini_and_hochbergs_procedure():
     # Rejected are all up to the last p-value of rank k that is at most 0.05 k / 5: here .01, .02, .03.
-    assert discoveries([0.6, 0.03, 0.01, 0.045, 0.02]) == [False, True, True, False, True]
-    assert discoveries([]) == []
+    assert statistics.discoveries([0.6, 0.03, 0.01, 0.045, 0.02]) == [False, True, True, False, True]
+    assert statistics.discoveries([]) == []
 
 
 def curve_of(shape, seeds=24, noise=0.5, seed=0):

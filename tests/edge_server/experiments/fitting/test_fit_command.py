@@ -1,4 +1,4 @@
-"""``edge-server fit`` end to end on small sets: what it writes, going on, stopping, refusing."""
+"""Fits, by a command and as a library has them: what they write, going on, stopping, refusing."""
 
 from __future__ import annotations
 
@@ -8,14 +8,18 @@ import signal
 import time
 from contextlib import suppress
 
+import numpy as np
 import pytest
 
+import freshfield as ff
 from edge_server.cli import main as edge_server
 from edge_server.experiments.fitting.fit import Fit, marks_s
 from edge_server.experiments.scenes.multiview_still import WHITE, mean_baselines, open_still
+from edge_server.export import ExportError
 from edge_server.fidelity.images import BLACK
 from edge_server.fields import FitReport, checkpoint
 from edge_server.report.build_report import build_report
+from freshfield.geometry import look_at
 from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
 
 
@@ -60,12 +64,7 @@ def test_a_scene_of_ours_is_fitted_by_its_name(tmp_path, capsys, monkeypatch):
 
 @pytest.mark.parametrize("timed", [True, False])
 def test_one_carried_camera_is_a_scan_and_frames_with_times_are_refined(tmp_path, capsys, timed):
-    path = write_photos(tmp_path / "set", 9)
-    if timed:
-        described = json.loads(path.read_text())
-        for k, frame in enumerate(described["frames"]):
-            frame["time"] = 0.5 * k
-        path.write_text(json.dumps(described))
+    path = write_photos(tmp_path / "set", 9, more=lambda k: {"time": 0.5 * k} if timed else {})
     out = tmp_path / "out"
     words = ["--seconds", "1", "--option", "threads=1", "--option", "start=64", "--option", "seed_cells=16"]
     assert edge_server(["fit", str(path), "--out", str(out), "--field", "splat", *words]) == 0
@@ -132,3 +131,39 @@ def test_marks_end_with_the_whole_and_leave_a_long_last_slice():
         marks = marks_s(total)
         assert marks == sorted(set(marks)) and marks[-1] == total
         assert len(marks) == 1 or marks[-1] - marks[-2] >= 0.4 * total - 1e-9
+
+
+SMALL_SPLAT = {"gaussians": 512, "start": 256, "seed_cells": 16, "threads": 1}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> tuple[ff.Fit, object]:
+    folder = tmp_path_factory.mktemp("fit")
+    write_photos(folder / "set", 9)
+    seen = []
+    data = ff.load(folder / "set", holdout=3, scale=2)
+    fit = ff.fit(data, seconds=1.0, field="splat", options=SMALL_SPLAT, progress=seen.append)
+    assert seen == fit.rows and len(data.held_out) == 3
+    fit.save(folder / "out")
+    return fit, folder
+
+
+def test_what_was_saved_loads_and_renders_the_same(made):
+    fit, folder = made
+    again = ff.load(folder / "out")
+    pose = look_at((0.3, 0.1, 0.4), (0.0, 0.0, 0.0))
+    color, depth = fit.render(pose, size=(40, 30)), fit.depth(pose, size=(40, 30))
+    assert color.shape == (30, 40, 3) and color.dtype == np.float32 and 0.0 <= color.min() <= color.max() <= 1.0
+    assert depth.shape == (30, 40) and depth.max() > 0.0
+    np.testing.assert_array_equal(again.render(pose, size=(40, 30)), color)
+    assert fit.seed == ff.Fit(fit.data, "splat", SMALL_SPLAT).seed == 0
+    assert fit.psnr.shape == (len(fit.rows), 2) and fit.psnr[-1, 0] == pytest.approx(1.0, rel=0.3)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("camera", ["nobody", np.eye(3), np.full((4, 4), np.nan)])
+def test_what_is_no_camera_is_refused(made, camera):
+    with pytest.raises(ExportError, match="camera"):
+        made[0].render(camera)
+    with pytest.raises(ExportError, match="expected pixels"):
+        made[0].render(np.eye(4), size=(0, 10**6))

@@ -8,37 +8,31 @@ from dataclasses import replace
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.experiments.frontier import from_scratch, frontier_command
+from edge_server.experiments.frontier import from_scratch, frontier_command, update_time
 from edge_server.experiments.frontier.output import recommendation, table
-from edge_server.experiments.frontier.update_time import (
-    Charged,
-    MovingRun,
-    MovingScene,
-    Variant,
-    mean_over_seeds,
-    measure_compute,
-    run_updates,
-)
 from edge_server.experiments.virtual import costs
 from edge_server.live.frontier import read_frontier
 from edge_server.settings import ComputeConfig
 from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS
 
-TINY = MovingScene(cameras=4, size=32)
+TINY = update_time.MovingScene(cameras=4, size=32)
 COMPUTE = ComputeConfig(ms_per_step=30.0, ms_per_update=10.0)
 
 
 def test_an_update_time_point_is_the_same_bit_for_bit_whatever_ran_before():
-    medium, layers = Variant("ngp", False, SMALL), Variant("splat", True, {"gaussians": 64, "start": 32})
-    run = MovingRun(TINY, 1.0, medium, 5, 0.1, 0.6, COMPUTE, lead_s=0.5)
-    first = run_updates(run)
-    run_updates(replace(run, update_s=0.4))
-    assert run_updates(run) == first
+    medium, layers = (
+        update_time.Variant("ngp", False, SMALL),
+        update_time.Variant("splat", True, {"gaussians": 64, "start": 32}),
+    )
+    run = update_time.MovingRun(TINY, 1.0, medium, 5, 0.1, 0.6, COMPUTE, lead_s=0.5)
+    first = update_time.run_updates(run)
+    update_time.run_updates(replace(run, update_s=0.4))
+    assert update_time.run_updates(run) == first
     assert (first["steps"], first["update_s"]) == (3, 0.1) and first["shown_psnr_moving_db"] > 5.0
-    longer = run_updates(replace(run, update_s=0.4))
+    longer = update_time.run_updates(replace(run, update_s=0.4))
     assert longer["update_s"] == pytest.approx(0.4)
     assert longer["aaoi_ms"] - first["aaoi_ms"] == pytest.approx(300, abs=90)
-    at_arrivals = run_updates(replace(run, variant=layers, update_s=0.04, compute=ComputeConfig(0.0, 1.0)))
+    at_arrivals = update_time.run_updates(replace(run, variant=layers, update_s=0.04, compute=ComputeConfig(0.0, 1.0)))
     assert (at_arrivals["steps"], at_arrivals["update_s"]) == (10, 0.04) and at_arrivals["aaoi_ms"] < first["aaoi_ms"]
 
 
@@ -46,7 +40,14 @@ def test_an_update_time_point_is_the_same_bit_for_bit_whatever_ran_before():
 def test_a_cycle_is_charged_a_frame_of_each_camera_and_layers_every_frame(layers, charged, monkeypatch):
     measured = {"ms_per_step": 0.5, "ms_per_update": 20.0, "ms_per_view": 2.0}
     monkeypatch.setattr(costs, "measure", lambda scenario, seconds: {"compute": measured})
-    assert tuple(measure_compute(Charged(TINY, 1.0, Variant("splat", layers, {}))).values()) == charged
+    assert (
+        tuple(
+            update_time.measure_compute(
+                update_time.Charged(TINY, 1.0, update_time.Variant("splat", layers, {}))
+            ).values()
+        )
+        == charged
+    )
 
 
 def test_the_front_is_what_nothing_beats_in_both():
@@ -62,7 +63,7 @@ def test_seeds_are_averaged_with_their_standard_error():
     base = {"speed_m_per_s": 1.0, "planned_update_s": 0.5, "update_s": 0.5, "steps": 4, "aaoi_ms": 100.0}
     base |= {"shown_psnr_moving_db": None, "shown_ssim": 0.5, "shown_lpips": None}
     base |= {"field": "ngp", "layers": False, "options": {"threads": 1}}
-    (row,) = mean_over_seeds([{**base, "shown_psnr_db": 20.0}, {**base, "shown_psnr_db": 22.0}])
+    (row,) = update_time.mean_over_seeds([{**base, "shown_psnr_db": 20.0}, {**base, "shown_psnr_db": 22.0}])
     assert row["shown_psnr_db"] == 21.0 and row["shown_psnr_db_error"] == pytest.approx(1.0)
     assert row["shown_psnr_moving_db"] is None and row["shown_psnr_moving_db_error"] is None
     assert row["steps"] == 4 and row["seeds"] == 2
@@ -79,24 +80,12 @@ def test_the_last_line_recommends_an_update_time_at_a_persons_speed():
     assert recommendation([]) == "for this scene: update_ms: any"
 
 
-@pytest.fixture
-def tiny_sweep(monkeypatch):
-    sweep = replace(
-        frontier_command.QUICK,
-        planned_s=(0.2, 0.4),
-        speeds=(1.0,),
-        update_s=(0.1, 0.4),
-        run_s=0.8,
-        size=32,
-        moving=TINY,
-    )
-    monkeypatch.setattr(frontier_command, "QUICK", sweep)
-    monkeypatch.setattr("edge_server.experiments.frontier.update_time._COSTS_S", 0.3)
-    return sweep
-
-
 @pytest.mark.slow
-def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_sweep):
+def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
+    times_s = {"planned_s": (0.2, 0.4), "update_s": (0.1, 0.4), "run_s": 0.8}
+    tiny = replace(frontier_command.QUICK, speeds=(1.0,), size=32, moving=TINY, **times_s)
+    monkeypatch.setattr(frontier_command, "QUICK", tiny)
+    monkeypatch.setattr("edge_server.experiments.frontier.update_time._COSTS_S", 0.3)
     words = ["frontier", "--quick", "--out", str(tmp_path), *SMALL_WORDS]
     assert edge_server(words) == 0
     first = capsys.readouterr().out

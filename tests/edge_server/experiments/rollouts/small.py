@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -33,22 +32,8 @@ def scenario(channel: dict[str, Any] | None = None, **other: Any) -> Scenario:
 
 def setting(channel: dict[str, Any] | None = None, **more: Any) -> Setting:
     """One held-out camera, updates from nothing and one motion, unless ``more`` says otherwise."""
-    values: dict[str, Any] = {
-        "steps": 4,
-        "decisions": 2,
-        "lead_ms": 800.0,
-        "span_ms": 600.0,
-        "warm_steps": 6,
-        "scratch": True,
-        "motions": False,
-    }
-    return Setting(scenario(channel), **{**values, **more})
-
-
-def reported(**more: Any) -> Setting:
-    """The same with cam04 to report."""
-    apart = scenario(cameras={"count": 5, "held_out": ["cam00", "cam04"]})
-    return dataclasses.replace(setting(**more), scenario=apart, report=("cam04",))
+    sizes: dict[str, Any] = {"steps": 4, "decisions": 2, "lead_ms": 800.0, "span_ms": 600.0, "warm_steps": 6}
+    return Setting(scenario(channel), **{**sizes, "scratch": True, "motions": False, **more})
 
 
 def thresholds(*omegas_ms: float) -> list[Candidate]:

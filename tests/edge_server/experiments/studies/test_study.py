@@ -1,22 +1,34 @@
-"""The studies of trials: their points are sound, their verdicts follow from the figures and can come out either way."""
+"""Studies: sound points, trials that repeat, verdicts that follow from the figures and can come out either way."""
 
 from __future__ import annotations
 
 import csv
 import json
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
+from edge_server.experiments.common.drawn_images import draw_images
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.common.statistics import Interval
-from edge_server.experiments.studies.registry import ON_A_CHANNEL, STUDIES
-from edge_server.experiments.studies.study import Claim, Finding, Study, StudyRequest, judge
+from edge_server.experiments.studies import drawing, metric_distortions, preferences, viewpoints
+from edge_server.experiments.studies import trial as trial_module
+from edge_server.experiments.studies.learned_schedulers import LEFT_OUT, WEIGHTED, WHICH_VIEWS
+from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT, TRAININGS
+from edge_server.experiments.studies.registry import LEARNING, ON_A_CHANNEL, STUDIES
+from edge_server.experiments.studies.study import Claim, Finding, Study, StudyRequest, judge, run_study
 from edge_server.experiments.studies.study_command import main
+from edge_server.experiments.studies.trial import Point, Trial, run_points, run_trial
+from edge_server.experiments.training.evaluation import BASELINE_POLICIES
 from edge_server.scheduler import make_policy
-from tests.edge_server.experiments.studies.invented import answers, figures, noise, peak, verdicts
+from tests.edge_server.experiments.studies.invented import answers, figures, noise, peak, request, verdicts
 
 
 @pytest.mark.parametrize("name", ON_A_CHANNEL)
@@ -147,3 +159,153 @@ def test_a_study_writes_rows_verdicts_and_a_page(tmp_path: Path):
     assert page.startswith("# What the three metrics say") and "2 seeds a point" in page
     assert "false discovery rate 5 %" in page and "![" in page and "local ghosting" in page
     assert {row["case"] for row in csv.DictReader((tmp_path / "metrics.csv").open())} >= {"Gaussian blur"}
+
+
+TINY = {"gaussians": 256, "start": 256}
+TRIAL = Trial(
+    "room", 1, {"preset": "ch5"}, "threshold", 120.0, size=24, cameras=5, field_options=TINY, steps=4, lpips=False
+)
+NO_DATA = Folders()
+SLOW = {"preset": "ch5", "service": {"law": "deterministic", "mean_ms": 200.0}}
+
+
+def test_a_trial_repeats_bit_for_bit_whatever_ran_before_it():
+    first = run_trial(TRIAL, NO_DATA)
+    run_trial(replace(TRIAL, seed=5, policy="wait", value=60.0), NO_DATA)
+    assert run_trial(TRIAL, NO_DATA) == first
+    assert first["psnr_db"] > 5.0 and first["shown_psnr_db"] > 5.0
+
+
+def test_the_three_readings_of_wait_differ_in_what_was_on_its_way():
+    """Frames that were on their way block the links for up to 200 ms: none of their successors is in time. Broken off,
+    the cameras' next frames are there when the wait ends."""
+    slow = replace(TRIAL, channel=SLOW, value=240.0, seed=4)
+    found = {p: run_trial(replace(slow, policy=p), NO_DATA) for p in ("wait", "wait-arrived", "wait-flush")}
+    assert found["wait-arrived"]["wait_ms"] == pytest.approx(240.0) and found["wait-arrived"]["views"] == 4.0
+    assert found["wait"]["wait_ms"] > 300.0 and found["wait-arrived"]["aaoi_ms"] > 200.0
+    assert found["wait-flush"]["wait_ms"] == pytest.approx(240.0) and found["wait-flush"]["views"] == 4.0
+
+
+def test_points_are_labeled_kept_and_not_run_again(tmp_path: Path, monkeypatch):
+    points = [Point({"policy": "threshold", "x": v}, replace(TRIAL, value=v)) for v in (60.0, 400.0)]
+    rows = run_points(points, request(tmp_path))
+    assert [row["x"] for row in rows] == [60.0, 400.0] and rows[0]["psnr_db"] != rows[1]["psnr_db"]
+    assert rows[0]["psnr_db"] == run_trial(points[0].trial, NO_DATA)["psnr_db"]
+    assert rows[0]["f_w"] is None, "without LPIPS"
+    monkeypatch.setattr(trial_module, "_decided", None)
+    assert run_points(points, request(tmp_path)) == rows
+    monkeypatch.undo()
+    other = [replace(points[0], trial=replace(TRIAL, value=60.0, steps=5))]
+    assert run_points(other, request(tmp_path))[0]["psnr_db"] != rows[0]["psnr_db"]
+
+
+def test_the_lowest_panel_alone_names_the_axis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    metrics, named = ("psnr_db", "ssim", "aaoi_ms"), []
+    monkeypatch.setattr(drawing, "label_lines", lambda at, y, x: named.append(x))
+    row = {"scene": "room", "channel": "ch5", **dict.fromkeys(metrics, 20.0)}
+    table = SeedTable([{**row, "gamma_ms": gamma, "seed": seed} for gamma in (30.0, 60.0) for seed in (0, 1)])
+    drawing.curves("mat", "gamma_ms", "maximum age (ms)", metrics, "channel")(request(tmp_path), table)
+    assert named == [None, None, "maximum age (ms)"] and (tmp_path / "mat-room-0.png").is_file()
+
+
+def test_distortions_are_drawn_as_bright_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[tuple[str, np.ndarray]] = []
+    monkeypatch.setattr(metric_distortions, "draw_images", lambda path, rows: drawn.extend(rows[0][1]))
+    metric_distortions._draw(request(tmp_path), SeedTable([]))
+    assert [label for label, _ in drawn] == ["reference", *metric_distortions.THESIS]
+    np.testing.assert_allclose(drawn[0][1], 255 * metric_distortions._reference(0), atol=1.0)
+
+
+def test_rows_of_one_image_each_are_drawn(tmp_path: Path) -> None:
+    black = np.zeros((4, 6, 3), np.uint8)
+    draw_images(tmp_path / "rows.png", [("room", [("reference", black)]), ("tower", [("reference", black)])])
+    assert (cv2.imread(str(tmp_path / "rows.png")) < 64).mean() > 0.25, "titles stand beside the images"
+
+
+FIXED = {"random": 0.0, "all": 0.5, "threshold:40": 0.4, "threshold:80": 0.6, "wait:0": 0.4, "wait:60": 0.6}
+
+
+def table_of(levels: Mapping[str, float], trainings: int = 3, seeds: int = 12, **labels: Any) -> SeedTable:
+    """Every policy earns its level, but for what the seed does to all and a little luck. Names with a blank are of
+    learned policies, each of several trainings."""
+    rng = np.random.default_rng(1)
+    shared = rng.normal(size=seeds)
+    rows = []
+    for name, level in levels.items():
+        policy, _, value = name.partition(":")
+        runs: list[dict[str, Any]] = [{"value": float(value)} if value else {}]
+        if policy.startswith("learned") or " by " in policy:
+            runs = [{"training": run} for run in range(trainings)]
+        for run in runs:
+            for seed in range(seeds):
+                reward = 5.0 + level + shared[seed] + 0.01 * rng.normal()
+                row = {"case": "a case", "judged_by": "its reward", "policy": policy, **run, **labels, "seed": seed}
+                places = ("elsewhere", "where it is rewarded")
+                rows += [{**row, "judged_from": place, "reward": reward} for place in places]
+    return SeedTable(rows)
+
+
+def test_cases_judge_by_cameras_that_neither_reward_nor_train(tmp_path: Path):
+    assert set(FOUR_VIEWPOINTS).isdisjoint(REPORT) and TRAININGS[False] >= 3
+    for name in LEARNING:
+        cases = STUDIES[name].cases(StudyRequest(False, tmp_path, Folders()))
+        assert len({case.name for case in cases}) == len(cases) > 0, name
+        for case in cases:
+            apart = {*case.setting.judging, *case.setting.rewarding}
+            assert set(case.setting.judging).isdisjoint(case.setting.rewarding)
+            assert apart.isdisjoint(case.setting.scenario.training)
+            assert all((t.setting or case.setting).rewarding == case.setting.rewarding for t in case.trainings)
+            rewards = [*case.rewards.values(), *(t.reward for t in case.trainings if t.reward is not None)]
+            assert rewards and all(reward.weights.get("age", -1.0) < 0.0 for reward in rewards), "age is a cost"
+
+
+@pytest.mark.parametrize(("gain", "said"), [(1.0, "holds"), (-1.0, "does not hold")])
+def test_claims_hold_if_and_only_if_what_was_learned_is_better(gain: float, said: str):
+    baselines = dict.fromkeys(BASELINE_POLICIES, 0.2)
+    oracles = {"oracle wait": 0.6, "oracle threshold": 0.6}
+    by_state = {f"select by {variant}": 3.0 - 0.5 * gain * (3 - k) for k, variant in enumerate(WHICH_VIEWS)}
+    by_state |= {
+        f"{kind} by {v}": 3.0 - 0.5 * gain * k for kind in ("threshold", "wait") for k, v in enumerate(LEFT_OUT)
+    }
+    by_reward = {f"learned by {name}": 3.0 - gain * (name != "moving") for name in WEIGHTED}
+    for name, levels, claim in (
+        ("ppo-select", {**baselines, "learned": 3.0 * gain, "oracle": 1.0, "oracle threshold": 0.6}, "random set"),
+        ("ppo-wait", {**oracles, "learned wait": 3.0 * gain, "learned threshold": 3.0 * gain}, "best fixed omega"),
+        ("ppo-wait", {**oracles, "learned wait": 3.0 + gain, "learned threshold": 3.0}, "waiting beats thresholds"),
+        ("ablation", {**by_state, "wait-arrived:60": 0.6}, "better by Z, age, pose than"),
+        ("weights", by_reward, "it matters"),
+        ("drift", {"learned before": 3.0, "learned afterwards": 3.0 + 0.5 * gain}, "on the new channel"),
+    ):
+        found = judge(STUDIES[name], table_of({**FIXED, **levels}, judged_by="moving"))
+        assert answers(found, claim) == {said}, name
+
+
+FEW_VIEWS, SOME = viewpoints.Workload((3, 8), 16, 3, 24), ("random", "coverage, short way")
+
+
+@pytest.mark.slow
+def test_both_studies_run_whole(tmp_path, monkeypatch):
+    """With few arms, tastes and habits: the others differ in what they choose."""
+    monkeypatch.setattr(viewpoints, "QUICK", FEW_VIEWS)
+    monkeypatch.setattr(viewpoints, "ARMS", {arm: viewpoints.ARMS[arm] for arm in SOME})
+    monkeypatch.setattr(viewpoints, "_SHOWN", SOME[:1])
+    monkeypatch.setattr(preferences, "_POOL", {True: 9})
+    monkeypatch.setattr(preferences, "_UPDATES", {True: 1})
+    monkeypatch.setattr(preferences, "ASKED", (2, 4))
+    monkeypatch.setattr(preferences, "_ARMS", SOME[:1])
+    monkeypatch.setattr(preferences, "TASTES", {"edges": preferences.TASTES["edges"]})
+    request = StudyRequest(True, tmp_path, Folders(), seeds=2)
+    for study in (viewpoints.VIEWPOINTS, preferences.PREFERENCES):
+        assert run_study(study, request)
+    assert "Simulated experts only" in (tmp_path / "preferences.md").read_text()
+    table = list(csv.DictReader((tmp_path / "viewpoints.csv").open()))
+    assert {r["arm"] for r in table} == set(SOME) and len(table) == len(SOME) * 2 * 2
+    first = {r["seed"]: r["psnr_db"] for r in table if r["arm"] == "coverage, short way" and r["views"] == "3"}
+    assert len(set(first.values())) == 2 and np.isfinite([float(v) for v in first.values()]).all()
+    assert (tmp_path / "viewpoints-tile-paths.png").exists() and (tmp_path / "preferences-tile.png").exists()
+
+    # The same command again finds everything done: not even a policy is trained.
+    before = (tmp_path / "preferences.csv").read_bytes()
+    monkeypatch.setattr(preferences, "train_policy", None)
+    run_study(preferences.PREFERENCES, request)
+    assert (tmp_path / "preferences.csv").read_bytes() == before

@@ -23,14 +23,10 @@ def evaluation_of(rng: np.random.Generator, matters: float) -> Evaluation:
     fit's luck."""
     best = rng.integers(len(OMEGAS), size=(20, 4))
     fixed = [Candidate({"policy": "threshold", "value": float(omega)}, f"threshold:{omega}") for omega in OMEGAS]
-    fits = [
-        {
-            (seed, n): [outcome(20.0 + rng.normal() + matters * (best[seed, n] == k)) for _ in range(2)]
-            for seed in range(20)
-            for n in range(4)
-        }
-        for k in range(len(OMEGAS) + 2)
-    ]
+    fits = []
+    for k in range(len(OMEGAS) + 2):
+        gain = matters * (best == k)
+        fits.append({at: [outcome(20.0 + rng.normal() + gain[at]) for _ in range(2)] for at in np.ndindex(20, 4)})
     others = [Candidate({"policy": name}, name) for name in ("random", "learned")]
     return Evaluation([*fixed, *others], fits)
 
@@ -40,14 +36,9 @@ def table_of(found: Evaluation) -> SeedTable:
 
 
 def test_the_best_of_several_is_chosen_by_one_fit_and_measured_by_the_other():
-    names = ("a", "b", "c")
-    fits = [[3.0, 0.5], [1.0, 2.0], [None, 9.0]]
-    found = table_of(
-        Evaluation(
-            [Candidate({"policy": name}, name) for name in names],
-            [{(0, 0): [outcome(v) for v in values]} for values in fits],
-        )
-    )
+    fits = {"a": [3.0, 0.5], "b": [1.0, 2.0], "c": [None, 9.0]}
+    outcomes = [{(0, 0): [outcome(v) for v in values]} for values in fits.values()]
+    found = table_of(Evaluation([Candidate({"policy": name}, name) for name in fits], outcomes))
     # The first fit prefers a, which the second has at 0.5; the second prefers b, which the first has at 1.
     assert found.values("reward", policy="oracle") == {0: pytest.approx(0.75)}
     assert found.values("reward", policy="a") == {0: 1.75} and found.values("reward", policy="c") == {0: None}

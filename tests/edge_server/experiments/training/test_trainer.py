@@ -78,18 +78,13 @@ def test_it_learns_to_use_fresh_views_where_only_age_counts(tmp_path: Path):
     spec = Spec("threshold", StateLayout(("age",)), omegas, hidden=16, learning_rate=1e-2)
     config = TrainingConfig(spec, Reward("age", 0.0, 0.0, 0.0, age=-0.01), episodes=60, batch=6)
     learner = trained(tmp_path, setting(steps=1), config)
-    candidates = [
-        *fixed_candidates([], ("random",)),
-        *thresholds(*omegas),
-        Candidate({"policy": "learned"}, learner.actor),
-    ]
+    mine, fixed = Candidate({"policy": "learned"}, learner.actor), fixed_candidates([], ("random",))
     engine = Engine(threads=1, say=quiet)
-    found = evaluate(setting(steps=1), NOTHING, engine, seeds(0, "test", 6), candidates)
+    test_seeds = seeds(0, "test", 6)
+    found = evaluate(setting(steps=1), NOTHING, engine, test_seeds, [*fixed, *thresholds(*omegas), mine])
     table = SeedTable(found.rows(config.reward, ["cam00"]))
-    ages = [
-        np.mean(list(table.values("aaoi_ms", **of).values()))
-        for of in ({"policy": "learned"}, {"policy": "threshold", "value": 100.0})
-    ]
+    learned, middle = {"policy": "learned"}, {"policy": "threshold", "value": 100.0}
+    ages = [np.mean(list(table.values("aaoi_ms", **of).values())) for of in (learned, middle)]
     assert ages[0] < ages[1]
     assert difference(table.runs("reward", policy="learned"), table.runs("reward", policy="random")).low > 0.0
     log = read_log(tmp_path)
@@ -98,12 +93,8 @@ def test_it_learns_to_use_fresh_views_where_only_age_counts(tmp_path: Path):
 
 def run_of(*decided: tuple[int, float | None]) -> Run:
     """A run with rewards (REWARD without SSIM: 0.02 PSNR) at these slots."""
-    return Run(
-        [
-            Decided(slot, {"": Outcome(None if r is None else 50.0 * r, *[None] * 4, 1.0, 0.0)}, [[1.0, 1.0]], 0, -0.7)
-            for slot, r in decided
-        ]
-    )
+    of = {slot: Outcome(None if r is None else 50.0 * r, *[None] * 4, 1.0, 0.0) for slot, r in decided}
+    return Run([Decided(slot, {"": outcome}, [[1.0, 1.0]], 0, -0.7) for slot, outcome in of.items()])
 
 
 def test_samples_are_compared_with_the_others_of_their_slot():
@@ -167,10 +158,9 @@ def test_a_still_scene_has_no_moving_pixels_and_training_says_so(tmp_path):
     still = setting()
     source = {**still.scenario.source, "speed_m_per_s": 0.0}
     still = dataclasses.replace(still, scenario=dataclasses.replace(still.scenario, source=source))
+    of_motion = dataclasses.replace(CONFIG, reward=make_reward("set", fidelity="moving", distance=0.0))
     with pytest.raises(TrainingError, match=r"psnr_moving: nothing moves.*--on whole"):
-        trained(
-            tmp_path, still, dataclasses.replace(CONFIG, reward=make_reward("set", fidelity="moving", distance=0.0))
-        )
+        trained(tmp_path, still, of_motion)
     learner = trained(tmp_path / "whole", still)
     assert all(np.isfinite(w).all() for w in learner.actor.weights.values())
     assert all(row["reward"] is not None for row in read_log(tmp_path / "whole"))

@@ -24,20 +24,14 @@ from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from edge_server.settings import ComputeConfig, read_config
 from freshfield.scenario import ScenarioError, load
+from tests.edge_server.experiments.rollouts.small import RAW
 from tests.edge_server.experiments.sets import SMALL, write_photos
 
 
 def write(tmp_path: Path, **edge: Any) -> Path:
-    section = {
-        "name": "small",
-        "seed": 5,
-        "cameras": {"count": 5, "held_out": ["cam00"]},
-        "source": {"kind": "world", "scene": "room", "width": 24, "height": 24, "params": {"supersample": 1}},
-        "channel": {"preset": "ch5", "faults": {"loss": {"probability": 0.1}}},
-        "edge": {"field": "ngp", "field_options": SMALL, "steps": 2, **edge},
-    }
-    path = tmp_path / "small.yaml"
-    path.write_text(yaml.safe_dump(section))
+    lossy = {"preset": "ch5", "faults": {"loss": {"probability": 0.1}}}
+    section = {**RAW, "channel": lossy, "edge": {"field": "ngp", "field_options": SMALL, "steps": 2, **edge}}
+    (path := tmp_path / "small.yaml").write_text(yaml.safe_dump(section))
     return path
 
 
@@ -113,14 +107,9 @@ def test_an_arm_keeps_real_time():
 
 def test_cameras_that_are_seen_to_move_become_a_scan_and_the_reason_is_said(tmp_path: Path, capsys):
     write_photos(tmp_path / "set", 19)
-    data = {
-        "name": "photos",
-        "seed": 3,
-        "cameras": {"count": 4, "held_out": ["cam00"]},
-        "source": {"kind": "transforms", "data": str(tmp_path / "set"), "fps": 10},
-        "edge": {"lpips": "none", "grace_ms": 0.0},
-    }
-    (path := tmp_path / "photos.yaml").write_text(json.dumps(data))
+    source = {"kind": "transforms", "data": str(tmp_path / "set"), "fps": 10}
+    cameras, edge = {"count": 4, "held_out": ["cam00"]}, {"lpips": "none", "grace_ms": 0.0}
+    (path := tmp_path / "photos.yaml").write_text(json.dumps({"cameras": cameras, "source": source, "edge": edge}))
     assert main([str(path), "--seconds", "3", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert re.fullmatch(r"splat as a scan, updated in a cycle for 80 ms: cam0[123] moves", found["chosen"])
@@ -129,16 +118,12 @@ def test_cameras_that_are_seen_to_move_become_a_scan_and_the_reason_is_said(tmp_
 
 def test_newest_and_all_held_out_frames_are_scored_each_two_seconds_and_reported(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    world = {"kind": "world", "width": 24, "height": 24, "fps": 10, "carried": ["hand"]}
-    section = {
-        "cameras": {"ids": ["hand", "kept"], "held_out": ["kept"], "held_out_every": 8},
-        "source": {**world, "params": {"people": 0, "supersample": 1}},
-        "channel": {"preset": "ch5"},
-        "edge": {"field": "ngp", "field_options": SMALL, "steps": 2},
-    }
-    (tmp_path / "walk.yaml").write_text(yaml.safe_dump(section))
-    run = tmp_path / "run"
-    assert main([str(tmp_path / "walk.yaml"), "--seconds", "5", "--json", "--out", str(run)]) == 0
+    cameras = {"ids": ["hand", "kept"], "held_out": ["kept"], "held_out_every": 8}
+    walked = {"fps": 10, "carried": ["hand"], "params": {"people": 0, "supersample": 1}}
+    path, run = write(tmp_path), tmp_path / "run"
+    section = yaml.safe_load(path.read_text())
+    path.write_text(yaml.safe_dump({**section, "cameras": cameras, "source": {**section["source"], **walked}}))
+    assert main([str(path), "--seconds", "5", "--json", "--out", str(run)]) == 0
     means = json.loads(capsys.readouterr().out)["now_and_all"]
     last = json.loads((run / "edge.json").read_text())["so_far"]
     # Frames of 0, .8, ..., 4.0 s; marks at 2 and 4 s, and means are those from 4 s on.

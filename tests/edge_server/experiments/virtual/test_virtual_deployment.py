@@ -20,6 +20,7 @@ from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.settings import ComputeConfig
 from freshfield.frame import to_request
 from freshfield.scenario import Scenario, parse
+from tests.edge_server.experiments.rollouts.small import RAW
 from tests.edge_server.experiments.sets import SMALL
 from tests.support import small_world
 
@@ -27,12 +28,12 @@ SETTINGS = RunSettings(steps=2, compute=ComputeConfig(ms_per_step=40.0, ms_per_u
 
 
 def scenario(channel: dict[str, Any] | None = None, seed: int = 3, **other: Any) -> Scenario:
+    over = RAW["channel"] if channel is None else channel
     data = {
-        "name": "virtual",
+        **RAW,
         "seed": seed,
-        "cameras": {"count": 5, "held_out": ["cam00"]},
         "source": small_world(),
-        "channel": {"preset": "ch5"} if channel is None else channel,
+        "channel": over,
         "edge": {"field": "ngp", "field_options": SMALL},
     }
     return parse({**data, **other}, Path("virtual.yaml"))
@@ -51,16 +52,8 @@ def closes(frames: dict[str, Any]) -> bool:
     return sent == frames["sent"] and frames["sent"] + frames["duplicated"] == out
 
 
-FAULTS = {
-    "preset": "ch6",
-    "faults": {
-        "loss": {"probability": 0.1},
-        "corruption": {"probability": 0.2},
-        "duplication": {"probability": 0.2},
-        "reset": {"at_ms": [400.0]},
-        "bandwidth": {"megabits_per_s": 2.0},
-    },
-}
+_SHARES = {kind: {"probability": share} for kind, share in (("loss", 0.1), ("corruption", 0.2), ("duplication", 0.2))}
+FAULTS = {"preset": "ch6", "faults": {**_SHARES, "reset": {"at_ms": [400.0]}, "bandwidth": {"megabits_per_s": 2.0}}}
 
 
 @pytest.mark.parametrize("channel", [{"preset": "ch5"}, FAULTS], ids=["ch5", "faults"])
@@ -83,15 +76,11 @@ def test_the_books_close_with_every_fault_and_damage_is_refused():
     assert frames["lost"] > 0 and frames["broken"] > 0 and frames["skipped"] > 0
 
 
-def with_sensors(channel: dict[str, Any], every: int) -> Scenario:
-    return scenario(channel, source=small_world(depth_every=every, effects={"depth_sensor": {}}))
-
-
 @pytest.mark.parametrize("every", [1, 5])
 def test_depth_is_in_one_of_so_many_frames_and_takes_its_time_on_the_line(every):
-    rate = {"preset": "ideal", "faults": {"bandwidth": 1.0}}
+    rate, sensors = {"preset": "ideal", "faults": {"bandwidth": 1.0}}, {"depth_sensor": {}}
     seen: dict[int, bool] = {}
-    deployment = build_deployment(with_sensors(rate, every), SETTINGS)
+    deployment = build_deployment(scenario(rate, source=small_world(depth_every=every, effects=sensors)), SETTINGS)
     for _ in range(12):
         deployment.run(1 / 15)
         for item in deployment.updates.buffer.newest().values():

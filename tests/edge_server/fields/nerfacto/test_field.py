@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget
-from edge_server.fields.common.kernels.hash_grid import Grid
 from edge_server.fields.common.kernels.render import BATCH, TILE, render_tiles
 from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.supervision import lens_row
@@ -80,8 +79,7 @@ def _render(
 
 def test_a_ray_is_what_torch_makes_of_its_samples(snapshot: RaySnapshot) -> None:
     view, solid = VIEWS[2], []
-    levels = snapshot.encoding
-    grid = to_torch(Grid(levels.resolution, levels.first, levels.dense, levels.table), dtype=torch.float64)
+    grid = to_torch(snapshot.encoding)
     params = torch.as_tensor(snapshot.net.params, dtype=torch.float64)
     for pixel in np.random.default_rng(0).uniform(0.0, 24.0, (40, 2)):
         places, t, delta, rendered = _render(snapshot, pixel[None])

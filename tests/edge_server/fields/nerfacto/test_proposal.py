@@ -10,13 +10,6 @@ from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT
 from edge_server.fields.common.kernels.rays import COARSE, Space
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
 from edge_server.fields.nerfacto.kernels import proposal
-from edge_server.fields.nerfacto.kernels.proposal import (
-    RAW_GAIN,
-    RAW_START,
-    ProposalGrid,
-    ProposalSampling,
-    bin_weights,
-)
 from edge_server.fields.nerfacto.kernels.train import WEIGHT_FLOOR, interlevel_loss, scatter_proposal
 
 F = np.float32
@@ -30,15 +23,15 @@ def _space(contracted: bool, occupied: np.ndarray | None = None) -> Space:
     return Space(cells, coarse, np.zeros(0, F), 16, contracted, F(0.1), F(0.1))
 
 
-def _encoding(values: np.ndarray) -> ProposalGrid:
+def _encoding(values: np.ndarray) -> proposal.ProposalGrid:
     """Four vertices of a hash level, then the proposal's cells."""
     table = np.concatenate([np.full((SEGMENT, FEATURES), 50.0, F), values.astype(F).reshape(-1, FEATURES)])
     first = np.array([0, SEGMENT], np.int64)
-    sampling = ProposalSampling(BINS, 16, F(0.1), F(1.5), F(0.04))
-    return ProposalGrid(np.array([2], np.int32), first, np.array([True]), table, CELLS, sampling)
+    sampling = proposal.ProposalSampling(BINS, 16, F(0.1), F(1.5), F(0.04))
+    return proposal.ProposalGrid(np.array([2], np.int32), first, np.array([True]), table, CELLS, sampling)
 
 
-def _bins_of(space: Space, encoding: ProposalGrid, shift: float = 0.4, leave: float = 6.0, bins: int = BINS):
+def _bins_of(space: Space, encoding: proposal.ProposalGrid, shift: float = 0.4, leave: float = 6.0, bins: int = BINS):
     cell, depth = np.full(bins + 5, -1, np.int32), np.full(bins + 5, np.nan, F)
     edges, at = np.empty((2, bins + 1), F), np.empty((2, bins), np.int32)
     count, finite = proposal.make_bins(
@@ -65,7 +58,7 @@ def test_bins_cover_the_ray_and_know_their_cells(contracted: bool, shift: float)
     index = np.clip((_unit(middle, contracted) * CELLS).astype(int), 0, CELLS - 1)
     expected = index[:, 0] + CELLS * (index[:, 1] + CELLS * index[:, 2])
     assert (cell == expected).mean() > 0.95  # float32 may round a middle into the neighbor
-    sigma = np.exp(np.clip(RAW_GAIN * values.astype(F)[cell] + RAW_START, RAW_LOW, RAW_HIGH))
+    sigma = np.exp(np.clip(proposal.RAW_GAIN * values.astype(F)[cell] + proposal.RAW_START, RAW_LOW, RAW_HIGH))
     np.testing.assert_allclose(depth, sigma * (edges[1] - edges[0]), rtol=1e-5)
 
 
@@ -124,7 +117,7 @@ def test_samples_lie_in_their_groups_and_stand_for_all_of_them(shift: float) -> 
     _, depth, edges, _ = _bins_of(_space(True, occupied), _encoding(values - 0.5))
     count = len(depth)
     weight = np.empty(count, F)
-    bin_weights(depth, ZERO, count, weight)
+    proposal.bin_weights(depth, ZERO, count, weight)
     total = np.r_[0.0, np.cumsum(depth, dtype=float)]
     np.testing.assert_allclose(weight, np.exp(-total[:-1]) - np.exp(-total[1:]), atol=1e-6)
     group, share = _allocated(weight, 16, 0.2, shift)
@@ -153,7 +146,7 @@ def _interlevel_case(seed: int):
     length = rng.random(count) * 0.4
     if seed % 2:
         cell[4], length[4] = 7, 1e-4
-    raw = np.clip(RAW_GAIN * values.astype(F)[cell] + RAW_START, RAW_LOW, RAW_HIGH)
+    raw = np.clip(proposal.RAW_GAIN * values.astype(F)[cell] + proposal.RAW_START, RAW_LOW, RAW_HIGH)
     depth = np.r_[0, 0, np.exp(raw) * length].astype(F)
     group = np.r_[9, 9, 0, 0, 1, 2, 2, 2, 3, 4, 5, 5, 6, 6].astype(np.int32)
     of = np.repeat(np.arange(7), [1, 4, 1, 3, 2, 1, 1]).astype(F)
@@ -163,9 +156,9 @@ def _interlevel_case(seed: int):
 
 def _interlevel_oracle(values: torch.Tensor, cell, length, group, of, w) -> tuple[torch.Tensor, torch.Tensor]:
     """Eq. 13 over groups of bins, in double precision; and all that the gradient is of."""
-    raw = RAW_GAIN * values[torch.as_tensor(cell, dtype=torch.long)] + RAW_START
+    raw = proposal.RAW_GAIN * values[torch.as_tensor(cell, dtype=torch.long)] + proposal.RAW_START
     depth = torch.as_tensor(length) * raw.clamp(RAW_LOW, RAW_HIGH).exp()
-    pull = 0.02 * (raw - RAW_START).clamp(min=0).square().sum()
+    pull = 0.02 * (raw - proposal.RAW_START).clamp(min=0).square().sum()
     after = torch.exp(-depth.cumsum(0))
     weight = torch.cat([torch.ones(1, dtype=after.dtype), after[:-1]]) - after
     inside = torch.zeros(7, dtype=torch.float64).index_add(0, torch.as_tensor(of, dtype=torch.long), w)
@@ -178,7 +171,7 @@ def _interlevel_oracle(values: torch.Tensor, cell, length, group, of, w) -> tupl
 def test_interlevel_loss_and_gradient_equal_the_oracle(seed: int) -> None:
     encoding, cell, length, depth, group, of, w = _interlevel_case(seed)
     weight, grad = np.empty(14, F), np.full(14, 7.0, F)
-    bin_weights(depth, 2, 12, weight)
+    proposal.bin_weights(depth, 2, 12, weight)
     bins = np.r_[0, 0, cell].astype(np.int32), depth, weight, group, 2, 12
     loss = interlevel_loss(encoding, *bins, w, of, 0, len(of), np.empty((2, BINS), F), grad)
     values = torch.as_tensor(encoding.table[SEGMENT:].reshape(-1), dtype=torch.float64).requires_grad_(True)

@@ -62,19 +62,16 @@ def flatten(cam: Tensor, params: Tensor, sh_degree: int) -> Flat:
     seen = z > cam[NEAR]
     z = torch.where(seen, z, torch.ones_like(z))
     a, b = x / z, y / z
-    ta, tb = (
-        a.clamp(float(cam[LIMITS]), float(cam[LIMITS + 1])),
-        b.clamp(float(cam[LIMITS + 2]), float(cam[LIMITS + 3])),
-    )
+    limits = cam[LIMITS : LIMITS + 4].tolist()
+    ta, tb = a.clamp(*limits[:2]), b.clamp(*limits[2:])
     with torch.enable_grad():  # the lens's Jacobian by autograd, to check the kernel's
         pa, pb = (ta, tb) if ta.requires_grad else (ta.requires_grad_(True), tb.requires_grad_(True))
         u, v = distort(lens, pa, pb)
         dxx, dxy = torch.autograd.grad(u.sum(), (pa, pb), create_graph=True)
         _, dyy = torch.autograd.grad(v.sum(), (pa, pb), create_graph=True)
     fx, fy, cx, cy = lens[:4]
-    mean = torch.stack(
-        [fx * (u + dxx * (a - ta) + dxy * (b - tb)) + cx, fy * (v + dxy * (a - ta) + dyy * (b - tb)) + cy], -1
-    )
+    mean_x, mean_y = u + dxx * (a - ta) + dxy * (b - tb), v + dxy * (a - ta) + dyy * (b - tb)
+    mean = torch.stack([fx * mean_x + cx, fy * mean_y + cy], -1)
     bent = torch.stack([fx * dxx, fx * dxy, fy * dxy, fy * dyy], dim=-1).view(-1, 2, 2)
     one, none = 1 / z, torch.zeros_like(z)
     plane = torch.stack([one, none, -ta / z, none, one, -tb / z], dim=-1).view(-1, 2, 3)

@@ -19,9 +19,9 @@ from freshfield.limits import MAX_VISITORS
 from freshfield.transport import Transport
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.page.browser import Browser
+from tests.edge_server.page.preview import bare_state
 from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, snapshot
 from tests.edge_server.page.test_access_guard import get, lines, login
-from tests.edge_server.page.test_page import bare_state
 from tests.edge_server.page.visitor import page_of
 from tests.role_table import TOKENS
 from tests.support import wait_until
@@ -48,10 +48,7 @@ class Drawer:
                 self.socket.send(each, websocket.ABNF.OPCODE_BINARY)
 
     def read_until(self, wanted) -> None:
-        end = time.monotonic() + 20.0
-        while not wanted():
-            assert time.monotonic() < end, self.reader.status
-            self.read()
+        wait_until(lambda: wanted() or self.read(), lambda: str(self.reader.status))
 
 
 def test_a_visitor_gets_everything_then_what_changes():
@@ -123,6 +120,7 @@ def test_the_rules_of_the_page_hold_for_the_stream():
 
 # --- a browser -------------------------------------------------------------------------------------
 
+ARRIVED = "window.splats && splats.reader.moves && splats.reader.shown.total + splats.reader.moving.count"
 # Draws at a fixed instant and returns the canvas.
 DRAW = """
 (() => {
@@ -155,8 +153,7 @@ def test_the_browser_draws_what_the_edge_renders():
     state, shown = bare_state(), snapshot()
     with page_of(state) as page, Browser(page.url + "/splats/?full", 640, 480) as browser:
         publish(state, shown)
-        arrived = "window.splats && splats.reader.moves && splats.reader.shown.total + splats.reader.moving.count"
-        browser.wait_for(lambda: browser.evaluate(arrived) == 820, "all Gaussians")
+        browser.wait_for(lambda: browser.evaluate(ARRIVED) == 820, "all Gaussians")
         assert browser.evaluate("splats.renderer.format === splats.renderer.gl.RGBA32F")
         # Last in half floats, as with a GPU.
         for ahead_s, format_ in ((-0.2, "RGBA32F"), (0.12, "RGBA32F"), (0.9, "RGBA16F")):
@@ -189,8 +186,7 @@ def test_a_stream_comes_back_when_it_broke_and_a_saved_one_is_played_without_the
         with page_of(state) as page:
             publish(state, shown)
             browser.call("Page.navigate", url=page.url + "/splats/?full")
-            arrived = "window.splats && splats.reader.moves && splats.reader.shown.total + splats.reader.moving.count"
-            browser.wait_for(lambda: browser.evaluate(arrived) == 820, "all Gaussians")
+            browser.wait_for(lambda: browser.evaluate(ARRIVED) == 820, "all Gaussians")
             data = bytes(browser.evaluate("splats.savedFile().arrayBuffer().then((b) => [...new Uint8Array(b)])"))
         browser.wait_for_text("The connection broke")
         again = start_page(state, "127.0.0.1", page.port)

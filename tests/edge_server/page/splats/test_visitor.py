@@ -10,15 +10,8 @@ import numpy as np
 import pytest
 
 from channel_emu.live.tcp_proxy import PIECE_BYTES, TIMEOUT_S
+from edge_server.page.splats import messages
 from edge_server.page.splats import settings as tuned
-from edge_server.page.splats.messages import (
-    KnotsBlock,
-    MovingBlock,
-    StaticBlock,
-    StreamReader,
-    UnseenBlock,
-    read_message,
-)
 from edge_server.page.splats.published import Published, Publisher
 from edge_server.page.splats.records import from_records
 from edge_server.page.splats.visitor import LinkWindow, Visitor
@@ -45,7 +38,7 @@ class Link:
 
     def __init__(self, bytes_per_s: float, delay_s: float = 0.02, publisher: Shared | None = None) -> None:
         self.rate, self.delay_s = bytes_per_s, delay_s
-        self.visitor, self.reader, self.publisher = Visitor(), StreamReader(), publisher or Publisher(0)
+        self.visitor, self.reader, self.publisher = Visitor(), messages.StreamReader(), publisher or Publisher(0)
         self.free_s = 0.0
         self.under_way: deque[tuple[float, bytes]] = deque()
         self.acknowledged: deque[tuple[float, int]] = deque()
@@ -59,7 +52,7 @@ class Link:
             while self.under_way and self.under_way[0][0] <= now_s:
                 came_s, data = self.under_way.popleft()
                 self.reader.read(data)
-                number, _, blocks = read_message(data)
+                number, _, blocks = messages.read_message(data)
                 self.blocks += [(now_s, block) for block in blocks]
                 self.acknowledged.append((self.back(came_s), number))
             while self.acknowledged and self.acknowledged[0][0] <= now_s:
@@ -87,7 +80,7 @@ class Link:
         return [block for at_s, block in self.blocks if isinstance(block, kind) and at_s >= since_s]
 
     def record_bytes(self, since_s: float = 0.0) -> int:
-        sizes = {StaticBlock: 16, MovingBlock: 21}
+        sizes = {messages.StaticBlock: 16, messages.MovingBlock: 21}
         return sum(size * len(block.records) for kind, size in sizes.items() for block in self.of(kind, since_s))
 
 
@@ -157,9 +150,9 @@ def test_a_fast_link_has_everything_and_goes_on():
     link = Link(2e6)
     link.run(ticks(3.0))
     assert len(link.reader.at(NEWEST_S)) == COUNT + 1000
-    sets = link.of(MovingBlock, since_s=1.0)
+    sets = link.of(messages.MovingBlock, since_s=1.0)
     assert 15 <= len(sets) <= 20  # ten a second
-    assert len(link.of(KnotsBlock, since_s=1.0)) > 50  # with each publication
+    assert len(link.of(messages.KnotsBlock, since_s=1.0)) > 50  # with each publication
     assert max(link.lags_s) < 0.12
     assert link.reader.status["link"]["static"] == [COUNT, COUNT]
 
@@ -184,9 +177,9 @@ def test_a_slow_link_is_kept_short_and_shows_what_is_large(kilobytes, all_of_it,
     assert (here == COUNT) == all_of_it and here > 0.15 * COUNT
     places = from_records(static.records[:here], static.scales)[:, :3]
     np.testing.assert_allclose(drawn[:, :3], places, atol=0.006)  # the largest ones, some of them not the newest
-    sizes = {len(block.records) for block in link.of(MovingBlock, since_s=4.0)}
+    sizes = {len(block.records) for block in link.of(messages.MovingBlock, since_s=4.0)}
     assert sizes and max(sizes) < 1000
-    assert len(link.of(KnotsBlock, since_s=4.0)) > 3 * len(link.of(MovingBlock, since_s=4.0)) > 3
+    assert len(link.of(messages.KnotsBlock, since_s=4.0)) > 3 * len(link.of(messages.MovingBlock, since_s=4.0)) > 3
     assert link.record_bytes() > 0.5 * 12.0 * link.rate  # and it is used
     link.rate = 2e6  # a link that becomes faster gets the rest
     link.run(ticks(16.0, 12.0))
@@ -241,7 +234,7 @@ def test_a_growing_field_replaces_sets_that_are_whole():
         link.run(ticks(second + 1.0, float(second)), growing)
         counts.append(len(link.reader.at(-1e9)))
     assert counts == sorted(counts) and counts[-1] > 4500 and len(set(counts)) >= 5
-    assert {block.total for block in link.of(StaticBlock)} >= set(counts)
+    assert {block.total for block in link.of(messages.StaticBlock)} >= set(counts)
 
 
 @pytest.mark.stability
@@ -260,7 +253,7 @@ def test_numbers_that_were_not_sent_change_nothing():
 def test_before_there_is_a_field_the_status_says_so():
     visitor = Visitor()
     data = visitor.message(None, 0.3, {"line": "compiling"}, 0.0)
-    assert read_message(data)[2][0].content["line"] == "compiling"
+    assert messages.read_message(data)[2][0].content["line"] == "compiling"
     assert [visitor.message(None, 0.3, {}, now_s) is not None for now_s in (0.1, 0.5)] == [False, True]
     assert not visitor.link.short, "there was no more to send"
 
@@ -280,7 +273,7 @@ def test_what_moves_stays_when_anchors_are_chosen_anew(kilobytes):
     for tick in ticks(6.0, 2.0):
         link.run(range(tick, tick + 1), anew)
         assert len(link.reader.at(NEWEST_S)) > len(link.reader._shown.params)
-    assert len({block.anchors for block in link.of(MovingBlock)}) > 6
+    assert len({block.anchors for block in link.of(messages.MovingBlock)}) > 6
 
 
 def test_what_has_left_is_shown_no_longer_and_nothing_else_is_sent_again():
@@ -290,7 +283,7 @@ def test_what_has_left_is_shown_no_longer_and_nothing_else_is_sent_again():
     assert len(link.reader.at(NEWEST_S)) == COUNT + 1000
     link.run(ticks(3.0, 2.0), lambda now_s: replace(trained(1.0), moving=None))
     assert len(link.reader.at(NEWEST_S)) == COUNT
-    assert len([block for block in link.of(MovingBlock, since_s=2.0) if not len(block.records)]) == 1
+    assert len([block for block in link.of(messages.MovingBlock, since_s=2.0) if not len(block.records)]) == 1
     link.run(ticks(4.0, 3.0))
     assert len(link.reader.at(NEWEST_S)) == COUNT + 1000 and link.reader._shown.number == still
 
@@ -304,9 +297,9 @@ def test_what_no_camera_has_seen_is_said_also_when_it_is_known_later():
             published = replace(published, static=replace(published.static, unseen=unseen))
         data = visitor.message(published, NEWEST_S, {}, now_s)
         if data is not None:
-            number, _, blocks = read_message(data)
+            number, _, blocks = messages.read_message(data)
             visitor.acknowledged(number, now_s + 0.01)
-            said += [(now_s, block.bits) for block in blocks if isinstance(block, UnseenBlock)]
+            said += [(now_s, block.bits) for block in blocks if isinstance(block, messages.UnseenBlock)]
     ((when_s, bits),) = said
     assert 1.0 < when_s < 1.1
     np.testing.assert_array_equal(bits, unseen)

@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from edge_server.scheduler.learned.distributions import (
-    most_probable_set,
-    omega_entropy,
-    omega_log_probabilities,
-    sample_sets,
-    set_entropy,
-    set_log_probability,
-)
+from edge_server.scheduler.learned import distributions as d
+from edge_server.scheduler.learned.distributions import most_probable_set, sample_sets, set_log_probability
 
 ALL = np.array(list(itertools.product((0.0, 1.0), repeat=4)))[1:]  # every non-empty set of four cameras
 
@@ -50,14 +44,11 @@ def test_they_sum_to_one_wherever_the_logits_are(logits):
     np.testing.assert_allclose(np.exp(logps).sum(), 1.0, rtol=1e-9)
 
 
-def test_cameras_that_never_reported_are_no_part_of_it():
+def test_cameras_that_never_reported_are_no_part_of_it_and_with_nobody_the_empty_set_is_certain():
     logits = np.array([0.3, -0.2, 50.0, 1.0])
     logps = every_set(logits, mask=[1, 1, 0, 1])
     allowed = ALL[:, 2] == 0
     np.testing.assert_allclose(np.exp(logps[allowed]).sum(), 1.0, rtol=1e-12)
-
-
-def test_with_nobody_there_the_empty_set_is_certain():
     zero = np.zeros((1, 3))
     logits = torch.zeros((1, 3), dtype=torch.float64, requires_grad=True)
     logp = set_log_probability(torch, logits, torch.tensor(zero), torch.tensor(zero))
@@ -112,10 +103,10 @@ def test_the_most_probable_set_is_the_likeliest_of_all():
 
 def test_entropy_of_sets_and_of_omegas():
     even = np.zeros((1, 4))
-    assert set_entropy(np, even, np.ones((1, 4)))[0] == pytest.approx(4 * np.log(2))
-    assert set_entropy(np, even, np.array([[1.0, 0, 0, 1.0]]))[0] == pytest.approx(2 * np.log(2))
-    assert set_entropy(np, np.array([[1e4, -1e4, 800.0, -800.0]]), np.ones((1, 4)))[0] == 0.0
-    assert omega_entropy(np, even)[0] == pytest.approx(np.log(4))
+    assert d.set_entropy(np, even, np.ones((1, 4)))[0] == pytest.approx(4 * np.log(2))
+    assert d.set_entropy(np, even, np.array([[1.0, 0, 0, 1.0]]))[0] == pytest.approx(2 * np.log(2))
+    assert d.set_entropy(np, np.array([[1e4, -1e4, 800.0, -800.0]]), np.ones((1, 4)))[0] == 0.0
+    assert d.omega_entropy(np, even)[0] == pytest.approx(np.log(4))
     certain = np.array([[0.0, -1e4, -900.0]])
-    assert omega_entropy(np, certain)[0] == 0.0
-    assert np.isfinite(omega_log_probabilities(np, certain)).all()
+    assert d.omega_entropy(np, certain)[0] == 0.0
+    assert np.isfinite(d.omega_log_probabilities(np, certain)).all()

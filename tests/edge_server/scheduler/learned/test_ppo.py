@@ -3,8 +3,10 @@ in a checkpoint."""
 
 from __future__ import annotations
 
+import re
 import zipfile
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -68,43 +70,70 @@ def test_a_checkpoint_goes_on_bit_for_bit(tmp_path):
     assert through.value(s) == resumed.value(s)
 
 
-def save(learner, path):
-    learner.save(path)
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """The file of a learner that has been taught once."""
+    learner = Learner(select(), 0)
+    teach(learner, FreshOnes(), 1)
+    learner.save(path := tmp_path_factory.mktemp("saved") / "policy.npz")
     return path
 
 
-def _edited(change):
-    """Writes the checkpoint anew, with its arrays and metadata changed."""
-
-    def edit(path):
-        arrays, about = checkpoint.load(path, kind="scheduler")
-        change(arrays, about)
-        checkpoint.save(path, arrays, about, kind="scheduler")
-
-    return edit
+def refused_by(load, path, match: str | None = None) -> None:
+    """In one line that names the file once."""
+    with pytest.raises(checkpoint.CheckpointError, match=match) as refused:
+        load(path)
+    assert str(refused.value).count(str(path)) == 1 and "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda path: path.write_bytes(path.read_bytes()[:-200]),
-        lambda path: checkpoint.save(path, {"a": np.zeros(3)}),
-        _edited(lambda arrays, about: arrays["actor.in"].__setitem__((0, 0), np.nan)),
-        _edited(lambda arrays, about: arrays.update({"actor.in": arrays["actor.in"][:, 1:]})),
-        _edited(lambda arrays, about: arrays.update({"actor.in": arrays["actor.in"].astype(str)})),
-        _edited(lambda arrays, about: arrays.pop("actor.out")),
-        _edited(lambda arrays, about: about["spec"].update(action="guess")),
-        _edited(lambda arrays, about: about["spec"].update(depth=3)),
-    ],
-    ids=["cut", "field", "nan", "shape", "words", "lacks", "action", "key"],
-)
-def test_a_file_that_is_no_whole_checkpoint_is_refused_in_one_line(tmp_path, damage):
-    path = save(Learner(select(), 0), tmp_path / "policy.npz")
-    damage(path)
+def edited(source, folder, change):
+    """Another checkpoint, with arrays and metadata changed."""
+    arrays, about = checkpoint.load(source, kind="scheduler")
+    change(arrays, about)
+    checkpoint.save(folder / "policy.npz", arrays, about, kind="scheduler")
+    return folder / "policy.npz"
+
+
+def _fact(key, value):
+    return lambda arrays, about: about.update({key: value})
+
+
+def _array(name, change):
+    return lambda arrays, about: arrays.update({name: change(arrays[name])})
+
+
+def _spec(**changed):
+    return lambda arrays, about: about["spec"].update(changed)
+
+
+def _filled(name, value):
+    return _array(name, lambda array: np.full_like(array, value))
+
+
+def _cut(name):
+    return _array(name, lambda array: array.T[..., :1])
+
+
+WHOLES = {
+    "nan": lambda arrays, about: arrays["actor.in"].__setitem__((0, 0), np.nan),
+    "shape": _array("actor.in", lambda array: array[:, 1:]),
+    "words": _array("actor.in", lambda array: array.astype(str)),
+    "lacks": lambda arrays, about: arrays.pop("actor.out"),
+    "action": _spec(action="guess"),
+    "key": _spec(depth=3),
+}
+
+
+@pytest.mark.parametrize("damage", ["cut", "field", *WHOLES])
+def test_a_file_that_is_no_whole_checkpoint_is_refused_in_one_line(tmp_path, saved, damage):
+    if damage in WHOLES:
+        path = edited(saved, tmp_path, WHOLES[damage])
+    elif damage == "cut":
+        (path := tmp_path / "policy.npz").write_bytes(saved.read_bytes()[:-200])
+    else:
+        checkpoint.save(path := tmp_path / "policy.npz", {"a": np.zeros(3)})
     for load in (Learner.load, Actor.load):
-        with pytest.raises(checkpoint.CheckpointError) as refused:
-            load(path)
-        assert str(refused.value).startswith(str(path)) and "\n" not in str(refused.value)
+        refused_by(load, path, f"^{re.escape(str(path))}")
 
 
 LARGE = {"hidden": {"hidden": 30_000}, "dim": {"layout": {"parts": ["age", "semantics"], "dim": 10**9}}}
@@ -119,33 +148,14 @@ WRONG = {
 
 
 @pytest.mark.parametrize("change", [*LARGE.values(), *WRONG.values()], ids=[*LARGE, *WRONG])
-def test_a_specification_that_nobody_trains_is_refused_before_anything_is_allocated(tmp_path, monkeypatch, change):
-    path = save(Learner(select(), 0), tmp_path / "policy.npz")
-    arrays, about = checkpoint.load(path, kind="scheduler")
-    layout = {**about["spec"]["layout"], **change.get("layout", {})}
-    about["spec"] |= {**change, "layout": layout}
-    checkpoint.save(path, arrays, about, kind="scheduler")
-
-    def allocated(*_: object) -> None:
-        raise MemoryError("weights of that size")
-
-    monkeypatch.setattr(networks, "_orthogonal", allocated)
+def test_a_specification_that_nobody_trains_is_refused_before_anything_is_allocated(
+    tmp_path, saved, monkeypatch, change
+):
+    layout = {**select().as_json()["layout"], **change.get("layout", {})}
+    path = edited(saved, tmp_path, _spec(**{**change, "layout": layout}))
+    monkeypatch.setattr(networks, "_orthogonal", MagicMock(side_effect=MemoryError("weights of that size")))
     for load in (Learner.load, Actor.load):
-        with pytest.raises(checkpoint.CheckpointError, match="its policy cannot be used") as refused:
-            load(path)
-        assert str(refused.value).count(str(path)) == 1 and "\n" not in str(refused.value)
-
-
-def _fact(key, value):
-    return lambda arrays, about: about.update({key: value})
-
-
-def _cut(name):
-    return lambda arrays, about: arrays.update({name: arrays[name].T[..., :1]})
-
-
-def _filled(name, value):
-    return lambda arrays, about: arrays.update({name: np.full_like(arrays[name], value)})
+        refused_by(load, path, "its policy cannot be used")
 
 
 @pytest.mark.parametrize(
@@ -163,14 +173,8 @@ def _filled(name, value):
         _fact("streams", {}),
     ],
 )
-def test_what_a_learner_cannot_have_saved_is_refused(tmp_path, change):
-    learner = Learner(select(), 0)
-    teach(learner, FreshOnes(), 1)
-    path = save(learner, tmp_path / "policy.npz")
-    _edited(change)(path)
-    with pytest.raises(checkpoint.CheckpointError) as refused:
-        Learner.load(path)
-    assert str(refused.value).count(str(path)) == 1 and "\n" not in str(refused.value)
+def test_what_a_learner_cannot_have_saved_is_refused(tmp_path, saved, change):
+    refused_by(Learner.load, edited(saved, tmp_path, change))
 
 
 def test_an_archive_that_grows_when_it_is_unpacked_is_not_unpacked(tmp_path):

@@ -42,9 +42,7 @@ def test_the_reward_of_waiting_is_minus_f_w():
 @pytest.mark.parametrize("value", [None, math.nan, math.inf])
 def test_a_missing_metric_is_reported_and_the_rest_stays_finite(value):
     found = make_reward("set").of(score(lpips=value))
-    assert found.terms["lpips"] is None
-    assert found.missing == ("lpips",)
-    assert not found.complete
+    assert found.terms["lpips"] is None and found.missing == ("lpips",) and not found.complete
     assert found.total == pytest.approx(0.95)
 
 

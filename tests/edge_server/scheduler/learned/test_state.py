@@ -48,29 +48,22 @@ def test_standardised_embeddings_have_mean_zero_and_spread_one_over_the_cameras_
     assert not layout.features(states[0])[0, :3].any()
 
 
-@pytest.mark.parametrize(
-    ("values", "says"),
-    [
-        ({"parts": ("color",)}, "color"),
-        ({"parts": ("semantics",)}, "dim 0"),
-        ({"parts": ("age",), "age_scale_ms": 0.0}, "positive"),
-        ({"parts": ("age",), "oldest_ms": np.inf}, "positive"),
-        ({"parts": ("semantics",), "dim": 2, "center": (0.0,), "spread": (1.0,)}, "2 values"),
-    ],
-)
-def test_a_wrong_layout_is_refused_by_name(values, says):
-    with pytest.raises(ValueError, match=says):
-        StateLayout(**values)
+def test_a_wrong_layout_is_refused_by_name():
+    for part, values, says in (
+        ("color", {}, "color"),
+        ("semantics", {}, "dim 0"),
+        ("age", {"age_scale_ms": 0.0}, "positive"),
+        ("age", {"oldest_ms": np.inf}, "positive"),
+        ("semantics", {"dim": 2, "center": (0.0,), "spread": (1.0,)}, "2 values"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            StateLayout((part,), **values)
 
 
 class Colors:
-    """Embeds a frame by its number; the third frame asked for has none. Counts."""
-
-    def __init__(self) -> None:
-        self.asked = 0
+    """Embeds a frame by its number; the third frame asked for has none."""
 
     def of(self, items):
-        self.asked += len(items)
         rows = np.array([[i.sequence, 1.0] for i in items], np.float32).reshape(-1, 2)
         return rows, np.arange(len(items)) != 2
 

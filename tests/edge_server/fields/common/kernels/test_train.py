@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,21 +13,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from edge_server.fields import View
+from edge_server.fields.common.kernels import volume_rendering as volume
 from edge_server.fields.common.kernels.train import RaySampling, train_chunks
-from edge_server.fields.common.kernels.volume_rendering import (
-    GUIDE_REACH,
-    Weights,
-    activate,
-    ray_loss,
-    samples_until_opaque,
-)
 from edge_server.fields.common.supervision import pack_views
 from edge_server.fields.common.training_schedule import step_length
 from edge_server.fields.ngp.field import NgpField
 from tests.edge_server.fields.small import KERNEL_SETTINGS as SETTINGS
 from tests.edge_server.fields.small import KERNEL_VIEWS as VIEWS
 from tests.edge_server.fields.small import kernel_field
-from tests.edge_server.fields.torch_model import TorchGrid, encode, mlp, ray_losses, shade, to_torch
+from tests.edge_server.fields.torch_model import encode, mlp, ray_losses, shade, to_torch
 
 DISTORTION = 0.2
 SAMPLES = 24  # of single rays
@@ -51,15 +46,13 @@ def _train(
     data = pack_views(views, field.view_store.box, field.view_store.memory)
     space = field._occupancy.space(step_length(SETTINGS, field.step))
     space = space._replace(density=space.density * np.float32(over))
-    weights = Weights(np.float32(DISTORTION))
+    weights = volume.Weights(np.float32(DISTORTION))
     batch, scratch = field._batch, field._scratch
     field.pool.run(train_chunks, data, ray_sampling, space, field._encoding, field._net, weights, batch, scratch, ())
     return float(batch.loss[0]), batch.d_params[0].copy(), int(batch.rays[0])
 
 
-def _oracle(
-    field: NgpField, rays: int, weight: NDArray[np.float32], grid: TorchGrid, params: Tensor
-) -> tuple[Tensor, Tensor]:
+def _oracle(field: NgpField, rays: int, weight: NDArray, grid: Any, params: Tensor) -> tuple[Tensor, Tensor]:
     """Color error and loss of the samples that the last chunk took, for an encoding and the network ``params``."""
     batch, scratch = field._batch, field._scratch
     first, ray = scratch.ray_first[0], scratch.ray[0]
@@ -89,7 +82,7 @@ def test_loss_and_gradient_equal_the_oracle(weighted: bool) -> None:
     loss, gradient, rays = _train(field, views)
     weight = field._scratch.ray[0, :rays, 10] if weighted else np.ones(rays, np.float32)
     assert field._encoding.dense[:LEVELS].any() and not field._encoding.dense[:LEVELS].all()
-    grid = to_torch(field._encoding, dtype=torch.float64)
+    grid = to_torch(field._encoding)
     params = torch.as_tensor(field._net.params, dtype=torch.float64).requires_grad_(True)
     grid.table.requires_grad_(True)
     error, total = _oracle(field, rays, weight, grid, params)
@@ -134,15 +127,15 @@ def _ray(seed: int, density: float):
 
 def _kernel(raw, line, ray, weights, guide=0.0):
     out, d_out = raw.copy(), np.zeros_like(raw)
-    activate(out, 0, SAMPLES)
-    error = ray_loss(out, d_out, *line, 0, SAMPLES, ray[:3], ray[3:], np.float32(guide), weights)
+    volume.activate(out, 0, SAMPLES)
+    error = volume.ray_loss(out, d_out, *line, 0, SAMPLES, ray[:3], ray[3:], np.float32(guide), weights)
     return error, d_out
 
 
 @pytest.mark.parametrize(("density", "guide"), [(1.0, 1.4), (-4.0, 50.0)])
 def test_weight_away_from_a_guide_costs_what_geman_and_mcclure_say(density: float, guide: float) -> None:
     raw, line, ray = _ray(9, density)
-    error, d_out = _kernel(raw, line, ray, Weights(*np.float32([0.3, 0.7])), guide)
+    error, d_out = _kernel(raw, line, ray, volume.Weights(*np.float32([0.3, 0.7])), guide)
     params = torch.as_tensor(raw.T.copy(), dtype=torch.float64).requires_grad_(True)
     sigma, color = shade(params, 0, torch.zeros(SAMPLES, 3, dtype=torch.float64))
     t, delta = (torch.as_tensor(line[k], dtype=torch.float64) for k in (0, 1))
@@ -151,7 +144,7 @@ def test_weight_away_from_a_guide_costs_what_geman_and_mcclure_say(density: floa
     assert error == pytest.approx(expected.item(), rel=1e-4)  # the guide is no color
     through = torch.exp(-torch.cumsum(sigma * delta, 0))
     before = torch.cat([torch.ones(1, dtype=torch.float64), through[:-1]])
-    off = (t - guide) / (GUIDE_REACH * guide)
+    off = (t - guide) / (volume.GUIDE_REACH * guide)
     away = ((before - through) * off**2 / (1 + off**2)).sum() + through[-1]
     (loss.sum() + 0.7 * away).backward()
     assert params.grad is not None
@@ -163,11 +156,11 @@ def test_a_ray_ends_where_a_ten_thousandth_of_the_light_is_left() -> None:
     raw, line, ray = _ray(5, 0.0)
     line[1], raw[0] = 0.05, np.log(0.7 / 0.05)  # an optical depth of .7 a sample
     out = raw.copy()
-    activate(out, 0, SAMPLES)
+    volume.activate(out, 0, SAMPLES)
     through = np.exp(-np.cumsum(out[0].astype(np.float64) * line[1]))
-    seen = samples_until_opaque(out, line[1], 0, SAMPLES)
+    seen = volume.samples_until_opaque(out, line[1], 0, SAMPLES)
     assert through[seen - 1] < 1e-4 < through[seen - 2]
-    error, d_out = _kernel(raw, line, ray, Weights(np.float32(0)))
+    error, d_out = _kernel(raw, line, ray, volume.Weights(np.float32(0)))
     weight = np.concatenate([[1.0], through[:-1]]) - through
     color = (weight * out[1:4]).sum(axis=1) + through[-1] * ray[3:]
     assert error == pytest.approx(float(np.square(color - ray[:3]).sum()), abs=3e-4)
@@ -177,13 +170,13 @@ def test_a_ray_ends_where_a_ten_thousandth_of_the_light_is_left() -> None:
 def test_clamped_density_and_what_is_not_finite_have_no_gradient() -> None:
     raw, line, ray = _ray(6, 0.0)
     raw[0, 0], raw[0, 1] = -40.0, -11.0
-    _, d_out = _kernel(raw, line, ray, Weights(np.float32(0)))
+    _, d_out = _kernel(raw, line, ray, volume.Weights(np.float32(0)))
     assert d_out[0, 0] == 0.0 and d_out[0, 1] != 0.0
     raw[0, 2] = 500.0  # overflows an unclamped exponential
-    error, d_out = _kernel(raw, line, ray, Weights(np.float32(0)))
+    error, d_out = _kernel(raw, line, ray, volume.Weights(np.float32(0)))
     assert np.isfinite(error) and error >= 0 and np.isfinite(d_out).all() and d_out[0, 2] == 0.0
     raw[2, 1] = np.inf  # full color
-    assert np.isfinite(_kernel(raw, line, ray, Weights(np.float32(0.1)))[1]).all()
+    assert np.isfinite(_kernel(raw, line, ray, volume.Weights(np.float32(0.1)))[1]).all()
     raw[2, 1] = np.nan
-    error, d_out = _kernel(raw, line, ray, Weights(np.float32(0.1)))
+    error, d_out = _kernel(raw, line, ray, volume.Weights(np.float32(0.1)))
     assert error == -1.0 and (d_out == 0).all(), "a ray that is not finite is refused whole"

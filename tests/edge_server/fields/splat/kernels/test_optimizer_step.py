@@ -45,20 +45,14 @@ def _adam_parameters(width: int, rate: float) -> AdamParameters:
     return AdamParameters(rates.astype(np.float32), corrections.astype(np.float32), np.float32(EPSILON))
 
 
-def _gradient(params: NDArray[np.float32], raster: RasterBuffers, cams: NDArray[np.float32]) -> NDArray[np.float32]:
-    """From Adam's first moment after one step from 0."""
-    width = params.shape[1]
-    moments = _moments(width, filled=False)
-    raster.step(cams, as_gaussians(params.copy()), moments, _adam_parameters(width, 0.0))
-    return moments.m / np.float32(1.0 - BETA1)
-
-
 @pytest.mark.parametrize("sh_degree", [0, 1])
 def test_a_step_is_adams(sh_degree: int) -> None:
     params = random_params(COUNT, sh_degree, 3)
     raster, cams = _raster(params)
     width = params.shape[1]
-    g = _gradient(params, raster, cams).astype(np.float64)
+    moments = _moments(width, filled=False)
+    raster.step(cams, as_gaussians(params.copy()), moments, _adam_parameters(width, 0.0))
+    g = (moments.m / np.float32(1.0 - BETA1)).astype(np.float64)  # from Adam's first moment after one step from 0
     seen = (raster.lists.own_count[:, :COUNT] > 0).any(axis=0)
     assert 0 < (~seen).sum() < COUNT // 2 and (np.abs(g[seen]).max(axis=1) > 0).all()
     moments, after = _moments(width, filled=True), params.copy()
@@ -106,11 +100,8 @@ def test_parameters_are_kept_within_their_bounds() -> None:
     """In numbers: what lies within stays as it is to the last bit."""
     params = random_params(5, seed=3)
     params[:, OPACITY] = 8.0, -8.5, 50.0, -50.0, np.nan
-    params[1, :3], params[2, SCALE:QUATERNION], params[3, SCALE:QUATERNION] = (
-        (500.0, -500.0, 1.0),
-        3.0,
-        (-1.0, -9.0, -1.0),
-    )
+    params[1, :3], params[2, SCALE:QUATERNION] = (500.0, -500.0, 1.0), 3.0
+    params[3, SCALE:QUATERNION] = -1.0, -9.0, -1.0
     params[2, QUATERNION:OPACITY], params[3, COLOR] = 0.0, 7.0
     before = params.copy()
     clamp_gaussians(params)

@@ -125,9 +125,8 @@ def _dissimilarity(rendered: Tensor, image: Tensor, weight: Tensor) -> Tensor:
                 continue
             share = w / w.sum()
             mr, mt = (share * r).sum((0, 1)), (share * t).sum((0, 1))
-            rr, tt, rt = (
-                (share * a * b).sum((0, 1)) for a, b in ((r - mr, r - mr), (t - mt, t - mt), (r - mr, t - mt))
-            )
+            r, t = r - mr, t - mt
+            rr, tt, rt = ((share * a * b).sum((0, 1)) for a, b in ((r, r), (t, t), (r, t)))
             alike = (2 * mr * mt + 1e-4) / (mr**2 + mt**2 + 1e-4) * (2 * rt + 9e-4) / (rr + tt + 9e-4)
             total = total + w.sum() * (0.5 - 0.5 * alike).sum()
     return total
@@ -163,11 +162,8 @@ def test_force_and_torque_are_the_gradient_by_the_cameras_pose() -> None:
     params[::3, OPACITY] = 8.0  # as opaque as they can be: those have no gradient of their opacity, and hide others
     _, gradient, rigid = _step(params, exposed=False)
     motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)  # shift and rotation vector, world axes
-    cam, theirs, zero = (
-        _double(_camera(BENT)[0]),
-        _double(params).requires_grad_(True),
-        torch.zeros((), dtype=torch.float64),
-    )
+    cam, theirs = _double(_camera(BENT)[0]), _double(params).requires_grad_(True)
+    zero = torch.zeros((), dtype=torch.float64)
     x, y, z = motion[3:]
     turn = torch.stack([torch.stack(row) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))])
     rotation = cam[:ORIGIN].reshape(3, 3) @ torch.linalg.matrix_exp(turn).T

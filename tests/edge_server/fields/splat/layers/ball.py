@@ -1,28 +1,33 @@
-"""A ball that moves before fixed cameras, and a field in layers that is shown it."""
+"""A ball that moves before fixed cameras, and fields in layers that are shown it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.settings import SplatSettings
-from tests.edge_server.fields.scenes import picture, psnr, ring
+from tests.edge_server.fields.scenes import picture, psnr, ring, seen
 
 SMALL = SplatSettings(gaussians=1200, start=700, seed_cells=32, densify_every=20, threads=2)
 CAMERAS, HELD = ring(12)[:11], ring(12)[11]
 FRAME_S = 1.0 / 15.0
 
 
-def ball_m(instant_s: float, moves: bool) -> np.ndarray:
-    """The ball comes from aside after a second and a half and goes around."""
-    if not moves or instant_s < 1.5:
-        return np.array([5.0, 0.0, 0.5])
-    return np.array([0.25 * np.cos(3 * instant_s), 0.25 * np.sin(3 * instant_s), 0.5])
+def place_m(instant_s: float, height_m: float = 0.5) -> NDArray[np.float64]:
+    """The ball goes around on a plate."""
+    return np.array([0.25 * np.cos(3 * instant_s), 0.25 * np.sin(3 * instant_s), height_m])
+
+
+def ball_m(instant_s: float, moves: bool) -> NDArray[np.float64]:
+    """It comes from aside after a second and a half and goes around."""
+    return np.array([5.0, 0.0, 0.5]) if not moves or instant_s < 1.5 else place_m(instant_s)
 
 
 @cache
@@ -33,9 +38,14 @@ def seen_by(camera: int, frame: int, moves: bool) -> View:
     return replace(view, image=image, generated_ns=round(instant_s * 1e9))
 
 
+def frame_of(number: int, moves: bool = True, cameras: int = len(CAMERAS)) -> list[View]:
+    """What the first so many cameras see."""
+    return [seen_by(k, number, moves) for k in range(cameras)]
+
+
 def played(field: Any, frames: range, moves: bool = True, steps: int = 30) -> None:
-    for frame in frames:
-        field.fit([seen_by(k, frame, moves) for k in range(len(CAMERAS))], Budget(steps=steps))
+    for number in frames:
+        field.fit(frame_of(number, moves), Budget(steps=steps))
 
 
 @cache
@@ -62,3 +72,46 @@ def resumed_field(state: dict[str, np.ndarray] | None = None) -> LayeredField:
 def score_of(shown: Any, instant_s: float, moves: bool = True) -> float:
     truth = picture(HELD.intrinsics, HELD.camera_to_world, ball_m(instant_s, moves))
     return psnr(shown.render(HELD.camera_to_world, HELD.intrinsics).color, truth / 255.0)
+
+
+def measured(view: View, image: NDArray, distance_m: NDArray[np.float64]) -> View:
+    """The view with this image and depth along the optical axis, 0 for the sky."""
+    z = np.where(np.isfinite(distance_m), distance_m * view.intrinsics.rays()[..., 2], 0.0)
+    return replace(view, image=image.astype(np.uint8), depth=z.astype(np.float32))
+
+
+Change = Callable[[int, int, View], View]
+"""Of a camera's number, a frame's, and its view."""
+
+
+class Rig:
+    """Some cameras of a ring of nine, with depth or without, and one that is held out."""
+
+    def __init__(self, cameras: tuple[int, ...], held: int, size: int = 48, depth: bool = True) -> None:
+        views = ring(9, size)
+        self.cameras, self.held, self.depth = [views[k] for k in cameras], views[held], depth
+        self.frame = cache(self._frame)
+
+    def _frame(self, camera: int, frame: int) -> View:
+        """What a camera sees and measures then, each at a phase of its own."""
+        view, instant_s = self.cameras[camera], (frame + camera / len(self.cameras)) * FRAME_S
+        now = measured(view, *seen(view.intrinsics, view.camera_to_world, place_m(instant_s)))
+        return replace(now, generated_ns=round(instant_s * 1e9), depth=now.depth if self.depth else None)
+
+    def run(
+        self, field: LayeredField, frames: range, changed: Change | None = None, cameras: int = 3, steps: int = 20
+    ) -> LayeredField:
+        """The field after these frames, each as ``changed``."""
+        for number in frames:
+            views = [self.frame(k, number) for k in range(cameras)]
+            if changed is not None:
+                views = [changed(k, number, view) for k, view in enumerate(views)]
+            field.fit(views, Budget(steps=steps))
+        return field
+
+    def score(self, field: LayeredField, frame: int) -> float:
+        """PSNR of what is shown to the held-out camera, dB; fails where it is not finite."""
+        lens, pose = self.held.intrinsics, self.held.camera_to_world
+        color = field.snapshot().render(pose, lens).color
+        assert np.isfinite(color).all()
+        return psnr(color, seen(lens, pose, place_m(frame * FRAME_S))[0] / 255.0)

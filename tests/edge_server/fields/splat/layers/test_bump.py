@@ -6,14 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from edge_server.fields import Budget
 from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.bump import degrees_of, find_turn
 from edge_server.fields.splat.layers.layered_field import LayeredField
-from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import Pinhole, so3_exp
 from tests.edge_server.fields.scenes import psnr, ring, seen
+from tests.edge_server.fields.splat.layers.ball import SMALL, place_m
 
 LENS = Pinhole.from_fov(96, 72, 60.0)
 TEXTURE = np.random.default_rng(3).random((3, 8))
@@ -25,14 +26,11 @@ def _sky(turn: np.ndarray, lens: Pinhole = LENS) -> np.ndarray:
     return (127.5 + 120.0 * waves[..., :3]).astype(np.uint8)
 
 
-@pytest.mark.parametrize(
-    ("degrees", "distortion"),
-    [
-        ((0.0, 2.0, 0.0), (0.0,) * 4),
-        ((-0.8, 0.5, 1.0), (-0.15, 0.02, 0.0, 0.0)),
-        ((1.5, -2.5, 0.0), (-0.15, 0.02, 0.0, 0.0)),
-    ],
-)
+BENT = (-0.15, 0.02, 0.0, 0.0)
+TURNS = [((0.0, 2.0, 0.0), (0.0,) * 4), ((-0.8, 0.5, 1.0), BENT), ((1.5, -2.5, 0.0), BENT)]
+
+
+@pytest.mark.parametrize(("degrees", "distortion"), TURNS)
 def test_a_turn_is_found_to_a_tenth_of_a_degree_beside_a_person(degrees, distortion):
     lens, turn = replace(LENS, distortion=distortion), so3_exp(np.deg2rad(degrees))
     frame = _sky(turn, lens)
@@ -61,18 +59,16 @@ def test_no_turn_is_found_where_there_is_none(frame):
     assert find_turn(before.astype(np.float32), known, pictures.get(frame, plate), LENS) is None
 
 
-SMALL = SplatSettings(gaussians=1200, start=700, seed_cells=32, densify_every=20, threads=1)
 CAMERAS, HELD = ring(7, 64)[:6], ring(7, 64)[6]
 BUMPED_S, END_S, SCORED_S = 1.6, 3.6, 0.6
 
 
 def _run(turn_deg: float, seconds: float = END_S) -> tuple[LayeredField, float]:
     """The field, and PSNR of the held-out view in the last second. The first camera turns at BUMPED_S."""
-    field, scores = LayeredField(SMALL), []
+    field, scores = LayeredField(structs.replace(SMALL, threads=1)), []
     for frame in range(1, round(15 * seconds) + 1):
         t = frame / 15.0
-        ball = np.array([0.25 * np.cos(3.0 * t), 0.25 * np.sin(3.0 * t), 0.3])
-        views = []
+        views, ball = [], place_m(t, 0.3)
         for k, view in enumerate(CAMERAS):
             stands = view.camera_to_world.copy()
             if k == 0 and t > BUMPED_S:

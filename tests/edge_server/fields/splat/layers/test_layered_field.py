@@ -22,107 +22,96 @@ from edge_server.fields.splat.layers import settings
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.layers.layered_state import VERSION
 from tests.edge_server.fields.small import same_state
-from tests.edge_server.fields.splat.layers.ball import (
-    CAMERAS,
-    FRAME_S,
-    HELD,
-    SMALL,
-    known_plates,
-    moving_field,
-    played,
-    resumed_field,
-    score_of,
-    seen_by,
-)
+from tests.edge_server.fields.splat.layers import ball
 
 
 def _turning() -> list[View]:
     """Frames of the first camera, each from another place."""
-    poses = [camera.camera_to_world for camera in (*CAMERAS[1:4], HELD)]
-    return [replace(seen_by(0, frame, True), camera_to_world=pose) for frame, pose in enumerate(poses, start=4)]
+    poses = [camera.camera_to_world for camera in (*ball.CAMERAS[1:4], ball.HELD)]
+    return [replace(ball.seen_by(0, frame, True), camera_to_world=pose) for frame, pose in enumerate(poses, start=4)]
 
 
 def test_it_is_the_still_field_at_first_and_where_a_camera_moves() -> None:
-    layered, plain = LayeredField(SMALL), StillField(SMALL)
+    layered, plain = LayeredField(ball.SMALL), StillField(ball.SMALL)
     for field in (layered, plain):
-        played(field, range(4))
+        ball.played(field, range(4))
     same_state(layered.still, plain)
     assert layered.learning == "learning the background: 4 of 8 frames of each camera"
     for field in (layered, plain):
         for frame, turned in enumerate(_turning(), start=4):
-            field.fit([turned, seen_by(2, frame, True)], Budget(steps=10))
+            field.fit([turned, ball.seen_by(2, frame, True)], Budget(steps=10))
     assert not layered.layered and not layered.learning
-    played(layered, range(20, 40), steps=2)
-    played(plain, range(20, 40), steps=2)
+    ball.played(layered, range(20, 40), steps=2)
+    ball.played(plain, range(20, 40), steps=2)
     same_state(layered.still, plain)
-    shown, expected = (f.render(HELD.camera_to_world, HELD.intrinsics).color for f in (layered, plain))
+    shown, expected = (f.render(ball.HELD.camera_to_world, ball.HELD.intrinsics).color for f in (layered, plain))
     np.testing.assert_array_equal(shown, expected)
 
 
 def test_one_camera_alone_begins_no_layers_and_is_told_so_once(caplog: pytest.LogCaptureFixture) -> None:
-    field = LayeredField(SMALL)
+    field = LayeredField(ball.SMALL)
     with caplog.at_level(logging.WARNING):
         for frame in range(20):
-            field.fit([seen_by(0, frame, True)], Budget(steps=1))
+            field.fit(ball.frame_of(frame, cameras=1), Budget(steps=1))
     assert field.layered and field.tracker is None and not field.learning and caplog.text.count("tells no depth") == 1
     for frame in range(20, 30):
-        field.fit([seen_by(k, frame, True) for k in range(2)], Budget(steps=1))
+        field.fit(ball.frame_of(frame, cameras=2), Budget(steps=1))
     assert field.moving is not None and field.learning.endswith("of 50 steps")  # little was shown before
 
 
 def test_nothing_moves_where_nothing_moves() -> None:
-    field = LayeredField(SMALL)
-    played(field, range(36), moves=False)
+    field = LayeredField(ball.SMALL)
+    ball.played(field, range(36), moves=False)
     assert field.moving is not None and len(field.moving) == 0
     assert field.static.finished
-    report = field.fit([seen_by(0, 40, False)], Budget(steps=30))
+    report = field.fit([ball.seen_by(0, 40, False)], Budget(steps=30))
     assert report.steps == 0  # all is learned
-    assert score_of(field.snapshot(), 2.0, moves=False) > 22.0
+    assert ball.score_of(field.snapshot(), 2.0, moves=False) > 22.0
 
 
 def test_what_moves_is_shown_at_any_instant() -> None:
-    field = moving_field()
+    field = ball.moving_field()
     assert field.moving is not None and field.moving.alive
-    instant_s = 42 * FRAME_S
+    instant_s = 42 * ball.FRAME_S
     now = field.snapshot(round(instant_s * 1e9))
-    assert score_of(now, instant_s) > 22.0
+    assert ball.score_of(now, instant_s) > 22.0
     ahead = now.at(round((instant_s + 0.2) * 1e9))
-    assert score_of(ahead, instant_s + 0.2) > score_of(now, instant_s + 0.2) + 0.5
+    assert ball.score_of(ahead, instant_s + 0.2) > ball.score_of(now, instant_s + 0.2) + 0.5
     earlier = now.at(round((instant_s - 0.3) * 1e9))
-    assert score_of(earlier, instant_s - 0.3) > score_of(now, instant_s - 0.3) + 1.0
+    assert ball.score_of(earlier, instant_s - 0.3) > ball.score_of(now, instant_s - 0.3) + 1.0
     again = earlier.at(round(instant_s * 1e9))
     np.testing.assert_array_equal(again.gaussians.params, now.gaussians.params)
 
 
 def test_a_state_continues_bit_for_bit_and_a_snapshot_stays_as_it_is() -> None:
-    field = resumed_field()
-    same_state(field, moving_field())
+    field = ball.resumed_field()
+    same_state(field, ball.moving_field())
     shown = field.snapshot()
-    before = shown.render(HELD.camera_to_world, HELD.intrinsics).color
-    played(field, range(42, 44))
-    other = resumed_field(field.state())
+    before = shown.render(ball.HELD.camera_to_world, ball.HELD.intrinsics).color
+    ball.played(field, range(42, 44))
+    other = ball.resumed_field(field.state())
     for one in (field, other):
-        played(one, range(44, 50))
+        ball.played(one, range(44, 50))
     same_state(field, other)
-    one, two = (f.render(HELD.camera_to_world, HELD.intrinsics).color for f in (field, other))
+    one, two = (f.render(ball.HELD.camera_to_world, ball.HELD.intrinsics).color for f in (field, other))
     np.testing.assert_array_equal(one, two)
     for still in (shown, shown.at(None)):
-        np.testing.assert_array_equal(still.render(HELD.camera_to_world, HELD.intrinsics).color, before)
+        np.testing.assert_array_equal(still.render(ball.HELD.camera_to_world, ball.HELD.intrinsics).color, before)
 
 
 def test_it_tells_how_much_moves_before_each_camera_in_its_newest_frame() -> None:
-    field = resumed_field()
+    field = ball.resumed_field()
     newest = {o.camera: o.share for o in sorted(field.observations, key=lambda o: o.instant_s)}
     assert max(newest.values()) > 0.02 and len({*newest.values()}) > 3
     assert field.moving_shares == {name: max(share, 0.01) for name, share in newest.items()}
-    field.refused = {CAMERAS[0].camera}
-    assert field.moving_shares[CAMERAS[0].camera] == 0.01
+    field.refused = {ball.CAMERAS[0].camera}
+    assert field.moving_shares[ball.CAMERAS[0].camera] == 0.01
 
 
 def test_the_order_and_the_threads_change_nothing() -> None:
-    one, two = resumed_field(), LayeredField(structs.replace(SMALL, threads=1))
-    two.load_state(moving_field().state())
-    views = [seen_by(k, frame, True) for frame in (42, 43) for k in range(len(CAMERAS))]
+    one, two = ball.resumed_field(), LayeredField(structs.replace(ball.SMALL, threads=1))
+    two.load_state(ball.moving_field().state())
+    views = [ball.seen_by(k, frame, True) for frame in (42, 43) for k in range(len(ball.CAMERAS))]
     one.fit(views, Budget(steps=5))
     two.fit(views[::-1], Budget(steps=5))
     two.fit(views, Budget(steps=0))
@@ -131,19 +120,19 @@ def test_the_order_and_the_threads_change_nothing() -> None:
 
 
 def test_a_refused_state_changes_nothing_and_reset_forgets() -> None:
-    field, state = resumed_field(), moving_field().state()
+    field, state = ball.resumed_field(), ball.moving_field().state()
     old = str(state["meta"]).replace(f'"version": {VERSION}', '"version": 1')
     for wrong in (
-        StillField(SMALL).state(),
+        StillField(ball.SMALL).state(),
         {k: v for k, v in state.items() if k != "moving.anchor"},
         {**state, "moving.share": state["moving.share"] * np.nan},
         {**state, "meta": np.array(old)},
     ):
         with pytest.raises(ValueError):
             field.load_state(wrong)
-    same_state(field, moving_field())
+    same_state(field, ball.moving_field())
     field.reset()
-    same_state(field, LayeredField(SMALL))
+    same_state(field, LayeredField(ball.SMALL))
 
 
 @pytest.mark.slow
@@ -173,12 +162,12 @@ assert compiled() == before, (before, compiled())
 
 def _fitted_in_seconds(field: LayeredField, frame: int, seconds: float = 0.02) -> Any:
     """The report of a fit with all views of a frame."""
-    return field.fit([seen_by(k, frame, True) for k in range(len(CAMERAS))], Budget(seconds=seconds))
+    return field.fit(ball.frame_of(frame), Budget(seconds=seconds))
 
 
 def test_in_seconds_what_moves_is_followed_once_anything_is_shown_of_it() -> None:
     """Until then the still field has the processor."""
-    field = resumed_field(known_plates(5))
+    field = ball.resumed_field(ball.known_plates(5))
     assert field.tracker is not None and not field.supervision.layers_shown
     followed = field.tracker.fits
     for frame in range(17, 1000):
@@ -212,18 +201,16 @@ def test_slow_steps_that_are_over_do_not_end_the_learning_of_what_moves() -> Non
 
 
 @pytest.mark.parametrize(("threads", "seconds", "follows"), [(2, 1, 1), (3, 0, 1)])
-def test_the_pool_leaves_a_worker_to_a_thread_that_computes_beside_it(
-    monkeypatch: pytest.MonkeyPatch, threads: int, seconds: int, follows: int
-) -> None:
+def test_the_pool_leaves_a_worker_to_a_thread_that_computes_beside_it(monkeypatch, threads, seconds, follows) -> None:
     """And of two always, where budgets are in seconds: a kernel of both would wait for the one that others hold up."""
-    field, spared = LayeredField(structs.replace(SMALL, threads=threads)), list[int]()
+    field, spared = LayeredField(structs.replace(ball.SMALL, threads=threads)), list[int]()
     spare = field.pool.spare
     monkeypatch.setattr(field.pool, "spare", lambda count: (spared.append(count), spare(count)))
-    frames = [seen_by(k, 0, True) for k in range(len(CAMERAS))]
+    frames = [ball.seen_by(k, 0, True) for k in range(len(ball.CAMERAS))]
     for budget in (Budget(steps=1), Budget(seconds=0.02), Budget(steps=1)):
         field.fit(frames, budget)
     assert spared == [0, seconds, 0]
-    played(field, range(1, 17), steps=5)
+    ball.played(field, range(1, 17), steps=5)
     for frame in range(17, 400):
         spared.clear()
         _fitted_in_seconds(field, frame)
@@ -240,9 +227,9 @@ def test_the_pool_leaves_a_worker_to_a_thread_that_computes_beside_it(
 
 
 def test_a_camera_that_shows_something_else_is_refused_and_changes_nothing() -> None:
-    without, field, rng = resumed_field(), resumed_field(), np.random.default_rng(0)
+    without, field, rng = ball.resumed_field(), ball.resumed_field(), np.random.default_rng(0)
     for frame in range(42, 46):
-        first, *rest = (seen_by(k, frame, True) for k in range(len(CAMERAS)))
+        first, *rest = (ball.seen_by(k, frame, True) for k in range(len(ball.CAMERAS)))
         without.fit(rest, Budget(steps=5))
         noise = rng.integers(0, 255, first.image.shape, np.uint8)
         report = field.fit([replace(first, image=noise), *rest], Budget(steps=5))
@@ -250,16 +237,16 @@ def test_a_camera_that_shows_something_else_is_refused_and_changes_nothing() -> 
     one, two = without.snapshot(), field.snapshot()
     for a, b in zip((one.static, one.moving.params), (two.static, two.moving.params), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3)
-    resumed = resumed_field(field.state())
+    resumed = ball.resumed_field(field.state())
     assert resumed.refused == {first.camera}
-    assert resumed.fit([seen_by(k, 46, True) for k in range(len(CAMERAS))], Budget(steps=5)).refused == ()
+    assert resumed.fit([ball.seen_by(k, 46, True) for k in range(len(ball.CAMERAS))], Budget(steps=5)).refused == ()
 
 
 def test_layers_begin_again_when_the_box_of_the_scene_changes() -> None:
-    field = resumed_field()
+    field = ball.resumed_field()
     store, plates = field.still.view_store, {n: c.plate for n, c in field.cameras.items()}
     store.box = replace(store.box, radius_m=2.0 * store.box.radius_m)  # as a late camera may have it
-    played(field, range(42, 43), steps=5)
+    ball.played(field, range(42, 43), steps=5)
     assert field.moving is not None and field.moving.box is field.still.view_store.box
     assert field.still.step == 30
     assert {n: c.plate for n, c in field.cameras.items()} == plates
@@ -267,18 +254,18 @@ def test_layers_begin_again_when_the_box_of_the_scene_changes() -> None:
 
 
 def test_few_cameras_with_large_pictures_train_fewer_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    field, size = LayeredField(SMALL), CAMERAS[0].intrinsics.width * CAMERAS[0].intrinsics.height
+    field, size = LayeredField(ball.SMALL), ball.CAMERAS[0].intrinsics.width * ball.CAMERAS[0].intrinsics.height
     for frame in range(40):
-        field.fit([seen_by(k, frame, True) for k in range(4)], Budget(steps=30))
+        field.fit([ball.seen_by(k, frame, True) for k in range(4)], Budget(steps=30))
     for frame, (most_pixels, steps) in enumerate([(size, 10), (size - 1, 6)], 40):
         monkeypatch.setattr(settings, "FEW_STEPS_PIXELS", most_pixels)
-        report = field.fit([seen_by(k, frame, True) for k in range(4)], Budget(steps=30))
+        report = field.fit([ball.seen_by(k, frame, True) for k in range(4)], Budget(steps=30))
         assert report.steps == steps
 
 
 def test_it_wants_every_frame_and_tells_how_long_one_takes_until_a_camera_moves() -> None:
-    field, ticks = LayeredField(SMALL), itertools.count()
-    views = [seen_by(k, frame, True) for frame in range(2) for k in range(len(CAMERAS))]
+    field, ticks = LayeredField(ball.SMALL), itertools.count()
+    views = [ball.seen_by(k, frame, True) for frame in range(2) for k in range(len(ball.CAMERAS))]
     assert field.frame_s == 0.0 and field.most_pixels == 400_000  # not known yet
     field.now = lambda: float(next(ticks))
     field.fit(views, Budget(seconds=0.05))
@@ -291,7 +278,7 @@ def test_it_wants_every_frame_and_tells_how_long_one_takes_until_a_camera_moves(
 
 
 def test_a_thread_that_trains_ends_with_the_scene_and_tells_why_it_failed(monkeypatch: pytest.MonkeyPatch) -> None:
-    field = resumed_field(known_plates(30))
+    field = ball.resumed_field(ball.known_plates(30))
     _fitted_in_seconds(field, 17, 0.01)
     assert field.static.training
     state = field.state()  # a checkpoint ends it first
@@ -315,12 +302,12 @@ def test_a_thread_that_trains_ends_with_the_scene_and_tells_why_it_failed(monkey
 
 
 def test_one_wrong_pose_is_left_out_and_a_camera_that_shows_new_places_moves() -> None:
-    field = LayeredField(SMALL)
+    field = LayeredField(ball.SMALL)
     for frame in range(8):
         place = [0.0, 0.1, 0.0, 0.0, 0.1, 0.2, 0.3, 0.4][frame]
-        pose = CAMERAS[0].camera_to_world.copy()
+        pose = ball.CAMERAS[0].camera_to_world.copy()
         pose[0, 3] += place
-        views = [seen_by(k, frame, True) for k in range(len(CAMERAS))]
+        views = [ball.seen_by(k, frame, True) for k in range(len(ball.CAMERAS))]
         field.fit([replace(views[0], camera_to_world=pose), *views[1:]], Budget(steps=1))
         if frame < 4:
             assert field.cameras[views[0].camera].plate.count == frame + 1 - (frame > 0)
@@ -330,9 +317,9 @@ def test_one_wrong_pose_is_left_out_and_a_camera_that_shows_new_places_moves() -
 
 def test_where_all_cameras_are_knocked_layers_begin_again() -> None:
     """Two cameras on one stand: then nothing is observed from a place that is known."""
-    field = LayeredField(SMALL)
+    field = LayeredField(ball.SMALL)
     for frame in range(60):
-        views = [seen_by(k, frame, True) for k in (0, 5)]
+        views = [ball.seen_by(k, frame, True) for k in (0, 5)]
         if frame >= 30:
             for k, view in enumerate(views):
                 pose = view.camera_to_world.copy()

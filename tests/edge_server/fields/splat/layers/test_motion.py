@@ -137,7 +137,7 @@ def test_displacements_pass_through_the_knots_and_go_straight_on():
     np.testing.assert_allclose(motion.at(last) - motion.at(last - 1e-6), step * 5e-5, rtol=1e-3)
 
 
-def test_shares_fall_with_the_square_of_the_distance():
+def test_shares_fall_with_the_square_of_the_distance_and_the_nearest_anchor_comes_first():
     """As 1 / (d^2 + (reach / 4)^2), where the reach is 1: the median distance to the nearest other anchor."""
     motion = moving(3)
     motion.anchors = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
@@ -146,9 +146,6 @@ def test_shares_fall_with_the_square_of_the_distance():
     expected = 1.0 / (np.array([0.0625, 0.5625, 4.0625]) + 0.0625)
     assert anchor.tolist() == [[0, 1, 2]]
     np.testing.assert_allclose(share[0], expected / expected.sum(), rtol=1e-6)
-
-
-def test_each_anchor_attaches_what_is_nearest_to_it():
     motion = moving(8)
     anchor, share = motion.attach(motion.anchors, 10.0)
     np.testing.assert_array_equal(anchor[:, 0], np.arange(8))

@@ -71,9 +71,7 @@ def _new_m(moving: MovingSet, before: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("cameras", "distance_m", "bounds"), [(4, 3.2, (3.0, 3.0)), (2, 0.9, (0.9, 0.9)), (5, 0.9, (5.0, 2.0))]
 )
-def test_motion_of_few_cameras_is_bound_by_their_distance(
-    cameras: int, distance_m: float, bounds: tuple[float, float]
-) -> None:
+def test_motion_of_few_cameras_is_bound_by_their_distance(cameras, distance_m, bounds) -> None:
     """Acceleration and difference of neighbors' speeds; five cameras are not few."""
     moving = MovingSet(SplatSettings(), POOL, replace(BOX, distance_m=distance_m), 0)
     moving.bind(2)

@@ -24,7 +24,7 @@ from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import so3_exp
 from tests.edge_server.fields.scenes import BALL_M, RADIUS_M
 from tests.edge_server.fields.small import same_state
-from tests.edge_server.fields.splat.scan.walk import WALK, spoiled, walk
+from tests.edge_server.fields.splat.scan.carried import WALK, spoiled, walk
 
 Spoil = Callable[[list[View]], list[View]]
 WITH_DEPTH, WITHOUT = WALK, walk(depth=False)
@@ -181,9 +181,7 @@ def _another_camera(views: list[View]) -> list[View]:
         (_senseless_depth, WITH_DEPTH, 17.0),
     ],
 )
-def test_hard_footage_leaves_a_finite_field_that_shows_what_it_learned(
-    spoil: Spoil, footage: list[View], least_db: float
-) -> None:
+def test_hard_footage_leaves_a_finite_field_that_shows_what_it_learned(spoil, footage, least_db) -> None:
     """least_db: of frames that were learned, at their corrections. ``test_carried_field`` has what else befalls one."""
     footage = spoil(footage[::2])
     field = ScanField(_settings())

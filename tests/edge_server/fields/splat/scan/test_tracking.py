@@ -14,8 +14,8 @@ from edge_server.fields.splat.scan import settings as tuned
 from edge_server.fields.splat.scan.plausibility import moved_in, troubles, unturned
 from edge_server.fields.splat.scan.tracking import Rendered, align, gray
 from freshfield.geometry import Pinhole, se3_inverse, so3_exp
-from tests.edge_server.fields.common.cameras.test_constant_correction import arm_poses
-from tests.edge_server.fields.splat.scan.walk import LENS
+from tests.edge_server.fields.common.cameras.test_pose_corrections import arm_poses
+from tests.edge_server.fields.splat.scan.carried import LENS
 
 WALL = Pinhole.from_fov(160, 120, 60.0)
 

@@ -22,7 +22,7 @@ from edge_server.fields import Budget, View
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from freshfield.geometry import world_rays
 from tests.edge_server.fields.scenes import psnr, ring, seen
-from tests.edge_server.fields.splat.layers.depth.moving_ball import FRAME_S, SMALL, measured, place_m
+from tests.edge_server.fields.splat.layers.ball import FRAME_S, SMALL, measured, place_m
 
 pytestmark = [pytest.mark.stability, pytest.mark.usefixtures("shown_soon")]
 RIG = ring(9)
@@ -37,10 +37,6 @@ PATCHES = np.kron(np.random.default_rng(4).random((12, 12)) < 0.4, np.ones((4, 4
 Array = NDArray[np.float64]
 World = Callable[[View, Array], View]
 """What a camera sees, with depth, where the ball is at a place."""
-
-
-def _plain(view: View, ball_m: Array) -> View:
-    return measured(view, *seen(view.intrinsics, view.camera_to_world, ball_m))
 
 
 def _in_plane(view: View, y: float) -> Array:
@@ -88,7 +84,7 @@ class Case:
 
     recovers_s: float
 
-    world: World = _plain
+    world: World = lambda view, ball_m: measured(view, *seen(view.intrinsics, view.camera_to_world, ball_m))
     placed: Callable[[int, View], View] = lambda k, view: view
     told: Callable[[int, int, View], View] = lambda k, frame, view: view
     gains_db: float | None = None

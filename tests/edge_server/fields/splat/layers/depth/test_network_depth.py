@@ -16,7 +16,7 @@ from edge_server.fields.splat.layers.depth.network_depth import NetworkDepth
 from edge_server.fields.splat.layers.depth.surfaces import Surface
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from tests.edge_server.fields.small import same_state
-from tests.edge_server.fields.splat.layers.depth.moving_ball import SMALL, Rig
+from tests.edge_server.fields.splat.layers.ball import SMALL, Rig
 from tests.edge_server.fields.splat.layers.depth.room_plates import relative_of, room_plates
 from tests.edge_server.fields.splat.layers.depth.test_plate_stereo import filled
 

@@ -1,7 +1,8 @@
-"""Depth plates drawn from other places: what is seen, where, in which color; virtual plates; what cameras share."""
+"""Depth plates drawn from other places; large planes, virtual plates, and what cameras share."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,12 +16,14 @@ from edge_server.fields.splat.kernels.project import COLOR, QUATERNION, SCALE
 from edge_server.fields.splat.layers.depth import settings
 from edge_server.fields.splat.layers.depth.depth_plate import smooth
 from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
+from edge_server.fields.splat.layers.depth.large_planes import Plane, continued, large_planes
 from edge_server.fields.splat.layers.depth.overlaps import contradicting, exposures
 from edge_server.fields.splat.layers.depth.surfaces import Surface, SurfaceScene
 from edge_server.fields.splat.layers.depth.virtual_plates import beside_silhouettes, poses_between, virtual_plates
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import Pinhole, look_at, quaternion_to_matrix
 from tests.edge_server.fields.scenes import psnr, ring, seen
+from tests.edge_server.fields.splat.layers.depth.room_plates import room_surfaces
 
 POOL = CallerPool()
 
@@ -139,3 +142,48 @@ def test_exposures_follow_from_what_cameras_share() -> None:
     np.testing.assert_allclose(found, np.broadcast_to(logs[:, None], (4, 3)), atol=0.03)
     blind = replace(surface_of(CAMERAS[1]), inverse=np.zeros_like(SURFACES[1].inverse))
     np.testing.assert_allclose(exposures([surface_of(CAMERAS[0], gain=0.8), blind])[:, 0], [-0.112, 0.112], atol=0.03)
+
+
+def _planes(surfaces: Sequence[Surface]) -> list[Plane]:
+    return large_planes(surfaces, np.random.default_rng(0))
+
+
+def _opened(surface: Surface) -> Surface:
+    inverse = surface.inverse.copy()
+    inverse[:24] = 0.0
+    return replace(surface, inverse=inverse)
+
+
+def test_floor_and_walls_are_found_and_no_table() -> None:
+    planes = _planes(room_surfaces(4, 64))
+    floor = planes[0]
+    np.testing.assert_allclose(floor.normal, (0.0, 0.0, 1.0), atol=0.05)
+    assert abs(floor.point[2]) < 0.05
+    for _, other in planes[1:]:
+        assert np.abs(other).max() > 2.5  # walls and ceiling stand three meters apart from the middle; furniture within
+
+
+def test_what_has_no_depth_gets_that_of_the_nearest_plane_and_the_rest_stays() -> None:
+    surfaces = room_surfaces(4, 64)
+    planes = _planes(surfaces)
+    right = []
+    for surface in surfaces:
+        found = continued(_opened(surface), planes)
+        np.testing.assert_array_equal(found.inverse[24:], surface.inverse[24:])
+        unknown = replace(_opened(surface), known=np.zeros_like(surface.known))
+        assert not continued(unknown, planes).inverse[:24].any()
+        right.append(np.abs(found.inverse[:24] / surface.inverse[:24] - 1.0) < 0.05)
+    assert np.mean(right) > 0.6
+
+
+@pytest.mark.stability
+def test_no_depth_one_point_and_one_wall() -> None:
+    surface = room_surfaces(4, 64)[0]
+    nothing = replace(surface, inverse=np.zeros_like(surface.inverse))
+    assert _planes([nothing]) == [] and (continued(nothing, []).inverse == 0).all()
+    point = nothing.inverse.copy()
+    point[5, 5] = 0.5
+    assert np.isfinite(continued(nothing, _planes([replace(nothing, inverse=point)])).inverse).all()
+    wall = replace(surface, inverse=np.full_like(surface.inverse, 0.5), slope=np.zeros_like(surface.slope))
+    (plane,) = _planes([wall])
+    np.testing.assert_allclose(np.abs(plane.normal @ surface.pose[:3, 2]), 1.0, atol=1e-6)
