@@ -40,26 +40,23 @@ def test_json_is_replaced_whole_by_any_number_of_threads(tmp_path):
     assert [writer.exception() for writer in writers] == [None] * 4 and os.listdir(tmp_path) == ["status.json"]
 
 
-@pytest.mark.parametrize(
-    ("option", "place", "said"),
-    [
+def test_a_place_that_cannot_be_written_is_refused_with_its_option(tmp_path, capsys, monkeypatch):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link").symlink_to("nowhere")
+    monkeypatch.setattr(os, "access", lambda path, _: path.name != "folder")
+    for option, place, said in (
         (out_folder, "file/x", "file is a file, not a folder: name another"),
         (out_folder, "link", "link is a file, not a folder: name another"),
         (out_file, "folder", "folder is a folder, not a file: name another"),
         (out_folder, "folder/new/x", "folder cannot be written to: name another place"),
         (out_folder, "a\udcff", r"a\udcff' is not UTF-8: name another"),
-    ],
-)
-def test_a_place_that_cannot_be_written_is_refused_with_its_option(tmp_path, capsys, monkeypatch, option, place, said):
-    (tmp_path / "file").touch()
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "link").symlink_to("nowhere")
-    monkeypatch.setattr(os, "access", lambda path, _: path.name != "folder")
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--out", type=option)
-    refused(SystemExit, "2", parser.parse_args, ["--out", str(tmp_path / place)])
-    told = capsys.readouterr().err
-    assert "argument --out: " in told and f"{tmp_path}/{said}" in told
+    ):
+        parser = argparse.ArgumentParser()
+        parser.add_argument("--out", type=option)
+        refused(SystemExit, "2", parser.parse_args, ["--out", str(tmp_path / place)])
+        told = capsys.readouterr().err
+        assert "argument --out: " in told and f"{tmp_path}/{said}" in told
 
 
 def test_places_that_are_there_or_not_yet_can_be_written(tmp_path, monkeypatch):

@@ -79,7 +79,8 @@ def test_blackout_loses_what_is_on_the_way_during_a_window():
     for blackout, at_ms, lost in (
         # 79 arrives at 99; 100 and later overlap the window; 220 starts after it.
         ({"windows_ms": [[100, 200]]}, (0, 79, 100, 150, 190, 220), {100, 150, 190}),
-        ({"every_ms": 100, "for_ms": 10}, (0, 69, 95, 160, 185, 350), {95, 185}),
+        ({"windows_ms": [[100, 200]]}, (80, 200), {80}),  # the first arrives as it begins, the second starts as it ends
+        ({"every_ms": 100, "for_ms": 10}, (0, 69, 95, 160, 185, 270, 350), {95, 185, 270}),
         ({"windows_ms": [[0, 1000]], "cameras": ["another"]}, (0,), set()),
     ):
         found = fates(link({"blackout": blackout}, delay_ms=20), at_ms)
