@@ -1,13 +1,18 @@
-"""Free ports, small worlds, waits for other threads and processes, and the work that a refusal takes."""
+"""Free ports, small worlds, waits for other threads and processes, refusals and the work that one takes, turned
+pictures."""
 
 from __future__ import annotations
 
+import asyncio
 import socket
+import struct
 import sys
 import time
 from collections.abc import Callable
 from types import FrameType
 from typing import Any
+
+import pytest
 
 MOST_MS = 50.0
 """Of the work before a refusal: ingest answers every camera on one thread."""
@@ -33,6 +38,35 @@ def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], time
         assert time.monotonic() < end, what if isinstance(what, str) else what()
         time.sleep(0.02)
     return value
+
+
+async def until(condition: Callable[[], Any], timeout_s: float = 30.0) -> None:
+    """Wait on the event loop until ``condition`` holds; TimeoutError if it does not."""
+    async with asyncio.timeout(timeout_s):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+def refused(error: Any, message: str, call: Callable[..., Any], /, *args: Any, **options: Any) -> Any:
+    """The ``error`` with which ``call`` refuses, in one line that matches ``message``."""
+    with pytest.raises(error, match=message or None) as raised:
+        call(*args, **options)
+    assert "\n" not in str(raised.value)
+    return raised.value
+
+
+def refusal(capsys: pytest.CaptureFixture[str], main: Callable[[list[str]], int], *words: object) -> str:
+    """The line with which a command refuses, with exit code 2."""
+    assert main([str(word) for word in words]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    return said
+
+
+def turned_jpeg(data: bytes, orientation: int) -> bytes:
+    """A JPEG with an orientation in its Exif data."""
+    tag = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0) + b"\0\0\0\0"
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(tag) + 2) + tag + data[2:]
 
 
 def work_ms(call: Callable[[], Any]) -> float:

@@ -1,7 +1,5 @@
 """A camera that measures depth with each frame."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np
@@ -18,16 +16,10 @@ class DepthSource(Source):
     """contents: see ``Source``. unit: meters a count. error: raised instead of giving depth. depth: further keys of
     each shot's ``DepthImage``, whose counts are the shot's number + 1."""
 
-    def __init__(
-        self,
-        camera: str,
-        contents: int | None = None,
-        fps: float = 10.0,
-        unit: float = 0.001,
-        error: Exception | None = None,
-        **depth,
-    ) -> None:
-        self.camera, self.contents, self.fps, self.intrinsics = camera, contents, Fraction(fps), LENS
+    fps, intrinsics = Fraction(10), LENS
+
+    def __init__(self, camera: str, contents: int | None = None, unit=0.001, error: Exception | None = None, **depth):
+        self.camera, self.contents = camera, contents
         self._unit, self._error, self._depth = unit, error, depth
 
     def content(self, tick: int) -> int:

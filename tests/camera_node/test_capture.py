@@ -1,7 +1,5 @@
 """When captures are due; the cache and the outbox: bounded, and honest about every frame."""
 
-from __future__ import annotations
-
 import asyncio
 from fractions import Fraction
 from itertools import pairwise
@@ -18,11 +16,10 @@ from camera_node.sources.base import Shot
 from freshfield import ledger
 from freshfield.clock import VirtualClock
 from freshfield.frame import Frame
-from freshfield.geometry import Pinhole, Pose
-from tests.camera_node.depth_source import DepthSource
+from freshfield.geometry import Pinhole
+from tests.camera_node.depth_source import LENS, POSE, DepthSource
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
-
-POSE, LENS = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Pinhole.from_fov(8, 8, 60)
+from tests.support import refused
 
 
 def test_the_cache_never_exceeds_its_bound_and_keeps_what_it_has():
@@ -78,7 +75,7 @@ def test_depth_is_cached_encoded_and_its_bytes_count():
     ("wrong", "message"),
     [
         ({"after_image_ns": 10**11}, "100 s after its image"),
-        ({"intrinsics": LENS}, "a lens of"),
+        ({"intrinsics": Pinhole.from_fov(8, 8, 60)}, "a lens of"),
         ({"unit": float("nan")}, "nan m a count is not within"),
         ({"error": OSError("depth/007.png: no such file")}, "depth/007.png: no such file"),
     ],
@@ -107,8 +104,7 @@ async def test_the_outbox_keeps_the_newest_and_books_each_frame(tmp_path):
         box.put(frame(k))
     await box.wait_frame()
     assert box.take().sequence == 3 and box.waiting == 0
-    with pytest.raises(LookupError):
-        box.take()
+    refused(LookupError, "", box.take)
     box.record(3, "answered", "accepted")
     with pytest.raises(TimeoutError):
         async with asyncio.timeout(0.02):

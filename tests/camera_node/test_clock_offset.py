@@ -1,17 +1,15 @@
 """The estimate of another machine's clock."""
 
-from __future__ import annotations
-
 import asyncio
 from unittest.mock import AsyncMock
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from camera_node import clock_offset
 from camera_node.clock_offset import ClockSync, OffsetEstimator
 from freshfield.clock import WallClock
+from tests.support import refused
 
 MS = 1_000_000
 
@@ -84,7 +82,6 @@ def test_exchanges_follow_each_other_quickly_at_first_and_four_replace_an_old_pe
 
     monkeypatch.setattr(clock_offset, "exchange", exchanged)
     monkeypatch.setattr(clock_offset.asyncio, "sleep", pause)
-    with pytest.raises(asyncio.CancelledError):
-        asyncio.run(sync.run())
+    refused(asyncio.CancelledError, "", asyncio.run, sync.run())
     assert pauses == [0.05, 0.05, 0.05, 1.0, 1.0, 1.0, 0.05, 0.05, 0.05, 1.0, 1.0]
     assert offsets == [0] * 9 + [hour_ns] * 2

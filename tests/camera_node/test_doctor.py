@@ -1,11 +1,9 @@
 """The doctor finds what is wrong, of depth and of poses too, names what to do, and moves nothing."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -28,11 +26,12 @@ from freshfield.depth import DepthImage
 from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole, Pose, so3_exp
 from freshfield.scenario import load, parse
 from freshfield.transport import Transport
-from tests.camera_node.robot.arm.simulated import simulated_arm
+from tests.camera_node.depth_source import POSE
+from tests.camera_node.robot.arm.simulated import simulated_arm, write_cell
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
-from tests.camera_node.sources.devices.mjpeg import NetworkCamera
-from tests.camera_node.sources.devices.test_live import CALIBRATION
+from tests.camera_node.sources.devices.mjpeg import CALIBRATION, NetworkCamera, camera_file
 from tests.integration.peer import Peer
+from tests.support import refused
 
 
 def examined(capsys, *arguments):
@@ -43,13 +42,9 @@ def examined(capsys, *arguments):
     return code, {part["part"]: (part["ok"], part["said"]) for part in found["parts"]}
 
 
-def cell_at(folder: Path, host: str, **arm) -> str:
-    data = yaml.safe_load(load("cell").path.read_text())
-    mount = load("cell").path.parent / data["source"]["arm"]["cameras"]["hand"]
-    data["source"]["arm"].update({"host": host, "cameras": {"hand": str(mount)}, **arm})
-    file = folder / "cell.yaml"
-    file.write_text(yaml.safe_dump(data))
-    return str(file)
+def cell_at(folder: Path, host: str, **changed) -> str:
+    mount = load("cell").path.parent / load("cell").source["arm"]["cameras"]["hand"]
+    return str(write_cell(folder, host, **{"cameras": {"hand": str(mount)}, **changed}))
 
 
 def test_without_a_scenario_the_machine_is_examined(capsys, tmp_path):
@@ -71,8 +66,7 @@ def test_an_arm_that_is_well(capsys, tmp_path, host):
 
 
 def test_a_tour_that_leaves_a_side_out_and_the_examples_calibration_are_wrong(capsys, tmp_path, host):
-    path = {**load("cell").source["arm"]["path"], "radius_m": 0.55}
-    code, parts = examined(capsys, cell_at(tmp_path, host, path=path, simulated=False))
+    code, parts = examined(capsys, cell_at(tmp_path, host, path={"radius_m": 0.55}, simulated=False))
     ok, said = parts["arm's path"]
     assert code == 1 and ok is False
     assert 3 <= int(re.search(r"reaches (\d+) of 51 viewpoints: change radius_m", said)[1]) < 0.6 * 51
@@ -100,20 +94,10 @@ def test_every_fault_is_named_in_one_call(capsys, monkeypatch, tmp_path, host):
         assert parts[part][0] is False and said in parts[part][1], part
 
 
-def bench_with(folder: Path, camera: NetworkCamera, **source) -> str:
-    """A scenario with one calibrated network camera, eye."""
-    (folder / "calibration.json").write_text(json.dumps(CALIBRATION))
-    given = {"kind": "camera", "devices": {"eye": camera.address}, "calibration": "calibration.json"}
-    given |= {"first_frame_s": 10, **source}
-    (folder / "bench.yaml").write_text(yaml.safe_dump({"cameras": {"ids": ["eye"]}, "source": given}))
-    return str(folder / "bench.yaml")
-
-
 def test_a_camera_is_opened_and_watched(capsys, tmp_path):
-    camera = NetworkCamera(WallClock())
-    file = bench_with(tmp_path, camera, fps=15)
-    _, parts = examined(capsys, file)
-    camera.close()
+    with closing(NetworkCamera(WallClock())) as camera:
+        file = str(camera_file(tmp_path, camera.address, fps=15, first_frame_s=10))
+        _, parts = examined(capsys, file)
     assert parts["camera eye"][0] and parts["camera eye"][1].startswith("64 x 48, ")
     assert parts["camera eye"][1].endswith("stamped by their arrival, less latency_ms; its lens as calibrated")
     assert parts["calibration"] == (True, "calibration.json: 1 cameras")
@@ -125,9 +109,8 @@ def test_a_camera_is_opened_and_watched(capsys, tmp_path):
 
 @pytest.mark.parametrize("asked, ok", [(40, False), (4, True)])
 def test_a_camera_at_a_fraction_of_the_rate_that_was_asked_for_is_wrong(capsys, tmp_path, asked, ok):
-    camera = NetworkCamera(WallClock(), fps=12.0)
-    _, parts = examined(capsys, bench_with(tmp_path, camera, fps=asked))
-    camera.close()
+    with closing(NetworkCamera(WallClock(), fps=12.0)) as camera:
+        _, parts = examined(capsys, str(camera_file(tmp_path, camera.address, fps=asked, first_frame_s=10)))
     found, said = parts["camera eye"]
     assert found is ok and 2.0 < float(re.search(r"([\d.]+) frames a second", said)[1]) < 16.0
     assert ok or f"of the {asked} asked: is it too dark" in said
@@ -164,7 +147,6 @@ def test_what_fixed_cameras_see_is_reckoned_and_drawn(capsys, tmp_path):
     assert said.startswith("not reckoned: the cameras move, ")
 
 
-NOWHERE = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 APART = np.eye(4)
 APART[:3, :3], APART[:3, 3] = so3_exp([0.0, 0.05, 0.0]), (-0.03, 0.0, 0.01)
 
@@ -221,7 +203,7 @@ def test_right_depth_is_described():
         (lambda v: recounted(v, np.zeros_like), "100% without depth: is the scene within the sensor's range"),
         (lambda v: recounted(v, lambda c: np.where(c > 0, 8000 - c, 0)), "are near and far exchanged"),
         (lambda v: recounted(v, lambda c: c[:, ::-1]), "is the pose, a lens"),
-        (lambda v: replace(v, pose=NOWHERE), "is the pose, a lens"),
+        (lambda v: replace(v, pose=POSE), "is the pose, a lens"),
     ],
     ids=["feet", "constant", "holes", "inverted", "mirrored", "nowhere"],
 )
@@ -307,8 +289,7 @@ def test_other_units_other_axes_and_poses_without_rotation_are_said():
         (still, "lack the rotation"),
         (right @ OPENGL_TO_OPENCV, "axes"),
     ):
-        with pytest.raises(ValueError, match=message):
-            compared(wrong)
+        refused(ValueError, message, compared, wrong)
 
 
 @pytest.mark.stability
@@ -332,5 +313,4 @@ def test_a_recording_is_read_as_it_is_streamed(tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(data))
     cameras = {"ids": ["hand", "kept"], "held_out": ["kept"], "held_out_every": 8}
     found = parse({"cameras": cameras, "source": {"kind": "transforms", "data": str(tmp_path)}}, tmp_path / "s.yaml")
-    with pytest.raises(ValueError, match="ms late"):
-        pose_check.check(found, source_config(found), None)
+    refused(ValueError, "ms late", pose_check.check, found, source_config(found), None)

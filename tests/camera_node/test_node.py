@@ -1,7 +1,5 @@
 """A node as a whole: cameras that wait keep no other waiting, and its end says whether anything was taken."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from fractions import Fraction
@@ -19,14 +17,13 @@ from camera_node.settings import CameraConfig
 from camera_node.sources.base import Shot, Source
 from freshfield.clock import VirtualClock
 from freshfield.frame import Frame
-from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import load
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
-from tests.camera_node.depth_source import DepthSource
-from tests.integration.peer import Answer, Peer, answer, silence
+from tests.camera_node.depth_source import LENS, POSE, DepthSource
+from tests.integration.peer import Peer, answer, silence
+from tests.support import until
 
-POSE, LENS = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Pinhole.from_fov(8, 8, 60)
 NOBODY = "127.0.0.1:1"
 
 
@@ -40,7 +37,7 @@ class Eye(Source):
         if self._until is not None:
             self._until.wait(10.0)
             raise ValueError("the camera is gone")
-        return Shot(np.zeros((8, 8, 3), np.uint8), POSE, LENS)
+        return Shot(np.zeros((24, 32, 3), np.uint8), POSE, LENS)
 
 
 def node_of(sources: list[Source], to: str = NOBODY, seconds: float | None = None) -> Node:
@@ -52,9 +49,7 @@ async def test_cameras_that_wait_for_their_devices_keep_no_other_waiting():
     gone = threading.Event()
     node = node_of([Eye("cam01", gone), Eye("cam02", gone), Eye("cam03")])
     running = asyncio.ensure_future(node.run())
-    async with asyncio.timeout(8.0):
-        while not node.outboxes or node.outboxes["cam03"].counts["captured"] < 5:
-            await asyncio.sleep(0.01)
+    await until(lambda: node.outboxes and node.outboxes["cam03"].counts["captured"] >= 5, 8.0)
     waiting = gone.is_set() + sum(node.outboxes[name].counts["captured"] for name in ("cam01", "cam02"))
     gone.set()
     node.stop()
@@ -79,7 +74,7 @@ async def test_frames_that_go_without_their_depth_are_counted():
         (silence, None),
     ],
 )
-async def test_the_end_says_if_every_frame_was_refused(respond: Answer, failure: str | None):
+async def test_the_end_says_if_every_frame_was_refused(respond, failure):
     peer = await Peer(respond=respond).start()
     node = node_of([Eye("cam01")], peer.address)
     running = asyncio.ensure_future(node.run())

@@ -1,14 +1,11 @@
 """The source section and the command: what they take, and one clear line for what they do not."""
 
-from __future__ import annotations
-
 from pathlib import Path
-
-import pytest
 
 from camera_node.cli import main
 from camera_node.settings import WorldConfig, find_data, source_config
 from freshfield.scenario import ScenarioError, parse
+from tests.support import refusal, refused
 
 VIDEO = {"kind": "video", "data": "x"}
 
@@ -25,9 +22,8 @@ def test_what_is_given_reaches_the_source():
     assert config(kind="camera", devices={"a": 0, "b": "/dev/video2"}).devices == {"a": 0, "b": "/dev/video2"}
 
 
-@pytest.mark.parametrize(
-    ("source", "message"),
-    [
+def test_errors_name_file_and_key():
+    for source, message in (
         ({}, "source.kind: expected one of world, transforms, video"),
         ({"kind": "wrold"}, "source.kind: .*'wrold'"),
         ({"kind": "world", "fbs": 3}, "source.fbs: unknown key; did you mean 'fps'"),
@@ -36,36 +32,29 @@ def test_what_is_given_reaches_the_source():
         ({"kind": "transforms", "data": "x", "background": "keep"}, "use png"),
         ({**VIDEO, "trajectory": {"files": {}, "start_s": 1e300}}, "trajectory.start_s: expected"),
         ({"kind": "world", "quality": 10**400}, "source.quality: expected .*1 to 100, got 10{99}"),
-    ],
-)
-def test_errors_name_file_and_key(source, message):
-    with pytest.raises(ScenarioError, match=message) as error:
-        config(**source)
-    assert str(error.value).startswith("s.yaml: source") and "\n" not in str(error.value)
+    ):
+        assert str(refused(ScenarioError, message, config, **source)).startswith("s.yaml: source")
 
 
 def test_data_is_found_below_the_folder_that_was_given(tmp_path, monkeypatch):
     scenario = parse({"cameras": {"count": 2}}, Path("s.yaml"))
     (tmp_path / "set").mkdir()
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
-    with pytest.raises(ScenarioError, match="--data DIR or set FRESHFIELD_DATA"):
-        find_data("set", scenario, None)
+    refused(ScenarioError, "--data DIR or set FRESHFIELD_DATA", find_data, "set", scenario, None)
     assert find_data("set", scenario, tmp_path) == tmp_path / "set"
     assert find_data(str(tmp_path / "set"), scenario, None) == tmp_path / "set"
     monkeypatch.setenv("FRESHFIELD_DATA", str(tmp_path))
     assert find_data("set", scenario, None) == tmp_path / "set"
-    with pytest.raises(ScenarioError, match="does not exist"):
-        find_data("other", scenario, None)
+    refused(ScenarioError, "does not exist", find_data, "other", scenario, None)
     # What lies beside the scenario comes first.
     (tmp_path / "mine/set").mkdir(parents=True)
     mine = parse({"cameras": {"count": 2}}, tmp_path / "mine/s.yaml")
     assert find_data("set", mine, tmp_path) == tmp_path / "mine/set"
 
 
-def fails(capsys, *arguments: str) -> str:
-    assert main(list(arguments)) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("camera-node: ") and said.count("\n") == 1
+def fails(capsys, *words: str) -> str:
+    said = refusal(capsys, main, *words)
+    assert said.startswith("camera-node: ")
     return said
 
 
@@ -81,8 +70,7 @@ def test_mistakes_are_one_line_and_exit_code_2(capsys, tmp_path, monkeypatch):
         assert "--seconds: expected" in fails(capsys, "run", "room", "--all", "--seconds", wrong, *to)
     assert "cannot read" in fails(capsys, "run", "room", "--all", "--token-file", str(tmp_path / "no"), *to)
     (tmp_path / "file").write_text("")
-    with pytest.raises(SystemExit, match="2"):
-        main(["run", "tile", "--all", "--out", str(tmp_path / "file/x"), *to])
+    refused(SystemExit, "2", main, ["run", "tile", "--all", "--out", str(tmp_path / "file/x"), *to])
     assert "--out: " in capsys.readouterr().err
     (tmp_path / "bad.yaml").write_text("cameras: {count: 20}\nsource: {kind: world, scene: room}\n")
     assert "bad.yaml: source: " in fails(capsys, "run", str(tmp_path / "bad.yaml"), "--all", *to)

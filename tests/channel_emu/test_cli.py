@@ -1,10 +1,7 @@
-from __future__ import annotations
-
 import json
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +14,7 @@ from channel_emu.model import notation
 from channel_emu.model.presets import PRESETS
 from freshfield import ledger
 from tests.channel_emu.test_testing import HELLO, Greeter
-from tests.support import free_port
+from tests.support import free_port, refusal, refused, wait_until
 
 
 @pytest.fixture
@@ -39,7 +36,7 @@ def rows(capsys, line: str) -> dict[str, str]:
     return dict(row.rsplit(maxsplit=1) for row in capsys.readouterr().out.splitlines())
 
 
-def test_simulate_takes_the_short_notation(capsys) -> None:
+def test_simulate_takes_the_short_notation(capsys):
     rest = "--service-state modulated --discipline drop-new --cameras 3 --seconds 120 --seed 4"
     spelled = "--arrivals periodic:30ms --service exp:30ms,exp:60ms --chain mu1=1/30,mu2=1/30"
     found = simulate(capsys, f"{spelled} {rest}")
@@ -49,7 +46,7 @@ def test_simulate_takes_the_short_notation(capsys) -> None:
     assert again["mean_age_ms"] == found["mean_age_ms"]  # the same channel in other words
 
 
-def test_people_are_shown_what_there_is_to_say(capsys, scenario: Path) -> None:
+def test_people_are_shown_what_there_is_to_say(capsys, scenario):
     line = "--preset ch6 --seconds 60 --fault duplication:0.5 --fault corruption:0.25"
     found, shown = simulate(capsys, line), rows(capsys, line)
     assert found["duplicated"] == pytest.approx(0.5 * found["delivered"], rel=0.2)
@@ -62,7 +59,7 @@ def test_people_are_shown_what_there_is_to_say(capsys, scenario: Path) -> None:
     assert not {"duplicated", "corrupted", "share of state -"} & plain.keys()
 
 
-def test_presets_are_listed_with_their_mean_delays(capsys) -> None:
+def test_presets_are_listed_with_their_mean_delays(capsys):
     assert main(["presets"]) == 0
     text = capsys.readouterr().out
     assert all(f"\n{name} " in text for name in PRESETS)
@@ -71,7 +68,7 @@ def test_presets_are_listed_with_their_mean_delays(capsys) -> None:
     assert "\nswing                     82.5 " in text
 
 
-def test_the_frames_of_a_simulation_can_be_fitted(capsys, tmp_path: Path) -> None:
+def test_the_frames_of_a_simulation_can_be_fitted(capsys, tmp_path):
     frames = tmp_path / "new" / "frames.csv"
     line = f"--preset ch5 --seconds 60 --csv {frames} --fault loss:0.1 --fault"
     found = simulate(capsys, line, "duplication:{probability: 0.5}")
@@ -84,33 +81,28 @@ def test_the_frames_of_a_simulation_can_be_fitted(capsys, tmp_path: Path) -> Non
     assert fitted["parameters"]["mean_ms"]["low"] < 60 < fitted["parameters"]["mean_ms"]["high"]
 
 
-def test_spans_and_rates() -> None:
+def test_spans_and_rates():
     for text, value in (("30ms", 30), ("3s", 3000), ("250us", 0.25), ("7", 7), ("1.5min", 90_000)):
         assert notation.span_ms(text) == pytest.approx(value)
     for text, value in (("1/30ms", 1 / 30), ("1/30", 1 / 30), ("0.5/ms", 0.5), ("33/s", 0.033), ("2/1s", 0.002)):
         assert notation.rate_per_ms(text) == pytest.approx(value)
 
 
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
+def test_mistakes_get_one_line(capsys):
+    for words, why in (
         (["--arrivals", "sometimes"], "expected as-offered, periodic:30ms"),
         (["--service", "exp:30ms,det:60ms"], "expected one distribution"),
         (["--service", "trace:/no/such/file"], "cannot be read"),
         (["--frame-bytes", "9" * 400], "frame_bytes: expected 0 to"),
         (["--fault", "bandwidth:" + "9" * 400], "bandwidth.megabits_per_s: expected a number"),
         (["--scenario", "/no/such.yaml"], "/no/such.yaml"),
-    ],
-)
-def test_mistakes_get_one_line(capsys, words: list[str], why: str) -> None:
-    assert main(["simulate", *words]) == 2
-    error = capsys.readouterr().err
-    assert why in error and error.count("\n") == 1 and error.startswith("channel-emu: ")
+    ):
+        said = refusal(capsys, main, "simulate", *words)
+        assert why in said and said.startswith("channel-emu: ")
 
 
-def test_a_command_is_asked_for(capsys) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        main([])
+def test_a_command_is_asked_for(capsys):
+    refused(SystemExit, "2", main, [])
     assert "COMMAND" in capsys.readouterr().err
 
 
@@ -133,15 +125,12 @@ def ended(process: subprocess.Popen[str]) -> str:
     return out
 
 
-def test_run_as_a_process_ends_cleanly_when_told(scenario: Path, tmp_path: Path, capsys) -> None:
+def test_run_as_a_process_ends_cleanly_when_told(scenario, tmp_path, capsys):
     out, port = tmp_path / "out", free_port()
     words = ["run", str(scenario), "--listen", f"127.0.0.1:{port}", "--to", f"127.0.0.1:{free_port()}"]
     words += ["--out", str(out), "--trace", str(out / "t.jsonl")]
     with command(*words) as process:
-        deadline = time.monotonic() + 30
-        while not (out / "channel.json").exists():
-            assert process.poll() is None and time.monotonic() < deadline
-            time.sleep(0.05)
+        wait_until((out / "channel.json").exists, "no status", 30.0)
         # A second emulator on the port is told so.
         assert main(["proxy", "--to", "x:1", "--listen", f"127.0.0.1:{port}", "--no-priority"]) == 2
         assert "cannot listen on" in capsys.readouterr().err
@@ -150,7 +139,7 @@ def test_run_as_a_process_ends_cleanly_when_told(scenario: Path, tmp_path: Path,
     assert any(file.closed and file.role == "emulator" for file in ledger.read_all(out))
 
 
-def test_proxy_puts_a_service_behind_a_link_until_told() -> None:
+def test_proxy_puts_a_service_behind_a_link_until_told():
     greeter, listen = Greeter(), f"127.0.0.1:{free_port()}"
     options = ("--service", "det:30ms", "--direction", "both", "--seed", 2)
     with command("proxy", "--to", greeter.address, "--json", "--listen", listen, *options) as process:
@@ -164,9 +153,8 @@ def test_proxy_puts_a_service_behind_a_link_until_told() -> None:
 
 
 @pytest.mark.parametrize("words", ["simulate --csv", "run SCENARIO --out", "proxy --to 127.0.0.1:1 --trace"])
-def test_a_path_that_cannot_be_written_is_said_in_one_line(capsys, scenario: Path, tmp_path: Path, words: str) -> None:
+def test_a_path_that_cannot_be_written_is_said_in_one_line(capsys, scenario, tmp_path, words):
     (tmp_path / "file").write_text("")
-    with pytest.raises(SystemExit, match="2"):
-        main([*words.replace("SCENARIO", str(scenario)).split(), str(tmp_path / "file" / "x")])
+    refused(SystemExit, "2", main, [*words.replace("SCENARIO", str(scenario)).split(), str(tmp_path / "file" / "x")])
     said = capsys.readouterr().err
     assert f"argument {words.split()[-1]}: {tmp_path / 'file'} is a file, not a folder" in said

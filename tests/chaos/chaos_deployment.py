@@ -6,8 +6,6 @@ checkpoint. Each event of a frame is written to the ledger of the process that w
 counted in ``really``, so that the ledgers' accounting can be compared with what really happened.
 """
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from functools import partial

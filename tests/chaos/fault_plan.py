@@ -1,7 +1,5 @@
 """Deployments and faults drawn from a seed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

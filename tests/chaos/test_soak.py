@@ -4,8 +4,6 @@ Recovery is the time from the end of a fault until the edge has taken a frame of
 when the new process begins its ledger. Longer runs, with memory watched, are in docs/results/soak.md.
 """
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import time
@@ -60,7 +58,7 @@ def recovery_s(out: Path, kind: str, role: str, over_ns: int) -> float:
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_real_processes_recover_from_kills_and_a_stop(tmp_path: Path) -> None:
+def test_real_processes_recover_from_kills_and_a_stop(tmp_path):
     (file := tmp_path / "small.yaml").write_text(SMALL)
     found = process_set(scenarios.load(file), tmp_path, free_ports(1)[0])
     children = dict(zip(ROLES, (found.node, found.emulator, found.edge)))

@@ -1,7 +1,5 @@
 """What ``kubectl kustomize`` makes of the overlays: the few features that they use."""
 
-from __future__ import annotations
-
 import base64
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """``freshfield check-plugin``: what keeps its contract passes, and each check can fail."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +12,7 @@ from edge_server.scheduler import POLICIES, SelectionWindow
 from freshfield.settings import Settings
 from freshfield_up.cli import main
 from tests.integration.own_classes import Darker, Flat, LastFirst, Late, Turning, Youngest
+from tests.support import refusal
 
 COUNT = itertools.count()
 OWN = Path(__file__).parent.parent / "integration/own_classes.py"
@@ -128,7 +127,6 @@ def test_each_check_can_fail(kind, name, says, capsys):
 
 
 def test_what_is_not_there_is_one_line(capsys):
-    assert main(["check-plugin", "policy", "al"]) == 2
-    assert "did you mean all?" in capsys.readouterr().err
-    assert main(["check-plugin", "fault", "loss", "probability=["]) == 2
-    assert "freshfield: parameters: expected KEY=VALUE" in capsys.readouterr().err
+    assert "did you mean all?" in refusal(capsys, main, "check-plugin", "policy", "al")
+    said = refusal(capsys, main, "check-plugin", "fault", "loss", "probability=[")
+    assert "freshfield: parameters: expected KEY=VALUE" in said

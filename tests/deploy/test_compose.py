@@ -1,7 +1,5 @@
 """The compose file: what it promises about networks, checked as data."""
 
-from __future__ import annotations
-
 import re
 
 import pytest
@@ -19,7 +17,7 @@ CAMERAS = {name: s for name, s in SERVICES.items() if "camera-node" in s["comman
 BASE_IMAGE = "docker.io/library/python:3.11-slim-bookworm"
 
 
-def test_every_camera_of_the_scenario_has_its_container_and_only_the_page_is_published() -> None:
+def test_every_camera_of_the_scenario_has_its_container_and_only_the_page_is_published():
     scenario = load(ROOT / "deploy" / "scenarios" / "quad.yaml")
     assert set(CAMERAS) == set(scenario.cameras)
     for name, service in CAMERAS.items():
@@ -28,7 +26,7 @@ def test_every_camera_of_the_scenario_has_its_container_and_only_the_page_is_pub
     assert published == {"edge": ["127.0.0.1:8080:8080"]}
 
 
-def test_the_only_way_from_a_camera_to_the_edge_is_the_emulator() -> None:
+def test_the_only_way_from_a_camera_to_the_edge_is_the_emulator():
     edge, emulator = set(SERVICES["edge"]["networks"]), set(SERVICES["emulator"]["networks"])
     assert edge and edge <= set(COMPOSE["networks"])
     for name, service in CAMERAS.items():
@@ -41,7 +39,7 @@ def test_the_only_way_from_a_camera_to_the_edge_is_the_emulator() -> None:
     assert not any("network_mode" in s or "links" in s for s in SERVICES.values())
 
 
-def test_what_listens_unprotected_says_so_and_the_secure_file_protects_it() -> None:
+def test_what_listens_unprotected_says_so_and_the_secure_file_protects_it():
     secure = yaml.safe_load((ROOT / "deploy" / "compose.secure.yaml").read_text())["services"]
     assert secure.keys() == SERVICES.keys()
     tls = ["--tls-cert", "/keys/cert.pem", "--tls-key", "/keys/key.pem", "--tls-ca", "/keys/ca.pem"]
@@ -56,7 +54,7 @@ def test_what_listens_unprotected_says_so_and_the_secure_file_protects_it() -> N
         assert (check is None) == (name in CAMERAS)
 
 
-def test_each_service_writes_to_volumes_of_its_own_and_to_nothing_else() -> None:
+def test_each_service_writes_to_volumes_of_its_own_and_to_nothing_else():
     mounted = [volume for service in SERVICES.values() for volume in service["volumes"]]
     assert [v for v in mounted if v.endswith(":ro")] == ["emulator:/emulator:ro"], "read by another one"
     writable = [v.split(":")[0] for v in mounted if not v.endswith(":ro")]
@@ -73,7 +71,7 @@ def test_each_service_writes_to_volumes_of_its_own_and_to_nothing_else() -> None
 
 
 @pytest.mark.parametrize("name", ["camera", "edge"])
-def test_an_image_runs_as_nobody_in_particular(name: str) -> None:
+def test_an_image_runs_as_nobody_in_particular(name):
     text = (ROOT / "deploy" / f"{name}.Dockerfile").read_text()
     stages = text.split("\nFROM ")
     assert stages[0].endswith(f"\nARG BASE={BASE_IMAGE}"), "make images puts a digest here"
@@ -85,7 +83,7 @@ def test_an_image_runs_as_nobody_in_particular(name: str) -> None:
         assert (ROOT / path).exists(), f"{name}.Dockerfile copies {path}, which is gone"
 
 
-def test_the_edges_image_compiles_the_kernels_of_a_field_that_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_edges_image_compiles_the_kernels_of_a_field_that_there_is(monkeypatch):
     (line,) = re.findall(r"^RUN freshfield (.*)$", (ROOT / "deploy" / "edge.Dockerfile").read_text(), re.MULTILINE)
     compiled = list[object]()
     for kind in (LayeredField, CarriedField):

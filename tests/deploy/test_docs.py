@@ -1,7 +1,5 @@
 """The documentation: links resolve, commands and files exist."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import re
@@ -42,13 +40,13 @@ def of_today(page: Path) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_relative_links_resolve(page: Path) -> None:
+def test_relative_links_resolve(page):
     """Anchors are checked by ``make docs``."""
     for link in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
         assert "://" in link or (page.parent / link).exists(), f"{page}: {link}"
 
 
-def test_every_page_is_in_the_site_s_navigation_and_the_readme_is_short() -> None:
+def test_every_page_is_in_the_site_s_navigation_and_the_readme_is_short():
     words, lines = len(README.read_text().split()), len(README.read_text().splitlines())
     assert words <= 1200 and lines <= 160
     shown = (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2]
@@ -58,7 +56,7 @@ def test_every_page_is_in_the_site_s_navigation_and_the_readme_is_short() -> Non
 
 
 @pytest.mark.parametrize("page", CURRENT)
-def test_commands_exist_with_the_options_they_are_given(page: Path) -> None:
+def test_commands_exist_with_the_options_they_are_given(page):
     for code in code_of(of_today(page)):
         called = rf"(?<!import )\b({'|'.join(site_pages.PROGRAMS)}) ([^|;&`]+)"
         for program, rest in re.findall(called, re.sub(r"\s#.*", "", code)):
@@ -73,7 +71,7 @@ def test_commands_exist_with_the_options_they_are_given(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", CURRENT)
-def test_files_and_modules_that_are_named_exist(page: Path) -> None:
+def test_files_and_modules_that_are_named_exist(page):
     for code in code_of(of_today(page)):
         for path in re.findall(rf"(?<![\w/.-])((?:{'|'.join(TOP)})/[\w./*@-]*)", code):
             test = re.search(rf"{re.escape(path)}::(\w+)", code)
@@ -98,7 +96,7 @@ def defaults(program: str) -> dict[str, str]:
     return found
 
 
-def test_each_command_sends_to_where_the_next_one_listens() -> None:
+def test_each_command_sends_to_where_the_next_one_listens():
     emulator, edge = defaults("channel-emu"), defaults("edge-server")
     assert emulator["--to"] == edge["--listen"] != emulator["--listen"]
     # A camera is always told where to send: its examples name the emulator.

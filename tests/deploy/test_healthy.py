@@ -1,12 +1,9 @@
 """The containers' health check against a real server and real files."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time
 from concurrent import futures
-from pathlib import Path
 
 import grpc
 import pytest
@@ -25,7 +22,7 @@ def healthy(*words: str, camera: str | None = None) -> bool:
         return health_check.main() == 0
 
 
-def test_a_server_is_healthy_while_it_says_so() -> None:
+def test_a_server_is_healthy_while_it_says_so():
     server = grpc.server(futures.ThreadPoolExecutor(1))
     servicer = health.HealthServicer()
     health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
@@ -41,7 +38,7 @@ def test_a_server_is_healthy_while_it_says_so() -> None:
     assert not healthy("--serving", f"127.0.0.1:{port}")
 
 
-def test_a_node_is_healthy_while_its_own_status_is_fresh(tmp_path: Path) -> None:
+def test_a_node_is_healthy_while_its_own_status_is_fresh(tmp_path):
     assert not healthy("--node", str(tmp_path))
     (tmp_path / "node-cam01.json").write_text("{}")
     assert healthy("--node", str(tmp_path)) and healthy("--node", str(tmp_path), camera="cam01")

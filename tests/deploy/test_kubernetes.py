@@ -1,8 +1,6 @@
 """deploy/kubernetes: valid by the published schemas, every name refers to what there is, and only the emulator reaches
 the edge."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path
@@ -51,7 +49,7 @@ def pods(documents: list[Document]) -> dict[str, Document]:
     return {name: d["spec"]["template"] for name, d in of(documents, "StatefulSet", "Deployment").items()}
 
 
-def test_they_follow_the_published_schemas(documents: list[Document]) -> None:
+def test_they_follow_the_published_schemas(documents):
     validator = pytest.importorskip("kubernetes_validate", reason="kubernetes-validate is not installed (extra dev)")
     for document in documents:
         validator.validate(document, SCHEMAS, strict=True)
@@ -61,9 +59,7 @@ def test_they_follow_the_published_schemas(documents: list[Document]) -> None:
         validator.validate(broken, SCHEMAS, strict=True)
 
 
-def test_a_pod_for_each_camera_and_commands_that_their_programs_take(
-    monkeypatch: pytest.MonkeyPatch, scene: str, documents: list[Document]
-) -> None:
+def test_a_pod_for_each_camera_and_commands_that_their_programs_take(monkeypatch, scene, documents):
     (config,) = of(documents, "ConfigMap").values()
     assert config["data"] == {"SCENARIO": scene}
     cameras = load(scene).cameras
@@ -87,7 +83,7 @@ def test_a_pod_for_each_camera_and_commands_that_their_programs_take(
     assert container["env"][0]["name"] == "INDEX"
 
 
-def test_the_emulator_is_the_only_way_from_a_camera_to_the_edge(documents: list[Document]) -> None:
+def test_the_emulator_is_the_only_way_from_a_camera_to_the_edge(documents):
     policies = of(documents, "NetworkPolicy")
     labels = {name: template["metadata"]["labels"] for name, template in pods(documents).items()}
     denied = policies["default-deny"]["spec"]
@@ -113,7 +109,7 @@ def test_the_emulator_is_the_only_way_from_a_camera_to_the_edge(documents: list[
     assert ways == {("camera", "emulator", 7001), ("emulator", "edge", 7000), ("edge", "emulator", 7001)}
 
 
-def test_pods_are_confined_limited_and_watched(documents: list[Document]) -> None:
+def test_pods_are_confined_limited_and_watched(documents):
     (namespace,) = of(documents, "Namespace").values()
     assert namespace["metadata"]["labels"] == {"pod-security.kubernetes.io/enforce": "restricted"}
     for template in pods(documents).values():

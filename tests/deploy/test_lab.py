@@ -1,7 +1,5 @@
 """The files for a bench are what the programs accept; ``test_docs`` has the guide itself."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil
@@ -21,7 +19,7 @@ LAB = ROOT / "deploy" / "lab"
 UNITS = sorted((LAB / "systemd").glob("*.service"))
 
 
-def test_the_example_bench_is_a_scenario_whose_arm_reaches_its_tour() -> None:
+def test_the_example_bench_is_a_scenario_whose_arm_reaches_its_tour():
     scenario = load(LAB / "bench-example.yaml")
     config = source_config(scenario)
     assert checked(scenario)
@@ -32,7 +30,7 @@ def test_the_example_bench_is_a_scenario_whose_arm_reaches_its_tour() -> None:
 
 
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
-def test_units_call_the_programs_with_options_they_have(unit) -> None:
+def test_units_call_the_programs_with_options_they_have_confined_to_a_folder_of_their_own(unit):
     text = unit.read_text().replace("\\\n", " ")
     words = shlex.split(re.search(r"^ExecStart=(.*)$", text, re.M)[1])
     program, command = words[0].rsplit("/", 1)[1], words[1]
@@ -43,10 +41,6 @@ def test_units_call_the_programs_with_options_they_have(unit) -> None:
     assert "EnvironmentFile=/etc/freshfield/bench.env" in text and "WantedBy=" in text
     assert command != "drive-arm", "nothing starts an arm by itself"
 
-
-@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
-def test_units_are_confined_to_a_folder_of_their_own(unit) -> None:
-    text = unit.read_text()
     own = {re.search(r"--out %S/(\S+)", text)[1], re.search(r"^StateDirectory=(.*)$", text, re.M)[1]}
     assert len(own) == 1 and "ProtectSystem=strict" in text and "ReadWritePaths" not in text
     if shutil.which("systemd-analyze") is not None:

@@ -1,12 +1,16 @@
-"""What an installation rests on: locks that hold what is asked for, and bounds that fit the generated code."""
-
-from __future__ import annotations
+"""What an installation rests on: locks that hold what is asked for, bounds that fit the generated code, and a wheel
+that does what a checkout does."""
 
 import contextlib
 import importlib.metadata
-import itertools
+import json
+import os
 import re
+import subprocess
+import sys
 import tomllib
+import zipfile
+from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
@@ -14,6 +18,7 @@ from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 from tests.conftest import ROOT
+from tests.support import free_port
 
 DECLARED = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT, BUILD = DECLARED["project"], DECLARED["build-system"]["requires"]
@@ -26,7 +31,7 @@ GENERATED = ROOT / "proto" / "freshfield" / "v1"
 
 def lower_bound(name: str) -> Version:
     groups = [PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()]
-    asked = next(each for each in map(Requirement, itertools.chain(*groups)) if each.name == name)
+    asked = next(each for group in groups for each in map(Requirement, group) if each.name == name)
     return max(Version(s.version) for s in asked.specifier if s.operator in (">=", "=="))
 
 
@@ -36,7 +41,7 @@ def generator(pattern: str, files: str) -> Version:
     return found
 
 
-def test_installing_the_oldest_allowed_versions_satisfies_the_generated_code() -> None:
+def test_installing_the_oldest_allowed_versions_satisfies_the_generated_code():
     grpc = generator(r"GRPC_GENERATED_VERSION = '(.*)'", "*_pb2_grpc.py")
     for name in ("grpcio", "grpcio-health-checking", "grpcio-reflection"):
         assert lower_bound(name) >= grpc
@@ -45,7 +50,7 @@ def test_installing_the_oldest_allowed_versions_satisfies_the_generated_code() -
 
 
 @pytest.mark.parametrize("locks", [("camera",), ("edge", "torch-cpu"), ("edge", "torch-cuda")])
-def test_an_image_installs_all_that_the_project_and_its_packages_ask_for(locks: tuple[str, ...]) -> None:
+def test_an_image_installs_all_that_the_project_and_its_packages_ask_for(locks):
     locked = {name: Version(version) for lock in locks for name, version in LOCKS[lock].items()}
     for lock in locks:  # a package in two of them has one version
         assert LOCKS[lock].items() <= {name: str(version) for name, version in locked.items()}.items()
@@ -67,7 +72,7 @@ def test_an_image_installs_all_that_the_project_and_its_packages_ask_for(locks: 
     assert ("torch" in locked) == ("edge" in locks)
 
 
-def test_every_locked_wheel_has_its_hash() -> None:
+def test_every_locked_wheel_has_its_hash():
     for file in (ROOT / "deploy" / "locks").glob("*.txt"):
         for line in file.read_text().replace("\\\n", "").splitlines():
             if not line.startswith("#"):
@@ -77,7 +82,7 @@ def test_every_locked_wheel_has_its_hash() -> None:
 @pytest.mark.parametrize(
     ("image", "locks"), [("camera", {"build", "camera"}), ("edge", {"build", "edge", "torch-$TORCH"})]
 )
-def test_an_image_installs_locked_wheels_and_the_project_alone(image: str, locks: set[str]) -> None:
+def test_an_image_installs_locked_wheels_and_the_project_alone(image, locks):
     text = (ROOT / "deploy" / f"{image}.Dockerfile").read_text().replace("\\\n", " ")
     installs = re.findall(r"pip install ([^\n&]*)", text)
     assert len(installs) == 3 and all("--no-deps" in words for words in installs)
@@ -85,3 +90,50 @@ def test_an_image_installs_locked_wheels_and_the_project_alone(image: str, locks
     assert set(re.findall(r"-r deploy/locks/(\S+)\.txt", text)) == locks
     assert {Requirement(text).name for text in BUILD} <= LOCKS["build"].keys()
     assert "!deploy/locks" in (ROOT / ".dockerignore").read_text().splitlines()
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), str(ROOT)]
+    subprocess.run(command, check=True, capture_output=True, timeout=300)
+    (found,) = folder.glob("*.whl")
+    return found
+
+
+def installed(wheel: Path, home: Path) -> Path:
+    """The bin folder of a new environment that holds the wheel and sees this one's third-party packages."""
+    subprocess.run([sys.executable, "-m", "venv", str(home)], check=True, timeout=120)
+    python = home / "bin" / "python"
+    (site,) = (home / "lib").glob("python*/site-packages")
+    # A .pth file in a folder named by a .pth file is not read: the checkout itself stays out of sight.
+    here = [path for path in sys.path if path.endswith("site-packages")]
+    (site / "third-party.pth").write_text("\n".join(here))
+    install = [str(python), "-m", "pip", "install", "-q", "--no-deps", "--force-reinstall", str(wheel)]
+    subprocess.run(install, check=True, capture_output=True, timeout=300)
+    return home / "bin"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_wheel_carries_scenarios_models_and_launcher(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
+    scenarios = ROOT / "deploy/scenarios"
+    shipped = {f"freshfield/scenarios/{path.relative_to(scenarios)}" for path in scenarios.rglob("*.*")}
+    folders = [ROOT / f"edge_server/{room}/models" for room in ("embed", "foreground")]
+    models = {str(path.relative_to(ROOT)) for folder in folders for path in folder.iterdir()}
+    assert shipped <= names and models <= names
+    assert {"freshfield_up/cli.py", "edge_server/frontier.json"} <= names
+    assert not [name for name in names if name.startswith(("tests/", "deploy/", "docs/"))]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_launcher_runs_a_shipped_scenario_by_name(wheel, tmp_path):
+    words = ["demo", "quad", "--for", "5s", "--out", "runs/up", "--port", str(free_port())]
+    command = [str(installed(wheel, tmp_path / "venv") / "freshfield"), *words]
+    there = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "MYPYPATH")}
+    done = subprocess.run(command, cwd=tmp_path, env=there, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads((tmp_path / "runs/up/report.json").read_text())
+    assert report["frames"]["closes"] and report["frames"]["delivered"] > 0

@@ -1,17 +1,18 @@
-"""Starting, stopping and describing the exit of real processes."""
+"""Starting and stopping real processes; the four commands at Ctrl-C and when nobody reads their output."""
 
-from __future__ import annotations
-
+import os
 import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import pytest
 
-from freshfield_up import processes
+from freshfield_up import console, processes
 from freshfield_up.processes import Child
+from tests.conftest import ROOT
 from tests.support import wait_until
 
 
@@ -19,9 +20,7 @@ def python(tmp_path: Path, code: str, name: str = "one") -> Child:
     return Child(name, f"process {name}", [sys.executable, "-c", code], tmp_path / f"log-{name}.txt")
 
 
-def test_a_child_becomes_its_command_and_runs_no_python_between_fork_and_exec(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_child_becomes_its_command_and_runs_no_python_between_fork_and_exec(tmp_path, monkeypatch):
     """There it might wait forever for a lock that another thread of the launcher held."""
     options: list[str] = []
     start = subprocess.Popen
@@ -33,16 +32,10 @@ def test_a_child_becomes_its_command_and_runs_no_python_between_fork_and_exec(
     assert "preexec_fn" not in options and "start_new_session" in options
 
 
-def test_stop_terminates_first_and_kills_after_the_grace_time(tmp_path: Path) -> None:
+def test_stop_terminates_first_and_kills_after_the_grace_time(tmp_path):
     answers = {"obedient": "lambda *_: sys.exit(print('goodbye'))", "stubborn": "signal.SIG_IGN"}
-    obedient, stubborn = (
-        python(
-            tmp_path,
-            f"import signal, sys, time\nsignal.signal(signal.SIGTERM, {answer})\nprint('up')\ntime.sleep(60)",
-            name,
-        )
-        for name, answer in answers.items()
-    )
+    code = "import signal, sys, time\nsignal.signal(signal.SIGTERM, {})\nprint('up')\ntime.sleep(60)"
+    obedient, stubborn = (python(tmp_path, code.format(answer), name) for name, answer in answers.items())
     for child in (obedient, stubborn):
         child.start()
         wait_until(lambda child=child: "\nup\n" in child.log.read_text(), "it did not start")
@@ -55,7 +48,7 @@ def test_stop_terminates_first_and_kills_after_the_grace_time(tmp_path: Path) ->
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells children that their parent is gone")
-def test_no_child_outlives_a_launcher_that_was_killed_outright(tmp_path: Path) -> None:
+def test_no_child_outlives_a_launcher_that_was_killed_outright(tmp_path):
     launcher = """
 import sys, time
 from pathlib import Path
@@ -79,3 +72,48 @@ time.sleep(60)
             return True
 
     wait_until(ended, "the child outlived its parent")
+
+
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+
+
+def start(command: str, words: list[str], before: str = "", **streams: int) -> subprocess.Popen[bytes]:
+    """The command as its installed script starts it. before: Python that runs first."""
+    module, _, function = SCRIPTS[command].partition(":")
+    code = f"import sys; sys.argv = {[command, *words]}; {before}\nimport {module}; sys.exit({module}.{function}())"
+    return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, **streams)
+
+
+@pytest.mark.parametrize("after_s", [0.05, 0.4])
+def test_ctrl_c_while_it_starts_prints_no_traceback(after_s):
+    words = ["simulate", "--preset", "ch6", "--seconds", "1e6"]
+    process = start("channel-emu", words, "print(flush=True)", stdout=subprocess.PIPE)
+    process.stdout.readline()  # Python itself has started
+    time.sleep(after_s)
+    process.send_signal(signal.SIGINT)
+    errors = process.communicate(timeout=30)[1]
+    assert b"Traceback" not in errors and b"ignored" not in errors
+    if after_s == 0.05:
+        assert process.returncode == -signal.SIGINT  # it was still importing
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "unbuffered"),
+    [("freshfield", ["scenario", "keys", "effects"], ""), ("channel-emu", ["presets"], "1")],
+)
+def test_output_that_nobody_reads_ends_it_without_a_word(command, words, unbuffered, tmp_path, monkeypatch):
+    """Where it is buffered, the last of it is written at the end."""
+    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    monkeypatch.chdir(tmp_path)
+    reader, writer = os.pipe()
+    os.close(reader)
+    process = start(command, words, stdout=writer)
+    os.close(writer)
+    assert process.communicate(timeout=30)[1] == b""
+    assert process.returncode == console.NOBODY_READS
+
+
+def test_the_status_of_a_command_is_passed_on():
+    process = start("freshfield", ["demo", "no-such-scenario"], stdout=subprocess.DEVNULL)
+    assert b"no-such-scenario" in process.communicate(timeout=30)[1] and process.returncode == 2

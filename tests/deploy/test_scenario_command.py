@@ -1,6 +1,4 @@
-"""``freshfield scenario``: what it lists, writes, checks and describes."""
-
-from __future__ import annotations
+"""``freshfield scenario``: what it lists, writes, checks and describes; every shipped one is valid."""
 
 import json
 import re
@@ -12,11 +10,16 @@ from typing import Any
 import jsonschema
 import pytest
 
+from camera_node.settings import LiveConfig, source_config
+from camera_node.sources.registry import open_sources
 from freshfield import plugins
-from freshfield.scenario import SCENARIO_FOLDER
+from freshfield.scenario import SCENARIO_FOLDER, load
 from freshfield.untrusted import read_yaml
 from freshfield_up.cli import main
 from freshfield_up.keys import schema
+from freshfield_up.scenario_command import checked
+from tests.conftest import data_dir
+from tests.support import refusal
 
 OWN = Path(__file__).parent.parent / "integration/own_classes.py"
 SHIPPED = sorted(SCENARIO_FOLDER.glob("*.yaml"))
@@ -28,10 +31,9 @@ def printed(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    assert main(words) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("freshfield: ") and error.count("\n") == 1
-    return error
+    said = refusal(capsys, main, *words)
+    assert said.startswith("freshfield: ")
+    return said
 
 
 def test_the_list_names_each_shipped_scenario_and_the_data_that_it_needs(capsys):
@@ -61,9 +63,8 @@ def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path,
     assert not (tmp_path / "third.yaml").exists()
 
 
-@pytest.mark.parametrize(
-    ("section", "wrong"),
-    [
+def test_check_reads_every_section(tmp_path, capsys):
+    for section, wrong in (
         ("source: {kind: mcap, file: a.mcap}", "cameras.phase: spread is for source.kind world alone"),
         ("source: {kind: world, scene: castle}", "source: .*castle"),
         ("source: {kind: world, effects: {rain: null}}", "source.effects: effect 'rain' is not known"),
@@ -74,13 +75,11 @@ def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path,
         ("edge: {field: OWN:Flat, field_options: {level: 2}}", "edge.field: flat.level: expected .*0 to 1, got 2"),
         ("channel: {faults: {rain: 1}}", "channel.faults.rain"),
         ("edge: {update_ms: 1}", "edge.update_ms"),
-    ],
-)
-def test_check_reads_every_section(section, wrong, tmp_path, capsys):
-    file = tmp_path / "mine.yaml"
-    source = "" if section.startswith("source") else "source: {kind: world, scene: room}\n"
-    file.write_text(f"cameras: {{count: 4, phase: spread}}\n{source}{section.replace('OWN', str(OWN))}\n")
-    assert re.search(wrong, refused(capsys, "scenario", "check", str(file)))
+    ):
+        file = tmp_path / "mine.yaml"
+        source = "" if section.startswith("source") else "source: {kind: world, scene: room}\n"
+        file.write_text(f"cameras: {{count: 4, phase: spread}}\n{source}{section.replace('OWN', str(OWN))}\n")
+        assert re.search(wrong, refused(capsys, "scenario", "check", str(file)))
 
 
 def test_keys_of_a_section_and_of_all(capsys):
@@ -119,7 +118,7 @@ def test_options_of_plug_ins_are_keys_named_or_installed(section, name, line, ca
             assert ours.is_valid({"cameras": {"count": 2}, "source": {"kind": "world"}, **faults}) == valid
 
 
-def test_the_schema_takes_what_ships_and_knows_kinds_bounds_and_short_notation() -> None:
+def test_the_schema_takes_what_ships_and_knows_kinds_bounds_and_short_notation():
     found = json.loads(json.dumps(schema()))
     jsonschema.Draft202012Validator.check_schema(found)
     validator = jsonschema.Draft202012Validator(found)
@@ -136,3 +135,37 @@ def test_the_schema_takes_what_ships_and_knows_kinds_bounds_and_short_notation()
     assert valid(channel={"service": "exp:60ms", "faults": {"loss": 0.1}}) and valid(edge=None)
     assert valid(source={"kind": "realsense", "width": 640}) and not valid(source={"kind": "world", "iso": 400})
     assert not valid(edge={"update_ms": 1}) and not valid(cameras={"count": -1})
+
+
+@pytest.mark.parametrize("file", SHIPPED, ids=lambda file: file.stem)
+def test_every_package_accepts_its_section(file):
+    scenario = load(file)
+    assert scenario.name == file.stem, "a report names the scenario: it must lead back to the file"
+    assert scenario.description
+    source = source_config(scenario)
+    arm = getattr(source, "arm", None)
+    # A scene needs views from several sides: of several cameras, of two that measure depth, or of one that an arm or
+    # somebody carries round it.
+    depth = "depth_sensor" in source.effects or source.kind in ("oak", "realsense")
+    least = 1 if scenario.held_out_every else 2 if depth else 3
+    assert len(scenario.training) >= least or set(arm.cameras) >= set(scenario.training)
+    assert checked(scenario)
+
+
+@pytest.mark.parametrize("file", SHIPPED, ids=lambda file: file.stem)
+def test_every_camera_has_a_first_image(file):
+    scenario = load(file)
+    config = source_config(scenario)
+    if isinstance(config, LiveConfig):
+        pytest.skip("needs cameras: tests/camera_node/sources/devices has them")
+    if getattr(config, "arm", None) is not None:
+        pytest.skip("needs an arm: tests/camera_node/robot/test_flange_camera.py has one")
+    folder = getattr(config, "data", "")
+    data = data_dir(folder.split("/")[0]).parent if folder else None
+    # One trained and one held-out camera: a world takes a while to prepare each.
+    cameras = [scenario.training[0], *scenario.held_out[:1]]
+    sources = open_sources(scenario, config, cameras, data)
+    assert set(sources) == set(cameras)
+    for source in sources.values():
+        shot = source.read(source.content(0))
+        assert (shot.intrinsics.width, shot.intrinsics.height) == (source.intrinsics.width, source.intrinsics.height)

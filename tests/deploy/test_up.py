@@ -1,9 +1,9 @@
-"""The launcher with the real processes: runs that end as asked, and runs in which a process dies."""
-
-from __future__ import annotations
+"""The launcher with the real processes: runs that end as asked, and runs in which a process dies; that of a simulated
+arm, and which processes start in which order."""
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -17,6 +17,7 @@ import pytest
 
 import freshfield as ff
 from freshfield.scenario import ScenarioError, load
+from freshfield_up import commands
 from freshfield_up import run as launcher
 from freshfield_up.cli import main
 from freshfield_up.commands import ProcessSet
@@ -24,7 +25,9 @@ from freshfield_up.demo_command import seconds
 from freshfield_up.deployment import DeploymentError
 from freshfield_up.folder import EARLIER, prepare
 from freshfield_up.processes import Child
-from tests.support import free_port, wait_until
+from freshfield_up.status import read_json
+from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde
+from tests.support import free_port, refused, wait_until
 
 SMALL = """
 name: small
@@ -58,11 +61,8 @@ class Up:
         return self._log.read_text()
 
 
-Asleep = Callable[..., launcher.Launcher]
-
-
 @pytest.fixture
-def asleep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Asleep:
+def asleep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., launcher.Launcher]:
     """Makes a launcher whose edge and emulator only sleep, and whose node runs the given words."""
 
     def make(node: str) -> launcher.Launcher:
@@ -79,9 +79,7 @@ def asleep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Asleep:
     return make
 
 
-def test_a_process_that_dies_ends_the_run_is_named_and_the_others_are_stopped(
-    asleep: Asleep, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_process_that_dies_ends_the_run_is_named_and_the_others_are_stopped(asleep, capfd):
     run = asleep("import os, time; print('so much'); time.sleep(0.8); os.kill(os.getpid(), 9)")
     assert run.run() == 1
     said, made = capfd.readouterr().out, run.processes
@@ -92,7 +90,7 @@ def test_a_process_that_dies_ends_the_run_is_named_and_the_others_are_stopped(
     assert rows[0]["edge"]["pid"] == made.edge.pid and "machine" in rows[0]
 
 
-def test_a_trouble_is_said_once_of_each_camera_though_its_numbers_change(asleep: Asleep) -> None:
+def test_a_trouble_is_said_once_of_each_camera_though_its_numbers_change(asleep):
     run, said = asleep("pass"), []
     run._say = said.append
     run.options.out.mkdir()
@@ -104,9 +102,7 @@ def test_a_trouble_is_said_once_of_each_camera_though_its_numbers_change(asleep:
     assert said == [f"note: {line}" for line in (*first, plugin)]
 
 
-def test_a_recording_that_is_over_before_the_first_update_ends_the_run_well(
-    asleep: Asleep, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recording_that_is_over_before_the_first_update_ends_the_run_well(asleep, capfd, monkeypatch):
     """Kernels are still being compiled."""
     run = asleep("import time; time.sleep(0.5)")
     emulator = run.processes.emulator
@@ -114,7 +110,7 @@ def test_a_recording_that_is_over_before_the_first_update_ends_the_run_well(
     assert run.run() == 0 and "the recording is over" in capfd.readouterr().out
 
 
-def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(asleep: Asleep, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(asleep, monkeypatch):
     """``freshfield demo room | head -3``."""
     run = asleep(SLEEPS)
     edge, (reader, writer) = run.processes.edge, os.pipe()
@@ -124,7 +120,7 @@ def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(asleep: Asleep, monkey
     assert edge.process is not None and not any(child.running for child in run.processes.children)
 
 
-def test_ctrl_c_ends_a_run_and_a_second_one_kills(asleep: Asleep, capfd: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_ends_a_run_and_a_second_one_kills(asleep, capfd):
     run = asleep("import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up'); time.sleep(60)")
     log = run.processes.node.log
 
@@ -139,7 +135,7 @@ def test_ctrl_c_ends_a_run_and_a_second_one_kills(asleep: Asleep, capfd: pytest.
     assert "stopping (Ctrl-C)" in said and "the node did not end in time and was killed" in said
 
 
-def test_a_start_that_fails_says_why_and_costs_no_earlier_run(tmp_path: Path) -> None:
+def test_a_start_that_fails_says_why_and_costs_no_earlier_run(tmp_path):
     prepare(tmp_path / "run", {}).close()
     (tmp_path / "run" / "report.json").write_text("{}")
     run = Up(tmp_path, "--policy", "foo")
@@ -149,7 +145,7 @@ def test_a_start_that_fails_says_why_and_costs_no_earlier_run(tmp_path: Path) ->
     assert (run.out / EARLIER / "report.json").exists()
 
 
-def test_times_and_commands_are_read_and_written_as_people_write_them(asleep: Asleep) -> None:
+def test_times_and_commands_are_read_and_written_as_people_write_them(asleep):
     assert [seconds(text) for text in ("60", "60s", "1.5m", "2h", "0")] == [60.0, 60.0, 90.0, 7200.0, 0.0]
     assert launcher.command_line(["/usr/bin/freshfield", "demo", "my file"]) == "freshfield demo 'my file'"
     assert launcher.command_line(["/lib/freshfield_up/__main__.py", "demo"]) == "freshfield demo"
@@ -161,9 +157,7 @@ def test_times_and_commands_are_read_and_written_as_people_write_them(asleep: As
     assert run._headline(112.9) == "12 s"
 
 
-def test_what_cannot_run_is_refused_in_one_line_before_anything_starts(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_run_is_refused_in_one_line_before_anything_starts(tmp_path, capsys):
     def refusal(scenario: str | Path, port: int, out: str = "new", *more: str) -> str:
         assert main(["demo", str(scenario), "--out", str(tmp_path / out), "--port", str(port), *more]) == 2
         said = capsys.readouterr().err
@@ -184,12 +178,49 @@ def test_what_cannot_run_is_refused_in_one_line_before_anything_starts(
     assert "is emptied first; choose another --out" in said and learned.read_bytes() == b"weights"
 
 
-def test_a_deployment_in_a_script_says_why_it_cannot_start(tmp_path: Path) -> None:
+def test_a_deployment_in_a_script_says_why_it_cannot_start(tmp_path):
     (tmp_path / "small.yaml").write_text(SMALL.replace("lpips: none", "policy: {name: nothing}"))
     with (
         pytest.raises(DeploymentError, match="the edge server"),
         ff.deployment(tmp_path / "small.yaml", out=tmp_path / "run"),
     ):
         pass
-    with pytest.raises(ScenarioError, match="shipped scenarios"):
-        ff.deployment("nothing")
+    refused(ScenarioError, "shipped scenarios", ff.deployment, "nothing")
+
+
+CELL = load("cell")
+
+
+def test_a_simulated_arm_and_its_driver_belong_to_the_run(monkeypatch, tmp_path):
+    monkeypatch.setattr(commands, "program", lambda name: name)
+    found = commands.process_set(CELL, tmp_path, 8080)
+    assert [child.command[1] for child in found.arms + found.drivers] == ["simulate-arm", "drive-arm"]
+    assert found.arm_address == "127.0.0.2:30004"
+    # Senders stop before receivers: driver, cameras, arm, channel, edge.
+    assert [child.name for child in found.children] == ["driver", "node", "arm", "emulator", "edge"]
+
+
+@pytest.mark.slow
+def test_the_cell_runs_from_one_command(tmp_path):
+    require_ur_rtde()
+    mount = CELL.path.parent / CELL.source["arm"]["cameras"]["hand"]
+    text = CELL.path.read_text().replace("../lab/hand-eye-example.yaml", str(mount))
+    text = re.sub(r"host: \S+", f"host: {own_address()}", text)
+    text = text.replace("width: 128", "width: 48").replace("height: 128", "height: 48")
+    run = Up(tmp_path, scenario=text)
+    try:
+        wait_until(
+            lambda: read_json(run.out / "edge.json").get("updates", {}).get("count", 0) >= 30, "no updates", 400.0
+        )
+        run.process.terminate()
+        assert run.process.wait(300.0) == 0, run.output
+    finally:
+        run.process.kill()
+    frames = read_json(run.out / "report.json")["frames"]
+    assert frames["closes"] and frames["by_camera"]["hand"]["delivered"] > 5
+    assert "43 viewpoints in 62 stops\n" in (run.out / "log-driver.txt").read_text()
+    # The arm sets out when the field can learn: after the emulator, which waits for the edge to serve.
+    # All may begin within one row; but processes are numbered in their order.
+    last = json.loads((run.out / "processes.jsonl").read_text().splitlines()[-1])
+    numbers = int(Path("/proc/sys/kernel/pid_max").read_text())
+    assert 0 < (last["driver"]["pid"] - last["emulator"]["pid"]) % numbers < numbers // 2

@@ -1,15 +1,21 @@
-"""A gRPC server with handlers that a test made, on loopback."""
+"""A gRPC server with handlers that a test made, on loopback; why it refuses a call."""
 
-from __future__ import annotations
-
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable
 from contextlib import asynccontextmanager
 
 import grpc
 import grpc.aio
+import pytest
 
 from freshfield.streams import serve_health
 from freshfield.transport import Transport
+
+
+async def status(call: Awaitable[object]) -> str:
+    """Why a call is refused."""
+    with pytest.raises(grpc.aio.AioRpcError) as error:
+        await call
+    return error.value.code().name
 
 
 @asynccontextmanager

@@ -1,7 +1,5 @@
 """A session written as a ROS 2 bag, read by rosbags' own reader and by ours."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +20,7 @@ from freshfield.depth import DepthImage
 from freshfield.session.bag_writer import BagWriter
 from tests.edge_server.live.output.test_recorder import PUBLICATION
 from tests.freshfield.test_session import LENS, requests
+from tests.support import refused
 
 
 def sent_frames(codec: str = "jpeg", meters_per_count: float = 0.001) -> list:
@@ -116,8 +115,7 @@ def test_what_cannot_be_decoded_costs_itself_and_a_killed_bag_is_read(tmp_path, 
     writer = BagWriter(tmp_path / "killed", {})
     for request, arrived_ns in sent[:2]:
         writer.frame(request, arrived_ns)
-    with pytest.raises(ValueError, match="Out of range"):
-        writer.data("/scores", "freshfield.Decision", {}, {"psnr_db": float("nan")}, 5)
+    refused(ValueError, "Out of range", writer.data, "/scores", "freshfield.Decision", {}, {"psnr_db": float("nan")}, 5)
     writer.abandon()
     assert not (tmp_path / "killed/metadata.yaml").exists()
     assert Recorder(tmp_path / "bag", "test").file.name == "bag-2", "a server that starts again keeps the first"

@@ -1,7 +1,5 @@
 """What fixed cameras see, against what can be reckoned by hand."""
 
-from __future__ import annotations
-
 from xml.etree import ElementTree
 
 import numpy as np
@@ -9,6 +7,7 @@ import pytest
 
 from freshfield.coverage import MOST_OBLIQUE_DEG, PLAN, plan_svg, reckon
 from freshfield.geometry import Pinhole, look_at
+from tests.support import refused
 
 LENS = Pinhole.from_fov(100, 100, 70.0)
 # Share of the directions of the sphere within an angle of one of them.
@@ -35,9 +34,7 @@ def test_two_opposite_cameras_share_nothing_and_two_at_one_place_everything():
     assert apart.seen_by[1] == pytest.approx(2 * FACING, abs=0.03)
     same = reckon([camera(0), camera(0)])
     assert same.seen_by[1] == 0.0 and same.parallax_deg == pytest.approx(0.0, abs=1e-5)
-
-
-def test_the_parallax_is_the_angle_between_the_cameras():
+    # The parallax is the angle between the cameras.
     wide, narrow = (reckon([camera(-a), camera(a)]).parallax_deg for a in (20, 10))
     assert wide / narrow == pytest.approx(2.0, rel=0.1) and 30.0 < wide < 45.0
     lens = Pinhole.from_fov(100, 100, 20.0)
@@ -68,5 +65,4 @@ def test_odd_rigs_give_finite_numbers(poses):
     found = reckon([(LENS, np.asarray(pose, np.float64)) for pose in poses])
     assert sum(found.seen_by) == pytest.approx(1.0) and np.isfinite(found.further.pose).all()
     assert "nan" not in plan_svg({str(k): (LENS, p) for k, p in enumerate(poses)}, found) and "nan" not in found.words
-    with pytest.raises(ValueError, match="no camera"):
-        reckon([])
+    refused(ValueError, "no camera", reckon, [])

@@ -1,7 +1,5 @@
 """Files are whole whenever somebody looks, and a full disk costs lines, not processes."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import logging
@@ -13,6 +11,7 @@ from contextlib import contextmanager
 import pytest
 
 from freshfield.files import Lines, out_file, out_folder, write_json
+from tests.support import refused
 
 
 @contextmanager
@@ -41,27 +40,23 @@ def test_json_is_replaced_whole_by_any_number_of_threads(tmp_path):
     assert [writer.exception() for writer in writers] == [None] * 4 and os.listdir(tmp_path) == ["status.json"]
 
 
-@pytest.mark.parametrize(
-    ("option", "place", "said"),
-    [
+def test_a_place_that_cannot_be_written_is_refused_with_its_option(tmp_path, capsys, monkeypatch):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link").symlink_to("nowhere")
+    monkeypatch.setattr(os, "access", lambda path, _: path.name != "folder")
+    for option, place, said in (
         (out_folder, "file/x", "file is a file, not a folder: name another"),
         (out_folder, "link", "link is a file, not a folder: name another"),
         (out_file, "folder", "folder is a folder, not a file: name another"),
         (out_folder, "folder/new/x", "folder cannot be written to: name another place"),
         (out_folder, "a\udcff", r"a\udcff' is not UTF-8: name another"),
-    ],
-)
-def test_a_place_that_cannot_be_written_is_refused_with_its_option(tmp_path, capsys, monkeypatch, option, place, said):
-    (tmp_path / "file").touch()
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "link").symlink_to("nowhere")
-    monkeypatch.setattr(os, "access", lambda path, _: path.name != "folder")
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--out", type=option)
-    with pytest.raises(SystemExit, match="2"):
-        parser.parse_args(["--out", str(tmp_path / place)])
-    told = capsys.readouterr().err
-    assert "argument --out: " in told and f"{tmp_path}/{said}" in told
+    ):
+        parser = argparse.ArgumentParser()
+        parser.add_argument("--out", type=option)
+        refused(SystemExit, "2", parser.parse_args, ["--out", str(tmp_path / place)])
+        told = capsys.readouterr().err
+        assert "argument --out: " in told and f"{tmp_path}/{said}" in told
 
 
 def test_places_that_are_there_or_not_yet_can_be_written(tmp_path, monkeypatch):
@@ -76,8 +71,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_beside_it(tmp_path):
     write_json(path, {"a": 1})
     with no_file_longer_than(10), pytest.raises(OSError):
         write_json(path, {"a": "x" * 1000})
-    with pytest.raises(ValueError):
-        write_json(path, {"a": float("nan")})
+    refused(ValueError, "", write_json, path, {"a": float("nan")})
     assert json.loads(path.read_text()) == {"a": 1} and os.listdir(tmp_path) == ["status.json"]
 
 
@@ -96,5 +90,4 @@ def test_lines_that_do_not_fit_are_counted_and_said_once(tmp_path, caplog):
     found = (tmp_path / "rows.jsonl").read_text().splitlines()[2:]
     # The half line is a line of its own, and no JSON.
     assert [line == row for line in found] == [True, True, False, True]
-    with pytest.raises(ValueError):
-        json.loads(found[2])
+    refused(ValueError, "", json.loads, found[2])

@@ -1,19 +1,17 @@
 """The ledger: what was written is read, whatever killed the writer."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from freshfield.ledger import Event, Ledger, LedgerReader, read_all
 from tests.freshfield.test_files import no_file_longer_than
+from tests.support import refused
 
 
 def write(out, events, closed=True):
@@ -58,8 +56,7 @@ def test_damaged_lines_are_left_out_and_other_files_refused(tmp_path):
     assert file.events[0] == EVENTS[0] and file.torn and file.closed
     for data in (b"", b"hello\n", b"#freshfield-ledger 2 node cam00 1\n", b"\xff\xfe"):
         path.write_bytes(data)
-        with pytest.raises(ValueError, match="not a freshfield ledger"):
-            LedgerReader(path)
+        refused(ValueError, "not a freshfield ledger", LedgerReader, path)
 
 
 def test_threads_do_not_tear_each_others_lines(tmp_path):

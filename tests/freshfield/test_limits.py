@@ -1,8 +1,6 @@
 """Bounds of what is accepted are part of the contract: a peer of another version, or another's, keeps within them, so a
 changed one is a changed protocol. Written out, since the tests of each bound import it."""
 
-from __future__ import annotations
-
 from freshfield import limits
 
 OF_A_FRAME = {

@@ -1,7 +1,5 @@
 """What a measurement cost: this process's own cores and memory, and the machine's."""
 
-from __future__ import annotations
-
 import os
 import resource
 

@@ -1,7 +1,5 @@
 """Classes from outside: found by file, module or entry point; errors that say what is wrong; nothing loaded unasked."""
 
-from __future__ import annotations
-
 import sys
 from importlib.metadata import EntryPoint
 
@@ -9,21 +7,13 @@ import pytest
 
 from freshfield import plugins, scenario
 from freshfield.plugins import PluginError, absolute, find, refuse_foreign, split_value
-
-SOURCE = """
-import sys
-sys.loaded = getattr(sys, "loaded", 0) + 1
-
-
-class Mine:
-    pass
-"""
+from tests.support import refused
 
 
 @pytest.fixture
 def file(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "loaded", 0, raising=False)
-    (tmp_path / "mine.py").write_text(SOURCE)
+    (tmp_path / "mine.py").write_text("import sys\nsys.loaded += 1\nclass Mine:\n    pass\n")
     return tmp_path / "mine.py"
 
 
@@ -40,8 +30,7 @@ def test_a_module_and_an_entry_point(monkeypatch):
     entry = EntryPoint("exact", "fractions:Fraction", "freshfield.policy")
     monkeypatch.setattr(plugins, "entry_points", lambda group: [entry] if group == "freshfield.policy" else [])
     assert find("policy", "exact", ()).__name__ == "Fraction"
-    with pytest.raises(PluginError, match="effect 'exact' is not known"):
-        find("effect", "exact", ["fog"])
+    refused(PluginError, "effect 'exact' is not known", find, "effect", "exact", ["fog"])
 
 
 @pytest.mark.parametrize(
@@ -57,8 +46,7 @@ def test_a_module_and_an_entry_point(monkeypatch):
 def test_what_cannot_be_used_is_said(file, name, message):
     (file.parent / "broken.py").write_text("1 / 0")
     for _ in range(2):  # the second time too: what failed is not kept
-        with pytest.raises(PluginError, match=message):
-            find("policy", name.format(file=file, folder=file.parent), ["all", "threshold"])
+        refused(PluginError, message, find, "policy", name.format(file=file, folder=file.parent), ["all", "threshold"])
 
 
 def test_a_file_beside_the_scenario_is_found_from_anywhere(file, monkeypatch):

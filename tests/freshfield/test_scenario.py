@@ -1,14 +1,16 @@
-"""Scenario files: strict, with one clear line for everything that is wrong."""
-
-from __future__ import annotations
+"""Scenario files and their sections: strict, with one clear line for everything that is wrong."""
 
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 import pytest
+from msgspec import field
 
 from freshfield.limits import MAX_IMAGE_SIDE_PX
 from freshfield.scenario import ScenarioError, load, parse
+from freshfield.settings import Settings, as_mapping, describe, read_settings, within
+from tests.support import refused
 
 FILE = Path("s.yaml")
 
@@ -22,9 +24,8 @@ def test_a_whole_file(tmp_path):
     assert load(file, seed=9).seed == 9
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_errors_are_one_line_with_the_file(tmp_path):
+    for text, message in (
         ("[1, 2]", "expected a mapping"),
         ("cameras: {count: 2}\nsede: 3", "sede: unknown key; did you mean 'seed'"),
         ("{}", "either count"),
@@ -34,22 +35,17 @@ def test_a_whole_file(tmp_path):
         ("cameras: {ids: ['a/b']}", "'a/b' is not an id"),
         ("cameras: {count: 2, held_out: [cam02]}", "'cam02' is not one of the cameras"),
         ("cameras: {count: 1, held_out: [cam00]}", "every camera is held out"),
-    ],
-)
-def test_errors_are_one_line_with_the_file(tmp_path, text, message):
-    file = tmp_path / "s.yaml"
-    file.write_text(text)
-    with pytest.raises(ScenarioError, match=message) as error:
-        load(file)
-    assert str(error.value).startswith(str(file)) and "\n" not in str(error.value)
+    ):
+        file = tmp_path / "s.yaml"
+        file.write_text(text)
+        assert str(refused(ScenarioError, message, load, file)).startswith(str(file))
 
 
 def test_shipped_ones_go_by_name_and_a_missing_file_lists_them(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "room").mkdir()  # hides nothing
     assert len(load("room").cameras) == 13 and load("room").held_out == ("cam00",)
-    with pytest.raises(ScenarioError, match=r"shipped scenarios: .*room"):
-        load("no-such-scenario")
+    refused(ScenarioError, r"shipped scenarios: .*room", load, "no-such-scenario")
 
 
 def test_random_streams_are_independent_of_the_number_of_cameras():
@@ -82,3 +78,55 @@ def test_images_are_as_large_as_the_source_says_and_else_bounded():
     assert largest(width=128, height=96) == 128 and largest(width=96, height=128) == 128
     assert largest(kind="camera", width=128, height=96) == MAX_IMAGE_SIDE_PX
     assert largest() == largest(width=128) == largest(width="128", height=0) == MAX_IMAGE_SIDE_PX
+
+
+class Inner(Settings, frozen=True):
+    rate: float
+    name: str = "x"
+
+
+class Outer(Settings, frozen=True):
+    count: int = 1
+    on: bool = False
+    share: float | None = None
+    size: tuple[int, int] = (1, 1)
+    inner: Inner | None = None
+    level: Annotated[int, within(0, 10, "of noise")] = 3
+    mode: Literal["mean", "max"] = "mean"
+    tags: list[str] = field(default_factory=list)
+    table: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.count < 0:
+            raise ValueError("count cannot be negative")
+
+
+def test_a_mapping_becomes_a_struct():
+    given = {"share": 1, "size": [3, 4], "inner": {"rate": 2}, "tags": ["a"], "table": {"k": 0.5}}
+    assert read_settings(Outer, given, "s: x") == Outer(1, False, 1.0, (3, 4), Inner(2.0), 3, "mean", ["a"], {"k": 0.5})
+    found = read_settings(Outer, given, "s: x")
+    assert read_settings(Outer, as_mapping(found), "s: x") == found
+
+
+def test_sections_refuse_by_name():
+    for given, message in (
+        ({"cuont": 1}, r"s: x\.cuont: unknown key; did you mean 'count'"),
+        ({"count": 1.0}, r"s: x\.count: expected a whole number"),
+        ({"on": 1}, r"s: x\.on: expected true or false"),
+        ({"share": float("inf")}, r"s: x\.share: expected a number"),
+        ({"size": [1, "b"]}, r"s: x\.size\[1\]: expected a whole number"),
+        ({"inner": {}}, r"s: x\.inner\.rate: missing"),
+        ({"level": 11}, r"s: x\.level: expected a whole number, 0 to 10, got 11"),
+        ({"mode": "sum"}, r"s: x\.mode: expected one of mean, max, got 'sum'"),
+        ({"tags": [7]}, r"s: x\.tags\[0\]: expected text, got 7: put it in quotes"),
+        ({"count": -1}, r"s: x: count cannot be negative"),
+        ([], "s: x: expected a mapping"),
+    ):
+        refused(ScenarioError, message, read_settings, Outer, given, "s: x")
+
+
+def test_keys_are_described_with_default_bounds_and_help():
+    lines = describe(Outer, leave_out=("inner",))
+    assert "    level                  default 3; 0 to 10; of noise" in lines
+    assert "    mode                   default 'mean'; one of mean, max" in lines
+    assert not any("inner" in line for line in lines)

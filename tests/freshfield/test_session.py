@@ -1,7 +1,5 @@
 """A recorded session: what is read is what was written, from whole files and cut ones, here and by MCAP."""
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import replace
@@ -26,6 +24,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from freshfield.session.reader import Session
 from freshfield.session.writer import SessionWriter
+from tests.support import refused
 
 LENS = Pinhole(32, 24, 40.1, 41.3, 15.7, 12.2, (0.01, -0.002, 0.0003, 0.0))
 SCHEMA = {"type": "object", "properties": {"number": {"type": "integer"}}}
@@ -148,10 +147,8 @@ def test_damage_is_left_out_and_said(tmp_path):
 def test_what_is_no_recording_says_so_and_one_is_never_overwritten(tmp_path):
     for data in (b"", b"\x89MCAP0", b"not an MCAP file at all"):
         (tmp_path / "x.mcap").write_bytes(data)
-        with pytest.raises(SessionError, match=r"x\.mcap: is no MCAP file"):
-            Session(tmp_path / "x.mcap")
-    with pytest.raises(FileExistsError):
-        SessionWriter(tmp_path / "x.mcap", {})
+        refused(SessionError, r"x\.mcap: is no MCAP file", Session, tmp_path / "x.mcap")
+    refused(FileExistsError, "", SessionWriter, tmp_path / "x.mcap", {})
 
 
 def test_compressed_chunks_are_left_out_unopened_and_said(tmp_path):

@@ -1,14 +1,11 @@
 """A server's open streams: nobody shuts the others out, and nobody goes on with another's session."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 from contextlib import asynccontextmanager, suppress
 
 import grpc
 import grpc.aio
-import pytest
 
 from freshfield import streams as served
 from freshfield.access import ANYBODY
@@ -17,6 +14,7 @@ from freshfield.limits import MAX_SESSIONS_PER_CAMERA, SESSION_IDLE_NS
 from freshfield.streams import OpenStreams, SessionStreams
 from freshfield.transport import Transport
 from tests.freshfield.serving import serving
+from tests.support import refused, until
 
 
 @asynccontextmanager
@@ -74,8 +72,7 @@ async def poured(channel) -> grpc.StatusCode:
 async def test_a_stream_that_ends_in_the_midst_of_an_answer_is_told_why():
     async with echoing(OpenStreams(8)) as channel:
         calls = [asyncio.create_task(poured(channel)) for _ in range(200)]
-        while sum(not call.done() for call in calls) > 8:
-            await asyncio.sleep(0.02)
+        await until(lambda: sum(not call.done() for call in calls) <= 8)
         ended = [call.result() for call in calls if call.done()]
         assert ended == 192 * [grpc.StatusCode.RESOURCE_EXHAUSTED]
         for call in calls:
@@ -130,16 +127,14 @@ class Stream:
 def test_a_session_belongs_to_the_stream_that_sends_it():
     sessions, mine, spoofer = SessionStreams(["cam00"]), Stream(), Stream()
     sessions.claim("cam00", "s", mine, 0)
-    with pytest.raises(FrameRejected) as refused:
-        sessions.claim("cam00", "s", spoofer, SESSION_IDLE_NS - 1)
-    assert refused.value.reason == "session_in_use"
+    error = refused(FrameRejected, "", sessions.claim, "cam00", "s", spoofer, SESSION_IDLE_NS - 1)
+    assert error.reason == "session_in_use"
     sessions.claim("cam00", "other", spoofer, 1)
     mine.open = False
     sessions.claim("cam00", "s", spoofer, 2)  # its stream ended
     again = Stream()
     sessions.claim("cam00", "s", again, 2 + SESSION_IDLE_NS)  # or is gone without a word
-    with pytest.raises(FrameRejected):
-        sessions.claim("cam00", "s", spoofer, 3 + SESSION_IDLE_NS)
+    refused(FrameRejected, "", sessions.claim, "cam00", "s", spoofer, 3 + SESSION_IDLE_NS)
     sessions.claim("cam00", "s", spoofer, 0)  # a clock that was set back delays nobody
     for k in range(1000):
         sessions.claim("cam00", f"s{k}", spoofer, k)
@@ -176,8 +171,7 @@ async def test_calls_that_only_begin_and_watches_of_health_are_bounded(monkeypat
         async with asyncio.timeout(20):
             for call in (begun[0], watches[0]):
                 assert await ended(call) is grpc.StatusCode.RESOURCE_EXHAUSTED
-            while calls.ended < 5 * most:
-                await asyncio.sleep(0.01)
+            await until(lambda: calls.ended >= 5 * most)
         assert len(calls._silent) + len(calls._used) <= most
         await camera.write(b"still here")
         assert await camera.read() == b"still here"
@@ -186,6 +180,4 @@ async def test_calls_that_only_begin_and_watches_of_health_are_bounded(monkeypat
         for call in (*begun, *watches):
             call.cancel()
         camera.cancel()
-        async with asyncio.timeout(20):
-            while calls._silent or calls._used:
-                await asyncio.sleep(0.01)
+        await until(lambda: not (calls._silent or calls._used))

@@ -1,7 +1,5 @@
 """Channels and servers: token, TLS, ports, message limits."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import contextlib
@@ -18,7 +16,8 @@ import pytest
 from freshfield import transport
 from freshfield.limits import MAX_PAYLOAD_BYTES
 from freshfield.transport import Transport, TransportError, host_port, peer_text
-from tests.freshfield.serving import serving
+from tests.freshfield.serving import serving, status
+from tests.support import refused
 
 CLOCK, FRAMES = "freshfield.v1.ClockService", "freshfield.v1.FrameStreamService"
 
@@ -65,11 +64,8 @@ async def test_plain_text_and_messages_up_to_the_limit():
         grpc.aio.insecure_channel(f"localhost:{port}", options=unbounded) as of_stranger,
     ):
         assert await push(channel, MAX_PAYLOAD_BYTES) == MAX_PAYLOAD_BYTES
-        with pytest.raises(grpc.aio.AioRpcError):
-            await push(channel, MAX_PAYLOAD_BYTES + 8192)
-        with pytest.raises(grpc.aio.AioRpcError) as refused:
-            await push(of_stranger, 4 * MAX_PAYLOAD_BYTES)
-        assert refused.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+        await status(push(channel, MAX_PAYLOAD_BYTES + 8192))
+        assert await status(push(of_stranger, 4 * MAX_PAYLOAD_BYTES)) == "RESOURCE_EXHAUSTED"
         assert await ask(Transport(), port) == b"42"
 
 
@@ -79,16 +75,14 @@ RIGHT = Transport(tokens={"camera:*": "right"})
 async def test_a_port_in_use_is_not_shared_nor_one_opened_unprotected():
     async with serving(Transport()) as port:
         for address, why in ((f"localhost:{port}", f"localhost:{port}"), ("0.0.0.0:0", "nothing is encrypted")):
-            with pytest.raises(TransportError, match=why):
-                Transport().bind(Transport().aio_server(), address)
+            refused(TransportError, why, Transport().bind, Transport().aio_server(), address)
 
 
 def test_host_and_port_are_told_apart():
     assert host_port("emu:7001") == ("emu", 7001) and host_port(":7001") == ("127.0.0.1", 7001)
     assert host_port("0.0.0.0:0") == ("0.0.0.0", 0) and host_port("[::1]:65535") == ("[::1]", 65535)
     for wrong in ("", "host", "7001", "host:", "host:-1", "host:65536", "host:\u00b2", "::1:7001", "unix:/tmp/s"):
-        with pytest.raises(TransportError, match="expected HOST:PORT"):
-            host_port(wrong)
+        refused(TransportError, "expected HOST:PORT", host_port, wrong)
 
 
 @pytest.fixture(scope="module")
@@ -117,21 +111,16 @@ async def test_tls_and_mutual_tls(pem):
     trusting, deceived = Transport(ca=pem / "ca.pem"), Transport(ca=pem / "stranger.pem")
     known = Transport(cert=pem / "client.pem", key=pem / "client.key", ca=pem / "ca.pem")
 
-    async def refusal(client: Transport, port: int) -> str:
-        with pytest.raises(grpc.aio.AioRpcError) as error:
-            await ask(client, port)
-        return error.value.code().name
-
     async with serving(server_tls, *handlers()) as port:
         assert await ask(trusting, port) == b"42"
         for client in (deceived, Transport()):
-            assert await refusal(client, port) == "UNAVAILABLE"
+            assert await status(ask(client, port)) == "UNAVAILABLE"
     async with serving(mutual, *handlers()) as port:
         assert await ask(known, port) == b"42"
-        assert await refusal(trusting, port) == "UNAVAILABLE"
-        assert await refusal(mutual, port) == "UNAUTHENTICATED", "its name is no caller's"
+        assert await status(ask(trusting, port)) == "UNAVAILABLE"
+        assert await status(ask(mutual, port)) == "UNAUTHENTICATED", "its name is no caller's"
         wrong_token = dataclasses.replace(known, tokens={"": "wrong"})
-        assert await refusal(wrong_token, port) == "UNAUTHENTICATED", "a certificate does not make it good"
+        assert await status(ask(wrong_token, port)) == "UNAUTHENTICATED", "a certificate does not make it good"
 
 
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # and empty SETTINGS
@@ -176,8 +165,7 @@ def test_a_server_refuses_to_listen_unprotected_beyond_this_machine():
         (Transport(**tls), "0.0.0.0", "nobody is asked"),
         (Transport(), "[::]", "nothing is encrypted .* and nobody is asked"),
     ):
-        with pytest.raises(TransportError, match=why):
-            given.guard(host, "gRPC")
+        refused(TransportError, why, given.guard, host, "gRPC")
     with pytest.raises(TransportError, match="machines, and nobody can log in"):
         Transport(**tls, ca=Path("ca")).guard("0.0.0.0", "page", http=True)
     assert Transport(**tls, tokens={"viewer": "x"}).guard("0.0.0.0", "page", http=True) == ""
@@ -189,8 +177,7 @@ def test_a_server_refuses_to_listen_unprotected_beyond_this_machine():
 
 
 async def test_a_token_does_not_leave_the_machine_in_plain_text():
-    with pytest.raises(TransportError, match="plain text"):
-        RIGHT.aio_channel("edge:7000")
+    refused(TransportError, "plain text", RIGHT.aio_channel, "edge:7000")
     await dataclasses.replace(RIGHT, insecure=True).aio_channel("edge:7000").close()
 
 
@@ -209,8 +196,7 @@ def test_options_become_a_transport(pem, tmp_path):
     assert parsed("--token-file", str(token)).tokens == {"camera:cam00": "one", "operator": "two"}
     for wrong in ("viewer a\nviewer b", "viewer a\noperator a", "a\nb", "viewer a b", "\n"):
         token.write_text(wrong)
-        with pytest.raises(TransportError, match=r"NAME TOKEN|is empty"):
-            parsed("--token-file", str(token))
+        refused(TransportError, r"NAME TOKEN|is empty", parsed, "--token-file", str(token))
     damaged.write_text("-----BEGIN CERTIFICATE-----\nMIIB\n")
     for words, why in (
         (("--tls-ca", str(tmp_path / "none.pem")), "cannot read"),
@@ -218,8 +204,7 @@ def test_options_become_a_transport(pem, tmp_path):
         (("--tls-ca", str(damaged)), r"damaged\.pem holds no certificate"),
         (("--tls-cert", str(damaged), "--tls-key", str(pem / "server.key")), r"cannot use --tls-cert .*damaged\.pem"),
     ):
-        with pytest.raises(TransportError, match=why):
-            parsed(*words)
+        refused(TransportError, why, parsed, *words)
 
 
 async def test_a_slow_reader_is_felt_at_once():

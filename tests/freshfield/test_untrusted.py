@@ -1,7 +1,5 @@
 """Bombs of references: refused before anything of their size is made."""
 
-from __future__ import annotations
-
 import math
 import os
 import tracemalloc
@@ -16,15 +14,14 @@ from freshfield import untrusted
 from freshfield.limits import MAX_ERROR_CHARS, MAX_YAML_CHARS
 from freshfield.scenario import ScenarioError, load
 from freshfield.untrusted import UntrustedError, read_bytes, read_json, read_text, read_yaml
-from tests.support import work_ms
+from tests.support import refused, work_ms
 
 
 def one_line(read, text: str) -> str:
     """Why a text is refused."""
-    with pytest.raises(UntrustedError) as error:
-        read(text)
-    assert "\n" not in str(error.value) and len(str(error.value)) < 500
-    return str(error.value)
+    said = str(refused(UntrustedError, "", read, text))
+    assert len(said) < 500
+    return said
 
 
 LEVELS = "abcdefghijklmnop"
@@ -44,8 +41,7 @@ MERGES = bomb("{k: v, l: w}", "{{<<: [{}]}}")
 @pytest.mark.parametrize("text", [LISTS, MERGES, "&a [*a, *a]"], ids=["lists", "merges", "itself"])
 def test_an_alias_bomb_is_refused_at_once(text):
     tracemalloc.start()
-    with pytest.raises(UntrustedError, match="references stand for more than"):
-        read_yaml(text)
+    refused(UntrustedError, "references stand for more than", read_yaml, text)
     assert tracemalloc.get_traced_memory()[1] < 2_000_000
     tracemalloc.stop()
 
@@ -119,16 +115,13 @@ def test_what_is_no_json_is_one_line(text, why):
 
 def test_a_scenario_that_is_a_bomb_is_one_short_line(tmp_path):
     (file := tmp_path / "a.yaml").write_text(f"edge: 1\n{LISTS}")
-    with pytest.raises(ScenarioError) as error:
-        load(file)
-    assert len(str(error.value)) < MAX_ERROR_CHARS + 10 and "\n" not in str(error.value)
+    assert len(str(refused(ScenarioError, "", load, file))) < MAX_ERROR_CHARS + 10
 
 
 def test_a_wide_value_takes_no_more_than_itself():
     """Lists in lists: what waits is counted, not only what was seen."""
     wide = [[0] * 1000] * 1000
-    with pytest.raises(UntrustedError):
-        untrusted.refuse_expansion(wide, 5000, lambda v: v if isinstance(v, list) else ())
+    refused(UntrustedError, "", untrusted.refuse_expansion, wide, 5000, lambda v: v if isinstance(v, list) else ())
     untrusted.refuse_expansion(wide, 1_001_001, lambda v: v if isinstance(v, list) else ())
 
 
@@ -143,8 +136,7 @@ def test_what_has_no_end_is_not_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for read in (untrusted.check_file, read_bytes, read_text):
         for path in (Path("/dev/zero"), tmp_path / "pipe", tmp_path):
-            with pytest.raises(OSError, match="a folder, a device or a pipe, not a file"):
-                read(path)
+            refused(OSError, "a folder, a device or a pipe, not a file", read, path)
 
 
 def test_a_file_is_read_up_to_its_bound(tmp_path):
@@ -152,8 +144,7 @@ def test_a_file_is_read_up_to_its_bound(tmp_path):
     file.write_bytes(b"a\r\nb" + bytes(2**20))
     assert read_bytes(file, 2**20 + 4) == file.read_bytes()
     assert read_text(file).startswith("a\nb")
-    with pytest.raises(OSError, match="larger than 1 MB"):
-        read_bytes(file, 2**20)
+    refused(OSError, "larger than 1 MB", read_bytes, file, 2**20)
 
 
 @pytest.mark.parametrize(("read", "text"), [(read_yaml, r'{a: [x, "\ud800y"]}'), (read_json, r'["\ud800"]')])

@@ -1,16 +1,239 @@
-"""Every target takes its honest inputs and refuses, in one line, its corpus and variants of both."""
+"""What strangers may send or write, each as a function of bytes that raises only what it documents.
 
-from __future__ import annotations
+Honest messages and files are made here, so that they stay honest; hostile ones, and whatever fuzzing once
+found, lie in ``corpus/TARGET/``.
+"""
 
+import contextlib
 import random
+import tempfile
 import time
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from camera_node.settings import source_config
+from channel_emu.live.frame_proxy import damage_payload
+from channel_emu.model.settings import channel_from_mapping
+from edge_server.fields import checkpoint
+from edge_server.live.buffer import FrameBuffer
+from edge_server.live.ingest import Ingest
+from edge_server.settings import read_config
+from freshfield import payload, scenario
+from freshfield.clock import VirtualClock
+from freshfield.depth import DepthImage, EncodedDepth
+from freshfield.frame import FrameRejected, checksum, counted_ids, parse, to_request
+from freshfield.geometry import Pinhole
 from freshfield.session import SessionError
-from tests.fuzz.targets import MOST_FILE_MS, MOST_MS, TARGETS, seeds
+from freshfield.v1 import frames_pb2 as pb
+from tests.edge_server.frames import frame
 from tests.support import work_ms
+
+CORPUS = Path(__file__).parent / "corpus"
+NOW = 10**18
+CAMERAS = ("cam00", "cam01")
+Target = Callable[[bytes], str]
+"""Takes one input; returns what became of it, in a word, and raises what must never be raised."""
+
+
+def request(folder: Path) -> Target:
+    """A message at the edge, as it is and with a checksum that fits: ``from_request`` and all behind it."""
+    clock, ledger = VirtualClock(NOW), SimpleNamespace(write=lambda *line: "\t".join(map(str, line)))
+    ingest = Ingest(clock, FrameBuffer(["cam01"]), ["cam00"], ledger, lambda frame: None)  # type: ignore[arg-type]
+
+    def take(data: bytes) -> str:
+        plain = ingest.take(data)
+        with contextlib.suppress(FrameRejected):
+            message = parse(data)
+            message.crc32c = checksum(message)
+            data = message.SerializeToString()
+        clock.advance_to(clock.now_ns() + 10**6)
+        mended = ingest.take(data)
+        return (plain.reason and mended.reason) or "accepted"
+
+    return take
+
+
+def header(folder: Path) -> Target:
+    """A message at the emulator, which reads the header alone and may damage the payload."""
+
+    def take(data: bytes) -> str:
+        try:
+            found = parse(data).header
+        except FrameRejected as error:
+            return error.reason
+        counted_ids(found, CAMERAS)
+        parse(damage_payload(data, ((0.5, 1), (0.999, 255))))
+        return "read"
+
+    return take
+
+
+def pixels(folder: Path) -> Target:
+    """``payload.check``, and ``decode`` of what passes. The first three bytes: codec, width, height."""
+
+    def take(data: bytes) -> str:
+        codec, width, height = (data[:3] + b"\0\0\0")[:3]
+        name = payload.CODECS[codec % 3]
+        try:
+            image = payload.decode(data[3:], name, width, height)
+        except payload.PayloadError as error:
+            return error.reason
+        assert image.dtype == np.uint8 and image.shape[:2] == (height, width) and image.shape[2] in (3, 4)
+        return name
+
+    return take
+
+
+def depths(folder: Path) -> Target:
+    """``EncodedDepth.check``, and ``decode`` of what passes. The first two bytes: width and height."""
+
+    def take(data: bytes) -> str:
+        width, height = (data[:2] + b"\0\0")[:2]
+        depth = EncodedDepth(data[2:], width, height, 0.001)
+        try:
+            depth.check(Pinhole(width, height, 9.0, 9.0, 1.0, 1.0), 1)
+            counts = depth.decode().counts
+        except payload.PayloadError as error:
+            return error.reason
+        assert counts.dtype == np.uint16 and counts.shape == (height, width)
+        return "depth"
+
+    return take
+
+
+def of_file(name: str, folder: Path, read: Callable[[Path], str], refusals: type[Exception]) -> Target:
+    """A target that reads a file: what it refuses is one line of bounded length."""
+    file = folder / name
+
+    def take(data: bytes) -> str:
+        file.write_bytes(data)
+        try:
+            return read(file)
+        except refusals as error:
+            assert len(str(error)) < 3000, f"an error of {len(str(error))} characters"
+            return type(error).__name__
+
+    return take
+
+
+def scenarios(folder: Path) -> Target:
+    """A scenario file, with the sections of all three packages."""
+
+    def read(file: Path) -> str:
+        found = scenario.load(file)
+        source_config(found)
+        channel_from_mapping(found.channel)
+        read_config(found)
+        return "read"
+
+    return of_file("a.yaml", folder, read, scenario.ScenarioError)
+
+
+def checkpoints(folder: Path) -> Target:
+    def read(file: Path) -> str:
+        checkpoint.load(file, most_bytes=10**6)
+        return "read"
+
+    return of_file("a.npz", folder, read, checkpoint.CheckpointError)
+
+
+def mcap(folder: Path) -> Target:
+    """A recorded session, of which every payload is read."""
+    from freshfield.session import SessionError
+    from freshfield.session.reader import Session
+
+    def read(file: Path) -> str:
+        session = Session(file)
+        try:
+            for found in session.frames.values():
+                for one in found:
+                    session.payload(one)
+                    session.depth(one)
+        finally:
+            session.close()
+        return f"{len(session.frames)} cameras"
+
+    return of_file("a.mcap", folder, read, SessionError)
+
+
+TARGETS: dict[str, Callable[[Path], Target]] = {
+    "request": request,
+    "header": header,
+    "payload": pixels,
+    "depth": depths,
+    "scenario": scenarios,
+    "checkpoint": checkpoints,
+    "mcap": mcap,
+}
+MOST_MS = {"request": 50.0, "header": 50.0, "payload": 200.0, "depth": 50.0}
+"""Of one input's processor time: what a loop with other callers may be kept; a file may take MOST_FILE_MS."""
+MOST_FILE_MS = 2000.0
+PNG = payload.encode(np.zeros((2, 2, 3), np.uint8), "png")
+
+
+def seeds(target: str) -> list[bytes]:
+    """Honest inputs, made here, and the files of the corpus."""
+    return [*_HONEST[target](), *(file.read_bytes() for file in sorted((CORPUS / target).glob("*")))]
+
+
+def _messages() -> Iterable[bytes]:
+    small = payload.encode(np.zeros((2, 2, 3), np.uint8), "zstd")
+    for camera, codec, data in (("cam01", "zstd", small), ("cam00", "png", PNG), ("x", "png", PNG)):
+        lens = Pinhole(2, 2, 2.0, 2.0, 1.0, 1.0, (0.1, 0.0, 0.0, 0.0))
+        sent = frame(camera, codec=codec, payload=data, intrinsics=lens, generated_ns=NOW, held_out=camera == "cam00")
+        yield to_request(sent).SerializeToString()
+    measured = DepthImage(np.eye(2, dtype=np.uint16), 0.001, lens, sent.pose, 5).encode()
+    yield to_request(
+        replace(sent, camera="cam01", sequence=1, generated_ns=NOW + 1, depth=measured)
+    ).SerializeToString()
+    yield pb.PushRequest().SerializeToString()
+
+
+def _payloads() -> Iterable[bytes]:
+    image = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
+    for number, codec in enumerate(payload.CODECS):
+        yield bytes([number, 8, 8]) + payload.encode(image, codec)
+
+
+def _depths() -> Iterable[bytes]:
+    for counts in (np.arange(64, dtype=np.uint16).reshape(8, 8), np.eye(8, dtype=np.uint16)):  # the second with a table
+        yield b"\x08\x08" + DepthImage(counts, 0.001).encode().payload
+
+
+def _checkpoints() -> Iterable[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        checkpoint.save(Path(folder) / "a", {"x": np.zeros(3, np.float32), "n": np.array(2)}, {"steps": 1})
+        yield (Path(folder) / "a").read_bytes()
+
+
+def _sessions() -> Iterable[bytes]:
+    from freshfield.session.writer import SessionWriter
+
+    with tempfile.TemporaryDirectory() as folder:
+        writer = SessionWriter(Path(folder) / "a", {"scenario": "fuzz"})
+        given = list(_messages())
+        for message in (*given[:2], given[3]):  # of two cameras, the last with depth
+            writer.frame(pb.PushRequest.FromString(message), NOW)
+        writer.close({"dropped": 0})
+        yield (Path(folder) / "a").read_bytes()
+
+
+_HONEST: dict[str, Callable[[], Iterable[bytes]]] = {
+    "request": _messages,
+    "header": _messages,
+    "payload": _payloads,
+    "depth": _depths,
+    "checkpoint": _checkpoints,
+    "mcap": _sessions,
+    "scenario": lambda: (f.read_bytes() for f in sorted(scenario.SCENARIO_FOLDER.glob("*.yaml"))),
+}
+
 
 HONEST = {"request": 3, "header": 2, "payload": 3, "depth": 2, "scenario": 15, "checkpoint": 1, "mcap": 1}
 ACCEPTED = ("accepted", "read", "jpeg", "png", "zstd", "depth", "2 cameras")

@@ -1,7 +1,5 @@
 """A source, a policy, an effect, a fault, a selector and a field as a user writes them; and policies that fail."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from typing import Annotated, ClassVar
 

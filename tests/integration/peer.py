@@ -1,7 +1,5 @@
 """A real gRPC peer for nodes, in the test's own event loop, that can be told to misbehave."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
@@ -14,6 +12,7 @@ from freshfield.frame import Frame, from_request
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, frames_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
+from tests.support import until
 
 Answer = Callable[[pb.PushRequest], Awaitable[pb.PushResponse | None]]
 
@@ -58,7 +57,7 @@ class Peer:
     def address(self) -> str:
         return f"127.0.0.1:{self.port}"
 
-    async def start(self) -> Peer:
+    async def start(self) -> "Peer":
         """Listen, after a ``stop`` on the same port again."""
         self._server = self.transport.aio_server()
         frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(_Frames(self), self._server)
@@ -76,16 +75,12 @@ class Peer:
 
     async def until(self, frames: int, timeout_s: float = 60.0) -> None:
         """Until so many frames arrived in all; TimeoutError if they do not."""
-        async with asyncio.timeout(timeout_s):
-            while len(self.frames) < frames:
-                await asyncio.sleep(0.01)
+        await until(lambda: len(self.frames) >= frames, timeout_s)
 
     async def until_each(self, cameras: list[str], frames: int) -> None:
         """Until so many more frames of each camera arrived."""
         begin = len(self.frames)
-        async with asyncio.timeout(60.0):
-            while any(sum(f.camera == c for f in self.frames[begin:]) < frames for c in cameras):
-                await asyncio.sleep(0.01)
+        await until(lambda: all(sum(f.camera == c for f in self.frames[begin:]) >= frames for c in cameras), 60.0)
 
 
 class _Frames(frames_pb2_grpc.FrameStreamServiceServicer):

@@ -1,15 +1,18 @@
-"""A node against a real peer: what arrives, what it is told, and one frame at a time."""
-
-from __future__ import annotations
+"""A node against a real peer: what arrives, what it is told, one frame at a time; and its books when processes die."""
 
 import asyncio
 import json
+import signal
+import subprocess
+import sys
+import time
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from camera_node.capture import build_cameras
 from camera_node.node import Node, NodeOptions
@@ -17,9 +20,12 @@ from camera_node.settings import source_config
 from freshfield import ledger, payload
 from freshfield.clock import WallClock
 from freshfield.limits import MAX_CAPTURE_AGE_NS
+from freshfield.scenario import load
 from freshfield.transport import Transport
 from tests.camera_node.sources.datasets.photos import photo_scenario, picture, write_photos
+from tests.camera_node.sources.devices.mjpeg import NetworkCamera, camera_file
 from tests.integration.peer import Peer, answer, silence, wrong_number
+from tests.support import until
 
 
 def make_node(tmp_path: Path, to: str, seconds: float | None = None, cameras: int = 3, **options) -> Node:
@@ -145,9 +151,7 @@ async def test_answers_much_later_than_before_mean_a_dead_stream_and_a_slow_link
     async def work():
         await peer.until(40)
         peer.respond = silence
-        async with asyncio.timeout(20.0):
-            while peer.streams < 4:
-                await asyncio.sleep(0.05)
+        await until(lambda: peer.streams >= 4)
         peer.respond = answer(after_s=1.6)  # more than was waited for until then
         await peer.until(len(peer.frames) + 12)
 
@@ -186,3 +190,74 @@ def test_the_first_frame_waits_for_the_clock_and_is_the_newest(tmp_path):
     first = {f.camera: f for f in reversed(peer.frames)}
     assert {f.sequence > 1 for f in first.values()} == {True}  # what was captured meanwhile was replaced
     check_books(tmp_path / "out")
+
+
+CAMERAS = ["cam00", "cam01", "cam02"]
+
+
+async def test_a_peer_that_comes_late_and_dies_again_and_again(tmp_path):
+    peer = await Peer().start()
+    await peer.stop()  # the port is known now, and nobody listens
+    node = make_node(tmp_path, peer.address)
+    gaps_s = []
+
+    async def work():
+        await asyncio.sleep(0.7)
+        for _ in range(4):
+            begin = time.perf_counter()
+            await peer.start()
+            await peer.until_each(CAMERAS, 5)
+            gaps_s.append(time.perf_counter() - begin)
+            await peer.stop()
+            await asyncio.sleep(0.3)
+        await peer.start()
+        await peer.until_each(CAMERAS, 5)
+
+    await run_while(node, work())
+    await peer.stop()
+    counts = check_books(tmp_path / "out")
+    for camera in CAMERAS:
+        sequences = [f.sequence for f in peer.frames if f.camera == camera]
+        assert sequences == sorted(set(sequences))
+        assert len(sequences) <= counts[camera]["sent"] <= len(sequences) + counts[camera]["broken"]
+        assert node.senders[camera].connections >= 5
+    # Back-off is capped: five frames at 20 a second arrive within seconds of every restart.
+    assert max(gaps_s) < 10
+    # What waited through an outage was replaced by newer captures, not kept.
+    late_ms = [(a - f.generated_edge_ns) / 1e6 for a, f in zip(peer.arrived_ns, peer.frames)]
+    assert sorted(late_ms)[len(late_ms) // 2] < 100 and max(late_ms) < 1000
+
+
+async def test_sigterm_ends_cleanly_with_the_last_answer(tmp_path):
+    peer = await Peer().start()
+    source = {"kind": "transforms", "data": str(write_photos(tmp_path / "data", 24)), "fps": 50, "codec": "png"}
+    scenario = {"name": "photos", "cameras": {"count": 3, "held_out": ["cam00"]}, "source": source}
+    (file := tmp_path / "photos.yaml").write_text(yaml.safe_dump(scenario))
+    command = [sys.executable, "-m", "camera_node.cli", "run", str(file), "--all", "--to", peer.address, "--quiet"]
+    node = subprocess.Popen([*command, "--out", str(tmp_path / "out")], stderr=subprocess.PIPE)
+    await peer.until_each(CAMERAS, 10)
+    status = json.loads((tmp_path / "out" / "node-cam00+2.json").read_text())
+    node.send_signal(signal.SIGTERM)
+    _, said = await asyncio.to_thread(node.communicate, timeout=5)
+    await peer.stop()
+    assert (node.returncode, said) == (0, b"")
+    assert status["phase"] in ("preparing", "streaming") and status["cameras"]["cam02"]["fps"] == 50
+    (file,) = ledger.read_all(tmp_path / "out")
+    assert file.events and file.closed and not file.torn
+    assert all(c["sent"] == c["answered"] for c in books(tmp_path / "out").values())
+
+
+async def test_a_frame_is_as_old_as_its_camera_says(tmp_path):
+    network_camera = NetworkCamera(WallClock())
+    scenario = load(camera_file(tmp_path, network_camera.address, latency_ms=3000.0))
+    (camera,) = build_cameras(scenario, source_config(scenario), ["eye"])
+    peer = await Peer().start()
+    node = Node(scenario, [camera], NodeOptions(to=peer.address, transport=Transport()))
+    await run_while(node, peer.until(5))
+    await peer.stop()
+    camera.source.close()
+    network_camera.close()
+    ages_s = [(at - frame.generated_ns) / 1e9 for frame, at in zip(peer.frames, peer.arrived_ns)]
+    assert all(3.0 < age < 20.0 for age in ages_s)
+    stamps = [frame.generated_ns for frame in peer.frames]
+    assert stamps == sorted(set(stamps))

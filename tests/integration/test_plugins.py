@@ -1,10 +1,11 @@
-"""Classes of one's own in a deployment: source, policy, effect, fault and field from a file beside the scenario."""
-
-from __future__ import annotations
+"""Classes of one's own in a deployment: from a file beside the scenario, or installed, as the plug-in's template is."""
 
 import asyncio
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +29,11 @@ from edge_server.scheduler import make_policy
 from freshfield.scenario import parse
 from freshfield.settings import ScenarioError
 from freshfield.transport import Transport
+from tests.conftest import ROOT
 from tests.edge_server.experiments.rollouts.small import RAW
 from tests.edge_server.fields_for_tests import tiny_field
 from tests.edge_server.frames import frame
+from tests.support import refused
 
 FILE = Path(__file__).with_name("own_classes.py")
 MS = 1_000_000
@@ -48,12 +51,6 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(whole))
     monkeypatch.chdir("/")
     return tmp_path
-
-
-def changed(folder: Path, **sections) -> None:
-    """Change sections of the scenario of ``folder``."""
-    whole = yaml.safe_load((folder / "mine.yaml").read_text())
-    (folder / "mine.yaml").write_text(yaml.safe_dump({**whole, **sections}))
 
 
 def run(folder: Path, capsys, *words: str) -> dict:
@@ -103,8 +100,7 @@ def test_a_policy_that_raises_costs_its_decision_live_and_stops_what_is_measured
     assert len([line for line in caplog.messages if "all views are used" in line]) == 1
     live.policy = make_policy("all", None, np.random.default_rng(0))
     assert not live.troubles
-    with pytest.raises((RuntimeError, KeyError)):
-        measured.select(measured.plan(200 * MS), 200 * MS)
+    refused((RuntimeError, KeyError), "", lambda: measured.select(measured.plan(200 * MS), 200 * MS))
 
 
 def test_what_is_of_the_wrong_kind_is_refused_by_name(folder):
@@ -113,7 +109,7 @@ def test_what_is_of_the_wrong_kind_is_refused_by_name(folder):
     def source(**section):
         source_config(parse({"cameras": {"count": 2}, "source": section}, Path("raw.yaml")))
 
-    for refused, why in (
+    for use, why in (
         (lambda: make_policy(f"{own}Darker", None, None), r"does not derive from edge_server\.scheduler\.Policy"),
         (lambda: load_effects({f"{own}Late": {}}, None), "expected a subclass of EffectParameters"),
         (lambda: channel_from_mapping({"faults": {f"{own}Youngest": {}}}), r"from channel_emu\.model\.link\.Fault"),
@@ -121,20 +117,48 @@ def test_what_is_of_the_wrong_kind_is_refused_by_name(folder):
         (lambda: source(kind=f"{own}Youngest"), r"raw.yaml: source.kind: .*base\.Source"),
         (lambda: source(kind=f"{own}Turning", level=256), r"raw.yaml: source.level: expected .*0 to 255"),
     ):
-        with pytest.raises(ScenarioError, match=why):
-            refused()
+        refused(ScenarioError, why, use)
 
 
 def test_a_field_of_ones_own_runs_is_saved_and_is_not_loaded_from_a_folder_of_others(folder, capsys):
     own = f"{folder / 'own.py'}:Flat"
     assert "level" in option_help(own)
-    with pytest.raises(ScenarioError, match="has no option hight"):
-        make_field(own, {"hight": 1})
-    changed(folder, edge={**RAW["edge"], "field": "own.py:Flat", "field_options": {"level": 0.25}})
+    refused(ScenarioError, "has no option hight", make_field, own, {"hight": 1})
+    edge = {**RAW["edge"], "field": "own.py:Flat", "field_options": {"level": 0.25}}
+    (folder / "mine.yaml").write_text(yaml.safe_dump({**RAW, "edge": edge}))
     assert run(folder, capsys)["updates"] > 0
     field = make_field(own, {"level": 0.25})
     checkpoint.save(folder / "flat.npz", field.state(), {"field": own, "options": {}})
-    with pytest.raises(ExportError, match="--allow-plugins"):
-        open_source(folder / "flat.npz")
+    refused(ExportError, "--allow-plugins", open_source, folder / "flat.npz")
     with pytest.raises(ExportError, match="has seen no camera yet"):  # its code ran
         open_source(folder / "flat.npz", allow_plugins=True)
+
+
+def python(words: list[str], cwd: Path, *path: Path) -> str:
+    here = [str(each) for each in (*path, ROOT / "proto", ROOT, ROOT / "deploy")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(here)}
+    command = [sys.executable, "-m", *words]
+    done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_template_is_built_installed_checked_and_used(tmp_path):
+    source, wheels, site = tmp_path / "plugin", tmp_path / "wheels", tmp_path / "site"
+    shutil.copytree(ROOT / "examples/plugin", source)
+    python(["pip", "wheel", "-q", "--no-deps", "-w", str(wheels), str(source)], tmp_path)
+    (wheel,) = wheels.iterdir()
+    python(["pip", "install", "-q", "--no-deps", "--no-index", "--target", str(site), str(wheel)], tmp_path)
+    (source / "freshfield_example.py").unlink()  # the installed one is meant
+
+    assert "4 passed" in python(["pytest", "-q", "test_contract.py"], source, site)
+    edge = {**RAW["edge"], "policy": {"name": "least-used", "value": 1}}
+    whole = {**RAW, "edge": edge, "source": {**RAW["source"], "effects": {"vignette": {"loss": 0.3}}}}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(whole))
+    said = python(["edge_server.cli", "simulate", "mine.yaml", "--seconds", "1", "--json"], tmp_path, site)
+    assert json.loads(said)["policy"] == "least-used"
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({**whole, "source": {"kind": "bar", "bar_px": 4}}))
+    said = python(["edge_server.cli", "simulate", "mine.yaml", "--seconds", "1", "--json"], tmp_path, site)
+    assert json.loads(said)["updates"] > 0

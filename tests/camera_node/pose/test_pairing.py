@@ -1,6 +1,8 @@
-"""Pairing while samples still arrive: in order or not, from clocks that are set, interpolated or nearest."""
+"""Poses while samples still arrive: in order or not, from clocks that are set, from a file that is being written."""
 
-from __future__ import annotations
+import os
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -8,7 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from camera_node.pose.pairing import PoseGapError, SampleBuffer, interpolate_joints
+from camera_node.pose.providers import read_tum
+from camera_node.pose.tracker import TrackerPoses
 from freshfield.geometry import Pose, se3, so3_exp
+from tests.camera_node.sources.datasets.photos import fails
+from tests.support import refused
 
 MS = 1_000_000
 
@@ -21,25 +27,21 @@ def at(t_ms: float) -> Pose:
 def test_nearest_or_between_with_the_gap_and_a_bound_that_counts():
     joints = SampleBuffer(interpolate_joints, max_gap_ns=10 * MS)
     nearest = SampleBuffer(None, max_gap_ns=10 * MS)
-    with pytest.raises(PoseGapError, match="no pose yet"):
-        joints.at(0)
+    refused(PoseGapError, "no pose yet", joints.at, 0)
     for t_ms in (0, 8, 16, 60, 68):
         for buffer in (joints, nearest):
             buffer.add(t_ms * MS, np.full(6, float(t_ms)))
     between, gap_ns = joints.at(10 * MS)
     assert between == pytest.approx(np.full(6, 10.0)) and gap_ns == 2 * MS
     assert nearest.at(10 * MS)[0][0] == 8 and nearest.at(13 * MS)[0][0] == 16
-    with pytest.raises(PoseGapError, match=r"22\.0 ms away, more than 10 ms"):
-        joints.at(38 * MS)
+    refused(PoseGapError, r"22\.0 ms away, more than 10 ms", joints.at, 38 * MS)
     # Outside: the first or the last, not beyond it, as far as the bound itself.
     assert joints.at(78 * MS)[0][0] == 68 and joints.at(-10 * MS)[0][0] == 0
     for t_ms in (-11, 79):
-        with pytest.raises(PoseGapError, match="nearest pose"):
-            joints.at(t_ms * MS)
+        refused(PoseGapError, "nearest pose", joints.at, t_ms * MS)
     assert not joints.ready(69 * MS) and joints.ready(68 * MS)
     for wrong in ({"max_gap_ns": -1}, {"keep_ns": 0}, {"restart_after": 0}):
-        with pytest.raises(ValueError, match="must be positive"):
-            SampleBuffer(None, **wrong)
+        refused(ValueError, "must be positive", SampleBuffer, None, **wrong)
 
 
 def test_exactly_so_many_old_samples_restart_the_buffer():
@@ -49,8 +51,7 @@ def test_exactly_so_many_old_samples_restart_the_buffer():
     assert [buffer.add(k * MS, k) for k in range(3)] == [False] * 3
     assert buffer.at(10**12)[0] == 0, "one fewer does not"
     assert buffer.add(3 * MS, 3) and buffer.at(0)[0] == 0 and buffer.at(3 * MS)[0] == 3
-    with pytest.raises(PoseGapError):
-        buffer.at(10**12)
+    refused(PoseGapError, "", buffer.at, 10**12)
 
 
 @pytest.mark.stability
@@ -69,8 +70,7 @@ def test_the_order_and_the_number_of_arrivals_do_not_matter(random, stamps_ms):
         try:
             expected = track.at(t_ms * MS)
         except PoseGapError:
-            with pytest.raises(PoseGapError):
-                buffer.at(t_ms * MS)
+            refused(PoseGapError, "", buffer.at, t_ms * MS)
         else:
             assert buffer.at(t_ms * MS) == expected
 
@@ -101,3 +101,108 @@ def test_late_samples_in_disorder_restart_nothing_and_memory_is_bounded():
     for t_ms in (50, 40, 30, 20, 10, 0, 0, 0):
         assert not buffer.add(t_ms * MS, float(t_ms))
     assert buffer.at(9998 * MS)[0] == 9998
+
+
+START_NS = 1_700_000_000_000_000_000
+STEP_NS = 20_000_000
+
+
+def _line(k: int, x: float | None = None) -> str:
+    t_ns = START_NS + k * STEP_NS
+    return f"{t_ns // 10**9}.{t_ns % 10**9:09d} {k if x is None else x} 0 0 0 0 0 1\n"
+
+
+def _written(file, text: str, mode: str = "a") -> None:
+    with open(file, mode) as out:
+        out.write(text)
+
+
+def _x(poses: TrackerPoses, k: float, within_s: float = 5.0) -> float:
+    """The position at step ``k``; a busy machine may be late."""
+    until = time.monotonic() + within_s
+    while True:
+        try:
+            return poses.at(START_NS + round(k * STEP_NS))[0].translation_m[0]
+        except PoseGapError:
+            if time.monotonic() > until:
+                raise
+
+
+@pytest.fixture
+def followed(tmp_path):
+    poses = TrackerPoses(tmp_path / "poses.txt")
+    yield poses
+    poses.close()
+
+
+def test_a_file_is_followed_from_before_it_is_there_to_its_next_beginning(followed):
+    refused(PoseGapError, r"poses\.txt: there is no pose yet; its times are seconds since 1970", followed.at, START_NS)
+    _written(followed.path, _line(0) + _line(1)[:20])
+    assert _x(followed, 0) == 0.0
+    _written(followed.path, _line(1)[20:] + _line(2))
+    assert _x(followed, 1.25) == pytest.approx(1.25)
+    _written(followed.path, _line(3), "w")  # shorter: the tracker began anew
+    assert _x(followed, 3) == 3.0
+    other = followed.path.with_suffix(".new")
+    _written(other, _line(4) * 20)
+    os.replace(other, followed.path)
+    assert _x(followed, 4) == 4.0
+    for k in (5, 6):  # in place, as long as before, then longer
+        _written(followed.path, _line(k) * (15 + k), "r+")
+        assert _x(followed, k) == k
+    assert followed.refused == 0
+
+
+def test_a_frame_waits_for_the_pose_that_is_computed_after_it(followed):
+    _written(followed.path, _line(0))
+    assert _x(followed, 0) == 0.0
+    threading.Timer(0.03, _written, (followed.path, _line(1))).start()
+    assert followed.at(START_NS + STEP_NS // 2)[0].translation_m[0] == pytest.approx(0.5)
+
+
+def test_a_named_pipe_is_read_from_one_writer_after_the_other(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    poses = TrackerPoses(tmp_path / "pipe")
+    for k in range(2):
+        writer = threading.Thread(target=_written, args=(poses.path, _line(k)))
+        writer.start()
+        assert _x(poses, k) == k
+        writer.join(5.0)
+    poses.close()
+    assert not poses._thread.is_alive()
+
+
+@pytest.mark.stability
+def test_lines_that_are_no_pose_are_counted_and_cost_nothing_else(followed, caplog):
+    bad = ["nan 0 0 0 0 0 0 1\n", f"{START_NS} 0 0 0 0 0 0 1\n", "1 2\n", "\xff" * 20 + "\n", "0 0 0 0 0 0 0 0\n"]
+    _written(followed.path, "# t x y z\n" + "".join(bad) + "x" * 20_000 + "\n" + _line(0) + "\n" + _line(1))
+    assert _x(followed, 1) == 1.0 and _x(followed, 0) == 0.0
+    assert followed.refused == len(bad) + 1
+    assert caplog.text.count("lines that are no pose are left out") == 1
+
+
+def test_tum_files_keep_nanoseconds_and_put_w_first(tmp_path):
+    file = tmp_path / "groundtruth.txt"
+    file.write_text("# comment\n\n1305031102.175304 1 2 3 0 0 0.5 0.8660254\n1305031102.2 1,2,3,0,0,0,1\n")
+    track = read_tum(file)
+    exact, gap_ns = track.at(1305031102_175304000)
+    assert gap_ns == 0 and read_tum(file, start_ns=1305031102_175304000).at(0) == (exact, 0)
+    between, _ = track.at(1305031102_187652000)
+    for pose, angle in ((exact, np.pi / 3), (between, np.pi / 6)):
+        np.testing.assert_allclose(pose.matrix()[:3, :3], so3_exp([0, 0, angle]), atol=1e-6)
+    file.write_text("2 1 2 3 0 0 0 1")
+    assert read_tum(file).at(2_050_000_000)[0].translation_m == (1.0, 2.0, 3.0), "one sample is enough"
+
+
+def test_bad_lines_are_named(tmp_path):
+    for text, message in (
+        ("", "at least one sample"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 zero\n", ":2: expected t tx ty tz"),
+        ("0 0 0 0 0 0 0 0\n", ":1: quaternion"),
+        ("0 nan 0 0 0 0 0 1\n", ":1: expected"),
+        ("0 0 0 0 0 0 0 1\n-1e300 0 0 0 0 0 0 1\n", ":2: the time -1e.* milliseconds or nanoseconds"),
+        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "times that increase"),
+    ):
+        file = tmp_path / "track.txt"
+        file.write_text(text)
+        fails(f"{file}.*{message}", read_tum, file)

@@ -1,7 +1,5 @@
 """Sources as the node uses them: ticks, frames held out of a carried camera's path, effects on the wire."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -24,8 +22,8 @@ from edge_server.settings import read_config
 from freshfield import payload
 from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import Scenario, ScenarioError, parse
-from tests.camera_node.sources.datasets.photos import edited, fails, opencv_pose, photo_scenario, picture, write_photos
-from tests.support import small_world
+from tests.camera_node.sources.datasets.photos import edited, photo_scenario, picture, pose_of, write_photos
+from tests.support import refused, small_world
 
 
 def opened(scenario, cameras=None, data: Path | None = None):
@@ -39,7 +37,7 @@ def test_photos_are_streamed_as_moving_cameras(tmp_path):
     for tick, index in ((0, 0), (1, 8), (2, 16), (3, 8), (4, 0)):
         shot = held_out.read(held_out.content(tick))
         np.testing.assert_array_equal(shot.image, picture(index)[..., ::-1])
-        np.testing.assert_allclose(shot.pose.matrix(), opencv_pose(index), atol=1e-9)
+        np.testing.assert_allclose(shot.pose.matrix(), pose_of(index), atol=1e-9)
     np.testing.assert_array_equal(first.read(first.content(1)).image, picture(3)[..., ::-1])
 
 
@@ -56,8 +54,7 @@ def test_a_recording_is_assigned_by_name(tmp_path):
         (3, {"cam09": "cam00"}, r"assignment\.cam09"),
         (3, {"cam01": "cam00"}, "more than one camera shows cam00"),
     ):
-        with pytest.raises(ScenarioError, match=message):
-            opened(photo_scenario(data, count, assignment=assignment))
+        refused(ScenarioError, message, opened, photo_scenario(data, count, assignment=assignment))
 
 
 @pytest.mark.parametrize(("fps", "time_unit_s"), [(0, 1.0), (1e9, 1.0), (None, 1e308), (None, 1e-320)])
@@ -67,8 +64,7 @@ def test_an_impossible_rate_of_a_recording_is_named(fps, time_unit_s, tmp_path):
         lambda d: [frame.update(time=frame["time"] * time_unit_s) for frame in d["frames"]],
         fps=fps,
     )
-    with pytest.raises(DatasetError, match=r"transforms\.json: recorded .* expected 0\.01 to 1000"):
-        opened(photo_scenario(data, 2))
+    refused(DatasetError, r"transforms\.json: recorded .* expected 0\.01 to 1000", opened, photo_scenario(data, 2))
 
 
 def test_a_jpeg_of_the_right_size_is_sent_as_it_lies(tmp_path):
@@ -94,8 +90,7 @@ def test_photos_are_dealt_in_turn_and_each_eighth_or_the_sets_own_is_held_out():
     assert split_photos(10, ["a", "b"], ["d"]) == {"d": [0, 8], "a": [1, 3, 5, 7], "b": [2, 4, 6, 9]}
     assert split_photos(6, ["a", "b"], ["d"], [1, 4]) == {"d": [1, 4], "a": [0, 3], "b": [2, 5]}
     assert split_photos(6, ["a", "b"], [], [1, 4]) == {"a": [0, 3], "b": [2, 5]}
-    with pytest.raises(DatasetError, match="3 images are too few"):
-        split_photos(3, ["a", "b", "c"], ["d"])
+    refused(DatasetError, "3 images are too few", split_photos, 3, ["a", "b", "c"], ["d"])
 
 
 def recorded(**times: list[float]) -> Dataset:
@@ -129,16 +124,11 @@ def cameras_of(found: Scenario, only: str = "") -> dict[str, Camera]:
     return {c.name: c for c in build_cameras(found, source_config(found), [only] if only else found.cameras)}
 
 
-def path_of_one(folder: Path, count: int) -> Path:
-    """A recording of one moving camera at 10 frames a second."""
-    file = write_photos(folder, count)
-    return edited(file, lambda data: [frame.update(time=3.0 + k / 10) for k, frame in enumerate(data["frames"])])
-
-
 @pytest.mark.parametrize("loop", ["back-and-forth", "restart"])
 @pytest.mark.parametrize(("fps", "count"), [(None, 33), (5, 60)])
 def test_no_frame_of_a_recording_is_both_held_out_and_trained_on_in_any_round(tmp_path, loop, fps, count):
-    data = path_of_one(tmp_path, count)
+    at_10 = [3.0 + k / 10 for k in range(count)]
+    data = edited(write_photos(tmp_path, count), lambda d: [f.update(time=t) for f, t in zip(d["frames"], at_10)])
     source = {"kind": "transforms", "data": str(data), "loop": loop, "codec": "png"}
     hand, kept = cameras_of(scenario({**source, "fps": fps} if fps else source)).values()
     rate = fps or 10
@@ -152,9 +142,7 @@ def test_no_frame_of_a_recording_is_both_held_out_and_trained_on_in_any_round(tm
     assert kept.capture(1).pose != kept.capture(0).pose
 
 
-def test_a_held_out_frame_of_the_world_has_the_errors_of_the_camera_that_is_carried(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-
+def test_a_held_out_frame_of_the_world_has_the_errors_of_the_camera_that_is_carried():
     def whole(effects):
         source = {**WORLD, "effects": effects}
         return cameras_of(parse({"seed": 5, "cameras": {"ids": ["hand"]}, "source": source}, Path("w")))["hand"]
@@ -197,7 +185,7 @@ def test_a_walk_repeats_after_a_lap_and_neither_jumps_nor_leaves_the_room():
     ],
 )
 def test_what_cannot_be_divided_is_said_in_one_line(source, every, ids, message):
-    fails(message, lambda: cameras_of(scenario(source, every, ids)), error=ScenarioError)
+    refused(ScenarioError, message, lambda: cameras_of(scenario(source, every, ids)))
 
 
 @pytest.fixture(autouse=True)
@@ -285,6 +273,6 @@ def test_recordings_stand_where_they_stood_and_are_sent_as_they_lie_with_a_wrong
     truth, wrong = build_cameras(scenario, source_config(scenario), ["cam00", "cam01"])
     shot = wrong.capture(1)
     np.testing.assert_array_equal(payload.decode(shot.payload, "png", 32, 24), picture(3)[..., ::-1])
-    assert not np.allclose(shot.pose.matrix(), opencv_pose(3), atol=1e-6)
-    assert np.allclose(shot.pose.matrix(), opencv_pose(3), atol=0.3)
-    np.testing.assert_allclose(truth.capture(1).pose.matrix(), opencv_pose(8), atol=1e-9)
+    assert not np.allclose(shot.pose.matrix(), pose_of(3), atol=1e-6)
+    assert np.allclose(shot.pose.matrix(), pose_of(3), atol=0.3)
+    np.testing.assert_allclose(truth.capture(1).pose.matrix(), pose_of(8), atol=1e-9)

@@ -4,8 +4,6 @@ a scene stay figures of that scene. After a wanted change:
     python -m tests.camera_node.synthetic.test_golden
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

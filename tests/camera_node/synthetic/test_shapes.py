@@ -1,7 +1,5 @@
 """Shapes, images and depth against geometry that the renderer does not use. How scenes look is in golden."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 
@@ -97,7 +95,6 @@ def test_rays_along_the_axes_from_everywhere_are_finite_or_miss(shape):
 # Ambient only: every surface shows its albedo.
 FLAT = Light(np.array([[0.0, 0.0, 50.0]]), 0.0, 1.0, (1.0, 1.0, 1.0), (1.0, 1.0, 1.0))
 WHITE = Plain((1.0, 1.0, 1.0))
-DISTORTION = (-0.25, 0.06, 0.004, -0.003)
 
 
 def test_culling_leaves_out_no_ray_that_hits():
@@ -138,7 +135,7 @@ def test_a_light_inside_or_on_a_surface_does_no_harm(z):
 
 
 def test_depth_is_z_at_pixel_centers_of_parts_that_stand_and_move_and_0_where_nothing_is():
-    lens = dataclasses.replace(Pinhole.from_fov(64, 48, 60.0), distortion=DISTORTION)
+    lens = dataclasses.replace(Pinhole.from_fov(64, 48, 60.0), distortion=(-0.25, 0.06, 0.004, -0.003))
     pose = look_at([0.0, -3.0, 1.0], [0.0, 0.0, 1.0])  # looks along +y
     wall = Part(Quad((50.0, 50.0)), WHITE, facing((1, 0, 0), (0, 0, 1), (0, 1, 0)))
     ball = Part(Sphere(0.3), WHITE)

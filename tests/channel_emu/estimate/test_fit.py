@@ -1,7 +1,7 @@
-"""What ``fit`` says of channels whose parameters are known, and of recordings that allow no answer."""
+"""What ``fit`` says of channels whose parameters are known, and of recordings that allow no answer; its recursions
+against sums over all paths and small steps of time."""
 
-from __future__ import annotations
-
+import itertools
 import json
 import math
 from pathlib import Path
@@ -9,26 +9,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from scipy import linalg
 
 from channel_emu.cli import main
 from channel_emu.estimate import recording as recordings
+from channel_emu.estimate import two_states
 from channel_emu.estimate.fit import Fit, IntervalEstimate, fit
 from channel_emu.estimate.report import format_fit
+from channel_emu.estimate.two_states import TwoStates
+from channel_emu.model.chain import two_state_generator
 from channel_emu.model.link import FITTED_DISCIPLINES
 from channel_emu.model.settings import channel_from_mapping
 from channel_emu.model.trace import TraceWriter
 from channel_emu.virtual.simulate import simulate
 from freshfield import scenario
+from tests.support import refused
 
+RATES = {"mu1_per_ms": 1 / 1000, "mu2_per_ms": 1 / 500}
 # A slow channel: periodic frames, delays of 20 and 120 ms.
 SLOW = {
     "arrivals": {"process": "periodic", "period_ms": 30.0},
-    "chain": {"mu1_per_ms": 1 / 1000, "mu2_per_ms": 1 / 500},
+    "chain": RATES,
     "service": {"law": "exponential", "mean_ms": [20.0, 120.0]},
     "discipline": "drop-new",
 }
 HEAD = "offered_ms,delivered_ms\n"
-RATES = {"mu1_per_ms": 1 / 1000, "mu2_per_ms": 1 / 500}
 SLOW_TRUE = {**RATES, "mean_1_ms": 20.0, "mean_2_ms": 120.0}
 
 
@@ -67,7 +72,7 @@ def check(found: Fit, true: dict[str, float]) -> None:
         assert interval is not None and interval[1] / interval[0] < 3.5
 
 
-def test_a_slow_chain_from_delays_alone(tmp_path: Path) -> None:
+def test_a_slow_chain_from_delays_alone(tmp_path):
     found = fit(write_trace(tmp_path / "t.jsonl", SLOW, 1, cameras=2, seconds=120))
     assert found.arrivals == "periodic" and found.bic[2] < found.bic[1] - 100 and not found.warnings
     check(found, SLOW_TRUE)
@@ -81,7 +86,7 @@ def test_a_slow_chain_from_delays_alone(tmp_path: Path) -> None:
     assert visits + shares in format_fit(found).splitlines()
 
 
-def test_states_that_differ_by_nothing_but_their_losses(tmp_path: Path) -> None:
+def test_states_that_differ_by_nothing_but_their_losses(tmp_path):
     """Gilbert and Elliott's channel."""
     service = {"law": "deterministic", "mean_ms": 20.0}
     bursts = {**SLOW, "service": service, "discipline": "parallel", "faults": {"loss": [0.02, 0.5]}}
@@ -92,7 +97,7 @@ def test_states_that_differ_by_nothing_but_their_losses(tmp_path: Path) -> None:
     assert found.channel["service"] == service
 
 
-def test_delays_and_losses_together_and_a_shape(tmp_path: Path) -> None:
+def test_delays_and_losses_together_and_a_shape(tmp_path):
     service = {"law": "gamma", "mean_ms": [20.0, 60.0], "shape": 4.0}
     section = {**SLOW, "service": service, "faults": {"loss": [0.01, 0.3]}, "discipline": "parallel"}
     found = fit(write_rows(tmp_path / "rows.csv", section), discipline="parallel")
@@ -100,7 +105,7 @@ def test_delays_and_losses_together_and_a_shape(tmp_path: Path) -> None:
     assert found.channel["service"]["law"] == "gamma" and not found.warnings
 
 
-def test_one_state_and_arrivals_that_sample_frames(tmp_path: Path) -> None:
+def test_one_state_and_arrivals_that_sample_frames(tmp_path):
     """The thesis's traffic in its low state: arrivals of one rate, delays of one mean, independent losses."""
     section = {"preset": "ch6-low", "faults": {"loss": 0.2}}
     found = fit(write_trace(tmp_path / "t.jsonl", section, 4, cameras=4, seconds=120, frame_period_ms=33.3))
@@ -109,15 +114,14 @@ def test_one_state_and_arrivals_that_sample_frames(tmp_path: Path) -> None:
     assert found.channel["discipline"] == "newest-waits"
 
 
-def test_rows_behind_a_waiting_place(tmp_path: Path) -> None:
+def test_rows_behind_a_waiting_place(tmp_path):
     """Transmission starts when the link becomes free; without a word of it the waiting would count as delay."""
     path = write_rows(tmp_path / "rows.csv", {**SLOW, "discipline": "newest-waits"}, 7)
-    with pytest.raises(recordings.RecordingError, match=r"% of the frames .* --discipline"):
-        fit(path)
+    refused(recordings.RecordingError, r"% of the frames .* --discipline", fit, path)
     check(fit(path, discipline="newest-waits"), SLOW_TRUE)
 
 
-def test_what_is_still_on_its_way_is_not_lost(tmp_path: Path) -> None:
+def test_what_is_still_on_its_way_is_not_lost(tmp_path):
     """A parallel link recorded until 10 s: late frames that had not come by then are no losses, and one that is
     missing long before is."""
     offered = np.arange(0.0, 10_000.0, 10.0)
@@ -130,9 +134,8 @@ def test_what_is_still_on_its_way_is_not_lost(tmp_path: Path) -> None:
     assert (camera.outcome == "").sum() == (came > 10_000).sum() - 1 > 2
 
 
-@pytest.mark.parametrize(
-    ("rows", "why"),
-    [
+def test_nothing_to_fit_is_said_in_one_line(tmp_path):
+    for rows, why in (
         ("", "there is no frame in it"),
         (HEAD, "there is no frame in it"),
         (HEAD + "0,5\n30,40\n", "2 delays .2 frames, 2 came.; at least 20 are needed"),
@@ -142,28 +145,23 @@ def test_what_is_still_on_its_way_is_not_lost(tmp_path: Path) -> None:
         (HEAD + "0,5\n1e12,\n1.1e12,\n", "line 4: offered_ms is decades away from the first: 1.1e12, "),
         (HEAD + '"' + 140_000 * "0", "cannot be read as a table: field larger than"),
         ("0,5\n30,40\n", "expected a header with the columns offered_ms, .* it has no header"),
-    ],
-)
-def test_nothing_to_fit_is_said_in_one_line(tmp_path: Path, rows: str, why: str) -> None:
-    (tmp_path / "rows.csv").write_text(rows)
-    with pytest.raises(ValueError, match=why) as error:
-        fit(tmp_path / "rows.csv")
-    assert "\n" not in str(error.value)
+    ):
+        (tmp_path / "rows.csv").write_text(rows)
+        refused(ValueError, why, fit, tmp_path / "rows.csv")
 
 
-def test_constant_delays_are_one_state_of_constant_delays(tmp_path: Path) -> None:
+def test_constant_delays_are_one_state_of_constant_delays(tmp_path):
     path = tmp_path / "rows.csv"
     path.write_text("\ufeff" + HEAD + "".join(f"{30 * n}, {30 * n + 12.5}\n" for n in range(200)))
     found = fit(path)
     assert found.states == 1 and found.channel["service"] == {"law": "deterministic", "mean_ms": 12.5}
     assert "hardly vary" in found.warnings[0]
-    with pytest.raises(ValueError, match="nothing to tell states by"):
-        fit(path, "2")
+    refused(ValueError, "nothing to tell states by", fit, path, "2")
     path.write_text(HEAD + "".join(f"{30 * n}, {30 * n}\n" for n in range(200)))
     assert fit(path).channel["service"] == {"law": "none"}
 
 
-def test_a_few_huge_delays_are_no_state(tmp_path: Path) -> None:
+def test_a_few_huge_delays_are_no_state(tmp_path):
     path = write_rows(tmp_path / "rows.csv", {"preset": "ch5", "discipline": "parallel"}, 3, seconds=30)
     lines = path.read_text().splitlines()
     for n, delay in ((100, 5e5), (400, 7e6), (700, 3e12)):
@@ -176,7 +174,7 @@ def test_a_few_huge_delays_are_no_state(tmp_path: Path) -> None:
     assert any("1 frames took longer than 1e+09 ms" in w for w in found.warnings)
 
 
-def test_the_command_writes_a_scenario_and_a_picture(tmp_path: Path, capsys) -> None:
+def test_the_command_writes_a_scenario_and_a_picture(tmp_path, capsys):
     path = write_trace(tmp_path / "t.jsonl", SLOW, 1, 2, seconds=60)
     words = ["fit", str(path), "--out", str(tmp_path / "f.yaml"), "--plot", str(tmp_path / "f.png")]
     assert main(words) == 0
@@ -192,7 +190,7 @@ def test_the_command_writes_a_scenario_and_a_picture(tmp_path: Path, capsys) -> 
 
 @pytest.mark.stability
 @pytest.mark.parametrize("seed", [*range(3), *(pytest.param(k, marks=pytest.mark.slow) for k in range(3, 8))])
-def test_odd_recordings_give_finite_figures_or_one_line(tmp_path: Path, seed: int) -> None:
+def test_odd_recordings_give_finite_figures_or_one_line(tmp_path, seed):
     """Frames in one instant or in bursts, delays over sixteen decades, of two values, or of none; nine in ten
     lost. Nothing overflows on the way, and what comes out is a channel."""
     rng = np.random.default_rng(seed)
@@ -223,3 +221,68 @@ def test_odd_recordings_give_finite_figures_or_one_line(tmp_path: Path, seed: in
             for value in found.parameters.values():
                 assert all(math.isfinite(v) for v in (value.value, *(value.interval or ())))
                 assert value.interval is None or value.interval[0] <= value.value <= value.interval[1]
+
+
+LEAVE, MEAN, LOSS = (0.02, 0.05), (20.0, 90.0), (0.05, 0.4)
+MODEL = TwoStates(np.array([LEAVE]), np.array([MEAN]), np.array([LOSS]), np.array([1.0]))
+START_MS = np.array([0.0, 12.0, 13.0, 70.0, 71.0, 400.0])
+DELAY_MS = np.array([5.0, 100.0, np.nan, 15.0, np.nan, 60.0])
+LOST = np.array([0.0, 0.0, 1.0, 1.0, np.nan, 0.0])
+
+
+def likelihood(state: int, k: int) -> float:
+    """Of frame k, written out."""
+    density = 1.0 if math.isnan(DELAY_MS[k]) else math.exp(-DELAY_MS[k] / MEAN[state]) / MEAN[state]
+    return density * {0.0: 1 - LOSS[state], 1.0: LOSS[state]}.get(float(LOST[k]), 1.0)
+
+
+def test_likelihood_states_and_losses_are_sums_over_all_paths():
+    q, count = two_state_generator(*LEAVE), len(START_MS)
+    steps = [linalg.expm(q * span) for span in np.diff(START_MS)]
+    share = (LEAVE[1] / sum(LEAVE), LEAVE[0] / sum(LEAVE))
+    total, states = 0.0, np.zeros((count, 2))
+    for path in itertools.product((0, 1), repeat=count):
+        p = share[path[0]] * math.prod(likelihood(s, k) for k, s in enumerate(path))
+        p *= math.prod(step[a, b] for step, a, b in zip(steps, path, path[1:]))
+        total += p
+        states[range(count), path] += p
+    states /= total
+    data = two_states.segments((START_MS, DELAY_MS, LOST), True)
+    after, log_likelihood, second = two_states.step(MODEL, data, "exponential")
+    assert log_likelihood[0] == pytest.approx(math.log(total), rel=1e-12)
+    assert second[0, 0] == pytest.approx(states[:, 1], rel=1e-10)
+    known, came = ~np.isnan(LOST), ~np.isnan(DELAY_MS)
+    assert after.loss[0] == pytest.approx((LOST[known] @ states[known]) / states[known].sum(0))
+    assert after.mean_ms[0] == pytest.approx((DELAY_MS[came] @ states[came]) / states[came].sum(0))
+
+
+def test_a_step_gives_the_expected_jumps_over_the_expected_time():
+    """Two frames 40 ms apart, and the way between them in four thousand steps of the chain."""
+    parts, span = 4000, 40.0
+    start, delay, lost = np.array([0.0, span]), np.array([5.0, 150.0]), np.array([0.0, 0.0])
+    after, _, _ = two_states.step(MODEL, two_states.segments((start, delay, lost), True), "exponential")
+    q, h = two_state_generator(*LEAVE), span / parts
+    small = linalg.expm(q * h)
+    ahead = np.empty((parts + 1, 2))
+    back = np.empty((parts + 1, 2))
+    ahead[0] = [LEAVE[1 - k] / sum(LEAVE) * math.exp(-5.0 / MEAN[k]) / MEAN[k] * (1 - LOSS[k]) for k in (0, 1)]
+    back[-1] = [math.exp(-150.0 / MEAN[k]) / MEAN[k] * (1 - LOSS[k]) for k in (0, 1)]
+    for k in range(parts):
+        ahead[k + 1] = ahead[k] @ small
+        back[-k - 2] = small @ back[-k - 1]
+    time_in = (ahead * back)[:-1].sum(0) * h
+    jumps = [(ahead[:-1, k] * small[k, 1 - k] * back[1:, 1 - k]).sum() for k in (0, 1)]
+    assert after.leave_per_ms[0] == pytest.approx(np.array(jumps) / time_in, rel=2e-3)
+
+
+def test_the_maximum_is_higher_than_all_around_it_and_reached_in_a_dozen_steps():
+    base = two_states.segments((np.arange(1500) * 30.0, np.ones(1500), np.zeros(1500)), False)
+    data = two_states.draw(MODEL, base, 1, np.random.default_rng(1))
+    found, best = two_states.maximize(MODEL, data, "gamma")
+    for k, parameter in itertools.product((0, 1), ("leave_per_ms", "mean_ms", "loss")):
+        for by in (0.97, 1.03):
+            values = {name: getattr(found, name).copy() for name in ("leave_per_ms", "mean_ms", "loss", "shape")}
+            values[parameter][0, k] *= by
+            assert two_states.step(TwoStates(**values), data, "gamma")[1] < best + 0.01
+    far = TwoStates(MODEL.leave_per_ms * [[3.0, 0.3]], MODEL.mean_ms * [[2.0, 0.7]], np.full((1, 2), 0.2), MODEL.shape)
+    assert two_states.maximize(far, data, "gamma", 12)[1] > best - 0.05

@@ -1,7 +1,5 @@
 """A live emulator between real cameras' streams and the edge's real ingest, on one event loop."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import itertools
@@ -30,6 +28,7 @@ from freshfield.payload import encode
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2_grpc, frames_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
+from tests.support import until
 
 CAMERAS = ("cam00", "cam01", "cam02", "cam03")
 _IMAGE = encode(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8).astype(np.uint8), "jpeg")
@@ -44,7 +43,7 @@ def frame_of(camera: str, session: str, sequence: int, at_ns: int, held_out: boo
 
 
 def make(
-    out: Path, address: str, section: dict, cameras: tuple[str, ...] = ("cam00",), **options
+    out: Path, address: str, section: dict, cameras=("cam00",), **options
 ) -> tuple[FrameProxy, list[CameraStream]]:
     """A proxy for the frame stream, not started, and its cameras' flows."""
     chosen = ProxyOptions("127.0.0.1:0", address, options.pop("transport", Transport()), **options)
@@ -149,18 +148,16 @@ class Emulation:
 
     async def connected(self) -> None:
         """Wait until every stream to the edge is open."""
-        async with asyncio.timeout(30):
-            while not all(flow.connected for flow in self.proxy.flows.values()):
-                await asyncio.sleep(0.01)
+        await until(lambda: all(flow.connected for flow in self.proxy.flows.values()))
 
     async def settled(self) -> None:
         """Wait until nothing is inside the emulator any more."""
         async with asyncio.timeout(30):
             await self.proxy.settled()
 
-    def stranger(self, transport: Transport | None = None) -> grpc.aio.Channel:
+    def stranger(self) -> grpc.aio.Channel:
         """A channel to the emulator."""
-        return (transport or Transport()).aio_channel(f"127.0.0.1:{self.proxy.port}")
+        return Transport().aio_channel(f"127.0.0.1:{self.proxy.port}")
 
 
 async def answer_to(call: grpc.aio.StreamStreamCall, raw: bytes) -> pb.PushResponse:
@@ -171,13 +168,7 @@ async def answer_to(call: grpc.aio.StreamStreamCall, raw: bytes) -> pb.PushRespo
 
 @contextlib.asynccontextmanager
 async def emulate(
-    out: Path,
-    section: dict,
-    *,
-    cameras: tuple[str, ...] = CAMERAS,
-    held_out: tuple[str, ...] = (),
-    transport: Transport | None = None,
-    **options: Any,
+    out: Path, section: dict, *, cameras=CAMERAS, held_out=(), transport: Transport | None = None, **options
 ) -> AsyncIterator[Emulation]:
     transport = transport or Transport()
     edge = Edge(out, cameras, held_out, transport)

@@ -1,6 +1,5 @@
-"""The live emulator with the edge's real ingest behind it, on the wall clock."""
-
-from __future__ import annotations
+"""The live emulator with the edge's real ingest behind it, on the wall clock. What breaks inside or behind it ends it,
+or its stream, in plain sight; an edge that is slow or away costs frames and nothing else."""
 
 import asyncio
 import dataclasses
@@ -13,10 +12,13 @@ import grpc.aio
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from channel_emu.live import live_link
-from channel_emu.live.camera_stream import PUSH
+from channel_emu.live import frame_proxy, live_link
+from channel_emu.live.camera_stream import CREDITS, PUSH
+from channel_emu.live.live_link import Message
+from channel_emu.live.proxy import EmulatorFailed
 from channel_emu.live.status import SET_BY_HAND
 from channel_emu.model import trace
+from channel_emu.model.chain import ChainError
 from channel_emu.model.channel import Channel
 from channel_emu.model.trace import Trace
 from channel_emu.virtual.simulate import offer_all
@@ -26,7 +28,10 @@ from freshfield.ledger import read_all
 from freshfield.transport import Transport
 from freshfield.v1 import channel_pb2, channel_pb2_grpc, clock_pb2, clock_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
-from tests.channel_emu.live.emulator import CAMERAS, answer_to, emulate, frame_of
+from tests.channel_emu.live.emulator import CAMERAS, answer_to, emulate, frame_of, make, offer
+from tests.freshfield.serving import status
+from tests.integration.peer import Peer, silence
+from tests.support import free_port, until
 
 # The thesis's channel six times faster, so that a test takes seconds.
 FAST = {
@@ -69,7 +74,7 @@ def different(found: Trace) -> list[str]:
 
 
 @pytest.mark.parametrize("section", [FAST, ONE_LINE], ids=["ch6", "preempt, one line"])
-async def test_live_decisions_are_those_of_virtual_time(tmp_path: Path, section: dict) -> None:
+async def test_live_decisions_are_those_of_virtual_time(tmp_path, section):
     """The emulator's trace, its offers decided again in virtual time: every start, due and outcome alike."""
     async with emulate(tmp_path, section, trace=tmp_path / "t.jsonl") as r:
         await r.stream(80, 0.004)
@@ -93,7 +98,7 @@ async def test_live_decisions_are_those_of_virtual_time(tmp_path: Path, section:
         assert sum(status["state_share"].values()) == pytest.approx(1)
 
 
-async def test_a_trace_replayed_at_another_pace_is_decided_and_delivered_alike(tmp_path: Path) -> None:
+async def test_a_trace_replayed_at_another_pace_is_decided_and_delivered_alike(tmp_path):
     """Each delivery as long after its offer as recorded, later by the delay error alone."""
     paths = tmp_path / "0" / "t.jsonl", tmp_path / "1" / "t.jsonl"
     for path, section, period_s in zip(paths, (FAST, QUICK), (0.004, 0.006)):
@@ -111,7 +116,7 @@ async def test_a_trace_replayed_at_another_pace_is_decided_and_delivered_alike(t
                 assert now.actual_ns is None or now.actual_ns >= now.ended_ns
 
 
-async def test_the_account_closes_with_every_fault(tmp_path: Path) -> None:
+async def test_the_account_closes_with_every_fault(tmp_path):
     async with emulate(tmp_path, {**QUICK, "faults": {"loss": 0.2, "duplication": 0.2, "corruption": 0.2}}) as r:
         await r.stream(60, 0.005)
         await r.settled()
@@ -124,7 +129,7 @@ async def test_the_account_closes_with_every_fault(tmp_path: Path) -> None:
     assert status["delay_error_ms"]["count"] == status["counts"]["forwarded"] == status["counts"]["delivered"]
 
 
-async def test_a_reset_breaks_the_stream_and_the_camera_comes_back(tmp_path: Path) -> None:
+async def test_a_reset_breaks_the_stream_and_the_camera_comes_back(tmp_path):
     section = {"service": "det:300ms", "faults": {"reset": {"at_ms": [1500.0]}}}
     async with emulate(tmp_path, section, cameras=("cam00",)) as r:
         camera = r.cameras["cam00"]
@@ -139,13 +144,11 @@ async def test_a_reset_breaks_the_stream_and_the_camera_comes_back(tmp_path: Pat
         assert r.proxy.flows["cam00"].link.model.counts["broken"] == 1
 
 
-async def test_held_out_frames_pass_beside_the_channel(tmp_path: Path) -> None:
+async def test_held_out_frames_pass_beside_the_channel(tmp_path):
     async with emulate(tmp_path, {"service": {"law": "deterministic", "mean_ms": 1e9}}, held_out=("cam03",)) as r:
         await r.cameras["cam03"].stream(20, 0.002)
         await r.cameras["cam00"].stream(5, 0.002)
-        async with asyncio.timeout(10):
-            while len(r.edge.truth) < 20:
-                await asyncio.sleep(0.01)
+        await until(lambda: len(r.edge.truth) >= 20)
         assert r.cameras["cam00"].answers == {"accepted": 1, "dropped_busy": 4}
         delays_ms = [(at - f.generated_ns) / 1e6 for f, at in r.edge.truth]
         assert sorted(delays_ms)[10] < 100
@@ -155,7 +158,7 @@ async def test_held_out_frames_pass_beside_the_channel(tmp_path: Path) -> None:
     assert frame_account(tmp_path)["in_flight"] == 1
 
 
-async def test_the_edge_may_die_and_come_back(tmp_path: Path) -> None:
+async def test_the_edge_may_die_and_come_back(tmp_path):
     async with emulate(tmp_path, QUICK) as r:
         await r.stream(20, 0.005)
         await r.edge.stop()
@@ -171,7 +174,7 @@ async def test_the_edge_may_die_and_come_back(tmp_path: Path) -> None:
     assert account["sent"] == 240 and account["in_flight"] == 0 and account["broken"] > 20
 
 
-async def test_clock_and_health_pass_a_slow_channel(tmp_path: Path) -> None:
+async def test_clock_and_health_pass_a_slow_channel(tmp_path):
     async with emulate(tmp_path, {"service": "det:1000s"}) as r, r.stranger() as channel:
         clock = clock_pb2_grpc.ClockServiceStub(channel)
         reply = await clock.Exchange(clock_pb2.ExchangeRequest(client_sent_ns=7), timeout=5)
@@ -181,13 +184,12 @@ async def test_clock_and_health_pass_a_slow_channel(tmp_path: Path) -> None:
             state = await health.Check(health_pb2.HealthCheckRequest(service=service), timeout=5)
             assert state.status == health_pb2.HealthCheckResponse.SERVING
         await r.edge.stop()
-        with pytest.raises(grpc.aio.AioRpcError) as gone:
-            await clock.Exchange(clock_pb2.ExchangeRequest(), timeout=10)
-        assert gone.value.code() in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
+        gone = await status(clock.Exchange(clock_pb2.ExchangeRequest(), timeout=10))
+        assert gone in ("UNAVAILABLE", "DEADLINE_EXCEEDED")
 
 
-async def test_strangers_and_nonsense_are_refused_and_counted(tmp_path: Path) -> None:
-    """What cannot be parsed is found before the link decides to flip its bytes."""
+async def test_strangers_and_nonsense_are_refused_and_counted(tmp_path):
+    """What cannot be parsed, or damaged, is found before the link decides to flip its bytes."""
     async with emulate(tmp_path, {"faults": {"corruption": 1.0}}) as r, r.stranger() as channel:
         call = channel.stream_stream(PUSH)()
         unknown = pb.PushRequest(header=pb.FrameHeader(camera_id="cam77", session_id="s"))
@@ -211,7 +213,7 @@ async def test_strangers_and_nonsense_are_refused_and_counted(tmp_path: Path) ->
     assert refused == {("?", "?", "unknown_camera"): 2, ("cam00", "?", "bad_id"): 1, ("?", "?", "unparsable"): 6}
 
 
-async def test_silent_streams_and_a_spoofed_session_do_not_keep_a_camera_out(tmp_path: Path) -> None:
+async def test_silent_streams_and_a_spoofed_session_do_not_keep_a_camera_out(tmp_path):
     async with emulate(tmp_path, {}) as r:
         camera = r.cameras["cam00"]
         await camera.stream(2)
@@ -230,7 +232,7 @@ async def test_silent_streams_and_a_spoofed_session_do_not_keep_a_camera_out(tmp
         assert r.edge.ingest.delivered["cam00"] == 5 and not r.edge.ingest.rejected
 
 
-async def test_what_is_inside_the_links_is_bounded_in_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_what_is_inside_the_links_is_bounded_in_bytes(tmp_path, monkeypatch):
     monkeypatch.setattr(live_link, "MAX_QUEUED_BYTES", 20_000)
     async with emulate(tmp_path, {"service": "det:200ms", "discipline": "fcfs"}, cameras=("cam00", "cam01")) as r:
         for camera in r.cameras.values():
@@ -246,32 +248,16 @@ async def test_what_is_inside_the_links_is_bounded_in_bytes(tmp_path: Path, monk
     frame_account(tmp_path)
 
 
-async def test_a_message_that_cannot_be_damaged_does_not_end_the_emulator(tmp_path: Path) -> None:
-    """Field number 0: to be found before the link decides to flip its bytes."""
-    async with emulate(tmp_path, {"faults": {"corruption": {"probability": 1.0}}}) as r:
-        good = to_request(frame_of("cam00", "s", 1, r.proxy.clock.now_ns())).SerializeToString()
-        async with r.stranger() as channel:
-            call = channel.stream_stream(PUSH)()
-            for raw in (good + b"\0\0", good):
-                await call.write(raw)
-                await call.read()
-        await r.settled()
-        r.proxy.check()
-        assert r.edge.ingest.rejected == {"crc_mismatch": 1}
-
-
-async def test_the_token_is_demanded_and_passed_on(tmp_path: Path) -> None:
+async def test_the_token_is_demanded_and_passed_on(tmp_path):
     async with emulate(tmp_path, {}, transport=Transport(tokens={"camera:*": "open sesame"})) as r:
         await r.cameras["cam00"].stream(5, 0.002)
         await r.settled()
         assert r.edge.ingest.delivered["cam00"] == 5
         async with r.stranger() as channel:
-            with pytest.raises(grpc.aio.AioRpcError) as refused:
-                await channel.stream_stream(PUSH)().read()
-            assert refused.value.code() == grpc.StatusCode.UNAUTHENTICATED
+            assert await status(channel.stream_stream(PUSH)().read()) == "UNAUTHENTICATED"
 
 
-async def test_an_operator_changes_the_channel_and_gives_it_back(tmp_path: Path) -> None:
+async def test_an_operator_changes_the_channel_and_gives_it_back(tmp_path):
     section = {"arrivals": "poisson:1/1ms", "service": "exp:1ms", "discipline": "parallel"}
     async with emulate(tmp_path, section, cameras=("cam00",)) as r, r.stranger() as operator:
         counts = r.proxy.links["cam00"].model.counts
@@ -296,3 +282,110 @@ async def test_an_operator_changes_the_channel_and_gives_it_back(tmp_path: Path)
         shown = r.proxy._snapshot()
         assert [change["loss"] for change in shown["changes"]] == [0.0, 1.0, None]
         assert shown["by_hand"] is None and shown["state"] is None
+
+
+SHORT = {"service": "det:300ms"}
+FULL = Path("/dev/full")
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
+@pytest.mark.parametrize("edge_is_there", [False, True], ids=["in the timer", "in the upstream task"])
+async def test_a_full_disk_ends_the_emulator_and_its_other_books_are_closed(tmp_path, monkeypatch, edge_is_there):
+    """A frame comes due whose fate cannot be recorded: broken at once, or forwarded by the stream's task."""
+    monkeypatch.setattr(frame_proxy, "_FIRST_WAIT_S", 5.0 if edge_is_there else 0.1)
+    edge = await Peer().start() if edge_is_there else None
+    address = edge.address if edge else f"127.0.0.1:{free_port()}"
+    proxy, (flow,) = make(tmp_path, address, SHORT, trace=tmp_path / "t.jsonl")
+    running = asyncio.create_task(proxy.run(asyncio.Event()))
+    await until(lambda: proxy.port and flow.opened.is_set() is edge_is_there)
+    offer(flow, 0)
+    proxy._trace.close()
+    proxy._trace._file = FULL.open("wb", buffering=0)
+    with pytest.raises(EmulatorFailed, match=r"No space left on device.*is there room"):
+        async with asyncio.timeout(15):
+            await running
+    if edge:
+        await edge.stop()
+    assert json.loads((tmp_path / "channel.json").read_text())["running"] is False
+    (ledger,) = read_all(tmp_path)
+    assert ledger.closed
+
+
+def raising(*_: object) -> None:
+    raise ChainError("no such state")
+
+
+@pytest.mark.parametrize("part", ["background", "timer"])
+async def test_a_part_that_breaks_ends_the_emulator(tmp_path, monkeypatch, part):
+    """With an error that is no OSError."""
+    monkeypatch.setattr(frame_proxy, "_FIRST_WAIT_S", 0.1)
+    proxy, (flow,) = make(tmp_path, f"127.0.0.1:{free_port()}", SHORT)
+    if part == "background":
+        proxy.channel.forget = raising
+    else:
+        flow.link.advance = raising
+    running = asyncio.create_task(proxy.run(asyncio.Event()))
+    await asyncio.sleep(0.3)
+    if not running.done():
+        offer(flow, 0)
+    with pytest.raises(EmulatorFailed, match="ChainError: no such state"):
+        async with asyncio.timeout(15):
+            await running
+
+
+@pytest.mark.parametrize(
+    "answers",
+    [[b"\xff\xff\xff"], [pb.PushResponse(sequence=77).SerializeToString()] * 1000],
+    ids=["no answer", "to no frame"],
+)
+async def test_answers_that_are_none_end_the_stream_and_not_the_emulator(tmp_path, answers):
+    """Nor do they keep it busy for as long as they come."""
+
+    async def nonsense(request: bytes, context: grpc.aio.ServicerContext) -> None:
+        await context.read()
+        for answer in answers:
+            await context.write(answer)
+        await asyncio.sleep(60)
+
+    server = Transport().aio_server()
+    handler = {"Push": grpc.stream_stream_rpc_method_handler(nonsense)}
+    server.add_generic_rpc_handlers(
+        (grpc.method_handlers_generic_handler("freshfield.v1.FrameStreamService", handler),)
+    )
+    address = f"127.0.0.1:{Transport().bind(server, '127.0.0.1:0')}"
+    await server.start()
+    proxy, (flow,) = make(tmp_path, address, {})
+    await proxy.start()
+    offer(flow, 0)
+    await until(lambda: flow.connections >= 2)
+    assert flow.broken == 1 and not proxy._failure.done()
+    await proxy.stop()
+    await server.stop(None)
+
+
+async def test_an_edge_that_never_answers_costs_frames_and_no_memory(tmp_path):
+    """The credits hold for frames and for bytes."""
+    edge = await Peer(respond=silence).start()
+    proxy, flows = make(tmp_path, edge.address, {}, ("cam00", "cam01"))
+    await proxy.start()
+    assert all(flow.connected for flow in flows), "cameras are let in once the streams to the edge stand"
+    for n in range(200):
+        offer(flows[0], n)
+        await asyncio.sleep(0)
+    await edge.until(CREDITS)
+    assert (flows[0].pending, flows[0].broken) == (CREDITS + 1, 200 - CREDITS - 1)
+    large = Message(bytes(5 * 2**20), "s", 0, flows[1])
+    for _ in range(6):
+        flows[1].send(large)
+    assert (flows[1].pending, flows[1].broken) == (2, 4)  # one on its way, the newest held
+    assert proxy._snapshot()["counts"]["in_flight"] == CREDITS + 3
+    await proxy.stop()
+    assert flows[0].broken == 200
+    await edge.stop()
+
+
+async def test_a_status_that_a_thread_still_holds_does_not_replace_the_last(tmp_path):
+    proxy, _ = make(tmp_path, "127.0.0.1:1", {})
+    proxy._write_status({"running": False})
+    proxy._write_status({"running": True})
+    assert json.loads((tmp_path / "channel.json").read_text()) == {"running": False}

@@ -1,7 +1,5 @@
 """The small parts of the live emulator: timer, histogram, priority, flow of a call."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import sys
@@ -23,7 +21,7 @@ from freshfield.streams import ServedCall
 
 
 @pytest.mark.parametrize("platform", [sys.platform, "elsewhere"])
-async def test_timer_fires_once_armed_and_never_early(platform: str, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_timer_fires_once_armed_and_never_early(platform, monkeypatch):
     monkeypatch.setattr(timer.sys, "platform", platform)
     fired: list[int] = []
     woken = asyncio.Event()
@@ -48,7 +46,7 @@ async def test_timer_fires_once_armed_and_never_early(platform: str, monkeypatch
 
 
 @given(st.lists(st.floats(-3, 1e6), max_size=300), st.sampled_from([1, 50, 95, 99, 100]))
-def test_histogram_percentiles_are_within_a_bin(values: list[float], percent: int) -> None:
+def test_histogram_percentiles_are_within_a_bin(values, percent):
     histogram = Histogram()
     for value in values:
         histogram.add(value)
@@ -66,7 +64,7 @@ def test_histogram_percentiles_are_within_a_bin(values: list[float], percent: in
 
 
 @pytest.mark.parametrize("short_slice", [True, False])
-def test_without_real_time_the_priority_is_raised(monkeypatch: pytest.MonkeyPatch, short_slice: bool) -> None:
+def test_without_real_time_the_priority_is_raised(monkeypatch, short_slice):
     def forbidden(*_: object) -> None:
         raise PermissionError
 
@@ -80,7 +78,7 @@ def test_without_real_time_the_priority_is_raised(monkeypatch: pytest.MonkeyPatc
     assert priority.raise_priority() == ("short-slice" if short_slice else "normal")
 
 
-async def test_behind_a_message_in_the_link_no_more_are_read_than_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_behind_a_message_in_the_link_no_more_are_read_than_the_bound(monkeypatch):
     monkeypatch.setattr(call_flow, "_MOST_BEHIND", 100)
     link, read, written = mock.Mock(calls=set()), [], []
     flow = CallFlow(0, ServedCall(mock.Mock()), link, lambda: 0)

@@ -1,7 +1,5 @@
 """Bytes of any protocol through a link: in order and whole, later where the link is slow, loses or damages."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import time
@@ -14,7 +12,7 @@ from channel_emu.live.proxy import ProxyOptions
 from channel_emu.live.tcp_proxy import BEHIND, PIECE_BYTES, TIMEOUT_S, TcpProxy
 from channel_emu.model.settings import channel_from_mapping
 from freshfield.transport import TransportError
-from tests.support import free_port
+from tests.support import free_port, until
 
 DATA = np.random.default_rng(0).integers(0, 256, 20 * PIECE_BYTES + 5, np.uint8).tobytes()
 
@@ -84,12 +82,9 @@ async def test_a_sender_waits_for_a_slow_link():
     async with echo({"service": "det:60s"}) as proxy:
         _, writer = await asyncio.open_connection("127.0.0.1", proxy.port)
         writer.write(bytes(100 * PIECE_BYTES))
-        link = None
-        while link is None or link.model.offered < BEHIND:
-            await asyncio.sleep(0.01)
-            link = proxy.links.get("up bytes")
+        await until(lambda: "up bytes" in proxy.links and proxy.links["up bytes"].model.offered >= BEHIND)
         await asyncio.sleep(0.2)
-        assert link.model.offered == BEHIND
+        assert proxy.links["up bytes"].model.offered == BEHIND
         writer.close()
 
 

@@ -5,8 +5,6 @@ one waiting place; Yates and Kaul (IEEE T-IT 65(3), 2019) for preemption by seve
 derived where they stand, by renewal arguments.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -24,7 +22,7 @@ from channel_emu.virtual.simulate import simulate
 TOLERANCE = 0.005
 
 
-def test_ages_by_hand() -> None:
+def test_ages_by_hand():
     """Generated at 0, 20, 10 ms; delivered at 5, 30, 40: the last comes too late to matter."""
     age = RunningAge((at * 10**6, born * 10**6) for at, born in ((5, 0), (30, 20), (40, 10)))
     # Teeth: 5 -> 30 over 25 ms, then 10 -> 30 over 20 ms.
@@ -40,7 +38,7 @@ def test_ages_by_hand() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 50), st.integers(0, 50)), min_size=1, max_size=30), st.integers(1, 50))
-def test_the_mean_is_that_over_all_instants(steps: list[tuple[int, int]], after: int) -> None:
+def test_the_mean_is_that_over_all_instants(steps, after):
     """Deliveries in order of time, of frames of any age, out of order and doubled."""
     deliveries, at_ns = [], 100
     for step, old in steps:
@@ -132,7 +130,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_mean_age_and_peak_age(case: str) -> None:
+def test_mean_age_and_peak_age(case):
     arrivals, service, discipline, seconds, age, peak = CASES[case]
     section = {"arrivals": arrivals, "service": service, "discipline": discipline}
     found = simulate(channel_from_mapping(section), 1, seconds, seed=5).summary()
@@ -143,7 +141,7 @@ def test_mean_age_and_peak_age(case: str) -> None:
 @pytest.mark.parametrize(
     ("discipline", "form"), [("lcfs-preempt", mm1_preemptive), ("drop-new", mm1_drop_new), ("fcfs", mm1_fcfs)]
 )
-def test_several_sources_at_one_server(discipline: str, form: Callable[[float, float, float], float]) -> None:
+def test_several_sources_at_one_server(discipline, form):
     """The first source is two of five cameras, the second three: what they deliver is one source's deliveries. The
     known forms hold at the rates that the numbers drawn happen to have."""
     section = {"arrivals": "poisson:0.1", "service": "exp:1ms", "discipline": discipline}
@@ -160,7 +158,7 @@ def test_several_sources_at_one_server(discipline: str, form: Callable[[float, f
         assert age == pytest.approx(form(mine, other, mu), rel=TOLERANCE)
 
 
-def test_losses_by_state() -> None:
+def test_losses_by_state():
     """Gilbert and Elliott's channel: the mean age and peak age that bursts of losses leave."""
     age, peak = gilbert_elliott(1 / 200, 1 / 70, (0.05, 0.7), 30.0, 20.0)
     section = {"arrivals": "periodic:30ms", "service": "det:20ms", "discipline": "parallel"}

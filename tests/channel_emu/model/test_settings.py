@@ -1,4 +1,4 @@
-from __future__ import annotations
+"""Channels in words: sections and the short notation, and tables of delays as loggers write them."""
 
 from pathlib import Path
 
@@ -6,14 +6,17 @@ import msgspec
 import pytest
 import yaml
 
+from channel_emu.estimate.recording import read_recording
+from channel_emu.model.notation import NotationError, delays_ms
 from channel_emu.model.settings import channel_from_mapping
+from tests.support import refused
 
 
 def read(text: str, folder: Path = Path()):
     return channel_from_mapping(yaml.safe_load(text), "room.yaml: channel", folder)
 
 
-def test_presets_hold_the_thesis_numbers() -> None:
+def test_presets_hold_the_thesis_numbers():
     ch5, ch6 = read("preset: ch5"), read("preset: ch6")
     assert (ch5.arrivals.period_ms, ch5.service.law, ch5.service.mean_ms) == (30.0, "exponential", 60.0)
     assert ch5.discipline == "drop-new" and ch5.chain is None
@@ -30,9 +33,10 @@ def test_presets_hold_the_thesis_numbers() -> None:
     assert (ideal.preset, ideal.service.law, ideal.arrivals.process) == ("ideal", "none", "as-offered")
 
 
-@pytest.mark.parametrize(
-    ("short", "long"),
-    [
+def test_the_short_notation_stands_for_sections(tmp_path):
+    """Files are relative to the given folder; the preset's name alone may differ. Reading what was written gives the
+    same."""
+    for short, long in (
         ("{arrivals: 'periodic:30ms'}", "{arrivals: {process: periodic, period_ms: 30}}"),
         ("{preset: ch5, arrivals: periodic}", "{preset: ch5}"),
         (
@@ -54,20 +58,15 @@ def test_presets_hold_the_thesis_numbers() -> None:
             "{preset: gilbert-elliott, faults: {corruption: 0.1}}",
             "{preset: gilbert-elliott, faults: {loss: [0.01, 0.5], corruption: {probability: 0.1}}}",
         ),
-    ],
-)
-def test_the_short_notation_stands_for_sections(tmp_path: Path, short: str, long: str) -> None:
-    """Files are relative to the given folder; the preset's name alone may differ. Reading what was written gives the
-    same."""
-    (tmp_path / "delays.csv").write_text("# a link\ntime_s, delay_ms\n0.1,1.5\n0.2,20\n0.3,3\n")
-    found, expected = (read(text, tmp_path) for text in (short, long))
-    assert msgspec.structs.replace(found, preset=None) == msgspec.structs.replace(expected, preset=None)
-    assert msgspec.structs.replace(channel_from_mapping(found.to_mapping()), preset=found.preset) == found
+    ):
+        (tmp_path / "delays.csv").write_text("# a link\ntime_s, delay_ms\n0.1,1.5\n0.2,20\n0.3,3\n")
+        found, expected = (read(text, tmp_path) for text in (short, long))
+        assert msgspec.structs.replace(found, preset=None) == msgspec.structs.replace(expected, preset=None)
+        assert msgspec.structs.replace(channel_from_mapping(found.to_mapping()), preset=found.preset) == found
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
+def test_one_line_names_the_key_and_what_was_expected():
+    for text, expected in (
         ("{delay_ms: 5}", "channel.delay_ms: unknown key"),
         ("{service: {law: exponential, mean_ms: -1}}", "service.mean_ms: expected a number, at least 0"),
         ("{service: {law: exponential, mean_ms: 1, shape: 2}}", "shape: belongs to law gamma only"),
@@ -81,10 +80,52 @@ def test_the_short_notation_stands_for_sections(tmp_path: Path, short: str, long
         ("{chain: 'mu3=1'}", "channel.chain: 'mu3=1': expected mu1="),
         ("{faults: {blackout: {windows_ms: [[5, 3]]}}}", "channel.faults.blackout: windows_ms"),
         ("{faults: [loss]}", "channel.faults: expected a mapping"),
-    ],
-)
-def test_one_line_names_the_key_and_what_was_expected(text: str, expected: str) -> None:
-    with pytest.raises(ValueError) as refused:
-        read(text)
-    assert str(refused.value).startswith("room.yaml: channel") and expected in str(refused.value)
-    assert "\n" not in str(refused.value)
+    ):
+        said = str(refused(ValueError, "", read, text))
+        assert said.startswith("room.yaml: channel") and expected in said
+
+
+def test_delays_are_read_by_the_header(tmp_path):
+    for text in (
+        "\ufeff# a logger\n\n20\n21.5\n30\n",
+        "delay_ms,seq\r\n20,0\r\n21.5,1\r\n30,2\r\n",
+        "seq;Delay [ms];note\n0;20,0;a\n1;21,5;b\n2;30;c,d\n",
+        "seq;Delay [s]\n0;0,020\n1;0,0215\n2;3,000e-2\n",
+        "seq\tlatency (s)\n0\t0.02\n1\t0.0215\n2\t3e-2\n",
+        "# seq delay_us\n0 20000\n1 21500\n2 30000\n",
+        "One-way delay / s\n0,02\n0,0215\n0,03\n",
+        "delay_ms,lost\n20,no\nNaN,yes\n21.5,no\n,no\n30,no\n",
+        "owd_ns\n20000000\n21500000\n30000000\n",
+    ):
+        (tmp_path / "delays").write_text(text)
+        assert delays_ms(tmp_path / "delays") == pytest.approx([20.0, 21.5, 30.0])
+
+
+def test_what_can_be_read_in_two_ways_or_none_is_refused(tmp_path):
+    for text, message in (
+        ("0,20\n1,21\n", "expected one delay in ms a line, with a decimal point, or a header"),
+        ("seq,rtt_ms\n0,20\n", r"expected a column delay_ms .* it has seq, rtt_ms"),
+        ("delay [furlongs]\n20\n", "has no unit that is known: call it delay_ms"),
+        ("delay_ms,delay_s\n20,1\n", "two columns are called delay"),
+        ("seq,delay_ms\n0,20,5\n", "line 2 has 3 fields, expected 2: decimal commas need semicolons"),
+        ("seq;delay_ms\n0;1,5\n1;1.5\n", "decimal points and with commas"),
+        ("seq;delay_us\n0;1,500\n1;12,500\n2;900\n", "1,500 may be thousands or have three decimals: write decimal"),
+        ("delay_ms\n20\n\nslow\n", "line 4: delay_ms is 'slow', expected a number"),
+        ("delay_ms,lost\n20,perhaps\n", "line 2: lost is 'perhaps', expected 0 or 1"),
+        ("", "holds no delay"),
+    ):
+        (tmp_path / "delays").write_text(text)
+        refused(NotationError, message, delays_ms, tmp_path / "delays")
+
+
+def test_recordings_are_read_by_the_header(tmp_path):
+    for text in (
+        "seq;offered_s;delivered_s;camera\n0;0,0;0,0415;a\n1;0,033;;a\n",
+        "sent [s],received [s],camera\n1764285533.125,1764285533.1665,a\n1764285533.158,,a\n",
+        "send_time_ns,delay_ms,camera\n1764285533125000192,41.5,a\n1764285533158000128,,a\n",
+        "offered_ms,delay_ms,lost,camera\n0,41.5,0,a\n33,0,1,a\n",
+    ):
+        (tmp_path / "rows.csv").write_text(text)
+        (camera,) = read_recording(tmp_path / "rows.csv").cameras
+        assert camera.name == "a" and camera.offered_ms == pytest.approx([0.0, 33.0])
+        assert camera.delay_ms[0] == pytest.approx(41.5) and camera.delivered().tolist() == [True, False]

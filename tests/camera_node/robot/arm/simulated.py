@@ -1,7 +1,5 @@
 """A simulated controller in a process of its own, as the client library needs it; the scenario ``cell``."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os

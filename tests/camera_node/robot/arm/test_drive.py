@@ -1,7 +1,5 @@
 """``camera-node drive-arm`` with the real control interface and a simulated arm."""
 
-from __future__ import annotations
-
 import signal
 import socket
 import time
@@ -18,6 +16,7 @@ from camera_node.settings import source_config
 from freshfield.clock import WallClock
 from freshfield.scenario import load
 from tests.camera_node.robot.arm.simulated import simulated_arm, start_cli, wait_until_moving, write_cell
+from tests.support import wait_until
 
 PATH = {
     "azimuths_deg": [-150, -120],
@@ -46,14 +45,10 @@ def near(file):
     return angles, "--joints=" + ",".join(map(str, angles))
 
 
-def at_rest(truth, within_s=5.0):
-    clock, until = WallClock(), time.monotonic() + within_s
-    while time.monotonic() < until:
-        before = truth.joints(clock.now_ns())
-        time.sleep(0.1)
-        if np.array_equal(truth.joints(clock.now_ns()), before):
-            return True
-    return False
+def at_rest(truth):
+    before = truth.joints(WallClock().now_ns())
+    time.sleep(0.1)
+    return np.array_equal(truth.joints(WallClock().now_ns()), before)
 
 
 def shown(text):
@@ -95,7 +90,7 @@ def test_a_drive_that_is_killed_leaves_no_arm_moving(cell):
         wait_until_moving(truth, process)
         process.kill()
         process.communicate()
-        assert at_rest(truth)
+        wait_until(lambda: at_rest(truth), "it moves on", 5.0)
         assert np.abs(truth.joints(WallClock().now_ns()) - stops_of(file)[0]).max() > 0.2
 
 
@@ -109,11 +104,12 @@ def test_a_program_stopped_at_the_pendant_and_a_signal_end_the_drive(cell):
             dashboard.sendall(b"stop\n")
             assert process.wait(20.0) == 1
         assert "its program was ended" in process.communicate()[1]
-        assert at_rest(truth)
+        wait_until(lambda: at_rest(truth), "it moves on", 5.0)
         process = start_cli("drive-arm", file)
         wait_until_moving(truth, process)
         process.send_signal(signal.SIGTERM)  # ends it in order
-        assert process.wait(20.0) == 0 and at_rest(truth, 0.3)
+        assert process.wait(20.0) == 0
+        wait_until(lambda: at_rest(truth), "it moves on", 0.3)
 
 
 @pytest.mark.parametrize("under_nohup", [False, True])

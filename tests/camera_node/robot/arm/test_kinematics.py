@@ -9,28 +9,10 @@ from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import PAIRS, CapsuleModel, segment_distance
 from camera_node.robot.arm.kinematics import UR3E, apply_calibration
 from freshfield.geometry import se3, so3_exp
+from tests.support import refused
 
 POSTURES = np.random.default_rng(3).uniform(-math.pi, math.pi, (40, 6))
 angles = st.floats(-math.pi, math.pi, allow_subnormal=False)
-
-# Deviations as large as real files have them: lengths along nearly parallel axes are ill-determined, so the
-# factory's fit puts meters into d of joints 2 to 4 that all but cancel.
-CALIBRATION = """
-[mounting]
-delta_theta = [ 4.1e-05, -0.0597, 0.1880, -0.1284, 1.9e-05, -3.7e-05]   # radians
-delta_a = [ 3.7e-05, 4.3e-04, 1.5e-03, 3.5e-05, 5.1e-05, 0]
-delta_d = [ 2.2e-04, -6.2913, 8.5694, -2.2780, -7.3e-05, 4.1e-04]
-delta_alpha = [ 1.2e-04, 2.3e-03, 1.2e-02, 4.7e-04, -2.3e-04, 0]
-calibration_status = 2
-joint_checksum = [ 0x1, 0x2, 0x3, 0x4, 0x5, 0x6 ]
-"""
-
-
-@pytest.fixture
-def factory(tmp_path):
-    file = tmp_path / "calibration.conf"
-    file.write_text(CALIBRATION)
-    return file
 
 
 def by_exponentials(joints):
@@ -111,21 +93,16 @@ def test_a_calibration_moves_the_flange_and_the_inverse_follows_it(factory):
     assert np.array_equal(apply_calibration(UR3E, factory).forward(POSTURES), UR3E.forward(POSTURES))
 
 
-def test_a_wrong_calibration_is_refused_by_name(factory):
+def test_a_wrong_calibration_and_joints_that_no_arm_has_are_refused(factory):
     for text, says in (
         ("[mounting]\ndelta_a = [1, 2, 3, 4, 5, nan]\n", "delta_a: expected a list of six numbers"),
         ("[mounting]\nother = 1\n", "has no delta_theta"),
         ("delta_a = [0, 0, 0, 0, 0, 0]\n", "cannot be read"),
     ):
         factory.write_text(text)
-        with pytest.raises(ArmError, match=says):
-            apply_calibration(UR3E, factory)
-
-
-def test_joints_that_no_arm_has_are_refused():
+        refused(ArmError, says, apply_calibration, UR3E, factory)
     for joints in ([0] * 5, [0] * 7, [0, 0, 0, 0, 0, math.nan]):
-        with pytest.raises(ArmError, match="six finite"):
-            UR3E.forward(joints)
+        refused(ArmError, "six finite", UR3E.forward, joints)
 
 
 @pytest.mark.stability

@@ -1,18 +1,25 @@
+"""Where the arm carries its camera: the tour of viewpoints, and the saved hand-eye calibration on the arm's clock:
+T_W^C = T_W^EE T_EE^C (4.7)."""
+
 import itertools
 
 import msgspec
 import numpy as np
 import pytest
+import yaml
 
+from camera_node.pose.pairing import SampleBuffer
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
 from camera_node.robot.arm.capsules import CapsuleModel
+from camera_node.robot.arm.hand_eye_mount import read_hand_eye
 from camera_node.robot.arm.kinematics import UR3E, apply_calibration
 from camera_node.robot.arm.viewpoint_tour import FARTHEST_RAD, _extend_tour, is_free, plan_tour, reachable, viewpoints
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from camera_node.settings import PathConfig, source_config
+from freshfield.geometry import Pose, se3, so3_exp
 from freshfield.scenario import ScenarioError, load, parse
-from tests.camera_node.robot.arm.test_kinematics import CALIBRATION
+from tests.support import refused
 
 CELL = load("cell")
 ARM = source_config(CELL).arm
@@ -33,11 +40,9 @@ def test_viewpoints_look_at_their_target_from_their_radius():
     assert np.isclose(heights[1], heights[2]) and azimuths[1] < azimuths[2]
 
 
-def test_a_calibrated_arm_is_kept_above_the_floor_too(tmp_path):
+def test_a_calibrated_arm_is_kept_above_the_floor_too(factory):
     """The height of its joints, not of the frames that its calibration puts meters beside them."""
-    file = tmp_path / "calibration.conf"
-    file.write_text(CALIBRATION)
-    arm = apply_calibration(UR3E, file)
+    arm = apply_calibration(UR3E, factory)
     shape, free = CapsuleModel(UR3E, 0.08, 0.04), 0
     for joints in np.random.default_rng(6).uniform(-3, 3, (200, 6)):
         if shape.clearance(UR3E.link_frames(joints[None]))[0].min() < 0.03:
@@ -98,18 +103,56 @@ def test_a_camera_that_is_not_calibrated_yet_has_the_hands_poses_wherever_the_ba
     assert np.allclose(base_matrix(arm) @ [1, 0, 0, 1], [1, 3, 3, 1])
 
 
-@pytest.mark.parametrize(
-    "changed, says",
-    [
+def test_a_wrong_file_or_host_is_refused_by_name():
+    for changed, says in (
         # A simulated one is driven without a question.
         ({"host": "192.168.56.101", "simulated": True}, r"simulated: host is 192\.168"),
         ({"cameras": {"nobody": None}}, "arm.cameras: 'nobody' is not one of the scenario's cameras"),
         ({"cameras": {"hand": "no-such.yaml"}}, r"arm.cameras.hand: .*no-such.yaml: cannot be read"),
         ({"calibration": "no-such.conf"}, r"source.arm.calibration: .*no-such.conf: cannot be read"),
-    ],
-)
-def test_a_wrong_file_or_host_is_refused_by_name(changed, says):
-    scenario = cell(**changed)
-    with pytest.raises(ScenarioError, match=says):
-        load_hand_eyes(scenario, source_config(scenario).arm, scenario.cameras)
-        arm_model(scenario, source_config(scenario).arm)
+    ):
+        scenario = cell(**changed)
+        with pytest.raises(ScenarioError, match=says):
+            load_hand_eyes(scenario, source_config(scenario).arm, scenario.cameras)
+            arm_model(scenario, source_config(scenario).arm)
+
+
+MS = 1_000_000
+HELD = se3(so3_exp((0.1, 0, 0)), (0.05, 0, 0.1))
+
+
+def written(tmp_path, **change):
+    data = {"setup": "eye-in-hand", "transform": HELD.round(9).tolist(), "time_offset_s": 0.02, "method": "refined"}
+    file = tmp_path / "hand.yaml"
+    file.write_text(yaml.safe_dump({**data, **change}))
+    return file
+
+
+def test_a_camera_on_a_moving_flange_follows_it_and_one_that_stands_does_not(tmp_path):
+    calibration = read_hand_eye(written(tmp_path))
+    assert calibration.details == {"method": "refined"}
+    flange = SampleBuffer(Pose.interpolate)
+    for k in range(10):
+        flange.add(k * 10 * MS, Pose.from_matrix(se3(so3_exp((0, 0, 0.1 * k)), (0.01 * k, 0, 0))))
+    # The arm's stamps are 20 ms ahead: the camera's 30 ms are the arm's 50 ms.
+    found, gap_ns = calibration.camera_poses(flange).at(30 * MS)
+    expected = se3(so3_exp((0, 0, 0.5)), (0.05, 0, 0)) @ HELD
+    np.testing.assert_allclose(found.matrix(), expected, atol=1e-8)
+    assert gap_ns == 0
+    stands = read_hand_eye(written(tmp_path, setup="eye-to-hand")).camera_poses(flange)
+    np.testing.assert_allclose(stands.at(7)[0].matrix(), HELD, atol=1e-8)
+
+
+def test_a_file_that_cannot_be_used_is_named(tmp_path):
+    for change, message in (
+        ({"setup": "eye-on-foot"}, "setup: expected eye-in-hand or eye-to-hand"),
+        ({"transform": (2 * np.eye(4)).tolist()}, "transform: expected 4 x 4 numbers with the last row"),
+        ({"transform": np.diag([1.0, 1, -1, 1]).tolist()}, "transform: the pose's rotation"),
+        ({"transform": [[10**400] * 4] * 4}, "transform: .* too large"),
+        ({"time_offset_s": float("nan")}, "time_offset_s"),
+        ("[1, 2]", "expected setup and transform"),
+    ):
+        file = written(tmp_path, **(change if isinstance(change, dict) else {}))
+        if isinstance(change, str):
+            file.write_text(change)
+        assert "hand.yaml" in str(refused(ArmError, message, read_hand_eye, file))

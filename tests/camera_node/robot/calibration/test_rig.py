@@ -1,11 +1,10 @@
 """Poses and lenses of a rig of fixed cameras, against known ones."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json
 import time
+from contextlib import closing
 
 import cv2
 import numpy as np
@@ -20,7 +19,7 @@ from camera_node.sources.rig_calibration import load_calibration
 from freshfield.clock import WallClock
 from freshfield.geometry import Pinhole, look_at, matrix_to_quaternion, se3, se3_inverse, so3_exp, so3_log
 from tests.camera_node.robot.calibration import known_truth
-from tests.camera_node.sources.devices.mjpeg import NetworkCamera, number_of
+from tests.camera_node.sources.devices.mjpeg import NetworkCamera, camera_file, number_of
 
 BOARD = "charuco:8x5:60mm:45mm"
 TARGET = parse_target(BOARD)
@@ -214,40 +213,31 @@ def test_a_live_camera_that_is_unplugged_is_named_and_the_others_go_on():
 @pytest.mark.stability
 def test_a_live_camera_shows_its_newest_frame_however_slowly_it_is_asked(tmp_path):
     """Of network cameras, frames wait in the stream."""
-    camera = NetworkCamera(WallClock())
-    (tmp_path / "a.yaml").write_text(
-        f"cameras: {{ids: [a]}}\nsource: {{kind: camera, devices: {{a: '{camera.address}'}}, fps: 10}}\n"
-    )
-    try:
-        cameras, close = rig_inputs.open_cameras(str(tmp_path / "a.yaml"))
+    with closing(NetworkCamera(WallClock())) as camera:
+        cameras, close = rig_inputs.open_cameras(str(camera_file(tmp_path, camera.address)))
         numbers = []
         for _ in range(3):
             time.sleep(1.0)
-            numbers.append(number_of(np.repeat(cameras["a"]()[..., None], 3, axis=2)))
+            numbers.append(number_of(np.repeat(cameras["eye"]()[..., None], 3, axis=2)))
         assert min(np.diff(numbers)) > 4
         close()
-    finally:
-        camera.close()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ([], "expected one of FOLDER"),
-        (["{folder}"], "--board SPEC"),
-        (["{folder}/cam0", "--board", BOARD], "for each of at least two cameras, found 0"),
-        (["{folder}", "--board", BOARD], "cam0 never sees the target: charuco:8x5:60mm:45mm not found: no markers"),
-        (["--colmap", "{folder}"], "--length CAM CAM METERS"),
-        (["--live", "room", "--board", BOARD], "expected camera, oak or realsense"),
-    ],
-)
-def test_what_cannot_be_used_is_refused_in_one_line(words, message, tmp_path, capsys):
+def test_what_cannot_be_used_is_refused_in_one_line(tmp_path, capsys):
     for name in ("cam0", "cam1"):
         (tmp_path / name).mkdir()
         cv2.imwrite(str(tmp_path / name / "1.png"), np.zeros((48, 64), np.uint8))
-    assert main(["calibrate", "rig", *(word.format(folder=tmp_path) for word in words)]) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith("camera-node: ") and message in error
+    for words, message in (
+        ([], "expected one of FOLDER"),
+        ([tmp_path], "--board SPEC"),
+        ([tmp_path / "cam0", "--board", BOARD], "for each of at least two cameras, found 0"),
+        ([tmp_path, "--board", BOARD], "cam0 never sees the target: charuco:8x5:60mm:45mm not found: no markers"),
+        (["--colmap", tmp_path], "--length CAM CAM METERS"),
+        (["--live", "room", "--board", BOARD], "expected camera, oak or realsense"),
+    ):
+        assert main(["calibrate", "rig", *map(str, words)]) == 2
+        error = capsys.readouterr().err.splitlines()[-1]
+        assert error.startswith("camera-node: ") and message in error
 
 
 def test_a_colmap_model_is_scaled_by_a_known_length(tmp_path, capsys):

@@ -1,7 +1,5 @@
 """The real client library against the simulated controller."""
 
-from __future__ import annotations
-
 import socket
 import time
 
@@ -12,6 +10,7 @@ from camera_node.robot.arm.rtde_process import VARIABLES
 from camera_node.robot.simulated_controller import rtde_protocol as rtde
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
+from tests.support import refused, wait_until
 
 
 @pytest.fixture(scope="module")
@@ -43,10 +42,8 @@ def control(arm, receive):
 def _joints(receive) -> np.ndarray:
     """Joints of a state that was sent after the call."""
     for _ in range(2):
-        stamp, deadline = receive.getTimestamp(), time.monotonic() + 5.0
-        while receive.getTimestamp() == stamp:
-            assert time.monotonic() < deadline, "no state for five seconds"
-            time.sleep(0.001)
+        stamp = receive.getTimestamp()
+        wait_until(lambda stamp=stamp: receive.getTimestamp() != stamp, "no state for five seconds", 5.0)
     return np.array(receive.getActualQ())
 
 
@@ -75,8 +72,7 @@ def test_what_it_cannot_do_stops_the_program_and_is_not_called_done(control, rec
     """As a fault does on a real one."""
     before = receive.getActualQ()
     if wrong == "kinematics":
-        with pytest.raises(RuntimeError, match="did not succeed"):
-            control.getForwardKinematics(before, [0.0] * 6)
+        refused(RuntimeError, "did not succeed", control.getForwardKinematics, before, [0.0] * 6)
         done = False
     elif wrong == "not simulated":
         done = control.moveL([0.2, 0.2, 0.2, 0.0, 3.0, 0.0], 0.1, 0.5)
@@ -85,9 +81,7 @@ def test_what_it_cannot_do_stops_the_program_and_is_not_called_done(control, rec
     assert not done and not control.isProgramRunning()
     assert receive.getActualQ() == before
     assert control.reuploadScript()
-    until = time.monotonic() + 10.0
-    while not control.isProgramRunning() and time.monotonic() < until:
-        time.sleep(0.01)
+    wait_until(control.isProgramRunning, "no program", 10.0)
     assert control.moveJ(before, 1.0, 4.0)
 
 

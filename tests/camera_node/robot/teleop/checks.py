@@ -1,7 +1,5 @@
 """What must hold of every tick, computed by other means than the limiter's own."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import numpy as np

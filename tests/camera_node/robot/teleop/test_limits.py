@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -13,8 +11,8 @@ from camera_node.robot.teleop.limits import JointLimits, Limiter
 from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.stylus import StylusSample
 from camera_node.robot.teleop.teleoperator import SILENT, Command, Teleoperator
-from tests.camera_node.robot.arm.test_kinematics import CALIBRATION
 from tests.camera_node.robot.teleop.checks import HOME, assert_within_limits, drive, sample
+from tests.support import refused
 
 
 def stop_way(v: float, change: float, dt: float) -> float:
@@ -56,34 +54,25 @@ def test_what_is_no_speed_is_a_stop_and_counted(wanted):
     assert np.abs(limiter.v).max() < before
 
 
-@pytest.mark.parametrize(
-    "changes, says",
-    [
+def test_an_arm_that_breaks_a_limit_standing_still_is_refused(factory):
+    """The link frames of a calibrated one lie meters beside it: the limits may not take them for the arm."""
+    for changes, says in (
         ({"floor_m": 0.5}, "223.3 mm high, below floor_m, 500 mm"),
         ({"margin_m": 0.1}, "forearm and wrist 3 are 61.3 mm apart, nearer than margin_m, 100 mm"),
-    ],
-)
-def test_an_arm_that_breaks_a_limit_standing_still_is_refused(changes, says, tmp_path):
-    """The link frames of a calibrated one lie meters beside it: the limits may not take them for the arm."""
-    (tmp_path / "calibration.conf").write_text(CALIBRATION)
-    for arm in (UR3E, apply_calibration(UR3E, tmp_path / "calibration.conf")):
-        Limiter(arm, TeleopConfig(), HOME)
-        with pytest.raises(ArmError, match=says):
-            Limiter(arm, TeleopConfig(**changes), HOME)
+    ):
+        for arm in (UR3E, apply_calibration(UR3E, factory)):
+            Limiter(arm, TeleopConfig(), HOME)
+            refused(ArmError, says, Limiter, arm, TeleopConfig(**changes), HOME)
 
 
-@pytest.mark.parametrize(
-    "joints, says",
-    [
+def test_joints_that_are_none_or_outside_are_refused():
+    for joints, says in (
         (HOME[:5], "the arm gives no joint angles"),
         ([np.nan, *HOME[1:]], "the arm gives no joint angles"),
         ([*HOME[:5], 2 * math.pi - 0.01], r"joint 6 stands at 359\.4 degrees"),
         (HOME, r"\[0.299, -0.131, 0.303\] m, outside workspace_low_m \[0.0, 0.0, 0.4\] .*high_m \[0.45, 0.45, 0.6\]"),
-    ],
-)
-def test_joints_that_are_none_or_outside_are_refused(joints, says):
-    with pytest.raises(ArmError, match=says):
-        Limiter(UR3E, TeleopConfig(workspace_low_m=(0.0, 0.0, 0.4)), joints)
+    ):
+        refused(ArmError, says, Limiter, UR3E, TeleopConfig(workspace_low_m=(0.0, 0.0, 0.4)), joints)
 
 
 CONFIG = TeleopConfig(scale=(3.0, 3.0, 3.0), rate_hz=100.0)

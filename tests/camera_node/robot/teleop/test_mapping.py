@@ -1,7 +1,5 @@
 """From a stylus to a target of the flange, and from there to speeds of the joints."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

@@ -1,12 +1,14 @@
-from __future__ import annotations
-
 import contextlib
 import csv
 import itertools
+import json
 import math
+import os
+import pty
 import signal
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from unittest.mock import MagicMock
 
@@ -20,15 +22,11 @@ from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.flange_camera import TruthClient
 from camera_node.robot.teleop import sinks, teleop_command
 from camera_node.robot.teleop.settings import TeleopConfig
+from camera_node.robot.teleop.stylus import KeyboardStylus, NetworkStylus, open_stylus, parse
 from camera_node.robot.teleop.teleoperator import Command, Teleoperator
 from tests.camera_node.robot.arm.simulated import simulated_arm, start_cli, wait_until_moving, write_cell
 from tests.camera_node.robot.teleop.checks import HOME, sample
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
+from tests.support import free_port, refusal, refused, wait_until
 
 
 @contextlib.contextmanager
@@ -102,8 +100,7 @@ def test_an_arm_that_has_been_stopped_is_sent_nothing_more(monkeypatch):
             sink.send(0.0, still)
     assert control.servoJ.call_count == 2
     stream.trouble = "arm at 10.0.0.1: safety: protective stop"
-    with pytest.raises(ArmError, match="protective stop: stopped"):
-        sink.send(0.01, still)
+    refused(ArmError, "protective stop: stopped", sink.send, 0.01, still)
     assert control.servoJ.call_count == 2
 
 
@@ -125,16 +122,99 @@ def test_the_operator_ends_it_and_the_arm_comes_to_rest(capsys):
     assert "clutch pressed 1 times" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("section", "part"),
-    [
+def test_wrong_settings_are_refused_by_name(tmp_path, capsys):
+    for section, part in (
         ({"speed_rad_s": 99}, "source.arm.teleop.speed_rad_s"),
         ({"scale": [1, 0, 1]}, "source.arm.teleop: scale"),
         ({"acceleration_rad_s2": 0.06}, "too low to come to rest"),
         ({"workspace_low_m": [0, 0, 1]}, "workspace_low_m must be below"),
-    ],
-)
-def test_wrong_settings_are_refused_by_name(tmp_path, capsys, section, part):
-    words = ["teleop", str(write_cell(tmp_path, "127.0.0.2", teleop=section)), "--stylus", f"network:{free_port()}"]
-    assert main([*words, "--dry-run", str(tmp_path / "x.csv")]) == 2
-    assert part in capsys.readouterr().err
+    ):
+        words = ["teleop", write_cell(tmp_path, "127.0.0.2", teleop=section), "--stylus", f"network:{free_port()}"]
+        assert part in refusal(capsys, main, *words, "--dry-run", tmp_path / "x.csv")
+
+
+GOOD = {"t_ns": 5, "p": [0.1, 0.2, 0.3], "q": [1, 0, 0, 0], "clutch": True}
+
+
+def received(stylus: NetworkStylus, now_ns: int, *sent: tuple[socket.socket, bytes]) -> list:
+    for sender, data in sent:
+        sender.sendto(data, ("127.0.0.1", stylus.port))
+    return wait_until(lambda: stylus.poll(now_ns), "nothing arrives")
+
+
+def test_messages_of_one_sender_arrive_as_they_were_sent():
+    stylus = NetworkStylus("127.0.0.1", 0)
+    first, second = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    sent = [sample(k, (0.1, -0.2, 0.3)) for k in range(5)]
+    assert received(stylus, 0, (first, b"nonsense"), (first, encode(sent[1]))) == [sent[1]]
+    assert stylus.poll(0) == []
+    assert received(stylus, 10, (second, encode(sent[2])), (first, encode(sent[3]))) == [sent[3]]
+    assert received(stylus, 1_000_000_010, (second, encode(sent[4]))) == [sent[4]], "the first has been silent"
+    refused(ArmError, r"cannot listen at .*name another port", NetworkStylus, "127.0.0.1", stylus.port)
+    for each in (first, second, stylus):
+        each.close()
+
+
+def test_what_is_no_message_is_none():
+    for data in (
+        b"",
+        b"\xff\xfe",
+        b"[" * 1500,
+        json.dumps({**GOOD, "p": [0, 0]}).encode(),
+        json.dumps({**GOOD, "q": "none"}).encode(),
+        json.dumps({**GOOD, "clutch": 1}).encode(),
+        json.dumps({**GOOD, "t_ns": 1.5}).encode(),
+        json.dumps({"t_ns": 1}).encode(),
+        json.dumps({**GOOD, "p": [float("nan"), 0, 0]}).encode(),
+        json.dumps({**GOOD, "more": "x" * 2048}).encode(),
+    ):
+        assert parse(data) is None
+
+
+@pytest.mark.parametrize("text", ["mouse", "network:x", "network:0", "network:99999", "keyboard:2"])
+def test_unknown_styluses_are_refused_and_those_that_other_machines_reach(text):
+    refused(ArmError, "--stylus: expected", open_stylus, text)
+    for host in ("0.0.0.0", "[::]", "example.com"):
+        refused(ArmError, r"other machines reach .*driver on this machine", open_stylus, f"network:{host}:7010")
+
+
+AXES = {"w": 0, "s": 0, "a": 1, "d": 1, "r": 2, "f": 2, "o": 3, "u": 3, "k": 4, "i": 4, "j": 5, "l": 5}
+
+
+def test_every_key_moves_along_or_turns_about_its_axis(monkeypatch):
+    """Forwards is x, left y, up z; turns follow the right hand, but k and i: the tip goes down and up."""
+    for key, axis in AXES.items():
+        controller, terminal = pty.openpty()
+        stylus = KeyboardStylus(terminal)
+        monkeypatch.setattr(stylus, "_read", lambda key=key: key)
+        (found,) = stylus.poll(0)
+        expected = np.eye(6)[axis] * (0.005 if axis < 3 else np.sin(0.01)) * (1 if key in "warokj" else -1)
+        np.testing.assert_allclose([*found.position_m, *found.quaternion[1:]], expected, atol=1e-12)
+        stylus.close()
+        os.close(controller)
+        os.close(terminal)
+
+
+def test_the_keyboard_of_a_real_terminal():
+    controller, terminal = pty.openpty()
+    stylus = KeyboardStylus(terminal)
+
+    def typed(keys: bytes):
+        os.write(controller, keys)
+        time.sleep(0.05)
+        return stylus.poll(1)[0]
+
+    assert stylus.poll(0)[0].clutch is False
+    held = typed(b" wwaR")
+    assert held.clutch and held.position_m == pytest.approx((0.010, 0.005, 0.005))
+    turned = typed(b"jj\x1b[A").quaternion  # turns, and an arrow key that means nothing
+    assert turned[3] == pytest.approx(np.sin(0.02)) and turned[1:3] == pytest.approx((0, 0), abs=1e-12)
+    assert not typed(b"q").clutch and stylus.ended
+    stylus.close()
+    gone = KeyboardStylus(terminal)
+    os.close(controller)
+    gone.poll(0)
+    assert gone.ended, "its terminal is gone"
+    os.close(terminal)
+    with open(os.devnull) as nothing, pytest.raises(ArmError, match="needs a terminal"):
+        KeyboardStylus(nothing.fileno())

@@ -3,13 +3,12 @@
 The writers share nothing with the loaders: conventions are spelt out here a second time.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -69,9 +68,8 @@ def write_dynerf(folder: Path, cameras: list[Taken], frames: int = 6, written_at
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
     for camera in cameras:
-        video = cv2.VideoWriter(
-            str(folder / f"{camera.name}.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT)
-        )
+        file = str(folder / f"{camera.name}.mp4")
+        video = cv2.VideoWriter(file, cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT))
         for k in range(frames):
             video.write(camera.shows(k)[..., ::-1])
         video.release()
@@ -102,21 +100,12 @@ def write_zju(folder: Path, cameras: list[Taken], frames: int = 4, k3: float = 0
     return folder
 
 
-def _eyeful_pose(camera: Taken) -> np.ndarray:
-    """Camera-to-world in a world whose y points up: its x is our y, its y our z, its z our x."""
-    turn = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
-    return turn @ camera.camera_to_world
-
-
 def write_eyeful(
-    folder: Path,
-    cameras: list[Taken],
-    positions: int = 2,
-    model: str = "RadialAndTangential",
-    distortion: list[float] | None = None,
-    full: int = 4,
+    folder: Path, cameras: list[Taken], positions: int = 2, model: str = "RadialAndTangential", distortion: Any = None
 ) -> Path:
-    """full: the JSON describes images so many times larger than those in images-jpeg-2k."""
+    """The JSON describes images four times larger than those in images-jpeg-2k, of a world whose y points up: its x is
+    our y, its y our z, its z our x."""
+    turn, full = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]]), 4
     bend = distortion or [*cameras[0].lens.distortion, 0.0]
     krt, splits = [], {"train": [], "test": []}  # type: ignore[var-annotated]
     for number, camera in enumerate(cameras):
@@ -126,19 +115,9 @@ def write_eyeful(
             splits["test" if number == 0 else "train"].append(name)
             lens = camera.lens
             K = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1 / full]]) * full
-            krt.append(
-                {
-                    "width": WIDTH * full,
-                    "height": HEIGHT * full,
-                    "cameraId": name,
-                    "frameId": k,
-                    "sensorId": number,
-                    "K": K.T.tolist(),
-                    "T": np.linalg.inv(_eyeful_pose(camera)).T.tolist(),
-                    "distortionModel": model,
-                    "distortion": bend,
-                }
-            )
+            entry = {"width": WIDTH * full, "height": HEIGHT * full, "cameraId": name, "frameId": k, "sensorId": number}
+            entry |= {"K": K.T.tolist(), "T": np.linalg.inv(turn @ camera.camera_to_world).T.tolist()}
+            krt.append(entry | {"distortionModel": model, "distortion": bend})
     (folder / "cameras.json").write_text(json.dumps({"KRT": krt}))
     (folder / "splits.json").write_text(json.dumps(splits))
     return folder

@@ -1,6 +1,5 @@
-"""Every data set's loader against a set in its exact format: conventions by reprojection, damage by name."""
-
-from __future__ import annotations
+"""Every data set's loader against a set in its exact format, and those that the edge exports: conventions by
+reprojection, damage by name."""
 
 import pickle
 import subprocess
@@ -16,6 +15,10 @@ from camera_node.sources.datasets.formats import FORMATS, open_dataset
 from camera_node.sources.datasets.lens import Lens, exact, pinhole, undistort
 from camera_node.sources.datasets.photo import FULL_SIZE
 from camera_node.sources.registry import open_sources
+from edge_server.export import PosedImage
+from edge_server.export.colmap import Cloud, write_model
+from edge_server.export.images import write_images
+from edge_server.export.transforms import write_transforms
 from freshfield.geometry import Pinhole, se3_inverse
 from freshfield.scenario import parse
 from tests.camera_node.sources.datasets import sets
@@ -25,17 +28,17 @@ BENT = Pinhole(64, 48, 60.0, 61.0, 31.2, 24.9, (-0.08, 0.02, 0.002, -0.003))
 NEAR_PX = 0.01
 
 
-def seen(record, points=sets.POINTS):
-    """Where a record's camera sees points."""
-    inverse = se3_inverse(record.camera_to_world)
-    return record.intrinsics.project(points @ inverse[:3, :3].T + inverse[:3, 3])
+def seen(camera_to_world, lens, points=sets.POINTS):
+    """Where a camera sees points."""
+    inverse = se3_inverse(camera_to_world)
+    return lens.project(points @ inverse[:3, :3].T + inverse[:3, 3])
 
 
 def agree(records, cameras, instant=0):
     """Every record sees every point where OpenCV sees it, and shows what its camera showed then."""
     assert len(records) == len(cameras)
     for record, camera in zip(records, cameras):
-        assert np.abs(seen(record) - camera.pixels()).max() < NEAR_PX
+        assert np.abs(seen(record.camera_to_world, record.intrinsics) - camera.pixels()).max() < NEAR_PX
         off = [np.abs(record.read().astype(float) - each.shows(instant)).mean() for each in cameras]
         # What is left is compression, of videos at a quarter of the colors.
         assert off[cameras.index(camera)] == min(off) < 15, off
@@ -179,6 +182,26 @@ def test_colmap_sees_points_where_they_are(tmp_path, model, binary):
     else:
         agree(list(dataset), cameras)
         np.testing.assert_allclose(dataset[1].camera_to_world, cameras[1].camera_to_world, atol=1e-9)
+
+
+@pytest.mark.parametrize("form", ["colmap", "transforms"])
+def test_what_the_edge_exports_reads_back_to_the_pixel(tmp_path, form):
+    """One picture a camera, half of the lenses bent."""
+    straight, bent = sets.rig(3), sets.rig(3, BENT)
+    cameras = [straight[0], bent[1], straight[2], bent[0]]
+    shots = [PosedImage(f"view{k}.png", c.shows(0), c.camera_to_world, c.lens) for k, c in enumerate(cameras)]
+    write_images(tmp_path / "images", shots)
+    if form == "transforms":
+        write_transforms(tmp_path, shots)
+    else:
+        cloud = Cloud(sets.POINTS, np.zeros((200, 3), np.uint8), np.ones((200, len(shots)), np.bool_))
+        write_model(tmp_path / "sparse/0", shots, cloud)
+    _, dataset = open_dataset(tmp_path)
+    for shot, record in zip(shots, dataset, strict=True):
+        assert record.intrinsics == shot.intrinsics
+        there, back = (seen(each.camera_to_world, each.intrinsics) for each in (shot, record))
+        assert np.abs(there - back).max() < NEAR_PX
+        np.testing.assert_array_equal(record.read(), shot.image)
 
 
 WRITERS = {

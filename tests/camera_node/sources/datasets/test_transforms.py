@@ -1,10 +1,7 @@
 """transforms.json data sets: every corner of the format, and files as other tools and people leave them."""
 
-from __future__ import annotations
-
 import json
 import re
-import struct
 
 import cv2
 import numpy as np
@@ -21,18 +18,19 @@ from tests.camera_node.sources.datasets.photos import (
     BOMB,
     edited,
     fails,
-    opencv_pose,
     photo_scenario,
     picture,
+    pose_of,
     write_photos,
 )
+from tests.support import turned_jpeg
 
 
 def test_poses_become_opencv_and_images_rgb_at_the_scale_asked_for(tmp_path):
     dataset = load_dataset(write_photos(tmp_path, 3))
     assert len(dataset) == 3 and dataset.cameras == ("",) and not dataset.moving
     for index, record in enumerate(dataset):
-        np.testing.assert_allclose(record.camera_to_world, opencv_pose(index), atol=1e-12)
+        np.testing.assert_allclose(record.camera_to_world, pose_of(index), atol=1e-12)
         np.testing.assert_array_equal(record.read(), picture(index)[..., ::-1])
         assert record.intrinsics == Pinhole(32, 24, 40.0, 41.0, 16.0, 12.0)
     record = load_dataset(tmp_path, ImageOptions(2))[0]
@@ -120,9 +118,8 @@ def lens_of(fx=40.0, fy=41.0, radial=(), tangential=(0.0, 0.0), fisheye=False):
     return Lens(32, 24, fx, fy, 16.0, 12.0, radial, tangential, fisheye)
 
 
-@pytest.mark.parametrize(
-    ("keys", "lens"),
-    [
+def test_keys_of_the_camera_are_honored(tmp_path):
+    for keys, lens in (
         ({"is_fisheye": True, "k1": 0.03, "k2": -0.005}, lens_of(radial=(0.03, -0.005), fisheye=True)),
         ({"camera_model": "OPENCV_FISHEYE", **BENDS}, lens_of(radial=tuple(BENDS.values()), fisheye=True)),
         ({"k3": 0.59, "p1": 0.01}, lens_of(radial=(0.0, 0.0, 0.59), tangential=(0.01, 0.0))),
@@ -134,18 +131,15 @@ def lens_of(fx=40.0, fy=41.0, radial=(), tangential=(0.0, 0.0), fisheye=False):
         ({"k5": 0, "rolling_shutter": [0, 0, 0, 0], "is_fisheye": False, "aabb_scale": 4}, lens_of()),
         # Numbers that belong to a larger original.
         ({"w": 64, "h": 48, "fl_x": 80, "fl_y": 82, "cx": 32, "cy": 24}, lens_of()),
-    ],
-)
-def test_keys_of_the_camera_are_honored(tmp_path, keys, lens):
-    found, expected = load_edited(write_photos(tmp_path, 2), **keys)[0].intrinsics, pinhole(lens)
-    assert (found.width, found.height) == (expected.width, expected.height)
-    numbers = [(c.fx, c.fy, c.cx, c.cy, *c.distortion) for c in (found, expected)]
-    assert numbers[0] == pytest.approx(numbers[1])
+    ):
+        found, expected = load_edited(write_photos(tmp_path, 2), **keys)[0].intrinsics, pinhole(lens)
+        assert (found.width, found.height) == (expected.width, expected.height)
+        numbers = [(c.fx, c.fy, c.cx, c.cy, *c.distortion) for c in (found, expected)]
+        assert numbers[0] == pytest.approx(numbers[1])
 
 
-@pytest.mark.parametrize(
-    ("keys", "message"),
-    [
+def test_keys_that_change_the_meaning_are_refused_by_name(tmp_path):
+    for keys, message in (
         *(({key: [0.1]}, rf"json: {key}: .*(undistort|convert|give|cut|correct|store)") for key in sorted(REFUSED)),
         ({"lens_shift_x": 0.1}, "lens_shift_x is not understood and may change the camera"),
         ({"is_fisheye": "false"}, "is_fisheye is 'false', expected true or false"),
@@ -153,10 +147,8 @@ def test_keys_of_the_camera_are_honored(tmp_path, keys, lens):
         ({"is_fisheye": True, "p1": 0.1}, "p1 and p2 belong to no fisheye lens"),
         ({"train_filenames": ["images/009.png"]}, r"train_filenames: images/009\.png is no file_path"),
         ({"mask_path": "masks/none.png"}, r"mask_path: 'masks/none\.png' is missing"),
-    ],
-)
-def test_keys_that_change_the_meaning_are_refused_by_name(tmp_path, keys, message):
-    fails(message, load_dataset, edited(write_photos(tmp_path, 2), **keys))
+    ):
+        fails(message, load_dataset, edited(write_photos(tmp_path, 2), **keys))
 
 
 @pytest.mark.parametrize(
@@ -196,18 +188,13 @@ def test_a_split_of_the_datas_own(tmp_path):
     assert truth == {r.read().tobytes() for r in found if r.name in found.held_out}
 
 
-def exif(orientation: int) -> bytes:
-    tag = b"II*\0\x08\0\0\0\x01\0" + struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0) + b"\0\0\0\0"
-    return b"\xff\xe1" + struct.pack(">H", len(tag) + 8) + b"Exif\0\0" + tag
-
-
 def test_orientation_and_size_are_what_the_camera_says(tmp_path):
     file = write_photos(tmp_path, 2, suffix=".jpg")
     image = tmp_path / "images/000.jpg"
     as_stored = load_dataset(file)[0].read()
     data = image.read_bytes()
     for orientation in (3, 6, 8):
-        image.write_bytes(data[:2] + exif(orientation) + data[2:])
+        image.write_bytes(turned_jpeg(data, orientation))
         np.testing.assert_array_equal(load_dataset(file)[0].read(), as_stored)  # its size is the camera's
     turned = load_edited(file, lambda d: d["frames"].pop(), w=24, h=32, cx=12, cy=16)
     np.testing.assert_array_equal(turned[0].read(), np.rot90(as_stored))

@@ -1,16 +1,36 @@
 """A network camera: numbered pictures at a steady rate over HTTP, as cheap cameras stream them."""
 
-from __future__ import annotations
-
 import http.server
+import json
 import threading
 import time
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 SIZE = (64, 48)
 BLOCKS = 8
+
+
+CALIBRATION = {
+    "eye": {
+        "width": SIZE[0],
+        "height": SIZE[1],
+        "K": [[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]],
+        "R_world_to_cam": np.eye(3).tolist(),
+        "t_world_to_cam": [0.0, 0.0, 1.0],
+    }
+}
+
+
+def camera_file(folder: Path, device: str, **source: Any) -> Path:
+    """A scenario with one calibrated camera, eye, and further keys of its source."""
+    (folder / "calibration.json").write_text(json.dumps(CALIBRATION))
+    given = {"kind": "camera", "devices": {"eye": device}, "calibration": "calibration.json", "fps": 10, **source}
+    (folder / "eye.yaml").write_text(json.dumps({"cameras": {"ids": ["eye"]}, "source": given}))
+    return folder / "eye.yaml"
 
 
 def picture(number: int) -> np.ndarray:

@@ -1,10 +1,8 @@
 """Real cameras as sources: the list of those that are plugged in, and one that streams over the network."""
 
-from __future__ import annotations
-
-import json
 import threading
 import time
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from unittest.mock import MagicMock
@@ -21,45 +19,31 @@ from camera_node.sources.devices.connected import Connected, connected
 from camera_node.sources.devices.feed import CameraError, Plugged, select_device
 from camera_node.sources.devices.live import LiveSource
 from freshfield.clock import WallClock
-from freshfield.geometry import Pinhole, Pose
-from freshfield.scenario import parse
-from tests.camera_node.sources.devices.mjpeg import SIZE, NetworkCamera, number_of
+from freshfield.geometry import Pinhole
+from freshfield.scenario import load, parse
+from tests.camera_node.depth_source import POSE
+from tests.camera_node.sources.devices.mjpeg import SIZE, NetworkCamera, camera_file, number_of
+from tests.support import refused, wait_until
 
 WITHIN_S = 20.0
-CALIBRATION = {
-    "eye": {
-        "width": SIZE[0],
-        "height": SIZE[1],
-        "K": [[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]],
-        "R_world_to_cam": np.eye(3).tolist(),
-        "t_world_to_cam": [0.0, 0.0, 1.0],
-    }
-}
-
-
-@pytest.fixture
-def clock():
-    return WallClock()
 
 
 def scenario(folder: Path, device: str):
-    (folder / "calibration.json").write_text(json.dumps(CALIBRATION))
-    source = {"kind": "camera", "devices": {"eye": device}, "fps": 10, "calibration": "calibration.json"}
-    source |= {"width": SIZE[0], "height": SIZE[1]}
-    return parse({"cameras": {"ids": ["eye"]}, "source": source}, folder / "scenario.yaml")
+    return load(camera_file(folder, device, width=SIZE[0], height=SIZE[1]))
 
 
 def patiently(take):
     """The next frame; a busy machine may be late."""
-    until = time.monotonic() + WITHIN_S
-    while True:
-        try:
+
+    def attempt():
+        with suppress(CameraError):
             return take()
-        except CameraError:
-            assert time.monotonic() < until
+
+    return wait_until(attempt, "no frame")
 
 
-def test_frames_come_once_each_in_order_and_with_the_time_of_their_arrival(tmp_path, clock):
+def test_frames_come_once_each_in_order_and_with_the_time_of_their_arrival(tmp_path):
+    clock = WallClock()
     network = NetworkCamera(clock)
     plan = scenario(tmp_path, network.address)
     (camera,) = build_cameras(plan, source_config(plan), plan.cameras)
@@ -79,12 +63,11 @@ def test_frames_come_once_each_in_order_and_with_the_time_of_their_arrival(tmp_p
     network.close()
     for device, says in (("77", "eye: no camera at 77: is it plugged in"), (__file__, "it is a file, not a device")):
         plan = scenario(tmp_path, device)
-        with pytest.raises(CameraError, match=says):
-            build_cameras(plan, source_config(plan), plan.cameras)
+        refused(CameraError, says, build_cameras, plan, source_config(plan), plan.cameras)
 
 
 LENS = Pinhole.from_fov(*SIZE, 60.0)
-STANDING = FixedPose(Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+STANDING = FixedPose(POSE)
 
 
 class Feed:
@@ -140,10 +123,8 @@ def test_whatever_a_driver_raises_the_camera_is_opened_again(where):
         return opened[-1]
 
     source = LiveSource("eye", Fraction(30), open_feed, STANDING)
-    until = time.monotonic() + WITHIN_S
-    while len(opened) < 4 and time.monotonic() < until:
-        time.sleep(0.01)
-    assert len(opened) >= 4 and opened[0].closed
+    wait_until(lambda: len(opened) >= 4, "it is not opened again")
+    assert opened[0].closed
     assert patiently(lambda: source.read(0)).intrinsics == LENS
     source.close()
 
@@ -160,8 +141,7 @@ def test_the_lens_is_the_calibrations_scaled_to_the_pictures_and_missed_only_wit
     source = LiveSource("eye", Fraction(30), lambda: Feed(None, why), STANDING, calibrated=LENS.scaled(0.5))
     source.close()
     assert source.intrinsics == LENS
-    with pytest.raises(CameraError, match=why):
-        LiveSource("eye", Fraction(30), lambda: Feed(None, why), STANDING)
+    refused(CameraError, why, LiveSource, "eye", Fraction(30), lambda: Feed(None, why), STANDING)
     wide = Pinhole.from_fov(100, 48, 60.0)
     with pytest.raises(CameraError, match=r"pictures are 64 x 48, calibrated for 100 x 48"):
         LiveSource("eye", Fraction(30), Feed, STANDING, calibrated=wide)
@@ -179,8 +159,7 @@ def test_a_camera_that_fails_leaves_no_other_one_open(tmp_path, monkeypatch):
     plan = parse({"cameras": {"ids": ["eye", "other"]}, "source": source}, tmp_path / "scenario.yaml")
     monkeypatch.setattr(live, "_poses", lambda *_: {"eye": arm, "other": STANDING})
     monkeypatch.setattr(live, "open_feed", open_feed)
-    with pytest.raises(CameraError, match="other: no camera"):
-        live.open_live(plan, source_config(plan), plan.cameras)
+    refused(CameraError, "other: no camera", live.open_live, plan, source_config(plan), plan.cameras)
     assert first.closed and arm.close.called
     assert "camera eye" not in [thread.name for thread in threading.enumerate()]
 
@@ -207,11 +186,11 @@ class Capture:
         ([1e6, 50, 40], "their arrival, less latency_ms", [20, 20, 20]),
     ],
 )
-def test_the_first_frame_decides_whose_stamps_count(monkeypatch, clock, ages_ms, stamped_by, expected_ms):
+def test_the_first_frame_decides_whose_stamps_count(monkeypatch, ages_ms, stamped_by, expected_ms):
     """A stamp of the kernel's is moved to the middle of the exposure; none changes its clock midway."""
     monkeypatch.setattr(opencv_camera, "_open", lambda *_: Capture(ages_ms))
     config = CameraConfig(kind="camera", exposure_us=8000, latency_ms=20.0)
-    feed = opencv_camera.OpenCvFeed("eye", "0", config, Fraction(30), clock)
+    feed = opencv_camera.OpenCvFeed("eye", "0", config, Fraction(30), clock := WallClock())
     for age_ms in expected_ms:
         taken = feed.grab(1.0)
         if age_ms is None:
@@ -232,11 +211,10 @@ def test_the_camera_that_is_meant_is_the_one_named_or_the_only_one():
         ("c", "ab", r"^eye: no OAK camera c; there are a, b$"),
         (None, "", r"^eye: no OAK camera found: is it plugged in\?$"),
     ):
-        with pytest.raises(CameraError, match=message):
-            chosen(device, *serials)
+        refused(CameraError, message, chosen, device, *serials)
 
 
-def test_video_devices_are_listed_with_the_name_that_lasts(tmp_path: Path) -> None:
+def test_video_devices_are_listed_with_the_name_that_lasts(tmp_path):
     for number, index, name in ((0, 0, "HD Webcam"), (1, 1, "HD Webcam"), (10, 0, "Other")):
         entry = tmp_path / f"sys/class/video4linux/video{number}"
         entry.mkdir(parents=True)

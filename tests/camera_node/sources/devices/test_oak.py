@@ -1,7 +1,5 @@
 """The OAK source with the real depthai and no device."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from fractions import Fraction
@@ -16,6 +14,7 @@ from camera_node.sources.devices import oak
 from camera_node.sources.devices.feed import CameraError, Plugged
 from freshfield.clock import WallClock
 from freshfield.scenario import parse
+from tests.support import refused
 
 try:
     dai = oak.library()
@@ -23,10 +22,6 @@ except CameraError as error:
     pytest.skip(str(error), allow_module_level=True)
 
 WIDTH, HEIGHT = 64, 48
-
-
-def plan(**source):
-    return parse({"cameras": {"ids": ["eye"]}, "source": {"kind": "oak", **source}}, Path("scenario.yaml"))
 
 
 def sent(queue, values: np.ndarray, kind) -> None:
@@ -52,8 +47,7 @@ def test_frames_come_as_rgb_with_their_time_on_our_clock_until_the_camera_is_gon
         stamps.append(captured_ns)
     assert stamps == sorted(set(stamps)) and frames.grab(0.001) is None
     queue.close()
-    with pytest.raises(CameraError, match="eye: the OAK camera is gone"):
-        frames.grab(10.0)
+    refused(CameraError, "eye: the OAK camera is gone", frames.grab, 10.0)
 
 
 def test_depth_is_the_newest_frame_in_millimeters_with_its_time():
@@ -86,7 +80,8 @@ def test_only_a_device_that_was_calibrated_straightens_pictures_and_fixes_its_fo
     fixed, focused = calibration(), calibration()
     focused.setLensPosition(dai.CameraBoardSocket.CAM_A, 131)
     device.readCalibration.side_effect = [dai.CalibrationHandler(), fixed, focused]
-    bare, *calibrated = (oak.OakFeed("eye", None, source_config(plan()), Fraction(10), WallClock()) for _ in range(3))
+    config = source_config(parse({"cameras": {"ids": ["eye"]}, "source": {"kind": "oak"}}, Path("scenario.yaml")))
+    bare, *calibrated = (oak.OakFeed("eye", None, config, Fraction(10), WallClock()) for _ in range(3))
     assert bare.intrinsics is None and "eye: the device holds no calibration" in bare.no_intrinsics
     assert all(feed.intrinsics.fx == pytest.approx(1500 * 640 / 1920, abs=1e-3) for feed in calibrated)
     camera = pipeline.return_value.create.return_value.build.return_value

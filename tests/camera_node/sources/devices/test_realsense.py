@@ -1,7 +1,5 @@
 """The RealSense source with the real library and its software device, which makes real frames."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +13,7 @@ from camera_node.sources.devices.feed import CameraError, Plugged
 from freshfield.clock import VirtualClock, WallClock
 from freshfield.geometry import look_at
 from freshfield.scenario import parse
+from tests.support import refused
 
 rs = pytest.importorskip(
     "pyrealsense2",
@@ -100,8 +99,7 @@ def test_intrinsics_are_the_devices_or_refused_if_a_frame_cannot_carry_them():
     bent = realsense.lens("eye", intrinsics(rs.distortion.brown_conrady, (-0.1, 0.02, 1e-3, -1e-3, 0.0)))
     assert np.allclose(bent.distortion, (-0.1, 0.02, 1e-3, -1e-3), atol=1e-6)
     for model, coefficients in ((None, (0.1, 0, 0, 0, 0)), (rs.distortion.brown_conrady, (0.1, 0, 0, 0, 0.2))):
-        with pytest.raises(CameraError, match="a frame cannot carry"):
-            realsense.lens("eye", intrinsics(model, coefficients))
+        refused(CameraError, "a frame cannot carry", realsense.lens, "eye", intrinsics(model, coefficients))
 
 
 class Stream(NamedTuple):

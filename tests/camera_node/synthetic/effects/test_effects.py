@@ -1,7 +1,5 @@
 """Every effect keeps the contract; its errors are as large as asked for, and each camera's own."""
 
-from __future__ import annotations
-
 import pkgutil
 import subprocess
 import sys
@@ -22,6 +20,7 @@ from camera_node.synthetic.source import WorldSource
 from freshfield.geometry import Pinhole, Pose, look_at
 from freshfield.settings import ScenarioError
 from freshfield_up import check_plugin
+from tests.support import refused
 
 STREAM = """
 import sys, tracemalloc
@@ -54,16 +53,12 @@ print(modules, streams, calls > 0, sum(s.size for s in held) > 0)
 """
 
 
-def stream(listed: dict, folder: str) -> str:
-    code = STREAM.format(listed=listed, folder=folder)
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert out.returncode == 0, out.stderr
-    return out.stdout.strip()
-
-
 def test_what_is_listed_is_all_that_is_imported_called_and_allocated(tmp_path):
-    assert stream({}, str(tmp_path)) == "[] [] False False"
-    assert stream({"depth_sensor": {}}, str(tmp_path)) == "['depth_sensor'] ['depth_sensor'] True True"
+    used = "['depth_sensor'] ['depth_sensor'] True True\n"
+    for listed, printed in (({}, "[] [] False False\n"), ({"depth_sensor": {}}, used)):
+        code = STREAM.format(listed=listed, folder=str(tmp_path))
+        out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert (out.returncode, out.stdout) == (0, printed), out.stderr
 
 
 def test_every_file_is_registered_and_keeps_its_contract_and_others_are_refused():
@@ -74,8 +69,7 @@ def test_every_file_is_registered_and_keeps_its_contract_and_others_are_refused(
         ({"smoke": {}}, "effect 'smoke' is not known; there are: bump, clock_drift, depth_sensor, exposure_drift, "),
         ({"pose_noise": {"correlation_s": 1e-9}}, "correlation_s must be 0 or at least 0.001"),
     ):
-        with pytest.raises(ScenarioError, match=message):
-            fx.load_effects(listed, lambda name: np.random.default_rng(0))
+        refused(ScenarioError, message, fx.load_effects, listed, lambda name: np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("name", ["depth_sensor", "exposure_drift", "pose_noise", "sensor_noise"])

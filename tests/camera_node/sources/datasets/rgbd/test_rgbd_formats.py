@@ -1,7 +1,5 @@
 """TUM RGB-D, 7-Scenes, Record3D and Polycam as their tools write them, of a known world; depth files of each kind."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable
@@ -213,22 +211,18 @@ def test_what_is_no_number_or_too_far_is_not_measured(tmp_path):
         assert not DepthFile(written(tmp_path / "e.npy", empty)).read(photo()).counts.any()
 
 
-def with_depth(folder: Path, **keys) -> Path:
-    """Photos of which every frame but the second has depth; that of the third is missing."""
+def test_transforms_bring_depth_with_the_frames_that_have_it(tmp_path):
+    """All but the second; that of the third is missing."""
 
     def add(data) -> None:
         for index, frame in enumerate(data["frames"]):
             if index != 1:
                 frame["depth_file_path"] = f"depth/{index:03d}.png"
             if index != 2:
-                written(folder / f"depth/{index:03d}.png", np.where(MM > 0, MM + index, 0).astype(np.uint16))
+                written(tmp_path / f"depth/{index:03d}.png", np.where(MM > 0, MM + index, 0).astype(np.uint16))
 
-    (folder / "depth").mkdir()
-    return edited(write_photos(folder, 16), add, **keys)
-
-
-def test_transforms_bring_depth_with_the_frames_that_have_it(tmp_path):
-    file = with_depth(tmp_path, depth_unit_scale_factor=0.0005)
+    (tmp_path / "depth").mkdir()
+    file = edited(write_photos(tmp_path, 16), add, depth_unit_scale_factor=0.0005)
     found = transforms.load_dataset(file)
     assert [image.depth is not None for image in found][:4] == [True, False, False, True]
     assert "1 of its depth files are missing, first" in found.notes[-1]

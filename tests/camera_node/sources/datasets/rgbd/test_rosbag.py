@@ -1,7 +1,5 @@
 """ROS bags, and MCAP files in Foxglove's messages, written by the packages of both."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -227,8 +225,7 @@ def write_foxglove(file: Path, encoding: str = "16UC1", frames: int = 3, d: tupl
             message.timestamp.FromNanoseconds(t_ns)
             writer.write_message(topic, message, log_time=t_ns + 5_000_000, publish_time=t_ns)
 
-        k = [40.0, 0, 15.5, 0, 41.0, 11.5, 0, 0, 1]
-        lens = CameraCalibration(frame_id="front", width=32, height=24, K=k, D=d, distortion_model="plumb_bob")
+        lens = CameraCalibration(frame_id="front", width=32, height=24, K=K, D=d, distortion_model="plumb_bob")
         add("/camera_info", lens, START_NS)
         for n in range(frames):
             t_ns = START_NS + n * 100_000_000
@@ -240,8 +237,7 @@ def write_foxglove(file: Path, encoding: str = "16UC1", frames: int = 3, d: tupl
                 moved.rotation.w, moved.rotation.x, moved.rotation.y, moved.rotation.z = w, x, y, z
                 moved.translation.x, moved.translation.y, moved.translation.z = matrix[:3, 3]
                 add("/tf", moved, at_ns)
-            png = cv2.imencode(".png", PICTURE[..., ::-1])[1].tobytes()
-            add("/color", CompressedImage(frame_id="front", format="png", data=png), t_ns)
+            add("/color", CompressedImage(frame_id="front", format="png", data=png(PICTURE[..., ::-1])), t_ns)
             raw = RawImage(frame_id="front", width=32, height=24, encoding="bgr8", step=96)
             raw.data = PICTURE[..., ::-1].tobytes()
             add("/color_raw", raw, t_ns + 50_000_000)

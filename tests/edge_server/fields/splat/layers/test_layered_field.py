@@ -191,7 +191,7 @@ def test_in_seconds_what_moves_is_followed_once_anything_is_shown_of_it() -> Non
 
 
 def test_slow_steps_that_are_over_do_not_end_the_learning_of_what_moves() -> None:
-    field = resumed_field()
+    field = ball.resumed_field()
     tracker, parameters = field.tracker, field.still.adam_parameters(0.3)
     assert tracker is not None and field.moving is not None and field.moving.alive
     for _ in range(5):
