@@ -12,22 +12,15 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from edge_server.live import settings as tuned
 from freshfield.frame import Frame
 from freshfield.limits import MAX_CAPTURE_AHEAD_NS
-
-MOST_UNSELECTED = 8  # most frames of a camera that are kept for a field that wants every frame
-# After this many takes without a frame of a camera, its next one goes first, however old (after a blackout).
-LONGEST_WAIT = 16
-_AS_YOUNG_NS = 1_000_000  # ages, measured from the youngest frame, are compared in steps of this length
-# Of two cameras, the one before which e times as much moves goes first, unless its frame is older by so much: about the
-# time from one frame to the next in `kitchen`, where it was chosen.
-_FADES_MS = 40.0
 
 
 class FrameBuffer:
     """The newest frame of each training camera. Thread-safe.
 
-    Memory is one encoded frame a camera, whatever arrives; MOST_UNSELECTED more with ``keep_every_frame``.
+    Memory is one encoded frame a camera, whatever arrives; ``MOST_UNSELECTED`` more with ``keep_every_frame``.
     arrivals: frames put in so far. stale_on_arrival: those that arrived after a newer one of their camera.
     held_back: newest frames that the last ``take`` had no room for.
     shed: frames left out for lack of time since the first ``take``, with ``keep_every_frame``.
@@ -61,7 +54,7 @@ class FrameBuffer:
                 self._newest[frame.camera] = item
             if self._unselected is not None:
                 waiting = self._unselected[frame.camera]
-                self.shed += len(waiting) == MOST_UNSELECTED and self._takes > 0
+                self.shed += len(waiting) == tuned.MOST_UNSELECTED and self._takes > 0
                 waiting.append(item)
             self.arrivals += 1
             self._arrived.notify_all()
@@ -71,7 +64,7 @@ class FrameBuffer:
         with self._arrived:
             if wanted != (self._unselected is not None):
                 self._unselected = (
-                    {camera: deque(maxlen=MOST_UNSELECTED) for camera in self.cameras} if wanted else None
+                    {camera: deque(maxlen=tuned.MOST_UNSELECTED) for camera in self.cameras} if wanted else None
                 )
 
     def take(
@@ -88,7 +81,7 @@ class FrameBuffer:
         ``most`` admits the newest frame of each camera first, then the second newest of each, and so on.
         Frames of equal rank go in this order: cameras without a frame in the last ``LONGEST_WAIT`` takes, the
         longest wait first; then those of cameras before which most moves, each counting less with its age
-        (``_FADES_MS``); among equals, the camera that has waited longest. What exceeds ``most`` is dropped and
+        (``FADES_MS``); among equals, the camera that has waited longest. What exceeds ``most`` is dropped and
         counted in ``shed``, except for a camera's newest frame, which waits on. Frames of cameras that were not
         selected are dropped.
         """
@@ -108,10 +101,10 @@ class FrameBuffer:
                 if camera in own:
                     arrived.sort(key=lambda item: (-item.generated_edge_ns, item is not own[item.camera]))
                     last, share = self._last_take[camera], (moving or {}).get(camera, 1.0)
-                    waits_on = self._takes - last <= LONGEST_WAIT
+                    waits_on = self._takes - last <= tuned.LONGEST_WAIT
                     for k, item in enumerate(arrived):
-                        older_ms = max(youngest_ns - item.generated_edge_ns, 0) // _AS_YOUNG_NS
-                        worth = share * math.exp(-older_ms / _FADES_MS) if waits_on else 0.0
+                        older_ms = max(youngest_ns - item.generated_edge_ns, 0) // tuned.AS_YOUNG_NS
+                        worth = share * math.exp(-older_ms / tuned.FADES_MS) if waits_on else 0.0
                         ranked.append(((k, waits_on, -worth, last, -item.generated_edge_ns), item))
             ordered = [item for _, item in sorted(ranked, key=lambda one: one[0])]
             taken = ordered if most is None else ordered[:most]
@@ -121,7 +114,7 @@ class FrameBuffer:
             self.held_back = 0
             for item in left:
                 waiting = self._unselected[item.camera]
-                if item is own[item.camera] and len(waiting) < MOST_UNSELECTED:
+                if item is own[item.camera] and len(waiting) < tuned.MOST_UNSELECTED:
                     waiting.appendleft(item)
                     self.held_back += 1
                 else:

@@ -14,11 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-
-APART_M = 0.03
-APART_DEG = 5.0
-_MOVES = 2  # places that a camera leaves until it counts as moving
-_IN_A_ROW = 2  # frames away from a place until the camera has left it
+from edge_server.live import settings as tuned
 
 
 def pose_distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[float, float]:
@@ -64,7 +60,7 @@ class CameraMotion:
             place.away = 0
             return False
         apart_m, apart_deg = pose_distance(place.pose, view.camera_to_world)
-        place.away = place.away + 1 if apart_m > APART_M or apart_deg > APART_DEG else 0
-        if place.away == _IN_A_ROW:
+        place.away = place.away + 1 if apart_m > tuned.APART_M or apart_deg > tuned.APART_DEG else 0
+        if place.away == tuned.IN_A_ROW:
             place.pose, place.away, place.left = view.camera_to_world, 0, place.left + 1
-        return place.left >= _MOVES
+        return place.left >= tuned.MOVES

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from edge_server.fields import Budget, Field, FitReport, View
+from edge_server.live import settings as tuned
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.camera_motion import CameraMotion
 from edge_server.live.state import Publication
@@ -34,9 +35,6 @@ if TYPE_CHECKING:  # imported at run time only where a policy is learned, or a s
 
 
 log = logging.getLogger(__name__)
-
-INTAKE_SHARE = 0.6  # share of a budget in seconds for taking in new frames, if the field wants every frame
-LEAST_TAKEN = 4  # fewest new frames to take in, however short the budget is
 
 
 @dataclass(frozen=True)
@@ -222,7 +220,7 @@ class FieldUpdater:
         frame_s = self.field.frame_s
         if not frame_s or budget is None or budget.seconds is None:
             return None if frame_s is None else most_new
-        return max(int(INTAKE_SHARE * budget.seconds / frame_s), LEAST_TAKEN)
+        return max(int(tuned.INTAKE_SHARE * budget.seconds / frame_s), tuned.LEAST_TAKEN)
 
     def fit(self, selection: Selection, budget: Budget) -> tuple[list[View], FitReport] | None:
         """Decode the selected views and train on them.

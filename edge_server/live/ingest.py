@@ -16,6 +16,7 @@ import grpc
 import grpc.aio
 import numpy as np
 
+from edge_server.live import settings as tuned
 from edge_server.live.buffer import FrameBuffer
 from freshfield import limits
 from freshfield.clock import Clock
@@ -59,8 +60,6 @@ class DepthArrivals:
 
 
 LastFrames = Mapping[str, Mapping[str, tuple[int, int]]]
-
-_SILENT_NS = 3 * 10**9  # a session that has sent nothing for this long is not that of a second node
 
 
 class FrameAdmission:
@@ -145,7 +144,7 @@ class FrameAdmission:
         two nodes keep two sessions going side by side."""
         now_ns, mine = frame.generated_edge_ns, sessions[frame.session]
         other = max(sessions.values(), key=lambda session: session.began_ns)
-        goes_on = now_ns - other.newest_ns < _SILENT_NS
+        goes_on = now_ns - other.newest_ns < tuned.SILENT_SESSION_NS
         if goes_on and mine.began_ns < other.began_ns < now_ns - limits.MAX_CLOCK_UNCERTAINTY_NS:
             if frame.camera not in self.doubled:
                 log.warning(

@@ -22,12 +22,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from edge_server.fields import SEPARATOR, View
+from edge_server.live import settings as tuned
 from edge_server.live.camera_motion import pose_distance
 from edge_server.settings import KeyframesConfig
-
-# A camera leaving a keyframe replaces its image only within this share of the distance to the next one.
-_NEAR = 0.5
-RESTARTS_BELOW = 16
 
 
 @dataclasses.dataclass
@@ -57,14 +54,14 @@ class Keyframes:
     def __init__(self, config: KeyframesConfig, resumed: bool = False) -> None:
         self.config = config
         self._cameras: dict[str, _CameraKeyframes] = {}
-        self._started_with = RESTARTS_BELOW if resumed else 0
+        self._started_with = tuned.RESTARTS_BELOW if resumed else 0
 
     def should_restart(self, count: int) -> bool:
         """Whether the field should restart with an update of ``count`` views. True counts as a restart."""
         if self._started_with == 0:  # the very first: the field is new
-            self._started_with = min(count, RESTARTS_BELOW)
+            self._started_with = min(count, tuned.RESTARTS_BELOW)
             return False
-        if self._started_with >= RESTARTS_BELOW or count < 2 * self._started_with:
+        if self._started_with >= tuned.RESTARTS_BELOW or count < 2 * self._started_with:
             return False
         self._started_with = count
         return True
@@ -100,7 +97,7 @@ class Keyframes:
             frames[number] = _Keyframe(view, self._named(view, number))
         elif frames[number].view.generated_ns != view.generated_ns and (
             # A slow camera on its way out would otherwise leave every keyframe with an image from its edge.
-            camera.current != number or apart <= max(_NEAR, frames[number].apart)
+            camera.current != number or apart <= max(tuned.NEAR_KEYFRAME, frames[number].apart)
         ):
             frames[number].view, frames[number].apart = self._named(view, number), apart
         camera.current = number

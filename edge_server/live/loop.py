@@ -11,17 +11,13 @@ from queue import Empty, Queue
 
 from edge_server.fields import Budget, FitReport, Snapshot, View
 from edge_server.fields.compiling import told
+from edge_server.live import settings as tuned
 from edge_server.live.field_updater import FieldUpdater, Selection
 from edge_server.live.state import Controls, Publication
 from freshfield.clock import Clock
 
 log = logging.getLogger(__name__)
 
-# Longest sleep before the loop looks at the controls again.
-_MAX_SLEEP_S = 0.2
-_TOO_SHORT = 3  # updates in a row without a step, after which a warning is due
-_WARN_EVERY_S = 30.0  # between two warnings of one kind
-STOP_S = 20.0
 """How long the server waits at its end for the update in progress, without which there is no checkpoint. On a machine
 with five times as much to do as it has cores, updates of ``ngp`` at 640 x 480 take 6 s, the longest 18. The launcher
 kills the server after ``freshfield_up.processes.GRACE_S``, of which the checkpoint and the last pictures need some."""
@@ -64,7 +60,7 @@ class UpdateLoop:
         self._stop = threading.Event()
         self._paused = False
         self.without_step, self._in_a_row = 0, 0  # updates without time for a step: all, and the newest
-        self._warned_short_s = -_WARN_EVERY_S + clock.now_ns() / 1e9
+        self._warned_short_s = -tuned.WARN_EVERY_S + clock.now_ns() / 1e9
         self._warned_of = (0, 0, clock.now_ns() / 1e9)  # frames shed and arrived, and when
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._main, name="loop", daemon=True)
@@ -72,7 +68,7 @@ class UpdateLoop:
     def start(self) -> None:
         self._thread.start()
 
-    def stop(self, timeout_s: float = STOP_S) -> None:
+    def stop(self, timeout_s: float = tuned.STOP_S) -> None:
         """Ask the loop to end after the current update, and wait up to ``timeout_s`` for it; ``alive`` says
         whether it still runs."""
         self._stop.set()
@@ -118,7 +114,7 @@ class UpdateLoop:
             if reported == wanted or (first_ns is not None and now_ns - first_ns > self._grace_ns):
                 return
             self._on_status(f"waiting for training cameras: {reported} of {wanted} have reported")
-            arrivals = self._updater.buffer.wait(arrivals, _MAX_SLEEP_S)
+            arrivals = self._updater.buffer.wait(arrivals, tuned.LONGEST_SLEEP_S)
 
     def _update_once(self) -> None:
         self._apply_controls()
@@ -127,7 +123,7 @@ class UpdateLoop:
             self._on_event(f"an operator {'paused updates' if self._paused else 'resumed'}")
         if self._paused:
             self._on_status("paused")
-            self._stop.wait(_MAX_SLEEP_S)
+            self._stop.wait(tuned.LONGEST_SLEEP_S)
             return
         budget = Budget(seconds=self.update_ms / 1e3)
         selection = self._select(budget)
@@ -163,7 +159,7 @@ class UpdateLoop:
         self.without_step += report.short
         self._in_a_row = self._in_a_row + 1 if report.short else 0
         now_s = self._clock.now_ns() / 1e9
-        if self._in_a_row >= _TOO_SHORT and now_s - self._warned_short_s >= _WARN_EVERY_S:
+        if self._in_a_row >= tuned.TOO_SHORT and now_s - self._warned_short_s >= tuned.WARN_EVERY_S:
             self._warned_short_s = now_s
             log.warning(
                 "an update of %.0f ms made no step: all its time went into taking in new pictures. Send smaller ones "
@@ -175,7 +171,7 @@ class UpdateLoop:
         """Log now and then what share of the frames was left out for lack of time."""
         buffer, now_s = self._updater.buffer, self._clock.now_ns() / 1e9
         shed, arrived, since_s = self._warned_of
-        if now_s - since_s < _WARN_EVERY_S:
+        if now_s - since_s < tuned.WARN_EVERY_S:
             return
         if buffer.shed > shed:
             log.warning(
@@ -216,8 +212,8 @@ class UpdateLoop:
                 return None
             left_s = (plan.wait_until_ns - now_ns) / 1e9
             if left_s > 0:
-                self._stop.wait(min(left_s, _MAX_SLEEP_S))
+                self._stop.wait(min(left_s, tuned.LONGEST_SLEEP_S))
             else:
                 self._on_status("waiting for a frame that qualifies")
-                arrivals = self._updater.buffer.wait(arrivals, _MAX_SLEEP_S)
+                arrivals = self._updater.buffer.wait(arrivals, tuned.LONGEST_SLEEP_S)
         return None

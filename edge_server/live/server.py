@@ -24,14 +24,15 @@ from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.common.threads.thread_pool import SERVER_NICE
 from edge_server.fields.registry import make_field
+from edge_server.live import settings as tuned
 from edge_server.live.field_updater import open_updater
 from edge_server.live.frontier import open_frontier
 from edge_server.live.grpc_services import GrpcThread
 from edge_server.live.ingest import Ingest, LastFrames, RollingPercentiles
-from edge_server.live.loop import STOP_S, UpdateLoop
+from edge_server.live.loop import UpdateLoop
 from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.output.journal import Journal
-from edge_server.live.scoring_thread import ScoringThread
+from edge_server.live.scoring.scoring_thread import ScoringThread
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Snapshot
 from edge_server.machine import run_facts
 from edge_server.run_records import DepthCounts, DepthStatus, EdgeStatus, UpdateCounts
@@ -49,12 +50,6 @@ if TYPE_CHECKING:  # imported at run time only where a run is recorded
     from edge_server.live.output.recorder import Recorder
 
 log = logging.getLogger(__name__)
-
-_STATUS_PERIOD_S = 0.5
-_AGES_PERIOD_S = 0.2
-_SNAPSHOT_TIMEOUT_S = 30.0
-_LAST_SCORES_S = 4.0  # for what waits at the end, and for all frames of held-out cameras that move: 64 take 2 s
-_UPDATE_TIMES = 4096  # latest update times that percentiles are computed from
 
 
 class OpenPage(Protocol):
@@ -107,7 +102,7 @@ class EdgeServer:
         self.start_ns = self.clock.now_ns()
         self._run_facts = run_facts()
         self._stopping = threading.Event()
-        self._update_ms = RollingPercentiles(_UPDATE_TIMES)
+        self._update_ms = RollingPercentiles(tuned.UPDATE_TIMES)
         self._counts = UpdateCounts()
         self._snapshot_lock = threading.Lock()
         options.out.mkdir(parents=True, exist_ok=True)
@@ -225,7 +220,7 @@ class EdgeServer:
             self._stopping.set()
             self.loop.stop()
             self._write_field()  # first: who asked for the end does not wait for ever
-            self.scoring.stop(_LAST_SCORES_S)
+            self.scoring.stop(tuned.LAST_SCORES_S)
             grpc.join(1.0)
             self._write_final()
             for page in opened:
@@ -248,9 +243,9 @@ class EdgeServer:
 
     def _watch(self) -> None:
         """Write status and ages, and notice if the loop ends."""
-        ticks, every = 0, round(_STATUS_PERIOD_S / _AGES_PERIOD_S)
+        ticks, every = 0, round(tuned.STATUS_PERIOD_S / tuned.AGES_PERIOD_S)
         saved_ns = self.clock.now_ns()
-        while not self._stopping.wait(_AGES_PERIOD_S) and self.loop.alive:
+        while not self._stopping.wait(tuned.AGES_PERIOD_S) and self.loop.alive:
             now_ns = self.clock.now_ns()
             ages = self.buffer.ages_ms(now_ns), self.ingest.depth_ages_ms(now_ns)
             self.journal.ages((now_ns - self.start_ns) / 1e9, *ages)
@@ -322,9 +317,9 @@ class EdgeServer:
             raise RuntimeError("another one is being written")
         try:
             path = self.options.out / f"snapshot-{self.updater.number:06d}.npz"
-            return self.loop.request_checkpoint(path).result(_SNAPSHOT_TIMEOUT_S)
+            return self.loop.request_checkpoint(path).result(tuned.SNAPSHOT_TIMEOUT_S)
         except TimeoutError:
-            raise RuntimeError(f"the update in progress took over {_SNAPSHOT_TIMEOUT_S:g} s") from None
+            raise RuntimeError(f"the update in progress took over {tuned.SNAPSHOT_TIMEOUT_S:g} s") from None
         finally:
             self._snapshot_lock.release()
 
@@ -408,7 +403,7 @@ class EdgeServer:
     def _write_field(self) -> None:
         path = self.options.out / "field.npz"
         if self.loop.alive:
-            log.error("%s: not written: the last update did not end within %g s", path, STOP_S)
+            log.error("%s: not written: the last update did not end within %g s", path, tuned.STOP_S)
         elif self.state.started:
             try:
                 self._write_checkpoint(path)

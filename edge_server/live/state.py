@@ -18,12 +18,10 @@ from numpy.typing import NDArray
 
 from edge_server.fidelity.scorer import SELECTED, Score
 from edge_server.fields import Snapshot
+from edge_server.live import settings as tuned
 from edge_server.run_records import Frontier, SoFarScores
 from edge_server.scheduler import Policy
 from freshfield.frame import Frame
-
-MOST_EVENTS = 200  # kept: each is in every edge.json
-SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages
 
 
 @dataclass(frozen=True)
@@ -161,9 +159,9 @@ class EdgeState:
     started: bool = False
     status_line: str = ""
     warnings: list[str] = field(default_factory=list)
-    events: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
+    events: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=tuned.MOST_EVENTS))
     _publications: deque[Publication] = field(default_factory=lambda: deque(maxlen=4096))
-    _shown: deque[Score] = field(default_factory=lambda: deque(maxlen=SHOWN_OF))
+    _shown: deque[Score] = field(default_factory=lambda: deque(maxlen=tuned.SHOWN_OF))
     _renderer: Snapshot | None = None
     _comparison: Comparison | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -203,7 +201,7 @@ class EdgeState:
         milliseconds from one update to the next, PSNR shown of the whole image and, where known, of moving
         pixels. None until there are a score and two updates."""
         with self._lock:
-            scores, last = list(self._shown), list(self._publications)[-SHOWN_OF:]
+            scores, last = list(self._shown), list(self._publications)[-tuned.SHOWN_OF :]
         moving = [s.psnr_moving_db for s in scores if s.psnr_moving_db is not None]
         if not scores or len(last) < 2:
             return None

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import pytest
 
-from edge_server.live.buffer import MOST_UNSELECTED, FrameBuffer
+from edge_server.live.buffer import FrameBuffer
+from edge_server.live.settings import MOST_UNSELECTED
 from freshfield.frame import Frame
 from tests.edge_server.frames import frame
 

@@ -9,7 +9,8 @@ import pytest
 from edge_server.fidelity.psnr import PSNR_CEILING_DB
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Rendering
-from edge_server.live.held_out import MAX_PENDING, HeldOutCamera
+from edge_server.live.scoring.held_out import HeldOutCamera
+from edge_server.live.settings import MOST_PENDING
 from edge_server.live.state import Publication
 from freshfield import payload
 from freshfield.frame import Frame
@@ -85,7 +86,7 @@ def test_without_a_capture_within_half_a_period_there_is_no_score_and_nothing_pi
     held_out, shown = camera(400), shows(0)
     for k in range(100):
         held_out.publish(publication(401 + k), shown)
-    assert len(shown.poses) == MAX_PENDING
+    assert len(shown.poses) == MOST_PENDING
 
 
 def test_the_history_stays_short_and_nothing_is_decoded_that_no_score_needs(monkeypatch):

@@ -13,8 +13,9 @@ import pytest
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fidelity.so_far import MOST
 from edge_server.fields import Rendering, View
-from edge_server.live import scoring_thread
-from edge_server.live.scoring_thread import ScoringThread
+from edge_server.live import settings
+from edge_server.live.scoring import scoring_thread
+from edge_server.live.scoring.scoring_thread import ScoringThread
 from edge_server.live.state import Publication
 from freshfield import payload
 from freshfield.frame import Frame
@@ -70,7 +71,7 @@ def _run(
 
 
 def test_the_newest_publication_is_shown_carried_on_to_the_capture(monkeypatch: Any) -> None:
-    monkeypatch.setattr(scoring_thread, "_SHOWN_SHARE", 1e-9)
+    monkeypatch.setattr(settings, "SHOWN_SHARE", 1e-9)
     shown = _run([100 * MS, 350 * MS, 600 * MS], [k * 10 * MS for k in range(90)])
     assert len(shown) > 1
     for score, publication in shown:
@@ -94,7 +95,7 @@ def test_a_thread_that_falls_behind_keeps_no_snapshots() -> None:
         alive.add(snapshot := Brightness(k * 20 * MS))
         thread.published(_publication(k, snapshot.at_ns), snapshot, [])
     del snapshot
-    assert len(alive) == scoring_thread._WAITING_PUBLICATIONS
+    assert len(alive) == settings.WAITING_PUBLICATIONS
 
 
 def test_snapshots_replaced_before_the_next_scored_capture_are_dropped() -> None:
@@ -106,7 +107,7 @@ def test_snapshots_replaced_before_the_next_scored_capture_are_dropped() -> None
 
 
 def test_a_silent_held_out_camera_keeps_no_snapshots(monkeypatch: Any) -> None:
-    monkeypatch.setattr(scoring_thread, "_SILENT_NS", 100 * MS)
+    monkeypatch.setattr(settings, "SILENT_CAMERA_NS", 100 * MS)
     thread = _thread("cam00", "cam01")
     for k in range(1, 13):
         thread._held_out["cam00"].take(_frame(k, k * 20 * MS))
@@ -115,13 +116,13 @@ def test_a_silent_held_out_camera_keeps_no_snapshots(monkeypatch: Any) -> None:
 
 
 def test_what_is_shown_is_scored_as_often_as_its_share_affords_and_before_publications(monkeypatch: Any) -> None:
-    monkeypatch.setattr(scoring_thread, "_SHOWN_SHARE", 0.5)
+    monkeypatch.setattr(settings, "SHOWN_SHARE", 0.5)
     scored: list[Publication] = []
     frames = [k * 10 * MS for k in range(90)]
     shown = _run([100 * MS, 350 * MS], frames, scored)
     assert len(shown) > 10 and len(scored) == 2
     assert all((score.ssim is not None) == (k % 4 == 0) for k, (score, _) in enumerate(shown))
-    monkeypatch.setattr(scoring_thread, "_RESERVE_S", scoring_thread._ALLOWANCE_S)
+    monkeypatch.setattr(settings, "RESERVE_S", settings.ALLOWANCE_S)
     scored.clear()
     assert len(_run([100 * MS, 350 * MS], frames, scored)) > 10 and not scored
 

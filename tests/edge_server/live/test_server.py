@@ -22,8 +22,9 @@ from edge_server.cli import main as edge_server
 from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
 from edge_server.fields.splat.scan.carried_field import CarriedField
-from edge_server.live.loop import STOP_S, UpdateLoop
+from edge_server.live.loop import UpdateLoop
 from edge_server.live.server import EdgeServer, ServerOptions
+from edge_server.live.settings import STOP_S
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.decision_record import read_decision
 from edge_server.scheduler.learned.networks import init_actor

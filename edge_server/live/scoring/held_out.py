@@ -20,6 +20,7 @@ from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fidelity.so_far import FrameScore, score_frame, stays
 from edge_server.fields import Snapshot, View
+from edge_server.live import settings as tuned
 from edge_server.live.state import Publication
 from freshfield import payload
 from freshfield.frame import Frame
@@ -29,11 +30,6 @@ log = logging.getLogger(__name__)
 
 # Longer than the longest lag, so that the frame nearest to it is still here at low frame rates.
 HISTORY_NS = round((LAGS_MS[-1] + 1000.0) * 1e6)
-HISTORY_FRAMES = 128
-# Publications that wait for their truth. More than this means that no held-out frames arrive.
-MAX_PENDING = 8
-# The truth may be half a period from the present; the rest allows for jitter of a real camera's clock.
-GAP_PERIODS = 0.55
 
 Image = NDArray[np.float32]
 
@@ -92,14 +88,14 @@ class HeldOutCamera:
         self.noise = NoiseEstimate()
         self.so_far: list[Truth] = []
         self._places = 0
-        self.truths: deque[Truth] = deque(maxlen=HISTORY_FRAMES)
+        self.truths: deque[Truth] = deque(maxlen=tuned.HISTORY_FRAMES)
         self._scorer, self._noisy = scorer, noisy
         self._pending: deque[tuple[Publication, Image | Snapshot, Pose]] = deque()
 
     def publish(self, publication: Publication, snapshot: Snapshot) -> list[Scored]:
         """Let a publication wait for its truth; returns those that have theirs. It goes unscored before the camera's
-        second frame, while ``MAX_PENDING`` wait, and while another one waits for a camera that moves."""
-        if len(self.truths) < 2 or len(self._pending) == MAX_PENDING:
+        second frame, while ``MOST_PENDING`` wait, and while another one waits for a camera that moves."""
+        if len(self.truths) < 2 or len(self._pending) == tuned.MOST_PENDING:
             return []
         newest = self.truths[-1].frame
         if self.truths[-2].frame.pose == newest.pose:
@@ -159,7 +155,7 @@ class HeldOutCamera:
             present_ns = publication.published_ns
             truth = min(self.truths, key=lambda truth: abs(truth.taken_ns - present_ns))
             moved = isinstance(waiting, np.ndarray) and truth.frame.pose != pose
-            if moved or abs(truth.taken_ns - present_ns) > GAP_PERIODS * period_ns:
+            if moved or abs(truth.taken_ns - present_ns) > tuned.GAP_PERIODS * period_ns:
                 continue
             try:
                 found = self._against(truth, present_ns, waiting)

@@ -26,7 +26,8 @@ from edge_server.fidelity.images import to_bytes
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fidelity.so_far import FrameScore, so_far
 from edge_server.fields import Snapshot, View
-from edge_server.live.held_out import HeldOutCamera, Scored, Truth
+from edge_server.live import settings as tuned
+from edge_server.live.scoring.held_out import HeldOutCamera, Scored, Truth
 from edge_server.live.state import Comparison, Publication
 from edge_server.run_records import Baseline, SoFarScores
 from freshfield.frame import Frame
@@ -34,25 +35,6 @@ from freshfield.machine_load import usable_cores
 from freshfield.scenario import seed_sequence
 
 log = logging.getLogger(__name__)
-
-# Niceness: scoring serves observers and gives way to the field's updates.
-_NICE = 5
-_WAITING_FRAMES = 256  # held-out frames that wait while one publication is scored; older ones are not needed
-_WAITING_PUBLICATIONS = 2
-_OPEN_PUBLICATIONS = 16
-_BASELINE_EVERY = 5  # publications; where nothing is held out, scored ones
-_MOST_SNAPSHOTS = 16  # kept for held-out frames that arrive late
-_SILENT_NS = 2_000_000_000  # behind the others: such a camera's captures are not waited for
-_SHOWN_EVERY_S = 0.4  # largest mean time between two scores of what a held-out camera is shown
-_FULL_EVERY = 4  # one in this many scores of what is shown has all metrics, the others only PSNR
-# This thread may use a share of the cores' time, refilling an allowance of CPU seconds. What is shown may use
-# its part of that share; publications are scored only while the reserve, CPU seconds, is left for it. The first
-# allowance is small: in its first seconds the field needs the cores.
-_SHARE, _SHOWN_SHARE, _ALLOWANCE_S, _RESERVE_S = 0.03, 0.02, 1.0, 0.1
-_FIRST_ALLOWANCE_S = 0.2
-# Of held-out cameras that move, all frames so far are scored again and again, 30 ms each at 320 x 240, with this share
-# more. One publication, whose metrics cost some ten times that, is scored for so many of them.
-_LOOK_BACK_SHARE, _LOOKS_A_SCORE = 0.03, 12
 
 
 class ScoringThread:
@@ -81,13 +63,13 @@ class ScoringThread:
         self._on_scored = on_scored
         self._on_shown = on_shown
         self._rng = np.random.default_rng(seed_sequence(seed, "shown"))
-        self._recent: deque[tuple[Publication, Snapshot]] = deque(maxlen=_MOST_SNAPSHOTS)
+        self._recent: deque[tuple[Publication, Snapshot]] = deque(maxlen=tuned.MOST_SNAPSHOTS)
         self._left_out_ns = 0  # instant of the newest publication that went by unseen
         self._next_shown_ns = dict.fromkeys(self._held_out, 0)
         self._shown_count, self._shown_cost_s = 0, np.inf  # cost of the last score of what is shown, CPU s
-        self._allowance_s = _FIRST_ALLOWANCE_S
+        self._allowance_s = tuned.FIRST_ALLOWANCE_S
         self._asked_s, self._used_s = time.monotonic(), 0.0
-        self._new_frames: deque[Frame] = deque(maxlen=_WAITING_FRAMES)
+        self._new_frames: deque[Frame] = deque(maxlen=tuned.WAITING_FRAMES)
         self._new_publications: deque[tuple[Publication, Snapshot, list[View]]] = deque()
         self._wake = threading.Condition()
         self._ending = False
@@ -136,14 +118,14 @@ class ScoringThread:
         """An update was published. Never blocks."""
         with self._wake:
             self._new_publications.append((publication, renderer, views))
-            if len(self._new_publications) > _WAITING_PUBLICATIONS:
+            if len(self._new_publications) > tuned.WAITING_PUBLICATIONS:
                 left_out, _, _ = self._new_publications.popleft()
                 self._left_out_ns = left_out.published_ns
             self._wake.notify()
 
     def _main(self) -> None:
         try:
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), tuned.SCORING_NICE)
         except (OSError, AttributeError):
             log.debug("thread priority cannot be lowered here")
         self._asked_s, self._used_s = time.monotonic(), time.thread_time()
@@ -172,26 +154,26 @@ class ScoringThread:
         """Refill this thread's allowance with its share of the cores' time; whether more than ``reserve_s``
         CPU seconds are left."""
         now_s, used_s = time.monotonic(), time.thread_time()
-        share = _SHARE + (_LOOK_BACK_SHARE if self._moving() else 0.0)
+        share = tuned.SCORING_SHARE + (tuned.LOOK_BACK_SHARE if self._moving() else 0.0)
         gained_s = share * usable_cores() * (now_s - self._asked_s) - (used_s - self._used_s)
-        self._allowance_s = min(self._allowance_s + gained_s, _ALLOWANCE_S)
+        self._allowance_s = min(self._allowance_s + gained_s, tuned.ALLOWANCE_S)
         self._asked_s, self._used_s = now_s, used_s
         return self._allowance_s > reserve_s
 
     def _score_shown(self, frame: Frame) -> None:
         """Score what was shown when a held-out frame was taken, if the next random instant has come; these
-        are as frequent as _SHOWN_SHARE allows."""
+        are as frequent as ``SHOWN_SHARE`` allows."""
         taken_ns = frame.generated_edge_ns
         found = next(((p, s) for p, s in reversed(self._recent) if p.published_ns <= taken_ns), None)
         if found is None or taken_ns < self._next_shown_ns[frame.camera] or not self._affordable():
             return
         if found[0].published_ns < self._left_out_ns <= taken_ns:  # another one was shown
             return
-        every_s = self._shown_cost_s * len(self._held_out) / (_SHOWN_SHARE * usable_cores())
-        gap_s = self._rng.exponential(min(every_s, _SHOWN_EVERY_S))
+        every_s = self._shown_cost_s * len(self._held_out) / (tuned.SHOWN_SHARE * usable_cores())
+        gap_s = self._rng.exponential(min(every_s, tuned.SHOWN_EVERY_S))
         self._next_shown_ns[frame.camera] = taken_ns + round(gap_s * 1e9)
         publication, snapshot = found
-        begun_s, full = time.thread_time(), self._shown_count % _FULL_EVERY == 0
+        begun_s, full = time.thread_time(), self._shown_count % tuned.FULL_EVERY == 0
         score = self._held_out[frame.camera].score_newest(taken_ns, snapshot.at(taken_ns), psnr_only=not full)
         self._shown_cost_s = time.thread_time() - begun_s
         self._shown_count += 1
@@ -201,13 +183,13 @@ class ScoringThread:
     def _score_later(self, publication: Publication, renderer: Snapshot, views: list[View]) -> None:
         self._recent.append((publication, renderer))
         self._forget_snapshots()
-        if not self._affordable(_RESERVE_S):
+        if not self._affordable(tuned.RESERVE_S):
             return
-        if self._moving() and self._looked_at % _LOOKS_A_SCORE:
+        if self._moving() and self._looked_at % tuned.LOOKS_A_SCORE:
             self._look_back()
             return
         self._open[publication.number] = []
-        while len(self._open) > _OPEN_PUBLICATIONS:
+        while len(self._open) > tuned.OPEN_PUBLICATIONS:
             del self._open[min(self._open)]
         self._views = views
         for camera in self._held_out.values():
@@ -244,7 +226,7 @@ class ScoringThread:
     def _forget_snapshots(self) -> None:
         """Drop those that were replaced before the next capture at which what is shown is scored."""
         newest_ns = {name: c.truths[-1].taken_ns if c.truths else 0 for name, c in self._held_out.items()}
-        since_ns = max(newest_ns.values()) - _SILENT_NS
+        since_ns = max(newest_ns.values()) - tuned.SILENT_CAMERA_NS
         next_ns = min(max(self._next_shown_ns[name], t_ns) for name, t_ns in newest_ns.items() if t_ns >= since_ns)
         while len(self._recent) > 1 and self._recent[1][0].published_ns <= next_ns:
             self._recent.popleft()
@@ -257,7 +239,7 @@ class ScoringThread:
             scores = self._open[publication.number]
             scores.append(each.score)
             truth = each.truth.image()
-            if publication.number % _BASELINE_EVERY == 0 and self._views:
+            if publication.number % tuned.BASELINE_EVERY == 0 and self._views:
                 self.baselines.add(baseline(self._views, truth, each.truth.frame.pose.matrix()))
             comparison = Comparison(each.score.camera, truth[..., :3], to_bytes(each.rendered), publication.number)
             final = len(scores) == len(self._held_out)
@@ -273,7 +255,7 @@ class ScoringThread:
         score = self._scorer.score_selected(renderings, publication.published_ns)
         if score is None:
             return
-        turn, left = divmod(self._selected_scored, _BASELINE_EVERY)
+        turn, left = divmod(self._selected_scored, tuned.BASELINE_EVERY)
         self._selected_scored += 1
         if left == 0:
             one_of_them = whole[turn % len(whole)]  # in turn: the mean is that of all

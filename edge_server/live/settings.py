@@ -1,0 +1,64 @@
+"""Numbers of the live edge server that no scenario sets."""
+
+from __future__ import annotations
+
+# --- frames that wait in the buffer ---
+MOST_UNSELECTED = 8  # most frames of a camera that are kept for a field that wants every frame
+# After this many takes without a frame of a camera, its next one goes first, however old (after a blackout).
+LONGEST_WAIT = 16
+AS_YOUNG_NS = 1_000_000  # ages, measured from the youngest frame, are compared in steps of this length
+# Of two cameras, the one before which e times as much moves goes first, unless its frame is older by so much: about the
+# time from one frame to the next in `kitchen`, where it was chosen.
+FADES_MS = 40.0
+
+# --- taking frames in ---
+INTAKE_SHARE = 0.6  # share of a budget in seconds for taking in new frames, if the field wants every frame
+LEAST_TAKEN = 4  # fewest new frames to take in, however short the budget is
+SILENT_SESSION_NS = 3 * 10**9  # a session that has sent nothing for this long is not that of a second node
+
+# --- whether a camera moves ---
+APART_M, APART_DEG = 0.03, 5.0  # two places of a camera are at least so far apart
+MOVES = 2  # places that a camera leaves until it counts as moving
+IN_A_ROW = 2  # frames away from a place until the camera has left it
+
+# --- keyframes of fields without keyframes of their own ---
+NEAR_KEYFRAME = 0.5  # a camera leaving a keyframe replaces its image only within this share of the distance to the next
+RESTARTS_BELOW = 16  # viewpoints: the field begins anew each time their number has doubled
+
+# --- the loop of updates ---
+LONGEST_SLEEP_S = 0.2  # before it looks at the controls again
+TOO_SHORT = 3  # updates in a row without a step, after which a warning is due
+WARN_EVERY_S = 30.0  # between two warnings of one kind
+STOP_S = 20.0  # for the last update, when the server ends
+
+# --- scores: which held-out frame shows the instant of an update ---
+HISTORY_FRAMES = 128
+MOST_PENDING = 8  # publications that wait for their truth: more means that no held-out frames arrive
+GAP_PERIODS = 0.55  # the truth may be half a period from the present; the rest is jitter of a real camera's clock
+
+# --- scores: what they may cost ---
+SCORING_NICE = 5  # niceness: scoring serves observers and gives way to the field's updates
+WAITING_FRAMES = 256  # held-out frames that wait while one publication is scored; older ones are not needed
+WAITING_PUBLICATIONS = 2
+OPEN_PUBLICATIONS = 16
+BASELINE_EVERY = 5  # publications; where nothing is held out, scored ones
+MOST_SNAPSHOTS = 16  # kept for held-out frames that arrive late
+SILENT_CAMERA_NS = 2_000_000_000  # behind the others: such a camera's captures are not waited for
+SHOWN_EVERY_S = 0.4  # largest mean time between two scores of what a held-out camera is shown
+FULL_EVERY = 4  # one in this many scores of what is shown has all metrics, the others only PSNR
+# The thread may use a share of the cores' time, refilling an allowance of CPU seconds. What is shown may use its part
+# of that share; publications are scored only while the reserve, CPU seconds, is left for it. The first allowance is
+# small: in its first seconds the field needs the cores.
+SCORING_SHARE, SHOWN_SHARE, ALLOWANCE_S, RESERVE_S = 0.03, 0.02, 1.0, 0.1
+FIRST_ALLOWANCE_S = 0.2
+# Of held-out cameras that move, all frames so far are scored again and again, 30 ms each at 320 x 240, with this share
+# more. One publication, whose metrics cost some ten times that, is scored for so many of them.
+LOOK_BACK_SHARE, LOOKS_A_SCORE = 0.03, 12
+
+# --- what is told of a run ---
+STATUS_PERIOD_S, AGES_PERIOD_S = 0.5, 0.2
+SNAPSHOT_TIMEOUT_S = 30.0
+LAST_SCORES_S = 4.0  # for what waits at the end, and for all frames of held-out cameras that move: 64 take 2 s
+UPDATE_TIMES = 4096  # latest update times that percentiles are computed from
+MOST_EVENTS = 200  # kept: each is in every edge.json
+SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages
