@@ -6,10 +6,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from edge_server.fields.common.hash_grid_settings import HashGridSettings
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid
 from edge_server.fields.common.kernels.mlp import Net, param_count
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.common.trainer_settings import HashGridSettings, TrainerSettings
+from edge_server.fields.common.trainer_settings import TrainerSettings
 
 FINENESS = 1.0  # cells of the finest level per pixel
 FIRST_DENSITY = 0.3  # a scene unit of fog dims by a quarter: every sample gets a gradient at first

@@ -10,7 +10,8 @@ from collections.abc import Callable
 import numpy as np
 
 from edge_server.fields import Budget
-from edge_server.fields.common.trainer_settings import HashGridSettings, TrainerSettings
+from edge_server.fields.common.hash_grid_settings import HashGridSettings
+from edge_server.fields.common.trainer_settings import TrainerSettings
 
 # Of encodings and their networks: a first fit has a hundred steps or so, and with .9 a tenth of them pass
 # before Adam forgets the gradients of fog that is gone.

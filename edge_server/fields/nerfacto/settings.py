@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from edge_server.fields.common.trainer_settings import HashGridSettings
+from edge_server.fields.common.hash_grid_settings import HashGridSettings
 from freshfield.settings import within
 
 

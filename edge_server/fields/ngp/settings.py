@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from edge_server.fields.common.trainer_settings import HashGridSettings
+from edge_server.fields.common.hash_grid_settings import HashGridSettings
 
 STATE_SHAPE = (
     "levels",
