@@ -65,7 +65,7 @@ SLOWEST_RATE = 1.0 / 24.0  # least weight of a new frame in a mode's running mea
 RUN = 12  # arrivals in a row that join another mode: it becomes the plate
 KNOWN_VOTES, KNOWN_SHARE, EARLY_SHARE = 8.0, 0.3, 0.9  # see ``kernels.plates``
 LEAST_WEIGHT = 0.05  # a mode of less is forgotten
-CLOSE, SPECK, HOLE = 5, 10, 0.02  # pixels, pixels, share of the image: see ``plates.clean_mask``
+SPECK, HOLE = 10, 0.02  # pixels, share of the image: see ``kernels.masks``
 REFUSED_SHARE = 0.6  # of the pixels: with more foreground, a frame does not show what the plate shows
 HELD_OPACITY, HELD_ERROR = 0.5, 0.12  # where the moving set explains a frame
 
