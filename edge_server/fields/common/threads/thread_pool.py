@@ -11,7 +11,7 @@ itself, whatever its priority. Callers may then compute at once, each as worker 
 belongs to one caller.
 
 Where the caller is worker 0, it and the workers wait for each other without sleeping for some 80 us (``brief_wait``):
-a step of training is a row of small kernels, and to wake for each took a tenth to a fifth of it. In a server, whose
+a step of training is a row of small kernels, and to wake for each took 5 to 30 % of it. In a server, whose
 workers have a low priority, nobody waits so: cameras' frames need the cores.
 """
 
