@@ -34,7 +34,7 @@ import edge_server.fields.splat.layers.layered_field
 import edge_server.fields.splat.layers.depth.depth_supervision
 """
 WARM_UP = """
-import edge_server.fields.splat.layers.layered_field, edge_server.fields.splat.scan.carried_field
+import edge_server.fields.splat.layers.layered_field, edge_server.fields.splat.carried_camera.carried_field
 import edge_server.fields.warm_up_command
 """
 EMULATOR = """

@@ -5,8 +5,8 @@ import re
 import pytest
 import yaml
 
+from edge_server.fields.splat.carried_camera.carried_field import CarriedField
 from edge_server.fields.splat.layers.layered_field import LayeredField
-from edge_server.fields.splat.scan.carried_field import CarriedField
 from freshfield.scenario import load
 from freshfield_up.cli import main
 from tests.conftest import ROOT

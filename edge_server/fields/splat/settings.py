@@ -83,7 +83,9 @@ class SplatSettings(FieldSettings, frozen=True):
         """Layers, and what a scan needs, are imported only where they are asked for."""
         if self.layers:
             return "splat.layers.layered_field"
-        return f"splat.scan.{'carried_field' if self.carried else 'scan_field'}" if self.scan else "splat.field"
+        return (
+            f"splat.carried_camera.{'carried_field' if self.carried else 'scan_field'}" if self.scan else "splat.field"
+        )
 
     @property
     def planar(self) -> bool:

@@ -11,8 +11,8 @@ from edge_server.cli import main
 from edge_server.fields.common.kernels.jit import cache_folder
 from edge_server.fields.compiling import told
 from edge_server.fields.ngp.field import NgpField
+from edge_server.fields.splat.carried_camera.carried_field import CarriedField
 from edge_server.fields.splat.layers.layered_field import LayeredField
-from edge_server.fields.splat.scan.carried_field import CarriedField
 from freshfield.scenario import load
 
 KERNEL = """

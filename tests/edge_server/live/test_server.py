@@ -21,7 +21,7 @@ import pytest
 from edge_server.cli import main as edge_server
 from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
-from edge_server.fields.splat.scan.carried_field import CarriedField
+from edge_server.fields.splat.carried_camera.carried_field import CarriedField
 from edge_server.live.loop import UpdateLoop
 from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.live.settings import STOP_S

@@ -11,12 +11,21 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.splat.scan import settings as tuned
+from edge_server.fields.splat.carried_camera import settings as tuned
 from freshfield.geometry import look_at, se3, so3_exp
 from tests.edge_server.fields.scenes import seen
 from tests.edge_server.fields.small import same_state
-from tests.edge_server.fields.splat.scan import carried
-from tests.edge_server.fields.splat.scan.carried import BAD_FROM, LENS, SEEDS, WALK, carried_field, given, slow, walk
+from tests.edge_server.fields.splat.carried_camera import carried
+from tests.edge_server.fields.splat.carried_camera.carried import (
+    BAD_FROM,
+    LENS,
+    SEEDS,
+    WALK,
+    carried_field,
+    given,
+    slow,
+    walk,
+)
 
 
 def test_frames_become_keyframes_and_held_out_ones_take_their_neighbors_corrections() -> None:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.splat.carried_camera import settings as tuned
 from edge_server.fields.splat.kernels.rasterize import EXPOSURE
-from edge_server.fields.splat.scan import settings as tuned
 
 Array = NDArray[np.float64]
 

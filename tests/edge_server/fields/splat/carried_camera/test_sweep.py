@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.threads.thread_pool import shared_pool
+from edge_server.fields.splat.carried_camera import settings as tuned
+from edge_server.fields.splat.carried_camera.discs import discs, filled, quadtree, usable_depth
+from edge_server.fields.splat.carried_camera.sweep import neighbors, sweep_depth
 from edge_server.fields.splat.kernels.project import BASE, COLOR, QUATERNION, SCALE
-from edge_server.fields.splat.scan import settings as tuned
-from edge_server.fields.splat.scan.discs import discs, filled, quadtree, usable_depth
-from edge_server.fields.splat.scan.sweep import neighbors, sweep_depth
 from freshfield.geometry import Pinhole, look_at, quaternion_to_matrix, so3_exp, world_rays
 from tests.edge_server.fields.scenes import seen
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from edge_server.fields import Correction, View
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
-from edge_server.fields.splat.scan.exposures import Exposures
+from edge_server.fields.splat.carried_camera.exposures import Exposures
 from edge_server.fields.splat.snapshot import SplatSnapshot
 
 

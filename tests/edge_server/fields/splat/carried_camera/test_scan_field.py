@@ -15,16 +15,16 @@ from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, RefinesCameras, View
 from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.fields.splat.carried_camera import scan_field
+from edge_server.fields.splat.carried_camera.scan_field import ScanField
+from edge_server.fields.splat.carried_camera.sweep import sweep_depth
 from edge_server.fields.splat.densification import opacity, raw_opacity
 from edge_server.fields.splat.kernels.project import OPACITY
-from edge_server.fields.splat.scan import scan_field
-from edge_server.fields.splat.scan.scan_field import ScanField
-from edge_server.fields.splat.scan.sweep import sweep_depth
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import so3_exp
 from tests.edge_server.fields.scenes import BALL_M, RADIUS_M
 from tests.edge_server.fields.small import same_state
-from tests.edge_server.fields.splat.scan.carried import WALK, spoiled, walk
+from tests.edge_server.fields.splat.carried_camera.carried import WALK, spoiled, walk
 
 Spoil = Callable[[list[View]], list[View]]
 WITH_DEPTH, WITHOUT = WALK, walk(depth=False)

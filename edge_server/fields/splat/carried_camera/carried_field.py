@@ -19,15 +19,15 @@ from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.kernels.camera import CAMERA
 from edge_server.fields.common.supervision import CameraMemory, check_view
 from edge_server.fields.common.view_store import Arrays
+from edge_server.fields.splat.carried_camera import settings as tuned
+from edge_server.fields.splat.carried_camera.discs import usable_depth
+from edge_server.fields.splat.carried_camera.own_motion import OwnMotion, search
+from edge_server.fields.splat.carried_camera.plausibility import agreeing, flat, moved_in, troubles, unturned
+from edge_server.fields.splat.carried_camera.scan_field import ScanField, Shown, aim_of
+from edge_server.fields.splat.carried_camera.sweep import sweep_depth
+from edge_server.fields.splat.carried_camera.tracking import Alignment, Rendered, align, gray
 from edge_server.fields.splat.densification import opacity
 from edge_server.fields.splat.kernels.rasterize import EXPOSURE, Targets
-from edge_server.fields.splat.scan import settings as tuned
-from edge_server.fields.splat.scan.discs import usable_depth
-from edge_server.fields.splat.scan.own_motion import OwnMotion, search
-from edge_server.fields.splat.scan.plausibility import agreeing, flat, moved_in, troubles, unturned
-from edge_server.fields.splat.scan.scan_field import ScanField, Shown, aim_of
-from edge_server.fields.splat.scan.sweep import sweep_depth
-from edge_server.fields.splat.scan.tracking import Alignment, Rendered, align, gray
 
 # What a field that begins anew, which no depth was measured for, still knows of its cameras and their frames.
 _OF_CAMERAS = ("_pixels", "_taken", "_blind", "_bare", "_seen", "_seen_m", "_left_out", "_in_a_row")

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.cameras.pose_corrections import Leap, PoseCorrection, PoseCorrections
-from edge_server.fields.splat.scan import settings as tuned
-from edge_server.fields.splat.scan.tracking import Gray, Rendered, align, align_from, gray
+from edge_server.fields.splat.carried_camera import settings as tuned
+from edge_server.fields.splat.carried_camera.tracking import Gray, Rendered, align, align_from, gray
 from freshfield.geometry import se3, se3_inverse, so3_exp, so3_log
 
 Array = NDArray[np.float64]

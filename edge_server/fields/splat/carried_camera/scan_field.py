@@ -22,16 +22,16 @@ from edge_server.fields.common.cameras.pose_corrections import PoseCorrections, 
 from edge_server.fields.common.plane_sweep import foreground_mask
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.view_store import Arrays, same_views
+from edge_server.fields.splat.carried_camera import settings as tuned
+from edge_server.fields.splat.carried_camera.discs import discs, filled, quadtree, usable_depth
+from edge_server.fields.splat.carried_camera.exposures import Exposures
+from edge_server.fields.splat.carried_camera.refined_cameras import RefinedCameras, ScanSnapshot
+from edge_server.fields.splat.carried_camera.sweep import sweep_depth
 from edge_server.fields.splat.densification import GaussianCloud, opacity
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_corrections, clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, QUATERNION, SCALE, SH_COLUMNS
 from edge_server.fields.splat.kernels.rasterize import LOSSES, MOMENTS, render_tiles
-from edge_server.fields.splat.scan import settings as tuned
-from edge_server.fields.splat.scan.discs import discs, filled, quadtree, usable_depth
-from edge_server.fields.splat.scan.exposures import Exposures
-from edge_server.fields.splat.scan.refined_cameras import RefinedCameras, ScanSnapshot
-from edge_server.fields.splat.scan.sweep import sweep_depth
 from edge_server.fields.splat.settings import PRUNE_OPACITY
 from freshfield.geometry import Pinhole
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge_server.fields.splat.scan import settings as tuned
-from edge_server.fields.splat.scan.exposures import Exposures
+from edge_server.fields.splat.carried_camera import settings as tuned
+from edge_server.fields.splat.carried_camera.exposures import Exposures
 
 R = np.random.default_rng(3).uniform(0.1, 0.9, (400, 3))
 

@@ -10,12 +10,12 @@ import pytest
 
 from edge_server.fields import View
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
-from edge_server.fields.splat.scan import settings as tuned
-from edge_server.fields.splat.scan.plausibility import moved_in, troubles, unturned
-from edge_server.fields.splat.scan.tracking import Rendered, align, gray
+from edge_server.fields.splat.carried_camera import settings as tuned
+from edge_server.fields.splat.carried_camera.plausibility import moved_in, troubles, unturned
+from edge_server.fields.splat.carried_camera.tracking import Rendered, align, gray
 from freshfield.geometry import Pinhole, se3_inverse, so3_exp
 from tests.edge_server.fields.common.cameras.test_pose_corrections import arm_poses
-from tests.edge_server.fields.splat.scan.carried import LENS
+from tests.edge_server.fields.splat.carried_camera.carried import LENS
 
 WALL = Pinhole.from_fov(160, 120, 60.0)
 
