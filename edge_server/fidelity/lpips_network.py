@@ -30,7 +30,10 @@ def distance(
 
     parameters: AlexNet's arrays by name. lins: a vector of channel weights (C,) per slice.
     mask: (H, W), outside which both are black, and by whose share in each cell it counts; None: all count the same.
+    ValueError: the mask is empty.
     """
+    if mask is not None and not mask.any():
+        raise ValueError("the mask leaves no pixel to compare")
     pair = np.stack([rendering, truth])
     with torch.inference_mode(), one_torch_thread():
         shares = None if mask is None else torch.from_numpy(mask[None].astype(np.float64))

@@ -1,6 +1,6 @@
 """The scores of one rendering against one truth, by every metric.
 
-When a truth is one of the present is for who holds the truths: ``live.held_out`` for captures that arrive,
+When a truth is one of the present is for who holds the truths: ``live.scoring.held_out`` for captures that arrive,
 ``experiments.virtual.truth`` in virtual time. Where nothing is held out, ``score_selected`` scores on the views
 the field was trained on (6.21)-(6.22), and the score says so.
 """

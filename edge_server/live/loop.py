@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
@@ -17,10 +18,6 @@ from edge_server.live.state import Controls, Publication
 from freshfield.clock import Clock
 
 log = logging.getLogger(__name__)
-
-"""How long the server waits at its end for the update in progress, without which there is no checkpoint. On a machine
-with five times as much to do as it has cores, updates of ``ngp`` at 640 x 480 take 6 s, the longest 18. The launcher
-kills the server after ``freshfield_up.processes.GRACE_S``, of which the checkpoint and the last pictures need some."""
 
 
 class UpdateLoop:
@@ -59,7 +56,8 @@ class UpdateLoop:
         self._checkpoints: Queue[tuple[Path, Future[Path]]] = Queue()
         self._stop = threading.Event()
         self._paused = False
-        self.without_step, self._in_a_row = 0, 0  # updates without time for a step: all, and the newest
+        self.without_step = 0  # updates without time for a step
+        self._too_short: deque[bool] = deque(maxlen=tuned.TOO_SHORT_OF)
         self._warned_short_s = -tuned.WARN_EVERY_S + clock.now_ns() / 1e9
         self._warned_of = (0, 0, clock.now_ns() / 1e9)  # frames shed and arrived, and when
         self.failure: BaseException | None = None
@@ -157,14 +155,15 @@ class UpdateLoop:
     def _warn_without_steps(self, report: FitReport) -> None:
         """Log once, and now and then if it recurs, that updates are too short to learn anything."""
         self.without_step += report.short
-        self._in_a_row = self._in_a_row + 1 if report.short else 0
+        self._too_short.append(report.short)
         now_s = self._clock.now_ns() / 1e9
-        if self._in_a_row >= tuned.TOO_SHORT and now_s - self._warned_short_s >= tuned.WARN_EVERY_S:
+        if sum(self._too_short) >= tuned.TOO_SHORT and now_s - self._warned_short_s >= tuned.WARN_EVERY_S:
             self._warned_short_s = now_s
             log.warning(
-                "an update of %.0f ms made no step: all its time went into taking in new pictures. Send smaller ones "
+                "%d of %d updates made no step: their time went into taking in new pictures. Send smaller ones "
                 "(source.scale, or width and height), or give updates more time (edge.update_ms)",
-                report.seconds * 1e3,
+                sum(self._too_short),
+                len(self._too_short),
             )
 
     def _warn_of_shed(self) -> None:

@@ -13,13 +13,13 @@ AFTER_ERROR_S = 1.0
 class PageThread:
     """Base of the page's threads; a subclass implements ``_step``, which returns the seconds until the next one.
 
-    name: of the thread. what: names its work in log lines. ``_wake``, notified, begins the next step at once.
+    name: of the thread. what: names its work in log lines. ``wake`` begins the next step at once.
     """
 
     def __init__(self, name: str, what: str) -> None:
         self._what, self._last_error = what, ""
         self._wake = threading.Condition()
-        self._stopped = False
+        self._stopped = self._asked = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
@@ -32,6 +32,12 @@ class PageThread:
             self._wake.notify_all()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
+
+    def wake(self) -> None:
+        """Begin the next step at once, also where one is at work and has looked already."""
+        with self._wake:
+            self._asked = True
+            self._wake.notify_all()
 
     def _step(self) -> float:
         raise NotImplementedError
@@ -46,8 +52,8 @@ class PageThread:
                     self._wake.wait_for(lambda: self._stopped, AFTER_ERROR_S)
                 continue
             with self._wake:
-                if seconds > 0.0 and not self._stopped:
-                    self._wake.wait(seconds)
+                self._wake.wait_for(lambda: self._stopped or self._asked, max(seconds, 0.0))
+                self._asked = False
 
     def _say(self, error: Exception) -> None:
         """Log an error, but not again until another one came."""

@@ -114,7 +114,7 @@ class RenderLoop(PageThread):
             if visitor is not None:
                 visitor.view, visitor.level = view, -1
                 visitor.serial += 1
-                self._wake.notify_all()
+                self.wake()
 
     def camera_moved(self, client: Any) -> None:
         """Replace the viewpoint to render for the client."""
@@ -136,7 +136,7 @@ class RenderLoop(PageThread):
             visitor.moved_at = perf_counter()
             visitor.serial += 1
             visitor.level = -1
-            self._wake.notify_all()
+            self.wake()
 
     # --- the thread -----------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ from edge_server.surface import SurfaceError
 
 METHODS = ("tsdf", "sdf")
 MIN_WEIGHT = 0.2  # of a known voxel; a camera at normal incidence counts 1
-MOST_VOXELS = 1 << 27  # of the box around the blocks: 512 MB of distances, and about as much for each step
+MOST_VOXELS = 1 << 27  # of the box around the blocks: 512 MB of distances, and up to 3.2 GB if all lie near a surface
 SHARPENED_PIXELS = 10_000_000  # of all maps that are sharpened: seven minutes of processor time, 41 s a million
 COVERING_POINTS = 200  # of a map, by which is chosen what to sharpen
 # The distance function: grids, each twice as fine as the last; Adam's steps and samples of each kind on each of them,

@@ -97,7 +97,7 @@ class SplatStream(PageThread):
         connected = _Connected(asyncio.get_running_loop(), Visitor())
         with self._wake:
             self._connected.append(connected)
-            self._wake.notify_all()
+            self.wake()
         sending = asyncio.create_task(_send(connection, connected.queue))
         try:
             async for message in connection:

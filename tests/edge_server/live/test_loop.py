@@ -141,16 +141,17 @@ def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(tmp_path):
     assert not run.loop.alive
 
 
-def test_updates_without_time_to_learn_are_warned_of_again_every_half_minute(caplog):
-    """Also where the third in a row comes sooner than that after the last warning, and none recovers."""
+@pytest.mark.parametrize(("learns_each", "expected"), [(100, [10, 40, 70]), (2, [19, 49]), (4, [13, 43, 73]), (1, [])])
+def test_updates_without_time_to_learn_are_warned_of_again_every_half_minute(learns_each, expected, caplog):
+    """Also where one learns now and then."""
     clock = VirtualClock()
     starved = Running(updates(), clock=clock).loop
     told = []
-    for second in range(70):  # one update a second; that of 20 learns something
+    for second in range(75):  # one update a second
         clock.advance_to(second * 1000 * MS)
-        starved._warn_without_steps(FitReport(0, 0.1, 0.0, 0, 0, short=second != 20))
+        starved._warn_without_steps(FitReport(0, 0.1, 0.0, 0, 0, short=second % learns_each > 0))
         told += [second] * (len(caplog.records) - len(told))
-    assert told == [2, 32, 62]
+    assert told == expected
 
 
 @pytest.mark.parametrize("where", ["checkpoint", "fit"])

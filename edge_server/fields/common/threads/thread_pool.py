@@ -17,6 +17,7 @@ workers have a low priority, nobody waits so: cameras' frames need the cores.
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
 import time
@@ -28,6 +29,8 @@ import numpy as np
 
 from edge_server.fields.common.kernels.simd import COUNTER
 from edge_server.fields.common.threads.brief_wait import await_next_job, await_workers
+
+log = logging.getLogger(__name__)
 
 # Environment variable: threads of a pool, for users who run several processes side by side.
 THREADS_VARIABLE = "FRESHFIELD_THREADS"
@@ -144,15 +147,19 @@ class Pool:
         """For a caller that is worker 0: do its share of a job and wait for the others."""
         self._done[0] = 0
         try:
-            self._work(job, 0)
-            await_workers(self._done, len(job.finished) - 1)
-        except BaseException:  # of an interrupt: perhaps not all were woken
-            self._wake_others(0, job)
-            job.finished[0] = 1
-            raise
-        finally:
-            job.wait()
+            try:
+                self._work(job, 0)
+                await_workers(self._done, len(job.finished) - 1)
+            except BaseException:  # of an interrupt: perhaps not all were woken
+                self._wake_others(0, job)
+                job.finished[0] = 1
+                raise
+            finally:
+                job.wait()
             self._drawn[:] = 0
+        except BaseException:  # a worker may still draw, after a second interrupt: it keeps the array that it has
+            self._drawn = np.zeros_like(self._drawn)
+            raise
 
     def _serve(self, worker: int) -> None:
         lower_priority(self.nice)
@@ -161,8 +168,16 @@ class Pool:
                 self._work(job, worker)
             del job  # or the last job's arrays would live until the next one comes
             if not self.nice:
-                await_next_job(self._done, self._drawn)
+                self._await_next_job()
         self._wake_others(worker, None)
+
+    def _await_next_job(self) -> None:
+        """Look for one before sleeping. Nothing depends on it, so that no error of it may end a worker: as of a full
+        disk, where numba keeps what it has compiled."""
+        try:
+            await_next_job(self._done, self._drawn)
+        except Exception as error:
+            log.debug("workers sleep at once: %s", error)
 
     def _work(self, job: _Job, worker: int) -> None:
         self._wake_others(worker, job)
@@ -187,6 +202,8 @@ def compile_kernels(run_kernels: Callable[[Pool], None]) -> float:
     minutes."""
     start = time.perf_counter()
     run_kernels(CallerPool())
+    await_workers(np.zeros(COUNTER, np.int64), 0)
+    await_next_job(np.zeros(COUNTER, np.int64), np.zeros(COUNTER, np.int64))
     return time.perf_counter() - start
 
 

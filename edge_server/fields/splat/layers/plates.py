@@ -15,10 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common.field_state import give_attributes, take_attributes
+from edge_server.fields.common.field_state import give_attributes, load_arrays, take_attributes
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.layers import settings as tuned
-from edge_server.fields.splat.layers.kernels.plates import MODES, PlateArrays, compare_with_plate, count_exposure, vote
+from edge_server.fields.splat.layers.kernels.plates import (
+    MODES,
+    PlateArrays,
+    blur,
+    compare_with_plate,
+    count_exposure,
+    vote,
+)
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray]
@@ -94,7 +101,7 @@ class Plate:
         by_itself: what the fields show does not say what is background. While plates are not certain, fields that were
             learned from them would confirm what is wrong with them.
         """
-        before = dict(vars(self))
+        before, image = dict(vars(self)), np.ascontiguousarray(image)
         self._follow_exposure(image)
         earlier = [self._recent[(self.count - lag) % len(self._recent)] for lag in tuned.LAGS]
         foreground, changing = masks = np.empty((2, *self.known.shape), np.uint8)
@@ -164,10 +171,11 @@ class Plate:
     def _blur(self) -> None:
         """What follows from the static field's rendering and the latest frames."""
         self._static_blurred = cv2.blur(self._static, (3, 3))
-        self._recent = [
-            cv2.boxFilter(frame, cv2.CV_32F, (3, 3)) * gain
-            for frame, gain in zip(self._frames, self._gains, strict=True)
-        ]
+        self._recent = []
+        for frame, gain in zip(self._frames, self._gains, strict=True):
+            blurred = np.empty(frame.shape, np.float32)
+            self.pool.run(blur, frame, blurred)
+            self._recent.append(blurred * gain)
 
     def _fill(self) -> None:
         """The picture, as ``vote`` leaves it."""
@@ -179,8 +187,9 @@ class Plate:
         return {**{n: a.copy() for n, a in self.arrays._asdict().items()}, **take_attributes(self, _KEPT)}
 
     def load_state(self, state: Arrays) -> None:
-        """Continue from ``state``. KeyError: it lacks something."""
-        self.arrays = PlateArrays(*(np.array(state[name]) for name in PlateArrays._fields))
+        """Continue from ``state``. KeyError, ValueError: it lacks something, or is of other images."""
+        arrays = self.arrays._asdict()
+        load_arrays(arrays | {name: getattr(self, name) for name in ("_frames", "_gains", "_held", "_static")}, state)
         give_attributes(self, _KEPT, state)
         self._blur()
         self._fill()

@@ -86,6 +86,12 @@ def _blur(image, blurred):
 
 
 @kernel
+def blur(counter, worker, image, blurred):
+    """Blur a frame, uint8 (H, W, 3), into float32 (H, W, 3)."""
+    _blur(image, blurred)
+
+
+@kernel
 def compare_with_plate(
     counter, worker, image, blurred, plate, earlier, lags, static, has_static, difference, flags, eights, masks, counts
 ):

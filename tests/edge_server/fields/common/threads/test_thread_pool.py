@@ -13,6 +13,7 @@ import pytest
 from numba import njit
 
 from edge_server.fields.common.kernels.simd import COUNTER, draw
+from edge_server.fields.common.threads import thread_pool
 from edge_server.fields.common.threads.brief_wait import await_next_job, await_workers
 from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
 
@@ -152,6 +153,37 @@ def test_a_caller_that_is_interrupted_waits_for_what_it_has_begun(nice: int) -> 
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
     assert seen == ["slow"] and _engaged(pool) == [0, 1, 2]
+    pool.close()
+
+
+def test_after_an_interrupt_each_task_is_done_once_again() -> None:
+    """The worker that the caller waits for when Ctrl-C comes has drawn tasks of a job that is over then."""
+    pool, slow = Pool(2), np.zeros(40, np.int64)
+
+    def interrupted(counter, worker, done):
+        _share(counter, worker, done)
+        if worker == 1:
+            time.sleep(0.1)
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.1)
+
+    with pytest.raises(KeyboardInterrupt):
+        pool.run(interrupted, slow)
+    done = np.zeros(1000, np.int64)
+    pool.run(_share, done)
+    assert (done == 1).all() and (slow == 1).all()
+    pool.close()
+
+
+def test_a_worker_outlives_a_wait_that_fails(monkeypatch) -> None:
+    def full(*_) -> None:
+        raise OSError("no space left on the device")
+
+    monkeypatch.setattr(thread_pool, "await_next_job", full)
+    pool, done = Pool(3), np.zeros(30, np.int64)
+    for _ in range(3):
+        pool.run(_share, done)
+    assert (done == 3).all()
     pool.close()
 
 

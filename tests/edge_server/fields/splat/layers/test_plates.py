@@ -112,3 +112,17 @@ def test_plain_is_what_changes_by_less_than_two_steps_within_nine_pixels() -> No
     one = faint.copy()
     one[..., 2] = grained[..., 2]
     assert plain_share([one]) < 0.01  # one channel tells places apart
+
+
+def test_a_plate_takes_images_that_are_views_of_others_and_loads_no_state_of_other_images() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (SIZE, SIZE, 3), np.uint8)
+    one, other = Plate(SIZE, SIZE, CallerPool()), Plate(SIZE, SIZE, CallerPool())
+    for _ in range(4):
+        one.take(image[::-1, :, ::-1])
+        other.take(image[::-1, :, ::-1].copy())
+    state = one.state()
+    for name, array in other.state().items():
+        np.testing.assert_array_equal(state[name], array)
+    for name in ("weight", "total", "run", "deviation", "_held", "_frames"):
+        with pytest.raises(ValueError, match=f"lacks '{name}'"):
+            Plate(SIZE, SIZE, CallerPool()).load_state(state | {name: state[name][..., :-1, :]})

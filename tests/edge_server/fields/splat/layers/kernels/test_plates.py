@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.splat.layers.kernels.plates import (
     CHANGING,
@@ -14,7 +13,7 @@ from edge_server.fields.splat.layers.kernels.plates import (
     LIKE_STATIC,
     MODES,
     PlateArrays,
-    _blur,
+    blur,
     compare_with_plate,
     count_exposure,
     vote,
@@ -54,11 +53,6 @@ def _masks() -> np.ndarray:
     return np.empty((2, H, W), np.uint8)
 
 
-@kernel
-def _blur_alone(image, blurred):
-    _blur(image, blurred)
-
-
 def _off(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.abs(a - b).max(axis=-1)
 
@@ -93,7 +87,7 @@ def test_a_frame_is_compared_with_plate_earlier_frames_and_static_field() -> Non
 def test_frames_of_any_size_are_blurred(shape: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
     blurred = np.empty((*shape, 3), np.float32)
-    _blur_alone(image, blurred)
+    CallerPool().run(blur, image, blurred)
     np.testing.assert_allclose(blurred, cv2.boxFilter(image, cv2.CV_32F, (3, 3)), rtol=1e-6)
 
 
