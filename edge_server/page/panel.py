@@ -137,7 +137,7 @@ class Panel:
         )
         rows, columns = comparison.truth.shape[:2]
         height = max(1, round(PAIR_WIDTH / 2 * rows / columns))
-        pair = browser_image(views.compared(comparison, PAIR_WIDTH, height, error=False))
+        pair = browser_image(views.compared(comparison, PAIR_WIDTH, height, error=False, labeled=False))
         if self._pair is None:
             order = self._caption.order + 0.5  # below its caption
             self._pair = self._gui.add_image(pair, format="jpeg", jpeg_quality=88, order=order)

@@ -66,9 +66,9 @@ def age_view(
     return cv2.resize(colors, size, interpolation=cv2.INTER_NEAREST) * light
 
 
-def compared(comparison: Comparison, width: int, height: int, error: bool) -> Image:
+def compared(comparison: Comparison, width: int, height: int, error: bool, labeled: bool = True) -> Image:
     """Truth and rendering of the held-out camera as large as they fit into (height, width, 3): side by side, or one
-    above the other where that is larger. error: their absolute difference alone."""
+    above the other where that is larger. error: their absolute difference alone. labeled: the image says what is what."""
     truth = comparison.truth.astype(np.float32) / 255
     rendered = cv2.resize(comparison.rendered, truth.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     rendered = rendered.astype(np.float32) / 255
@@ -81,7 +81,8 @@ def compared(comparison: Comparison, width: int, height: int, error: bool) -> Im
     shown = max(row, column, key=scale_of)
     size = [max(1, int(side * scale_of(shown))) for side in shown.shape[1::-1]]
     large = cv2.resize(shown, size, interpolation=cv2.INTER_AREA if scale_of(shown) < 1 else cv2.INTER_NEAREST)
-    for number, words in enumerate(("error",) if error else ("truth", "what the field renders")):
+    labels = ("error",) if error else ("truth", "what the field renders")
+    for number, words in enumerate(labels if labeled else ()):
         x, y = (number * size[0] // 2, 0) if shown is row else (0, number * size[1] // 2)
         for color, thickness in ((0.0, 4), (1.0, 1)):  # an outline, so that it is read on any image
             at = (x + LABEL_PX, y + 2 * LABEL_PX)

@@ -68,6 +68,7 @@ def test_truth_and_rendering_are_as_large_as_they_fit(size, beside):
     assert np.median(first[(first != views.BACKDROP).all(axis=2)]) == pytest.approx(200 / 255)
     second = image[:, size[0] // 2 :] if beside else image[size[1] // 2 :]
     assert first.max() == second.max() == 1.0, "both are labeled"
+    assert views.compared(comparison, *size, error=False, labeled=False).max() == pytest.approx(200 / 255)
     error = views.compared(comparison, *size, error=True)
     assert error[size[1] // 2, size[0] // 2] == pytest.approx(4 * 5 / 255, abs=1e-3)
 
