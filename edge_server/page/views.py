@@ -68,7 +68,10 @@ def age_view(
 
 def compared(comparison: Comparison, width: int, height: int, error: bool, labeled: bool = True) -> Image:
     """Truth and rendering of the held-out camera as large as they fit into (height, width, 3): side by side, or one
-    above the other where that is larger. error: their absolute difference alone. labeled: the image says what is what."""
+    above the other where that is larger.
+
+    error: their absolute difference alone. labeled: the image says what is what.
+    """
     truth = comparison.truth.astype(np.float32) / 255
     rendered = cv2.resize(comparison.rendered, truth.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     rendered = rendered.astype(np.float32) / 255
