@@ -14,6 +14,7 @@ import yaml
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.datasets.transforms import load_dataset
 from edge_server.experiments.common.arguments import OptionError
+from edge_server.experiments.scenes import captures
 from edge_server.experiments.scenes.multiview_still import open_still, score_views
 from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.fidelity.scorer import Scorer
@@ -174,3 +175,18 @@ def test_what_cannot_be_used_is_said_and_costs_nothing_else(tmp_path):
         open_still(_scenario(tmp_path, kind="world", scene="room"))
     with pytest.raises(DatasetError, match=r"mine\.yaml"):
         open_still(_scenario(tmp_path, kind="video", data="none.mp4"))
+
+
+def test_a_rate_above_the_recordings_gives_each_image_once(monkeypatch):
+    shot = SimpleNamespace(pose=SimpleNamespace(matrix=lambda: np.eye(4)), intrinsics=Pinhole.from_fov(8, 6, 60.0))
+    source = SimpleNamespace(
+        camera="hand",
+        fps=60.0,
+        repeats_after=12,
+        content=lambda tick: (tick // 2) % 5,
+        read=lambda content: shot,
+        release=list,
+    )
+    monkeypatch.setattr(captures, "pixels", lambda shot, codec: np.zeros((6, 8, 3), np.uint8))
+    found, wrong = captures._views(source, SimpleNamespace(codec="jpeg", depth_every=None))
+    assert list(found) == [f"hand/{k:04d}" for k in range(5)] and not wrong  # then it begins again
