@@ -22,7 +22,7 @@ class FrameBuffer:
 
     Memory is one encoded frame a camera, whatever arrives; ``MOST_UNSELECTED`` more with ``keep_every_frame``.
     arrivals: frames put in so far. stale_on_arrival: those that arrived after a newer one of their camera.
-    held_back: newest frames that the last ``take`` had no room for.
+    held_back: frames that the last ``take`` had no room for, and that wait on.
     shed: frames left out for lack of time since the first ``take``, with ``keep_every_frame``.
     """
 
@@ -81,8 +81,9 @@ class FrameBuffer:
         ``most`` admits the newest frame of each camera first, then the second newest of each, and so on.
         Frames of equal rank go in this order: cameras without a frame in the last ``LONGEST_WAIT`` takes, the
         longest wait first; then those of cameras before which most moves, each counting less with its age
-        (``FADES_MS``); among equals, the camera that has waited longest. What exceeds ``most`` is dropped and
-        counted in ``shed``, except for a camera's newest frame, which waits on. Frames of cameras that were not
+        (``FADES_MS``); among equals, the camera that has waited longest. What exceeds ``most`` waits on, after
+        the next ``take``'s newer frames: a burst is worked off later. The oldest of more than
+        ``MOST_UNSELECTED`` of a camera are dropped and counted in ``shed``. Frames of cameras that were not
         selected are dropped.
         """
         until_ns = max((item.received_ns for item in selected), default=0)
@@ -102,7 +103,8 @@ class FrameBuffer:
                     arrived.sort(key=lambda item: (-item.generated_edge_ns, item is not own[item.camera]))
                     last, share = self._last_take[camera], (moving or {}).get(camera, 1.0)
                     waits_on = self._takes - last <= tuned.LONGEST_WAIT
-                    for k, item in enumerate(arrived):
+                    newest_was_taken = not any(item is own[camera] for item in arrived)
+                    for k, item in enumerate(arrived, start=int(newest_was_taken)):
                         older_ms = max(youngest_ns - item.generated_edge_ns, 0) // tuned.AS_YOUNG_NS
                         worth = share * math.exp(-older_ms / tuned.FADES_MS) if waits_on else 0.0
                         ranked.append(((k, waits_on, -worth, last, -item.generated_edge_ns), item))
@@ -112,9 +114,9 @@ class FrameBuffer:
                 self._last_take[item.camera] = self._takes + k / len(taken)
             left = ordered[len(taken) :]
             self.held_back = 0
-            for item in left:
+            for item in sorted(left, key=lambda item: -item.received_ns):
                 waiting = self._unselected[item.camera]
-                if item is own[item.camera] and len(waiting) < tuned.MOST_UNSELECTED:
+                if len(waiting) < tuned.MOST_UNSELECTED:
                     waiting.appendleft(item)
                     self.held_back += 1
                 else:

@@ -97,20 +97,23 @@ def test_frames_that_wait_for_the_first_take_are_not_shed():
     assert buffer.shed == 0
 
 
-def test_where_there_is_no_time_for_all_the_oldest_are_left_out_and_counted_once():
+def test_what_there_is_no_time_for_waits_behind_newer_frames_and_the_oldest_of_too_many_are_left_out():
     buffer = _keeping(*(f"cam{k:02d}" for k in range(4)))
     for sequence in range(3):
         for k, camera in enumerate(buffer.cameras):
             _put(buffer, camera, sequence, 10 * sequence + k)
     assert _taken(buffer, 6) == [[(camera, 2) for camera in buffer.cameras], [("cam02", 1), ("cam03", 1)]]
-    assert (buffer.shed, buffer.arrivals) == (6, 12)
+    assert (buffer.shed, buffer.held_back) == (0, 6)
     _put(buffer, "cam00", 3, 30)
     _put(buffer, "cam01", 3, 31)
-    # What was taken before costs nothing; a camera's newest frame waits on.
-    assert _taken(buffer, 1) == [[("cam01", 3), ("cam02", 2), ("cam03", 2)], []]
-    assert (buffer.shed, buffer.held_back) == (6, 1)
-    assert len(_taken(buffer, 1)[0]) == 4 and buffer.shed == 6
-    _put(buffer, "cam00", 4, 40)
+    # What was taken before costs nothing; the newest frames go first, though others have waited.
+    assert _taken(buffer, 2) == [[("cam00", 3), ("cam01", 3), ("cam02", 2), ("cam03", 2)], []]
+    assert _taken(buffer, 4)[1] == [("cam02", 0), ("cam03", 0), ("cam00", 1), ("cam01", 1)]
+    assert (buffer.shed, buffer.held_back) == (0, 2)
+    for sequence in range(4, 4 + MOST_UNSELECTED):
+        _put(buffer, "cam00", sequence, 10 * sequence)
+    assert (buffer.shed, len(_taken(buffer)[1])) == (1, MOST_UNSELECTED)  # less the newest, and one of cam01
+    _put(buffer, "cam00", 20, 200)
     _taken(buffer, 0)
     assert buffer.held_back == 1
     buffer.keep_every_frame(False)

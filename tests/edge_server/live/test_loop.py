@@ -85,17 +85,21 @@ def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
     views, _ = u.fit(selection, budget)
     assert len(fed[0]) == len(decoded) == 10  # .6 of the budget: the newest of all, and two others
     assert [v.camera for v in views] == list(cameras)
-    assert (u.buffer.shed, u.buffer.arrivals) == (6, 16)
+    assert (u.buffer.shed, u.buffer.held_back, u.buffer.arrivals) == (0, 6, 16)
     for camera in cameras:
         u.buffer.put(frame(camera, sequence=50, generated_ns=50 * MS), 50 * MS)
     u.field.moving_shares = {camera: 0.01 * k for k, camera in enumerate(cameras)}
     views, _ = u.fit(u.select(u.plan(60 * MS), 60 * MS, Budget(seconds=1e-3)), Budget(seconds=1e-3))
     assert [v.camera for v in views] == list(cameras[4:])  # before which most moves
-    assert len(decoded) == 14 and u.buffer.shed == 6  # the newest frames of the others wait
+    assert len(decoded) == 14 and u.buffer.held_back == 10  # the newest frames of the others wait, before older ones
     u.on_arrivals = True
     views, _ = u.fit(u.select(u.plan(61 * MS), 61 * MS, Budget(seconds=1e-3)), Budget(seconds=1e-3))
-    assert len(decoded) == 18 and u.buffer.shed == 6  # and are taken although nothing has arrived since
-    assert u.select(u.plan(62 * MS), 62 * MS, Budget(seconds=1e-3)) is None
+    assert [item.camera for item in decoded[14:]] == list(cameras[:4])  # taken although nothing has arrived since
+    for left in (2, 0):
+        u.fit(u.select(u.plan(62 * MS), 62 * MS, Budget(seconds=1e-3)), Budget(seconds=1e-3))
+        assert u.buffer.held_back == left
+    assert (len(decoded), u.buffer.shed) == (24, 0)
+    assert u.select(u.plan(63 * MS), 63 * MS, Budget(seconds=1e-3)) is None
 
 
 class Running:

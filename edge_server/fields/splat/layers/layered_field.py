@@ -268,6 +268,8 @@ class LayeredField:
         field = LayeredField(tiny, pool)
         views = [View("warm-up", np.full((32, 32, 3), 128, np.uint8), pose, camera, k) for k in range(2)]
         field._take_in(views)
+        plate = field.cameras["warm-up"].plate
+        plate.load_state(plate.state())  # blurs its frames, as a change of exposure does
         field.static.begin([camera.plate_image(fine=False) for camera in field.cameras.values()])
         moving = field._begin_layers().moving
         field._find_rows()
@@ -339,8 +341,11 @@ class LayeredField:
         if view.camera not in self.cameras:
             self.cameras[view.camera] = FixedCamera.begin(view, self.caller)
         camera = self.cameras[view.camera]
+        overtaken = any(known_ns > view.generated_ns for known_ns in camera.taken)
         camera.taken.append(view.generated_ns)
         if not camera.stands_at(view):
+            if overtaken:
+                return  # it shows where the camera stood before
             if not camera.leaves_for(view):
                 self.refused |= {view.camera}
                 return

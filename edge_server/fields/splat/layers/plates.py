@@ -165,7 +165,7 @@ class Plate:
         is no plate."""
         self._static = np.clip(color * self.gain, 0.0, 1.0).astype(np.float32) * np.float32(255.0)
         self._has_static = True
-        self._blur()
+        self._static_blurred = cv2.blur(self._static, (3, 3))
         self._fill()
 
     def _blur(self) -> None:

@@ -7,8 +7,9 @@ LEAST_CAMERAS = 2  # one alone gives no depth: the still field learns its frames
 PLATE_FRAMES, PLATE_S = 8, 3.2  # frames of each camera, and time since the first, before plates are certain
 # Layers begin with what is known of the plates then: nine tenths in `room`. At PLATE_S the still field begins anew.
 EARLY_S = 1.0
-# Until then a thread beside may first show what it has learned since EARLY_S: two cores show 12 cameras after 3 s.
-PLATES_SURE_S = 6.0
+# Where it learns in a thread beside, not before it has had so many steps, or at PLATES_SURE_S: two cores make 330 by
+# PLATE_S with 12 cameras, and what began anew then was worse than what was shown until 8 s.
+EARLY_STEPS, PLATES_SURE_S = 600, 6.0
 PLATES_EVERY_S = 0.5  # how often plates are compared with what the still field has learned
 EVIDENCE_S = 0.8  # largest age of a frame from which motion is estimated
 RENDERINGS_A_FIT = 2  # renderings of the still field that plates take over in a fit

@@ -215,9 +215,10 @@ class StaticSupervision:
         beside: in a thread, until it has learned them; or else only note that there is something to learn.
         """
         begun, now_s = self.times.now(), observations.newest_s
-        # On a busy machine nothing may have been shown of what was learned so far: first it is, or is given up.
-        shown = not beside or self.layers_shown or now_s >= tuned.PLATES_SURE_S
-        certain = self.early and now_s >= tuned.PLATE_S and shown
+        # A thread beside learns slowly: what begins anew at once would not be better than what is shown for long.
+        learned = self.layers_shown and self.static.field.step >= tuned.EARLY_STEPS
+        learned = learned or not beside or now_s >= tuned.PLATES_SURE_S
+        certain = self.early and now_s >= tuned.PLATE_S and learned
         more = tuned.STEREO_CAMERAS < len(cameras) <= tuned.PLAIN_CAMERAS
         if self.plain is None and more and now_s >= tuned.PLATE_S:
             plates = [camera.plate_image(fine=False).color for camera in cameras.values()]

@@ -329,3 +329,15 @@ def test_where_all_cameras_are_knocked_layers_begin_again() -> None:
         assert frame != 29 or field.tracker is not None
         assert frame != 31 or field.tracker is None
     assert field.layered and field.tracker is not None and not any(camera.anew for camera in field.cameras.values())
+
+
+def test_late_frames_from_where_a_camera_stood_before_do_not_move_it_back() -> None:
+    field, camera = LayeredField(ball.SMALL), ball.seen_by(0, 0, True).camera
+    there = ball.CAMERAS[0].camera_to_world.copy()
+    there[0, 3] += 0.1
+    for frame in (0, 1, 2, 5, 6, 3, 4):  # knocked after frame 4
+        view = ball.seen_by(0, frame, True)
+        view = replace(view, camera_to_world=there) if frame > 4 else view
+        field.fit([view, *(ball.seen_by(k, frame, True) for k in range(1, len(ball.CAMERAS)))], Budget(steps=1))
+    np.testing.assert_array_equal(field.cameras[camera].reported_pose, there)
+    assert camera not in field.refused

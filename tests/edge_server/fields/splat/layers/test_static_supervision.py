@@ -116,10 +116,14 @@ def test_a_still_field_that_began_anew_is_shown_once_it_fits_as_well_as_what_it_
     assert not static.ready
 
 
-@pytest.mark.parametrize(("shown_after", "anew_s"), [(20, 1.2), (10_000, 2.0)])
-def test_in_seconds_the_still_field_begins_anew_after_it_was_shown_or_late(monkeypatch, shown_after, anew_s) -> None:
-    """Else nobody would ever see what a slow machine learns before plates are certain."""
-    for name, value in {"EARLY_S": 0.6, "PLATE_S": 1.2, "PLATES_SURE_S": 2.0, "EARLY_SHOWN_AFTER": shown_after}.items():
+@pytest.mark.parametrize(("learned", "anew_s"), [((20, 20), 1.2), ((20, 10_000), 2.0), ((10_000, 20), 2.0)])
+def test_in_seconds_the_still_field_begins_anew_once_it_has_learned_and_is_shown_or_late(
+    monkeypatch, learned, anew_s
+) -> None:
+    """Else a slow machine would show for long what is worse, or nothing of what it learns before plates are certain."""
+    shown_after, steps = learned
+    times = {"EARLY_S": 0.6, "PLATE_S": 1.2, "PLATES_SURE_S": 2.0}
+    for name, value in (times | {"EARLY_SHOWN_AFTER": shown_after, "EARLY_STEPS": steps}).items():
         monkeypatch.setattr(settings, name, value)
     field, frame = LayeredField(ball.SMALL), 0
     while not field.tracker or field.supervision.early:
