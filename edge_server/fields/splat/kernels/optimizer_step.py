@@ -155,20 +155,23 @@ def _gather_gradients(base, here, touched, params, moments, rule, s, g):
 @device_function
 def _adam(first, size, params, moments, rule, g):
     """An Adam step for parameters first, ..., first + size - 1 of the flattened arrays; g: see
-    ``_gather_gradients``. A block at once: the fourteen parameters of one Gaussian do not fill a register."""
+    ``_gather_gradients``. A block at once: the fourteen parameters of one Gaussian do not fill a register. Slices: an
+    index that might be negative keeps the loop from being vectorized."""
     third, limit = g.size // 3, np.float32(GRADIENT_LIMIT)
-    flat, flat_m, flat_v = params.reshape(-1), moments.m.reshape(-1), moments.v.reshape(-1)
+    gradients, rates, seconds = g[:third], g[third : 2 * third], g[2 * third :]
+    x = params.reshape(-1)[first : first + size]
+    xm, xv = moments.m.reshape(-1)[first : first + size], moments.v.reshape(-1)[first : first + size]
     for k in range(size):
-        old, old_m, old_v, given = flat[first + k], flat_m[first + k], flat_v[first + k], g[k]
+        old, old_m, old_v, given = x[k], xm[k], xv[k], gradients[k]
         d = min(max(given, -limit), limit)
         m = _BETA1 * old_m + (_F1 - _BETA1) * d
         v = _BETA2 * old_v + (_F1 - _BETA2) * d * d
         sound = is_finite(m) & is_finite(v)
         m, v = m if sound else _F0, v if sound else _F0
         moves = is_finite(given)
-        step = g[third + k] * m / (np.sqrt(v * g[2 * third + k]) + rule.epsilon)
-        flat[first + k] = old - step if moves else old
-        flat_m[first + k], flat_v[first + k] = m if moves else old_m, v if moves else old_v
+        step = rates[k] * m / (np.sqrt(v * seconds[k]) + rule.epsilon)
+        x[k] = old - step if moves else old
+        xm[k], xv[k] = m if moves else old_m, v if moves else old_v
 
 
 @kernel
