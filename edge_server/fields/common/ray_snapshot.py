@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edge_server.fields import Rendering
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.rays import Space
-from edge_server.fields.common.kernels.render import BATCH, render_tiles
+from edge_server.fields.common.kernels.render import ROW, render_tiles
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool
@@ -68,7 +68,7 @@ class RaySnapshot:
         camera, n = (lens, rotation, self.box.normalise(pose[:3, 3])), len(pixels)
         out = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
         units, pixels = int(self.net.widths.sum()), np.ascontiguousarray(pixels, dtype=np.float64)
-        scratch = tuple(np.empty((self.pool.threads, rows, BATCH), np.float32) for rows in (units, 3, 3))
+        scratch = tuple(np.empty((self.pool.threads, rows, ROW), np.float32) for rows in (units, 3, 3))
         model, degree = (self.encoding, self.levels, self.net), self.settings.sh_degree
         self.pool.run(render_tiles, camera, pixels, self.space, model, degree, self.background, scratch, out)
         color, depth, opacity = out

@@ -23,7 +23,7 @@ from edge_server.fields.common.field_state import load_arrays
 from edge_server.fields.common.kernels.adam import PART, Rule, adam
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.rays import Space, Views
-from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, Batch, RaySampling, Scratch, train_chunks
+from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, ROW, Batch, RaySampling, Scratch, train_chunks
 from edge_server.fields.common.kernels.volume_rendering import Weights
 from edge_server.fields.common.occupancy_grid import EVERY, OccupancyGrid
 from edge_server.fields.common.ray_snapshot import RaySnapshot
@@ -202,8 +202,8 @@ class TrainedField(SteppedField[RaySnapshot]):
         chunks, workers = max(s.batch_samples // CHUNK, 1), self.pool.threads
         units = int(self._net.widths.sum())
         self._batch = Batch(
-            x=np.zeros((chunks, 3, CHUNK), np.float32),
-            d_features=np.zeros((chunks, self._feature_rows(), CHUNK), np.float32),
+            x=np.zeros((chunks, 3, ROW), np.float32),
+            d_features=np.zeros((chunks, self._feature_rows(), ROW), np.float32),
             d_params=np.zeros((chunks, self._net.params.size), np.float32),
             columns=np.zeros(chunks, np.int64),
             samples=np.zeros(chunks, np.int64),
@@ -213,17 +213,17 @@ class TrainedField(SteppedField[RaySnapshot]):
             d_embeddings=np.zeros((chunks, 0, 0), np.float32),
         )
         self._scratch = Scratch(
-            acts=np.zeros((workers, units, CHUNK), np.float32),
-            d_acts=np.zeros((workers, units, CHUNK), np.float32),
-            line=np.zeros((workers, 3, CHUNK), np.float32),
-            by_ray=np.zeros((workers, 11, CHUNK), np.float32),
+            acts=np.zeros((workers, units, ROW), np.float32),
+            d_acts=np.zeros((workers, units, ROW), np.float32),
+            line=np.zeros((workers, 3, ROW), np.float32),
+            by_ray=np.zeros((workers, 11, ROW), np.float32),
             column=np.zeros((workers, CHUNK), np.int64),
             ray_first=np.zeros((workers, CHUNK_RAYS + 1), np.int64),
             ray=np.zeros((workers, CHUNK_RAYS, 12), np.float32),
             travel=np.zeros((workers, CHUNK_RAYS, 3), np.float32),
             span=np.zeros((workers, CHUNK, 4), np.int64),
         )
-        self._scratch_x = np.zeros((workers, 3, CHUNK), np.float32)
+        self._scratch_x = np.zeros((workers, 3, ROW), np.float32)
 
     def _take_table(self, table: NDArray[np.float32]) -> None:
         """Allocate the moments and gradients of a table."""

@@ -36,7 +36,7 @@ def sample_density(counter, worker, key, phase, phases, fade, encoding, levels, 
     """Refresh every ``phases``-th cell's density: the larger of the faded old one and a new random sample.
 
     key: uint64, random stream. grid: ``Cells``.
-    acts: float32 (W, units, CHUNK) and x: float32 (W, 3, CHUNK), scratch.
+    acts: float32 (W, units, ROW) and x: float32 (W, 3, ROW), scratch (``train.Scratch``).
     """
     cells, seen, min_views, density = grid.side, grid.seen, grid.needed, grid.density
     per_task = CELLS_A_TASK

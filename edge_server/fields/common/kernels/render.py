@@ -6,6 +6,7 @@ import numpy as np
 from numba.extending import overload
 
 from edge_server.fields.common.kernels.jit import kernel
+from edge_server.fields.common.kernels.mlp import PADDING
 from edge_server.fields.common.kernels.radiance_model import has, query_color, query_density, sample_rays
 from edge_server.fields.common.kernels.rays import NEVER, interval, march, pixel_direction
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite
@@ -14,6 +15,7 @@ from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, act
 TILE = 256  # rays a task
 ROUND = 8  # samples a ray gets before the opaque ones are dropped
 BATCH = TILE * ROUND  # samples that the network evaluates at a time
+ROW = BATCH + PADDING  # of which BATCH are used
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
@@ -42,7 +44,7 @@ def render_tiles(counter, worker, camera, pixels, space, model, sh_degree, backg
     camera: lens, float64 (8,); rotation, float64 (3, 3), camera to world; origin, float64 (3,), scene units.
     model: encoding, number of its levels in use, network.
     pixels: float64 (N, 2), image points. background: float32 (3,).
-    scratch: float32 (W, units, BATCH), (W, 3, BATCH) and (W, 3, BATCH), activations, points and lines.
+    scratch: float32 (W, units, ROW), (W, 3, ROW) and (W, 3, ROW), activations, points and lines.
     out: color, float32 (N, 3) in [0, 1], depth (scene units) and opacity in [0, 1]: float32 (N,); all written.
     """
     (lens, rotation, origin), (encoding, levels, net), (color, depth, opacity) = camera, model, out

@@ -9,6 +9,7 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
+from edge_server.fields.common.kernels.mlp import PADDING
 from edge_server.fields.common.kernels.radiance_model import (
     fill_chunk,
     has,
@@ -29,6 +30,7 @@ from edge_server.fields.common.kernels.volume_rendering import (
 )
 
 CHUNK = 2048  # samples a chunk has room for; its activations stay in the second-level cache
+ROW = CHUNK + PADDING  # of which CHUNK are used
 CHUNK_RAYS = 512
 
 DRAWN = 32  # rays drawn at a time
@@ -49,7 +51,7 @@ _F0, _F1, _BYTE = np.float32(0.0), np.float32(1.0), np.float32(1.0 / 255.0)
 class Batch(NamedTuple):
     """The results of a step's chunks, C of them.
 
-    x: float32 (C, 3, CHUNK), unit cube. d_features: float32 (C, rows, CHUNK). d_params: float32 (C, P).
+    x: float32 (C, 3, ROW), unit cube. d_features: float32 (C, rows, ROW). d_params: float32 (C, P).
     columns: int64 (C,), how many columns are in use, not all of them by samples of whole rays.
     samples, rays, dropped: int64 (C,). loss: float64 (C,), squared error summed over rays and channels.
     d_embeddings: float32 (C, V, A), dLoss / dembedding of each view.
@@ -70,13 +72,13 @@ class Scratch(NamedTuple):
     """Memory of each worker, W of them; R = CHUNK_RAYS.
 
     A column of these is a sample, in the order in which samples were found:
-    acts, d_acts: float32 (W, units, CHUNK). line: float32 (W, 3, CHUNK), distance, length, and a
+    acts, d_acts: float32 (W, units, ROW). line: float32 (W, 3, ROW), distance, length, and a
         representation's own number.
     span: int64 (W, CHUNK, 4), samples of a ray that were found together: ray (-1: none), first column, end of
         those before it is opaque, end.
 
     A column of these is a sample, ray after ray:
-    by_ray: float32 (W, 11, CHUNK), density and color, their gradient, distance, length, weight.
+    by_ray: float32 (W, 11, ROW), density and color, their gradient, distance, length, weight.
     column: int64 (W, CHUNK), where it was found; behind the last one, the columns that are not used.
     ray_first: int64 (W, R + 1), the first sample of each ray.
 
