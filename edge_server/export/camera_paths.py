@@ -14,6 +14,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from edge_server.export import ExportError
+from edge_server.export.settings import MOST_FRAMES, WIDEST_GAP_DEG
 from edge_server.fields import View
 from freshfield.geometry import GeometryError, Pinhole, converging_point, look_at, world_up
 from freshfield.limits import MAX_IMAGE_SIDE_PX
@@ -21,9 +22,6 @@ from freshfield.untrusted import UntrustedError, read_json, read_text
 
 Matrix = NDArray[np.float64]
 
-# Largest angle without a camera that an orbit crosses: beyond it nobody saw what it would show.
-WIDEST_GAP_DEG = 90.0
-MOST_FRAMES = 20_000  # of a path: ten minutes
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's camera axes: y up, z backward
 
 

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.export import ExportError, PosedImage
+from edge_server.export.settings import JPEG_QUALITY
 from edge_server.fidelity.images import to_bytes
 
 Image = NDArray[np.uint8]
 IMAGE_ENDINGS, VIDEO_ENDINGS = (".png", ".jpg", ".jpeg"), (".mp4",)
 # OpenCV's own 95 halves the colors' resolution visibly at edges; what is learned from should not.
-_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 98, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 
 
 def write_images(folder: Path, shots: Iterable[PosedImage]) -> None:

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from edge_server.export.colmap import Cloud
+from edge_server.export.settings import SAME
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.refine_depth import on_surface
-
-SAME = 0.01  # depth tolerance of the same point, share of the distance
 
 
 def sparse_points(maps: Sequence[DepthMap], count: int) -> Cloud:

@@ -7,10 +7,20 @@ POINTS = 20_000
 PIXELS_A_POINT = 1000
 """At most, of the depth that points are drawn from: 20 million pixels take 8 s of processor time."""
 
+SAME = 0.01
+"""Tolerance of the depth at which maps see the same point, share of the distance."""
+
 DEFAULT_HEIGHT_PX = 480
 """Of a rendering, at the shape of the cameras' images."""
 MOST_NAMED = 20
 """Cameras in an error."""
+
+JPEG_QUALITY = 98
+"""Of rendered images."""
+WIDEST_GAP_DEG = 90.0
+"""Largest angle without a camera that an orbit crosses: beyond it nobody saw what it would show."""
+MOST_FRAMES = 20_000
+"""Of a camera's path: ten minutes."""
 
 FRAMES_PER_S = 30
 """At which players show a sequence, unless told otherwise."""

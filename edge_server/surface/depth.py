@@ -15,13 +15,9 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Renderer
 from edge_server.surface import SurfaceError
+from edge_server.surface import settings as tuned
 from freshfield.geometry import Pinhole
 
-SOLID = 0.8  # minimum opacity of a ray that hits a surface
-EMPTY = 0.1  # maximum opacity of a ray that hits nothing
-EMPTY_TRUST = 0.25  # of a pixel whose ray hits nothing; 1 is a surface at normal incidence
-MAX_DEPTH_M = 1e6  # larger depths are invalid
-STEEPEST_DEG = 80.0  # maximum angle between ray and normal; beyond it is an edge, or unreliable
 Camera = tuple[NDArray[np.float64], Pinhole]
 
 
@@ -63,7 +59,7 @@ def depth_map(
     camera_to_world: NDArray[np.float64],
     intrinsics: Pinhole,
     sure: NDArray[np.float32] | None = None,
-    steepest_deg: float = STEEPEST_DEG,
+    steepest_deg: float = tuned.STEEPEST_DEG,
 ) -> DepthMap:
     """A depth map from depth along rays. Trust is the cosine between ray and normal: uncertainty grows as the
     surface turns away.
@@ -82,12 +78,12 @@ def depth_map(
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise SurfaceError("a depth map's camera_to_world must be a finite (4, 4) matrix")
     empty = np.isposinf(depth)
-    depth = np.where((depth > 0) & (depth < MAX_DEPTH_M), depth, 0).astype(np.float32)
+    depth = np.where((depth > 0) & (depth < tuned.MAX_DEPTH_M), depth, 0).astype(np.float32)
     cosine = incidence_cosine(depth, intrinsics)
     trust = cosine if sure is None else cosine * np.clip(np.nan_to_num(sure, nan=0.0), 0.0, 1.0)
     seen = cosine >= np.cos(np.deg2rad(steepest_deg))
     depth = np.where(seen, depth, np.where(empty, np.inf, 0.0)).astype(np.float32)
-    trust = np.where(seen, trust, np.where(empty, EMPTY_TRUST, 0.0)).astype(np.float32)
+    trust = np.where(seen, trust, np.where(empty, tuned.EMPTY_TRUST, 0.0)).astype(np.float32)
     return DepthMap(depth, trust, np.where(empty, np.float32(1.0), cosine), color, pose, intrinsics)
 
 
@@ -106,7 +102,10 @@ def incidence_cosine(depth: NDArray[np.float32], intrinsics: Pinhole) -> NDArray
 
 
 def render_depth_maps(
-    renderer: Renderer, cameras: Sequence[Camera], solid: float = SOLID, on_map: Callable[[int], None] | None = None
+    renderer: Renderer,
+    cameras: Sequence[Camera],
+    solid: float = tuned.SOLID,
+    on_map: Callable[[int], None] | None = None,
 ) -> Iterator[DepthMap]:
     """Render depth maps for ``cameras``, one at a time. For a ``planar`` renderer, ``render_surface`` gives
     unbiased depth.
@@ -117,7 +116,7 @@ def render_depth_maps(
     for k, (pose, lens) in enumerate(cameras):
         found = show(pose, lens)
         with np.errstate(invalid="ignore"):
-            beyond = np.where(found.opacity <= EMPTY, np.inf, 0.0)
+            beyond = np.where(found.opacity <= tuned.EMPTY, np.inf, 0.0)
             depth = np.where(found.opacity >= solid, found.depth, beyond).astype(np.float32)
         color = np.rint(np.clip(np.nan_to_num(found.color), 0.0, 1.0) * 255.0).astype(np.uint8)
         yield depth_map(depth, color, pose, lens, found.opacity)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.surface import SurfaceError
+from edge_server.surface import settings as tuned
 from edge_server.surface.kernels.fuse import CELLS, SIDE
 from edge_server.surface.volume import Volume, unblock
 
@@ -17,8 +18,6 @@ if TYPE_CHECKING:  # of the extra surface
 
 Floats = NDArray[np.float32]
 
-LEAST = 1e-3  # voxels; a distance of exactly 0 puts a vertex on a voxel and makes degenerate triangles
-KEEP_SHARE = 0.002  # share of the largest component's area; smaller components are removed
 NO_SURFACE = "the depth maps hold no surface within the bounds"
 INSTALL = "a mesh needs scikit-image and trimesh: pip install 'freshfield[surface]'"
 
@@ -85,7 +84,7 @@ class _Dense:
         sure = np.zeros((*table.shape, CELLS), np.bool_)
         distance[known] = blocks.distance[table[known]]
         sure[known] = blocks.weight[table[known]] > self.min_weight
-        least = np.float32(LEAST * grid.voxel_m)
+        least = np.float32(tuned.LEAST * grid.voxel_m)
         dense, sure = unblock(distance), unblock(sure)
         dense = np.where(np.abs(dense) < least, np.where(dense < 0, -least, least), dense)
         return np.ascontiguousarray(dense), sure
@@ -121,7 +120,7 @@ def remove_degenerate(mesh: Trimesh) -> Trimesh:
     return _with_faces(mesh, mesh.area_faces > 0.0)
 
 
-def remove_small_components(mesh: Trimesh, keep_share: float = KEEP_SHARE) -> Trimesh:
+def remove_small_components(mesh: Trimesh, keep_share: float = tuned.KEEP_SHARE) -> Trimesh:
     """The components with at least ``keep_share`` of the largest area."""
     from trimesh.graph import connected_component_labels
 

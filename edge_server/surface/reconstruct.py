@@ -10,17 +10,16 @@ import numpy as np
 
 from edge_server.fields import Renderer, View
 from edge_server.surface import SurfaceError
-from edge_server.surface.depth import SOLID, DepthMap, render_depth_maps
+from edge_server.surface import settings as tuned
+from edge_server.surface.depth import DepthMap, render_depth_maps
 from edge_server.surface.mesh import extract_mesh, remove_small_components
-from edge_server.surface.refine_depth import GAIN_WITHIN, on_surface, refine_depth
+from edge_server.surface.refine_depth import on_surface, refine_depth
 from edge_server.surface.settings import COVERING_POINTS, MIN_WEIGHT, SHARPENED_PIXELS, MeshSettings
-from edge_server.surface.volume import TRUNCATION, Grid, bounding_box, fuse_maps
+from edge_server.surface.volume import Grid, bounding_box, fuse_maps
 
 if TYPE_CHECKING:  # of the extra surface
     from trimesh import Trimesh
 
-GUESS = 0.5  # minimum opacity of a surface as initial depth for refinement
-FINEST = 512  # maximum voxels along the longest side without a given voxel size
 Say = Callable[[str, float], None]
 
 
@@ -42,7 +41,7 @@ def make_depth_maps(
         raise SurfaceError("the field knows no cameras yet: fit it first")
     cameras = [(v.camera_to_world, v.intrinsics) for v in views]
     # A translucent initial surface is sufficient for refinement.
-    solid = GUESS if settings.sharpen else SOLID
+    solid = tuned.GUESS if settings.sharpen else tuned.SOLID
     maps = list(render_depth_maps(renderer, cameras, solid, lambda done: say("depth", done / len(views))))
     if not settings.sharpen or len(maps) < 2:
         return maps
@@ -60,7 +59,7 @@ def covering_maps(maps: Sequence[DepthMap], most_pixels: int) -> list[int]:
     if sum(found.depth.size for found in maps) <= most_pixels:
         return list(range(len(maps)))
     points = np.concatenate([found.points()[:: 1 + int(found.seen.sum()) // COVERING_POINTS] for found in maps])
-    sees = np.stack([on_surface(found, points, GAIN_WITHIN) for found in maps])
+    sees = np.stack([on_surface(found, points, tuned.GAIN_WITHIN) for found in maps])
     worth = 1.0 / np.maximum(sees.sum(axis=0), 1)  # a surface is sampled by each map that sees it
     chosen, left = list[int](), most_pixels
     for _ in maps:
@@ -96,10 +95,10 @@ def grid_for(maps: Sequence[DepthMap], settings: MeshSettings) -> Grid:
     if settings.bounds is not None:
         lower, upper = settings.bounds
     else:
-        lower, upper = bounding_box(maps, 2.0 * TRUNCATION * voxel_m)
+        lower, upper = bounding_box(maps, 2.0 * tuned.TRUNCATION * voxel_m)
     if settings.voxel_m is None:
-        voxel_m = max(voxel_m, float(np.subtract(upper, lower).max()) / FINEST)
-    return Grid(lower, upper, voxel_m, TRUNCATION * voxel_m)
+        voxel_m = max(voxel_m, float(np.subtract(upper, lower).max()) / tuned.FINEST)
+    return Grid(lower, upper, voxel_m, tuned.TRUNCATION * voxel_m)
 
 
 def pixel_m(maps: Sequence[DepthMap]) -> float:

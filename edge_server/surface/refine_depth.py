@@ -19,22 +19,11 @@ from numpy.typing import NDArray
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.surface import SurfaceError
+from edge_server.surface import settings as tuned
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.patch_images import Images, Planes, Search, View
 from edge_server.surface.kernels.patch_match import SOURCES, WORST, choose_sources, confirm, match, offer
 from freshfield.geometry import seen_from
-
-REACH = 0.18  # how far to each side depth is searched, as a share of the initial depth
-GAIN_POINTS, LEAST_SHARED = 500, 50  # points of an image; fewest that two must share to compare brightness
-GAIN_WITHIN = 0.05  # tolerance of the initial depth, share of the distance
-SAME_GAIN, MOST_GAIN = 0.03, 0.7  # logarithms of the least and the largest correction
-SMOOTH_PX = 2.5  # sigma of the Gaussian blur for initial normals
-CONFIRMED = 0.004  # tolerance of another map's surface, share of the distance, plus one pixel
-OFFERED = 0.6  # largest cost of a plane that is tried in other maps
-CHEAP, DEAR = 0.3, 1.2  # trust falls from 1 to 0 between these costs of a plane
-UNSURE = 0.05  # factor of the trust of a pixel whose depth the images do not determine
-PLAIN = 0.0005  # rise of the cost a pixel's width away, below which they hardly determine it
-NOTHING = 1e-5  # ... below which they do not, and the field's depth stays
 
 
 @dataclass(frozen=True)
@@ -52,12 +41,12 @@ class Phase:
 
 
 PHASES = (
-    Phase(Search(4, REACH, 0.02, 0.4, 0.0), choose=True),
-    Phase(Search(4, REACH, 0.02, 0.4, 0.0)),
-    Phase(Search(4, REACH, 0.01, 0.3, 0.0), choose=True, offer="cheapest"),
-    Phase(Search(2, REACH, 0.005, 0.2, 0.0), offer="nearest"),
-    Phase(Search(0, REACH, 0.005, 0.2, 0.1), choose=True, offer="cheapest"),
-    Phase(Search(0, REACH, 0.002, 0.1, 0.1), choose=True, offer="nearest"),
+    Phase(Search(4, tuned.REACH, 0.02, 0.4, 0.0), choose=True),
+    Phase(Search(4, tuned.REACH, 0.02, 0.4, 0.0)),
+    Phase(Search(4, tuned.REACH, 0.01, 0.3, 0.0), choose=True, offer="cheapest"),
+    Phase(Search(2, tuned.REACH, 0.005, 0.2, 0.0), offer="nearest"),
+    Phase(Search(0, tuned.REACH, 0.005, 0.2, 0.1), choose=True, offer="cheapest"),
+    Phase(Search(0, tuned.REACH, 0.002, 0.1, 0.1), choose=True, offer="nearest"),
 )
 
 
@@ -106,12 +95,12 @@ def exposures(maps: Sequence[DepthMap], grays: Sequence[NDArray[np.float32]]) ->
     pairs, ratios = [], []
     for k, found in enumerate(maps):
         at = np.flatnonzero(found.seen)
-        at = at[:: max(1, len(at) // GAIN_POINTS)]
-        points = found.points()[:: max(1, int(found.seen.sum()) // GAIN_POINTS)]
+        at = at[:: max(1, len(at) // tuned.GAIN_POINTS)]
+        points = found.points()[:: max(1, int(found.seen.sum()) // tuned.GAIN_POINTS)]
         own = grays[k].ravel()[at]
         for j, other in enumerate(maps):
-            both = on_surface(other, points, GAIN_WITHIN) if j != k else np.zeros(0, np.bool_)
-            if both.sum() < LEAST_SHARED:
+            both = on_surface(other, points, tuned.GAIN_WITHIN) if j != k else np.zeros(0, np.bool_)
+            if both.sum() < tuned.LEAST_SHARED:
                 continue
             _, at_other, _ = seen_from(other.intrinsics, other.camera_to_world, points[both])
             column, row = at_other.astype(np.int64).T
@@ -125,7 +114,9 @@ def exposures(maps: Sequence[DepthMap], grays: Sequence[NDArray[np.float32]]) ->
         right[j] += ratio
         right[k] -= ratio
     log_gain = np.linalg.solve(system, right) if len(maps) else right
-    return np.where(np.abs(log_gain) > SAME_GAIN, np.exp(np.clip(log_gain, -MOST_GAIN, MOST_GAIN)), 1.0)
+    return np.where(
+        np.abs(log_gain) > tuned.SAME_GAIN, np.exp(np.clip(log_gain, -tuned.MOST_GAIN, tuned.MOST_GAIN)), 1.0
+    )
 
 
 def on_surface(found: DepthMap, points: NDArray[np.float64], within: float) -> NDArray[np.bool_]:
@@ -146,8 +137,8 @@ def smooth_normals(depth: NDArray[np.float32], rays: NDArray[np.float64]) -> NDA
     known points: the plane that best fits the pixels around each."""
     known = depth > 0
     points = rays * depth[..., None].astype(np.float64)
-    weight = cv2.GaussianBlur(known.astype(np.float64), (0, 0), SMOOTH_PX)
-    smooth = cv2.GaussianBlur(points, (0, 0), SMOOTH_PX) / np.maximum(weight, 1e-6)[..., None]
+    weight = cv2.GaussianBlur(known.astype(np.float64), (0, 0), tuned.SMOOTH_PX)
+    smooth = cv2.GaussianBlur(points, (0, 0), tuned.SMOOTH_PX) / np.maximum(weight, 1e-6)[..., None]
     normal = np.cross(np.gradient(smooth, axis=1), np.gradient(smooth, axis=0))
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = np.where(length > 0, normal / np.where(length > 0, length, 1.0), -rays)
@@ -197,7 +188,7 @@ def _images(maps: Sequence[DepthMap], grays: Sequence[NDArray[np.float32]], plan
 def _offers(images: Images, views: Sequence[View], planes: Sequence[Planes], which: str, pool: Pool) -> list[Planes]:
     """For every map, planes of other maps to try, see ``Phase``."""
     none = [Planes(np.zeros_like(p.depth), p.normal, p.cost) for p in planes]
-    sure = [(p.depth > 0) & (p.cost < OFFERED) for p in planes]
+    sure = [(p.depth > 0) & (p.cost < tuned.OFFERED) for p in planes]
     if not which or not any(s.any() for s in sure):
         return none
     points = np.concatenate(
@@ -230,20 +221,20 @@ def _with_trust(found: DepthMap, view: View, planes: Planes, images: Images, poo
     shape = planes.depth.shape
     agree, against = np.zeros(shape, np.int16), np.zeros(shape, np.int16)
     rise = np.zeros(shape, np.float32)
-    pool.run(confirm, images, view, planes, CONFIRMED, agree, against, rise)
+    pool.run(confirm, images, view, planes, tuned.CONFIRMED, agree, against, rise)
     compared = view.chosen[..., 0] >= 0
-    alike = np.clip((DEAR - planes.cost) / (DEAR - CHEAP), 0.0, 1.0)
+    alike = np.clip((tuned.DEAR - planes.cost) / (tuned.DEAR - tuned.CHEAP), 0.0, 1.0)
     sure = alike * np.minimum(0.4 + 0.2 * agree, 1.0) * ((agree > 0) & (agree >= against))
     # Images may agree by being flat; then only the field knows.
-    sure = np.where(rise >= PLAIN, sure, np.minimum(sure, UNSURE))
+    sure = np.where(rise >= tuned.PLAIN, sure, np.minimum(sure, tuned.UNSURE))
     # What no other camera sees, and what they show flat, stays as the field has it.
-    compared &= np.abs(rise) > NOTHING
+    compared &= np.abs(rise) > tuned.NOTHING
     kept = np.where(compared, sure > 0.0, found.seen)
     depth = np.where(compared, planes.depth, np.where(found.seen, found.depth, np.float32(0.0)))
     cosine = -(planes.normal * view.rays).sum(axis=-1)
     cosine = np.where(compared, np.maximum(cosine, 0.0), found.cosine)
     empty = np.isposinf(found.depth)
-    trust = np.where(compared, sure, np.float32(UNSURE)) * cosine
+    trust = np.where(compared, sure, np.float32(tuned.UNSURE)) * cosine
     return replace(
         found,
         depth=np.where(kept, depth, np.where(empty, np.inf, 0.0)).astype(np.float32),

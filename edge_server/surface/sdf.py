@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.surface import SurfaceError, settings
+from edge_server.surface import settings as tuned
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.fuse import CELLS, SIDE
 from edge_server.surface.volume import Grid, Volume, fuse_maps
-
-MAX_NODES = 1 << 24
 
 
 def fit_sdf(grid: Grid, maps: Sequence[DepthMap], say: Callable[[str, float], None] | None = None) -> Volume:
@@ -35,8 +34,8 @@ def fit_sdf(grid: Grid, maps: Sequence[DepthMap], say: Callable[[str, float], No
     if not len(samples[0]):
         raise SurfaceError("no camera sees anything solid within the bounds")
     nodes = int(np.prod(grid.blocks * SIDE))
-    if nodes > MAX_NODES:
-        least = grid.voxel_m * (nodes / MAX_NODES) ** (1 / 3)
+    if nodes > tuned.MAX_NODES:
+        least = grid.voxel_m * (nodes / tuned.MAX_NODES) ** (1 / 3)
         raise SurfaceError(
             f"a distance function at {1e3 * grid.voxel_m:g} mm has too many nodes: take {1e3 * least:.2g} mm "
             "or more, smaller bounds, or method tsdf"

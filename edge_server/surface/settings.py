@@ -1,4 +1,4 @@
-"""Settings of meshes, and numbers of the distance function."""
+"""Settings of meshes, and numbers that no option sets."""
 
 from __future__ import annotations
 
@@ -7,14 +7,45 @@ from dataclasses import dataclass
 from edge_server.surface import SurfaceError
 
 METHODS = ("tsdf", "sdf")
-MIN_WEIGHT = 0.2  # of a known voxel; a camera at normal incidence counts 1
-MOST_VOXELS = 1 << 27  # of the box around the blocks: 512 MB of distances, and up to 3.2 GB if all lie near a surface
+
+# --- depth maps (depth, reconstruct) ---
+SOLID = 0.8  # minimum opacity of a ray that hits a surface
+EMPTY = 0.1  # maximum opacity of a ray that hits nothing
+EMPTY_TRUST = 0.25  # of a pixel whose ray hits nothing; 1 is a surface at normal incidence
+MAX_DEPTH_M = 1e6  # larger depths are invalid
+STEEPEST_DEG = 80.0  # maximum angle between ray and normal; beyond it is an edge, or unreliable
+GUESS = 0.5  # minimum opacity of a surface as initial depth for refinement
+FINEST = 512  # maximum voxels along the longest side without a given voxel size
+
+# --- sharpening by photo-consistency (refine_depth) ---
 SHARPENED_PIXELS = 10_000_000  # of all maps that are sharpened: seven minutes of processor time, 41 s a million
 COVERING_POINTS = 200  # of a map, by which is chosen what to sharpen
-# The distance function: grids, each twice as fine as the last; Adam's steps and samples of each kind on each of them,
-# and its learning rate in voxels; lambda of (3.15), and the weight of the third term.
+REACH = 0.18  # how far to each side depth is searched, as a share of the initial depth
+GAIN_POINTS, LEAST_SHARED = 500, 50  # points of an image; fewest that two must share to compare brightness
+GAIN_WITHIN = 0.05  # tolerance of the initial depth, share of the distance
+SAME_GAIN, MOST_GAIN = 0.03, 0.7  # logarithms of the least and the largest correction
+SMOOTH_PX = 2.5  # sigma of the Gaussian blur for initial normals
+CONFIRMED = 0.004  # tolerance of another map's surface, share of the distance, plus one pixel
+OFFERED = 0.6  # largest cost of a plane that is tried in other maps
+CHEAP, DEAR = 0.3, 1.2  # trust falls from 1 to 0 between these costs of a plane
+UNSURE = 0.05  # factor of the trust of a pixel whose depth the images do not determine
+PLAIN = 0.0005  # rise of the cost a pixel's width away, below which they hardly determine it
+NOTHING = 1e-5  # ... below which they do not, and the field's depth stays
+
+# --- fusion and meshes (volume, sdf, mesh) ---
+MIN_WEIGHT = 0.2  # of a known voxel; a camera at normal incidence counts 1
+MOST_VOXELS = 1 << 27  # of the box around the blocks: 512 MB of distances, and up to 3.2 GB if all lie near a surface
+MAX_BLOCKS = 1 << 24  # in the table of blocks: 24 bytes each during fusion
+TRUNCATION = 4.0  # voxels
+OUTLIERS = 0.002  # share of points at each end of each axis
+MAX_NODES = 1 << 24  # of the distance function's finest grid
+LEAST = 1e-3  # voxels; a distance of exactly 0 puts a vertex on a voxel and makes degenerate triangles
+KEEP_SHARE = 0.002  # share of the largest component's area; smaller components are removed
+# The distance function (sdf): grids, each twice as fine as the last; Adam's steps and samples of each kind on each of
+# them, and its learning rate in voxels; lambda of (3.15), and the weight of the third term.
 SDF_LEVELS, SDF_STEPS, SDF_POINTS, SDF_RATE = 3, 60, 20_000, 0.1
 SDF_EIKONAL, SDF_SIDES = 0.1, 1.0
+
 Corner = tuple[float, float, float]
 
 

@@ -16,13 +16,10 @@ from numpy.typing import NDArray
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.surface import SurfaceError
+from edge_server.surface import settings as tuned
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.fuse import CELLS, FAR, SIDE, Blocks, KernelDepth, fuse
 from edge_server.surface.settings import MOST_VOXELS
-
-MAX_BLOCKS = 1 << 24  # in the table of blocks: 24 bytes each during fusion
-TRUNCATION = 4.0  # voxels
-OUTLIERS = 0.002  # share of points at each end of each axis
 
 
 @dataclass(frozen=True)
@@ -48,8 +45,8 @@ class Grid:
         if not all(low < high for low, high in zip(self.lower, self.upper)):
             raise SurfaceError(f"bounds: each lower corner must be below its upper one: {self.describe()}")
         entries = np.prod(self.blocks.astype(float))
-        if entries > MAX_BLOCKS:
-            least = self.voxel_m * (entries / MAX_BLOCKS) ** (1 / 3)
+        if entries > tuned.MAX_BLOCKS:
+            least = self.voxel_m * (entries / tuned.MAX_BLOCKS) ** (1 / 3)
             raise SurfaceError(
                 f"{1e3 * self.voxel_m:g} mm voxels are too many in {self.describe()}: "
                 f"take {1e3 * least:.2g} mm or more, or smaller bounds"
@@ -84,7 +81,7 @@ def bounding_box(
     every = np.concatenate(points) if points else np.zeros((0, 3))
     if not len(every):
         raise SurfaceError("no camera sees anything solid: fit the field longer")
-    low, high = np.quantile(every, [OUTLIERS, 1.0 - OUTLIERS], axis=0)
+    low, high = np.quantile(every, [tuned.OUTLIERS, 1.0 - tuned.OUTLIERS], axis=0)
     a, b = low - margin_m, high + margin_m
     return (float(a[0]), float(a[1]), float(a[2])), (float(b[0]), float(b[1]), float(b[2]))
 

@@ -14,15 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import ViewpointError
+from edge_server.viewpoints.settings import LEAST_ODDS, WIDTHS
 
 Array = NDArray[np.float64]
 
-# Widths of the prior (standard deviations of the weights) that the evidence chooses from. By the scale of the
-# features, a width is also the standard deviation of the reward difference of a usual pair.
-WIDTHS = (0.1, 0.3, 1.0, 3.0, 10.0)
-# Odds against a coin from which on answers count as informative. Answers by a coin reach them at most once in
-# this many times (Markov's inequality, for exact evidence).
-LEAST_ODDS = 10.0
 _NEWTON_STEPS = 50
 _UNBIASED = 3
 _NODES, _NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(15)

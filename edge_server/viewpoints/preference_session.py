@@ -17,14 +17,10 @@ from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.preference_model import Answer, RewardModel, fit_reward, next_pair
+from edge_server.viewpoints.settings import REMEMBERED, REPEAT_EVERY
 
 KIND: Literal["freshfield preference answers"] = "freshfield preference answers"
 PERSON = "person"
-# After this many questions an earlier pair is repeated with its sides swapped: that reveals who answers by
-# the side, or by chance.
-REPEAT_EVERY = 6
-# ... but none of the last ones, which people remember.
-_REMEMBERED = 2
 Choice = Literal["left", "right", "neither"]
 _SWAPPED = {"left": "right", "right": "left", "neither": "neither"}
 
@@ -114,7 +110,7 @@ class PreferenceSession:
         again = {a.repeats for a in self.answers}
         new = [k for k, a in enumerate(self.answers) if a.repeats is None and k not in again]
         if n % REPEAT_EVERY == REPEAT_EVERY - 1 and new:
-            k = int(rng.choice(new[: max(len(new) - _REMEMBERED, 1)]))
+            k = int(rng.choice(new[: max(len(new) - REMEMBERED, 1)]))
             return Question(self.answers[k].right, self.answers[k].left, k)
         pair = next_pair(self.model, self.features, rng)
         # Both orders of a pair are equally informative up to rounding, which would put the better one left.

@@ -32,3 +32,16 @@ PRIOR = 1.0
 """Prior information about a parameter, as a share of what the views give on average over all Gaussians: that has the
 parameter's unit, and bounds the value of an unseen Gaussian. With a share of .01 the views go to the edge of the dome:
 on four captures of ``tile``, 8 views gave 19.8 dB, and with 1, 22.2 dB."""
+
+# Preferences: how people are asked, and what their answers tell.
+REPEAT_EVERY = 6
+"""After so many questions an earlier pair is repeated with its sides swapped: that reveals who answers by the side, or
+by chance."""
+REMEMBERED = 2
+"""Of the latest pairs, which people remember, none is repeated."""
+WIDTHS = (0.1, 0.3, 1.0, 3.0, 10.0)
+"""Of the prior (standard deviations of the weights), that the evidence chooses from. By the scale of the features, a
+width is also the standard deviation of the reward difference of a usual pair."""
+LEAST_ODDS = 10.0
+"""Against a coin, from which on answers count as informative. Answers by a coin reach them at most once in so many
+times (Markov's inequality, for exact evidence)."""

@@ -13,7 +13,8 @@ from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels import patch_match
 from edge_server.surface.kernels.patch_images import Images, Planes, View
 from edge_server.surface.reconstruct import covering_maps
-from edge_server.surface.refine_depth import REACH, UNSURE, exposures, refine_depth, smooth_normals
+from edge_server.surface.refine_depth import exposures, refine_depth, smooth_normals
+from edge_server.surface.settings import REACH, UNSURE
 from freshfield.geometry import Pinhole, look_at, world_rays
 
 LENS = Pinhole.from_fov(72, 72, 45.0)

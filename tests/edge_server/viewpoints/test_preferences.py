@@ -11,7 +11,8 @@ from edge_server.viewpoints.candidates import ViewpointError, half_hemisphere
 from edge_server.viewpoints.experts import SimulatedExpert
 from edge_server.viewpoints.features import GEOMETRY, StepFeatures
 from edge_server.viewpoints.preference_model import Answer, fit_reward, next_pair
-from edge_server.viewpoints.preference_session import REPEAT_EVERY, PreferenceSession, Question
+from edge_server.viewpoints.preference_session import PreferenceSession, Question
+from edge_server.viewpoints.settings import REPEAT_EVERY
 from freshfield.geometry import Pinhole
 
 DOME = half_hemisphere((0, 0, 0), 1.0, Pinhole.from_fov(16, 16, 50.0), 40)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from camera_node.robot.arm.kinematics import UR3E
-from camera_node.robot.teleop.mapping import Mapping, OneEuro
+from camera_node.robot.teleop.mapping import Mapping
+from camera_node.robot.teleop.one_euro_filter import OneEuro
 from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.stylus import StylusSample
 from camera_node.robot.teleop.teleoperator import commanded_twist, joint_speeds
