@@ -9,10 +9,10 @@ from concurrent import futures
 import grpc
 import pytest
 
-from channel_emu.live import proxy
+from channel_emu.live import call_flow, proxy
 from channel_emu.model import trace
 from channel_emu.testing import EmulatedLink, channel
-from tests.support import refused
+from tests.support import refused, wait_until
 
 assert channel  # the fixture; where a conftest.py lists the plugin, no import is needed
 pytest_plugins = ["pytester"]
@@ -176,6 +176,17 @@ def test_cancellation_reaches_the_service_and_frees_the_link(channel, greeter, c
     report = link.settle()
     assert report.offered < 100 and report.in_flight == 0
     assert report.delivered == report.outcomes["forwarded"] + report.outcomes.get("cancelled", 0)
+
+
+def test_behind_a_message_in_the_link_no_more_are_read_than_the_bound(channel, greeter, client, monkeypatch):
+    monkeypatch.setattr(call_flow, "_MOST_BEHIND", 10)
+    link = channel({"service": "det:300ms", "discipline": "fcfs", "queue_limit": 1000}, to=greeter.address)
+    answers = client(link).stream_stream(ECHO)(paced(100, 0.0), timeout=20)
+    wait_until(lambda: link.report().offered == 10, "messages do not come")
+    time.sleep(0.1)
+    assert link.report().offered == 10
+    assert next(answers) == b"0"
+    wait_until(lambda: link.report().offered == 11, "it does not go on")
 
 
 def test_no_service_and_a_link_that_failed_say_so_and_it_still_closes(channel, client):

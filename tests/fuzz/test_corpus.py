@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 
 from camera_node.settings import source_config
-from channel_emu.live.frame_proxy import damage_payload
 from channel_emu.model.settings import channel_from_mapping
 from edge_server.fields import checkpoint
 from edge_server.live.buffer import FrameBuffer
@@ -27,7 +26,7 @@ from edge_server.settings import read_config
 from freshfield import payload, scenario
 from freshfield.clock import VirtualClock
 from freshfield.depth import DepthImage, EncodedDepth
-from freshfield.frame import FrameRejected, checksum, counted_ids, parse, to_request
+from freshfield.frame import FrameRejected, checksum, parse, to_request
 from freshfield.geometry import Pinhole
 from freshfield.session import SessionError
 from freshfield.v1 import frames_pb2 as pb
@@ -36,7 +35,6 @@ from tests.support import work_ms
 
 CORPUS = Path(__file__).parent / "corpus"
 NOW = 10**18
-CAMERAS = ("cam00", "cam01")
 Target = Callable[[bytes], str]
 """Takes one input; returns what became of it, in a word, and raises what must never be raised."""
 
@@ -55,21 +53,6 @@ def request(folder: Path) -> Target:
         clock.advance_to(clock.now_ns() + 10**6)
         mended = ingest.take(data)
         return (plain.reason and mended.reason) or "accepted"
-
-    return take
-
-
-def header(folder: Path) -> Target:
-    """A message at the emulator, which reads the header alone and may damage the payload."""
-
-    def take(data: bytes) -> str:
-        try:
-            found = parse(data).header
-        except FrameRejected as error:
-            return error.reason
-        counted_ids(found, CAMERAS)
-        parse(damage_payload(data, ((0.5, 1), (0.999, 255))))
-        return "read"
 
     return take
 
@@ -164,14 +147,13 @@ def mcap(folder: Path) -> Target:
 
 TARGETS: dict[str, Callable[[Path], Target]] = {
     "request": request,
-    "header": header,
     "payload": pixels,
     "depth": depths,
     "scenario": scenarios,
     "checkpoint": checkpoints,
     "mcap": mcap,
 }
-MOST_MS = {"request": 50.0, "header": 50.0, "payload": 200.0, "depth": 50.0}
+MOST_MS = {"request": 50.0, "payload": 200.0, "depth": 50.0}
 """Of one input's processor time: what a loop with other callers may be kept; a file may take MOST_FILE_MS."""
 MOST_FILE_MS = 2000.0
 PNG = payload.encode(np.zeros((2, 2, 3), np.uint8), "png")
@@ -226,7 +208,6 @@ def _sessions() -> Iterable[bytes]:
 
 _HONEST: dict[str, Callable[[], Iterable[bytes]]] = {
     "request": _messages,
-    "header": _messages,
     "payload": _payloads,
     "depth": _depths,
     "checkpoint": _checkpoints,
@@ -235,7 +216,7 @@ _HONEST: dict[str, Callable[[], Iterable[bytes]]] = {
 }
 
 
-HONEST = {"request": 3, "header": 2, "payload": 3, "depth": 2, "scenario": 15, "checkpoint": 1, "mcap": 1}
+HONEST = {"request": 3, "payload": 3, "depth": 2, "scenario": 15, "checkpoint": 1, "mcap": 1}
 ACCEPTED = ("accepted", "read", "jpeg", "png", "zstd", "depth", "2 cameras")
 
 

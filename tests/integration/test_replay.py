@@ -6,7 +6,6 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from camera_node.capture import Camera, ShotCache, build_cameras
@@ -17,10 +16,8 @@ from edge_server.live.ingest import Ingest
 from edge_server.live.output.recorder import Recorder
 from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.settings import read_config
-from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.frame import Frame, to_request
-from freshfield.geometry import Pinhole, Pose
 from freshfield.ledger import Ledger
 from freshfield.scenario import parse
 from freshfield.transport import Transport
@@ -142,16 +139,28 @@ def test_cameras_may_be_renamed_or_wrong(session, tmp_path):
         refused(ValueError, why, camera_of, wrong)
 
 
-def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
-    pose = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    data = payload.encode(np.zeros((24, 32, 3), np.uint8))
-    writer = SessionWriter(tmp_path / "a.mcap", {})
-    lens = Pinhole(32, 24, 40.0, 40.0, 16.0, 12.0)
-    for session, sequence, at_ms in (("a", 0, 1000), ("a", 1, 2000), ("b", 0, 1500), ("b", 1, 3000)):
-        at_ns = at_ms * 1_000_000
-        frame = Frame("cam01", session, sequence, at_ns, pose, lens, "jpeg", data)
-        writer.frame(to_request(frame), at_ns + 5)
+def recorded(camera: Camera, file: Path, stamps: list[tuple[str, int, int]]) -> list[pb.PushRequest]:
+    """Frames of a camera, written to a session. stamps: of each, session, number, milliseconds."""
+    writer, sent = SessionWriter(file, {}), []
+    for k, (session, sequence, at_ms) in enumerate(stamps):
+        shot, at_ns = camera.capture(k), at_ms * 1_000_000
+        frame = Frame("cam01", session, sequence, at_ns, shot.pose, shot.intrinsics, "jpeg", shot.payload)
+        sent.append(to_request(replace(frame, depth=shot.encoded_depth)))
+        writer.frame(sent[-1], at_ns + 5)
     writer.close({})
+    return sent
+
+
+STAMPS = [("s", k, 100 * k + 1000) for k in range(4)]
+
+
+def depth_camera(depth_every: int = 1, **more) -> Camera:
+    return Camera(DepthSource("cam01", 4, **more), WorldConfig(kind="world"), ShotCache(10**6), depth_every=depth_every)
+
+
+def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
+    stamps = [("a", 0, 1000), ("a", 1, 2000), ("b", 0, 1500), ("b", 1, 3000)]
+    recorded(depth_camera(), tmp_path / "a.mcap", stamps)
     scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam01": "cam01", "cam02": "y"})
     with caplog.at_level(logging.WARNING):
         camera = camera_of(scenario)
@@ -160,23 +169,9 @@ def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
     assert [schedule.due_ns(k) - 7 for k in range(3)] == [0, 10**9, 2 * 10**9] and schedule.next(2, 0) == (None, 0)
 
 
-def recorded(camera: Camera, file: Path, count: int) -> list[pb.PushRequest]:
-    """Frames of a camera, written to a session."""
-    writer, sent = SessionWriter(file, {}), []
-    for k in range(count):
-        shot, at_ns = camera.capture(k), (k + 10) * 10**8
-        frame = Frame("cam01", "s", k, at_ns, shot.pose, shot.intrinsics, "jpeg", shot.payload)
-        sent.append(to_request(replace(frame, depth=shot.encoded_depth)))
-        writer.frame(sent[-1], at_ns + 5)
-    writer.close({})
-    return sent
-
-
 def test_a_recorded_run_replays_with_its_depth(tmp_path):
     """As it came, also where it belongs to another instant; what shows a held-out camera sends none."""
-    source = DepthSource("cam01", 4, after_image_ns=-40_000_000)
-    camera = Camera(source, WorldConfig(kind="world"), ShotCache(10**6), depth_every=2)
-    sent = recorded(camera, tmp_path / "a.mcap", 4)
+    sent = recorded(depth_camera(2, after_image_ns=-40_000_000), tmp_path / "a.mcap", STAMPS)
     scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam02": "y"})
     got = sent_by(scenario, ["cam01"])
     assert [said(request) for request in got] == [said(request) for request in sent]
@@ -189,8 +184,8 @@ def test_a_recorded_run_replays_with_its_depth(tmp_path):
 @pytest.mark.stability
 def test_depth_that_cannot_be_read_again_costs_only_the_depth(tmp_path):
     """The file is damaged after it was opened: within, checksums leave whole chunks out."""
-    camera = Camera(DepthSource("cam01", 2), WorldConfig(kind="world"), ShotCache(10**6), depth_every=1)
-    recorded(camera, tmp_path / "a.mcap", 2)
+    camera = depth_camera()
+    recorded(camera, tmp_path / "a.mcap", STAMPS[:2])
     scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam02": "y"})
     replayed = camera_of(scenario)
     location = Session(tmp_path / "a.mcap").frames["cam01"][0].depth_location

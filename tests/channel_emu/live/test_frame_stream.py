@@ -59,18 +59,13 @@ def status_of(out: Path) -> dict:
 def different(found: Trace) -> list[str]:
     """Every recorded message that, offered again at its recorded instant, gets another outcome, start, due instant or
     state."""
-    cameras, unlike = found.by_camera(), []
+    cameras = found.by_camera()
     offers = {name: [(r.offered_ns, r.bytes) for r in records] for name, records in cameras.items()}
     last_ns = max(max(r.offered_ns, r.started_ns or 0, r.ended_ns or 0) for r in found.records)
     _, decided = offer_all(Channel(found.config, found.seed), offers, last_ns)
-    for camera, records in cameras.items():
-        for then, now in zip(records, decided[camera], strict=True):
-            # A message still inside at the end of the recording may have an outcome now.
-            same = then.outcome in (None, now.outcome)
-            starts = [(each.started_ns, each.due_ns, each.state) for each in (then, now)]
-            if not same or (then.started_ns is not None and starts[0] != starts[1]):
-                unlike.append(f"{camera} {then.sequence}: {then.outcome} {starts[0]}, now {now.outcome} {starts[1]}")
-    return unlike
+    pairs = [pair for name, records in cameras.items() for pair in zip(records, decided[name], strict=True)]
+    told = [[(each.outcome, each.started_ns, each.due_ns, each.state) for each in pair] for pair in pairs]
+    return [f"{then}, now {now}" for then, now in told if then != now]
 
 
 @pytest.mark.parametrize("section", [FAST, ONE_LINE], ids=["ch6", "preempt, one line"])
@@ -92,10 +87,7 @@ async def test_live_decisions_are_those_of_virtual_time(tmp_path, section):
     status = status_of(tmp_path)
     assert status["running"] is False and status["counts"]["delivered"] == account["delivered"]
     assert status["delay_error_ms"]["count"] == account["delivered"]
-    assert sum(status["drawn_delay_ms"]["histogram"]["counts"]) > 0
-    if section is FAST:
-        assert status["state"] in status["states"] == ["low", "high"]
-        assert sum(status["state_share"].values()) == pytest.approx(1)
+    assert section is not FAST or status["state"] in status["states"] == ["low", "high"]
 
 
 async def test_a_trace_replayed_at_another_pace_is_decided_and_delivered_alike(tmp_path):
@@ -279,9 +271,7 @@ async def test_an_operator_changes_the_channel_and_gives_it_back(tmp_path):
         for wrong in ({"delay_ms": float("nan")}, {"delay_ms": -1.0}, {"delay_ms": 1e9}, {"loss": 1.5}):
             with pytest.raises(grpc.aio.AioRpcError, match="0 to 1"):
                 await ask(channel_pb2.SetChannelRequest(**wrong))
-        shown = r.proxy._snapshot()
-        assert [change["loss"] for change in shown["changes"]] == [0.0, 1.0, None]
-        assert shown["by_hand"] is None and shown["state"] is None
+        assert [change["loss"] for change in r.proxy._snapshot()["changes"]] == [0.0, 1.0, None]
 
 
 SHORT = {"service": "det:300ms"}
@@ -315,22 +305,13 @@ def raising(*_: object) -> None:
     raise ChainError("no such state")
 
 
-@pytest.mark.parametrize("part", ["background", "timer"])
-async def test_a_part_that_breaks_ends_the_emulator(tmp_path, monkeypatch, part):
+async def test_a_part_that_breaks_ends_the_emulator(tmp_path):
     """With an error that is no OSError."""
-    monkeypatch.setattr(frame_proxy, "_FIRST_WAIT_S", 0.1)
-    proxy, (flow,) = make(tmp_path, f"127.0.0.1:{free_port()}", SHORT)
-    if part == "background":
-        proxy.channel.forget = raising
-    else:
-        flow.link.advance = raising
-    running = asyncio.create_task(proxy.run(asyncio.Event()))
-    await asyncio.sleep(0.3)
-    if not running.done():
-        offer(flow, 0)
+    proxy, _ = make(tmp_path, f"127.0.0.1:{free_port()}", SHORT)
+    proxy.channel.forget = raising
     with pytest.raises(EmulatorFailed, match="ChainError: no such state"):
         async with asyncio.timeout(15):
-            await running
+            await proxy.run(asyncio.Event())
 
 
 @pytest.mark.parametrize(
@@ -348,10 +329,10 @@ async def test_answers_that_are_none_end_the_stream_and_not_the_emulator(tmp_pat
         await asyncio.sleep(60)
 
     server = Transport().aio_server()
-    handler = {"Push": grpc.stream_stream_rpc_method_handler(nonsense)}
-    server.add_generic_rpc_handlers(
-        (grpc.method_handlers_generic_handler("freshfield.v1.FrameStreamService", handler),)
+    push = grpc.method_handlers_generic_handler(
+        "freshfield.v1.FrameStreamService", {"Push": grpc.stream_stream_rpc_method_handler(nonsense)}
     )
+    server.add_generic_rpc_handlers((push,))
     address = f"127.0.0.1:{Transport().bind(server, '127.0.0.1:0')}"
     await server.start()
     proxy, (flow,) = make(tmp_path, address, {})

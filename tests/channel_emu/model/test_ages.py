@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
-from scipy.linalg import expm
 
 from channel_emu.model.ages import RunningAge
 from channel_emu.model.settings import channel_from_mapping
@@ -101,21 +100,6 @@ def mm1_fcfs(lam: float, other: float, mu: float) -> float:
     return lam * (1 / lam**2 + workload + 1 / (lam * mu))
 
 
-def gilbert_elliott(a: float, b: float, loss: tuple[float, float], period: float, delay: float) -> tuple[float, float]:
-    """Mean and peak age of periodic frames that each take ``delay``, lost with the probability of the state.
-
-    N frames from one delivery to the next: with P the chain's change over a period, F = P diag(loss) and
-    G = P diag(1 - loss), alpha = alpha (I - F)^-1 G is the state at a delivery; E[N] = alpha (I - F)^-1 1,
-    E[N²] = alpha (I + F) (I - F)^-2 1. Age: delay + C E[N²] / (2 E[N]); peak: delay + C E[N].
-    """
-    p = expm(np.array([[-a, a], [b, -b]]) * period)
-    f, g = p * np.array(loss), p * (1 - np.array(loss))
-    r = np.linalg.inv(np.eye(2) - f)
-    alpha = np.linalg.matrix_power(r @ g, 1000)[0]
-    first, second = alpha @ r @ np.ones(2), alpha @ (np.eye(2) + f) @ r @ r @ np.ones(2)
-    return delay + period * second / (2 * first), delay + period * first
-
-
 LOGNORMAL = dg1_drop_new(1.0, 1.5, stats.lognorm(0.8, scale=1.5 * np.exp(-0.32)).sf)
 THESIS = dg1_drop_new(30.0, 60.0, stats.expon(scale=60.0).sf)
 # Arrivals, service, discipline, seconds, exact mean age, exact peak age where known.
@@ -156,16 +140,3 @@ def test_several_sources_at_one_server(discipline, form):
         came = [(t.ended_ns, t.offered_ns) for run in group for t in run.transits if t.outcome == "delivered"]
         age = RunningAge(sorted(came)).mean_age_ms(group[0].end_ns)
         assert age == pytest.approx(form(mine, other, mu), rel=TOLERANCE)
-
-
-def test_losses_by_state():
-    """Gilbert and Elliott's channel: the mean age and peak age that bursts of losses leave."""
-    age, peak = gilbert_elliott(1 / 200, 1 / 70, (0.05, 0.7), 30.0, 20.0)
-    section = {"arrivals": "periodic:30ms", "service": "det:20ms", "discipline": "parallel"}
-    section |= {"chain": "mu1=1/200,mu2=1/70", "faults": {"loss": [0.05, 0.7]}}
-    found = simulate(channel_from_mapping(section), 1, 1800, seed=5).summary()
-    assert found["mean_age_ms"] == pytest.approx(age, rel=TOLERANCE)
-    assert found["peak_age_ms"] == pytest.approx(peak, rel=TOLERANCE)
-    section["faults"] = {"loss": 0.05 * 20 / 27 + 0.7 * 7 / 27}  # as many losses, but not in bursts
-    found = simulate(channel_from_mapping(section), 1, 600, seed=5).summary()
-    assert found["mean_age_ms"] != pytest.approx(age, rel=TOLERANCE)

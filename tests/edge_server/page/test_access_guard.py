@@ -192,9 +192,6 @@ def test_a_foreign_web_site_reaches_nothing() -> None:
             Visitor(page.port, headers=[f"Host: {foreign}"])
         with pytest.raises(websocket.WebSocketBadStatusException):
             websocket.create_connection(f"ws://{own}", origin="http://evil.example", timeout=10)
-    port = free_port()
-    serve_metrics(bare_state(), INGEST, "127.0.0.1", port)
-    assert get(port, "/metrics")[0] == 200 and get(port, "/metrics", Host=foreign)[0] == 403
 
 
 def test_a_flood_of_refused_requests_and_visitors_is_counted_and_said_once_a_minute(caplog, monkeypatch) -> None:
@@ -250,21 +247,19 @@ def test_a_visitor_sets_values_of_controls_and_nothing_else() -> None:
             visitor.send("GuiUpdateMessage", uuid=handles[label]._impl.uuid, updates=updates)
             time.sleep(0.06)
         visitor.send("GuiUpdateMessage", uuid="another", updates={"value": True})
-        for kind in ("GuiRemoveMessage", "RemoveSceneNodeMessage", "ResetGuiMessage"):
-            visitor.send(kind, uuid=handles["field"]._impl.uuid, name="/cameras")
+        visitor.send("GuiRemoveMessage", uuid=handles["field"]._impl.uuid)
         visitor._socket.send("text")
         visitor._socket.send_binary(b"\xdd" * 60_000)  # arrays in arrays
         visitor.send("GuiUpdateMessage", uuid=handles["policy"]._impl.uuid, updates={"value": "threshold"})
         visitor.wait_for(lambda: state.controls.policy == "threshold", "what a control offers")
         after = {label: (h.value, h.disabled) for label, h in handles.items()}
         assert after == before | {"policy": ("threshold", False)} and not state.controls.paused
-        assert sum(guard_of(page).refused.values()) == 14
+        assert sum(guard_of(page).refused.values()) == 12
         other.wait_for(lambda: other.counts["GuiUpdateMessage"] > told, "the one change")
         assert not other.counts["GuiRemoveMessage"]
-        # Clicks come no faster than a person's.
-        for _ in range(500):
+        for _ in range(500):  # clicks come no faster than a person's
             press(visitor, page, "snapshot")
-        visitor.wait_for(lambda: sum(guard_of(page).refused.values()) > 414, "refusals")
+        visitor.wait_for(lambda: sum(guard_of(page).refused.values()) > 412, "refusals")
         assert visitor.counts["NotificationShowMessage"] < 100
 
 
@@ -297,21 +292,12 @@ def test_nothing_is_uploaded() -> None:
 def test_half_requests_end_for_new_ones(monkeypatch) -> None:
     monkeypatch.setattr(access_guard, "MAX_PAGE_CONNECTIONS", 8)
     with page_of(bare_state()) as page, Visitor(page.port) as visitor, contextlib.ExitStack() as open_:
-        halves = [socket.create_connection(("127.0.0.1", page.port)) for _ in range(30)]
+        halves = [open_.enter_context(socket.create_connection(("127.0.0.1", page.port), 4.0)) for _ in range(30)]
         for half in halves:
-            open_.enter_context(half).sendall(b"GET / HTTP/1.1\r\n")
-            half.setblocking(False)
-
-        def ended(half: socket.socket) -> bool:
-            try:
-                return not half.recv(1)
-            except BlockingIOError:
-                return False
-            except ConnectionError:
-                return True
-
-        # By themselves they would end after ten seconds.
-        wait_until(lambda: sum(map(ended, halves)) >= 23, "they all stay", 4.0)
+            half.sendall(b"GET / HTTP/1.1\r\n")
+        for oldest in halves[:-8]:  # by themselves they would end after ten seconds
+            with contextlib.suppress(ConnectionError):
+                assert oldest.recv(1) == b""
         assert get(page.port)[0] == 200
         visitor.stand_at((1.0, 1.0, 1.0))  # who is in stays in
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 
-from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.state import CameraView, Publication
 from edge_server.page import markup
 from edge_server.page.colors import HELD_OUT, STALE, css, scale_color
@@ -50,12 +49,9 @@ def test_the_age_of_what_is_shown_is_split_into_its_parts():
 def test_the_frontier_stands_beside_the_present_or_says_how_to_measure_it():
     measured = ((50.0, 20.0), (800.0, 24.0), (200.0, 28.0))
     found = Frontier([FrontierPoint(ms, db, db - 4.0) for ms, db in measured], "f.json, at <1> m/s")
-    html = markup.frontier(found, None)
-    assert html.count("<polyline") == 2 and html.count('stroke-dasharray="4 3"') == 1 and "<circle" not in html
-    assert "50 ms an update" in html and "800 ms" in html and "at &lt;1&gt; m/s" in html
     html = markup.frontier(found, (200.0, 28.0, None))
     assert html.count("<circle") == 1 and 'cx="170.0" cy="8.0"' in html, "at the best point, half way"
-    assert "30.0,8.0" in markup.frontier(Frontier(found.points[:1], ""), None), "one point"
+    assert "50 ms an update" in html and "at &lt;1&gt; m/s" in html
     unknown = Frontier([], "run `edge-server frontier --field x`")
     assert "edge-server frontier --field x" in markup.frontier(unknown, None)
 
@@ -70,8 +66,11 @@ def test_what_comes_from_outside_is_escaped():
         markup.chart_caption(evil, [(evil, (0, 0, 0))]),
         markup.chart_caption("", [], evil),
         markup.note(evil),
+        markup.channel_line({"preset": evil, "counts": 3, "drawn_delay_ms": {"mean": None}}),
     ]
-    assert not any("<img" in page for page in pages)
+    assert not any("<img" in page or "None" in page for page in pages)
+    said = {"preset": "ch5", "drawn_delay_ms": {"mean": 60.4}, "counts": {"forwarded": 481, "lost": 0}}
+    assert "ch5, mean delay 60 ms, 481 forwarded<" in markup.channel_line(said)
 
 
 def test_the_table_marks_age_truth_use_and_refusals():
@@ -97,23 +96,11 @@ def test_a_decision_is_told_in_words():
 
     assert "Update 8 uses all 6 views." in words(tuple(ages))
     assert "waits 62 ms, then uses all 6 views." in words(tuple(ages), 62.0, "wait-arrived")
-    assert "uses all 6 views; the policy chose 30 ms." in words(tuple(ages), 30.0, "bandit:policy.npz")
     old = words(("cam01", "cam03"), 120.0, "threshold")
     assert "uses 2 of 6 views, up to 120 ms old; leaves out cam02 (903 ms old), cam06 (800 ms old)" in old
     assert "cam04 (700 ms old) and 1 more." in old and "cam00" not in old
     assert "cam05 (650 ms old)." in words(("cam01", "cam03", "cam04"))  # three are named, and no more is there
     assert "refuses cam03, which contradict the others" in words(tuple(ages), refused=("cam03",))
-
-
-def test_the_channel_line_shows_only_what_the_emulator_reports():
-    counts = {"forwarded": 481, "dropped_busy": 12, "lost": 0}
-    line = markup.channel_line(
-        {"preset": "ch5", "discipline": "drop-new", "drawn_delay_ms": {"mean": 60.4}, "counts": counts}
-    )
-    assert "ch5, drop-new, mean delay 60 ms, 481 forwarded, 12 dropped busy<" in line
-    for odd in ({}, {"counts": 3, "drawn_delay_ms": []}, {"drawn_delay_ms": {"mean": None}}):
-        assert "None" not in markup.channel_line(odd)
-    assert "<b>" not in markup.channel_line({"preset": "<b>"})
 
 
 GOOD = CameraView("cam01", False, None, 80.0, 100, 3)
@@ -134,12 +121,6 @@ def scored(*psnr_db):
 def test_the_likely_cause_is_named(cause):
     said = poor_picture(12.0, scored(*[30.0] * 9, *[12.3, None] * FLAT_SCORES), CASES[cause])
     assert "no better than one mean color (12.3 dB; that color 12.0 dB)" in said and cause in said
-
-
-def test_views_that_were_learned_from_are_not_blurred_by_cameras_that_share_little():
-    for scored_on, cause in (("cam00", "different places"), (SELECTED, "too short a run")):
-        publications = [replace(each, scored_on=scored_on) for each in scored(*[12.3] * FLAT_SCORES)]
-        assert cause in poor_picture(12.0, publications, [GOOD, replace(GOOD, camera="cam02")])
 
 
 @pytest.mark.stability
