@@ -11,10 +11,9 @@ import pytest
 
 from channel_emu.cli import main
 from channel_emu.model import notation
-from channel_emu.model.presets import PRESETS
 from freshfield import ledger
 from tests.channel_emu.test_testing import HELLO, Greeter
-from tests.support import free_port, refusal, refused, wait_until
+from tests.support import free_port, refusal, wait_until
 
 
 @pytest.fixture
@@ -38,15 +37,6 @@ def test_simulate_takes_the_short_notation(capsys):
     assert found["offered"] == found["delivered"] + found["dropped"] + found["in_flight"]
     again = simulate(capsys, f"--preset ch6 --arrivals periodic:30 {rest}")
     assert again["mean_age_ms"] == found["mean_age_ms"]  # the same channel in other words
-
-
-def test_presets_are_listed_with_their_mean_delays(capsys):
-    assert main(["presets"]) == 0
-    text = capsys.readouterr().out
-    assert all(f"\n{name} " in text for name in PRESETS)
-    assert "\nch6                         45  mmpp:1/120ms,1/30ms  exp:30ms,exp:60ms " in text
-    assert " mu1=1/30,mu2=1/30,states=low/high " in text and " {loss: [0.01, 0.5]}\n" in text
-    assert "\nswing                     82.5 " in text
 
 
 def test_the_frames_of_a_simulation_can_be_fitted(capsys, tmp_path):
@@ -128,11 +118,3 @@ def test_proxy_puts_a_service_behind_a_link_until_told():
     greeter.stop()
     assert set(found["by_method"]) == {f"up {HELLO}", f"down {HELLO}"} and found["seed"] == 2
     assert found["delivered"] == found["offered"] == 2 and found["delay_ms"]["mean"] == 30
-
-
-@pytest.mark.parametrize("words", ["simulate --csv", "run SCENARIO --out", "proxy --to 127.0.0.1:1 --trace"])
-def test_a_path_that_cannot_be_written_is_said_in_one_line(capsys, scenario, tmp_path, words):
-    (tmp_path / "file").write_text("")
-    refused(SystemExit, "2", main, [*words.replace("SCENARIO", str(scenario)).split(), str(tmp_path / "file" / "x")])
-    said = capsys.readouterr().err
-    assert f"argument {words.split()[-1]}: {tmp_path / 'file'} is a file, not a folder" in said

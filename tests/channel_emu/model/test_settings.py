@@ -25,6 +25,7 @@ def test_presets_hold_the_thesis_numbers():
     assert ch6.arrivals.rate_per_ms == pytest.approx([1 / 120, 1 / 30]) and ch6.service.mean_ms == [30.0, 60.0]
     assert (ch6.service_state, ch6.discipline) == ("at-start", "newest-waits")
     assert slow.chain is not None and slow.chain.mu1_per_ms == pytest.approx(1 / 3000)
+    assert (ch6.mean_delay_ms, read("preset: swing").mean_delay_ms) == (pytest.approx(45), pytest.approx(82.5))
 
 
 def test_the_short_notation_stands_for_sections(tmp_path):

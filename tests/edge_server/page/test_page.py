@@ -21,7 +21,6 @@ from edge_server.page import PageError, panel, start_page, views
 from edge_server.page.controls import ControlPanel
 from edge_server.page.rendering import LEVELS, MOVING, NEWER, ClientState, RenderLoop, browser_image, hatched
 from edge_server.page.scene import Scene, thumbnail
-from edge_server.page.viewpoint import initial_viewpoint
 from freshfield import coverage
 from freshfield.geometry import Pinhole, Pose, look_at
 from tests.edge_server.frames import frame
@@ -71,7 +70,7 @@ def test_an_image_at_rest_has_a_band_for_every_tenth_of_a_second_that_the_last_o
         assert image.color.shape == (300, 40, 3) and broken.renders == renders
 
 
-def test_one_camera_is_first_seen_from_before_it_and_then_from_where_the_fields_box_is():
+def test_one_camera_is_seen_from_before_it_then_from_the_fields_box_and_looked_through_as_the_field_corrects_it():
     seen = frame()
     state = bare_state([CameraView("cam01", False, seen, 1.0, 1, 0), CameraView("never", False, None, None, 0, 0)])
     server = MagicMock()
@@ -84,21 +83,17 @@ def test_one_camera_is_first_seen_from_before_it_and_then_from_where_the_fields_
     np.testing.assert_array_equal(server.scene.add_camera_frustum.return_value.image, thumbnail(seen))
     ahead = scene._viewpoint.look_at - seen.pose.translation_m
     assert np.allclose(ahead, np.linalg.norm(ahead) * seen.pose.matrix()[:3, 2])
-    state.publish(publication(0), SimpleNamespace(box=replace(UNIT_BOX, center_m=(0.5, 0.0, 0.25))))
-    scene.refresh(state.cameras(), watched=True)
-    assert server.initial_camera.look_at.tolist() == [0.5, 0.0, 0.25]
-
-
-def test_a_visitor_looks_through_a_camera_from_its_refined_pose():
-    seen = frame()
-    state = bare_state([CameraView("cam01", False, seen, 1.0, 1, 0)])
-    scene, client, refined = Scene(MagicMock(), state), MagicMock(), seen.pose.matrix()
-    scene._viewpoint = initial_viewpoint(refined[None])
+    client, refined = MagicMock(), seen.pose.matrix()
     scene._look_through(client, "cam01")
     np.testing.assert_array_equal(client.camera.position, seen.pose.translation_m)
     assert client.camera.fov == pytest.approx(2 * np.arctan(0.5 * seen.intrinsics.height / seen.intrinsics.fy))
     refined[:3, 3] += 0.02
-    state.publish(publication(0), SimpleNamespace(correction=lambda view: SimpleNamespace(camera_to_world=refined)))
+    field = SimpleNamespace(
+        box=replace(UNIT_BOX, center_m=(0.5, 0.0, 0.25)), correction=lambda _: SimpleNamespace(camera_to_world=refined)
+    )
+    state.publish(publication(0), field)
+    scene.refresh(state.cameras(), watched=True)
+    assert server.initial_camera.look_at.tolist() == [0.5, 0.0, 0.25]
     scene._look_through(client, "cam01")
     np.testing.assert_array_equal(client.camera.position, refined[:3, 3])
 

@@ -15,7 +15,7 @@ from edge_server.page.splats import records as packing
 from edge_server.page.splats.published import Published, Publisher
 from freshfield.geometry import quaternion_to_matrix
 from tests.edge_server.fields.scenes import psnr
-from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, snapshot
+from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, motion, snapshot
 
 SCALES = (-5.0, -2.0)
 RECORDS = packing.to_records(gaussians(40, 0), SCALES)
@@ -91,6 +91,13 @@ def test_a_message_that_lies_is_refused_and_loses_nothing(data):
     assert len(before) == 40
 
 
+def test_displacements_are_those_of_the_motion():
+    first, knots = motion().newest_knots(6)
+    block = messages.KnotsBlock(0, first / 15.0, 15.0, 10.0, 0.3, knots)
+    for instant_s in np.arange(first + 1.0, first + 8.0, 0.37) / 15.0:  # also past the last knot
+        np.testing.assert_allclose(messages.displacements_at(block, instant_s), motion().at(instant_s), atol=1e-6)
+
+
 def test_a_static_set_is_shown_once_it_is_whole():
     reader = messages.StreamReader()
     first, second = (messages.StaticBlock(1, 40, k, SCALES, RECORDS[k : k + 20]) for k in (0, 20))
@@ -141,6 +148,8 @@ def test_a_record_is_the_same_ellipsoid():
     np.testing.assert_allclose(again[:, 11:14], params[:, 11:14], atol=0.0041)
     alpha = lambda p: 1 / (1 + np.exp(-p[:, 10]))  # noqa: E731
     np.testing.assert_allclose(alpha(again), alpha(params), atol=0.0021)
+    turn = packing.to_records(gaussians(20_000, 4), scales)["turn"]
+    assert (turn.min(), turn.max()) == (0, 255)  # bytes are neither wasted nor clipped
     there = packing.contract(places := np.array([-100.0, -1.0, -0.3, 0.0, 1.0, 1.5, 20.0]))
     assert np.abs(there).max() < 2.0
     np.testing.assert_allclose(packing.expand(there), places, rtol=1e-12)
