@@ -192,43 +192,48 @@ def failure(copy: Path, words: Sequence[str], limit_s: float) -> str | None:
     return None if done.returncode in (0, 5) or "session-timeout" in done.stdout else _ENDED  # 5: none is quick
 
 
-class Runner:
-    """Runs edits in a copy of the checkout, always at the same place: compiled kernels are kept by place."""
+def copy_checkout(copy: Path) -> None:
+    """Where edits run, always at the same place: compiled kernels are kept by place."""
+    shutil.rmtree(copy, ignore_errors=True)
+    listed = subprocess.run(["git", "-C", str(ROOT), "ls-files"], capture_output=True, text=True, check=True).stdout
+    for name in listed.splitlines():
+        if (ROOT / name).is_file():
+            (copy / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, copy / name)
 
-    def __init__(self, copy: Path) -> None:
-        self.copy = copy
-        shutil.rmtree(copy, ignore_errors=True)
-        listed = subprocess.run(["git", "-C", str(ROOT), "ls-files"], capture_output=True, text=True, check=True).stdout
-        for name in listed.splitlines():
-            if (ROOT / name).is_file():
-                (copy / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy2(ROOT / name, copy / name)
-        self._fails = cache(lambda test: failure(self.copy, [test], _COMPILING_S) is not None)
-        self._broken: list[str] = []
 
-    def caught_by(self, edit: Edit) -> str | None:
-        """A test that fails with the edit and passes without it, or None."""
-        compiles = "/kernels/" in edit.file or ("/fields/" in edit.file and edit.file.endswith("settings.py"))
-        begun_s, enough_s = os.times().children_user, _COMPILING_S if compiles else _ENOUGH_S
-        for tests in nearest_tests(edit.file):
-            if os.times().children_user - begun_s > enough_s:
-                break
-            limit_s = _COMPILING_S if compiles else _LIMIT_S
-            while (found := self._failure(edit, tests, limit_s)) not in (None, _ENDED) and self._fails(found):
-                self._broken.append(found)
-            if found is not None:
+@cache
+def _fails(copy: Path, test: str) -> bool:
+    """Whether a test fails without an edit."""
+    return failure(copy, [test], _COMPILING_S) is not None
+
+
+def caught_by(copy: Path, edit: Edit, broken: list[str]) -> str | None:
+    """A test that fails with the edit and passes without it, or None. broken: tests that fail without any; added to."""
+    compiles = "/kernels/" in edit.file or ("/fields/" in edit.file and edit.file.endswith("settings.py"))
+    limit_s, enough_s = (_COMPILING_S, _COMPILING_S) if compiles else (_LIMIT_S, _ENOUGH_S)
+    begun_s = os.times().children_user
+    for tests in nearest_tests(edit.file):
+        if os.times().children_user - begun_s > enough_s:
+            break
+        while (
+            found := _failure(copy, edit, [*(f"--deselect={test}" for test in broken), *tests], limit_s)
+        ) is not None:
+            if found == _ENDED or not _fails(copy, found):
                 return found
-        return None
+            broken.append(found)
+    return None
 
-    def _failure(self, edit: Edit, tests: list[str], limit_s: float) -> str | None:
-        (self.copy / edit.file).write_text(edit.made())
-        kernels = cache_folder(self.copy / "edge_server")
-        try:
-            return failure(self.copy, [*(f"--deselect={test}" for test in self._broken), *tests], limit_s)
-        finally:
-            shutil.copy2(ROOT / edit.file, self.copy / edit.file)
-            if kernels != cache_folder(self.copy / "edge_server"):
-                shutil.rmtree(kernels, ignore_errors=True)
+
+def _failure(copy: Path, edit: Edit, words: list[str], limit_s: float) -> str | None:
+    (copy / edit.file).write_text(edit.made())
+    kernels = cache_folder(copy / "edge_server")
+    try:
+        return failure(copy, words, limit_s)
+    finally:
+        shutil.copy2(ROOT / edit.file, copy / edit.file)
+        if kernels != cache_folder(copy / "edge_server"):
+            shutil.rmtree(kernels, ignore_errors=True)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -240,13 +245,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--json", type=Path, metavar="FILE", help="file to write the counts and the survivors to")
     add("--out", type=Path, default="runs/mutants.jsonl", metavar="FILE", help="where results are kept [%(default)s]")
     args = parser.parse_args(argv)
-    store, survivors, runner = ResultStore(args.out), [], None
+    store, copy, survivors, broken = ResultStore(args.out), args.out.with_suffix("").resolve(), [], []
+    copy_checkout(copy)
     for number, edit in enumerate(drawn(args.seed, args.count)):
         source = hashlib.sha256((ROOT / edit.file).read_bytes()).hexdigest()[:16]
         key = f"{source} {edit.file} {edit.operator} {edit.occurrence}"
         if key not in store.results:
-            runner = runner or Runner(args.out.with_suffix("").resolve())
-            store.put(key, {**asdict(edit), "text": edit.text()}, runner.caught_by(edit))
+            store.put(key, {**asdict(edit), "text": edit.text()}, caught_by(copy, edit, broken))
         print(f"{number:3} {'SURVIVED' if store.results[key] is None else 'caught':8} {edit.text()}", flush=True)
         survivors += [edit.text()] * (store.results[key] is None)
     print("\n  ".join(["\nsurvivors:", *survivors]))

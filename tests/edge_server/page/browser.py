@@ -63,7 +63,7 @@ def chromium() -> str:
     return found
 
 
-class Browser:
+class Browser(contextlib.AbstractContextManager):
     """One page in one fresh browser. Every wait raises AssertionError with what the page shows instead."""
 
     def __init__(self, url: str, width: int = 1600, height: int = 900, timeout_s: float = 60.0) -> None:
@@ -98,9 +98,6 @@ class Browser:
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> Browser:
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from unittest.mock import MagicMock, patch
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -50,15 +50,6 @@ def test_what_the_emulator_does_not_answer_is_told_to_its_visitor():
     control_of(network)._set(client, (400.0, 0.2))
     title, words = client.add_notification.call_args.args
     assert title == "The network has not changed" and "UNAVAILABLE" in words and network.in_force is None
-
-
-def test_a_slider_that_is_moved_right_after_a_button_keeps_nothing_of_the_blackout_before():
-    control = control_of(EmulatorControl(Transport(), "x:1"))
-    control.refresh({"by_hand": {"delay_ms": 0.0, "loss": 1.0}})
-    for button, values in (("bad", (400, 20)), ("blackout", (0, 100)), ("scenario", (0, 0))):
-        with patch.object(control, "_set_after") as asked:
-            asyncio.run(control._pressed(MagicMock(target=MagicMock(value=button))))
-        assert (control.delay.value, control.loss.value) == values and asked.called
 
 
 @pytest.mark.stability

@@ -21,7 +21,7 @@ from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.page.browser import Browser
 from tests.edge_server.page.preview import bare_state
 from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, snapshot
-from tests.edge_server.page.test_access_guard import get, lines, login
+from tests.edge_server.page.test_access_guard import get, login
 from tests.edge_server.page.visitor import page_of
 from tests.role_table import TOKENS
 from tests.support import wait_until
@@ -36,7 +36,7 @@ class Drawer:
 
     def __init__(self, page: Page, **headers: str) -> None:
         address = f"ws://127.0.0.1:{page.port}{STREAM}"
-        self.socket = websocket.create_connection(address, timeout=20, header=lines(headers))
+        self.socket = websocket.create_connection(address, timeout=20, header=headers)
         self.reader = StreamReader()
 
     def read(self, answer: bytes | None = None) -> None:
