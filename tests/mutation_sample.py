@@ -163,14 +163,13 @@ def nearest_tests(file: str) -> list[list[str]]:
     while not list(folder.glob("test_*.py")):
         folder = folder.parent
     above, imports = folder.parent if folder != package else folder, _importing(file)
-    groups: list[list[str]] = [[], [], [], []]
+    groups: list[list[str]] = [[], [], [], [], []]
     for test, text in _texts().items():
         near = (ROOT / test).parent
-        belongs = (near == folder and Path(test).stem == f"test_{path.stem}", near == folder, imports.search(text))
-        rank = next((k for k, does in enumerate((*belongs, near == above)) if does), None)
-        if rank is not None:
-            groups[rank].append(test)
-    groups[1].sort(key=lambda test: not imports.search(_texts()[test]))
+        named, beside, importing = Path(test).stem == f"test_{path.stem}", near == folder, imports.search(text)
+        ranks = (beside and named, beside and importing, beside, importing, near == above)
+        for group in [group for group, belongs in zip(groups, ranks) if belongs][:1]:
+            group.append(test)
     return [tests[k : k + 8] for tests in groups for k in range(0, len(tests), 8)]  # importing all takes long
 
 

@@ -68,7 +68,6 @@ def test_mistakes_get_one_line(capsys):
         (["--service", "trace:/no/such/file"], "cannot be read"),
         (["--frame-bytes", "9" * 400], "frame_bytes: expected 0 to"),
         (["--fault", "bandwidth:" + "9" * 400], "bandwidth.megabits_per_s: expected a number"),
-        (["--scenario", "/no/such.yaml"], "/no/such.yaml"),
     ):
         said = refusal(capsys, main, "simulate", *words)
         assert why in said and said.startswith("channel-emu: ")

@@ -126,15 +126,10 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("seed", read_seeds(metafunc.config.getoption("--seeds")))
 
 
-@pytest.fixture
-def faults(request: pytest.FixtureRequest) -> list[int] | None:
-    """Numbers of the faults to carry out; None: all."""
-    words = request.config.getoption("--faults")
-    return None if words is None else [int(word) for word in words.split(",") if word != "none"]
-
-
 @pytest.mark.chaos
-def test_a_seed_holds(seed, faults):
-    found = run_seed(seed, faults)
-    assert found["problems"] == [], "\n".join(found["faults"])  # --faults 0,3 runs some of them
+def test_a_seed_holds(seed, request):
+    """--faults 0,3 runs some of its faults."""
+    words = request.config.getoption("--faults")
+    found = run_seed(seed, None if words is None else [int(word) for word in words.split(",") if word != "none"])
+    assert found["problems"] == [], "\n".join(found["faults"])
     assert found["delivered"] > 20

@@ -146,19 +146,17 @@ def python(words: list[str], cwd: Path, *path: Path) -> str:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_the_template_is_built_installed_checked_and_used(tmp_path):
-    source, wheels, site = tmp_path / "plugin", tmp_path / "wheels", tmp_path / "site"
-    shutil.copytree(ROOT / "examples/plugin", source)
-    python(["pip", "wheel", "-q", "--no-deps", "-w", str(wheels), str(source)], tmp_path)
+    plugin, wheels, site = tmp_path / "plugin", tmp_path / "wheels", tmp_path / "site"
+    shutil.copytree(ROOT / "examples/plugin", plugin)
+    python(["pip", "wheel", "-q", "--no-deps", "-w", str(wheels), str(plugin)], tmp_path)
     (wheel,) = wheels.iterdir()
     python(["pip", "install", "-q", "--no-deps", "--no-index", "--target", str(site), str(wheel)], tmp_path)
-    (source / "freshfield_example.py").unlink()  # the installed one is meant
+    (plugin / "freshfield_example.py").unlink()  # the installed one is meant
 
-    assert "4 passed" in python(["pytest", "-q", "test_contract.py"], source, site)
+    assert "4 passed" in python(["pytest", "-q", "test_contract.py"], plugin, site)
     edge = {**RAW["edge"], "policy": {"name": "least-used", "value": 1}}
-    whole = {**RAW, "edge": edge, "source": {**RAW["source"], "effects": {"vignette": {"loss": 0.3}}}}
-    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(whole))
-    said = python(["edge_server.cli", "simulate", "mine.yaml", "--seconds", "1", "--json"], tmp_path, site)
-    assert json.loads(said)["policy"] == "least-used"
-    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({**whole, "source": {"kind": "bar", "bar_px": 4}}))
-    said = python(["edge_server.cli", "simulate", "mine.yaml", "--seconds", "1", "--json"], tmp_path, site)
-    assert json.loads(said)["updates"] > 0
+    source = {"kind": "bar", "bar_px": 4, "effects": {"vignette": {"loss": 0.3}}}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({**RAW, "edge": edge, "source": source}))
+    words = ["edge_server.cli", "simulate", "mine.yaml", "--seconds", "1", "--json"]
+    found = json.loads(python(words, tmp_path, site))
+    assert found["policy"] == "least-used" and found["updates"] > 0

@@ -27,7 +27,8 @@ from freshfield.frame import to_request
 from freshfield.limits import MAX_CAMERAS
 from freshfield.machine_load import rss_mb
 from freshfield.transport import Transport
-from tests.channel_emu.live.emulator import Edge, frame_of, make
+from tests.channel_emu.live.emulator import Edge, make
+from tests.edge_server.frames import frame
 
 CAMERAS = (1, 10, 100, 1000)
 RECKONED = (10, 100, 1000, 10_000)
@@ -100,7 +101,7 @@ async def push(port: int, cameras: tuple[str, ...], seconds: float) -> int:
         due_s, sequence = monotonic() + first_s, 0
         while due_s < end_s:
             await asyncio.sleep(max(due_s - monotonic(), 0.0))
-            await call.write(to_request(frame_of(name, "scale", sequence, clock.now_ns())).SerializeToString())
+            await call.write(to_request(frame(name, sequence, clock.now_ns())).SerializeToString())
             await call.read()
             answers, sequence, due_s = answers + 1, sequence + 1, due_s + len(cameras) / RATE
         call.cancel()

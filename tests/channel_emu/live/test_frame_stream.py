@@ -28,7 +28,8 @@ from freshfield.ledger import read_all
 from freshfield.transport import Transport
 from freshfield.v1 import channel_pb2, channel_pb2_grpc, clock_pb2, clock_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
-from tests.channel_emu.live.emulator import CAMERAS, answer_to, emulate, frame_of, make, offer
+from tests.channel_emu.live.emulator import CAMERAS, answer_to, emulate, make, offer
+from tests.edge_server.frames import frame
 from tests.freshfield.serving import status
 from tests.integration.peer import Peer, silence
 from tests.support import free_port, until
@@ -186,7 +187,7 @@ async def test_strangers_and_nonsense_are_refused_and_counted(tmp_path):
         call = channel.stream_stream(PUSH)()
         unknown = pb.PushRequest(header=pb.FrameHeader(camera_id="cam77", session_id="s"))
         bad_id = pb.PushRequest(header=pb.FrameHeader(camera_id="cam00", session_id="two\tcolumns\n"), payload=b"x")
-        good = to_request(frame_of("cam00", "s", 1, r.proxy.clock.now_ns())).SerializeToString()
+        good = to_request(frame("cam00", 1, r.proxy.clock.now_ns())).SerializeToString()
         wrong = (b"\xff\xff\xff", good[:-1], b"\x12\x05abc", b"\x0a\x02\xff\xff", b"\x0b", good + b"\0\0")
         expected = dict.fromkeys(wrong, "unparsable")
         expected |= {unknown.SerializeToString(): "unknown_camera", b"": "unknown_camera"}
@@ -214,7 +215,7 @@ async def test_silent_streams_and_a_spoofed_session_do_not_keep_a_camera_out(tmp
             for _ in range(30):
                 silent.append(channel.stream_stream(PUSH)())
                 await silent[-1].initial_metadata()
-            spoof = to_request(frame_of("cam00", camera.session, 2**63, r.proxy.clock.now_ns()))
+            spoof = to_request(frame("cam00", 2**63, r.proxy.clock.now_ns(), session=camera.session))
             assert (await answer_to(silent[-1], spoof.SerializeToString())).reason == "session_in_use"
             await camera.stream(3)
             await r.cameras["cam01"].stream(1)  # opens a stream of its own only now
@@ -225,12 +226,12 @@ async def test_silent_streams_and_a_spoofed_session_do_not_keep_a_camera_out(tmp
 
 
 async def test_what_is_inside_the_links_is_bounded_in_bytes(tmp_path, monkeypatch):
-    monkeypatch.setattr(live_link, "MAX_QUEUED_BYTES", 20_000)
+    monkeypatch.setattr(live_link, "MAX_QUEUED_BYTES", 5_000)
     async with emulate(tmp_path, {"service": "det:200ms", "discipline": "fcfs"}, cameras=("cam00", "cam01")) as r:
         for camera in r.cameras.values():
             await camera.stream(5)
         inside = [len(t.item.raw) for f in r.proxy.flows.values() for t in f.link.model.pending()]
-        assert 0 < sum(inside) == r.proxy._budget.held_bytes <= 20_000
+        assert 0 < sum(inside) == r.proxy._budget.held_bytes <= 5_000
         full = r.proxy.rejected["queue_full"]
         assert full == 10 - len(inside) and r.cameras["cam01"].reasons["queue_full"] > 0
         await r.settled()

@@ -25,7 +25,7 @@ from freshfield.access import HttpDoor
 from freshfield.limits import MAX_SCRAPES, MAX_VISITOR_MESSAGE_BYTES
 from freshfield.transport import Transport, TransportError
 from tests.edge_server.page.preview import BallScene, bare_state, publication
-from tests.edge_server.page.visitor import CAMERA, Visitor, page_of
+from tests.edge_server.page.visitor import CAMERA, Visitor, ask, page_of
 from tests.role_table import TOKENS, cells_of
 from tests.support import free_port, wait_until
 
@@ -36,14 +36,6 @@ LOGIN = Transport(tokens=TOKENS, insecure=True)
 def login(who: str) -> dict[str, str]:
     token = TOKENS.get(who, "no such token")
     return {"Authorization": "Basic " + base64.b64encode(f"me:{token}".encode()).decode()}
-
-
-def get(port: int, path: str = "/", **headers: str) -> tuple[int, dict[str, str]]:
-    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
-        connection.request("GET", path, headers=headers)
-        answer = connection.getresponse()
-        answer.read()
-        return answer.status, dict(answer.getheaders())
 
 
 def control(page: Page, label: str):
@@ -73,10 +65,10 @@ def test_who_may_look(what: str, who: str, may: bool) -> None:
         serve_metrics(bare_state(), INGEST, "127.0.0.1", port)
     with page_of(bare_state(), LOGIN, "0.0.0.0") as page:
         for number, path in ((page.port, "/"), (port, "/metrics")):
-            status, headers = get(number, path, **login(who))
-            assert status == (200 if may else 401) and get(number, path)[0] == 401
+            status, headers, _ = ask(number, path, **login(who))
+            assert status == (200 if may else 401) and ask(number, path)[0] == 401
             assert may or headers["WWW-Authenticate"].startswith("Basic")
-        assert get(port, "/metrics", Authorization=f"Bearer {TOKENS.get(who)}")[0] == (200 if may else 401)
+        assert ask(port, "/metrics", Authorization=f"Bearer {TOKENS.get(who)}")[0] == (200 if may else 401)
         with pytest.raises(websocket.WebSocketBadStatusException) if not may else contextlib.nullcontext():
             Visitor(page.port, headers=login(who)).close()
 
@@ -85,7 +77,7 @@ def test_who_may_look(what: str, who: str, may: bool) -> None:
 def test_who_may_change(what: str, who: str, may: bool) -> None:
     state = bare_state()
     with page_of(state, LOGIN, "0.0.0.0") as page:
-        if get(page.port, **login(who))[0] == 401:
+        if ask(page.port, **login(who))[0] == 401:
             assert not may
             return
         with Visitor(page.port, headers=login(who)) as visitor:
@@ -125,12 +117,12 @@ INGEST = SimpleNamespace(
 def test_a_login_lasts_for_the_websocket_and_is_nobody_elses() -> None:
     """Browsers do not all send the login again with a websocket."""
     with page_of(bare_state(), LOGIN, "0.0.0.0") as page:
-        _, headers = get(page.port, **login("viewer"))
+        _, headers, _ = ask(page.port, **login("viewer"))
         cookie, *flags = headers["Set-Cookie"].split("; ")
         assert {"HttpOnly", "SameSite=Strict"} <= set(flags)
-        assert get(page.port, Cookie=f"other=1; {cookie}")[0] == 200
-        assert get(page.port, Cookie=cookie[:-1] + "0é")[0] == 401
-        assert get(page.port, Cookie=cookie, **login("nobody"))[0] == 401
+        assert ask(page.port, Cookie=f"other=1; {cookie}")[0] == 200
+        assert ask(page.port, Cookie=cookie[:-1] + "0é")[0] == 401
+        assert ask(page.port, Cookie=cookie, **login("nobody"))[0] == 401
         Visitor(page.port, headers={"Cookie": cookie}).close()
 
 
@@ -159,7 +151,7 @@ def test_tls_and_login_or_words_or_no_page(tmp_path, caplog) -> None:
             assert answer.status == 200 and answer.read()
             assert path != "/" or "Secure" in answer.getheader("Set-Cookie")
             with pytest.raises((OSError, http.client.HTTPException)):
-                get(number, path)
+                ask(number, path)
     assert "--insecure" not in caplog.text
 
 
@@ -167,7 +159,7 @@ def test_the_page_says_in_words_what_is_open() -> None:
     state = bare_state()
     state.warnings = [Transport(insecure=True).guard("0.0.0.0", "page", http=True)]
     with page_of(state, Transport(insecure=True), "0.0.0.0") as page:
-        assert get(page.port)[0] == 200  # without a login
+        assert ask(page.port)[0] == 200  # without a login
         messages = page._server._websock_server._broadcast_buffer.message_from_id.values()
         texts = [m.props.content for m in messages if type(m).__name__ == "GuiHtmlMessage"]
     assert any("Insecure: page on 0.0.0.0" in text and "nobody is asked" in text for text in texts)
@@ -177,11 +169,11 @@ def test_a_foreign_web_site_reaches_nothing() -> None:
     state = bare_state()
     with page_of(state) as page:
         own, foreign = f"127.0.0.1:{page.port}", f"evil.example:{page.port}"
-        assert get(page.port, Origin=f"http://{own}")[0] == 200
-        assert get(page.port, Origin="http://evil.example")[0] == 403
-        assert get(page.port, Host=foreign)[0] == 403
-        assert get(page.port, Host=foreign, Origin=f"http://{foreign}")[0] == 403
-        assert "frame-ancestors 'self'" in get(page.port)[1]["Content-Security-Policy"]
+        assert ask(page.port, Origin=f"http://{own}")[0] == 200
+        assert ask(page.port, Origin="http://evil.example")[0] == 403
+        assert ask(page.port, Host=foreign)[0] == 403
+        assert ask(page.port, Host=foreign, Origin=f"http://{foreign}")[0] == 403
+        assert "frame-ancestors 'self'" in ask(page.port)[1]["Content-Security-Policy"]
         with pytest.raises(websocket.WebSocketBadStatusException):
             Visitor(page.port, headers={"Host": foreign})
         with pytest.raises(websocket.WebSocketBadStatusException):
@@ -202,8 +194,8 @@ def test_a_flood_of_refused_requests_and_visitors_is_counted_and_said_once_a_min
     with page_of(bare_state(), LOGIN, "0.0.0.0") as page, Visitor(page.port, headers=login_of) as visitor:
         guard = has_come(page, visitor)
         for _ in range(10):
-            assert get(page.port)[0] == 401
-            assert get(page.port, Origin="http://evil.example", **login("viewer"))[0] == 403
+            assert ask(page.port)[0] == 401
+            assert ask(page.port, Origin="http://evil.example", **login("viewer"))[0] == 403
             with pytest.raises(websocket.WebSocketBadStatusException, match="503"):
                 Visitor(page.port, headers=login_of)
             with socket.create_connection(("127.0.0.1", page.port), timeout=10) as raw:
@@ -218,7 +210,7 @@ def test_a_flood_of_refused_requests_and_visitors_is_counted_and_said_once_a_min
         assert said[1:] == [f"page: refused: {what} (1 so far)" for what in expected]
         for now_s[0], messages in ((59.9, []), (60.0, ["page: refused: requests with status 401 (12 so far)"])):
             caplog.clear()
-            assert get(page.port)[0] == 401
+            assert ask(page.port)[0] == 401
             assert [text for text in caplog.messages if "401" in text] == messages
         visitor.close()
         wait_until(lambda: not guard.visitors, "the place was kept")
@@ -292,7 +284,7 @@ def test_half_requests_end_for_new_ones(monkeypatch) -> None:
         for oldest in halves[:-8]:  # by themselves they would end after ten seconds
             with contextlib.suppress(ConnectionError):
                 assert oldest.recv(1) == b""
-        assert get(page.port)[0] == 200
+        assert ask(page.port)[0] == 200
         visitor.stand_at((1.0, 1.0, 1.0))  # who is in stays in
 
 

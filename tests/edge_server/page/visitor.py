@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import http.client
+import json
 import socket
 import threading
 from collections import Counter
@@ -32,6 +34,15 @@ def page_of(state: EdgeState, transport: Transport | None = None, host: str = "1
         yield page
     finally:
         page.stop()
+
+
+def ask(port: int, path: str = "/", method: str = "GET", body: Any = None, **headers: str) -> tuple[int, dict, bytes]:
+    """Status, headers and text of an answer. body: bytes, or what becomes JSON."""
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
+        sent = body if body is None or isinstance(body, bytes) else json.dumps(body)
+        connection.request(method, path, sent, headers)
+        answer = connection.getresponse()
+        return answer.status, dict(answer.getheaders()), answer.read()
 
 
 class Visitor(contextlib.AbstractContextManager):

@@ -21,8 +21,8 @@ from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.page.browser import Browser
 from tests.edge_server.page.preview import bare_state
 from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, snapshot
-from tests.edge_server.page.test_access_guard import get, login
-from tests.edge_server.page.visitor import page_of
+from tests.edge_server.page.test_access_guard import login
+from tests.edge_server.page.visitor import ask, page_of
 from tests.role_table import TOKENS
 from tests.support import wait_until
 
@@ -101,11 +101,11 @@ def test_the_rules_of_the_page_hold_for_the_stream():
     with page_of(state, Transport(tokens=TOKENS, insecure=True)) as page:
         publish(state, snapshot())
         for path in ("/splats/", "/splats/splats.js"):
-            assert get(page.port, path)[0] == 401
-            status, headers = get(page.port, path, **login("viewer"))
+            assert ask(page.port, path)[0] == 401
+            status, headers, _ = ask(page.port, path, **login("viewer"))
             assert status == 200 and "script-src 'self'" in headers["Content-Security-Policy"]
-        assert get(page.port, "/splats", **login("viewer"))[0] == 301
-        assert get(page.port, "/splats/../records.py", **login("viewer"))[0] in (404, 400)
+        assert ask(page.port, "/splats", **login("viewer"))[0] == 301
+        assert ask(page.port, "/splats/../records.py", **login("viewer"))[0] in (404, 400)
         with pytest.raises(websocket.WebSocketBadStatusException, match="401"):
             Drawer(page)
         drawer = Drawer(page, **login("viewer"))
