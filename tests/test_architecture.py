@@ -27,7 +27,7 @@ FORBIDDEN = {
         f"edge_server.{name}" for name in ("live", "scheduler", "fidelity", "page", "report", "surface")
     ),
     "edge_server.fields.common": tuple(
-        f"edge_server.fields.{name}" for name in ("splat", "ngp", "nerfacto", "tensorf")
+        f"edge_server.fields.{each}" for each in ("splat", "ngp", "nerfacto", "tensorf")
     ),
     "edge_server.embed": ("edge_server.live", "edge_server.fields", "edge_server.page", "edge_server.report"),
     "edge_server.scheduler": ("edge_server.live", "edge_server.page", "edge_server.report"),

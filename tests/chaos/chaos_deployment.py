@@ -88,8 +88,6 @@ class ChaosDeployment(VirtualDeployment):
         for ledger in self._ledgers.values():
             ledger.close(now_ns)
 
-    # --- faults ---------------------------------------------------------------------------------------
-
     def _do_crash(self, fault: Fault) -> None:
         """Kill -9 of a process, which is started again ``for_ms`` later."""
         role = fault.target
@@ -166,8 +164,6 @@ class ChaosDeployment(VirtualDeployment):
         if self._runs("edge"):
             checkpoint.save(self._checkpoint, self.updates.field.state(), durable=False)
 
-    # --- what a frame meets ---------------------------------------------------------------------------
-
     def _capture(self, name: str, now_ns: int) -> None:
         if not self._runs("node") or self._away[name] > 0:
             self._tick[name] += 1
@@ -238,8 +234,6 @@ class ChaosDeployment(VirtualDeployment):
 
     def _wake_ns(self) -> int:
         return max(self._wake.at_ns, self.clock.now_ns()) if self._runs("edge") else NEVER_NS
-
-    # --- processes ------------------------------------------------------------------------------------
 
     def _runs(self, *roles: str) -> bool:
         return not (self._down | self._stalled.keys()) & {*roles}

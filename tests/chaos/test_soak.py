@@ -48,11 +48,9 @@ def recovery_s(out: Path, kind: str, role: str, over_ns: int) -> float:
     ledgers = ledger.read_all(out)
     if kind == "kill":
         over_ns = max(int(one.path.stem.rpartition("-")[2]) for one in ledgers if one.role == role)
-    delivered = [e for one in ledgers if one.role == "edge" for e in one.events if e.event == "delivered"]
-    first = dict.fromkeys({event.camera for event in delivered}, 2**62)
-    for event in delivered:
-        if event.t_ns > over_ns:
-            first[event.camera] = min(first[event.camera], event.t_ns)
+    first: dict[str, int] = {}
+    for event in (e for one in ledgers if one.role == "edge" for e in one.events if e.event == "delivered"):
+        first[event.camera] = min(first.get(event.camera, 2**62), event.t_ns if event.t_ns > over_ns else 2**62)
     return (max(first.values()) - over_ns) / 1e9
 
 

@@ -16,7 +16,6 @@ from camera_node.capture import build_cameras
 from camera_node.node import Node, NodeOptions
 from camera_node.settings import source_config
 from camera_node.sources.base import pixels
-from camera_node.synthetic.effects import load_effects
 from channel_emu.model.settings import channel_from_mapping
 from edge_server.experiments.virtual.simulate import main as simulate
 from edge_server.export import ExportError
@@ -111,7 +110,6 @@ def test_what_is_of_the_wrong_kind_is_refused_by_name(folder):
 
     for use, why in (
         (lambda: make_policy(f"{own}Darker", None, None), r"does not derive from edge_server\.scheduler\.Policy"),
-        (lambda: load_effects({f"{own}Late": {}}, None), "expected a subclass of EffectParameters"),
         (lambda: channel_from_mapping({"faults": {f"{own}Youngest": {}}}), r"from channel_emu\.model\.link\.Fault"),
         (lambda: make_field(f"{own}Youngest"), "expected an attribute Settings"),
         (lambda: source(kind=f"{own}Youngest"), r"raw.yaml: source.kind: .*base\.Source"),

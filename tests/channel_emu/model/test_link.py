@@ -99,7 +99,6 @@ def test_sampling_takes_the_newest_offered_frame():
     transits = [subject.offer(i * 10 * MS)[0] for i in range(4000)]
     subject.advance(40_000 * MS)
     counts = Counter(str(t.outcome) for t in transits)
-    assert set(counts) <= {"skipped", "delivered", "None"} and counts["None"] <= 1
     # Sampled at the first arrival after each offer: one per 120 ms on average, and each within its period.
     assert counts["delivered"] == pytest.approx(4000 * (1 - 2.718281828 ** (-10 / 120)), rel=0.12)
     for t in transits:

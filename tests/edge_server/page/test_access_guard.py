@@ -27,7 +27,7 @@ from freshfield.transport import Transport, TransportError
 from tests.edge_server.page.preview import BallScene, bare_state, publication
 from tests.edge_server.page.visitor import CAMERA, Visitor, ask, page_of
 from tests.role_table import TOKENS, cells_of
-from tests.support import free_port, wait_until
+from tests.support import free_port, refused, wait_until
 
 # Without TLS the login is the same, and easier to talk to.
 LOGIN = Transport(tokens=TOKENS, insecure=True)
@@ -134,10 +134,8 @@ def tls_of(folder: Path) -> dict[str, Path]:
 def test_tls_and_login_or_words_or_no_page(tmp_path, caplog) -> None:
     files = tls_of(tmp_path)
     for half in (Transport(tokens=TOKENS), Transport(**files)):
-        with pytest.raises(TransportError, match="--insecure"):
-            start_page(bare_state(), "0.0.0.0", 0, half)
-        with pytest.raises(TransportError, match="--insecure"):
-            serve_metrics(bare_state(), INGEST, "0.0.0.0", 0, half)
+        refused(TransportError, "--insecure", start_page, bare_state(), "0.0.0.0", 0, half)
+        refused(TransportError, "--insecure", serve_metrics, bare_state(), INGEST, "0.0.0.0", 0, half)
     port = free_port()
     serve_metrics(bare_state(), INGEST, "0.0.0.0", port, Transport(**files, tokens=TOKENS))
     with page_of(bare_state(), Transport(**files, tokens=TOKENS), "0.0.0.0") as page:

@@ -73,7 +73,7 @@ class Client:
         return getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name).FromString(body), log_ns
 
 
-def test_one_message_of_each_kind(served):
+def test_one_message_of_each_kind_and_the_layout_that_shows_them(served):
     preview, server = served
     client = Client(server)
     held_out = preview.names[CAMERAS // 2]
@@ -100,6 +100,11 @@ def test_one_message_of_each_kind(served):
     assert decision["published_ns"] == log_ns and held_out not in decision["selected"]
     assert set(decision) == set(json.loads(client.channels["/decisions"]["schema"])["properties"])
     assert client.first("/scores")[0]["psnr_db"] == 30.0
+    # The layout shows topics and values that are served.
+    shown = set(re.findall(r'"(/[^"]*)"', (ROOT / "deploy/foxglove-layout.json").read_text()))
+    assert len(shown) > 6
+    for topic, _, value in (name.partition(".") for name in shown):
+        assert not value or value in json.loads(client.channels[topic]["schema"])["properties"], topic
 
 
 def test_points_are_the_gaussians_that_are_seen(served):
@@ -134,17 +139,6 @@ def test_a_taken_port_and_a_view_that_fails_are_said(served, caplog):
     client.subscribe("/rendered/image")
     wait_until(lambda: "serving Foxglove failed: ZeroDivisionError" in caplog.text, "no word of it")
     assert server._thread.is_alive()
-
-
-def test_the_layout_shows_topics_and_values_that_are_served(served):
-    _, server = served
-    client = Client(server)
-    shown = set(re.findall(r'"(/[^"]*)"', (ROOT / "deploy/foxglove-layout.json").read_text()))
-    assert len(shown) > 6
-    for name in shown:
-        topic, _, value = name.partition(".")
-        assert topic in client.channels, name
-        assert not value or value in json.loads(client.channels[topic]["schema"])["properties"], name
 
 
 def test_it_is_refused_beside_a_login_which_it_would_go_around(tmp_path, capsys):

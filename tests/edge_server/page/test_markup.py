@@ -13,7 +13,7 @@ from edge_server.page import markup, timelines
 from edge_server.page.colors import FRESH, HELD_OUT, STALE, css, scale_color
 from edge_server.page.diagnosis import poor_picture
 from edge_server.page.settings import FLAT_SCORES
-from edge_server.page.timelines import MAX_POINTS, History, _decimate
+from edge_server.page.timelines import MAX_POINTS, History
 from edge_server.run_records import Frontier, FrontierPoint, age_parts_ms
 from tests.edge_server.page.preview import publication
 
@@ -193,9 +193,8 @@ def test_the_charts_show_ages_scored_updates_of_the_window_and_states_by_name():
     history.sample(201.0, views(100.0, 500.0), None)
     charts.refresh(history, [])
     assert len(made) == 4 and len(made[3].data[0]) == 4
-
-
-def test_a_long_chart_is_thinned_and_keeps_the_newest():
-    t = np.arange(1000.0)
-    thin_t, thin_y = _decimate(t, 2 * t)
-    assert len(thin_t) <= MAX_POINTS and thin_t[-1] == 999 and np.array_equal(thin_y, 2 * thin_t)
+    for k in range(799):
+        history.sample(202.0 + k, views(1000.0 + k), None)
+    charts.refresh(history, [])
+    t, mean, _ = made[3].data  # thinned, with the newest
+    assert len(t) <= MAX_POINTS and t[-1] == 1000.0 and np.array_equal(mean[-9:], t[-9:] + 798.0)

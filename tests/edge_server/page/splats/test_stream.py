@@ -117,8 +117,6 @@ def test_the_rules_of_the_page_hold_for_the_stream():
             each.socket.close()
 
 
-# --- a browser -------------------------------------------------------------------------------------
-
 ARRIVED = "window.splats && splats.reader.moves && splats.reader.shown.total + splats.reader.moving.count"
 # Draws at a fixed instant and returns the canvas.
 DRAW = """

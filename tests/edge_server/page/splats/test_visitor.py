@@ -263,18 +263,6 @@ def test_what_moves_stays_when_anchors_are_chosen_anew(kilobytes):
     assert len({block.anchors for block in link.of(messages.MovingBlock)}) > 6
 
 
-def test_what_has_left_is_shown_no_longer_and_nothing_else_is_sent_again():
-    link = Link(Line(2e6))
-    link.run(ticks(2.0))
-    still = link.reader._shown.number
-    assert len(link.reader.at(NEWEST_S)) == COUNT + 1000
-    link.run(ticks(3.0, 2.0), lambda now_s: replace(trained(1.0), moving=None))
-    assert len(link.reader.at(NEWEST_S)) == COUNT
-    assert len([block for block in link.of(messages.MovingBlock, since_s=2.0) if not len(block.records)]) == 1
-    link.run(ticks(4.0, 3.0))
-    assert len(link.reader.at(NEWEST_S)) == COUNT + 1000 and link.reader._shown.number == still
-
-
 def test_what_no_camera_has_seen_is_said_also_when_it_is_known_later():
     visitor, published, said = Visitor(), Publisher(0).take(trained(0.0), 0.0), []
     unseen = np.arange(COUNT) % 3 == 0
