@@ -45,7 +45,6 @@ class ChaosDeployment(VirtualDeployment):
     arrivals: instants of deliveries, by camera.
     damaged_admitted: number of frames admitted although the network had damaged them.
     most_inside: largest number of frames inside a link.
-    restarts: number of restarts, by role.
     """
 
     def __init__(
@@ -55,7 +54,6 @@ class ChaosDeployment(VirtualDeployment):
         self.really: Counter[str] = Counter()
         self.arrivals: dict[str, list[int]] = {camera.name: [] for camera in cameras}
         self.most_inside = self.damaged_admitted = 0
-        self.restarts: Counter[str] = Counter()
         self._out, self._checkpoint = out, out / "field.npz"
         self._down: set[str] = set()
         self._stalled: dict[str, int] = {}
@@ -112,10 +110,9 @@ class ChaosDeployment(VirtualDeployment):
     def _restart(self, role: str, resume: bool) -> None:
         now_ns = self.clock.now_ns()
         self._down.discard(role)
-        self.restarts[role] += 1
         self._open_ledger(role)
         if role == "node":
-            self.session = f"restart-{self.restarts[role]}"
+            self.session = f"restart-{now_ns}"
             self._synced_ns = now_ns
         elif role == "emulator":
             self._channel_origin_ns = now_ns

@@ -25,7 +25,7 @@ from freshfield.v1 import frames_pb2 as pb
 from tests.camera_node.depth_source import DepthSource
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 from tests.edge_server.fields_for_tests import TINY
-from tests.integration.peer import Peer
+from tests.integration.peer import Peer, answer
 from tests.integration.test_node_stream import run_while
 from tests.support import free_port, refused
 
@@ -54,18 +54,13 @@ def node_of(scenario, to: str, cameras=None, seconds: float | None = None) -> No
     return Node(scenario, built, NodeOptions(to=to, transport=Transport(), seconds=seconds))
 
 
-def accepted(request: pb.PushRequest) -> pb.PushResponse:
-    return pb.PushResponse(sequence=request.header.sequence, outcome=pb.OUTCOME_ACCEPTED)
-
-
-def sent_by(scenario, cameras=None, seconds=None, take=accepted, after_s: float = 0.0) -> list[pb.PushRequest]:
+def sent_by(scenario, cameras=None, seconds=None, take=None, after_s: float = 0.0) -> list[pb.PushRequest]:
     """What a node sends until it ends by itself (or after some seconds); ``take`` answers, after a while."""
     got: list[pb.PushRequest] = []
 
     async def respond(request: pb.PushRequest) -> pb.PushResponse:
         got.append(request)
-        await asyncio.sleep(after_s)
-        return take(request)
+        return await answer(after_s=after_s)(request) if take is None else take(request)
 
     async def scene() -> None:
         peer = await Peer(respond=respond).start()

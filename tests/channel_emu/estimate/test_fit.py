@@ -13,7 +13,7 @@ from scipy import linalg
 from channel_emu.cli import main
 from channel_emu.estimate import recording as recordings
 from channel_emu.estimate import two_states
-from channel_emu.estimate.fit import Fit, IntervalEstimate, fit
+from channel_emu.estimate.fit import Fit, fit
 from channel_emu.estimate.report import format_fit
 from channel_emu.estimate.two_states import TwoStates
 from channel_emu.model.chain import two_state_generator
@@ -54,21 +54,15 @@ def write_rows(path: Path, section: dict, seed: int = 1, seconds: float = 120.0)
     return path
 
 
-def holds(found: IntervalEstimate, true: float, widened: float = 1.0) -> bool:
-    """Whether the interval, widened about the value on the logarithmic scale, holds the truth."""
-    assert found.interval is not None
-    low, high = (math.log(v / found.value) * widened for v in found.interval)
-    return low <= math.log(true / found.value) <= high
-
-
 def check(found: Fit, true: dict[str, float]) -> None:
     """Each parameter within one and a half times the reach of its interval (three standard deviations), and
     no interval so wide that it says nothing."""
     assert found.states == (2 if "mu1_per_ms" in true else 1) and set(found.parameters) == set(true)
     for name, value in true.items():
-        assert holds(found.parameters[name], value, 1.5), (name, found.parameters[name], value)
-        interval = found.parameters[name].interval
-        assert interval is not None and interval[1] / interval[0] < 3.5
+        parameter = found.parameters[name]
+        low, high = (1.5 * math.log(end / parameter.value) for end in parameter.interval)
+        assert low <= math.log(value / parameter.value) <= high, (name, parameter, value)
+        assert parameter.interval[1] / parameter.interval[0] < 3.5
 
 
 def test_a_slow_chain_from_delays_alone(tmp_path):

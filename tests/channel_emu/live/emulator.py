@@ -32,11 +32,9 @@ CAMERAS = ("cam00", "cam01", "cam02", "cam03")
 _sessions = itertools.count()
 
 
-def make(
-    out: Path, address: str, section: dict, cameras=("cam00",), **options
-) -> tuple[FrameProxy, list[CameraStream]]:
+def make(out: Path, to: str, section: dict, cameras=("cam00",), **options) -> tuple[FrameProxy, list[CameraStream]]:
     """A proxy for the frame stream, not started, and its cameras' flows."""
-    chosen = ProxyOptions("127.0.0.1:0", address, options.pop("transport", Transport()), **options)
+    chosen = ProxyOptions("127.0.0.1:0", to, options.pop("transport", Transport()), **options)
     proxy = FrameProxy(channel_from_mapping(section), 5, chosen, cameras, out)
     return proxy, list(proxy.flows.values())
 

@@ -6,6 +6,7 @@ import math
 from collections import deque
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,19 +20,6 @@ from edge_server.page.splats.visitor import LinkWindow, Visitor
 from tests.edge_server.page.splats.gaussians import NEWEST_S, gaussians, motion, snapshot
 
 COUNT = 6000
-
-
-class Shared:
-    """A publisher of several links that look at the same instants: what it publishes is made once."""
-
-    def __init__(self) -> None:
-        self._publisher = Publisher(0)
-        self._made: dict[float, Published | None] = {}
-
-    def take(self, shown, now_s: float) -> Published | None:
-        if now_s not in self._made:
-            self._made[now_s] = self._publisher.take(shown, now_s)
-        return self._made[now_s]
 
 
 class Line:
@@ -68,7 +56,7 @@ class Link:
     """A visitor at the end of a link. ages_s: of the publication that is shown, at each tick."""
 
     def __init__(
-        self, there: Line | Scattering, back: Line | Scattering | None = None, publisher: Shared | None = None
+        self, there: Line | Scattering, back: Line | Scattering | None = None, publisher: SimpleNamespace | None = None
     ) -> None:
         self.there, self.back = there, back or Line(math.inf)
         self.visitor, self.reader, self.publisher = Visitor(), messages.StreamReader(), publisher or Publisher(0)
@@ -123,9 +111,16 @@ def tenths(now_s: float):
 
 
 @pytest.fixture(scope="module")
-def publisher() -> Shared:
-    """Of ``tenths``."""
-    return Shared()
+def publisher() -> SimpleNamespace:
+    """Of ``tenths``, for links that look at the same instants: what it publishes is made once."""
+    publisher, made = Publisher(0), {}
+
+    def take(shown, now_s: float) -> Published | None:
+        if now_s not in made:
+            made[now_s] = publisher.take(shown, now_s)
+        return made[now_s]
+
+    return SimpleNamespace(take=take)
 
 
 def ticks(seconds: float, since_s: float = 0.0) -> range:
