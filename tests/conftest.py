@@ -38,7 +38,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 # What has the machine to itself: whole deployments, and what compares instants of the wall clock. All else computes, or
 # waits for what has seconds to come: whoever runs beside it changes nothing but how long it takes.
-_ALONE = {
+_FILES = {
     "camera_node/robot/arm": "drive joint_states",
     "camera_node/robot/simulated_controller": "controller",
     "camera_node/robot/teleop": "teleop_command",
@@ -50,6 +50,7 @@ _ALONE = {
     "edge_server/page/splats": "stream",
     "edge_server/page": "access_guard browser foxglove_live network_control page preferences",
 }
+_ALONE = {ROOT / f"tests/{folder}/test_{name}.py" for folder, names in _FILES.items() for name in names.split()}
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -75,20 +76,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--faults", metavar="K,...", help="only these faults of the seeds of -m chaos, or none [all]")
 
 
-def _is_alone(file: Path) -> bool:
-    return any(
-        file == ROOT / f"tests/{folder}/test_{name}.py" for folder, names in _ALONE.items() for name in names.split()
-    )
-
-
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Both passes of ``make test`` import their own files alone: all of them take ten seconds."""
     asked = config.getoption("markexpr")
     if not asked.endswith("side_by_side") or not collection_path.name.startswith("test_"):
         return None
     if asked.endswith("not side_by_side"):
-        return None if _is_alone(collection_path) or "mark.alone" in collection_path.read_text() else True
-    return _is_alone(collection_path) or None
+        return None if collection_path in _ALONE or "mark.alone" in collection_path.read_text() else True
+    return collection_path in _ALONE or None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -99,7 +94,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=[item for item in items if item.nodeid in left_out])
         items[:] = [item for item in items if item.nodeid not in left_out]
     for item in items:
-        if not _is_alone(item.path) and item.get_closest_marker("alone") is None:
+        if item.path not in _ALONE and item.get_closest_marker("alone") is None:
             item.add_marker("side_by_side")
 
 

@@ -55,11 +55,9 @@ _SWAPS = {
 }
 OPERATORS = (
     *(f"core/Replace{kind}Operator_{swap}" for kind, swaps in _SWAPS.items() for swap in swaps.split()),
-    *(f"core/Replace{a}With{b}" for a, b in (("True", "False"), ("False", "True"), ("And", "Or"), ("Or", "And"))),
-    *(f"core/Replace{a}With{b}" for a, b in (("Break", "Continue"), ("Continue", "Break"))),
-    "core/NumberReplacer",
-    "core/AddNot",
-    "core/ZeroIterationForLoop",
+    *(f"core/Replace{a}" for a in ("TrueWithFalse", "FalseWithTrue", "AndWithOr", "OrWithAnd")),
+    *("core/ReplaceBreakWithContinue", "core/ReplaceContinueWithBreak"),
+    *("core/NumberReplacer", "core/AddNot", "core/ZeroIterationForLoop"),
 )
 # What these hold is not computed with: messages, types, names of modules, what a file does when it is run.
 _PASSED_OVER = (ast.Raise, ast.JoinedStr, ast.Assert, ast.Import, ast.ImportFrom)

@@ -4,7 +4,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import grpc
 import pytest
@@ -14,13 +13,6 @@ from channel_emu.model import notation
 from freshfield import ledger
 from tests.channel_emu.test_testing import HELLO, Greeter
 from tests.support import free_port, refusal, wait_until
-
-
-@pytest.fixture
-def scenario(tmp_path: Path) -> Path:
-    path = tmp_path / "t.yaml"
-    path.write_text('{"name": "t", "seed": 3, "cameras": {"count": 2}, "channel": {"preset": "ch5"}}')
-    return path
 
 
 def simulate(capsys, line: str, *words: str) -> dict:
@@ -92,9 +84,9 @@ def ended(process: subprocess.Popen[str]) -> str:
     return out
 
 
-def test_run_as_a_process_ends_cleanly_when_told(scenario, tmp_path, capsys):
+def test_run_as_a_process_ends_cleanly_when_told(tmp_path, capsys):
     out, port = tmp_path / "out", free_port()
-    words = ["run", str(scenario), "--listen", f"127.0.0.1:{port}", "--to", f"127.0.0.1:{free_port()}"]
+    words = ["run", "card", "--listen", f"127.0.0.1:{port}", "--to", f"127.0.0.1:{free_port()}"]
     words += ["--out", str(out), "--trace", str(out / "t.jsonl")]
     with command(*words) as process:
         wait_until((out / "channel.json").exists, "no status", 30.0)

@@ -69,16 +69,9 @@ def greeter() -> Iterator[Greeter]:
     served.stop()
 
 
-@pytest.fixture
-def client(request: pytest.FixtureRequest):
-    """``client(link)``: a plain client channel to the link."""
-
-    def connect(link: EmulatedLink) -> grpc.Channel:
-        made = grpc.insecure_channel(link.address)
-        request.addfinalizer(made.close)
-        return made
-
-    return connect
+def client(link: EmulatedLink) -> grpc.Channel:
+    """A plain client channel to the link."""
+    return grpc.insecure_channel(link.address)
 
 
 def paced(count: int, every_s: float) -> Iterator[bytes]:
@@ -97,7 +90,7 @@ def code_of(call, *words, **options) -> str:
         return error.code().name
 
 
-def test_a_streams_ages_and_losses_are_the_channels(channel, greeter, client):
+def test_a_streams_ages_and_losses_are_the_channels(channel, greeter):
     """The example: 100 messages, one each 10 ms, over a link that takes 15 ms and drops what finds it busy:
     every second one gets through, if the machine paces them evenly."""
     link = channel({"service": "det:15ms", "discipline": "drop-new"}, to=greeter.address, seed=1)
@@ -113,7 +106,7 @@ def test_a_streams_ages_and_losses_are_the_channels(channel, greeter, client):
     assert numbers == sorted(set(numbers)) and report.by_method[f"up {COLLECT}"].offered == 100
 
 
-def test_a_dropped_unary_call_is_unavailable_and_the_same_ones_are_dropped_again(channel, greeter, client):
+def test_a_dropped_unary_call_is_unavailable_and_the_same_ones_are_dropped_again(channel, greeter):
     """Draws are looked up by the message's number: whatever the timing."""
 
     def codes(seed: int) -> list[str]:
@@ -127,7 +120,7 @@ def test_a_dropped_unary_call_is_unavailable_and_the_same_ones_are_dropped_again
     assert codes(3) == first != codes(4)
 
 
-def test_dropped_stream_messages_are_left_out_in_both_directions(channel, greeter, client):
+def test_dropped_stream_messages_are_left_out_in_both_directions(channel, greeter):
     link = channel(LOSSY, to=greeter.address, seed=5, direction="both")
     answers = list(client(link).stream_stream(ECHO)(paced(60, 0.001), timeout=20))
     report = link.settle()
@@ -138,7 +131,7 @@ def test_dropped_stream_messages_are_left_out_in_both_directions(channel, greete
     assert numbers == sorted(set(numbers)) and set(numbers) <= set(range(60))
 
 
-def test_metadata_status_trailers_and_deadline_pass(channel, greeter, client):
+def test_metadata_status_trailers_and_deadline_pass(channel, greeter):
     stub = client(channel({"service": "det:40ms"}, to=greeter.address, direction="both"))
     begun = time.monotonic()
     answer, call = stub.unary_unary(HELLO).with_call(b"you", timeout=5, metadata=(("name", "a test"),))
@@ -157,7 +150,7 @@ def test_metadata_status_trailers_and_deadline_pass(channel, greeter, client):
     assert code_of(stub.unary_unary(HELLO), b"you", timeout=0.02) == "DEADLINE_EXCEEDED"
 
 
-def test_cancellation_reaches_the_service_and_frees_the_link(channel, greeter, client):
+def test_cancellation_reaches_the_service_and_frees_the_link(channel, greeter):
     link = channel({"service": "det:5ms", "discipline": "fcfs"}, to=greeter.address, direction="down")
     call = client(link).unary_stream(COUNT)(b"1000", timeout=30)
     assert [int(word) for word in itertools.islice(call, 3)] == [0, 1, 2]
@@ -168,7 +161,7 @@ def test_cancellation_reaches_the_service_and_frees_the_link(channel, greeter, c
     assert report.delivered == report.outcomes["forwarded"] + report.outcomes.get("cancelled", 0)
 
 
-def test_behind_a_message_in_the_link_no_more_are_read_than_the_bound(channel, greeter, client, monkeypatch):
+def test_behind_a_message_in_the_link_no_more_are_read_than_the_bound(channel, greeter, monkeypatch):
     monkeypatch.setattr(call_flow, "_MOST_BEHIND", 10)
     link = channel({"service": "det:300ms", "discipline": "fcfs", "queue_limit": 1000}, to=greeter.address)
     answers = client(link).stream_stream(ECHO)(paced(100, 0.0), timeout=20)
@@ -179,7 +172,7 @@ def test_behind_a_message_in_the_link_no_more_are_read_than_the_bound(channel, g
     wait_until(lambda: link.report().offered == 11, "it does not go on")
 
 
-def test_no_service_and_a_link_that_failed_say_so_and_it_still_closes(channel, client):
+def test_no_service_and_a_link_that_failed_say_so_and_it_still_closes(channel):
     link = channel("ideal", to="127.0.0.1:1")
     assert code_of(client(link).unary_unary(HELLO), b"") == "UNAVAILABLE"
     link._loop.call_soon_threadsafe(link._proxy.fail, OSError(28, "No space left on device"))
@@ -187,7 +180,7 @@ def test_no_service_and_a_link_that_failed_say_so_and_it_still_closes(channel, c
     link.close()
 
 
-def test_damage_and_doubles(channel, greeter, client):
+def test_damage_and_doubles(channel, greeter):
     stub = client(channel({"faults": {"duplication": 1.0}}, to=greeter.address))
     doubled = list(stub.stream_stream(ECHO)(iter([b"a", b"b", b"c"]), timeout=5))
     assert doubled[1:] == [b"b", b"b", b"c", b"c"] or doubled == [b"a", b"a", b"b", b"b", b"c", b"c"]
@@ -197,7 +190,7 @@ def test_damage_and_doubles(channel, greeter, client):
     assert len(answer) == 7 and sum(a != b for a, b in zip(answer, b"payload")) == 1
 
 
-def test_methods_that_a_client_invents_share_one_link(channel, greeter, client, monkeypatch):
+def test_methods_that_a_client_invents_share_one_link(channel, greeter, monkeypatch):
     monkeypatch.setattr(proxy, "_MOST_METHODS", 2)
     link = channel("ideal", to=greeter.address)
     for n in range(5):

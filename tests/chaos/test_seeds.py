@@ -28,13 +28,8 @@ from freshfield.scenario import Scenario
 from tests.chaos.chaos_deployment import ChaosDeployment
 from tests.chaos.fault_plan import FAULTS_OVER_S, QUEUE_LIMIT, SECONDS, Fault, draw_faults, scenario_of
 
-SETTINGS = RunSettings(
-    steps=2,
-    compute=ComputeConfig(ms_per_step=20.0, ms_per_update=20.0),
-    grace_ms=500.0,
-    epoch_ms=100.0,
-    score_every_ms=None,
-)
+_COMPUTE = ComputeConfig(ms_per_step=20.0, ms_per_update=20.0)
+SETTINGS = RunSettings(steps=2, compute=_COMPUTE, grace_ms=500.0, epoch_ms=100.0, score_every_ms=None)
 RECOVERY_S = 2.0
 # Most frames inside a link: a queue's limit, plus the frame in service and the one not sampled yet.
 _MOST_INSIDE = QUEUE_LIMIT + 2

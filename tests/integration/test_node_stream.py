@@ -169,12 +169,6 @@ def test_offset_of_a_wrong_clock_is_estimated(tmp_path):
         assert frame.clock_uncertainty_ns < 20_000_000
 
 
-def test_without_a_clock_service_the_offset_is_said_to_be_unknown(tmp_path):
-    peer = Peer(with_clock_service=False)
-    run_against(peer, tmp_path, frames=10)
-    assert {f.clock_uncertainty_ns for f in peer.frames} == {MAX_CAPTURE_AGE_NS}
-
-
 def test_the_first_frame_waits_for_the_clock_and_is_the_newest(tmp_path):
     peer = Peer(clock=WallClock(offset_ns=7_000_000_000), clock_delay_s=0.4)
     run_against(peer, tmp_path, frames=20)
@@ -183,6 +177,8 @@ def test_the_first_frame_waits_for_the_clock_and_is_the_newest(tmp_path):
     first = {f.camera: f for f in reversed(peer.frames)}
     assert {f.sequence > 1 for f in first.values()} == {True}  # what was captured meanwhile was replaced
     check_books(tmp_path / "out")
+    run_against(peer := Peer(with_clock_service=False), tmp_path / "unknown", frames=10)
+    assert {f.clock_uncertainty_ns for f in peer.frames} == {MAX_CAPTURE_AGE_NS}
 
 
 CAMERAS = ["cam00", "cam01", "cam02"]

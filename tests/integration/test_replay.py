@@ -76,14 +76,8 @@ def session(tmp_path_factory):
     """A node's session, recorded at the edge's door: the file, and what was sent."""
     folder = tmp_path_factory.mktemp("session")
     recorder = Recorder(folder / "a.mcap", "test")
-    ingest = Ingest(
-        WallClock(),
-        FrameBuffer(("cam01", "cam02")),
-        ["cam00"],
-        Ledger(folder, "edge", "edge", 1),
-        lambda frame: None,
-        recorder.frame,
-    )
+    ledger, cameras = Ledger(folder, "edge", "edge", 1), FrameBuffer(("cam01", "cam02"))
+    ingest = Ingest(WallClock(), cameras, ["cam00"], ledger, lambda frame: None, recorder.frame)
     scenario = photo_scenario(write_photos(folder / "data", 24), 3, fps=25)
     sent = sent_by(scenario, seconds=1.5, take=ingest.take)
     recorder.close()
@@ -99,10 +93,8 @@ def said(request: pb.PushRequest) -> tuple:
     return (*parts, h.codec, h.width, h.height, h.role, h.pose_gap_ns, request.payload, depth)
 
 
-def of_each_camera(sent, got):
-    """Messages sent and got, camera by camera."""
-    for camera in ("cam00", "cam01", "cam02"):
-        yield camera, *([r for r in rows if r.header.camera_id == camera] for rows in (sent, got))
+def by_camera(sent: list[pb.PushRequest]) -> dict[str, list[pb.PushRequest]]:
+    return {name: [r for r in sent if r.header.camera_id == name] for name in ("cam00", "cam01", "cam02")}
 
 
 @pytest.mark.parametrize("after_s", [0.0, 0.05], ids=["quick answers", "answers slower than frames"])
@@ -110,9 +102,10 @@ def test_replay_is_exact_to_the_message(session, after_s):
     file, sent = session
     shifts, found = set(), Session(file)
     assert found.cut is None and len(sent) > 60
-    for camera, mine, _ in of_each_camera(sent, ()):
+    for camera, mine in by_camera(sent).items():
         assert [f.header for f in found.frames[camera]] == [r.header for r in mine]
-    for _, before, after in of_each_camera(sent, sent_by(replay_scenario(file), after_s=after_s)):
+    again = by_camera(sent_by(replay_scenario(file), after_s=after_s))
+    for before, after in zip(by_camera(sent).values(), again.values()):
         assert [said(r) for r in after] == [said(r) for r in before]
         assert [r.header.sequence for r in after] == list(range(len(before)))
         shifts |= {b.header.generated_ns - a.header.generated_ns for a, b in zip(before, after)}

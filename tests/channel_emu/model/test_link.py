@@ -80,8 +80,6 @@ def test_what_others_cause_is_told_at_once():
     assert subject["b"].next_event_ns == 20 * MS
     # One clock for all: c cannot offer before what was decided already.
     assert subject["c"].offer(5 * MS)[0].offered_ns == 12 * MS and subject["c"].clock_backwards == 1
-    with pytest.raises(ValueError, match="a has a link to this server already"):
-        Link("a", "fcfs", subject["a"]._service, server=subject["a"].server)
 
 
 def test_a_reset_breaks_one_camera_and_frees_the_line():

@@ -23,9 +23,7 @@ def record(path: Path, section: dict, frames: int) -> tuple[trace.Trace, dict[st
     told: dict[str, list[Event]] = {}
     for camera, phase in (("a", 0), ("b", 7)):
         link = channel.link(camera)
-        events: list[Event] = []
-        for n in range(frames):
-            events += link.offer((33 * n + phase) * MS, n, 1000 + n)[1]
+        events = [e for n in range(frames) for e in link.offer((33 * n + phase) * MS, n, 1000 + n)[1]]
         events += link.advance(33 * frames * MS)
         doubled = {e.transit.number for e in events if e.kind is EventKind.DUPLICATED}
         for e in events:

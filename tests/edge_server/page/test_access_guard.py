@@ -10,6 +10,7 @@ import ssl
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from unittest import mock
 
 import msgspec
 import numpy as np
@@ -109,9 +110,8 @@ def test_who_may_only_look_chooses_what_they_see_for_themselves_alone() -> None:
 
 
 POINTS = np.random.default_rng(0).random((300_000, 3), np.float32)  # 4.5 MB to send
-INGEST = SimpleNamespace(
-    rejected={}, depth={}, buffer=SimpleNamespace(shed=0), check_ms=SimpleNamespace(percentile=lambda percent: None)
-)
+INGEST = SimpleNamespace(rejected={}, depth={}, buffer=SimpleNamespace(shed=0), check_ms=mock.Mock())
+INGEST.check_ms.percentile.return_value = None
 
 
 def test_a_login_lasts_for_the_websocket_and_is_nobody_elses() -> None:
@@ -131,7 +131,8 @@ def tls_of(folder: Path) -> dict[str, Path]:
     return {part: folder / "keys" / "edge" / f"{part}.pem" for part in ("cert", "key")}
 
 
-def test_tls_and_login_or_words_or_no_page(tmp_path, caplog) -> None:
+def test_tls_and_login_or_words_or_no_page(tmp_path, caplog, monkeypatch) -> None:
+    monkeypatch.setattr(access_guard, "TLS_HANDSHAKE_TIMEOUT_S", 1.0)
     files = tls_of(tmp_path)
     for half in (Transport(tokens=TOKENS), Transport(**files)):
         refused(TransportError, "--insecure", start_page, bare_state(), "0.0.0.0", 0, half)
@@ -150,6 +151,8 @@ def test_tls_and_login_or_words_or_no_page(tmp_path, caplog) -> None:
             assert path != "/" or "Secure" in answer.getheader("Set-Cookie")
             with pytest.raises((OSError, http.client.HTTPException)):
                 ask(number, path)
+        with socket.create_connection(("127.0.0.1", page.port), timeout=4.0) as silent:  # no handshake
+            assert silent.recv(1) == b""
     assert "--insecure" not in caplog.text
 
 
@@ -284,14 +287,6 @@ def test_half_requests_end_for_new_ones(monkeypatch) -> None:
                 assert oldest.recv(1) == b""
         assert ask(page.port)[0] == 200
         visitor.stand_at((1.0, 1.0, 1.0))  # who is in stays in
-
-
-def test_a_connection_without_its_tls_handshake_ends(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(access_guard, "TLS_HANDSHAKE_TIMEOUT_S", 1.0)
-    transport = Transport(**tls_of(tmp_path), tokens=TOKENS)
-    with page_of(bare_state(), transport, "0.0.0.0") as page, contextlib.ExitStack() as open_:
-        silent = open_.enter_context(socket.create_connection(("127.0.0.1", page.port), timeout=4.0))
-        assert silent.recv(1) == b""
 
 
 @pytest.mark.parametrize("what", ["page", "metrics"])

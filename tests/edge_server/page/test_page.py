@@ -223,15 +223,12 @@ def test_the_page_outlives_a_broken_field_and_stops_at_once(raises):
         state.scored(replace(publication(7), psnr_db=float("inf")), Comparison("never", black, black, 7))
         wait_until(lambda: field.renders > 0, "nothing was rendered")
         state.publish(publication(8), BallScene(0.0))  # it has recovered
-        visitor.wait_for(lambda: visitor.image is not None and spread(visitor.image) > 20, "the ball")
+        image = lambda: cv2.imdecode(np.frombuffer(visitor.image, np.uint8), cv2.IMREAD_COLOR)  # noqa: E731
+        visitor.wait_for(lambda: visitor.image is not None and image().std() > 20, "the ball")
         with pytest.raises(PageError, match="--page-port"):
             start_page(bare_state(), "127.0.0.1", page.port)
     start_page(bare_state(), "127.0.0.1", page.port).stop()
     assert not [t for t in set(threading.enumerate()) - before if t.name.startswith("page")]
-
-
-def spread(image: bytes) -> float:
-    return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR).std()
 
 
 def test_a_state_that_fails_to_answer_is_reported_once_and_survived(caplog):

@@ -136,6 +136,9 @@ def test_a_fast_link_has_everything_and_goes_on():
     assert len(link.of(messages.KnotsBlock, since_s=1.0)) > 50  # with each publication
     assert max(link.lags_s) < 0.12
     assert link.reader.status["link"]["static"] == [COUNT, COUNT]
+    link.run(ticks(4.0, 3.0), lambda now_s: replace(trained(1.0), moving=None))
+    assert len(link.reader.at(NEWEST_S)) == COUNT  # what moved has left, and this is said once
+    assert [len(block.records) for block in link.of(messages.MovingBlock, since_s=3.0)].count(0) == 1
 
 
 def test_a_moving_set_that_found_no_room_lets_the_window_grow():
