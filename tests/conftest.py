@@ -38,28 +38,19 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 # What has the machine to itself: whole deployments, and what compares instants of the wall clock. All else computes, or
 # waits for what has seconds to come: whoever runs beside it changes nothing but how long it takes.
-_ALONE = (
-    "camera_node/robot/arm/test_drive.py",
-    "camera_node/robot/arm/test_joint_states.py",
-    "camera_node/robot/simulated_controller/test_controller.py",
-    "camera_node/robot/teleop/test_teleop_command.py",
-    "camera_node/robot/test_flange_camera.py",
-    "camera_node/sources/devices/test_live.py",
-    "camera_node/test_capture.py",
-    "camera_node/test_clock_offset.py",
-    "camera_node/test_node.py",
-    "deploy/test_up.py",
-    "edge_server/live/test_loop.py",
-    "edge_server/live/test_scoring_thread.py",
-    "edge_server/live/test_server.py",
-    "edge_server/page/splats/test_stream.py",
-    "edge_server/page/test_access_guard.py",
-    "edge_server/page/test_browser.py",
-    "edge_server/page/test_foxglove_live.py",
-    "edge_server/page/test_network_control.py",
-    "edge_server/page/test_page.py",
-    "edge_server/page/test_preferences.py",
-)
+_FILES = {
+    "camera_node/robot/arm": "drive joint_states",
+    "camera_node/robot/simulated_controller": "controller",
+    "camera_node/robot/teleop": "teleop_command",
+    "camera_node/robot": "flange_camera",
+    "camera_node/sources/devices": "live",
+    "camera_node": "capture clock_offset node",
+    "deploy": "up",
+    "edge_server/live": "loop scoring_thread server",
+    "edge_server/page/splats": "stream",
+    "edge_server/page": "access_guard browser foxglove_live network_control page preferences",
+}
+_ALONE = {ROOT / f"tests/{folder}/test_{name}.py" for folder, names in _FILES.items() for name in names.split()}
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -85,18 +76,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--faults", metavar="K,...", help="only these faults of the seeds of -m chaos, or none [all]")
 
 
-def _is_alone(file: Path) -> bool:
-    return any(file.is_relative_to(ROOT / "tests" / place) for place in _ALONE)
-
-
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Both passes of ``make test`` import their own files alone: all of them take ten seconds."""
     asked = config.getoption("markexpr")
     if not asked.endswith("side_by_side") or not collection_path.name.startswith("test_"):
         return None
     if asked.endswith("not side_by_side"):
-        return None if _is_alone(collection_path) or "mark.alone" in collection_path.read_text() else True
-    return _is_alone(collection_path) or None
+        return None if collection_path in _ALONE or "mark.alone" in collection_path.read_text() else True
+    return collection_path in _ALONE or None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -107,7 +94,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=[item for item in items if item.nodeid in left_out])
         items[:] = [item for item in items if item.nodeid not in left_out]
     for item in items:
-        if not _is_alone(item.path) and item.get_closest_marker("alone") is None:
+        if item.path not in _ALONE and item.get_closest_marker("alone") is None:
             item.add_marker("side_by_side")
 
 
@@ -123,25 +110,19 @@ def _same_priority() -> Iterator[None]:
     assert after == before, "what raises its priority belongs in a process of its own"
 
 
-def data_dir(name: str) -> Path:
+def data_dir(name: str, kind: str = "data") -> Path:
     """Folder ``name`` of the real input data, or skip with the reason.
 
     Looked for in $FRESHFIELD_DATA, then in ../shared/data beside the checkout.
+    kind: "cases", of the inputs that people reported, in the folder of this name beside that of the data.
     """
-    return _shared(name, "data", os.environ.get("FRESHFIELD_DATA"))
+    given = os.environ.get("FRESHFIELD_DATA")
+    for base in (Path(given) if given else None, ROOT.parent / "shared/data"):
+        if base and (found := base / name if kind == "data" else base.parent / kind / name).is_dir():
+            return found
+    pytest.skip(f"real data set {name!r} not found: set FRESHFIELD_DATA to the folder that holds it")
 
 
 def case_dir(name: str) -> Path:
-    """Folder ``name`` of the inputs that people reported, or skip with the reason.
-
-    Looked for in ``cases`` beside $FRESHFIELD_DATA, then in ../shared/cases beside the checkout.
-    """
-    data = os.environ.get("FRESHFIELD_DATA")
-    return _shared(name, "cases", str(Path(data).parent / "cases") if data else None)
-
-
-def _shared(name: str, kind: str, given: str | None) -> Path:
-    for base in (given, ROOT.parent / "shared" / kind):
-        if base and (Path(base) / name).is_dir():
-            return Path(base) / name
-    pytest.skip(f"real data set {name!r} not found: set FRESHFIELD_DATA to the folder that holds it")
+    """Folder ``name`` of the inputs that people reported, or skip with the reason."""
+    return data_dir(name, "cases")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections import Counter
+from collections.abc import Callable
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -26,7 +27,7 @@ FORBIDDEN = {
         f"edge_server.{name}" for name in ("live", "scheduler", "fidelity", "page", "report", "surface")
     ),
     "edge_server.fields.common": tuple(
-        f"edge_server.fields.{name}" for name in ("splat", "ngp", "nerfacto", "tensorf")
+        f"edge_server.fields.{each}" for each in ("splat", "ngp", "nerfacto", "tensorf")
     ),
     "edge_server.embed": ("edge_server.live", "edge_server.fields", "edge_server.page", "edge_server.report"),
     "edge_server.scheduler": ("edge_server.live", "edge_server.page", "edge_server.report"),
@@ -66,16 +67,15 @@ def within(module: str, room: str) -> bool:
     return module == room or module.startswith(f"{room}.")
 
 
+def wrong_arrows(of: Callable[[str], bool], forbidden: tuple[str, ...]) -> list[str]:
+    """Imports of what is forbidden by the modules for which ``of`` holds."""
+    arrows = [(module, target) for module, targets in imports().items() if of(module) for target in targets]
+    return [f"{m} -> {target}" for m, target in arrows if any(within(target, other) for other in forbidden)]
+
+
 @pytest.mark.parametrize("room", FORBIDDEN)
 def test_arrows_point_one_way(room: str) -> None:
-    wrong = [
-        f"{module} -> {target}"
-        for module, targets in imports().items()
-        if within(module, room) and module != LIBRARY
-        for target in targets
-        if any(within(target, other) for other in FORBIDDEN[room])
-    ]
-    assert not wrong
+    assert not wrong_arrows(lambda module: within(module, room) and module != LIBRARY, FORBIDDEN[room])
 
 
 def test_the_library_names_what_there_is_and_imports_nothing() -> None:
@@ -95,14 +95,8 @@ def test_the_library_names_what_there_is_and_imports_nothing() -> None:
 
 def test_only_experiments_compose_the_packages_and_nothing_imports_experiments() -> None:
     room = "edge_server.experiments"
-    wrong = [
-        f"{module} -> {target}"
-        for module, targets in imports().items()
-        if within(module, "edge_server") and not within(module, room)
-        for target in targets
-        if any(within(target, other) for other in (room, "camera_node", "channel_emu"))
-    ]
-    assert not wrong
+    outside = lambda module: within(module, "edge_server") and not within(module, room)  # noqa: E731
+    assert not wrong_arrows(outside, (room, "camera_node", "channel_emu"))
 
 
 def test_imports_form_no_circle() -> None:

@@ -45,7 +45,6 @@ class ChaosDeployment(VirtualDeployment):
     arrivals: instants of deliveries, by camera.
     damaged_admitted: number of frames admitted although the network had damaged them.
     most_inside: largest number of frames inside a link.
-    restarts: number of restarts, by role.
     """
 
     def __init__(
@@ -55,11 +54,10 @@ class ChaosDeployment(VirtualDeployment):
         self.really: Counter[str] = Counter()
         self.arrivals: dict[str, list[int]] = {camera.name: [] for camera in cameras}
         self.most_inside = self.damaged_admitted = 0
-        self.restarts: Counter[str] = Counter()
         self._out, self._checkpoint = out, out / "field.npz"
         self._down: set[str] = set()
-        self._stalled: set[str] = set()
-        self._stands_until_ns = dict.fromkeys(ROLES, 0)
+        self._stalled: dict[str, int] = {}
+        """Until when, by role."""
         self._away: Counter[str] = Counter()
         self._steps: dict[str, list[tuple[int, int]]] = {camera.name: [] for camera in cameras}
         self._synced_ns = 0  # when the node last asked for the edge's time for other reasons than its period
@@ -88,16 +86,13 @@ class ChaosDeployment(VirtualDeployment):
         for ledger in self._ledgers.values():
             ledger.close(now_ns)
 
-    # --- faults ---------------------------------------------------------------------------------------
-
     def _do_crash(self, fault: Fault) -> None:
         """Kill -9 of a process, which is started again ``for_ms`` later."""
         role = fault.target
         if role in self._down:
             return
         self._down.add(role)
-        self._stalled.discard(role)
-        self._stands_until_ns[role] = 0
+        self._stalled.pop(role, None)
         self._ledgers.pop(role)._lines.close()  # without the line ``closed``
         if role == "node":
             self.really["waiting"] += len(self._waiting)
@@ -115,10 +110,9 @@ class ChaosDeployment(VirtualDeployment):
     def _restart(self, role: str, resume: bool) -> None:
         now_ns = self.clock.now_ns()
         self._down.discard(role)
-        self.restarts[role] += 1
         self._open_ledger(role)
         if role == "node":
-            self.session = f"restart-{self.restarts[role]}"
+            self.session = f"restart-{now_ns}"
             self._synced_ns = now_ns
         elif role == "emulator":
             self._channel_origin_ns = now_ns
@@ -137,14 +131,13 @@ class ChaosDeployment(VirtualDeployment):
         """SIGSTOP of a process, and SIGCONT ``for_ms`` later."""
         role, until_ns = fault.target, self.clock.now_ns() + round(fault.for_ms * 1e6)
         if role not in self._down:
-            self._stalled.add(role)
-            self._stands_until_ns[role] = max(self._stands_until_ns[role], until_ns)
+            self._stalled[role] = max(self._stalled.get(role, 0), until_ns)
             self.at(until_ns, lambda: self._go_on(role))
 
     def _go_on(self, role: str) -> None:
-        if role not in self._stalled or self.clock.now_ns() < self._stands_until_ns[role]:
+        if self.clock.now_ns() < self._stalled.get(role, NEVER_NS):
             return  # killed meanwhile, or it stands for longer
-        self._stalled.discard(role)
+        del self._stalled[role]
         if role == "emulator":
             self._advance_links(self.clock.now_ns())
         self._send_waiting()
@@ -165,13 +158,11 @@ class ChaosDeployment(VirtualDeployment):
         self.next_policy = make_policy(name, value, self.scenario.rng("policy", name))
 
     def _do_checkpoint(self, fault: Fault) -> None:
-        if "edge" not in self._down | self._stalled:
+        if self._runs("edge"):
             checkpoint.save(self._checkpoint, self.updates.field.state(), durable=False)
 
-    # --- what a frame meets ---------------------------------------------------------------------------
-
     def _capture(self, name: str, now_ns: int) -> None:
-        if "node" in self._down | self._stalled or self._away[name] > 0:
+        if not self._runs("node") or self._away[name] > 0:
             self._tick[name] += 1
             return
         super()._capture(name, now_ns)
@@ -184,7 +175,7 @@ class ChaosDeployment(VirtualDeployment):
 
     def _send(self, frame: Frame, now_ns: int) -> None:
         self._count("captured", "node", frame)
-        if "emulator" not in self._down | self._stalled:
+        if self._runs("emulator"):
             self._offer(frame, now_ns)
             return
         if frame.camera in self._waiting:
@@ -193,11 +184,8 @@ class ChaosDeployment(VirtualDeployment):
 
     def _send_waiting(self) -> None:
         """Send the frames that wait at the node, if both the node and the emulator run."""
-        if {"node", "emulator"} & (self._down | self._stalled):
-            return
-        for frame in self._waiting.values():
-            self._offer(frame, self.clock.now_ns())
-        self._waiting.clear()
+        while self._waiting and self._runs("node", "emulator"):
+            self._offer(self._waiting.pop(next(iter(self._waiting))), self.clock.now_ns())
 
     def _offer(self, frame: Frame, now_ns: int) -> None:
         self._count("sent", "node", frame)
@@ -242,10 +230,10 @@ class ChaosDeployment(VirtualDeployment):
         return NEVER_NS if "emulator" in self._stalled else super()._link_event_ns()
 
     def _wake_ns(self) -> int:
-        stands = "edge" in self._down | self._stalled
-        return NEVER_NS if stands else max(self._wake.at_ns, self.clock.now_ns())
+        return max(self._wake.at_ns, self.clock.now_ns()) if self._runs("edge") else NEVER_NS
 
-    # --- processes ------------------------------------------------------------------------------------
+    def _runs(self, *roles: str) -> bool:
+        return not (self._down | self._stalled.keys()) & {*roles}
 
     def _new_updater(self, now_ns: int, resume: bool = False) -> FieldUpdater:
         """The updater of an edge that was just started. resume: load the last checkpoint, if there is one."""

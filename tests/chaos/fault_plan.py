@@ -48,14 +48,10 @@ def scenario_of(seed: int) -> Scenario:
         channel["server"] = {"shared": True}
     if discipline in ("fcfs", "parallel"):
         channel["queue_limit"] = QUEUE_LIMIT
-    faults = {
-        "loss": {"probability": 0.1},
-        "duplication": {"probability": 0.1},
-        "corruption": {"probability": 0.1},
-        "reset": {"at_ms": [900.0]},
-    }
+    faults = {"loss": 0.1, "duplication": 0.1, "corruption": 0.1, "reset": {"at_ms": [900.0]}}
     channel["faults"] = {name: about for name, about in faults.items() if rng.random() < 0.4}
-    policy, value = parse_policy(str(rng.choice(POLICIES)))
+    name, value = parse_policy(str(rng.choice(POLICIES)))
+    edge = {"field": "splat", "field_options": _SMALL, "updates": "cycle", "policy": {"name": name, "value": value}}
     return parse(
         {
             "name": f"chaos-{seed}",
@@ -64,12 +60,7 @@ def scenario_of(seed: int) -> Scenario:
             # With its own motion, its frames, which no other seed needs, are not kept on disk.
             "source": small_world(motion_seed=seed),
             "channel": channel,
-            "edge": {
-                "field": "splat",
-                "field_options": _SMALL,
-                "updates": "cycle",
-                "policy": {"name": policy, "value": value},
-            },
+            "edge": edge,
         },
         Path(f"chaos-{seed}.yaml"),
     )

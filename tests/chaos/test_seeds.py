@@ -28,13 +28,8 @@ from freshfield.scenario import Scenario
 from tests.chaos.chaos_deployment import ChaosDeployment
 from tests.chaos.fault_plan import FAULTS_OVER_S, QUEUE_LIMIT, SECONDS, Fault, draw_faults, scenario_of
 
-SETTINGS = RunSettings(
-    steps=2,
-    compute=ComputeConfig(ms_per_step=20.0, ms_per_update=20.0),
-    grace_ms=500.0,
-    epoch_ms=100.0,
-    score_every_ms=None,
-)
+_COMPUTE = ComputeConfig(ms_per_step=20.0, ms_per_update=20.0)
+SETTINGS = RunSettings(steps=2, compute=_COMPUTE, grace_ms=500.0, epoch_ms=100.0, score_every_ms=None)
 RECOVERY_S = 2.0
 # Most frames inside a link: a queue's limit, plus the frame in service and the one not sampled yet.
 _MOST_INSIDE = QUEUE_LIMIT + 2
@@ -81,23 +76,21 @@ def accounting(deployment: ChaosDeployment, account: Any) -> Iterator[str]:
     yield from account.doubts
     truth = FrameCounts(deployment.really)
     if truth.as_dict() != account.total.as_dict():
-        wrong = [k for k, v in truth.as_dict().items() if v != account.total.as_dict()[k]]
-        about = ", ".join(f"{k} {account.total.as_dict()[k]} (really {truth.as_dict()[k]})" for k in wrong)
-        yield f"the ledgers say {about}"
+        yield f"the ledgers say {account.total.as_dict()}, really {truth.as_dict()}"
 
 
 def bounds(deployment: ChaosDeployment) -> Iterator[str]:
     """Violated bounds of queues and memory, and numbers that are not finite."""
-    if deployment.most_inside > _MOST_INSIDE:
-        yield f"{deployment.most_inside} frames inside a link, at most {_MOST_INSIDE} expected"
-    if deployment.damaged_admitted:
-        yield f"{deployment.damaged_admitted} damaged frames were taken in"
     sessions = max(len(s) for s in deployment._admission._sessions.values())
-    if sessions > MAX_SESSIONS_PER_CAMERA:
-        yield f"{sessions} sessions remembered of a camera, at most {MAX_SESSIONS_PER_CAMERA} expected"
     held = max((len(frames) for frames in deployment._used.values()), default=0)
-    if held > 2:
-        yield f"{held} images kept of a camera, at most 2 expected"
+    for found, most, what in (
+        (deployment.most_inside, _MOST_INSIDE, "frames inside a link"),
+        (deployment.damaged_admitted, 0, "damaged frames taken in"),
+        (sessions, MAX_SESSIONS_PER_CAMERA, "sessions remembered of a camera"),
+        (held, 2, "images kept of a camera"),
+    ):
+        if found > most:
+            yield f"{found} {what}, at most {most} expected"
     for name, array in deployment.updates.field.state().items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             yield f"the field's {name} is not finite"
@@ -122,34 +115,16 @@ def _recovery(deployment: ChaosDeployment, faults: Sequence[Fault]) -> Iterator[
             yield "cameras and field were not up to date again in time"
 
 
-CAMERAS = ("cam01", "cam02", "cam03", "cam04")
-
-
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Seeds of --seeds: ``A..B``, or numbers separated by commas."""
     if metafunc.definition.get_closest_marker("chaos") is not None:
         metafunc.parametrize("seed", read_seeds(metafunc.config.getoption("--seeds")))
 
 
-@pytest.fixture
-def faults(request: pytest.FixtureRequest) -> list[int] | None:
-    """Numbers of the faults to carry out; None: all."""
-    words = request.config.getoption("--faults")
-    return None if words is None else [int(word) for word in words.split(",") if word != "none"]
-
-
 @pytest.mark.chaos
-def test_a_seed_holds(seed, faults):
-    found = run_seed(seed, faults)
-    assert found["problems"] == [], "\n".join(found["faults"])  # --faults 0,3 runs some of them
+def test_a_seed_holds(seed, request):
+    """--faults 0,3 runs some of its faults."""
+    words = request.config.getoption("--faults")
+    found = run_seed(seed, None if words is None else [int(word) for word in words.split(",") if word != "none"])
+    assert found["problems"] == [], "\n".join(found["faults"])
     assert found["delivered"] > 20
-
-
-def test_seeds_draw_every_kind_of_fault_and_all_are_over_in_time():
-    drawn = [fault for seed in range(50) for fault in draw_faults(seed, CAMERAS)]
-    kinds = {name.removeprefix("_do_") for name in dir(ChaosDeployment) if name.startswith("_do_")}
-    assert {f.kind for f in drawn} == kinds
-    assert {f.target for f in drawn if f.kind == "crash"} == {"node", "emulator", "edge"}
-    assert all(f.at_ms + f.for_ms <= 1e3 * FAULTS_OVER_S for f in drawn)
-    assert draw_faults(3, CAMERAS) == draw_faults(3, CAMERAS) != draw_faults(4, CAMERAS)
-    assert len({str(scenario_of(seed).channel) for seed in range(50)}) > 10

@@ -16,7 +16,6 @@ from camera_node.capture import build_cameras
 from camera_node.node import Node, NodeOptions
 from camera_node.settings import source_config
 from camera_node.sources.base import pixels
-from camera_node.synthetic.effects import load_effects
 from channel_emu.model.settings import channel_from_mapping
 from edge_server.experiments.virtual.simulate import main as simulate
 from edge_server.export import ExportError
@@ -111,7 +110,6 @@ def test_what_is_of_the_wrong_kind_is_refused_by_name(folder):
 
     for use, why in (
         (lambda: make_policy(f"{own}Darker", None, None), r"does not derive from edge_server\.scheduler\.Policy"),
-        (lambda: load_effects({f"{own}Late": {}}, None), "expected a subclass of EffectParameters"),
         (lambda: channel_from_mapping({"faults": {f"{own}Youngest": {}}}), r"from channel_emu\.model\.link\.Fault"),
         (lambda: make_field(f"{own}Youngest"), "expected an attribute Settings"),
         (lambda: source(kind=f"{own}Youngest"), r"raw.yaml: source.kind: .*base\.Source"),
@@ -146,19 +144,17 @@ def python(words: list[str], cwd: Path, *path: Path) -> str:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_the_template_is_built_installed_checked_and_used(tmp_path):
-    source, wheels, site = tmp_path / "plugin", tmp_path / "wheels", tmp_path / "site"
-    shutil.copytree(ROOT / "examples/plugin", source)
-    python(["pip", "wheel", "-q", "--no-deps", "-w", str(wheels), str(source)], tmp_path)
+    plugin, wheels, site = tmp_path / "plugin", tmp_path / "wheels", tmp_path / "site"
+    shutil.copytree(ROOT / "examples/plugin", plugin)
+    python(["pip", "wheel", "-q", "--no-deps", "-w", str(wheels), str(plugin)], tmp_path)
     (wheel,) = wheels.iterdir()
     python(["pip", "install", "-q", "--no-deps", "--no-index", "--target", str(site), str(wheel)], tmp_path)
-    (source / "freshfield_example.py").unlink()  # the installed one is meant
+    (plugin / "freshfield_example.py").unlink()  # the installed one is meant
 
-    assert "4 passed" in python(["pytest", "-q", "test_contract.py"], source, site)
+    assert "4 passed" in python(["pytest", "-q", "test_contract.py"], plugin, site)
     edge = {**RAW["edge"], "policy": {"name": "least-used", "value": 1}}
-    whole = {**RAW, "edge": edge, "source": {**RAW["source"], "effects": {"vignette": {"loss": 0.3}}}}
-    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(whole))
-    said = python(["edge_server.cli", "simulate", "mine.yaml", "--seconds", "1", "--json"], tmp_path, site)
-    assert json.loads(said)["policy"] == "least-used"
-    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({**whole, "source": {"kind": "bar", "bar_px": 4}}))
-    said = python(["edge_server.cli", "simulate", "mine.yaml", "--seconds", "1", "--json"], tmp_path, site)
-    assert json.loads(said)["updates"] > 0
+    source = {"kind": "bar", "bar_px": 4, "effects": {"vignette": {"loss": 0.3}}}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({**RAW, "edge": edge, "source": source}))
+    words = ["edge_server.cli", "simulate", "mine.yaml", "--seconds", "1", "--json"]
+    found = json.loads(python(words, tmp_path, site))
+    assert found["policy"] == "least-used" and found["updates"] > 0

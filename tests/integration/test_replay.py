@@ -6,7 +6,6 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from camera_node.capture import Camera, ShotCache, build_cameras
@@ -17,10 +16,8 @@ from edge_server.live.ingest import Ingest
 from edge_server.live.output.recorder import Recorder
 from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.settings import read_config
-from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.frame import Frame, to_request
-from freshfield.geometry import Pinhole, Pose
 from freshfield.ledger import Ledger
 from freshfield.scenario import parse
 from freshfield.transport import Transport
@@ -28,7 +25,7 @@ from freshfield.v1 import frames_pb2 as pb
 from tests.camera_node.depth_source import DepthSource
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 from tests.edge_server.fields_for_tests import TINY
-from tests.integration.peer import Peer
+from tests.integration.peer import Peer, answer
 from tests.integration.test_node_stream import run_while
 from tests.support import free_port, refused
 
@@ -57,18 +54,13 @@ def node_of(scenario, to: str, cameras=None, seconds: float | None = None) -> No
     return Node(scenario, built, NodeOptions(to=to, transport=Transport(), seconds=seconds))
 
 
-def accepted(request: pb.PushRequest) -> pb.PushResponse:
-    return pb.PushResponse(sequence=request.header.sequence, outcome=pb.OUTCOME_ACCEPTED)
-
-
-def sent_by(scenario, cameras=None, seconds=None, take=accepted, after_s: float = 0.0) -> list[pb.PushRequest]:
+def sent_by(scenario, cameras=None, seconds=None, take=None, after_s: float = 0.0) -> list[pb.PushRequest]:
     """What a node sends until it ends by itself (or after some seconds); ``take`` answers, after a while."""
     got: list[pb.PushRequest] = []
 
     async def respond(request: pb.PushRequest) -> pb.PushResponse:
         got.append(request)
-        await asyncio.sleep(after_s)
-        return take(request)
+        return await answer(after_s=after_s)(request) if take is None else take(request)
 
     async def scene() -> None:
         peer = await Peer(respond=respond).start()
@@ -84,14 +76,8 @@ def session(tmp_path_factory):
     """A node's session, recorded at the edge's door: the file, and what was sent."""
     folder = tmp_path_factory.mktemp("session")
     recorder = Recorder(folder / "a.mcap", "test")
-    ingest = Ingest(
-        WallClock(),
-        FrameBuffer(("cam01", "cam02")),
-        ["cam00"],
-        Ledger(folder, "edge", "edge", 1),
-        lambda frame: None,
-        recorder.frame,
-    )
+    ledger, cameras = Ledger(folder, "edge", "edge", 1), FrameBuffer(("cam01", "cam02"))
+    ingest = Ingest(WallClock(), cameras, ["cam00"], ledger, lambda frame: None, recorder.frame)
     scenario = photo_scenario(write_photos(folder / "data", 24), 3, fps=25)
     sent = sent_by(scenario, seconds=1.5, take=ingest.take)
     recorder.close()
@@ -107,10 +93,8 @@ def said(request: pb.PushRequest) -> tuple:
     return (*parts, h.codec, h.width, h.height, h.role, h.pose_gap_ns, request.payload, depth)
 
 
-def of_each_camera(sent, got):
-    """Messages sent and got, camera by camera."""
-    for camera in ("cam00", "cam01", "cam02"):
-        yield camera, *([r for r in rows if r.header.camera_id == camera] for rows in (sent, got))
+def by_camera(sent: list[pb.PushRequest]) -> dict[str, list[pb.PushRequest]]:
+    return {name: [r for r in sent if r.header.camera_id == name] for name in ("cam00", "cam01", "cam02")}
 
 
 @pytest.mark.parametrize("after_s", [0.0, 0.05], ids=["quick answers", "answers slower than frames"])
@@ -118,9 +102,10 @@ def test_replay_is_exact_to_the_message(session, after_s):
     file, sent = session
     shifts, found = set(), Session(file)
     assert found.cut is None and len(sent) > 60
-    for camera, mine, _ in of_each_camera(sent, ()):
+    for camera, mine in by_camera(sent).items():
         assert [f.header for f in found.frames[camera]] == [r.header for r in mine]
-    for _, before, after in of_each_camera(sent, sent_by(replay_scenario(file), after_s=after_s)):
+    again = by_camera(sent_by(replay_scenario(file), after_s=after_s))
+    for before, after in zip(by_camera(sent).values(), again.values()):
         assert [said(r) for r in after] == [said(r) for r in before]
         assert [r.header.sequence for r in after] == list(range(len(before)))
         shifts |= {b.header.generated_ns - a.header.generated_ns for a, b in zip(before, after)}
@@ -142,16 +127,28 @@ def test_cameras_may_be_renamed_or_wrong(session, tmp_path):
         refused(ValueError, why, camera_of, wrong)
 
 
-def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
-    pose = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    data = payload.encode(np.zeros((24, 32, 3), np.uint8))
-    writer = SessionWriter(tmp_path / "a.mcap", {})
-    lens = Pinhole(32, 24, 40.0, 40.0, 16.0, 12.0)
-    for session, sequence, at_ms in (("a", 0, 1000), ("a", 1, 2000), ("b", 0, 1500), ("b", 1, 3000)):
-        at_ns = at_ms * 1_000_000
-        frame = Frame("cam01", session, sequence, at_ns, pose, lens, "jpeg", data)
-        writer.frame(to_request(frame), at_ns + 5)
+def recorded(camera: Camera, file: Path, stamps: list[tuple[str, int, int]]) -> list[pb.PushRequest]:
+    """Frames of a camera, written to a session. stamps: of each, session, number, milliseconds."""
+    writer, sent = SessionWriter(file, {}), []
+    for k, (session, sequence, at_ms) in enumerate(stamps):
+        shot, at_ns = camera.capture(k), at_ms * 1_000_000
+        frame = Frame("cam01", session, sequence, at_ns, shot.pose, shot.intrinsics, "jpeg", shot.payload)
+        sent.append(to_request(replace(frame, depth=shot.encoded_depth)))
+        writer.frame(sent[-1], at_ns + 5)
     writer.close({})
+    return sent
+
+
+STAMPS = [("s", k, 100 * k + 1000) for k in range(4)]
+
+
+def depth_camera(depth_every: int = 1, **more) -> Camera:
+    return Camera(DepthSource("cam01", 4, **more), WorldConfig(kind="world"), ShotCache(10**6), depth_every=depth_every)
+
+
+def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
+    stamps = [("a", 0, 1000), ("a", 1, 2000), ("b", 0, 1500), ("b", 1, 3000)]
+    recorded(depth_camera(), tmp_path / "a.mcap", stamps)
     scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam01": "cam01", "cam02": "y"})
     with caplog.at_level(logging.WARNING):
         camera = camera_of(scenario)
@@ -160,23 +157,9 @@ def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
     assert [schedule.due_ns(k) - 7 for k in range(3)] == [0, 10**9, 2 * 10**9] and schedule.next(2, 0) == (None, 0)
 
 
-def recorded(camera: Camera, file: Path, count: int) -> list[pb.PushRequest]:
-    """Frames of a camera, written to a session."""
-    writer, sent = SessionWriter(file, {}), []
-    for k in range(count):
-        shot, at_ns = camera.capture(k), (k + 10) * 10**8
-        frame = Frame("cam01", "s", k, at_ns, shot.pose, shot.intrinsics, "jpeg", shot.payload)
-        sent.append(to_request(replace(frame, depth=shot.encoded_depth)))
-        writer.frame(sent[-1], at_ns + 5)
-    writer.close({})
-    return sent
-
-
 def test_a_recorded_run_replays_with_its_depth(tmp_path):
     """As it came, also where it belongs to another instant; what shows a held-out camera sends none."""
-    source = DepthSource("cam01", 4, after_image_ns=-40_000_000)
-    camera = Camera(source, WorldConfig(kind="world"), ShotCache(10**6), depth_every=2)
-    sent = recorded(camera, tmp_path / "a.mcap", 4)
+    sent = recorded(depth_camera(2, after_image_ns=-40_000_000), tmp_path / "a.mcap", STAMPS)
     scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam02": "y"})
     got = sent_by(scenario, ["cam01"])
     assert [said(request) for request in got] == [said(request) for request in sent]
@@ -189,8 +172,8 @@ def test_a_recorded_run_replays_with_its_depth(tmp_path):
 @pytest.mark.stability
 def test_depth_that_cannot_be_read_again_costs_only_the_depth(tmp_path):
     """The file is damaged after it was opened: within, checksums leave whole chunks out."""
-    camera = Camera(DepthSource("cam01", 2), WorldConfig(kind="world"), ShotCache(10**6), depth_every=1)
-    recorded(camera, tmp_path / "a.mcap", 2)
+    camera = depth_camera()
+    recorded(camera, tmp_path / "a.mcap", STAMPS[:2])
     scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam02": "y"})
     replayed = camera_of(scenario)
     location = Session(tmp_path / "a.mcap").frames["cam01"][0].depth_location

@@ -27,7 +27,8 @@ from freshfield.frame import to_request
 from freshfield.limits import MAX_CAMERAS
 from freshfield.machine_load import rss_mb
 from freshfield.transport import Transport
-from tests.channel_emu.live.emulator import Edge, frame_of, make
+from tests.channel_emu.live.emulator import Edge, make
+from tests.edge_server.frames import frame
 
 CAMERAS = (1, 10, 100, 1000)
 RECKONED = (10, 100, 1000, 10_000)
@@ -100,7 +101,7 @@ async def push(port: int, cameras: tuple[str, ...], seconds: float) -> int:
         due_s, sequence = monotonic() + first_s, 0
         while due_s < end_s:
             await asyncio.sleep(max(due_s - monotonic(), 0.0))
-            await call.write(to_request(frame_of(name, "scale", sequence, clock.now_ns())).SerializeToString())
+            await call.write(to_request(frame(name, sequence, clock.now_ns())).SerializeToString())
             await call.read()
             answers, sequence, due_s = answers + 1, sequence + 1, due_s + len(cameras) / RATE
         call.cancel()
@@ -136,15 +137,8 @@ def table(found: dict[str, Any]) -> str:
         rate = FRAMES_PER_S * count
         emulator, edge = (rate * near[f"{name}_ms_a_frame"] / 1e3 for name in ("emulator", "edge"))
         scenes = max(math.ceil(count / MAX_CAMERAS), math.ceil(max(emulator, edge)))
-        cells = (
-            f"{count:,}",
-            f"{rate:,}",
-            f"{rate * FRAME_BYTES / 1e6:.1f}",
-            f"{emulator:.1f}",
-            f"{edge:.1f}",
-            f"{scenes}",
-        )
-        lines.append(f"| {' | '.join(cells)} |")
+        reckoned = f"{rate * FRAME_BYTES / 1e6:.1f} | {emulator:.1f} | {edge:.1f} | {scenes}"
+        lines.append(f"| {count:,} | {rate:,} | {reckoned} |")
     return "\n".join(lines)
 
 

@@ -2,7 +2,6 @@
 against sums over all paths and small steps of time."""
 
 import itertools
-import json
 import math
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from scipy import linalg
 from channel_emu.cli import main
 from channel_emu.estimate import recording as recordings
 from channel_emu.estimate import two_states
-from channel_emu.estimate.fit import Fit, IntervalEstimate, fit
+from channel_emu.estimate.fit import Fit, fit
 from channel_emu.estimate.report import format_fit
 from channel_emu.estimate.two_states import TwoStates
 from channel_emu.model.chain import two_state_generator
@@ -55,21 +54,15 @@ def write_rows(path: Path, section: dict, seed: int = 1, seconds: float = 120.0)
     return path
 
 
-def holds(found: IntervalEstimate, true: float, widened: float = 1.0) -> bool:
-    """Whether the interval, widened about the value on the logarithmic scale, holds the truth."""
-    assert found.interval is not None
-    low, high = (math.log(v / found.value) * widened for v in found.interval)
-    return low <= math.log(true / found.value) <= high
-
-
 def check(found: Fit, true: dict[str, float]) -> None:
     """Each parameter within one and a half times the reach of its interval (three standard deviations), and
     no interval so wide that it says nothing."""
     assert found.states == (2 if "mu1_per_ms" in true else 1) and set(found.parameters) == set(true)
     for name, value in true.items():
-        assert holds(found.parameters[name], value, 1.5), (name, found.parameters[name], value)
-        interval = found.parameters[name].interval
-        assert interval is not None and interval[1] / interval[0] < 3.5
+        parameter = found.parameters[name]
+        low, high = (1.5 * math.log(end / parameter.value) for end in parameter.interval)
+        assert low <= math.log(value / parameter.value) <= high, (name, parameter, value)
+        assert parameter.interval[1] / parameter.interval[0] < 3.5
 
 
 def test_a_slow_chain_from_delays_alone(tmp_path):
@@ -81,20 +74,8 @@ def test_a_slow_chain_from_delays_alone(tmp_path):
     assert "faults" not in found.channel and found.channel["service"]["law"] == "exponential"
     mu1, mu2 = (found.parameters[f"mu{k}_per_ms"].value for k in (1, 2))
     low, high = found.channel["chain"]["states"]
-    visits = f"  a visit lasts {1 / mu1:.4g} ms in {low}, {1 / mu2:.4g} ms in {high}; "
-    shares = f"shares of time {mu2 / (mu1 + mu2):.3f}, {mu1 / (mu1 + mu2):.3f}"
-    assert visits + shares in format_fit(found).splitlines()
-
-
-def test_states_that_differ_by_nothing_but_their_losses(tmp_path):
-    """Gilbert and Elliott's channel."""
-    service = {"law": "deterministic", "mean_ms": 20.0}
-    bursts = {**SLOW, "service": service, "discipline": "parallel", "faults": {"loss": [0.02, 0.5]}}
-    found = fit(write_rows(tmp_path / "t", bursts, seconds=240), discipline="parallel")
-    check(found, {**RATES, "loss_1": 0.02, "loss_2": 0.5, "mean_ms": 20.0})
-    p, q = found.channel["faults"]["loss"]["probability"]
-    assert p == pytest.approx(0.02, abs=0.01) and q == pytest.approx(0.5, abs=0.06)
-    assert found.channel["service"] == service
+    visits = f"  a visit lasts {1 / mu1:.4g} ms in {low}, {1 / mu2:.4g} ms in {high}; shares of time "
+    assert f"{visits}{mu2 / (mu1 + mu2):.3f}, {mu1 / (mu1 + mu2):.3f}" in format_fit(found).splitlines()
 
 
 def test_delays_and_losses_together_and_a_shape(tmp_path):
@@ -136,12 +117,10 @@ def test_what_is_still_on_its_way_is_not_lost(tmp_path):
 
 def test_nothing_to_fit_is_said_in_one_line(tmp_path):
     for rows, why in (
-        ("", "there is no frame in it"),
         (HEAD, "there is no frame in it"),
         (HEAD + "0,5\n30,40\n", "2 delays .2 frames, 2 came.; at least 20 are needed"),
         (HEAD + "".join(f"{30 * n},\n" for n in range(100)), "none of its 100 frames came through"),
         (HEAD + "0,5\n30,20\n", "line 3: delivered_ms is not earlier than offered_ms, or blank: 30, 20"),
-        (HEAD + ",5\n30,40\n", "line 2: delivered_ms is not earlier than offered_ms, or blank"),
         (HEAD + "0,5\n1e12,\n1.1e12,\n", "line 4: offered_ms is decades away from the first: 1.1e12, "),
         (HEAD + '"' + 140_000 * "0", "cannot be read as a table: field larger than"),
         ("0,5\n30,40\n", "expected a header with the columns offered_ms, .* it has no header"),
@@ -183,9 +162,6 @@ def test_the_command_writes_a_scenario_and_a_picture(tmp_path, capsys):
     shown = yaml.safe_load(text[text.index("channel:") :])["channel"]
     assert channel_from_mapping(shown) == channel_from_mapping(scenario.load(tmp_path / "f.yaml").channel)
     assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
-    assert main(["fit", str(path), "--json", "--states", "1"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["states"] == 1 and found["chosen_by"] == "asked"
 
 
 @pytest.mark.stability
@@ -275,14 +251,9 @@ def test_a_step_gives_the_expected_jumps_over_the_expected_time():
     assert after.leave_per_ms[0] == pytest.approx(np.array(jumps) / time_in, rel=2e-3)
 
 
-def test_the_maximum_is_higher_than_all_around_it_and_reached_in_a_dozen_steps():
+def test_the_maximum_is_reached_in_a_dozen_steps():
     base = two_states.segments((np.arange(1500) * 30.0, np.ones(1500), np.zeros(1500)), False)
     data = two_states.draw(MODEL, base, 1, np.random.default_rng(1))
-    found, best = two_states.maximize(MODEL, data, "gamma")
-    for k, parameter in itertools.product((0, 1), ("leave_per_ms", "mean_ms", "loss")):
-        for by in (0.97, 1.03):
-            values = {name: getattr(found, name).copy() for name in ("leave_per_ms", "mean_ms", "loss", "shape")}
-            values[parameter][0, k] *= by
-            assert two_states.step(TwoStates(**values), data, "gamma")[1] < best + 0.01
+    best = two_states.maximize(MODEL, data, "gamma")[1]
     far = TwoStates(MODEL.leave_per_ms * [[3.0, 0.3]], MODEL.mean_ms * [[2.0, 0.7]], np.full((1, 2), 0.2), MODEL.shape)
     assert two_states.maximize(far, data, "gamma", 12)[1] > best - 0.05

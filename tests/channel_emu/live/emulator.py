@@ -11,7 +11,6 @@ from typing import Any
 
 import grpc
 import grpc.aio
-import numpy as np
 
 from channel_emu.live.camera_stream import CameraStream
 from channel_emu.live.frame_proxy import FrameProxy
@@ -22,38 +21,27 @@ from edge_server.live.grpc_services import ClockService
 from edge_server.live.ingest import Ingest
 from freshfield.clock import WallClock
 from freshfield.frame import Frame, to_request
-from freshfield.geometry import Pinhole, Pose
 from freshfield.ledger import Ledger
-from freshfield.payload import encode
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2_grpc, frames_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
+from tests.edge_server.frames import frame
 from tests.support import until
 
 CAMERAS = ("cam00", "cam01", "cam02", "cam03")
-_IMAGE = encode(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8).astype(np.uint8), "jpeg")
-_LENS = Pinhole(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)
 _sessions = itertools.count()
 
 
-def frame_of(camera: str, session: str, sequence: int, at_ns: int, held_out: bool = False) -> Frame:
-    """A real frame: encoded, posed, with a lens."""
-    pose = Pose((1, 0, 0, 0), (0, 0, 0))
-    return Frame(camera, session, sequence, at_ns, pose, _LENS, "jpeg", _IMAGE, held_out)
-
-
-def make(
-    out: Path, address: str, section: dict, cameras=("cam00",), **options
-) -> tuple[FrameProxy, list[CameraStream]]:
+def make(out: Path, to: str, section: dict, cameras=("cam00",), **options) -> tuple[FrameProxy, list[CameraStream]]:
     """A proxy for the frame stream, not started, and its cameras' flows."""
-    chosen = ProxyOptions("127.0.0.1:0", address, options.pop("transport", Transport()), **options)
+    chosen = ProxyOptions("127.0.0.1:0", to, options.pop("transport", Transport()), **options)
     proxy = FrameProxy(channel_from_mapping(section), 5, chosen, cameras, out)
     return proxy, list(proxy.flows.values())
 
 
 def offer(flow: CameraStream, sequence: int) -> None:
     """A frame comes in."""
-    request = to_request(frame_of(flow.camera, "s", sequence, sequence))
+    request = to_request(frame(flow.camera, sequence, sequence))
     flow.take(request.SerializeToString(), request.header)
 
 
@@ -109,15 +97,16 @@ class Camera:
         """Send one frame and wait for its answer."""
         if self.call is None:
             await self.connect()
-        frame = frame_of(self.name, self.session, self.sequence, self._clock.now_ns(), self.held_out)
-        self._write(frame.sequence, "captured")
-        self._write(frame.sequence, "sent")
+        number, now_ns = self.sequence, self._clock.now_ns()
+        sent = frame(self.name, number, now_ns, session=self.session, held_out=self.held_out)
+        self._write(number, "captured")
+        self._write(number, "sent")
         self.sequence += 1
-        await self.call.write(to_request(frame))
+        await self.call.write(to_request(sent))
         response = await self.call.read()
-        assert response.sequence == frame.sequence
+        assert response.sequence == number
         name = pb.Outcome.Name(response.outcome).removeprefix("OUTCOME_").lower()
-        self._write(frame.sequence, "answered", f"{name}:{response.reason}" if response.reason else name)
+        self._write(number, "answered", f"{name}:{response.reason}" if response.reason else name)
         self.answers[name] += 1
         self.reasons[response.reason] += 1
         return response

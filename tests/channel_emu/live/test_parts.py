@@ -1,23 +1,18 @@
-"""The small parts of the live emulator: timer, histogram, priority, flow of a call."""
+"""The small parts of the live emulator: timer, histogram, priority."""
 
 import asyncio
 import os
 import sys
 import time
-from unittest import mock
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from channel_emu.live import call_flow, priority, timer
-from channel_emu.live.call_flow import CallFlow
+from channel_emu.live import priority, timer
 from channel_emu.live.histogram import Histogram
-from channel_emu.live.live_link import Message
 from channel_emu.live.timer import LoopTimer
-from channel_emu.model.link import EventKind
-from freshfield.streams import ServedCall
 
 
 @pytest.mark.parametrize("platform", [sys.platform, "elsewhere"])
@@ -76,31 +71,3 @@ def test_without_real_time_the_priority_is_raised(monkeypatch, short_slice):
     assert len(asked) == 1 and asked[0] < 0
     monkeypatch.setattr(os, "nice", forbidden)
     assert priority.raise_priority() == ("short-slice" if short_slice else "normal")
-
-
-async def test_behind_a_message_in_the_link_no_more_are_read_than_the_bound(monkeypatch):
-    monkeypatch.setattr(call_flow, "_MOST_BEHIND", 100)
-    link, read, written = mock.Mock(calls=set()), [], []
-    flow = CallFlow(0, ServedCall(mock.Mock()), link, lambda: 0)
-
-    async def endless() -> bytes:
-        read.append(len(read))
-        await asyncio.sleep(0)
-        return b"x"
-
-    async def write(raw: bytes) -> None:
-        written.append(raw)
-
-    carrying = asyncio.create_task(flow.carry(endless, write))
-    for _ in range(1000):
-        await asyncio.sleep(0)
-    assert len(read) == 100 and not written
-    for message in list(flow._messages):
-        flow.settle(message, EventKind.DELIVERED)
-    for _ in range(1000):
-        await asyncio.sleep(0)
-    assert len(written) >= 100 and len(read) > 100  # it goes on
-    carrying.cancel()
-    dropped = Message(b"x" * 100, "call0", 0, flow)
-    flow.settle(dropped, EventKind.LOST)
-    assert dropped.raw == b"", "dropped messages hold no bytes"

@@ -38,7 +38,6 @@ def test_generators_that_are_none_are_refused():
         (np.zeros((2, 3)), "square"),
         ([[-1.0, 1.0], [np.inf, -np.inf]], "finite"),
         ([[1.0, -1.0], [1.0, -1.0]], "not negative"),
-        ([[-1.0, 0.5], [1.0, -1.0]], "sum to zero"),
         (np.zeros((2, 2)), "different states"),
     ):
         refused(ChainError, why, stationary, np.array(wrong))

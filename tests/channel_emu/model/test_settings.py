@@ -18,19 +18,10 @@ def read(text: str, folder: Path = Path()):
 
 def test_presets_hold_the_thesis_numbers():
     ch5, ch6 = read("preset: ch5"), read("preset: ch6")
-    assert (ch5.arrivals.period_ms, ch5.service.law, ch5.service.mean_ms) == (30.0, "exponential", 60.0)
-    assert ch5.discipline == "drop-new" and ch5.chain is None
-    assert ch6.chain is not None and ch6.chain.scope == "shared" and ch6.state_names == ["low", "high"]
-    assert ch6.chain.mu1_per_ms == ch6.chain.mu2_per_ms == pytest.approx(1 / 30)
-    assert ch6.arrivals.rate_per_ms == pytest.approx([1 / 120, 1 / 30])
-    assert ch6.service.mean_ms == [30.0, 60.0]
-    assert (ch6.service_state, ch6.discipline) == ("at-start", "newest-waits")
-    high, low, slow = read("preset: ch6-high"), read("preset: ch6-low"), read("preset: ch6-slow")
-    assert (high.arrivals.rate_per_ms, high.service.mean_ms) == (pytest.approx(1 / 60), 60.0)
-    assert (low.arrivals.rate_per_ms, low.service.mean_ms) == (pytest.approx(1 / 120), 30.0)
-    assert slow.chain is not None and slow.chain.mu1_per_ms == pytest.approx(1 / 3000)
-    ideal = read("{}")
-    assert (ideal.preset, ideal.service.law, ideal.arrivals.process) == ("ideal", "none", "as-offered")
+    assert (ch5.arrivals.period_ms, ch5.mean_delay_ms, ch5.discipline) == (30.0, 60.0, "drop-new")
+    assert ch6.arrivals.rate_per_ms == pytest.approx([1 / 120, 1 / 30]) and ch6.discipline == "newest-waits"
+    weighted = read("{service: 'exp:30ms,exp:60ms', chain: 'mu1=1/100,mu2=1/50'}")  # by the states' shares
+    assert (ch6.mean_delay_ms, weighted.mean_delay_ms) == (pytest.approx(45), pytest.approx(40))
 
 
 def test_the_short_notation_stands_for_sections(tmp_path):
@@ -38,15 +29,9 @@ def test_the_short_notation_stands_for_sections(tmp_path):
     same."""
     for short, long in (
         ("{arrivals: 'periodic:30ms'}", "{arrivals: {process: periodic, period_ms: 30}}"),
-        ("{preset: ch5, arrivals: periodic}", "{preset: ch5}"),
-        (
-            "{arrivals: mmpp, chain: 'mu1=1/30,mu2=1/30'}",
-            "{preset: ch6, service: none, discipline: drop-new, chain: {states: []}}",
-        ),
         # Keys beside a preset override it; another law replaces the preset's whole.
         ("{preset: ch5, service: {mean_ms: 90}}", "{preset: ch5, service: 'exp:90ms'}"),
         ("{preset: ch5, service: 'gamma:5ms:2'}", "{preset: ch5, service: {law: gamma, mean_ms: 5, shape: 2}}"),
-        ("{preset: ch6, service: 'exp:30ms,exp:60ms', chain: {scope: shared}}", "{preset: ch6}"),
         (
             "{preset: ch6, chain: {generator_per_ms: [[-1, 1], [2, -2]]}}",
             "{arrivals: mmpp, service: 'exp:30ms,exp:60ms', discipline: newest-waits, "
@@ -68,7 +53,6 @@ def test_the_short_notation_stands_for_sections(tmp_path):
 def test_one_line_names_the_key_and_what_was_expected():
     for text, expected in (
         ("{delay_ms: 5}", "channel.delay_ms: unknown key"),
-        ("{service: {law: exponential, mean_ms: -1}}", "service.mean_ms: expected a number, at least 0"),
         ("{service: {law: exponential, mean_ms: 1, shape: 2}}", "shape: belongs to law gamma only"),
         ("{service: {law: exponential, mean_ms: [1, 2]}}", "there is no chain"),
         ("{chain: {mu1_per_ms: 1}}", "expected mu1_per_ms and mu2_per_ms, or generator_per_ms"),
@@ -79,7 +63,6 @@ def test_one_line_names_the_key_and_what_was_expected():
         ("{faults: {loss: [0.1, 0.2]}}", "channel: faults.loss.probability: expected one number or one a state"),
         ("{chain: 'mu3=1'}", "channel.chain: 'mu3=1': expected mu1="),
         ("{faults: {blackout: {windows_ms: [[5, 3]]}}}", "channel.faults.blackout: windows_ms"),
-        ("{faults: [loss]}", "channel.faults: expected a mapping"),
     ):
         said = str(refused(ValueError, "", read, text))
         assert said.startswith("room.yaml: channel") and expected in said
@@ -95,7 +78,6 @@ def test_delays_are_read_by_the_header(tmp_path):
         "# seq delay_us\n0 20000\n1 21500\n2 30000\n",
         "One-way delay / s\n0,02\n0,0215\n0,03\n",
         "delay_ms,lost\n20,no\nNaN,yes\n21.5,no\n,no\n30,no\n",
-        "owd_ns\n20000000\n21500000\n30000000\n",
     ):
         (tmp_path / "delays").write_text(text)
         assert delays_ms(tmp_path / "delays") == pytest.approx([20.0, 21.5, 30.0])

@@ -24,9 +24,7 @@ def test_adding_and_renaming_cameras_changes_nothing_for_the_others():
 
 def test_impossible_requests_are_refused():
     for more, why in (
-        ({"cameras": 0}, "cameras"),
         ({"cameras": 10_001}, "cameras"),
-        ({"seconds": 0}, "seconds"),
         ({"frame_period_ms": float("nan")}, "frame_period_ms"),
         ({"frame_bytes": -1}, "frame_bytes"),
         ({"seconds": 1e7}, "frames"),

@@ -35,18 +35,9 @@ from tests.support import wait_until
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-dev-shm-usage",
-    "--disable-sync",
-    "--hide-scrollbars",
-    "--no-first-run",
-    "--remote-debugging-port=0",
-    "--remote-allow-origins=*",
+    "--headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-background-networking "
+    "--disable-component-update --disable-dev-shm-usage --disable-sync --hide-scrollbars --no-first-run "
+    "--remote-debugging-port=0 --remote-allow-origins=*"
 )
 
 # The visible element with the least text that contains what is looked for: a button, not the page.
@@ -72,7 +63,7 @@ def chromium() -> str:
     return found
 
 
-class Browser:
+class Browser(contextlib.AbstractContextManager):
     """One page in one fresh browser. Every wait raises AssertionError with what the page shows instead."""
 
     def __init__(self, url: str, width: int = 1600, height: int = 900, timeout_s: float = 60.0) -> None:
@@ -83,7 +74,13 @@ class Browser:
         self._profile = tempfile.mkdtemp(prefix="freshfield-browser-")
         self._socket: websocket.WebSocket | None = None
         self._process = subprocess.Popen(
-            [chromium(), *FLAGS, f"--window-size={width},{height}", f"--user-data-dir={self._profile}", "about:blank"],
+            [
+                chromium(),
+                *FLAGS.split(),
+                f"--window-size={width},{height}",
+                f"--user-data-dir={self._profile}",
+                "about:blank",
+            ],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,
@@ -101,9 +98,6 @@ class Browser:
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> Browser:
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()

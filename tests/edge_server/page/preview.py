@@ -64,13 +64,14 @@ class BallScene:
         return Rendering((image / 255.0).astype(np.float32), depth, solid.astype(np.float32))
 
 
-class Preview:
+class Preview(threading.Thread):
     """The cameras and updates of the toy deployment, on a thread of its own."""
 
     def __init__(self, silent: int = 0) -> None:
         """silent: how many cameras never report. The middle one is held out."""
+        super().__init__(name="preview", daemon=True)
         self._clock = WallClock()
-        self._stopped = threading.Event()
+        self._over = threading.Event()
         self.names = tuple(f"cam{i:02d}" for i in range(CAMERAS))
         self._reporting = self.names[: CAMERAS - silent]
         self._held_out = self.names[CAMERAS // 2]
@@ -79,23 +80,19 @@ class Preview:
         self.state = replace(bare_state(), controls=Controls("threshold", 600.0), cameras=self.cameras)
         self.state.policies, self.state.field_name = ("all", "threshold"), "analytic"
         self.state.start_ns, self.state.now_ns = self._clock.now_ns(), self._clock.now_ns
-        self._thread = threading.Thread(target=self._update, name="preview", daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
 
     def stop(self) -> None:
-        self._stopped.set()
-        self._thread.join(timeout=5.0)
+        self._over.set()
+        self.join(timeout=5.0)
 
     def cameras(self) -> list[CameraView]:
         now_ns, newest = self._clock.now_ns(), dict(self._newest)
         ages = {name: (now_ns - frame.generated_ns) / 1e6 for name, frame in newest.items()}
         return [CameraView(n, n == self._held_out, newest.get(n), ages.get(n), 1, 0) for n in self.names]
 
-    def _update(self) -> None:
+    def run(self) -> None:
         number = 0
-        while not self._stopped.wait(UPDATE_S):
+        while not self._over.wait(UPDATE_S):
             now_ns = self._clock.now_ns()
             scene = BallScene((now_ns - self.state.start_ns) / 1e9)
             for name in self._reporting:

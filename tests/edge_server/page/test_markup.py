@@ -1,17 +1,19 @@
-"""The panel's text: from outside it is escaped, unknown values are dashes; a poor picture's likely cause is told."""
+"""The panel's text and charts: from outside it is escaped, unknown values are dashes; a poor picture's likely cause."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 
-from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.state import CameraView, Publication
-from edge_server.page import markup
-from edge_server.page.colors import HELD_OUT, STALE, css, scale_color
+from edge_server.page import markup, timelines
+from edge_server.page.colors import FRESH, HELD_OUT, STALE, css, scale_color
 from edge_server.page.diagnosis import poor_picture
 from edge_server.page.settings import FLAT_SCORES
+from edge_server.page.timelines import MAX_POINTS, History
 from edge_server.run_records import Frontier, FrontierPoint, age_parts_ms
 from tests.edge_server.page.preview import publication
 
@@ -50,12 +52,9 @@ def test_the_age_of_what_is_shown_is_split_into_its_parts():
 def test_the_frontier_stands_beside_the_present_or_says_how_to_measure_it():
     measured = ((50.0, 20.0), (800.0, 24.0), (200.0, 28.0))
     found = Frontier([FrontierPoint(ms, db, db - 4.0) for ms, db in measured], "f.json, at <1> m/s")
-    html = markup.frontier(found, None)
-    assert html.count("<polyline") == 2 and html.count('stroke-dasharray="4 3"') == 1 and "<circle" not in html
-    assert "50 ms an update" in html and "800 ms" in html and "at &lt;1&gt; m/s" in html
     html = markup.frontier(found, (200.0, 28.0, None))
     assert html.count("<circle") == 1 and 'cx="170.0" cy="8.0"' in html, "at the best point, half way"
-    assert "30.0,8.0" in markup.frontier(Frontier(found.points[:1], ""), None), "one point"
+    assert "50 ms an update" in html and "at &lt;1&gt; m/s" in html
     unknown = Frontier([], "run `edge-server frontier --field x`")
     assert "edge-server frontier --field x" in markup.frontier(unknown, None)
 
@@ -70,8 +69,11 @@ def test_what_comes_from_outside_is_escaped():
         markup.chart_caption(evil, [(evil, (0, 0, 0))]),
         markup.chart_caption("", [], evil),
         markup.note(evil),
+        markup.channel_line({"preset": evil, "counts": 3, "drawn_delay_ms": {"mean": None}}),
     ]
-    assert not any("<img" in page for page in pages)
+    assert not any("<img" in page or "None" in page for page in pages)
+    said = {"preset": "ch5", "drawn_delay_ms": {"mean": 60.4}, "counts": {"forwarded": 481, "lost": 0}}
+    assert "ch5, mean delay 60 ms, 481 forwarded<" in markup.channel_line(said)
 
 
 def test_the_table_marks_age_truth_use_and_refusals():
@@ -97,23 +99,11 @@ def test_a_decision_is_told_in_words():
 
     assert "Update 8 uses all 6 views." in words(tuple(ages))
     assert "waits 62 ms, then uses all 6 views." in words(tuple(ages), 62.0, "wait-arrived")
-    assert "uses all 6 views; the policy chose 30 ms." in words(tuple(ages), 30.0, "bandit:policy.npz")
     old = words(("cam01", "cam03"), 120.0, "threshold")
     assert "uses 2 of 6 views, up to 120 ms old; leaves out cam02 (903 ms old), cam06 (800 ms old)" in old
     assert "cam04 (700 ms old) and 1 more." in old and "cam00" not in old
     assert "cam05 (650 ms old)." in words(("cam01", "cam03", "cam04"))  # three are named, and no more is there
     assert "refuses cam03, which contradict the others" in words(tuple(ages), refused=("cam03",))
-
-
-def test_the_channel_line_shows_only_what_the_emulator_reports():
-    counts = {"forwarded": 481, "dropped_busy": 12, "lost": 0}
-    line = markup.channel_line(
-        {"preset": "ch5", "discipline": "drop-new", "drawn_delay_ms": {"mean": 60.4}, "counts": counts}
-    )
-    assert "ch5, drop-new, mean delay 60 ms, 481 forwarded, 12 dropped busy<" in line
-    for odd in ({}, {"counts": 3, "drawn_delay_ms": []}, {"drawn_delay_ms": {"mean": None}}):
-        assert "None" not in markup.channel_line(odd)
-    assert "<b>" not in markup.channel_line({"preset": "<b>"})
 
 
 GOOD = CameraView("cam01", False, None, 80.0, 100, 3)
@@ -136,14 +126,78 @@ def test_the_likely_cause_is_named(cause):
     assert "no better than one mean color (12.3 dB; that color 12.0 dB)" in said and cause in said
 
 
-def test_views_that_were_learned_from_are_not_blurred_by_cameras_that_share_little():
-    for scored_on, cause in (("cam00", "different places"), (SELECTED, "too short a run")):
-        publications = [replace(each, scored_on=scored_on) for each in scored(*[12.3] * FLAT_SCORES)]
-        assert cause in poor_picture(12.0, publications, [GOOD, replace(GOOD, camera="cam02")])
-
-
 @pytest.mark.stability
 def test_nothing_is_said_of_a_better_picture_and_of_what_is_not_known():
     for scores in ([13.0] * FLAT_SCORES, [5.0] * (FLAT_SCORES - 1), [float("nan")] * FLAT_SCORES, []):
         assert poor_picture(12.0, scored(*scores), [GOOD]) == ""
     assert poor_picture(None, scored(*[5.0] * FLAT_SCORES), [GOOD]) == ""
+
+
+def views(*ages: float | None) -> list[CameraView]:
+    held_out = CameraView("truth", True, None, 1.0, 0, 0)
+    return [held_out, *(CameraView(f"c{i}", False, None, a, 0, 0) for i, a in enumerate(ages))]
+
+
+def test_history_keeps_the_window_and_leaves_the_held_out_camera_aside():
+    history = History(window_s=10.0)
+    for i in range(1000):
+        history.sample(0.1 * i, views(100.0, 300.0, None), {"state": "high"})
+    t, mean, worst, state = history.columns()
+    assert t[0] >= t[-1] - 10.0 and len(t) <= 102
+    assert np.allclose(mean, 200.0) and np.allclose(worst, 300.0) and np.allclose(state, 0.0)
+    history.sample(5.0, views(1.0), None)
+    assert len(history.columns()[0]) == len(t), "time that goes back"
+
+
+def test_states_are_numbered_by_the_emulators_list_or_as_they_come_and_averaged_over_cameras():
+    history = History()
+    said = [{"state": "high", "states": ["low", "high"]}, {"state": "low"}, {}, None, {"state": 2}]
+    for i, status in enumerate([*said, {"state": [1]}]):
+        history.sample(float(i), views(), status)
+    assert history.state_names == ["low", "high", "2"]
+    state = history.columns()[3]
+    assert state[:2].tolist() == [1, 0] and np.isnan(state[[2, 3, 5]]).all() and state[4] == 2
+    chains = {"a": {"state": "low"}, "b": {"state": "high"}, "c": {}, "d": 3}
+    history.sample(9.0, views(), {"state": None, "by_camera": chains})
+    history.sample(10.0, views(), {"states": 7, "by_camera": [1], "state": None})
+    assert history.columns()[3][-2] == 0.5 and np.isnan(history.columns()[3][-1])
+
+
+def test_the_charts_show_ages_scored_updates_of_the_window_and_states_by_name():
+    gui, made = MagicMock(), []
+    gui.add_uplot.side_effect = lambda **props: made.append(MagicMock(**props)) or made[-1]
+    captions = []
+    gui.add_html.side_effect = lambda *words, **props: captions.append(MagicMock(**props)) or captions[-1]
+    history, charts = History(window_s=1000.0), timelines.Timelines(gui)
+    history.sample(0.0, views(100.0, 300.0), {"state": "high", "states": ["low", "high"]})
+    charts.refresh(history, [])
+    assert not made  # one point is no line
+    for t in (100.0, 200.0):
+        history.sample(t, views(100.0, 500.0), {"state": "low"})
+    rows = ((10.0, 15.0, 40.0), (90.0, 20.0, 50.0), (190.0, None, 60.0), (195.0, 22.0, 60.0))
+    publications = [
+        Publication(k, t_s, 0, omega_ms, (), (), 0.0, 0.0, psnr_db=db, psnr_moving_db=db, scored_on="truth")
+        for k, (t_s, db, omega_ms) in enumerate(rows)
+    ]
+    charts.refresh(history, publications)
+    age, psnr, channel = ([column.tolist() for column in chart.data] for chart in made)
+    # A gap has the value beside it; of what came before the charts begin, nothing is shown.
+    assert age == [[0, 100, 200], [200, 300, 300], [300, 500, 500], [50, 50, 60]]
+    assert psnr == [[90.0, 195.0], [20.0, 22.0], [20.0, 22.0]]
+    assert channel == [[0, 100, 100, 200, 200], [1, 1, 0, 0, 0]]  # a staircase
+    assert "dB" in captions[1].content and "0 good, 1 bad" in captions[2].content
+    assert [line["label"] for line in made[0].series] == ["s", "mean", "worst", "omega"]
+    assert made[0].series[1]["stroke"] == css(FRESH) and made[0].scales["y"] == {"range": (0.0, None)}
+    charts.refresh(history, [])
+    assert made[0].remove.called and len(made[3].data) == 3  # without the line that has no values
+    history.sample(201.0, views(100.0, 500.0), None)
+    charts.refresh(history, [])
+    assert len(made) == 4 and len(made[3].data[0]) == 4
+    early = [replace(publications[0], t_s=190.0 + k, psnr_moving_db=None if k else 9.0) for k in range(11)]
+    charts.refresh(history, early)
+    assert len(made[-1].data) == 2  # nothing of what moves among the last ten
+    for k in range(799):
+        history.sample(202.0 + k, views(1000.0 + k), None)
+    charts.refresh(history, [])
+    t, mean, _ = made[-1].data  # thinned, with the newest
+    assert len(t) <= MAX_POINTS and t[-1] == 1000.0 and np.array_equal(mean[-9:], t[-9:] + 798.0)

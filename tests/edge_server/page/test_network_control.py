@@ -1,57 +1,42 @@
-"""The visitor changes the network: through the page in a browser, and the emulator's own process."""
+"""The visitor changes the network: from the page to an emulator that runs."""
 
 from __future__ import annotations
 
 import asyncio
-import json
-import subprocess
-import sys
-from dataclasses import replace
-from unittest.mock import MagicMock, patch
+import contextlib
+from unittest.mock import MagicMock
 
 import pytest
 
 from edge_server.page import start_page
 from edge_server.page.network_control import EmulatorControl, NetworkControl
 from edge_server.page.settings import MAX_SLIDER_DELAY_MS
-from freshfield.files import ReplacedJson
 from freshfield.transport import Transport
-from tests.edge_server.page.browser import Browser
-from tests.edge_server.page.preview import Preview
+from tests.channel_emu.live.emulator import emulate
+from tests.edge_server.page.preview import bare_state
+from tests.edge_server.page.test_access_guard import control
+from tests.edge_server.page.visitor import Visitor
 from tests.support import free_port, wait_until
 
 
-@pytest.mark.browser
-def test_a_visitor_changes_the_network_and_gives_it_back(tmp_path):
-    address, status = f"127.0.0.1:{free_port()}", ReplacedJson(tmp_path / "channel.json")
-    command = [sys.executable, "-m", "channel_emu.cli", "run", "card", "--listen", address, "--out", str(tmp_path)]
-    emulator = subprocess.Popen([*command, "--to", "127.0.0.1:1"], stderr=subprocess.DEVNULL)
-    preview = Preview()
-    preview.state = replace(preview.state, channel=status.read)
-    page = start_page(preview.state, "127.0.0.1", 0, emulator=address)
-    preview.start()
-    try:
-        with Browser(page.url, timeout_s=60.0) as browser:
-            browser.wait_for_text("The network is the scenario's.")
-            wait_until(lambda: status.read() is not None, "no status")
-            browser.close_notices()
-            browser.click_text("blackout")
-            browser.wait_for_text("The network is blackout: mean delay 0 ms, 100 % of the frames lost.")
-            browser.wait_for_text("2 set by hand")  # a state of the channel's chart
-            track = "document.querySelector('.mantine-Slider-track').getBoundingClientRect()"
-            x, y = browser.evaluate(f"(r => [r.x + r.width / 2, r.y + r.height / 2])({track})")
-            browser.click(x, y)
-            browser.wait_for_text("The network is set by hand: mean delay 1")
-            browser.click_text("scenario")
-            browser.wait_for_text("The network is the scenario's.")
-    finally:
-        page.stop()
-        preview.stop()
-        emulator.terminate()
-        emulator.wait(10)
-    changes = json.loads((tmp_path / "channel.json").read_text())["changes"]
-    assert [c["loss"] for c in changes] == [1.0, 1.0, None] and changes[0]["delay_ms"] == 0.0
-    assert 800.0 <= changes[1]["delay_ms"] <= 1200.0 and changes[2]["delay_ms"] is None
+async def test_a_visitor_changes_the_network_and_gives_it_back(tmp_path):
+    async with emulate(tmp_path, {}, cameras=("cam00",)) as emulation:
+
+        def changes() -> list[tuple]:
+            return [(change["delay_ms"], change["loss"]) for change in emulation.proxy._snapshot()["changes"]]
+
+        def visit() -> None:
+            page = start_page(bare_state(), "127.0.0.1", 0, emulator=f"127.0.0.1:{emulation.proxy.port}")
+            with contextlib.closing(Visitor(page.port)) as visitor:
+                visitor.wait_for(lambda: page._server.get_clients(), "the visit")
+                for label, value in (("network", "blackout"), ("delay, ms", 1000), ("network", "scenario")):
+                    before = len(changes())
+                    visitor.send("GuiUpdateMessage", uuid=control(page, label)._impl.uuid, updates={"value": value})
+                    wait_until(lambda: len(changes()) > before, label)  # noqa: B023
+            page.stop()
+
+        await asyncio.to_thread(visit)
+        assert changes() == [(0.0, 1.0), (1000.0, 1.0), (None, None)]
 
 
 def control_of(network: EmulatorControl) -> NetworkControl:
@@ -65,15 +50,6 @@ def test_what_the_emulator_does_not_answer_is_told_to_its_visitor():
     control_of(network)._set(client, (400.0, 0.2))
     title, words = client.add_notification.call_args.args
     assert title == "The network has not changed" and "UNAVAILABLE" in words and network.in_force is None
-
-
-def test_a_slider_that_is_moved_right_after_a_button_keeps_nothing_of_the_blackout_before():
-    control = control_of(EmulatorControl(Transport(), "x:1"))
-    control.refresh({"by_hand": {"delay_ms": 0.0, "loss": 1.0}})
-    for button, values in (("bad", (400, 20)), ("blackout", (0, 100)), ("scenario", (0, 0))):
-        with patch.object(control, "_set_after") as asked:
-            asyncio.run(control._pressed(MagicMock(target=MagicMock(value=button))))
-        assert (control.delay.value, control.loss.value) == values and asked.called
 
 
 @pytest.mark.stability

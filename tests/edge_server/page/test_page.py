@@ -17,11 +17,10 @@ from edge_server.fidelity.scorer import Score
 from edge_server.fields import Rendering
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.live.state import CameraView, Comparison, EdgeState
-from edge_server.page import PageError, page_url, panel, start_page, views
+from edge_server.page import PageError, panel, start_page, views
 from edge_server.page.controls import ControlPanel
 from edge_server.page.rendering import LEVELS, MOVING, NEWER, ClientState, RenderLoop, browser_image, hatched
 from edge_server.page.scene import Scene, thumbnail
-from edge_server.page.viewpoint import initial_viewpoint
 from freshfield import coverage
 from freshfield.geometry import Pinhole, Pose, look_at
 from tests.edge_server.frames import frame
@@ -56,9 +55,7 @@ def test_what_is_not_finite_shows_the_backdrop_and_the_rest_its_color():
 
 
 def test_what_no_camera_has_seen_is_hatched():
-    image, unseen = np.ones((48, 64, 3), np.float32), np.zeros((12, 16), bool)
-    assert hatched(image, None) is image and hatched(image, unseen) is image
-    unseen[:, 8:] = True
+    image, unseen = np.ones((48, 64, 3), np.float32), np.arange(16)[None].repeat(12, 0) >= 8
     shaded = hatched(image, unseen) < 1.0
     assert not shaded[:, :32].any() and 0.4 < shaded[:, 32:].mean() < 0.6
 
@@ -66,46 +63,37 @@ def test_what_no_camera_has_seen_is_hatched():
 @pytest.mark.parametrize(("took_s", "bands"), [(0.05, 1), (0.4, 4), (1.2, 12)])
 def test_an_image_at_rest_has_a_band_for_every_tenth_of_a_second_that_the_last_one_took(took_s, bands):
     """Each band projects the whole field again: an image that is quick is rendered whole."""
-    loop, finest = RenderLoop(bare_state()), len(LEVELS) - 1
-    loop._adapt(finest, took_s)
-    broken, visitor = Broken(), ClientState(None)
-    camera = Pinhole.from_fov(40, 300, 60)
-    assert loop._render(broken, np.eye(4), camera, visitor, visitor.serial, finest).color.shape == (300, 40, 3)
-    assert broken.renders == bands
-    loop._render(broken, np.eye(4), camera, visitor, visitor.serial, MOVING)
-    assert broken.renders == bands + 1
+    loop, broken, visitor = RenderLoop(bare_state()), Broken(), ClientState(None)
+    loop._adapt(len(LEVELS) - 1, took_s)
+    for level, renders in ((len(LEVELS) - 1, bands), (MOVING, bands + 1)):
+        image = loop._render(broken, np.eye(4), Pinhole.from_fov(40, 300, 60), visitor, visitor.serial, level)
+        assert image.color.shape == (300, 40, 3) and broken.renders == renders
 
 
-def test_one_camera_is_first_seen_from_before_it_and_then_from_where_the_fields_box_is():
+def test_one_camera_is_seen_from_before_it_then_from_the_fields_box_and_looked_through_as_the_field_corrects_it():
     seen = frame()
     state = bare_state([CameraView("cam01", False, seen, 1.0, 1, 0), CameraView("never", False, None, None, 0, 0)])
     server = MagicMock()
     server.get_clients.return_value = {}
     scene = Scene(server, state)
     assert thumbnail(replace(seen, payload=b"\xff\xd8 nothing")) is None
-    scene._seen_at = -1.0  # long enough ago: the other camera may never report
-    scene._seen = 1
+    scene._seen_at, scene._seen = -1.0, 1  # long enough ago: the other camera may never report
     scene.refresh(state.cameras(), watched=True)
-    (name,) = [call.args[0] for call in server.scene.add_camera_frustum.call_args_list]
-    assert name == "/cameras/cam01"
+    server.scene.add_camera_frustum.assert_called_once()
     np.testing.assert_array_equal(server.scene.add_camera_frustum.return_value.image, thumbnail(seen))
     ahead = scene._viewpoint.look_at - seen.pose.translation_m
     assert np.allclose(ahead, np.linalg.norm(ahead) * seen.pose.matrix()[:3, 2])
-    state.publish(publication(0), SimpleNamespace(box=replace(UNIT_BOX, center_m=(0.5, 0.0, 0.25))))
-    scene.refresh(state.cameras(), watched=True)
-    assert server.initial_camera.look_at.tolist() == [0.5, 0.0, 0.25]
-
-
-def test_a_visitor_looks_through_a_camera_from_its_refined_pose():
-    seen = frame()
-    state = bare_state([CameraView("cam01", False, seen, 1.0, 1, 0)])
-    scene, client, refined = Scene(MagicMock(), state), MagicMock(), seen.pose.matrix()
-    scene._viewpoint = initial_viewpoint(refined[None])
+    client, refined = MagicMock(), seen.pose.matrix()
     scene._look_through(client, "cam01")
     np.testing.assert_array_equal(client.camera.position, seen.pose.translation_m)
     assert client.camera.fov == pytest.approx(2 * np.arctan(0.5 * seen.intrinsics.height / seen.intrinsics.fy))
     refined[:3, 3] += 0.02
-    state.publish(publication(0), SimpleNamespace(correction=lambda view: SimpleNamespace(camera_to_world=refined)))
+    field = SimpleNamespace(
+        box=replace(UNIT_BOX, center_m=(0.5, 0.0, 0.25)), correction=lambda _: SimpleNamespace(camera_to_world=refined)
+    )
+    state.publish(publication(0), field)
+    scene.refresh(state.cameras(), watched=True)
+    assert server.initial_camera.look_at.tolist() == [0.5, 0.0, 0.25]
     scene._look_through(client, "cam01")
     np.testing.assert_array_equal(client.camera.position, refined[:3, 3])
 
@@ -136,10 +124,9 @@ def test_what_cameras_see_is_reckoned_when_they_stand_still():
         return shown._coverage.content
 
     assert "every camera has sent" in coverage_of(-1.0, 1.0)
-    assert "<svg" in (first := coverage_of(-1.0, 1.0)) and "degrees apart" in first
+    assert coverage.reached(2, depth=False) in (first := coverage_of(-1.0, 1.0))
     assert coverage_of(-1.0, 1.01) == coverage_of(-1.0, 1.2) == first  # noise; one that may be on its way
     assert coverage_of(-1.0, 1.2) != first
-    assert coverage.reached(2, depth=False) in first
     assert coverage.reached(2, depth=True) in coverage_of(-1.0, 1.2, depth=("cam00",))
 
 
@@ -155,37 +142,26 @@ def test_a_learned_policy_is_shown_by_its_files_name_and_chosen_by_its_path():
     chosen, path = [], "bandit:/far/away/p.npz"
     state = replace(bare_state(), policies=(path, "all"), set_policy=lambda *p: chosen.append(p))
     panel = control_panel(state)
-    state.chosen = "splat with keyframes: cam01 moves"
     assert panel.policy.options == ("bandit:p.npz", "all") and panel.policy.value == "all"
     panel._policy_chosen(MagicMock(target=MagicMock(value="bandit:p.npz")))
     assert chosen == [(path, None)]
     state.controls.policy = path
     panel.refresh()
-    assert panel.policy.value == "bandit:p.npz" and "cam01 moves" in panel.chosen.content
+    assert panel.policy.value == "bandit:p.npz"
 
 
-@pytest.mark.parametrize("said", ["", "expected a whole number from 1"])
-def test_what_an_operator_does_reaches_the_state_or_is_answered_with_what_was_wrong(said):
-    asked, client = [], MagicMock()
-
-    def set_policy(name, value):
-        if said:
-            raise ValueError(said)
-        asked.append((name, value))
-
+def test_an_operator_is_answered_with_what_was_wrong_and_pauses_resets_and_resumes():
+    client, set_policy = MagicMock(), MagicMock(side_effect=[ValueError("expected a whole number"), None])
     state = replace(bare_state(), policies=("all", "freshest-k"), set_policy=set_policy)
     panel = control_panel(state)
-    panel._policy_chosen(MagicMock(target=MagicMock(value="freshest-k"), client=client))
-    panel._value_entered(MagicMock(target=MagicMock(value=3), client=client))
-    panel._value_entered(MagicMock(target=MagicMock(value=4), client=None))  # set by refresh, not by a visitor
-    assert asked == ([] if said else [("freshest-k", None), ("all", 3.0)])
-    assert [call.args[1] for call in client.add_notification.call_args_list] == ([said] * 2 if said else [])
-    for button in ("pause", "reset"):
+    for value, by in ((5, client), (3, client), (4, None)):  # the last is set by refresh, not by a visitor
+        panel._value_entered(MagicMock(target=MagicMock(value=value), client=by))
+    assert [call.args for call in set_policy.call_args_list] == [("all", 5.0), ("all", 3.0)]
+    assert [call.args[1] for call in client.add_notification.call_args_list] == ["expected a whole number"]
+    for button, paused in (("pause", True), ("reset", True), ("resume", False)):
         asyncio.run(panel._pressed(MagicMock(target=MagicMock(value=button), client=client)))
-    assert state.controls.paused and state.controls.reset_requested
-    assert panel.buttons.options == ("resume", "reset", "snapshot")
-    asyncio.run(panel._pressed(MagicMock(target=MagicMock(value="resume"), client=client)))
-    assert not state.controls.paused
+        assert state.controls.paused == paused and ("resume" in panel.buttons.options) == paused
+    assert state.controls.reset_requested
 
 
 def test_the_present_point_is_the_mean_of_the_last_instants_and_updates():
@@ -237,7 +213,7 @@ def test_who_looks_at_truth_gets_each_comparison_once_and_the_picture_before_the
 
 
 @pytest.mark.parametrize("raises", [False, True])
-def test_the_page_outlives_a_broken_field_and_stops_at_once(raises, capfd):
+def test_the_page_outlives_a_broken_field_and_stops_at_once(raises):
     before, state, field = set(threading.enumerate()), bare_state(), Broken(raises)
     state.cameras = lambda: [CameraView("never", False, None, None, 0, 0)]
     with page_of(state) as page, Visitor(page.port) as visitor:
@@ -247,35 +223,21 @@ def test_the_page_outlives_a_broken_field_and_stops_at_once(raises, capfd):
         state.scored(replace(publication(7), psnr_db=float("inf")), Comparison("never", black, black, 7))
         wait_until(lambda: field.renders > 0, "nothing was rendered")
         state.publish(publication(8), BallScene(0.0))  # it has recovered
-        visitor.wait_for(lambda: visitor.image is not None and spread(visitor.image) > 20, "the ball")
+        image = lambda: cv2.imdecode(np.frombuffer(visitor.image, np.uint8), cv2.IMREAD_COLOR)  # noqa: E731
+        visitor.wait_for(lambda: visitor.image is not None and image().std() > 20, "the ball")
         with pytest.raises(PageError, match="--page-port"):
             start_page(bare_state(), "127.0.0.1", page.port)
-    page.stop()  # twice is once
-    assert page_url("", 8080) == page_url("0.0.0.0", 8080) == "http://localhost:8080"
-    assert page_url("::1", 8080, tls=True) == "https://[::1]:8080"
     start_page(bare_state(), "127.0.0.1", page.port).stop()
     assert not [t for t in set(threading.enumerate()) - before if t.name.startswith("page")]
-    assert "viser" not in capfd.readouterr().out  # no banner of a library on the operator's terminal
-
-
-def spread(image: bytes) -> float:
-    return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR).std()
 
 
 def test_a_state_that_fails_to_answer_is_reported_once_and_survived(caplog):
-    state, failing = bare_state(), threading.Event()
-    failing.set()
-
-    def cameras() -> list[CameraView]:
-        if failing.is_set():
-            raise RuntimeError("half started")
-        return [CameraView("late", False, None, None, 0, 0)]
-
-    state.cameras = cameras
+    state = bare_state()
+    state.cameras = MagicMock(side_effect=RuntimeError("half started"))
     with page_of(state) as page, Visitor(page.port) as visitor:
         wait_until(lambda: "half started" in caplog.text, "no log entry")
         time.sleep(1.2)
         assert caplog.text.count("page: refresh failed") == 1
-        failing.clear()
+        state.cameras = lambda: [CameraView("late", False, None, None, 0, 0)]
         at = visitor.counts["GuiUpdateMessage"]
         visitor.wait_for(lambda: visitor.counts["GuiUpdateMessage"] > at, "the table")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import http.client
 import json
 import socket
 from unittest.mock import MagicMock
@@ -17,6 +16,7 @@ from edge_server.page.preferences import MAX_BODY_BYTES, PreferencePage
 from edge_server.viewpoints.preference_session import PreferenceSession
 from freshfield.transport import Transport, TransportError
 from tests.edge_server.page.browser import Browser
+from tests.edge_server.page.visitor import ask
 
 COUNT, FRAMES, COLUMNS = 6, 6, 3
 NEW = PreferenceSession(
@@ -40,14 +40,11 @@ def asked():
 
 
 def request(url, method, path, body=None, **headers):
-    connection = http.client.HTTPConnection(url.removeprefix("http://"), timeout=10)
-    connection.request(method, path, body if body is None or isinstance(body, bytes) else json.dumps(body), headers)
-    answer = connection.getresponse()
-    return answer.status, answer.read(), answer
+    return ask(int(url.rpartition(":")[2]), path, method, body, **headers)
 
 
 def state(url):
-    return json.loads(request(url, "GET", "/state")[1])
+    return json.loads(request(url, "GET", "/state")[2])
 
 
 def level(jpeg):
@@ -73,10 +70,10 @@ def test_answers_are_of_the_pair_that_was_shown_written_and_nothing_is_answered_
     page, url, kept = asked
     keep, page._keep = page._keep, MagicMock(side_effect=OSError(28, "No space left on device"))
     turn = state(url)["turn"]
-    status, text, _ = request(url, "POST", "/answer", {"turn": turn, "choice": "left"})
+    status, _, text = request(url, "POST", "/answer", {"turn": turn, "choice": "left"})
     assert status == 507 and b"No space left" in text and state(url)["answered"] == 0
     page._keep = keep
-    shown = [level(request(url, "GET", f"/{side}/{turn}.jpg")[1]) for side in ("left", "right")]
+    shown = [level(request(url, "GET", f"/{side}/{turn}.jpg")[2]) for side in ("left", "right")]
     assert request(url, "POST", "/answer", {"turn": turn, "choice": "right"})[0] == 200
     (given,) = page.session.answers
     assert [given.left, given.right] == shown and given.choice == "right" and kept == [page.session]
@@ -93,9 +90,9 @@ def test_bad_requests_change_nothing(asked, body, status):
     _, url, kept = asked
     assert request(url, "POST", "/answer", {"choice": "left"}, Origin="http://evil.example")[0] == 403
     assert request(url, "GET", "/state", Host="evil.example:80")[0] == 403
-    policy = request(url, "GET", "/")[2].getheader("Content-Security-Policy")
+    policy = request(url, "GET", "/")[1]["Content-Security-Policy"]
     assert "frame-ancestors 'none'" in policy and "default-src 'none'" in policy
-    found, text, _ = request(url, "POST", "/answer", body)
+    found, _, text = request(url, "POST", "/answer", body)
     assert found == status and len(text.splitlines()) == 1 and not kept
     turn = state(url)["turn"]
     assert request(url, "POST", "/answer", {"turn": turn, "choice": "both"})[0] == 404 and not kept
@@ -121,7 +118,7 @@ def test_viewers_look_and_operators_answer():
         body = {"turn": page._turn, "choice": "left"}
         for token, may in (("view-token", False), ("op-token", True)):
             login = {"Authorization": f"Bearer {token}"}
-            assert json.loads(request(url, "GET", "/state", **login)[1])["may_change"] == may
+            assert json.loads(request(url, "GET", "/state", **login)[2])["may_change"] == may
             assert request(url, "POST", "/answer", body, **login)[0] == (200 if may else 403)
         with pytest.raises(PageError, match="--page-port"):
             page.serve("0.0.0.0", int(url.rpartition(":")[2]), Transport(insecure=True))

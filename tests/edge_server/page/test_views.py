@@ -68,7 +68,6 @@ def test_truth_and_rendering_are_as_large_as_they_fit(size, beside):
     assert np.median(first[(first != views.BACKDROP).all(axis=2)]) == pytest.approx(200 / 255)
     second = image[:, size[0] // 2 :] if beside else image[size[1] // 2 :]
     assert first.max() == second.max() == 1.0, "both are labeled"
-    assert views.compared(comparison, *size, error=False, labeled=False).max() == pytest.approx(200 / 255)
     error = views.compared(comparison, *size, error=True)
     assert error[size[1] // 2, size[0] // 2] == pytest.approx(4 * 5 / 255, abs=1e-3)
 
@@ -122,14 +121,8 @@ def test_the_visitor_stands_as_near_as_lets_them_see_the_share(spread_deg):
     assert np.allclose(view.up, (0, 0, 1), atol=1e-9)
     poses[:, :3, :2] *= -1  # held upside down
     assert np.allclose(initial_viewpoint(poses).up, (0, 0, -1), atol=1e-9)
-    rolling = np.stack([np.eye(4)] * 4)  # evenly: no common up, the first one's is taken
-    rolling[1:, :2, :2] = [[[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]]
-    assert np.allclose(initial_viewpoint(rolling).up, (0, -1, 0))
-
-
-def test_a_ring_has_no_behind_so_the_visitor_stands_behind_its_first_camera():
-    poses = rig(12, 330)
-    out, first = initial_viewpoint(poses).position - TARGET, poses[0, :3, 3] - TARGET
+    ring = rig(12, 330)  # has no behind, so the visitor stands behind its first camera
+    out, first = initial_viewpoint(ring).position - TARGET, ring[0, :3, 3] - TARGET
     assert out[:2] @ first[:2] > 0.98 * np.linalg.norm(out[:2]) * np.linalg.norm(first[:2])
 
 
@@ -163,8 +156,6 @@ def test_a_windows_camera_sees_what_the_window_sees(rows):
     assert np.allclose(corner, (camera.width, camera.height), atol=1e-6)
     _, small = visitor_camera((0, 0, 0), (1, 0, 0, 0), 0.9, 300, 200, 720)
     assert (small.width, small.height) == (300, 200), "never more rows than the window has"
-    _, tiny = visitor_camera((0, 0, 0), (1, 0, 0, 0), 0.9, 1, 1, 100)
-    assert (tiny.width, tiny.height) == (1, 1) and tiny.fx == pytest.approx(tiny.fy)
     # Bands are the image.
     bands = [(20, 0), (rows - 20, 20)]
     parts = [BallScene(0.7).render(pose, row_band(camera, first, count)).color for count, first in bands]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import http.client
+import json
 import socket
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import msgspec
@@ -34,11 +36,20 @@ def page_of(state: EdgeState, transport: Transport | None = None, host: str = "1
         page.stop()
 
 
-class Visitor:
+def ask(port: int, path: str = "/", method: str = "GET", body: Any = None, **headers: str) -> tuple[int, dict, bytes]:
+    """Status, headers and text of an answer. body: bytes, or what becomes JSON."""
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
+        sent = body if body is None or isinstance(body, bytes) else json.dumps(body)
+        connection.request(method, path, sent, headers)
+        answer = connection.getresponse()
+        return answer.status, dict(answer.getheaders()), answer.read()
+
+
+class Visitor(contextlib.AbstractContextManager):
     """Connects, with more ``headers``, and looks at the origin; reads in a thread unless ``reads`` is False.
     ``counts``: messages by type; ``images``: number of renderings; ``image``: the last one, encoded."""
 
-    def __init__(self, port: int, reads: bool = True, headers: Sequence[str] = ()) -> None:
+    def __init__(self, port: int, reads: bool = True, headers: Mapping[str, str] | None = None) -> None:
         self.counts: Counter[str] = Counter()
         self.images = 0
         self.image: bytes | None = None
@@ -47,16 +58,13 @@ class Visitor:
             f"ws://127.0.0.1:{port}",
             subprotocols=[f"viser-v{viser.__version__}"],
             timeout=20,
-            header=list(headers),
+            header=dict(headers or {}),
             sockopt=() if reads else ((socket.SOL_SOCKET, socket.SO_RCVBUF, 4096),),
         )
         self.stand_at((4.0, 0.0, 3.0))
         self._thread = threading.Thread(target=self._read, daemon=True)
         if reads:
             self._thread.start()
-
-    def __enter__(self) -> Visitor:
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import websocket
 
-from edge_server.live.state import EdgeState, Publication
 from edge_server.page import Page, start_page
 from edge_server.page.splats.messages import StreamReader, read_saved
 from edge_server.page.splats.stream import STREAM
@@ -19,16 +18,12 @@ from freshfield.limits import MAX_VISITORS
 from freshfield.transport import Transport
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.page.browser import Browser
-from tests.edge_server.page.preview import bare_state
+from tests.edge_server.page.preview import bare_state, publication
 from tests.edge_server.page.splats.gaussians import BOX, LENS, NEWEST_S, ORIGIN_NS, POSE, gaussians, snapshot
-from tests.edge_server.page.test_access_guard import get, lines, login
-from tests.edge_server.page.visitor import page_of
+from tests.edge_server.page.test_access_guard import login
+from tests.edge_server.page.visitor import ask, page_of
 from tests.role_table import TOKENS
 from tests.support import wait_until
-
-
-def publish(state: EdgeState, shown: object, number: int = 0) -> None:
-    state.publish(Publication(number, 1.0, state.now_ns(), None, (), (), 0.0, 20.0), shown)
 
 
 class Drawer:
@@ -36,7 +31,7 @@ class Drawer:
 
     def __init__(self, page: Page, **headers: str) -> None:
         address = f"ws://127.0.0.1:{page.port}{STREAM}"
-        self.socket = websocket.create_connection(address, timeout=20, header=lines(headers))
+        self.socket = websocket.create_connection(address, timeout=20, header=headers)
         self.reader = StreamReader()
 
     def read(self, answer: bytes | None = None) -> None:
@@ -57,12 +52,12 @@ def test_a_visitor_gets_everything_then_what_changes():
         drawer = Drawer(page)
         drawer.read()
         assert drawer.reader.scene is None and drawer.reader.status["scenario"] == state.scenario
-        publish(state, snapshot())
+        state.publish(publication(0), snapshot())
         drawer.read_until(lambda: len(drawer.reader.at(NEWEST_S)) == 820)
         assert drawer.reader.scene.radius_m == BOX.radius_m
-        publish(state, snapshot(gaussians(500, 7), movers=0), 1)
+        state.publish(publication(1), snapshot(gaussians(500, 7), movers=0))
         drawer.read_until(lambda: len(drawer.reader.at(NEWEST_S)) == 500)
-        publish(state, object(), 2)
+        state.publish(publication(2), object())
         drawer.read_until(lambda: "does not consist of Gaussians" in drawer.reader.status.get("line", ""))
         drawer.socket.close()
         wait_until(lambda: not page._splats._connected, "the end of the visit")
@@ -73,7 +68,7 @@ def test_a_visitor_gets_everything_then_what_changes():
 def test_answers_that_are_none_are_counted_and_cost_nothing():
     state = bare_state()
     with page_of(state) as page:
-        publish(state, snapshot())
+        state.publish(publication(0), snapshot())
         drawer = Drawer(page)
         for answer in (b"", b"abc", b"abcde", bytes(60_000), b"\xff\xff\xff\xff"):
             drawer.read(answer)
@@ -88,7 +83,7 @@ def test_who_acknowledges_without_reading_does_not_fill_the_memory():
         for number in range(400):  # all that may come
             drawer.socket.send(number.to_bytes(4, "little"), websocket.ABNF.OPCODE_BINARY)
         for number in range(60):
-            publish(state, snapshot(gaussians(6000, number % 5)), number)
+            state.publish(publication(number), snapshot(gaussians(6000, number % 5)))
             drawer.socket.send((number + 1).to_bytes(4, "little"), websocket.ABNF.OPCODE_BINARY)
             time.sleep(0.03)
         (connected,) = page._splats._connected
@@ -99,14 +94,12 @@ def test_who_acknowledges_without_reading_does_not_fill_the_memory():
 def test_the_rules_of_the_page_hold_for_the_stream():
     state = bare_state()
     with page_of(state, Transport(tokens=TOKENS, insecure=True)) as page:
-        publish(state, snapshot())
-        for path in ("/splats/", "/splats/splats.js"):
-            assert get(page.port, path)[0] == 401
-            status, headers = get(page.port, path, **login("viewer"))
-            assert status == 200 and "script-src 'self'" in headers["Content-Security-Policy"]
-        assert get(page.port, "/splats/", Origin="http://other.org", **login("viewer"))[0] == 403
-        assert get(page.port, "/splats", **login("viewer"))[0] == 301
-        assert get(page.port, "/splats/../records.py", **login("viewer"))[0] in (404, 400)
+        state.publish(publication(0), snapshot())
+        assert ask(page.port, "/splats/splats.js")[0] == 401
+        status, headers, _ = ask(page.port, "/splats/", **login("viewer"))
+        assert status == 200 and "script-src 'self'" in headers["Content-Security-Policy"]
+        assert ask(page.port, "/splats", **login("viewer"))[0] == 301
+        assert ask(page.port, "/splats/../records.py", **login("viewer"))[0] in (404, 400)
         with pytest.raises(websocket.WebSocketBadStatusException, match="401"):
             Drawer(page)
         drawer = Drawer(page, **login("viewer"))
@@ -117,8 +110,6 @@ def test_the_rules_of_the_page_hold_for_the_stream():
         for each in visitors:
             each.socket.close()
 
-
-# --- a browser -------------------------------------------------------------------------------------
 
 ARRIVED = "window.splats && splats.reader.moves && splats.reader.shown.total + splats.reader.moving.count"
 # Draws at a fixed instant and returns the canvas.
@@ -152,7 +143,7 @@ def rendered(shown, instant_s: float) -> np.ndarray:
 def test_the_browser_draws_what_the_edge_renders():
     state, shown = bare_state(), snapshot()
     with page_of(state) as page, Browser(page.url + "/splats/?full", 640, 480) as browser:
-        publish(state, shown)
+        state.publish(publication(0), shown)
         browser.wait_for(lambda: browser.evaluate(ARRIVED) == 820, "all Gaussians")
         assert browser.evaluate("splats.renderer.format === splats.renderer.gl.RGBA32F")
         # Last in half floats, as with a GPU.
@@ -167,7 +158,7 @@ def test_the_browser_draws_what_the_edge_renders():
         seen, striped = rendered(shown, NEWEST_S), drawn(browser, NEWEST_S, state.start_ns)
         assert 15.0 < psnr(striped, seen) < 40.0 and striped.mean() < seen.mean()
         still = snapshot(gaussians(1300, 9), movers=0)
-        publish(state, still, 1)
+        state.publish(publication(1), still)
         browser.wait_for(lambda: browser.evaluate("splats.reader.shown.total") == 1300, "the new set")
         assert psnr(drawn(browser, NEWEST_S, state.start_ns), rendered(still, NEWEST_S)) > 50.0
         # A context that is lost, as when a graphics driver starts anew.
@@ -184,13 +175,13 @@ def test_a_stream_comes_back_when_it_broke_and_a_saved_one_is_played_without_the
     state, shown = bare_state(), snapshot()
     with Browser("about:blank", 640, 480) as browser:
         with page_of(state) as page:
-            publish(state, shown)
+            state.publish(publication(0), shown)
             browser.call("Page.navigate", url=page.url + "/splats/?full")
             browser.wait_for(lambda: browser.evaluate(ARRIVED) == 820, "all Gaussians")
             data = bytes(browser.evaluate("splats.savedFile().arrayBuffer().then((b) => [...new Uint8Array(b)])"))
         browser.wait_for_text("The connection broke")
         again = start_page(state, "127.0.0.1", page.port)
-        publish(state, snapshot(gaussians(900, 3), movers=0), 1)
+        state.publish(publication(1), snapshot(gaussians(900, 3), movers=0))
         browser.wait_for(lambda: browser.evaluate("splats.reader.shown.total") == 900, "the stream again")
         assert "broke" not in browser.text()
         again.stop()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,73 +22,23 @@ from tests.edge_server.page.splats.gaussians import NEWEST_S, gaussians, motion,
 COUNT = 6000
 
 
-class Shared:
-    """A publisher of several links that look at the same instants: what it publishes is made once."""
+class Line:
+    """One direction of a link: bytes a second, then a delay, first come first served."""
 
-    def __init__(self) -> None:
-        self._publisher = Publisher(0)
-        self._made: dict[float, Published | None] = {}
+    def __init__(self, rate: float, delay_s: float = 0.02) -> None:
+        self.rate, self.delay_s, self.free_s = rate, delay_s, 0.0
 
-    def take(self, shown, now_s: float) -> Published | None:
-        if now_s not in self._made:
-            self._made[now_s] = self._publisher.take(shown, now_s)
-        return self._made[now_s]
-
-
-class Link:
-    """A visitor at the end of a link: bytes a second, one-way delay, first come first served."""
-
-    def __init__(self, bytes_per_s: float, delay_s: float = 0.02, publisher: Shared | None = None) -> None:
-        self.rate, self.delay_s = bytes_per_s, delay_s
-        self.visitor, self.reader, self.publisher = Visitor(), messages.StreamReader(), publisher or Publisher(0)
-        self.free_s = 0.0
-        self.under_way: deque[tuple[float, bytes]] = deque()
-        self.acknowledged: deque[tuple[float, int]] = deque()
-        self.lags_s: list[float] = []
-        self.blocks: list[tuple[float, object]] = []
-
-    def run(self, seconds: range, shown=None) -> None:
-        """Ticks of 30 ms; the field trains a little at each. shown: of an instant, what is published."""
-        for tick in seconds:
-            now_s = tick * tuned.TICK_S
-            while self.under_way and self.under_way[0][0] <= now_s:
-                came_s, data = self.under_way.popleft()
-                self.reader.read(data)
-                number, _, blocks = messages.read_message(data)
-                self.blocks += [(now_s, block) for block in blocks]
-                self.acknowledged.append((self.back(came_s), number))
-            while self.acknowledged and self.acknowledged[0][0] <= now_s:
-                self.visitor.acknowledged(self.acknowledged.popleft()[1], now_s)
-            published = self.publisher.take((shown or trained)(now_s), now_s)
-            data = self.visitor.message(published, NEWEST_S, {"line": ""}, now_s)
-            if data is not None:
-                self.under_way.append((self.there(len(data), now_s), data))
-                self.lags_s.append(self.under_way[-1][0] - self.delay_s - now_s)
-            self.each_tick(published)
-
-    def there(self, size: int, now_s: float) -> float:
+    def carry(self, size: int, now_s: float) -> float:
         """When so many bytes arrive."""
         self.free_s = max(self.free_s, now_s) + size / self.rate
         return self.free_s + self.delay_s
 
-    def back(self, now_s: float) -> float:
-        """When an acknowledgement arrives."""
-        return now_s + self.delay_s
 
-    def each_tick(self, published: Published) -> None:
-        pass
-
-    def of(self, kind: type, since_s: float = 0.0) -> list:
-        return [block for at_s, block in self.blocks if isinstance(block, kind) and at_s >= since_s]
-
-    def record_bytes(self, since_s: float = 0.0) -> int:
-        sizes = {messages.StaticBlock: 16, messages.MovingBlock: 21}
-        return sum(size * len(block.records) for kind, size in sizes.items() for block in self.of(kind, since_s))
-
-
-class Way:
+class Scattering:
     """One direction of TCP over a link of the emulator: pieces of 16 kB wait for one another, each takes an exponential
     time, and what is lost goes again after a timeout, while all that follows waits."""
+
+    delay_s = 0.0
 
     def __init__(self, mean_s: float, loss: float, rng: np.random.Generator) -> None:
         self.mean_s, self.loss, self.rng = mean_s, loss, rng
@@ -100,24 +52,46 @@ class Way:
         return self.last_s
 
 
-class Scattering(Link):
-    """A visitor at the end of two such ways. ages_s: of the publication that is shown, at each tick."""
+class Link:
+    """A visitor at the end of a link. ages_s: of the publication that is shown, at each tick."""
 
-    def __init__(self, mean_s: float, loss: float, seed: int, publisher: Shared) -> None:
-        super().__init__(1e9, 0.0, publisher)
-        rng = np.random.default_rng(seed)
-        self.ways = Way(mean_s, loss, rng), Way(mean_s, loss, rng)
+    def __init__(
+        self, there: Line | Scattering, back: Line | Scattering | None = None, publisher: SimpleNamespace | None = None
+    ) -> None:
+        self.there, self.back = there, back or Line(math.inf)
+        self.visitor, self.reader, self.publisher = Visitor(), messages.StreamReader(), publisher or Publisher(0)
+        self.under_way: deque[tuple[float, bytes]] = deque()
+        self.acknowledged: deque[tuple[float, int]] = deque()
+        self.lags_s: list[float] = []
         self.ages_s: list[float] = []
+        self.blocks: list[tuple[float, object]] = []
 
-    def there(self, size: int, now_s: float) -> float:
-        return self.ways[0].carry(size, now_s)
+    def run(self, seconds: range, shown=None) -> None:
+        """Ticks of 30 ms; the field trains a little at each. shown: of an instant, what is published."""
+        for tick in seconds:
+            now_s = tick * tuned.TICK_S
+            while self.under_way and self.under_way[0][0] <= now_s:
+                came_s, data = self.under_way.popleft()
+                self.reader.read(data)
+                number, _, blocks = messages.read_message(data)
+                self.blocks += [(now_s, block) for block in blocks]
+                self.acknowledged.append((self.back.carry(4, came_s), number))
+            while self.acknowledged and self.acknowledged[0][0] <= now_s:
+                self.visitor.acknowledged(self.acknowledged.popleft()[1], now_s)
+            published = self.publisher.take((shown or trained)(now_s), now_s)
+            data = self.visitor.message(published, NEWEST_S, {"line": ""}, now_s)
+            if data is not None:
+                self.under_way.append((self.there.carry(len(data), now_s), data))
+                self.lags_s.append(self.under_way[-1][0] - self.there.delay_s - now_s)
+            if published.knots is not None and self.reader._knots is not None:
+                self.ages_s.append(published.knots.newest_s - self.reader._knots.newest_s)
 
-    def back(self, now_s: float) -> float:
-        return self.ways[1].carry(4, now_s)
+    def of(self, kind: type, since_s: float = 0.0) -> list:
+        return [block for at_s, block in self.blocks if isinstance(block, kind) and at_s >= since_s]
 
-    def each_tick(self, published: Published) -> None:
-        if self.reader._knots is not None:
-            self.ages_s.append(published.knots.newest_s - self.reader._knots.newest_s)
+    def record_bytes(self, since_s: float = 0.0) -> int:
+        sizes = {messages.StaticBlock: 16, messages.MovingBlock: 21}
+        return sum(size * len(block.records) for kind, size in sizes.items() for block in self.of(kind, since_s))
 
 
 def trained(now_s: float):
@@ -137,9 +111,16 @@ def tenths(now_s: float):
 
 
 @pytest.fixture(scope="module")
-def publisher() -> Shared:
-    """Of ``tenths``."""
-    return Shared()
+def publisher() -> SimpleNamespace:
+    """Of ``tenths``, for links that look at the same instants: what it publishes is made once."""
+    publisher, made = Publisher(0), {}
+
+    def take(shown, now_s: float) -> Published | None:
+        if now_s not in made:
+            made[now_s] = publisher.take(shown, now_s)
+        return made[now_s]
+
+    return SimpleNamespace(take=take)
 
 
 def ticks(seconds: float, since_s: float = 0.0) -> range:
@@ -147,7 +128,7 @@ def ticks(seconds: float, since_s: float = 0.0) -> range:
 
 
 def test_a_fast_link_has_everything_and_goes_on():
-    link = Link(2e6)
+    link = Link(Line(2e6))
     link.run(ticks(3.0))
     assert len(link.reader.at(NEWEST_S)) == COUNT + 1000
     sets = link.of(messages.MovingBlock, since_s=1.0)
@@ -155,10 +136,13 @@ def test_a_fast_link_has_everything_and_goes_on():
     assert len(link.of(messages.KnotsBlock, since_s=1.0)) > 50  # with each publication
     assert max(link.lags_s) < 0.12
     assert link.reader.status["link"]["static"] == [COUNT, COUNT]
+    link.run(ticks(4.0, 3.0), lambda now_s: replace(trained(1.0), moving=None))
+    assert len(link.reader.at(NEWEST_S)) == COUNT  # what moved has left, and this is said once
+    assert [len(block.records) for block in link.of(messages.MovingBlock, since_s=3.0)].count(0) == 1
 
 
 def test_a_moving_set_that_found_no_room_lets_the_window_grow():
-    link, still = Link(2e6), snapshot(gaussians(COUNT, 0), movers=1000)
+    link, still = Link(Line(2e6)), snapshot(gaussians(COUNT, 0), movers=1000)
     link.run(ticks(3.0), lambda now_s: still)  # all that stands still is there
     window = link.visitor.link
     window.window -= window.room - 1500.0
@@ -169,7 +153,7 @@ def test_a_moving_set_that_found_no_room_lets_the_window_grow():
 
 @pytest.mark.parametrize("kilobytes, all_of_it, lag_s", [(15, False, 0.65), (60, True, 0.35)])
 def test_a_slow_link_is_kept_short_and_shows_what_is_large(kilobytes, all_of_it, lag_s):
-    link = Link(1e3 * kilobytes)
+    link = Link(Line(1e3 * kilobytes))
     link.run(ticks(12.0))
     assert np.quantile(link.lags_s[len(link.lags_s) // 3 :], 0.9) < lag_s  # of a queue that would hold seconds
     static, drawn = link.publisher._newest.static, link.reader._shown.params
@@ -180,14 +164,14 @@ def test_a_slow_link_is_kept_short_and_shows_what_is_large(kilobytes, all_of_it,
     sizes = {len(block.records) for block in link.of(messages.MovingBlock, since_s=4.0)}
     assert sizes and max(sizes) < 1000
     assert len(link.of(messages.KnotsBlock, since_s=4.0)) > 3 * len(link.of(messages.MovingBlock, since_s=4.0)) > 3
-    assert link.record_bytes() > 0.5 * 12.0 * link.rate  # and it is used
-    link.rate = 2e6  # a link that becomes faster gets the rest
+    assert link.record_bytes() > 0.5 * 12.0 * link.there.rate  # and it is used
+    link.there.rate = 2e6  # a link that becomes faster gets the rest
     link.run(ticks(16.0, 12.0))
     assert link.visitor.shown_static == COUNT and len(link.reader.at(NEWEST_S)) == COUNT + 1000
 
 
 def test_an_outage_during_a_probe_makes_no_link_one_whose_delays_scatter(publisher):
-    link, stall_s = Link(60e3, publisher=publisher), 10.0
+    link, stall_s = Link(Line(60e3), publisher=publisher), 10.0
     link.run(ticks(12.0), tenths)
     tick, probe = ticks(12.0).stop, link.visitor.link._probe
     while link.visitor.link._probe == probe:
@@ -195,7 +179,7 @@ def test_an_outage_during_a_probe_makes_no_link_one_whose_delays_scatter(publish
         tick += 1
     came_s, data = link.under_way.pop()
     link.under_way.append((came_s + stall_s, data))
-    link.free_s += stall_s
+    link.there.free_s += stall_s
     over = tick + ticks(stall_s).stop
     link.run(range(tick, over), tenths)
     sent = len(link.lags_s)
@@ -207,7 +191,8 @@ def test_a_link_whose_delays_scatter_gets_half_of_what_it_takes_and_has_no_long_
     """Mean delay 400 ms, a fifth lost: the live page's bad network, three of which are carried half full on average."""
     mean_s, loss, sent = 0.4, 0.2, 0
     for seed in range(3):
-        link = Scattering(mean_s, loss, seed, publisher)
+        rng = np.random.default_rng(seed)
+        link = Link(Scattering(mean_s, loss, rng), Scattering(mean_s, loss, rng), publisher)
         link.run(ticks(60.0), tenths)
         sent += link.record_bytes(since_s=15.0)
         ages_s = link.ages_s[len(link.ages_s) // 4 :]
@@ -225,7 +210,7 @@ def test_who_reads_nothing_costs_a_window():
 
 
 def test_a_growing_field_replaces_sets_that_are_whole():
-    link, counts = Link(300e3), []
+    link, counts = Link(Line(300e3)), []
 
     def growing(now_s):
         return snapshot(gaussians(COUNT, 0)[: 2000 + 80 * int(now_s / 0.09)], movers=0)
@@ -260,7 +245,7 @@ def test_before_there_is_a_field_the_status_says_so():
 
 @pytest.mark.parametrize("kilobytes", [20, 2000])
 def test_what_moves_stays_when_anchors_are_chosen_anew(kilobytes):
-    link, anchors = Link(1e3 * kilobytes), [motion().anchors.copy() for _ in range(2)]
+    link, anchors = Link(Line(1e3 * kilobytes)), [motion().anchors.copy() for _ in range(2)]
 
     def anew(now_s):
         """Other anchors each half second."""
@@ -274,18 +259,6 @@ def test_what_moves_stays_when_anchors_are_chosen_anew(kilobytes):
         link.run(range(tick, tick + 1), anew)
         assert len(link.reader.at(NEWEST_S)) > len(link.reader._shown.params)
     assert len({block.anchors for block in link.of(messages.MovingBlock)}) > 6
-
-
-def test_what_has_left_is_shown_no_longer_and_nothing_else_is_sent_again():
-    link = Link(2e6)
-    link.run(ticks(2.0))
-    still = link.reader._shown.number
-    assert len(link.reader.at(NEWEST_S)) == COUNT + 1000
-    link.run(ticks(3.0, 2.0), lambda now_s: replace(trained(1.0), moving=None))
-    assert len(link.reader.at(NEWEST_S)) == COUNT
-    assert len([block for block in link.of(messages.MovingBlock, since_s=2.0) if not len(block.records)]) == 1
-    link.run(ticks(4.0, 3.0))
-    assert len(link.reader.at(NEWEST_S)) == COUNT + 1000 and link.reader._shown.number == still
 
 
 def test_what_no_camera_has_seen_is_said_also_when_it_is_known_later():
