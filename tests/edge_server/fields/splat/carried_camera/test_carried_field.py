@@ -333,6 +333,7 @@ def test_a_camera_that_is_carried_elsewhere_meanwhile_has_not_leapt(frames: int,
         (_relocalized, BAD_FROM, 46, "poses leapt"),  # it is believed
         (_in_unit(1000.0), 0, 19, "reported poses do not fit"),  # pictures locate the camera
         (lambda k, view: carried.spoiled(WALK)[k], 0, 19, "[]"),  # poses and exposures are refined
+        (lambda k, view: replace(view, depth=None), 0, 19, ""),  # frames tell the depth
     ],
 )
 def test_it_resumes_bit_for_bit_whatever_the_number_of_threads(led_astray, begin, until, said) -> None:
