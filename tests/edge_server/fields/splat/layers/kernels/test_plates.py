@@ -239,6 +239,21 @@ def test_a_body_that_stays_becomes_the_plate_unless_what_moves_explains_it(expla
     assert (np.isclose(curtain, 40, atol=1) | np.isclose(curtain, 220, atol=1)).any() == held
 
 
+def test_what_is_unknown_shows_and_is_compared_with_the_static_field() -> None:
+    plate, image = Plate(SIZE, SIZE, CallerPool()), WALL.copy()
+    for k in range(20):
+        image[:, 30:] = (40, 220)[k % 2]
+        plate.take(image)
+    assert not plate.known[5:-5, 36:-5].any() and plate.known[:, :26].all()
+    plate.fill_unknown(np.full(WALL.shape, 99.0 / 255.0, np.float32))
+    np.testing.assert_allclose(plate.picture[5:-5, 36:-5], 99.0, atol=0.1)
+    np.testing.assert_allclose(plate.picture[:, :26], WALL[:, :26], atol=1.0)
+    image[:, 30:] = 99
+    assert not plate.take(image)[5:-5, 36:-5].any()
+    image[BODY, 34:44] = 250, 30, 30
+    assert plate.take(image)[BODY, 35:43].all()
+
+
 def test_a_fine_plate_is_at_the_common_exposure_and_leaves_out_what_moves() -> None:
     """The mean of frames divided by their exposures: with twice the light, half the color."""
     whole = ring(2, size=2 * SIZE)[0]
