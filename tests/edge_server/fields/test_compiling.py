@@ -1,45 +1,15 @@
-"""People are told when numba compiles, not when it loads; ``warm-up`` compiles what a scenario uses."""
+"""``warm-up`` compiles what a scenario uses; what is compiled is kept for the state of the sources."""
 
 from __future__ import annotations
-
-import runpy
-from pathlib import Path
 
 import pytest
 
 from edge_server.cli import main
 from edge_server.fields.common.kernels.jit import cache_folder
-from edge_server.fields.compiling import told
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.splat.carried_camera.carried_field import CarriedField
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from freshfield.scenario import load
-
-KERNEL = """
-from numba import njit
-
-@njit(cache=True)
-def doubled(x):
-    return 2 * x
-"""
-
-
-def test_compiling_is_told_and_loading_is_not(tmp_path: Path) -> None:
-    source = tmp_path / "kernels_of_a_test.py"
-    source.write_text(KERNEL)
-    lines: list[str] = []
-
-    def doubled(x: complex) -> complex:
-        """Of a module that is imported anew."""
-        return runpy.run_path(str(source))["doubled"](x)
-
-    with told(lines.append):
-        assert doubled(4) == 8 and doubled(4.0) == 8.0
-        assert [line.split("): ")[1] for line in lines] == ["number 1", "number 2"]
-        assert doubled(4) == 8
-    assert len(lines) == 2, "the third was loaded from numba's cache"
-    assert doubled(4j) == 8j
-    assert len(lines) == 2, "nobody is told after the end of the block"
 
 
 @pytest.mark.parametrize(

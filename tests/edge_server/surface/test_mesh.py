@@ -13,7 +13,7 @@ from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels.fuse import SIDE
 from edge_server.surface.mesh import extract_mesh, remove_degenerate, remove_small_components
 from edge_server.surface.reconstruct import mesh_from_depth_maps
-from edge_server.surface.sdf import fit_sdf, gradient_norm, sample_grid
+from edge_server.surface.sdf import fit_sdf
 from edge_server.surface.settings import MeshSettings
 from edge_server.surface.volume import Grid, bounding_box, fuse_maps
 from tests.edge_server.surface import ball as balls
@@ -78,27 +78,14 @@ def test_distances_are_those_of_the_ball_with_a_slope_of_one(monkeypatch):
     assert steep < 0.12, "without the eikonal term it is 0.20"
 
 
-def test_values_between_nodes_and_their_slope():
-    x, y, z = torch.meshgrid(*[torch.arange(n) * 0.5 for n in (5, 6, 7)], indexing="ij")
-    plane = (0.6 * x + 0.8 * z + 0.0 * y)[None, None]
-    extent, points = torch.tensor([2.0, 2.5, 3.0]), torch.tensor([[1.0, 1.2, 1.1], [0.8, 0.9, 2.2]])
-    torch.testing.assert_close(sample_grid(plane, points, extent), 0.6 * points[:, 0] + 0.8 * points[:, 2])
-    torch.testing.assert_close(gradient_norm(plane, points, extent, 0.5), torch.ones(2))
-
-
 def test_the_number_of_threads_changes_no_bit_of_a_distance_function(monkeypatch):
     for name, value in (("LEVELS", 2), ("STEPS", 10), ("POINTS", 2000)):
         monkeypatch.setattr(settings, f"SDF_{name}", value)
-    maps, before = balls.ball_maps(4), torch.get_num_threads()
-    found = []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            volume = fit_sdf(COARSE, maps)
-            found.append(volume.blocks.distance)
-    finally:
-        torch.set_num_threads(before)
-    np.testing.assert_array_equal(*found)
+    maps, found = balls.ball_maps(4), []
+    for threads in (1, 2, torch.get_num_threads()):  # as it was, at last
+        torch.set_num_threads(threads)
+        found.append(fit_sdf(COARSE, maps).blocks.distance)
+    np.testing.assert_array_equal(found[0], found[1])
 
 
 @pytest.fixture(scope="module")
@@ -116,16 +103,6 @@ def test_a_ball_comes_out_as_a_ball(ball):
         mesh.visual.vertex_colors[side, :3] for side in (mesh.vertices[:, 2] > 0.01, mesh.vertices[:, 2] < -0.01)
     )
     assert np.abs(top.astype(int) - (200, 20, 20)).mean() < 6 and np.abs(bottom.astype(int) - 90).mean() < 6
-
-
-def test_a_mesh_without_a_surface_is_refused(ball):
-    with pytest.raises(SurfaceError, match="no surface"):
-        extract_mesh(ball, min_weight=1e9)
-
-
-def test_what_nobody_saw_stays_open():
-    seen_from_above = fuse_maps(GRID, [m for m in balls.ball_maps(40) if m.camera_to_world[2, 3] > 0.1])
-    assert extract_mesh(seen_from_above).vertices[:, 2].min() > -0.09  # the ball's lower end is missing
 
 
 def test_dirt_and_faces_without_area_go_and_pieces_stay(ball):

@@ -13,7 +13,7 @@ from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels import patch_match
 from edge_server.surface.kernels.patch_images import Images, Planes, View
 from edge_server.surface.reconstruct import covering_maps
-from edge_server.surface.refine_depth import exposures, refine_depth, smooth_normals
+from edge_server.surface.refine_depth import exposures, refine_depth
 from edge_server.surface.settings import REACH, UNSURE
 from freshfield.geometry import Pinhole, look_at, world_rays
 
@@ -98,14 +98,6 @@ def test_the_number_of_threads_changes_no_bit(rig):
         np.testing.assert_array_equal(a.trust, b.trust)
 
 
-def test_one_camera_alone_keeps_its_depth(rig):
-    maps, pictures, _ = rig
-    (found,) = refine_depth(maps[:1], pictures[:1], POOL)
-    np.testing.assert_array_equal(found.depth[found.seen], maps[0].depth[found.seen])
-    assert found.seen.sum() > 0.8 * maps[0].seen.sum()
-    np.testing.assert_allclose(found.trust, UNSURE * maps[0].cosine, atol=1e-6)
-
-
 def _kernel_view(k: int, maps, gray) -> tuple[Images, View]:
     from edge_server.surface.refine_depth import _images, _view
 
@@ -151,23 +143,6 @@ def test_the_cost_is_that_of_plain_numpy(rig):
     )
 
 
-def test_a_pixel_is_compared_with_those_that_see_the_same_from_aside(rig):
-    maps, pictures, _ = rig
-    far = depth_map(maps[0].depth, maps[0].color, look_at((5.0, 0, 0.3), (5, 0, 0), up=(0, 1, 0)), LENS)
-    every = [*maps, far, replace(maps[0])]  # one sees something else, one stands where map 0 does
-    gray = [p[..., 0].astype(np.float32) for p in [*pictures, pictures[0], pictures[0]]]
-    images, view = _kernel_view(0, every, gray)
-    depth = np.where(maps[0].seen, maps[0].depth, 0).astype(np.float32)
-    planes = Planes(depth, smooth_normals(depth, view.rays), np.zeros_like(depth))
-    POOL.run(patch_match.choose_sources, images, view, planes, False)
-    assert set(view.chosen[36, 36]) == {1, 2, 3, -1}
-    assert view.chosen.shape[-1] == patch_match.SOURCES
-    # Hidden by something that stands before it in map 1: that comes last.
-    images.depth[images.first[1] : images.first[2]] = 0.1
-    POOL.run(patch_match.choose_sources, images, view, planes, True)
-    assert [s for s in view.chosen[36, 36] if s >= 0][-1] == 1
-
-
 def test_unknown_pixels_take_the_nearest_depth_and_empty_ones_none(rig):
     maps, pictures, exact = rig
     holed = []
@@ -181,20 +156,13 @@ def test_unknown_pixels_take_the_nearest_depth_and_empty_ones_none(rig):
     assert np.isposinf(found[0].depth[:, :6]).all()
 
 
-@pytest.mark.parametrize(
-    ("most", "chosen"),
-    [
-        (4, [0, 1, 2, 3]),  # all fit
-        (3, [0, 1, 3]),  # what sees nothing is the last to be chosen
-        (2, [0, 3]),  # the second map sees the same as the first
-        (0.5, [0, 3]),  # two are compared with each other, however large they are
-    ],
-)
-def test_only_the_maps_that_see_most_together_are_sharpened(most, chosen) -> None:
+def test_only_the_maps_that_see_most_together_are_sharpened() -> None:
     elsewhere = look_at((5.0, 0.0, 0.25), (5.0, 0.0, 0.0), up=(0, 1, 0))
     maps = [depth_map(*textured_plane(pose), pose, LENS) for pose in (POSES[0], POSES[0], POSES[0], elsewhere)]
     maps[2] = replace(maps[2], depth=np.zeros_like(maps[2].depth))
-    assert covering_maps(maps, int(most * maps[0].depth.size)) == chosen
+    # The third sees nothing, the second the same as the first; two are compared with each other, however large.
+    for most, chosen in ((4, [0, 1, 2, 3]), (3, [0, 1, 3]), (2, [0, 3]), (0.5, [0, 3])):
+        assert covering_maps(maps, int(most * maps[0].depth.size)) == chosen
 
 
 PICTURES = {

@@ -10,7 +10,7 @@ import pytest
 from edge_server.fields import Budget, View
 from edge_server.fields.common.supervision import CHANGE, FARTHEST_M, check_view, moved_pixels
 from tests.edge_server.fields.scenes import ring
-from tests.edge_server.fields_for_tests import tiny_field
+from tests.edge_server.fields.small import tiny
 
 VIEW = ring(1, size=16)[0]
 
@@ -59,7 +59,7 @@ def test_a_geographic_grid_and_a_long_lens_are_welcome() -> None:
 
 
 def test_a_field_that_was_given_what_cannot_be_goes_on() -> None:
-    field = tiny_field()
+    field = tiny("ngp")
     with pytest.raises(ValueError, match="camera cam00: its distortion"):
         field.fit([_lens(1e30, 0.0, 0.0, 0.0)], Budget(steps=2))
     assert field.step == 0 and not field.view_store.memory

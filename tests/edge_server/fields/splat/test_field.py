@@ -1,87 +1,20 @@
-"""What only the field of still Gaussians does; ``test_every_representation`` has the rest."""
+"""What only the field of still Gaussians does, also with flat ones: ``test_every_representation`` has the rest."""
 
 from __future__ import annotations
-
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from edge_server.fields import Budget
-from edge_server.fields.common.scene_box import scene_box
-from edge_server.fields.common.threads.thread_pool import CallerPool
+from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune, opacity
-from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
-from edge_server.fields.splat.seeding import seed_gaussians
-from tests.edge_server.fields.scenes import mean_psnr, ring
-from tests.edge_server.fields.small import SEEN, SMALL, healthy, run_with_bounds_checks, small, tiny
-from tests.edge_server.fields.splat.kernels.small_cloud import random_params
-
-
-def test_nothing_begins_at_pixels_without_weight() -> None:
-    box, pool, rng = scene_box(SEEN), CallerPool(), np.random.default_rng
-    weight = [np.full(v.image.shape[:2], k % 2, np.float32) for k, v in enumerate(SEEN)]
-    share = np.concatenate([w.ravel() for w in weight])
-    others = [replace(v, image=255 - v.image) if k % 2 == 0 else v for k, v in enumerate(SEEN)]  # of weight 0
-    one, two = (seed_gaussians(SMALL["splat"], pool, box, views, None, share, 300, rng(1)) for views in (SEEN, others))
-    assert len(one) > 100
-    np.testing.assert_array_equal(one, two)
-    assert len(seed_gaussians(SMALL["splat"], pool, box, SEEN, None, np.zeros_like(share), 300, rng(1))) == 0
-
-
-def test_the_number_of_gaussians_grows_to_the_cap_and_no_further() -> None:
-    field = small("splat")
-    counts = []
-    for _ in range(12):
-        field.fit(SEEN, Budget(steps=20))
-        counts.append(len(field.cloud))
-    assert counts[0] < counts[-1] == max(counts) <= SMALL["splat"].gaussians and counts[-1] > 1400
-
-
-TINY_VIEWS = ring(9, size=24)
-
-
-@pytest.mark.stability
-@pytest.mark.parametrize(
-    ("array", "column", "value"),
-    [("params", 0, np.nan), ("params", 3, 1e30), ("params", OPACITY, -np.inf), ("params", 12, 1e38), ("v", 0, np.nan)],
-)
-def test_damage_is_healed(array: str, column: int, value: float) -> None:
-    """Of every seventh Gaussian."""
-    field = tiny("splat")
-    field.fit(TINY_VIEWS, Budget(steps=40))
-    getattr(field.cloud, array)[::7, column] = value
-    field._snapshot = None
-    out = field.render(TINY_VIEWS[0].camera_to_world, TINY_VIEWS[0].intrinsics)
-    assert np.isfinite(out.color).all() and np.isfinite(out.depth).all()
-    field.fit(TINY_VIEWS, Budget(steps=120))
-    healthy(field, TINY_VIEWS)
-    assert mean_psnr(field, TINY_VIEWS) > 17.0
-    assert field.fit(TINY_VIEWS, Budget(steps=40)).dropped == 0, "still not finite 120 steps later"
-
-
-@pytest.mark.stability
-@pytest.mark.slow
-def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.FixtureRequest) -> None:
-    """A whole fit and rendering with numba's bounds checks, in a process of its own."""
-    code = """
-from dataclasses import replace
-import numpy as np
-from edge_server.fields import Budget
-from tests.edge_server.fields.splat.test_field import TINY_VIEWS, tiny
-bent = [replace(v, intrinsics=replace(v.intrinsics, distortion=(-.1, .01, .002, .001))) for v in TINY_VIEWS]
-for extra, views in (({}, TINY_VIEWS), ({"sh_degree": 1, "contracted": True}, bent),
-                     ({"flatten": 0.1}, bent)):
-    field = tiny("splat", **extra)
-    field.fit(views, Budget(steps=25))
-    out = field.render(TINY_VIEWS[0].camera_to_world, replace(TINY_VIEWS[0].intrinsics, width=37, height=19))
-    assert np.isfinite(out.color).all()
-moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in TINY_VIEWS]
-field.fit(moved, Budget(steps=20))
-"""
-    run_with_bounds_checks(code, tmp_path, request)
-
+from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE
+from edge_server.fields.splat.planar import plane_depth
+from edge_server.surface.depth import render_depth_maps
+from freshfield.geometry import Pinhole, look_at, matrix_to_quaternion, so3_exp, world_rays
+from tests.edge_server.fields.scenes import ring
+from tests.edge_server.fields.small import tiny
+from tests.edge_server.fields.splat.kernels.small_cloud import BOX, as_gaussians, binned, random_params
 
 RNG = np.random.default_rng(0)
 
@@ -132,3 +65,46 @@ def test_the_faint_the_unseen_and_the_broken_are_removed() -> None:
     cloud.params[:3, OPACITY] = np.log(0.019 / 0.981), np.log(0.021 / 0.979), -9.0
     cloud.looks[3], cloud.slope[:] = 0.0, 0.0
     assert densify_and_prune(cloud, 8, 100.0, RNG).tolist() == [1]
+
+
+# --- Gaussians as planes ----------------------------------------------------------------------------
+
+LENS = Pinhole.from_fov(24, 24, 40.0)
+POSE = look_at((0.5, -0.4, 2.0), (0, 0, 0))
+
+
+def flat(count: int, tilt: np.ndarray) -> np.ndarray:
+    """Parameters of flat Gaussians strewn over the plane through the origin with normal tilt[:, 2]."""
+    rng = np.random.default_rng(0)
+    p = np.zeros((count, BASE), np.float32)
+    p[:, :3] = rng.uniform(-0.9, 0.9, (count, 2)) @ tilt[:, :2].T
+    p[:, SCALE : SCALE + 2], p[:, SCALE + 2] = np.log(0.12), -7.0
+    p[:, QUATERNION : QUATERNION + 4] = matrix_to_quaternion(tilt)
+    p[:, OPACITY] = 2.0
+    return p
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.6])
+def test_the_depth_of_a_plane_is_where_the_rays_meet_it(angle: float) -> None:
+    tilt, cams = so3_exp([0.0, angle, 0.0]), camera_rows([POSE], [LENS], BOX)
+    params = flat(400, tilt)
+    depth, opacity = plane_depth(binned(cams, params), as_gaussians(params), cams[0], LENS)
+    origin, rays = world_rays(LENS, POSE)
+    exact = -(origin @ tilt[:, 2]) / (rays @ tilt[:, 2])
+    solid = opacity > 0.9
+    assert solid.mean() > 0.2
+    assert np.abs(depth / exact - 1)[solid].max() < 1e-4  # blended middles are off by centimeters
+
+
+def test_a_field_that_is_asked_for_surfaces_shows_their_planes() -> None:
+    views = ring(5, size=32)
+    fields = [tiny("splat"), tiny("splat", flatten=0.02)]
+    for field in fields:
+        field.fit(views, Budget(steps=40))
+    thin = [np.ptp(field.cloud.params[:, SCALE : SCALE + 3], axis=1) for field in fields]
+    assert np.median(thin[1]) > np.median(thin[0]) + 0.3 and thin[1].max() <= np.log(20.0) + 1e-5
+    camera = (views[0].camera_to_world, views[0].intrinsics)
+    snapshot = fields[1].snapshot()
+    assert snapshot.planar and not fields[0].snapshot().planar
+    (found,) = render_depth_maps(snapshot, [camera])
+    np.testing.assert_array_equal(found.depth[found.seen], snapshot.render_surface(*camera).depth[found.seen])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 
 from edge_server.fields.tensorf.field import TensorfField, upsample_table
@@ -91,16 +90,11 @@ def test_gradient_equals_the_oracle() -> None:
     assert (dirty >= touched).all() and not dirty.all()
 
 
-@pytest.mark.parametrize("new", [17, 31])
-def test_finer_planes_say_the_same(new: int) -> None:
-    """Exactly at 2 n - 1 vertices a side; nearly, otherwise."""
+def test_finer_planes_say_the_same() -> None:
+    """Exactly at 2 n - 1 vertices a side."""
     planes, (x, _) = _planes(), _points(200)
-    table = upsample_table(planes.table, planes.groups, planes.size, new)
-    fine = planes._replace(size=new, rows=len(table) // planes.groups, table=table)
+    table = upsample_table(planes.table, planes.groups, planes.size, 17)
+    fine = planes._replace(size=17, rows=len(table) // planes.groups, table=table)
     points = torch.as_tensor(x[0].T)
     before = _oracle(planes, torch.as_tensor(planes.table), points).numpy()
-    after = _oracle(fine, torch.as_tensor(table), points).numpy()
-    if new == 17:
-        np.testing.assert_allclose(after, before, atol=1e-4)
-    else:
-        assert np.corrcoef(before.ravel(), after.ravel())[0, 1] > 0.95
+    np.testing.assert_allclose(_oracle(fine, torch.as_tensor(table), points).numpy(), before, atol=1e-4)

@@ -107,14 +107,22 @@ def test_poses_reported_after_a_leap_are_taken_back_and_earlier_ones_are_not() -
 
 def test_a_step_moves_the_views_taken_around_it_but_not_those_without_times() -> None:
     for apart_ns, moved in ((1, 9), (0, 1)):
-        poses = PoseCorrections(0.3, 5.0)
+        poses, settled = PoseCorrections(0.3, 5.0), PoseCorrections(0.3, 5.0, full_steps=0.25)
         views = [_view(f"v{k:02d}", k * apart_ns) for k in range(30)]
-        for view in views:
-            poses.pose(view)
+        for each in (poses, settled):
+            for view in views:
+                each.pose(view)
+        poses.begin(replace(views[0], camera="elsewhere"), "of another camera")
         normal = normal_matrix(views[0], _depth(views[0]))
+        for _ in range(2):
+            before = settled.known["v00"].shift_m
+            settled.descend(views[0], np.full(6, 5.0), normal, WALL_M / LENS.fx)
         changed = poses.descend(views[0], np.full(6, 5.0), normal, WALL_M / LENS.fx)
         sizes = [np.linalg.norm(poses.known[view.camera].shift_m) for view in views]
         assert len(changed) == np.count_nonzero(sizes) == moved and np.argmax(sizes) == 0
+        assert not poses.known["elsewhere"].shift_m.any()
+        # The second step of a view is a quarter of a full one where those get shorter after a quarter of a step.
+        np.testing.assert_allclose(settled.known["v00"].shift_m - before, poses.known["v00"].shift_m / 4.0, atol=1e-12)
         again = PoseCorrections(0.3, 5.0)
         again.load(poses.meta())
         for one in (poses, again):

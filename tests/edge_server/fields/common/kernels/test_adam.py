@@ -9,7 +9,7 @@ from numba import njit
 from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT, Rule, adam
 from edge_server.fields.common.kernels.hash_grid import SEGMENT
 from edge_server.fields.common.kernels.jit import FAST
-from edge_server.fields.common.kernels.simd import COUNTER, draw, exp32, log32, uniform
+from edge_server.fields.common.kernels.simd import exp32, log32, uniform
 
 VERTICES = SEGMENT * 8
 
@@ -105,16 +105,3 @@ def test_uniform_is_uniform_and_streams_differ() -> None:
     a, b = _draw(np.uint64(1), 20_000), _draw(np.uint64(2), 20_000)
     assert a.min() >= 0.0 and a.max() < 1.0 and abs(a.mean() - 0.5) < 0.01
     assert abs(np.corrcoef(a[:-1], a[1:])[0, 1]) < 0.03 and abs(np.corrcoef(a, b)[0, 1]) < 0.03
-
-
-@njit
-def _drawn(counter, worker, tasks):
-    found = np.full(tasks, -1)
-    for k in range(tasks):
-        found[k] = draw(counter, worker, tasks)
-    return found, draw(counter, worker, tasks)
-
-
-def test_a_worker_draws_its_own_tasks_and_then_those_of_the_others() -> None:
-    found, after = _drawn(np.zeros(3 * COUNTER, np.int64), 1, 10)
-    assert found.tolist() == [3, 4, 5, 6, 7, 8, 9, 0, 1, 2] and after >= 10

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from edge_server.fields.common.kernels.simd import COUNTER, draw
+from edge_server.fields.common.kernels.simd import draw
 from edge_server.fields.common.threads import thread_pool
-from edge_server.fields.common.threads.brief_wait import await_next_job, await_workers
 from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
 
 # With a nice of 0 the caller is a worker itself.
@@ -64,27 +63,18 @@ def test_all_workers_compute_at_once_each_task_once_until_the_pool_is_closed(thr
 
 
 @either_priority
-def test_workers_that_are_spared_stay_idle_and_callers_of_the_last_compute_side_by_side(nice: int) -> None:
-    pool, done = Pool(3, nice), np.zeros(1000, np.int64)
+def test_workers_that_are_spared_stay_idle_and_a_closed_pool_computes_nothing(nice: int) -> None:
+    pool, done, callers = Pool(3, nice), np.zeros(1000, np.int64), set[int | None]()
     for spared, engaged in ((1, [0, 1]), (0, [0, 1, 2]), (9, [0])):
         pool.spare(spared)
         assert _engaged(pool) == engaged
         pool.run(_share, done)
     assert (done == 3).all()
-    together, seen = threading.Barrier(2), []
-
-    def meet(counter, worker):
-        together.wait(10)
-        seen.append((worker, threading.get_ident()))
-
-    caller = threading.Thread(target=pool.run, args=(meet,))
-    caller.start()
-    pool.run(meet)
-    caller.join(10)
-    assert sorted(seen) == sorted([(0, caller.ident), (0, threading.get_ident())])
+    pool.run(lambda counter, worker: callers.add(threading.get_ident()))
+    assert callers == {threading.get_ident()}, "where one worker is left, callers compute themselves"
     pool.close()
     with pytest.raises(RuntimeError, match="closed"):
-        pool.run(meet)
+        pool.run(_share, done)
 
 
 @either_priority
@@ -135,43 +125,24 @@ def test_a_caller_works_along_unless_it_is_to_go_first() -> None:
 
 
 @either_priority
-def test_a_caller_that_is_interrupted_waits_for_what_it_has_begun(nice: int) -> None:
-    """Else others would write to arrays that are the caller's."""
-    pool, seen = Pool(3, nice), []
-
-    def slow(counter, worker):
-        if worker == 1:
-            time.sleep(0.3)
-            seen.append("slow")
-
-    before = signal.signal(signal.SIGALRM, signal.default_int_handler)  # as from Ctrl-C
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.1)
-        with pytest.raises(KeyboardInterrupt):
-            pool.run(slow)
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
-    assert seen == ["slow"] and _engaged(pool) == [0, 1, 2]
-    pool.close()
-
-
-def test_after_an_interrupt_each_task_is_done_once_again() -> None:
-    """The worker that the caller waits for when Ctrl-C comes has drawn tasks of a job that is over then."""
-    pool, slow = Pool(2), np.zeros(40, np.int64)
+def test_an_interrupted_caller_waits_for_what_it_has_begun_and_no_task_is_lost_afterwards(nice: int) -> None:
+    """Else others would write to arrays that are the caller's. A worker has drawn tasks of a job that is over then."""
+    pool, slow, done, ended = Pool(3, nice), np.zeros(40, np.int64), np.zeros(1000, np.int64), []
 
     def interrupted(counter, worker, done):
         _share(counter, worker, done)
         if worker == 1:
             time.sleep(0.1)
             os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(0.1)
+            time.sleep(0.2)
+            ended.append(worker)
 
     with pytest.raises(KeyboardInterrupt):
         pool.run(interrupted, slow)
-    done = np.zeros(1000, np.int64)
+    assert ended == [1]
     pool.run(_share, done)
     assert (done == 1).all() and (slow == 1).all()
+    assert _engaged(pool) == [0, 1, 2]
     pool.close()
 
 
@@ -203,7 +174,7 @@ def test_a_caller_interrupted_before_it_has_woken_all_workers_loses_no_task(monk
 
 
 @either_priority
-def test_a_pool_that_rests_keeps_no_arrays(nice: int) -> None:
+def test_a_pool_that_rests_keeps_no_arrays_and_sleeps(nice: int) -> None:
     """Not those of a worker either that was done long before the others."""
     pool, array = Pool(3, nice), np.zeros(8)
     alive = weakref.ref(array)
@@ -213,22 +184,6 @@ def test_a_pool_that_rests_keeps_no_arrays(nice: int) -> None:
     while alive() is not None and time.monotonic() < deadline:
         time.sleep(0.005)
     assert alive() is None
-    pool.close()
-
-
-def test_a_wait_without_sleeping_ends_with_the_others_sign_or_gives_up() -> None:
-    done, drawn = np.zeros(COUNTER, np.int64), np.zeros(COUNTER, np.int64)
-    await_workers(done, 1)  # nobody is done: given up, or this would not end
-    await_next_job(done, drawn)  # the same, for a kernel
-    assert done[0] == 1
-    drawn[0] = 1  # of the job before, which is never reset
-    await_next_job(done, drawn)
-    assert done[0] == 2
-
-
-def test_workers_without_work_sleep() -> None:
-    pool, done = Pool(3), np.zeros(30, np.int64)
-    pool.run(_share, done)
     time.sleep(0.05)
     before_s = time.process_time()
     time.sleep(0.2)

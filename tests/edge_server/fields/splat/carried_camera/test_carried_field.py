@@ -12,6 +12,7 @@ import pytest
 
 from edge_server.fields import Budget, View
 from edge_server.fields.splat.carried_camera import settings as tuned
+from edge_server.fields.splat.carried_camera.carried_field import CarriedField
 from freshfield.geometry import look_at, se3, so3_exp
 from tests.edge_server.fields.scenes import seen
 from tests.edge_server.fields.small import same_state
@@ -43,19 +44,14 @@ def test_frames_become_keyframes_and_held_out_ones_take_their_neighbors_correcti
 
 
 def test_without_depth_it_begins_anew_until_it_has_seen_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    field, anew, taken = carried_field(), list[int](), list[int]()
-    begin = field._begin_anew
-    monkeypatch.setattr(field, "_begin_anew", lambda: anew.append(field._taken) or begin())
-    for view in walk(depth=False)[:30]:
-        given(field, [view])
-        taken.append(field._taken)
+    field, anew, begin = carried_field(), list[int](), CarriedField._begin_anew
+    monkeypatch.setattr(CarriedField, "_begin_anew", lambda self: anew.append(self._taken) or begin(self))
+    given(field, walk(depth=False)[:30])
     assert anew == [2, 4, 8]
-    # Beginning anew counts steps from 0 again, not the turns of frames.
-    assert taken == list(range(taken[0], taken[0] + 30))
     # The depth that was found serves the box, and each keyframe's own the steps of its pose.
     box, pixels_m = field.view_store.box, [pixel_m for _, pixel_m in field._aims[: tuned.BEGINS[-1]]]
     assert box is not None and box.distance_m == pytest.approx(field._seen_m) and len(set(pixels_m)) == len(pixels_m)
-    assert carried.undisturbed(False)[-1] > 18.0
+    assert field._taken == 30, "beginning anew counts steps from 0 again, not the turns of frames"
 
 
 def test_a_frame_is_taken_once_and_not_before_its_turn() -> None:
@@ -65,21 +61,7 @@ def test_a_frame_is_taken_once_and_not_before_its_turn() -> None:
     for camera, k, expected in (("hand", 2, 2), ("hand", 3, 3), ("hand", 4, 4), ("hand", 5, 4), ("other", 6, 5)):
         field.fit([replace(WALK[k], camera=camera)], Budget(steps=0))
         assert len(field.views) == expected, k
-
-
-@pytest.mark.slow
-def test_each_moving_camera_has_corrections_of_its_own() -> None:
-    """One is mounted 1.5 degrees askew, the other is not."""
-    field, askew = carried_field(), se3(so3_exp(np.array([0.0, np.deg2rad(1.5), 0.0])), np.zeros(3))
-    turned: dict[str, list[np.ndarray]] = {"left": [], "right": []}
-    for view in WALK[1:30]:
-        field.fit([replace(view, camera="left")], Budget(steps=24))
-        field.fit([replace(view, camera="right", camera_to_world=view.camera_to_world @ askew)], Budget(steps=24))
-    for name, known in field._poses.known.items():
-        assert known.track == name.partition("#")[0]
-        turned[known.track].append(known.given[:3, :3].T @ known.rotation)
-    apart_deg = np.rad2deg(np.mean(turned["right"], axis=0) - np.mean(turned["left"], axis=0))
-    assert -1.9 < apart_deg[1] < -0.75 and np.abs(apart_deg[[0, 2]]).max() < 0.4
+    assert [known.track for known in field._poses.known.values()] == [*["hand"] * 4, "other"]
 
 
 def test_keyframes_taken_near_each_other_go_first_and_memory_stays(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,17 +74,6 @@ def test_keyframes_taken_near_each_other_go_first_and_memory_stays(monkeypatch: 
     apart_m = np.linalg.norm(at_m[:, None] - at_m[None], axis=2) + 10.0 * np.eye(len(at_m))
     assert apart_m[: -tuned.NEWEST, : -tuned.NEWEST].min() > 0.25  # spread over the whole round
     assert carried.scored_db(field, WALK)[1] > 20.0
-
-
-def test_it_resumes_bit_for_bit_whatever_the_number_of_threads() -> None:
-    views = carried.spoiled(WALK)
-    one, two = (given(carried_field(threads), views[:20]) for threads in (2, 1))
-    three = carried.resumed_from(one.state())
-    for field in (one, two, three):
-        given(field, views[20:30])
-    for other in (two, three):
-        same_state(one, other)
-        assert one._poses.meta() == other._poses.meta()
 
 
 def _leaping(view: View) -> View:
@@ -361,13 +332,17 @@ def test_a_camera_that_is_carried_elsewhere_meanwhile_has_not_leapt(frames: int,
         (_relocalized, BAD_FROM, 42, "poses leapt"),  # two frames suggest the leap
         (_relocalized, BAD_FROM, 46, "poses leapt"),  # it is believed
         (_in_unit(1000.0), 0, 19, "reported poses do not fit"),  # pictures locate the camera
+        (lambda k, view: carried.spoiled(WALK)[k], 0, 19, "[]"),  # poses and exposures are refined
+        (lambda k, view: replace(view, depth=None), 0, 19, ""),  # frames tell the depth
     ],
 )
-def test_a_camera_whose_poses_are_not_believed_resumes_bit_for_bit(led_astray, begin, until, said) -> None:
+def test_it_resumes_bit_for_bit_whatever_the_number_of_threads(led_astray, begin, until, said) -> None:
+    """Also with poses that are not believed."""
     views = [led_astray(k, view) for k, view in enumerate(WALK)]
-    field = carried.resumed_from(carried.begun(True)[0]) if begin else carried_field()
-    resumed = carried.resumed_from(given(field, views[begin : until + 1]).state())
+    field, resumed = carried.resumed_from(carried.begun(True)[0]) if begin else carried_field(), carried_field(1)
+    resumed.load_state(given(field, views[begin : until + 1]).state())
     for each in (field, resumed):
         given(each, views[until + 1 : until + 10])
-    assert said in str(field.troubles) and resumed.troubles == field.troubles
+    assert said in str([*field.troubles]) and resumed.troubles == field.troubles
     same_state(field, resumed)
+    assert field._poses.meta() == resumed._poses.meta()

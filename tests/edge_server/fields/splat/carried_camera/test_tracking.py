@@ -1,19 +1,20 @@
-"""Alignment of a frame with a rendering, and what tells that something moves or that poses are late."""
+"""Alignment of a frame with a rendering, exposures in closed form, and what tells that something moves or that poses
+are late."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
 from edge_server.fields import View
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
 from edge_server.fields.splat.carried_camera import settings as tuned
+from edge_server.fields.splat.carried_camera.exposures import Exposures
 from edge_server.fields.splat.carried_camera.plausibility import moved_in, troubles, unturned
-from edge_server.fields.splat.carried_camera.tracking import Rendered, align, gray
-from freshfield.geometry import Pinhole, se3_inverse, so3_exp
+from edge_server.fields.splat.carried_camera.tracking import Rendered, align
+from freshfield.geometry import Pinhole, se3, se3_inverse, so3_exp
 from tests.edge_server.fields.common.cameras.test_pose_corrections import arm_poses
 from tests.edge_server.fields.splat.carried_camera.carried import LENS
 
@@ -112,35 +113,90 @@ def test_pictures_contradict_poses_without_rotation_and_no_camera_that_slides(
     assert not unturned(before, replace(now, image=np.full_like(images[0], 90))), "nothing to follow"
 
 
+def _troubles(reported: list[np.ndarray], right: list[np.ndarray]) -> list[str]:
+    """What is said of poses, 5 a second, that were corrected so."""
+    poses = PoseCorrections(0.5, 5.0)
+    for k, (given, corrected) in enumerate(zip(reported, right)):
+        view = View(f"hand#{k}", np.zeros((4, 4, 3), np.uint8), given, LENS, k * 200_000_000)
+        poses.begin(view, "hand")
+        poses.set_pose(view, corrected)
+    return troubles(poses)
+
+
 def test_late_and_drifting_poses_are_said() -> None:
-    times, moves = np.arange(40) / 5.0, np.random.default_rng(3).normal(0.0, 0.15, (40, 3)).cumsum(axis=0)
+    moves = np.random.default_rng(3).normal(0.0, 0.15, (40, 3)).cumsum(axis=0)
     smooth = np.stack([np.convolve(m, np.ones(5) / 5, "same") for m in moves.T], axis=1)
+    speed = np.gradient(smooth, 0.2, axis=0)
     for late_s, drift_m, words in ((0.1, 0.0, "late by some 100 ms or more"), (0.0, 0.0, None), (0.0, 0.4, "drift")):
-        poses, speed = PoseCorrections(0.5, 5.0), np.gradient(smooth, times, axis=0)
-        for k, t in enumerate(times):
-            pose = np.eye(4)
-            pose[:3, 3] = smooth[k]
-            view = View(f"hand#{k}", np.zeros((4, 4, 3), np.uint8), pose, LENS, round(t * 1e9))
-            poses.begin(view, "hand")
-            right = pose.copy()
-            right[:3, 3] += late_s * speed[k] + np.array([drift_m, 0.0, 0.0])
-            poses.set_pose(view, right)
-        found = troubles(poses)
+        right = smooth + late_s * speed + np.array([drift_m, 0.0, 0.0])
+        found = _troubles(*([se3(np.eye(3), at) for at in places] for places in (smooth, right)))
         assert (words is None and not found) or (words is not None and words in found[0]), found
 
 
 def test_a_mount_that_is_off_is_said_live() -> None:
-    mount, poses, still = np.eye(4), PoseCorrections(0.5, 5.0), PoseCorrections(0.5, 5.0)
-    mount[:3, :3], mount[:3, 3] = so3_exp(np.deg2rad([0.0, 1.0, 0.0])), [0.0, 0.02, 0.0]
-    for k, given in enumerate(arm_poses()):
-        view = View(f"hand#{k}", np.zeros((4, 4, 3), np.uint8), given, LENS, k * 10**8)
-        for each, error in ((poses, mount), (still, np.eye(4))):
-            each.begin(view, "hand")
-            each.set_pose(view, given @ error)
-    (said,) = troubles(poses)
-    assert "in common 1.0" in said and said.endswith("hand-eye calibration is off") and not troubles(still)
+    poses, mount = arm_poses(), se3(so3_exp(np.deg2rad([0.0, 1.0, 0.0])), [0.0, 0.02, 0.0])
+    (said,) = _troubles(poses, [pose @ mount for pose in poses])
+    assert "in common 1.0" in said and said.endswith("hand-eye calibration is off") and not _troubles(poses, poses)
 
 
-def test_gray_is_that_of_opencv() -> None:
-    image = np.random.default_rng(0).integers(0, 256, (6, 5, 4)).astype(np.uint8)
-    np.testing.assert_allclose(255 * gray(image), cv2.cvtColor(image[..., :3], cv2.COLOR_RGB2GRAY), atol=1.0)
+# --- exposures --------------------------------------------------------------------------------------
+
+R = np.random.default_rng(3).uniform(0.1, 0.9, (400, 3))
+
+
+def _sums(exposures: Exposures, camera: str, image: np.ndarray) -> np.ndarray:
+    """What a step sums: (3, MOMENTS)."""
+    gain, bias = exposures.of(camera)
+    t = (image - bias) / gain
+    return np.stack([part.sum(axis=0) for part in (np.ones_like(R), R, R * R, t, R * t)], axis=1)
+
+
+def test_gain_and_bias_are_found_and_errors_count_as_in_the_image() -> None:
+    exposures, gain, bias = Exposures(), np.array([1.3, 0.8, 1.0]), np.array([0.05, -0.1, 0.2])
+    image = gain * R + bias
+    for _ in range(40):
+        exposures.learn("a", _sums(exposures, "a", image))
+    found = exposures.of("a")
+    # The damped least squares, solved as a matrix.
+    for c in range(3):
+        normal = np.array([[np.mean(R[:, c] ** 2), R[:, c].mean()], [R[:, c].mean(), 1.0]])
+        right = [np.mean(R[:, c] * image[:, c]) + tuned.TOWARDS_ONE, image[:, c].mean()]
+        expected = np.linalg.solve(normal + tuned.TOWARDS_ONE * np.eye(2), right)
+        np.testing.assert_allclose(found[:, c], expected, atol=1e-5)
+    assert np.abs(found[0] * R + found[1] - image).max() < 0.05
+    row = exposures.row("a")
+    np.testing.assert_allclose(row, [*found[0], *found[1], np.square(found[0]).mean()], rtol=1e-6)
+    np.testing.assert_array_equal(exposures.row("unknown"), [1, 1, 1, 0, 0, 0, 1])
+
+
+def test_the_gauge_is_mean_gain_one_and_mean_bias_zero_and_between_is_between() -> None:
+    exposures = Exposures()
+    exposures.load({"a": [[0.8] * 3, [0.1] * 3], "b": [[1.8] * 3, [0.0] * 3]})
+    exposures.center()
+    a, b = exposures.of("a"), exposures.of("b")
+    np.testing.assert_allclose(a[0] * b[0], 1.0)
+    np.testing.assert_allclose(a[0] / b[0], 0.8 / 1.8)
+    np.testing.assert_allclose(a[1], -b[1])
+    middle = exposures.between({"a": 0.5, "b": 0.5})
+    np.testing.assert_allclose(middle, [[1.0] * 3, [0.0] * 3], atol=1e-12)
+    np.testing.assert_allclose(exposures.between({"b": 1.0}), b)
+    np.testing.assert_array_equal(exposures.between({}), [[1.0] * 3, [0.0] * 3])
+    again = Exposures()
+    again.load(exposures.meta())
+    assert again.meta() == exposures.meta()
+
+
+@pytest.mark.stability
+def test_no_sums_lead_out_of_bounds() -> None:
+    exposures, nothing = Exposures(), np.zeros((3, 5))
+    exposures.center()
+    for bad in (nothing, np.full((3, 5), np.nan), np.full((3, 5), np.inf)):
+        exposures.learn("a", bad)
+        assert not exposures.known
+    black, blown = _sums(exposures, "a", np.zeros_like(R)), _sums(exposures, "a", np.full_like(R, 50.0))
+    for sums in (black, blown, np.full((3, 5), 1e30), -np.full((3, 5), 1e-30)):
+        for _ in range(20):
+            exposures.learn("a", sums)
+            exposures.center()
+        gain, bias = exposures.of("a")
+        assert gain.min() >= tuned.GAINS[0] and gain.max() <= tuned.GAINS[1] and np.abs(bias).max() <= tuned.MOST_BIAS

@@ -80,38 +80,71 @@ def measured(view: View, image: NDArray, distance_m: NDArray[np.float64]) -> Vie
     return replace(view, image=image.astype(np.uint8), depth=z.astype(np.float32))
 
 
+def ball_alone(view: View, ball: NDArray[np.float64]) -> View:
+    """What a camera sees and measures."""
+    return measured(view, *seen(view.intrinsics, view.camera_to_world, ball))
+
+
 Change = Callable[[int, int, View], View]
 """Of a camera's number, a frame's, and its view."""
 
 
 class Rig:
-    """Some cameras of a ring of nine, with depth or without, and one that is held out."""
+    """Some cameras of a ring of nine, with depth or without, and one that is held out.
 
-    def __init__(self, cameras: tuple[int, ...], held: int, size: int = 48, depth: bool = True) -> None:
+    world: what a camera sees, with depth, where the ball is at a place.
+    """
+
+    def __init__(
+        self,
+        cameras: tuple[int, ...],
+        held: int,
+        size: int = 48,
+        depth: bool = True,
+        world: Callable[[View, NDArray[np.float64]], View] = ball_alone,
+    ) -> None:
         views = ring(9, size)
         self.cameras, self.held, self.depth = [views[k] for k in cameras], views[held], depth
-        self.frame = cache(self._frame)
+        self.world, self.frame = world, cache(self._frame)
 
     def _frame(self, camera: int, frame: int) -> View:
         """What a camera sees and measures then, each at a phase of its own."""
-        view, instant_s = self.cameras[camera], (frame + camera / len(self.cameras)) * FRAME_S
-        now = measured(view, *seen(view.intrinsics, view.camera_to_world, place_m(instant_s)))
-        return replace(now, generated_ns=round(instant_s * 1e9), depth=now.depth if self.depth else None)
+        instant_s = (frame + camera / len(self.cameras)) * FRAME_S
+        return replace(self.world(self.cameras[camera], place_m(instant_s)), generated_ns=round(instant_s * 1e9))
 
     def run(
-        self, field: LayeredField, frames: range, changed: Change | None = None, cameras: int = 3, steps: int = 20
+        self,
+        field: LayeredField,
+        frames: range,
+        changed: Change | None = None,
+        cameras: int | None = None,
+        steps: int = 20,
+        seconds: float | None = None,
     ) -> LayeredField:
-        """The field after these frames, each as ``changed``."""
+        """The field after these frames, each as ``changed``, with a budget in seconds if one is given."""
+        budget = Budget(steps=steps) if seconds is None else Budget(seconds=seconds)
         for number in frames:
-            views = [self.frame(k, number) for k in range(cameras)]
+            views = [self.frame(k, number) for k in range(cameras or len(self.cameras))]
             if changed is not None:
                 views = [changed(k, number, view) for k, view in enumerate(views)]
-            field.fit(views, Budget(steps=steps))
+            field.fit(views if self.depth else [replace(view, depth=None) for view in views], budget)
         return field
 
-    def score(self, field: LayeredField, frame: int) -> float:
-        """PSNR of what is shown to the held-out camera, dB; fails where it is not finite."""
-        lens, pose = self.held.intrinsics, self.held.camera_to_world
-        color = field.snapshot().render(pose, lens).color
+    def score(self, field: LayeredField, frame: int, told: Callable[[View], View] = lambda view: view) -> float:
+        """PSNR of what is shown to the held-out camera, dB; fails where it is not finite. told: how the field is told
+        of that camera."""
+        truth = self.world(self.held, place_m(frame * FRAME_S))
+        asked = told(truth)
+        color = field.snapshot().render(asked.camera_to_world, asked.intrinsics).color
         assert np.isfinite(color).all()
-        return psnr(color, seen(lens, pose, place_m(frame * FRAME_S))[0] / 255.0)
+        return psnr(color, truth.image / 255.0)
+
+    def curve(
+        self, field: LayeredField, frames: int, changed: Change, told: Callable[[View], View] = lambda view: view
+    ) -> list[float]:
+        """The score after each frame, from the first one on."""
+        shown_db = []
+        for frame in range(frames):
+            self.run(field, range(frame, frame + 1), changed)
+            shown_db.append(self.score(field, frame, told))
+        return shown_db

@@ -10,33 +10,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
-from itertools import product
+from functools import cache, partial
 
 import numpy as np
 import pytest
 from msgspec import structs
 from numpy.typing import NDArray
 
-from edge_server.fields import Budget, View
+from edge_server.fields import View
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from freshfield.geometry import world_rays
-from tests.edge_server.fields.scenes import psnr, ring, seen
-from tests.edge_server.fields.splat.layers.ball import FRAME_S, SMALL, measured, place_m
+from tests.edge_server.fields.scenes import ring, seen
+from tests.edge_server.fields.splat.layers.ball import FRAME_S, SMALL, Change, Rig, ball_alone, measured
 
 pytestmark = [pytest.mark.stability, pytest.mark.usefixtures("shown_soon")]
-RIG = ring(9)
-CAMERAS, HELD = [RIG[0], RIG[2], RIG[4], RIG[6]], RIG[1]
-FRAMES = 36
-HALF_SECOND = 8  # frames
+FOUR, FRAMES = (0, 2, 4, 6), 36
 SEEDS = (0, 1, 2)
+HALF_SECOND = 8  # frames
 DARK = range(18, 22)  # frames
 MIRROR_Y, PANE_Y = 0.85, -0.85  # planes behind and before the plate, as wide as it and 1 m high
 PATCHES = np.kron(np.random.default_rng(4).random((12, 12)) < 0.4, np.ones((4, 4), bool))
 
 Array = NDArray[np.float64]
-World = Callable[[View, Array], View]
-"""What a camera sees, with depth, where the ball is at a place."""
 
 
 def _in_plane(view: View, y: float) -> Array:
@@ -77,22 +72,22 @@ def _turned(view: View, degrees: float) -> View:
 
 @dataclass(frozen=True)
 class Case:
-    """world: what is there. placed: where the cameras really stand. told: what reaches the field of camera k's frame.
+    """world: see ``Rig``. placed: where the cameras really stand. told: what reaches the field of camera k's frame.
     gains_db: how much better than without depth the held-out view must be; None: not compared. below_easy_db: how much
     worse than in the easy scene it may be; both in the last half second. recovers_s: at most, see ``_recovered_s``;
     since the first frame, or since frame ``over``."""
 
     recovers_s: float
 
-    world: World = lambda view, ball_m: measured(view, *seen(view.intrinsics, view.camera_to_world, ball_m))
+    world: Callable[[View, Array], View] = ball_alone
     placed: Callable[[int, View], View] = lambda k, view: view
-    told: Callable[[int, int, View], View] = lambda k, frame, view: view
+    told: Change = lambda k, frame, view: view
     gains_db: float | None = None
     below_easy_db: float | None = None
     over: int = 0
 
 
-def _in_world(unit: float, away_m: float) -> Callable[[int, int, View], View]:
+def _in_world(unit: float, away_m: float) -> Change:
     """All in another unit, and moved."""
 
     def told(k: int, frame: int, view: View) -> View:
@@ -103,7 +98,7 @@ def _in_world(unit: float, away_m: float) -> Callable[[int, int, View], View]:
     return told
 
 
-def _of_first(change: Callable[[View], View]) -> Callable[[int, int, View], View]:
+def _of_first(change: Callable[[View], View]) -> Change:
     return lambda k, frame, view: change(view) if k == 0 else view
 
 
@@ -121,7 +116,7 @@ CASES = {
         1.1, told=_of_first(lambda v: replace(v, depth=v.depth * np.float32(1.05))), below_easy_db=0.9
     ),
     "pose 3 degrees off": Case(0.7, told=_of_first(lambda v: _turned(v, 3.0)), gains_db=-0.1),
-    "two at one place": Case(0.6, placed=lambda k, view: CAMERAS[1] if k == 0 else view, gains_db=2.5),
+    "two at one place": Case(0.6, placed=lambda k, view: ring(9)[2] if k == 0 else view, gains_db=2.5),
     "nothing in common": Case(0.3, placed=lambda k, view: _turned(view, (-24.0, 24.0, -24.0, 24.0)[k]), gains_db=1.1),
     "light off": Case(
         0.3,
@@ -137,23 +132,13 @@ CASES = {
 
 def _curves(case: Case, depth: bool = True) -> Array:
     """PSNR of the held-out view after each frame of each seed, (seeds, FRAMES). depth: whether frames bring it."""
-    shown_db = np.zeros((len(SEEDS), FRAMES))
-    for seed, frame in product(SEEDS, range(FRAMES)):
-        if frame == 0:
-            field = LayeredField(structs.replace(SMALL, seed=seed))
-        views = []
-        for k, camera in enumerate(CAMERAS):
-            instant_s = (frame + k / len(CAMERAS)) * FRAME_S
-            view = case.world(case.placed(k, camera), place_m(instant_s))
-            told = case.told(k, frame, replace(view, camera=camera.camera, generated_ns=round(instant_s * 1e9)))
-            views.append(told if depth else replace(told, depth=None))
-        field.fit(views, Budget(steps=20))
-        truth = case.world(HELD, place_m(frame * FRAME_S))
-        last = case.told(len(CAMERAS), FRAMES, truth)
-        color = field.snapshot().render(last.camera_to_world, last.intrinsics).color
-        assert np.isfinite(color).all() and field.layered and len(field.cameras) == len(CAMERAS)
-        shown_db[seed, frame] = psnr(color, truth.image / 255.0)
-    return shown_db
+    rig, curves = Rig(FOUR, held=1, depth=depth, world=case.world), []
+    rig.cameras = [replace(case.placed(k, view), camera=view.camera) for k, view in enumerate(rig.cameras)]
+    for seed in SEEDS:
+        field = LayeredField(structs.replace(SMALL, seed=seed))
+        curves.append(rig.curve(field, FRAMES, case.told, partial(case.told, len(FOUR), FRAMES)))
+        assert field.layered and len(field.cameras) == len(FOUR)
+    return np.array(curves)
 
 
 def _end_db(curves: Array) -> float:

@@ -18,7 +18,7 @@ from edge_server.fields.splat.layers.layered_field import LayeredField
 from tests.edge_server.fields.small import same_state
 from tests.edge_server.fields.splat.layers.ball import SMALL, Rig
 from tests.edge_server.fields.splat.layers.depth.room_plates import relative_of, room_plates
-from tests.edge_server.fields.splat.layers.depth.test_plate_stereo import filled
+from tests.edge_server.fields.splat.layers.depth.test_registration import filled
 
 Image = NDArray[np.float32]
 NAMES = ["cam01", "cam02", "cam03"]
@@ -31,6 +31,8 @@ class OfPlates:
         self.known = {p.color.astype(np.uint8).tobytes(): r for p, r in zip(plates, relative)}
 
     def __call__(self, image: NDArray[np.uint8]) -> Image:
+        if image.tobytes() not in self.known:
+            raise ValueError("an unknown image")
         return self.known[image.tobytes()]
 
 
@@ -77,10 +79,6 @@ def test_what_a_sensor_has_measured_stays_and_tells_scale_and_shift_to_cameras_w
         assert NAMES[k] not in network.refused and _right(found[k], depths[k]) > 0.8
 
 
-def _fails(image: NDArray[np.uint8]) -> Image:
-    raise ValueError("a.onnx: ONNX Runtime cannot run it")
-
-
 _RNG = np.random.default_rng(1)
 _RELATIVE: dict[str, Callable[[Image], Image]] = {
     "depth, not its inverse": lambda r: 1.0 / r,
@@ -89,23 +87,20 @@ _RELATIVE: dict[str, Callable[[Image], Image]] = {
     "noise": lambda r: _RNG.random(r.shape).astype(np.float32),
     "NaN": lambda r: np.full_like(r, np.nan),
     "huge": lambda r: np.where(r > np.median(r), np.float32(1e38), np.float32(-1e38)),
+    "none of this image": lambda r: r,
 }
 
 
 @pytest.mark.stability
 @pytest.mark.parametrize("kind", _RELATIVE)
-def test_a_network_that_does_not_agree_is_left_unused_and_named(kind: str) -> None:
+def test_a_network_that_fails_is_left_unused_and_named(kind: str) -> None:
+    """Or one that does not agree with what is known."""
     plates, surfaces, depths = _stereo()
     relative = [_RELATIVE[kind](relative_of(z, k)).astype(np.float32) for k, z in enumerate(depths)]
-    network = NetworkDepth(OfPlates(plates, relative))
+    network = NetworkDepth(OfPlates([] if kind == "none of this image" else plates, relative))
     found = _filled(network, surfaces, [np.zeros(p.known.shape, bool) for p in plates])
     assert all(a is b for a, b in zip(found, surfaces)) and list(network.refused) == NAMES
-    assert all("agree with it" in why or "too few" in why for why in network.refused.values())
-
-
-def test_a_network_that_fails_is_left_unused_and_named() -> None:
-    plates, failing = room_plates(3)[0], NetworkDepth(_fails)
-    assert _filled(failing, plates, [p.known for p in plates]) == plates and "cannot run it" in failing.refused["cam01"]
+    assert all(any(w in why for w in ("agree with it", "too few", "unknown")) for why in network.refused.values())
 
 
 # --- in the field: a ball, of which sensors see the left --------------------------------------------
@@ -126,19 +121,14 @@ def _of_the_ball(image: NDArray[np.uint8]) -> Image:
     return relative_of(np.where(views[k].depth > 0, views[k].depth, 6.0), k)
 
 
-def _begun(network: Callable[[NDArray[np.uint8]], Image] | None) -> LayeredField:
-    field = LayeredField(SMALL)
-    if network is not None:
-        field.use_depth_network(network)
-    return RIG.run(field, range(16), _measured, steps=5)
-
-
 def test_the_field_learns_it_and_resumes_bit_for_bit() -> None:
-    field, without = _begun(_of_the_ball), _begun(None)
+    field, without, other = LayeredField(SMALL), LayeredField(SMALL), LayeredField(SMALL)
+    field.use_depth_network(_of_the_ball)
+    for each in (field, without):
+        RIG.run(each, range(16), _measured, steps=5)
     assert field.supervision.with_depth and not field.troubles
     seen_m = [each.supervision.depth.scene.meshes.depth for each in (field, without)]
     assert np.count_nonzero(seen_m[0]) > 1.4 * np.count_nonzero(seen_m[1])
-    other = LayeredField(SMALL)
     other.load_state(field.state())
     other.use_depth_network(_of_the_ball)
     same_state(*(RIG.run(each, range(16, 24), _measured, steps=5) for each in (field, other)))
