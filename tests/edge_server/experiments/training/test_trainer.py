@@ -112,7 +112,6 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     assert main(words) == 0
     text = capsys.readouterr().out
     assert "2/2 episodes" in text and "rewarded from cam00\n" in text
-    assert f"edge-server compare {words[0]} all bandit:{out / 'policy.npz'}" in text
     # The scenario asks for no LPIPS, so that the reward has no such term, wherever weights lie about.
     assert "term_lpips" not in next(csv.DictReader((out / "training.csv").open()))
     make_policy(f"bandit:{out / 'policy.npz'}", None, np.random.default_rng(0))

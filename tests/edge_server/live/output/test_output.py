@@ -39,7 +39,10 @@ def test_series_keeps_the_order_of_publication_and_waits_for_scores(tmp_path):
     journal.scored(publication(1, 21.0), final=True)  # out of order: number 0 is still open
     assert lines(tmp_path / "series.jsonl") == []
     journal.scored(publication(0, 20.0), final=True)
+    journal.ages(0.25, {"cam01": 12.3456, "cam02": None}, {"cam01": 212.3456})
     journal.close()
+    age = {"t_s": 0.25, "age_ms": {"cam01": 12.346, "cam02": None}, "depth_age_ms": {"cam01": 212.346}}
+    assert lines(tmp_path / "ages.jsonl") == [age]
     assert [(s["number"], s["psnr_db"]) for s in lines(tmp_path / "series.jsonl")] == [(0, 20.0), (1, 21.0), (2, None)]
 
 
