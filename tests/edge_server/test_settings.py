@@ -1,13 +1,19 @@
-"""What an ``edge:`` section leaves open is chosen by what the cameras do, and what it says always wins."""
+"""What an ``edge:`` section leaves open is chosen by what cameras do; what long work says; the machine of a run."""
 
 from __future__ import annotations
 
+import io
+import os
 from pathlib import Path
 
 import pytest
 
-from edge_server.settings import MOST_CARRIED, SCAN, EdgeConfig, KeyframesConfig, cameras_move, described, read_config
+from edge_server.embed import EmbeddingConfig
+from edge_server.machine import machine
+from edge_server.progress import ProgressLine
+from edge_server.settings import MOST_CARRIED, SCAN, EdgeConfig, KeyframesConfig, cameras_move, read_config
 from freshfield.scenario import ScenarioError, parse
+from tests.support import refused
 
 STILL = EdgeConfig("splat", {"layers": True}, updates="arrivals", update_ms=20.0, steps=10)
 MOVING = EdgeConfig("splat", SCAN, updates="cycle", update_ms=80.0, steps=8)
@@ -18,12 +24,9 @@ def scenario(edge=None, **source):
     return parse({"cameras": {"count": 3}, "source": source, "edge": edge}, Path("x.yaml"))
 
 
-@pytest.mark.parametrize("edge", [None, {}])
-def test_an_empty_section_works_in_layers_before_fixed_cameras_and_as_a_scan_before_moving_ones(edge):
-    assert read_config(scenario(edge)) == STILL
-    assert read_config(scenario(edge), moving=True) == MOVING
-    assert SCAN == {"scan": True, "refine": True, "carried": True, "gaussians": 60_000}
-    assert read_config(parse({"cameras": {"count": 3}}, Path("x.yaml"))) == STILL
+def test_an_empty_section_works_in_layers_before_fixed_cameras_and_as_a_scan_before_moving_ones():
+    assert read_config(scenario({})) == read_config(scenario()) == STILL
+    assert read_config(scenario({}), moving=True) == MOVING
     for count, expected in ((MOST_CARRIED, MOVING), (MOST_CARRIED + 1, MANY_MOVING)):
         assert read_config(parse({"cameras": {"count": count}}, Path("x.yaml")), moving=True) == expected
 
@@ -43,7 +46,6 @@ def test_cameras_that_an_arm_or_a_trajectory_carries_are_known_to_move(key):
         ({"field": "ngp"}, (False, "cycle", 800.0, 100, False), (False, "cycle", 800.0, 100, True)),
         ({"field_options": {"layers": False}}, (False, "cycle", 800.0, 100, False), (False, "cycle", 80.0, 8, False)),
         ({"field_options": {"layers": True}}, (True, "arrivals", 20.0, 10, False), (True, "arrivals", 20.0, 10, False)),
-        ({"field_options": {"gaussians": 900}}, (True, "arrivals", 20.0, 10, False), (False, "cycle", 80.0, 8, False)),
         ({"keyframes": None}, (True, "arrivals", 20.0, 10, False), (False, "cycle", 800.0, 100, False)),
         ({"keyframes": {"most": 5}}, (True, "arrivals", 20.0, 10, True), (False, "cycle", 800.0, 100, True)),
     ],
@@ -53,25 +55,46 @@ def test_what_a_scenario_says_wins(edge, still, moving):
         found = read_config(scenario(edge), moving=moves)
         layers = bool(found.field_options.get("layers"))
         assert (layers, found.updates, found.update_ms, found.steps, found.keyframes is not None) == expected
-        scan = SCAN if found.field_options.get("carried") else {}
-        assert {k: v for k, v in found.field_options.items() if k != "layers"} == {
-            k: v for k, v in {**scan, **edge.get("field_options", {})}.items() if k != "layers"
-        }
-    if edge.get("keyframes"):
-        assert found.keyframes.most == 5
+    for given in ({"gaussians": 900}, {"layers": False}):
+        assert read_config(scenario({"field_options": given}), moving=True).field_options == {**SCAN, **given}
+
+
+def test_files_that_a_section_names_lie_beside_the_scenario():
+    def named(**edge):
+        found = read_config(parse({"cameras": {"count": 2}, "edge": edge}, Path("/there/x.yaml")))
+        return found.embedding, found.foreground and found.foreground.detector
+
+    assert named() == (None, None)
+    assert named(embedding={}, foreground={"detector": "tile"}) == (EmbeddingConfig(), "tile")
+    own = {"embedding": {"model": "m/yolo.onnx", "dim": 16}, "foreground": {"detector": "cat-seg.onnx"}}
+    assert named(**own) == (EmbeddingConfig("/there/m/yolo.onnx", 16), "/there/cat-seg.onnx")
 
 
 def test_a_section_of_another_kind_is_refused_by_name():
-    for edge, named in (({"field_options": 3}, "field_options"), ([], "edge"), ({"field": 3}, "field")):
-        with pytest.raises(ScenarioError, match=f"x.yaml: .*{named}"):
-            read_config(scenario(edge))
+    uncertain = {"foreground": {"detector": "tile", "confidence": 1.5}}
+    wrong = (({"field_options": 3}, "field_options"), ([], "edge"), ({"field": 3}, "field"), (uncertain, "confidence"))
+    for edge, named in wrong:
+        refused(ScenarioError, f"x.yaml: .*{named}", lambda edge=edge: read_config(scenario(edge)))
 
 
-def test_one_line_says_what_was_chosen_and_why():
-    at = scenario({})
-    assert described(at, MOVING, "cam01") == "splat as a scan, updated in a cycle for 80 ms: cam01 moves"
-    given = {"field": "ngp", "updates": "cycle", "update_ms": 300, "keyframes": None}
-    line = described(scenario(given), read_config(scenario(given)), "")
-    assert line == (
-        "ngp, updated in a cycle for 300 ms: no camera moves; the scenario sets field, updates, update_ms, keyframes"
-    )
+def test_a_pipe_is_told_of_long_work_alone(monkeypatch):
+    now, out = [0.0], io.StringIO()
+    monkeypatch.setattr("edge_server.progress.time.perf_counter", lambda: now[0])
+    line = ProgressLine(out)
+    for stage, each_s in (("depth", 0.05), ("sharpen", 2.0), ("fuse", 0.05)):
+        for step in range(11):
+            line(stage, step / 10)
+            now[0] += each_s
+    assert out.getvalue() == "  sharpen: some 18 s\n"
+
+
+def test_gpus_are_named_and_a_machine_without_proc_is_unknown(tmp_path):
+    found = machine(tmp_path)
+    assert found["memory_gb"] is None and found["gpus"] == []
+    assert found["cores"] == len(os.sched_getaffinity(0))
+    gpu = tmp_path / "driver/nvidia/gpus/0000:01:00.0/information"
+    gpu.parent.mkdir(parents=True)
+    gpu.write_text("Model: \t\t NVIDIA H100 80GB HBM3\nIRQ:   \t\t 42\n")
+    (other := gpu.parent.parent / "0000:02:00.0").mkdir()
+    (other / "information").write_text("IRQ:   \t\t 43\n")
+    assert machine(tmp_path)["gpus"] == ["NVIDIA H100 80GB HBM3"]

@@ -18,7 +18,7 @@ from freshfield import frame as wire
 from freshfield import payload
 from freshfield.depth import DepthImage
 from freshfield.session.bag_writer import BagWriter
-from tests.edge_server.live.output.test_recorder import PUBLICATION
+from tests.edge_server.live.output.test_output import PUBLICATION
 from tests.freshfield.test_session import LENS, requests
 from tests.support import refused
 

@@ -51,7 +51,6 @@ def detector(
     path: Path,
     size: int | None = 32,
     batch: int | None = None,
-    gain: float = 1.0,
     neck: bool = True,
     extra: tuple[onnx.NodeProto, ...] = (),
     weights: tuple[onnx.TensorProto, ...] = (),
@@ -59,15 +58,14 @@ def detector(
 ) -> Path:
     """Two convolutions, and where ``neck``, an enlargement that is joined with the finer map.
 
-    size, batch: None makes them free. gain: factor on the second map. extra: nodes behind the backbone's
+    size, batch: None makes them free. extra: nodes behind the backbone's
     end, which is called ``end``. Weights are the same in every file.
     """
     first, second = convolutions()
     nodes = [
         helper.make_node("Conv", ["images", "a"], ["c0"], strides=[2, 2], pads=[1] * 4, name="/model.0/Conv"),
         helper.make_node("Relu", ["c0"], ["fine"], name="/model.0/Relu"),
-        helper.make_node("Conv", ["fine", "b"], ["c1"], strides=[2, 2], pads=[1] * 4, name="/model.1/Conv"),
-        helper.make_node("Mul", ["c1", "gain"], ["end"], name="/model.1/Mul"),
+        helper.make_node("Conv", ["fine", "b"], ["end"], strides=[2, 2], pads=[1] * 4, name="/model.1/Conv"),
         *extra,
     ]
     last = extra[-1].output[0] if extra else "end"
@@ -78,7 +76,7 @@ def detector(
             # A head that cannot run shows that it is not run.
             helper.make_node("Reshape", ["joined", "impossible"], ["output0"], name="/model.4/Reshape"),
         ]
-    constants = {"a": first, "b": second, "gain": np.float32(gain), "scales": np.array([1, 1, 2, 2], np.float32)}
+    constants = {"a": first, "b": second, "scales": np.array([1, 1, 2, 2], np.float32)}
     constants["impossible"] = np.array([7, 11, 13], np.int64)
     images, output = [batch or "n", 3, size or "h", size or "w"], "output0" if neck else last
     return save(path, nodes, images, (output, None), constants, weights, meta=meta)

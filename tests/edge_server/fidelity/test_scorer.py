@@ -1,15 +1,22 @@
-"""Scores of images: PSNR, SSIM, moving pixels, baselines, and what is no image."""
+"""Scores of images: PSNR, SSIM, LPIPS, moving pixels, baselines, and what is no image."""
 
 from __future__ import annotations
 
 import itertools
+import sys
 
+import cv2
 import numpy as np
 import pytest
+import torch
+from torch.nn.functional import adaptive_avg_pool2d
 
+from edge_server.cli import main as edge_server
+from edge_server.fidelity import fetch_lpips, lpips_network
 from edge_server.fidelity.baselines import BaselineMean, baseline, mean_color_db, nearest_view, view_db
+from edge_server.fidelity.fetch_lpips import FetchError, convert
 from edge_server.fidelity.images import ImageError
-from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, open_lpips, weights_folder
 from edge_server.fidelity.moving_pixels import BOUND, NoiseEstimate, frames_at_lags, moving_mask, pair_noise
 from edge_server.fidelity.psnr import PSNR_CEILING_DB, psnr
 from edge_server.fidelity.scorer import Scorer, mean_score
@@ -18,6 +25,7 @@ from edge_server.fields import View
 from edge_server.run_records import Baseline
 from freshfield.geometry import Pinhole, look_at
 from tests.conftest import data_dir
+from tests.support import refusal, refused
 
 MS = 1_000_000
 
@@ -75,12 +83,6 @@ def test_black_and_saturated_blocks_have_no_vote_and_noise_has_a_bound():
 RNG = np.random.default_rng(5)
 
 
-def test_a_known_error_gives_the_value_of_3_31():
-    truth = np.full((9, 7, 3), 100, np.uint8)
-    rendering = np.full((9, 7, 3), 110, np.uint8)
-    assert psnr(rendering, truth) == pytest.approx(10 * np.log10(255**2 / 100), abs=1e-9)
-
-
 def test_8_bit_floating_and_transparent_images_agree():
     truth = RNG.integers(0, 256, (12, 12, 3), dtype=np.uint8)
     rendering = RNG.integers(0, 256, (12, 12, 3), dtype=np.uint8)
@@ -107,8 +109,7 @@ def test_what_is_no_image_is_refused_by_name():
     wrong = [(np.zeros(shape), "rendering.*shape") for shape in ((4, 4), (0, 4, 3), (4, 4, 2))]
     wrong += [(np.zeros((4, 4, 3), np.int32), "rendering.*int32"), (np.zeros((4, 5, 3)), "5 x 4.*4 x 4")]
     for image, said in wrong:
-        with pytest.raises(ImageError, match=said):
-            psnr(image, np.zeros((4, 4, 3)))
+        refused(ImageError, said, psnr, image, np.zeros((4, 4, 3)))
 
 
 def reference_ssim(a, b, mask=None):
@@ -146,8 +147,7 @@ def test_it_equals_the_definition_and_a_mask_leaves_the_windows_that_lie_wholly_
     assert ssim(a, b, mask) == pytest.approx(reference_ssim(a[4:15, 20:31], b[4:15, 20:31]), abs=1e-9)
     mask[4, 20] = False
     assert ssim(a, b, mask) is None
-    with pytest.raises(ImageError, match="at least 11 x 11"):
-        ssim(a[:10], b[:10])
+    refused(ImageError, "at least 11 x 11", ssim, a[:10], b[:10])
 
 
 def test_a_score_has_every_metric_of_the_whole_image_and_of_its_parts():
@@ -263,5 +263,87 @@ def test_poison_is_refused_by_name_and_never_scored(poison, which):
     good, bad = np.full((40, 40, 3), 0.5, np.float32), np.full((40, 40, 3), 0.5, np.float32)
     bad[-1, -1, -1] = poison
     pair = (bad, good) if which == "rendering" else (good, bad)
-    with pytest.raises(ImageError, match=f"{which}.*row 39, column 39"):
-        Scorer().score("h", pair[0], 0, pair[1], 0)
+    refused(ImageError, f"{which}.*row 39, column 39", Scorer().score, "h", pair[0], 0, pair[1], 0)
+
+
+def metric():
+    lpips, reason = open_lpips(data_dir("lpips"))
+    assert lpips is not None, reason
+    return lpips
+
+
+def example(name):
+    return cv2.imread(str(data_dir("lpips") / f"ex_{name}.png"))[..., ::-1]
+
+
+def test_values_published_with_the_weights():
+    """Of the authors' example images."""
+    lpips = metric()
+    assert lpips(example("p0"), example("ref")) == pytest.approx(0.7219, abs=1e-4)
+    assert lpips(example("p1"), example("ref")) == pytest.approx(0.1376, abs=1e-4)
+    assert lpips(example("ref"), example("ref")) == 0.0
+    assert lpips.minimum_side == 31
+    refused(ImageError, r"LPIPS needs .* 31 x 31", lpips, np.zeros((30, 64, 3)), np.ones((30, 64, 3)))
+
+
+def test_a_mask_blackens_the_rest_and_weighs_each_cell_of_a_slice_by_its_share():
+    lpips = metric()
+    a, b = np.random.default_rng(3).random((2, 64, 96, 3))
+    mask = np.ones((64, 96), bool)
+    mask[:, 70:] = mask[50:, :10] = False
+    distance, black = lpips(a, b, mask), (a * mask[..., None], b * mask[..., None])
+    assert distance == lpips(*black, mask) != pytest.approx(lpips(*black), rel=0.01)
+    assert lpips(a, b, np.ones_like(mask)) == pytest.approx(lpips(a, b), abs=1e-12)
+    parameters, expected = {name: torch.from_numpy(array) for name, array in lpips._parameters.items()}, 0.0
+    x = torch.from_numpy(np.stack(black).astype(np.float32).transpose(0, 3, 1, 2)) * 2 - 1
+    x = (x - torch.tensor(lpips_network.SHIFT).view(3, 1, 1)) / torch.tensor(lpips_network.SCALE).view(3, 1, 1)
+    for found, weights in zip(lpips_network._slices(parameters, x), lpips._lin):
+        unit = (found / found.norm(dim=1, keepdim=True).clamp_min(1e-9)).double().numpy()
+        map_ = ((unit[0] - unit[1]) ** 2 * weights[:, None, None]).sum(0)
+        share = adaptive_avg_pool2d(torch.from_numpy(mask.astype(float))[None], map_.shape)[0].numpy()
+        expected += np.average(map_, weights=share)
+    assert distance == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_weights_folder_is_the_nearest_that_was_named(tmp_path, monkeypatch):
+    data, named = tmp_path / "data", tmp_path / "named"
+    monkeypatch.delenv(FOLDER_VARIABLE, raising=False)
+    monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
+    lpips, reason = open_lpips()
+    assert lpips is None and "--lpips" in reason and FOLDER_VARIABLE in reason
+    assert weights_folder() is None and weights_folder(None, data) is None
+    (data / "lpips").mkdir(parents=True)
+    assert weights_folder(None, data) == data / "lpips"
+    monkeypatch.setenv("FRESHFIELD_DATA", str(data))
+    assert weights_folder() == data / "lpips"
+    monkeypatch.setenv(FOLDER_VARIABLE, str(named))
+    assert weights_folder(None, data) == named and weights_folder(tmp_path, data) == tmp_path
+
+
+def test_torn_and_wrong_weights_give_a_reason_and_no_metric(tmp_path):
+    source = data_dir("lpips")
+    features, lin = FILES
+    (tmp_path / lin).write_bytes((source / lin).read_bytes())
+    (tmp_path / features).write_bytes((source / features).read_bytes()[:100_000])
+    lpips, reason = open_lpips(tmp_path)
+    assert lpips is None and "cannot be used" in reason
+    (tmp_path / features).write_bytes((source / features).read_bytes())
+    np.savez(tmp_path / lin, lin0=np.ones(64, np.float32))
+    lpips, reason = open_lpips(tmp_path)
+    assert lpips is None and "[64]" in reason and "[64, 192, 384, 256, 256]" in reason
+
+
+def test_the_command_says_where_it_wrote_what_it_fetched_or_what_is_wrong(tmp_path, monkeypatch, capsys):
+    published = [dict(np.load(data_dir("lpips") / name)) for name in FILES]
+    features = {name.removeprefix("features."): array for name, array in published[0].items()}
+    lins = {f"{name}.model.1.weight": array.reshape(1, -1, 1, 1) for name, array in published[1].items()}
+    refused(FetchError, "cannot be used", convert, {k: v for k, v in features.items() if k != "3.bias"}, lins, tmp_path)
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "lpips", None)
+        needs = "needs lpips: pip install 'freshfield[edge,lpips]'"
+        assert needs in refusal(capsys, edge_server, "fetch-lpips", "--out", tmp_path)
+    monkeypatch.setattr(fetch_lpips, "_fetch", lambda: (features, lins))
+    assert edge_server(["fetch-lpips", "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.split() == [str(tmp_path / name) for name in FILES]
+    for name, arrays in zip(FILES, published):
+        np.testing.assert_equal(dict(np.load(tmp_path / name)), arrays)

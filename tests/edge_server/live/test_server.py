@@ -10,6 +10,7 @@ import threading
 import time
 import urllib.request
 from contextlib import suppress
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +23,6 @@ from edge_server.cli import main as edge_server
 from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
 from edge_server.fields.splat.carried_camera.carried_field import CarriedField
-from edge_server.live.loop import UpdateLoop
 from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.live.settings import STOP_S
 from edge_server.scheduler.learned.actor import Actor
@@ -41,7 +41,7 @@ from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, fr
 from freshfield_up.processes import GRACE_S
 from tests.edge_server.fields_for_tests import TINY
 from tests.edge_server.frames import frame
-from tests.support import free_port, wait_until
+from tests.support import free_port, refused, wait_until
 
 
 def tiny_scenario(tmp_path, **edge):
@@ -50,60 +50,43 @@ def tiny_scenario(tmp_path, **edge):
     return scenario.parse(data, tmp_path / "tiny.yaml")
 
 
-class Feed(threading.Thread):
-    """Streams real frames of every camera, one unacknowledged at a time, until stopped."""
-
-    def __init__(self, port: int, made: scenario.Scenario, moving: str = "") -> None:
-        super().__init__(daemon=True)
-        self.scenario, self.moving = made, moving
-        self.channel = Transport().channel(f"127.0.0.1:{port}")
-        self.done = threading.Event()
-        self.answers = []
-
-    def frames(self):
-        angle = {c: 0.5 * i for i, c in enumerate(self.scenario.cameras)}
-        for sequence in range(10**6):
-            for camera in self.scenario.cameras:
-                if self.done.wait(0.01):
-                    return
-                turned = angle[camera] + 0.1 * sequence * (camera == self.moving)
-                pose = Pose.from_matrix(look_at([2 * np.cos(turned), 2 * np.sin(turned), 0.5], [0, 0, 0]))
-                held_out = camera in self.scenario.held_out
-                yield to_request(frame(camera, sequence, time.time_ns(), pose=pose, held_out=held_out))
-
-    def run(self) -> None:
-        stub = frames_pb2_grpc.FrameStreamServiceStub(self.channel)
-        with suppress(grpc.RpcError):  # the server stops
-            for answer in stub.Push(self.frames(), wait_for_ready=True):
-                self.answers.append(answer)
-
-    def stop(self) -> None:
-        self.done.set()
-        self.join(5)
-        self.channel.close()
-
-
 class Run:
-    """A server on a thread, and who feeds it."""
-
-    feed: Feed
+    """A server on a thread, and a stream of frames to it."""
 
     def __init__(self, made: scenario.Scenario, out: Path, **options: Any) -> None:
-        self.port = free_port()
+        self.port, self.scenario = free_port(), made
         self.server = EdgeServer(made, read_config(made), ServerOptions(f"127.0.0.1:{self.port}", out, **options))
         self.thread = threading.Thread(target=self.server.run)
         self.thread.start()
+        self.done, self.answers = threading.Event(), []
+        self.feed = threading.Thread(target=self.push, daemon=True)
+        self.moving = ""
+
+    def frames(self):
+        for sequence, (k, camera) in product(range(10**4), enumerate(self.scenario.cameras)):
+            if self.done.wait(0.01):
+                return
+            turned = 0.5 * k + 0.1 * sequence * (camera == self.moving)
+            pose = Pose.from_matrix(look_at([2 * np.cos(turned), 2 * np.sin(turned), 0.5], [0, 0, 0]))
+            held_out = camera in self.scenario.held_out
+            yield to_request(frame(camera, sequence, time.time_ns(), pose=pose, held_out=held_out))
+
+    def push(self) -> None:
+        with Transport().channel(f"127.0.0.1:{self.port}") as channel, suppress(grpc.RpcError):  # the server stops
+            push = frames_pb2_grpc.FrameStreamServiceStub(channel).Push
+            self.answers.extend(push(self.frames(), wait_for_ready=True))
 
     def fed(self, moving: str = "") -> Run:
-        """Feeds it until it shows something."""
-        self.feed = Feed(self.port, self.server.scenario, moving)
+        """Fed with real frames, one unacknowledged at a time, until it shows something, and on."""
+        self.moving = moving
         self.feed.start()
         until(self.server.state.publications)
         return self
 
     def end(self) -> None:
-        if hasattr(self, "feed"):
-            self.feed.stop()
+        self.done.set()
+        if self.feed.is_alive():
+            self.feed.join(5)
         self.server.stop()
         self.thread.join(20)
         assert not self.thread.is_alive()
@@ -153,7 +136,7 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
     assert (out / "truth.png").exists() and (out / "rendered.png").exists()
     (ledger,) = read_all(out)
     delivered = [e for e in ledger.events if e.event == "delivered"]
-    assert ledger.closed and len(delivered) == len(run.feed.answers)
+    assert ledger.closed and len(delivered) == len(run.answers)
 
     # And it goes on from there.
     again = serve(resume=out / "field.npz").server
@@ -171,9 +154,8 @@ def test_operators_see_and_change_a_running_server(serve):
     run = serve()
     server, channel = run.server, connected(run)
     edge = edge_pb2_grpc.EdgeServiceStub(channel)
-    with pytest.raises(grpc.RpcError) as early:
-        edge.SaveSnapshot(edge_pb2.SaveSnapshotRequest())
-    assert early.value.code() == grpc.StatusCode.FAILED_PRECONDITION
+    early = edge.SaveSnapshot.future(edge_pb2.SaveSnapshotRequest())
+    assert early.code() == grpc.StatusCode.FAILED_PRECONDITION
     run.fed()
     decisions = edge.WatchDecisions(edge_pb2.WatchDecisionsRequest())
     first = next(decisions).decision
@@ -184,12 +166,8 @@ def test_operators_see_and_change_a_running_server(serve):
     changed = edge.SetPolicy(edge_pb2.SetPolicyRequest(name="threshold", value=77.0))
     assert (changed.name, changed.value) == ("threshold", 77.0)
     until(lambda: server.state.publications()[-1].omega_ms == 77.0)
-    with pytest.raises(grpc.RpcError) as unknown:
-        edge.SetPolicy(edge_pb2.SetPolicyRequest(name="best"))
-    assert unknown.value.code() == grpc.StatusCode.INVALID_ARGUMENT
-    assert "freshest-k" in unknown.value.details()
-    long = edge.SetPolicy.future(edge_pb2.SetPolicyRequest(name="n" * 8_000_000))
-    assert long.code() == grpc.StatusCode.INVALID_ARGUMENT and len(long.details()) < 200
+    unknown = edge.SetPolicy.future(edge_pb2.SetPolicyRequest(name="best"))
+    assert unknown.code() == grpc.StatusCode.INVALID_ARGUMENT and "freshest-k" in unknown.details()
     path = edge.SaveSnapshot(edge_pb2.SaveSnapshotRequest()).path
     assert checkpoint.load(path)[0]
     edge.ResetField(edge_pb2.ResetFieldRequest())
@@ -263,35 +241,14 @@ def test_snapshots_do_not_fill_the_disk(serve, tmp_path):
     server.state.save_snapshot()
     for k in range(MAX_SNAPSHOTS - 1):
         (tmp_path / "out" / f"snapshot-9{k:05d}.npz").touch()
-    with pytest.raises(RuntimeError, match="holds 20 already: move some away"):
-        server.state.save_snapshot()
-
-
-def test_a_final_checkpoint_that_is_not_written_is_said(serve, tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(UpdateLoop.stop, "__defaults__", (0.1,))
-    run = serve().fed()
-    begun, goes_on, fit = threading.Event(), threading.Event(), run.server.updater.fit
-
-    def long_update(*arguments):
-        begun.set()
-        goes_on.wait(30)
-        return fit(*arguments)
-
-    monkeypatch.setattr(run.server.updater, "fit", long_update)
-    assert begun.wait(30)
-    run.end()
-    goes_on.set()
-    assert not (tmp_path / "out" / "field.npz").exists()
-    assert "field.npz: not written: the last update did not end" in caplog.text
+    refused(RuntimeError, "holds 20 already: move some away", server.state.save_snapshot)
 
 
 def test_a_token_is_demanded_and_honoured(serve):
     secured = Transport(tokens={"camera:*": "open sesame"})
     with connected(serve(transport=secured)) as channel:
         push, sent = frames_pb2_grpc.FrameStreamServiceStub(channel).Push, to_request(frame("cam01", 0, time.time_ns()))
-        with pytest.raises(grpc.RpcError) as refused:
-            next(push(iter([sent])))
-        assert refused.value.code() == grpc.StatusCode.UNAUTHENTICATED
+        assert push(iter([sent])).code() == grpc.StatusCode.UNAUTHENTICATED
         assert next(push(iter([sent]), metadata=secured.metadata())).outcome == frames_pb2.OUTCOME_ACCEPTED
 
 
@@ -302,8 +259,7 @@ def test_every_port_beyond_this_machine_is_protected_or_named(tmp_path):
         ports = {"page_host": "0.0.0.0", "open_page": lambda state: pytest.fail("opened"), "metrics_port": 0}
         return EdgeServer(made, read_config(made), ServerOptions("0.0.0.0:0", tmp_path / "o", **ports, **options))
 
-    with pytest.raises(TransportError, match=r"cannot listen: gRPC on 0\.0\.0\.0"):
-        server().run()
+    refused(TransportError, r"cannot listen: gRPC on 0\.0\.0\.0", server().run)
     named = server(transport=Transport(insecure=True))._warnings()
     assert [words.split(" on ")[0] for words in named] == ["gRPC", "page", "metrics"]
 
@@ -315,13 +271,6 @@ def test_the_ledger_is_closed_even_if_nothing_else_can_be_written(serve, tmp_pat
     (ledger,) = read_all(tmp_path / "out")
     assert ledger.closed
     assert json.loads((tmp_path / "out" / "edge.json").read_text())["lines_lost"] == 0
-
-
-@pytest.mark.parametrize("option", ["--seconds=nan", "--checkpoint-every=1e300"])
-def test_a_time_that_no_timer_takes_is_refused(tmp_path, capsys, option):
-    assert edge_server(["run", "room", option, "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert "expected 0 to 1e+09" in said and said.count("\n") == 1
 
 
 def test_files_are_written_before_anything_that_may_take_long(serve, tmp_path, monkeypatch):
@@ -370,19 +319,12 @@ def test_a_learned_policy_decides_by_what_cameras_see_and_its_decisions_are_kept
     from tests.edge_server.embed.graphs import CHANNELS, detector
 
     detector(tmp_path / "d.onnx")
-    made = {}
-    for dim in (2, CHANNELS):
-        spec = Spec("select", StateLayout(("age", "semantics"), dim=dim))
-        Actor(spec, init_actor(spec, np.random.default_rng(1))).save(tmp_path / f"{dim}.npz")
-        edge = {"policy": {"name": f"bandit:{dim}.npz"}, "embedding": {"model": "d.onnx", "dim": CHANNELS}}
-        made[dim] = tiny_scenario(tmp_path, **edge)
-    with pytest.raises(scenario.ScenarioError, match="of 2 numbers"):
-        EdgeServer(made[2], read_config(made[2]), ServerOptions("127.0.0.1:0", tmp_path / "other"))
-    run = serve(made[CHANNELS]).fed()
+    spec = Spec("select", StateLayout(("age", "semantics"), dim=CHANNELS))
+    Actor(spec, init_actor(spec, np.random.default_rng(1))).save(tmp_path / "policy.npz")
+    embedding = {"model": "d.onnx", "dim": CHANNELS}
+    run = serve(tiny_scenario(tmp_path, policy={"name": "bandit:policy.npz"}, embedding=embedding)).fed()
     server = run.server
     until(lambda: server.updater.number >= 4)
-    with pytest.raises(ValueError, match="chosen at the start"):
-        server.state.set_policy(f"bandit:{tmp_path / 'other.npz'}", None)
     run.end()
     found = read_decision(tmp_path / "out", 1).decision
     used = [c for c, chosen in zip(found.state.cameras, found.action) if chosen]

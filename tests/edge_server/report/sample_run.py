@@ -30,6 +30,7 @@ EDGE = {
     "value": 120.0,
     "uptime_s": SECONDS,
     "updates": {"count": 50, "ms_p50": 800.0, "ms_p95": 900.0, "first_ms": 3100.0, "undecodable": 1},
+    "events": [{"t_s": 12.5, "what": "an operator reset the field"}],
     "baseline": {"mean_color_db": 14.5, "nearest_view_db": 13.8},
     "lpips_missing": None,
     "lpips_network": "alex",

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import tempfile
-import tracemalloc
 from collections import Counter
 from pathlib import Path
 
@@ -36,31 +35,12 @@ def counts(out, **expected):
 
 # name -> (lines of node, emulator and edge; every count that is not zero; part of a note, or none)
 RUNS = {
-    "every end of a frame": (
-        [*sent(*range(9)), *told("10:captured 10:replaced 11:captured 11:waiting")],
-        [
-            *((i, "received") for i in range(9)),
-            *told("0:skipped 1:dropped_busy 2:superseded 3:lost 4:broken 5:rejected:crc"),
-            *told("6:forwarded 7:forwarded 8:in_flight"),
-        ],
-        told("6:delivered 7:rejected:time_reversed"),
-        dict.fromkeys((*LINK_ENDS, "broken", "replaced", "waiting", "delivered"), 1)
-        | {"captured": 11, "sent": 9, "rejected": {"crc": 1, "time_reversed": 1}},
-        "1 in flight, last written by ledger-emulator",
-    ),
     "a node whose ledger is elsewhere": (
         None,
         [*told("0:received 0:forwarded 1:received 1:lost")],
         [(0, "delivered"), ("?", "?", 0, "rejected", "bad_id"), ("?", "?", 0, "rejected", "bad_id")],
         {"captured": 4, "sent": 4, "delivered": 1, "lost": 1, "rejected": {"bad_id": 2}},
         "no node's ledger",
-    ),
-    "a restarted node is a new session": (
-        [("a", "one", 0, "captured"), ("a", "one", 0, "sent"), ("a", "two", 0, "captured"), ("a", "two", 0, "sent")],
-        None,
-        [("a", "two", 0, "delivered"), ("a", "one", 0, "rejected", "stale")],
-        {"captured": 2, "sent": 2, "delivered": 1, "rejected": {"stale": 1}},
-        "",
     ),
     "a delivery at the edge outranks a broken stream": (
         [*sent(0, 1), (0, "broken"), (1, "broken")],
@@ -77,10 +57,10 @@ RUNS = {
         "",
     ),
     "an unknown event": (
-        [*sent(0), (0, "teleported")],
+        [*sent(0, 1), (0, "teleported")],
+        told("0:received 0:rejected:crc 1:received 1:in_flight"),
         None,
-        [(0, "rejected", "too_old")],
-        {"captured": 1, "sent": 1, "rejected": {"too_old": 1}},
+        {"captured": 2, "sent": 2, "in_flight": 1, "rejected": {"crc": 1}},
         "teleported",
     ),
 }
@@ -97,8 +77,6 @@ def test_every_frame_is_counted_by_what_was_written(tmp_path, name):
     assert accounting.ledgers == sum(lines is not None for lines in ledgers)
 
 
-FRAMES_OFF = "captured = replaced + waiting + sent is off by 1 frames"
-COPIES_OFF = "sent + duplicated = the sum of all ends is off by 1 copies"
 HELD = {
     "node": [*sent(0), (1, "captured"), (1, "waiting")],
     "emulator": [(0, "received"), (0, "duplicated"), (0, "forwarded"), (0, "in_flight")],
@@ -116,7 +94,8 @@ def test_no_term_is_a_remainder(tmp_path):
             write(folder, written, [line for line in lines if (written, line) != left_out])
         found = account_frames(folder).as_dict()
         assert found["closes"] == (left_out is None)
-        assert left_out is None or (FRAMES_OFF if left_out in frames_off else COPIES_OFF) in found["doubts"]
+        off = "off by 1 frames" if left_out in frames_off else "off by 1 copies"
+        assert left_out is None or any(doubt.endswith(off) for doubt in found["doubts"])
 
 
 def test_killed_processes_and_torn_lines(tmp_path):
@@ -209,25 +188,6 @@ def test_lines_lost_to_a_full_disk_are_no_contradiction_and_do_not_close(tmp_pat
     assert not accounting.as_dict()["closes"]
 
 
-def test_a_long_run_is_joined_in_little_memory(tmp_path):
-    frames = 8_000
-    files = {"node": ("captured", "sent", "answered"), "emulator": ("received", "forwarded"), "edge": ("delivered",)}
-    for role, events in files.items():
-        path = write(tmp_path, role, [], closed=False)
-        with path.open("a") as file:
-            for i in range(frames):
-                for event in events:
-                    file.write(f"{i}\tcam{i % 8:02}\tsession\t{i // 8}\t{event}\taccepted\n")
-            file.write("9\t\t\t0\tclosed\t\n")
-    tracemalloc.start()
-    accounting = account_frames(tmp_path)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert accounting.total["delivered"] == accounting.total["captured"] == frames
-    assert accounting.contradictions == []
-    assert peak < 300 * frames, f"{peak / frames:.0f} bytes a frame"
-
-
 ON_LINK = "node:captured node:sent emulator:received"
 # What really becomes of one frame: the lines that processes write about it, in order of time, where all end in order.
 LIVES = {end: f"{ON_LINK} emulator:{end}" for end in LINK_ENDS} | {
@@ -258,7 +218,9 @@ def test_counts_are_true_even_if_every_process_is_killed(fates, data):
             lines = [line for line in written[:alive] if line[1] == role]
             torn = lines[-1:] if role == torn_role else []
             lines = lines[: len(lines) - len(torn)]
-            path = write(Path(folder), role, [(i, *rest) for i, _, *rest in lines], closed=alive == len(written))
+            # A restarted node is a new session, which counts from zero again.
+            told = [("a", f"s{i % 2}", i // 2, *rest) for i, _, *rest in lines]
+            path = write(Path(folder), role, told, closed=alive == len(written))
             if torn:
                 with path.open("ab") as file:
                     file.write(b"99\ta\ts\t" + str(torn[0][0]).encode())

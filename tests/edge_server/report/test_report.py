@@ -1,23 +1,29 @@
-"""The report of a run: what it takes from the files, what of them it survives, and what its page shows."""
+"""The report of a run: what it takes from the files, what of them it survives, what it concludes and shows."""
 
 from __future__ import annotations
 
 import json
 import re
+from functools import reduce
 
-import cv2
 import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
+from edge_server.fidelity.scorer import SELECTED
+from edge_server.live.output.journal import Journal
 from edge_server.report import figures
 from edge_server.report.build_report import METRICS, SERIES, assemble, build_report, fidelity, updates
-from edge_server.report.events import MOST
-from edge_server.report.figures import draw_ages, draw_fidelity, draw_frontier
+from edge_server.report.conclusion import conclusion
+from edge_server.report.events import MOST, silences
+from edge_server.report.figures import draw_fidelity, draw_frontier
 from edge_server.report.run_files import continuous, read_run_files
-from edge_server.run_records import EdgeStatus, UpdateCounts, UpdateRow
+from edge_server.run_records import AgesRow, EdgeStatus, UpdateCounts, UpdateRow
+from freshfield.scenario import NOTHING_HELD_OUT
 from freshfield.untrusted import read_json
+from freshfield_up.summary import summarize
 from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, EDGE, SECONDS, page_of, publication, write_run
+from tests.support import refusal
 
 ENDED_S = 39.8  # the last sample of ages
 LATE_S = 0.8 * ENDED_S + 0.2 * 3.1
@@ -52,10 +58,12 @@ def test_report_json_holds_what_is_returned_and_every_documented_key(run):
     assert report["fidelity"]["baseline"] == {"mean_color_db": 14.5, "nearest_view_db": 13.8}
     assert all(tuple(row) == SERIES for row in report["fidelity"]["series"])
     assert report["channel"] == CHANNEL and report["chosen"] is None
-    words = ("network set: 400 ms, 20 % lost", "the scenario's network again")
-    assert report["events"] == [{"t_s": t_s, "what": what} for t_s, what in zip((10.0, 14.0), words)]
+    assert [(event["t_s"], event["what"]) for event in report["events"]] == [
+        (10.0, "network set: 400 ms, 20 % lost"),
+        (12.5, "an operator reset the field"),
+        (14.0, "the scenario's network again"),
+    ]
     assert report["run"] == {**EDGE["run"], "command": "freshfield demo"}, "of the run, not of the report"
-    assert set(report["outside_load"]) == {"cores", "ours", "method"}
     means = [report["age_ms"]["by_camera"][camera]["mean"] for camera in CAMERAS[1:]]
     assert report["age_ms"]["mean"] == pytest.approx(np.mean(means)) and report["age_ms"]["p50"] > 60.0
 
@@ -111,15 +119,15 @@ def test_depth_is_reported_where_there_is_some(run, tmp_path):
     write_run(tmp_path)
     found = {"cam01": {"frames": 40, "bytes": 380_000}, "cam02": {"frames": 10, "bytes": 120_000}}
     edit_edge(tmp_path, depth={"cameras": found, "undecodable": 2})
-    with (tmp_path / "ages.jsonl").open("a") as file:
-        for age_ms in (100.0, 300.0):
-            file.write(json.dumps({"t_s": 50.0, "age_ms": {}, "depth_age_ms": {"cam01": age_ms}}) + "\n")
+    journal = Journal(tmp_path, lambda: json.loads((tmp_path / "edge.json").read_text()))
+    for age_ms in (100.0, 300.0):
+        journal.ages(50.0, {"never": None}, {"cam01": age_ms})
+    journal.close()
     report, page = page_of(tmp_path)
     ages = {"mean": 200.0, "p50": 200.0, "p95": pytest.approx(290.0)}
     assert report["depth"] == {"frames": 50, "bytes": 500_000, "undecodable": 2, "age_ms": ages, "cameras": found}
     assert report["age_ms"] == run[1]["age_ms"]
     assert "50 frames brought depth, 10.0 kB each; the newest depth was 200 ms old on average" in page
-    assert "depth that could not be decoded: 2" in page
 
 
 def test_every_figure_is_drawn_and_inside_a_page_that_loads_nothing(run):
@@ -135,17 +143,11 @@ def test_every_figure_is_drawn_and_inside_a_page_that_loads_nothing(run):
 def test_the_page_says_what_the_report_holds(run):
     assert_says(
         (run[0] / "report.html").read_text(),
-        "40 s · seed 7 · field ngp · policy threshold 120",
-        "24.0 dB PSNR of what was shown, last fifth of the run 17.0 dB",
         "800 ms median of 50 updates 76 frames delivered of 200 captured",
         "shown, last fifth of the run 24.00 17.00 0.8000 –",
-        "nearest training view 13.80",
-        "Held out: cam00. 45 of 50 publications were scored.",
         "never never reported",
-        "50 updates; median 800 ms, 95 % within 900 ms; the first 3.1 s after the edge started;",
+        "12.5 s: an operator reset the field",
         "Every frame is accounted for. 3 ledgers joined, no contradictions.",
-        "dropped busy 80 discarded: the link was busy",
-        "rejected 4 crc 4",
         "cam01 50 10 40 0 20 0 0 0 19 0 0 1",
         "drawn delay (ms) delay error (ms) mean 60.20 – 50 % 41.00 0.10 95 % 180.00 – 99 % – 1.20 largest – 4.00",
     )
@@ -168,7 +170,6 @@ def test_a_killed_run_is_reported_with_notes_on_what_is_torn(tmp_path, capsys):
     assert report["scenario"] is None and report["updates"]["count"] > 10
     assert report["fidelity"]["final"]["psnr_db"] is not None
     assert not (tmp_path / "figure-comparison.png").exists()
-    assert "<h2>Notes</h2>" in (tmp_path / "report.html").read_text()
     (tmp_path / "empty").mkdir()
     report, page = page_of(tmp_path / "empty")
     assert report["updates"]["count"] == 0 and report["frames"]["captured"] == 0
@@ -193,41 +194,26 @@ def test_a_held_out_camera_that_moves_is_drawn_and_tabled_at_refined_poses(tmp_p
     write_run(tmp_path)
     so_far = {"now_psnr_db": 23.5, "all_psnr_db": 24.7, "now_ssim": 0.79, "all_ssim": 0.8125, "frames": 9}
     edit_edge(tmp_path, so_far={**so_far, "refined": True})
-    lines = [json.loads(line) for line in (tmp_path / "shown.jsonl").read_text().splitlines()]
-    assert draw_fidelity(page_of(tmp_path)[0], read_run_files(tmp_path), tmp_path / "of an earlier version.png")
-    (tmp_path / "shown.jsonl").write_text("".join(json.dumps({**line, "so_far": so_far}) + "\n" for line in lines))
-    report, page = page_of(tmp_path)
     lines = []
     monkeypatch.setattr(figures, "label_lines", lambda axes, *_, **__: lines.append(len(axes.lines)))
-    assert draw_fidelity(report, read_run_files(tmp_path), tmp_path / "figure.png")
-    assert lines == [4, 2], "now and so far; two levels to compare with"
-    assert_says(
-        page,
-        "0.812 SSIM of the same",
-        "newest held-out frame, at refined poses 23.50 0.7900",
-        "9 held-out frames so far, at refined poses 24.70 0.8125",
-        "shown, last fifth of the run, at given poses 24.00 17.00",
-    )
+    for row in ("", json.dumps({"t_s": 3.0, "so_far": so_far})):  # runs of earlier versions kept none
+        (tmp_path / "shown.jsonl").write_text(row)
+        report, page = page_of(tmp_path)
+        assert draw_fidelity(report, read_run_files(tmp_path), tmp_path / "figure.png")
+    assert lines[-2:] == [4, 2], "now and so far; two levels to compare with"
+    assert_says(page, "0.812 SSIM of the same", "9 held-out frames so far, at refined poses 24.70 0.8125")
 
 
-def test_the_band_of_ages_reaches_from_the_youngest_camera_to_the_oldest(run, tmp_path, monkeypatch) -> None:
-    files, bands = read_run_files(run[0]), []
+def test_each_part_of_a_figure_is_drawn_and_ages_from_the_youngest_camera_to_the_oldest(run, tmp_path, monkeypatch):
+    files, bands, drawn = read_run_files(run[0]), [], []
     monkeypatch.setattr("matplotlib.axes.Axes.fill_between", lambda axes, t, low, high, **_: bands.append((low, high)))
-    assert draw_ages(run[1], files, tmp_path / "ages.png")
+    monkeypatch.setattr(figures, "label_lines", lambda at, *_, **__: drawn.append((len(at.patches), len(at.lines))))
+    for draw in (figures.draw_ages, figures.draw_channel, figures.draw_processes):
+        assert draw(run[1], files, tmp_path / "figure.png")
     known = np.array([[row.age_ms[camera] for camera in CAMERAS[1:]] for row in files.ages])
     np.testing.assert_array_equal(bands, [(known.min(axis=1), known.max(axis=1))])
-
-
-def test_each_part_of_a_figure_is_drawn_on_axes_of_its_own(run, tmp_path, monkeypatch) -> None:
-    drawn = []
-    monkeypatch.setattr(
-        figures, "label_lines", lambda axes, *_, **__: drawn.append((axes, len(axes.patches), len(axes.lines)))
-    )
-    for draw in (figures.draw_channel, figures.draw_processes):
-        assert draw(run[1], read_run_files(run[0]), tmp_path / "figure.png")
     # Two states; fifty delays and their mean; memory and processor time of edge, emulator and nodes.
-    assert [counts for _, *counts in drawn] == [[2, 0], [50, 1], [0, 3], [0, 3]]
-    assert len({axes for axes, *_ in drawn}) == 4
+    assert drawn[2:] == [(2, 0), (50, 1), (0, 3), (0, 3)]
 
 
 @pytest.mark.stability
@@ -268,14 +254,11 @@ def test_hostile_names_do_not_reach_the_page_as_markup_nor_many_events(tmp_path)
 
 def test_the_run_stands_beside_the_measured_frontier(tmp_path, monkeypatch):
     write_run(tmp_path)
-    report, path = assemble(read_run_files(tmp_path)), tmp_path / "figure-frontier.png"
-    assert not draw_frontier(report, read_run_files(tmp_path), path), "a run without one"
+    report, path, at = assemble(read_run_files(tmp_path)), tmp_path / "figure-frontier.png", []
     point = {"update_ms": 50.0, "psnr_db": 20.0, "psnr_moving_db": 16.0}
     for points in ([], [{}], [point]):
         (tmp_path / "frontier.json").write_text(json.dumps({"points": points, "about": "f.json"}))
         assert draw_frontier(report, read_run_files(tmp_path), path) == (points == [point])
-    assert ((cv2.imread(str(path)) < 200).any(axis=-1)).sum() > 2000, "axes, words and points are drawn"
-    at: list[float] = []
     monkeypatch.setattr("matplotlib.axes.Axes.plot", lambda axes, x, *words, **more: at.append(float(x[0])))
     files = read_run_files(tmp_path)
     files.series = files.series[::2]  # a busy edge writes no row for some updates
@@ -290,5 +273,73 @@ def test_two_runs_are_printed_side_by_side(run, tmp_path, capsys, monkeypatch):
     rows = {line.split("  ")[0]: line.split()[-2:] for line in capsys.readouterr().out.splitlines()}
     shown = f"{report['fidelity']['final']['psnr_db']:.2f}"
     assert rows["published (dB)"] == [shown, shown] and rows["frames delivered"] == ["76", "76"]
-    assert edge_server(["report", str(out), "--beside", str(tmp_path / "c")]) == 2
-    assert "c: no such folder" in capsys.readouterr().err
+    assert "c: no such folder" in refusal(capsys, edge_server, "report", out, "--beside", tmp_path / "c")
+
+
+SO_FAR = {"now_psnr_db": 20.0, "all_psnr_db": 23.0, "frames": 9}
+TRAINED_ON = {"fidelity.scored_on": ["selected"], "fidelity.final.psnr_db": 17.4, "fidelity.shown.psnr_db": None}
+
+
+def test_three_sentences_say_what_was_shown_its_age_and_its_limit(run) -> None:
+    shown, age, limit = run[1]["conclusion"]
+    assert shown == (
+        "In the last fifth of the run, what was shown read 24.0 dB, 17.0 dB where the scene moves; "
+        "an image of one mean color reads 14.5 dB."
+    )
+    assert "(50 ms network, " in age and age.endswith("reads 26.0 dB, 9.0 above what moves.")
+    assert limit.startswith("Showing each image until the next was the limit")
+    assert "50% of the frames sent did not pass" in limit
+    assert " ".join(run[1]["conclusion"]) in (run[0] / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence", "words"),
+    [
+        ({"updates.count": 0}, 0, "Nothing was shown: the field was never updated."),
+        (TRAINED_ON, 0, "publications read 17.4 dB on training views, nothing is held out"),
+        ({"fidelity.shown.psnr_db": 12.0}, 0, "worse than an image of one mean color, which reads 14.5 dB."),
+        ({"fidelity.shown.psnr_db": None, "fidelity.final.psnr_db": None}, 0, "is not known"),
+        ({"fidelity.so_far": SO_FAR}, 0, "all 9 so far 23.0 dB"),
+        ({"fidelity.shown.age_ms.waiting": 0.0}, 2, "Waiting for an update and computing it were the limit"),
+        ({"fidelity.shown.age_ms.display": 10.0}, 2, "The network was the limit: it takes the largest part"),
+        ({"fidelity.shown.psnr_still_db": 15.0}, 2, "too few cameras"),
+        ({**TRAINED_ON, "fidelity.shown.psnr_still_db": None}, 2, "poses that do not fit, or too short a run"),
+        ({"fidelity.shown.psnr_still_db": 15.0, "fidelity.so_far": SO_FAR}, 2, "the limit: it takes"),
+        ({"updates.without_step": 3, "updates.count": 50}, 2, "6% of the updates had no time for a step of training"),
+        ({"updates.shed": 70}, 2, "92% of those delivered were left out for lack of time"),
+    ],
+)
+def test_the_conclusion_follows_the_figures(run, changes, sentence, words) -> None:
+    report = json.loads((run[0] / "report.json").read_text())
+    for path, value in changes.items():
+        *parents, last = path.split(".")
+        reduce(dict.__getitem__, parents, report)[last] = value
+    assert words in conclusion(report)[sentence]
+
+
+def test_cameras_that_fall_silent_together_are_one_event() -> None:
+    """At 10 s cam01 to cam05 lose the network, all but cam05 until 16 s; cam00 goes on."""
+    rows = []
+    for t_s in np.arange(0.0, 30.0, 0.2):
+        away = [k > 0 and t_s > 10.0 and (k == 5 or t_s < 16.0) for k in range(6)]
+        ages = {f"cam0{k}": 1e3 * (t_s - 10.0) if gone else 50.0 for k, gone in enumerate(away)}
+        rows.append(AgesRow(float(t_s), {**ages, "never": None}))
+    (gone,) = silences(rows)
+    assert gone.t_s == pytest.approx(10.0, abs=0.01) and gone.what == "cam01, cam02, cam03 and 2 more: no further frame"
+    (back,) = silences([AgesRow(row.t_s, {"cam01": row.age_ms["cam01"]}) for row in rows])
+    assert back.what == "cam01: no frame for 5.9 s"
+
+
+def test_the_age_of_what_was_shown_is_told_without_a_held_out_camera(tmp_path):
+    write_run(tmp_path)
+    (tmp_path / "shown.jsonl").unlink()
+    series = (tmp_path / "series.jsonl").read_text().replace('"scored_on": "cam00"', f'"scored_on": "{SELECTED}"')
+    (tmp_path / "series.jsonl").write_text(series.replace('"network_ms": null', '"network_ms": 50.0'))
+    report, page = page_of(tmp_path)
+    assert NOTHING_HELD_OUT in page.split("<h2>Age")[0]
+    age = report["fidelity"]["shown"]["age_ms"]
+    # Updates of some 745 ms follow each other: an image is shown for 750, and counts as old as it is in the middle.
+    assert age["network"] == 50.0 and age["computing"] == pytest.approx(757, abs=20)
+    assert age["display"] == pytest.approx(375, abs=40)
+    assert "(50 ms network, " in summarize(tmp_path)
+    assert "ms network" in page

@@ -7,7 +7,6 @@ from typing import Any
 
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.rollouts.setting import Setting
-from edge_server.experiments.training.evaluation import Candidate
 from freshfield.scenario import Scenario, parse
 from tests.support import small_world
 
@@ -34,8 +33,3 @@ def setting(channel: dict[str, Any] | None = None, **more: Any) -> Setting:
     """One held-out camera, updates from nothing and one motion, unless ``more`` says otherwise."""
     sizes: dict[str, Any] = {"steps": 4, "decisions": 2, "lead_ms": 800.0, "span_ms": 600.0, "warm_steps": 6}
     return Setting(scenario(channel), **{**sizes, "scratch": True, "motions": False, **more})
-
-
-def thresholds(*omegas_ms: float) -> list[Candidate]:
-    """Policies that leave out views older than each of ``omegas_ms``."""
-    return [Candidate({"policy": "threshold", "value": ms}, f"threshold:{ms:g}") for ms in omegas_ms]

@@ -12,7 +12,7 @@ import pytest
 from camera_node.synthetic import make_scene
 from edge_server.experiments.engine import Engine
 from edge_server.experiments.rollouts import rollout as rollout_module
-from edge_server.experiments.rollouts.episode import Choice, EpisodeFactory, Outcome
+from edge_server.experiments.rollouts.episode import Choice, EpisodeFactory, Outcome, mean_outcome
 from edge_server.experiments.rollouts.rollout import Job, choose, learned, named, rollout, run_rollouts
 from edge_server.experiments.rollouts.setting import PURPOSES, Setting, seeds
 from edge_server.experiments.virtual.from_scenario import build_deployment
@@ -26,6 +26,7 @@ from edge_server.settings import ComputeConfig
 from freshfield.scenario import ScenarioError
 from tests.edge_server.experiments.rollouts.small import FIELD, NOTHING, scenario, setting
 from tests.edge_server.experiments.sets import write_recording
+from tests.support import refused
 
 
 def one_of(what: Setting, seed: int = 5, camera: str = "cam00") -> Outcome:
@@ -47,7 +48,7 @@ def test_the_camera_that_reports_neither_rewards_nor_is_trained_on():
     assert rewarded.psnr_db != judged.psnr_db and rewarded.aaoi_ms == judged.aaoi_ms
 
 
-def test_every_episode_has_a_motion_of_its_own_and_its_cameras_see_the_same_one():
+def test_every_episode_has_a_motion_of_its_own_which_its_cameras_share_and_recordings_none(tmp_path):
     factory = EpisodeFactory(setting(motions=True), NOTHING)
     images = set()
     for seed in (1, 2_000_001):  # of training and of testing
@@ -60,12 +61,9 @@ def test_every_episode_has_a_motion_of_its_own_and_its_cameras_see_the_same_one(
     assert len(images) == 2
     same = EpisodeFactory(setting(motions=False), NOTHING)
     assert same.stage(1) is same.stage(2_000_001)
-
-
-def test_a_recording_has_no_motion_to_draw(tmp_path):
     recorded = scenario(source={"kind": "transforms", "data": str(write_recording(tmp_path))})
-    factory = EpisodeFactory(dataclasses.replace(setting(motions=True), scenario=recorded), NOTHING)
-    assert "motion_seed" not in factory.scenario(3).source
+    still = EpisodeFactory(dataclasses.replace(setting(motions=True), scenario=recorded), NOTHING)
+    assert "motion_seed" not in still.scenario(3).source
 
 
 def test_pictures_of_one_episode_are_not_taken_for_those_of_another():
@@ -155,13 +153,11 @@ def test_every_action_starts_from_the_same_field_whatever_was_evaluated_before(s
 def test_seeds_of_two_purposes_or_runs_never_meet():
     ranges = [set(seeds(run, purpose, 500)) for run in (0, 1, 2) for purpose in PURPOSES]
     assert len(set.union(*ranges)) == sum(map(len, ranges))
-    with pytest.raises(ValueError, match="at most 1000000"):
-        seeds(0, "train", 1, first=10**6)
+    refused(ValueError, "at most 1000000", seeds, 0, "train", 1, first=10**6)
 
 
 def test_a_setting_without_a_held_out_camera_is_refused():
-    with pytest.raises(ScenarioError, match="held_out"):
-        dataclasses.replace(setting(), scenario=scenario(cameras={"count": 5}))
+    refused(ScenarioError, "held_out", dataclasses.replace, setting(), scenario=scenario(cameras={"count": 5}))
 
 
 SELECT = Spec("select", StateLayout(("age", "pose")), hidden=8)
@@ -224,3 +220,30 @@ def test_results_are_kept_by_weights_and_not_by_the_names_of_their_files(tmp_pat
     Learner(SELECT, 1).actor.save(a)
     roll(a)
     assert known() == 2
+
+
+@pytest.fixture
+def environment():
+    """Makes environments of gymnasium."""
+    gymnasium = pytest.importorskip("gymnasium", reason="gymnasium is not installed (extra gym)")
+    few = {"decisions": 3, "steps": 2, "size": 16, "warm_steps": 4, "span_ms": 500.0, "scenario": "room"}
+    return lambda name, **more: gymnasium.make(f"freshfield.gym:freshfield/{name}-v0", **few, **more).unwrapped
+
+
+def test_gymnasiums_checker_finds_nothing(environment):
+    pytest.importorskip("gymnasium.utils.env_checker").check_env(environment("Select"), skip_render_check=True)
+
+
+def test_a_step_of_an_environment_is_what_the_policy_of_its_action_gets(environment):
+    env = environment("Wait", omegas_ms=(0.0, 80.0))
+    env.reset(seed=3)
+    episode, rewards = env._episode, []
+    for number in range(3):
+        policy = named("wait:80")(np.random.default_rng(0))
+        expected = mean_outcome(list(episode.evaluate(number, choose(policy, episode, number)).values()))
+        _, reward, over, _, info = env.step(1)
+        assert info["psnr_moving_db"] == expected.psnr_moving_db and info["missing"] == ()
+        rewards.append(reward)
+    assert over and all(rewards)
+    with pytest.raises(pytest.importorskip("gymnasium").error.ResetNeeded):
+        env.step(1)

@@ -6,25 +6,19 @@ import json
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 
 from edge_server.cli import main
 from edge_server.experiments.viewpoints.stage import open_stage
 from tests.edge_server.experiments.sets import write_photos
 
 
-def test_a_capture_is_planned_and_written(tmp_path, capsys, monkeypatch):
-    numbers = []
-    monkeypatch.setattr(Axes, "annotate", lambda at, text, *place, **how: numbers.append(text))
+def test_a_capture_is_planned_and_written(tmp_path):
     words = ["viewpoints", "tile", "--budget", "4,5m", "--candidates", "24", "--steps", "3"]
     assert main([*words, "--out", str(tmp_path)]) == 0
     plan = json.loads((tmp_path / "plan.json").read_text())
     assert plan["views"] == len(plan["stops"]) == 4 and plan["path_m"] <= 5.0 and plan["candidates"] == 24
     assert np.array(plan["stops"][0]["camera_to_world"]).shape == (4, 4)
     assert plan["held_out"]["psnr_db"] > 5.0 and (tmp_path / "plan.png").stat().st_size > 10_000
-    assert numbers == ["1", "2", "3", "4"], "the drawing says which comes when"
-    said = capsys.readouterr().out
-    assert "4 views" in said and "m away" in said and "held out: PSNR" in said
 
 
 @pytest.mark.parametrize("alpha", [False, True])

@@ -1,42 +1,48 @@
-"""A deployment in virtual time: repeatable bit for bit, books that close, time charged as said."""
+"""A deployment in virtual time: repeatable, books that close, time charged as said; the command that runs one."""
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from channel_emu.model.link import EventKind
 from channel_emu.model.settings import channel_from_mapping
 from channel_emu.virtual.simulate import simulate
-from edge_server.experiments.virtual.from_scenario import build_deployment
+from edge_server.experiments.virtual import costs
+from edge_server.experiments.virtual.costs import fitted
+from edge_server.experiments.virtual.costs import main as costs_main
+from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
 from edge_server.experiments.virtual.run_settings import RunSettings
-from edge_server.experiments.virtual.simulate import digest
+from edge_server.experiments.virtual.simulate import digest, main
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
-from edge_server.settings import ComputeConfig
+from edge_server.report.build_report import build_report
+from edge_server.scheduler.learned.decision_record import read_decision
+from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.settings import Spec
+from edge_server.scheduler.learned.state import StateLayout
+from edge_server.settings import ComputeConfig, read_config
 from freshfield.frame import to_request
-from freshfield.scenario import Scenario, parse
+from freshfield.scenario import Scenario, ScenarioError, load
 from tests.edge_server.experiments.rollouts.small import RAW
-from tests.edge_server.experiments.sets import SMALL
-from tests.support import small_world
+from tests.edge_server.experiments.rollouts.small import scenario as small_scenario
+from tests.edge_server.experiments.sets import SMALL, write_photos
+from tests.support import refused, small_world
 
 SETTINGS = RunSettings(steps=2, compute=ComputeConfig(ms_per_step=40.0, ms_per_update=20.0))
 
 
-def scenario(channel: dict[str, Any] | None = None, seed: int = 3, **other: Any) -> Scenario:
-    over = RAW["channel"] if channel is None else channel
-    data = {
-        **RAW,
-        "seed": seed,
-        "source": small_world(),
-        "channel": over,
-        "edge": {"field": "ngp", "field_options": SMALL},
-    }
-    return parse({**data, **other}, Path("virtual.yaml"))
+def scenario(channel: dict[str, Any] | None = None, **other: Any) -> Scenario:
+    edge = {"field": "ngp", "field_options": SMALL}
+    return small_scenario(channel, **{"source": small_world(), "edge": edge, **other})
 
 
 def run(what: Scenario, settings: RunSettings = SETTINGS, seconds: float = 1.0) -> VirtualDeployment:
@@ -122,27 +128,6 @@ def test_free_compute_publishes_at_the_decision_and_never_spins():
     assert np.diff(times).tolist() == [200_000_000] * (len(times) - 1)
 
 
-@pytest.mark.slow
-def test_at_twice_the_load_frames_are_left_out_and_what_is_shown_does_not_age() -> None:
-    """A processor that takes in less than 100 frames a second; sixty of them, and twice as many."""
-    options = {"layers": True, "gaussians": 300, "start": 200, "seed_cells": 12, "threads": 1}
-    edge = {"field": "splat", "field_options": options, "policy": {"name": "all"}, "updates": "arrivals"}
-    settings = RunSettings(
-        steps=1, compute=ComputeConfig(ms_per_update=5.0, ms_per_view=10.0), epoch_ms=40.0, score_every_ms=None
-    )
-    ages = []
-    for fps in (15.0, 30.0):
-        deployment = run(scenario({}, edge=edge, source=small_world(fps=fps)), settings, seconds=6.0)
-        late = [p for p in deployment.publications if p.t_s > 2.0]
-        assert max(p.update_ms for p in late) <= 80.0
-        halves = [np.mean([p.aaoi_ms for p in late if (p.t_s > 4.0) is second]) for second in (False, True)]
-        assert halves[1] < 1.1 * halves[0]
-        ages.append(np.mean(halves))
-        assert closes(deployment.frames())
-    assert deployment.updates.buffer.shed > 0.1 * deployment.updates.buffer.arrivals
-    assert ages[1] < 2.0 * ages[0]
-
-
 def test_a_camera_that_reports_late_is_waited_for_only_as_long_as_the_grace():
     channel = {"service": {"law": "deterministic", "mean_ms": 700.0}}
     settings = RunSettings(steps=1, grace_ms=0.0)
@@ -156,16 +141,9 @@ def test_what_is_shown_is_the_newest_publication_carried_on_to_seeded_instants()
     asked: list[tuple[int, int]] = []
     take = deployment.updates.field.snapshot
 
-    class Watched:
-        def __init__(self, snapshot: Any, published_ns: int) -> None:
-            self._snapshot, self._published_ns = snapshot, published_ns
-
-        def at(self, present_ns: int) -> Any:
-            asked.append((self._published_ns, present_ns))
-            return self._snapshot.at(present_ns)
-
-    def snapshot(present_ns: int | None = None) -> Any:
-        return Watched(take(present_ns), present_ns or 0)
+    def snapshot(published_ns: int) -> Any:
+        taken = take(published_ns)
+        return SimpleNamespace(at=lambda now_ns: asked.append((published_ns, now_ns)) or taken.at(now_ns))
 
     deployment.updates.field.snapshot = snapshot  # type: ignore[method-assign, assignment]
     deployment.settings = replace(settings, score_every_ms=None)
@@ -176,3 +154,105 @@ def test_what_is_shown_is_the_newest_publication_carried_on_to_seeded_instants()
     assert [s.published_ns for s in deployment.shown] == [at for _, at in asked]
     periods = {s.published_ns // 70_000_000 for s in deployment.shown}
     assert len(periods) == len(deployment.shown), "one in each period"
+
+
+def write(tmp_path: Path, **edge: Any) -> Path:
+    lossy = {"preset": "ch5", "faults": {"loss": {"probability": 0.1}}}
+    section = {**RAW, "channel": lossy, "edge": {"field": "ngp", "field_options": SMALL, "steps": 2, **edge}}
+    (path := tmp_path / "small.yaml").write_text(yaml.safe_dump(section))
+    return path
+
+
+def simulated(path: Path, capsys, *words: str) -> dict[str, Any]:
+    assert main([str(path), "--seconds", "1.5", "--json", *words]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_the_charge_is_the_scenarios_or_the_commands(tmp_path: Path, capsys):
+    path = write(tmp_path, compute={"ms_per_step": 40.0, "ms_per_update": 20.0})
+    assert simulated(path, capsys)["update_ms"] == pytest.approx(100.0)
+    assert simulated(path, capsys, "--compute", "zero")["update_ms"] == 0.0
+    assert simulated(path, capsys, "--compute", "5:1", "--steps", "4")["update_ms"] == pytest.approx(21.0)
+    assert simulated(path, capsys, "--policy", "wait-flush:60")["policy"] == "wait-flush"
+
+
+def test_what_a_learned_policy_decided_is_kept_as_of_a_live_run(tmp_path: Path):
+    Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), 1).save(tmp_path / "policy.npz")
+    out, file = tmp_path / "out", write(tmp_path)
+    words = ["--seconds", "1.5", "--out", str(out), "--policy", f"bandit:{tmp_path / 'policy.npz'}"]
+    assert main([str(file), *words]) == 0
+    lines = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
+    for number in (0, lines[-1]["number"]):
+        decided = read_decision(out, number).decision
+        used = [c for c, chosen in zip(decided.state.cameras, decided.action) if chosen]
+        assert lines[number]["selected"] == used
+
+
+def test_costs_are_measured_into_the_file_that_a_scenario_names(tmp_path: Path, capsys):
+    out = tmp_path / "costs.json"
+    assert costs_main([str(write(tmp_path, steps=5)), "--seconds", "1.2", "--out", str(out)]) == 0
+    found = json.loads(out.read_text())["compute"]
+    assert sum(found.values()) > 0.0
+    assert read_config(load(write(tmp_path, compute="costs.json"))).compute == ComputeConfig(**found)
+    for wrong in ("missing.json", 3):
+        refused(ScenarioError, r"edge\.compute", read_config, load(write(tmp_path, compute=wrong)))
+
+
+@pytest.mark.parametrize("part", ["static field", "static renders"])
+def test_what_is_done_beside_an_update_live_is_not_charged(part: str, tmp_path: Path, monkeypatch):
+    def build(*given: Any, **more: Any) -> VirtualDeployment:
+        deployment = build_deployment(*given, **more)
+        field = deployment.updates.field
+        fit, field.part_s = field.fit, {part: 0.0}
+
+        def slow(*given: Any) -> Any:
+            field.part_s[part] += 100.0  # says so, and does not take it
+            return fit(*given)
+
+        field.fit = slow
+        return deployment
+
+    monkeypatch.setattr(costs, "build_deployment", build)
+    assert costs.measure(load(write(tmp_path, steps=2)), 0.6)["median_ms"] < -90_000.0
+
+
+def test_costs_are_told_apart():
+    rng = np.random.default_rng(0)
+    steps, frames = rng.integers(1, 11, 200), rng.integers(0, 9, 200)
+    took_ms = 0.5 * steps + 2.0 * frames + 3.0
+    took_ms[:10] += 100.0  # while the machine did something else
+    found = fitted(np.column_stack([steps, frames, took_ms]))
+    assert (found.ms_per_step, found.ms_per_view, found.ms_per_update) == (0.5, 2.0, 3.0)
+
+
+def test_an_arm_keeps_real_time():
+    refused(ScenarioError, r"cell.yaml: source: .* cannot be run in virtual time", training_cameras, load("cell"))
+
+
+def test_cameras_that_are_seen_to_move_become_a_scan_and_the_reason_is_said(tmp_path: Path, capsys):
+    write_photos(tmp_path / "set", 19)
+    source = {"kind": "transforms", "data": str(tmp_path / "set"), "fps": 10}
+    cameras, edge = {"count": 4, "held_out": ["cam00"]}, {"lpips": "none", "grace_ms": 0.0}
+    (path := tmp_path / "photos.yaml").write_text(json.dumps({"cameras": cameras, "source": source, "edge": edge}))
+    assert main([str(path), "--seconds", "3", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert re.fullmatch(r"splat as a scan, updated in a cycle for 80 ms: cam0[123] moves", found["chosen"])
+    assert found["steps"] == 8
+
+
+def test_newest_and_all_held_out_frames_are_scored_each_two_seconds_and_reported(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    cameras = {"ids": ["hand", "kept"], "held_out": ["kept"], "held_out_every": 8}
+    walked = {"fps": 10, "carried": ["hand"], "params": {"people": 0, "supersample": 1}}
+    path, run = write(tmp_path), tmp_path / "run"
+    section = yaml.safe_load(path.read_text())
+    path.write_text(yaml.safe_dump({**section, "cameras": cameras, "source": {**section["source"], **walked}}))
+    assert main([str(path), "--seconds", "5", "--json", "--out", str(run)]) == 0
+    means = json.loads(capsys.readouterr().out)["now_and_all"]
+    last = json.loads((run / "edge.json").read_text())["so_far"]
+    # Frames of 0, .8, ..., 4.0 s; marks at 2 and 4 s, and means are those from 4 s on.
+    assert last["frames"] == 6 and last["now_psnr_db"] != last["all_psnr_db"]
+    assert means == pytest.approx({name: last[name] for name in means}) and "all_ssim" in means
+    shown = [json.loads(line) for line in (run / "shown.jsonl").read_text().splitlines()]
+    assert [row.get("so_far") is not None for row in shown] == [row["t_s"] >= 2.0 for row in shown]
+    assert shown[-1]["so_far"] == last and build_report(run)["fidelity"]["so_far"] == last

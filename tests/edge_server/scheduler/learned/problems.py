@@ -20,8 +20,13 @@ def collect(learner: Learner, problem: Any, seeds: Sequence[int]) -> Batch:
     rounds = [problem.draw(seed) for seed in seeds]
     states = [one.state for one in rounds]
     actions, logps = learner.act(states)
-    rewards = [one.reward(action)[0] for one, action in zip(rounds, actions)]
+    rewards = [one.reward(action) for one, action in zip(rounds, actions)]
     return learner.batch(states, actions, logps, rewards)
+
+
+def same(a: Learner, b: Learner) -> bool:
+    """Whether their actors have the same weights, bit for bit."""
+    return all(np.array_equal(w, b.actor.weights[name]) for name, w in a.actor.weights.items())
 
 
 def state(n: int, rng: np.random.Generator, d: int = 0, silent: int = 0) -> State:
@@ -39,9 +44,8 @@ class Drawn:
     gain: Any
     noise: float
 
-    def reward(self, action: Any) -> tuple[float, dict[str, float | None]]:
-        value = float(self.gain(action)) + self.noise
-        return value, {"value": value}
+    def reward(self, action: Any) -> float:
+        return float(self.gain(action)) + self.noise
 
     def regret(self, action: Any) -> float:
         return float(self.gain(self.best)) - float(self.gain(action))

@@ -1,5 +1,4 @@
-"""Learning happens, on bandits whose optimum is known; the same seed gives the same weights; nothing is lost
-in a checkpoint."""
+"""Learning happens, on bandits whose optimum is known, and repeats; checkpoints lose nothing; all stays finite."""
 
 from __future__ import annotations
 
@@ -17,14 +16,20 @@ from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.actor import MAX_BYTES, Actor
 from edge_server.scheduler.learned.clipped_update import Acted, clipped_update
-from edge_server.scheduler.learned.ppo import Learner, _RunningMeanStd
+from edge_server.scheduler.learned.ppo import Diagnostics, Learner, _RunningMeanStd
 from edge_server.scheduler.learned.settings import Spec
-from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, FreshOnes, Waits, collect, regret, state, teach
-
-
-def same(a: Learner, b: Learner) -> bool:
-    mine, other = a.actor.weights, b.actor.weights
-    return all(np.array_equal(mine[name], other[name]) for name in mine)
+from edge_server.scheduler.learned.state import State, StateLayout
+from tests.edge_server.scheduler.learned.problems import (
+    OMEGAS_MS,
+    FreshOnes,
+    Waits,
+    collect,
+    regret,
+    same,
+    state,
+    teach,
+)
+from tests.support import refused
 
 
 def select(**more) -> Spec:
@@ -79,102 +84,61 @@ def saved(tmp_path_factory):
     return path
 
 
-def refused_by(load, path, match: str | None = None) -> None:
-    """In one line that names the file once."""
-    with pytest.raises(checkpoint.CheckpointError, match=match) as refused:
-        load(path)
-    assert str(refused.value).count(str(path)) == 1 and "\n" not in str(refused.value)
-
-
-def edited(source, folder, change):
-    """Another checkpoint, with arrays and metadata changed."""
-    arrays, about = checkpoint.load(source, kind="scheduler")
-    change(arrays, about)
-    checkpoint.save(folder / "policy.npz", arrays, about, kind="scheduler")
-    return folder / "policy.npz"
-
-
-def _fact(key, value):
-    return lambda arrays, about: about.update({key: value})
-
-
-def _array(name, change):
-    return lambda arrays, about: arrays.update({name: change(arrays[name])})
-
-
-def _spec(**changed):
+def of_spec(**changed):
     return lambda arrays, about: about["spec"].update(changed)
 
 
-def _filled(name, value):
-    return _array(name, lambda array: np.full_like(array, value))
+def of_array(name, change):
+    return lambda arrays, about: arrays.update({name: change(arrays[name])})
 
 
-def _cut(name):
-    return _array(name, lambda array: array.T[..., :1])
+def cut(array):
+    return array.T[..., :1]
 
 
-WHOLES = {
+DAMAGED = {
+    "cut off": None,
     "nan": lambda arrays, about: arrays["actor.in"].__setitem__((0, 0), np.nan),
-    "shape": _array("actor.in", lambda array: array[:, 1:]),
-    "words": _array("actor.in", lambda array: array.astype(str)),
+    "shape": of_array("actor.in", cut),
+    "words": of_array("actor.in", lambda array: array.astype(str)),
     "lacks": lambda arrays, about: arrays.pop("actor.out"),
-    "action": _spec(action="guess"),
-    "key": _spec(depth=3),
+}
+SPECIFIED = {
+    "action": of_spec(action="guess"),
+    "hidden is text": of_spec(hidden="64"),
+    "omegas do not rise": of_spec(action="wait", omegas_ms=[50.0, 50.0]),
+    "waits too long": of_spec(action="wait", omegas_ms=[0.0, 1e308]),
+    "learning rate is no number": of_spec(learning_rate=float("nan")),
+    "hidden is large": of_spec(hidden=30_000),
+    "first layer is large": of_spec(hidden=1024, layout=StateLayout(("age", "semantics"), dim=4096).__dict__),
+}
+OF_LEARNERS = {
+    "moments": of_array("adam.3.exp_avg_sq", cut),
+    "value": of_array("value.mid", cut),
+    "step": of_array("adam.0.step", lambda array: np.full_like(array, np.nan)),
+    "negative moments": of_array("adam.0.exp_avg_sq", lambda array: np.full_like(array, -1.0)),
+    "rewards": lambda arrays, about: about["rewards"].update(variance=-1.0),
+    "updates": lambda arrays, about: about.update(updates=float("inf")),
+    "streams": lambda arrays, about: about.update(streams={}),
 }
 
 
-@pytest.mark.parametrize("damage", ["cut", "field", *WHOLES])
-def test_a_file_that_is_no_whole_checkpoint_is_refused_in_one_line(tmp_path, saved, damage):
-    if damage in WHOLES:
-        path = edited(saved, tmp_path, WHOLES[damage])
-    elif damage == "cut":
-        (path := tmp_path / "policy.npz").write_bytes(saved.read_bytes()[:-200])
-    else:
-        checkpoint.save(path := tmp_path / "policy.npz", {"a": np.zeros(3)})
-    for load in (Learner.load, Actor.load):
-        refused_by(load, path, f"^{re.escape(str(path))}")
-
-
-LARGE = {"hidden": {"hidden": 30_000}, "dim": {"layout": {"parts": ["age", "semantics"], "dim": 10**9}}}
-WRONG = {
-    "hidden is text": {"hidden": "64"},
-    "minibatch is no whole number": {"minibatch": 1.5},
-    "omegas fall": {"action": "wait", "omegas_ms": [50.0, 0.0]},
-    "waits too long": {"action": "wait", "omegas_ms": [0.0, 1e308]},
-    "learning rate is no number": {"learning_rate": float("nan")},
-    "center is infinite": {"layout": {"parts": ["semantics"], "dim": 1, "center": [np.inf], "spread": [1.0]}},
-}
-
-
-@pytest.mark.parametrize("change", [*LARGE.values(), *WRONG.values()], ids=[*LARGE, *WRONG])
-def test_a_specification_that_nobody_trains_is_refused_before_anything_is_allocated(
-    tmp_path, saved, monkeypatch, change
+@pytest.mark.parametrize("damage", [*DAMAGED, *SPECIFIED, *OF_LEARNERS])
+def test_what_no_learner_has_saved_is_refused_in_one_line_before_anything_is_allocated(
+    tmp_path, saved, monkeypatch, damage
 ):
-    layout = {**select().as_json()["layout"], **change.get("layout", {})}
-    path = edited(saved, tmp_path, _spec(**{**change, "layout": layout}))
-    monkeypatch.setattr(networks, "_orthogonal", MagicMock(side_effect=MemoryError("weights of that size")))
-    for load in (Learner.load, Actor.load):
-        refused_by(load, path, "its policy cannot be used")
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        _cut("adam.3.exp_avg_sq"),
-        _cut("usual"),
-        _cut("value.mid"),
-        _filled("adam.0.step", np.nan),
-        _filled("adam.0.exp_avg_sq", -1.0),
-        _fact("rewards", {"count": 5, "mean": 0.0, "variance": -1.0}),
-        _fact("rewards", {"count": -5, "mean": 0.0, "variance": 1.0}),
-        _fact("seed", "zz"),
-        _fact("updates", float("inf")),
-        _fact("streams", {}),
-    ],
-)
-def test_what_a_learner_cannot_have_saved_is_refused(tmp_path, saved, change):
-    refused_by(Learner.load, edited(saved, tmp_path, change))
+    path, said = tmp_path / "policy.npz", ".* its policy cannot be used" if damage in SPECIFIED else ""
+    if change := {**DAMAGED, **SPECIFIED, **OF_LEARNERS}[damage]:
+        arrays, about = checkpoint.load(saved, kind="scheduler")
+        change(arrays, about)
+        checkpoint.save(path, arrays, about, kind="scheduler")
+    else:
+        path.write_bytes(saved.read_bytes()[:-200])
+    if damage in SPECIFIED:
+        monkeypatch.setattr(networks, "_orthogonal", MagicMock(side_effect=MemoryError("weights of that size")))
+    for load in [Learner.load] if damage in OF_LEARNERS else [Learner.load, Actor.load]:
+        found = refused(checkpoint.CheckpointError, f"^{re.escape(str(path))}{said}", load, path)
+        assert str(found).count(str(path)) == 1
 
 
 def test_an_archive_that_grows_when_it_is_unpacked_is_not_unpacked(tmp_path):
@@ -183,8 +147,7 @@ def test_an_archive_that_grows_when_it_is_unpacked_is_not_unpacked(tmp_path):
         for _ in range(MAX_BYTES // 2**20 + 1):
             file.write(bytes(2**20))
     assert path.stat().st_size < 2**20
-    with pytest.raises(checkpoint.CheckpointError, match="unpacked it has"):
-        Actor.load(path)
+    refused(checkpoint.CheckpointError, "unpacked it has", Actor.load, path)
 
 
 @pytest.mark.parametrize("spec", [select(), WAIT], ids=lambda s: s.action)
@@ -246,3 +209,106 @@ def test_a_minibatch_is_clipped_where_its_ratio_leaves_the_range():
     assert found.policy_loss == pytest.approx(-(1.2 - 2.0) / 2) and found.value_loss == pytest.approx((4 + 4) / 2)
     assert found.moved == pytest.approx(2.0 - 1.0 - np.log(2.0)) and found.clipped == 1.0
     assert (found.steps, found.skipped) == (1, 0)
+
+
+HARD = StateLayout(("age", "pose", "semantics"), dim=4)
+
+
+@pytest.fixture(params=["select", "wait"])
+def spec(request) -> Spec:
+    return Spec(request.param, HARD, OMEGAS_MS if request.param == "wait" else ())
+
+
+EXTREME_AGES_MS = [0.0, -0.0, 1e12, -1e12, np.inf, -np.inf, np.nan, 5e-324, 1.7e308, 80.0]
+EXTREMES = np.array([np.nan, np.inf, -np.inf, 3.4e38, -3.4e38, 1e-45, 0.0, -0.0, 1.0, 1e20])
+
+
+def finite(learner: Learner, diagnostics: Diagnostics | None = None) -> None:
+    assert all(np.isfinite(w).all() for w in learner.actor.weights.values())
+    if diagnostics is not None:
+        d = diagnostics
+        assert np.isfinite((d.policy_loss, d.value_loss, d.entropy, d.moved, d.clipped, d.gradient)).all()
+        assert d.skipped == 0
+
+
+def decide_and_learn(learner: Learner, states: list[State], rewards=None) -> Diagnostics:
+    actions, logps = learner.act(states)
+    assert np.isfinite(logps).all() and (logps <= 1e-9).all()
+    given = np.random.default_rng(0).standard_normal(len(states)) if rewards is None else rewards
+    diagnostics = learner.update(learner.batch(states, actions, logps, given))
+    finite(learner, diagnostics)
+    assert np.isfinite(learner.value(states)).all()
+    return diagnostics
+
+
+@pytest.mark.stability
+def test_extreme_ages(spec):
+    n = len(EXTREME_AGES_MS)
+    states = []
+    for shift in range(n):
+        s = state(n, np.random.default_rng(shift), d=4)
+        states.append(replace(s, ages_ms=np.roll(EXTREME_AGES_MS, shift), reported=np.ones(n, bool)))
+    assert np.isfinite(HARD.batch(states)).all()
+    for _ in range(3):
+        decide_and_learn(Learner(spec, 0), states)
+    order = np.argsort(StateLayout(("age",)).features(states[0])[[0, 9, 2], 0])
+    np.testing.assert_array_equal(order, [0, 1, 2])  # 0, 80 and 1e12 ms stay in order
+
+
+@pytest.mark.parametrize("part", ["poses", "embeddings"])
+@pytest.mark.stability
+def test_extreme_poses_and_embeddings(spec, part):
+    rng = np.random.default_rng(1)
+    states = []
+    for _ in range(16):
+        s = state(6, rng, d=4)
+        array = rng.choice(EXTREMES, getattr(s, part).shape).astype(getattr(s, part).dtype)
+        states.append(replace(s, **{part: array}))
+    assert np.abs(HARD.batch(states)).max() <= max(8.0, np.log1p(HARD.oldest_ms / HARD.age_scale_ms))
+    decide_and_learn(Learner(spec, 0), states)
+    seen = np.concatenate([s.embeddings for s in states if s.embeddings is not None]).astype(np.float64)
+    fitted = HARD.standardized(seen)
+    assert np.isfinite(fitted.batch(states)).all()
+    decide_and_learn(Learner(replace(spec, layout=fitted), 0), states)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("reward", [0.873, 1e90])
+def test_constant_reward_moves_the_policy_nowhere(spec, reward):
+    learner = Learner(replace(spec, entropy=0.0), 0)
+    before = learner.actor.weights
+    states = [state(6, np.random.default_rng(i), d=4) for i in range(32)]
+    for _ in range(10):
+        diagnostics = decide_and_learn(learner, states, np.full(32, reward))
+        assert diagnostics.explained is None and diagnostics.reward == pytest.approx(reward)
+    assert all(np.array_equal(w, learner.actor.weights[name]) for name, w in before.items())
+
+
+@pytest.mark.stability
+def test_rewards_that_are_no_numbers_are_left_out_and_counted():
+    learner, problem = Learner(Spec("select", FreshOnes.layout), 0), FreshOnes()
+    for number in range(10):
+        batch = collect(learner, problem, range(64 * number, 64 * number + 64))
+        batch.rewards[::3] = [np.nan, np.inf, -np.inf, 1e200] * 5 + [np.nan, -1e300]
+        diagnostics = learner.update(batch)
+        finite(learner, diagnostics)
+        assert diagnostics.dropped == 22
+    assert regret(learner, problem) < 0.03
+    nothing = collect(learner, problem, range(8))
+    nothing.rewards[:] = np.nan
+    diagnostics = learner.update(nothing)
+    assert diagnostics.steps == 0 and diagnostics.dropped == 8 and diagnostics.reward is None
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("claimed", [-1e300, -800.0, -50.0, 0.0])
+def test_ratios_that_overflow(spec, claimed):
+    """Log-probabilities that another policy, or a damaged record, claims."""
+    learner = Learner(spec, 0)
+    states = [state(6, np.random.default_rng(i), d=4) for i in range(32)]
+    actions, _ = learner.act(states)
+    rewards = np.random.default_rng(1).standard_normal(32)
+    for _ in range(5):
+        finite(learner, learner.update(learner.batch(states, actions, np.full(32, claimed), rewards)))
+    diagnostics = learner.update(learner.batch(states, actions, np.full(32, np.nan), rewards))
+    assert diagnostics.dropped == 32

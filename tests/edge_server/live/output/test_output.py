@@ -1,12 +1,13 @@
-"""What a live edge writes and tells: the journal, whatever the disk; metrics while ingest goes on."""
+"""What a live edge writes and tells, and never waits: journal and recording, whatever the disk; metrics."""
 
 from __future__ import annotations
 
 import json
 import re
+import threading
 from collections import Counter
 from types import SimpleNamespace
-from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
@@ -14,8 +15,11 @@ from prometheus_client import CollectorRegistry, generate_latest
 from edge_server.live.ingest import DepthArrivals
 from edge_server.live.output.journal import Journal
 from edge_server.live.output.prometheus import EdgeCollector
+from edge_server.live.output.recorder import Recorder
 from edge_server.live.state import CameraView, Publication
+from freshfield.frame import to_request
 from tests.conftest import ROOT
+from tests.edge_server.frames import frame
 from tests.edge_server.page.preview import bare_state
 from tests.freshfield.test_files import no_file_longer_than
 
@@ -35,7 +39,10 @@ def test_series_keeps_the_order_of_publication_and_waits_for_scores(tmp_path):
     journal.scored(publication(1, 21.0), final=True)  # out of order: number 0 is still open
     assert lines(tmp_path / "series.jsonl") == []
     journal.scored(publication(0, 20.0), final=True)
+    journal.ages(0.25, {"cam01": 12.3456, "cam02": None}, {"cam01": 212.3456})
     journal.close()
+    age = {"t_s": 0.25, "age_ms": {"cam01": 12.346, "cam02": None}, "depth_age_ms": {"cam01": 212.346}}
+    assert lines(tmp_path / "ages.jsonl") == [age]
     assert [(s["number"], s["psnr_db"]) for s in lines(tmp_path / "series.jsonl")] == [(0, 20.0), (1, 21.0), (2, None)]
 
 
@@ -46,17 +53,6 @@ def test_a_score_that_never_comes_holds_nothing_up(tmp_path):
     assert len(lines(tmp_path / "series.jsonl")) == 68
     journal.close()
     assert len(lines(tmp_path / "series.jsonl")) == 100
-
-
-def test_status_and_ages_are_json_with_nulls_not_nan(tmp_path):
-    journal = Journal(tmp_path, lambda: {"updates": {"count": 3}})
-    journal.ages(0.25, {"cam01": 12.3456, "cam02": None})
-    journal.ages(0.5, {"cam01": 12.0}, {"cam01": 212.3456})
-    journal.close()
-    assert json.loads((tmp_path / "edge.json").read_text()) == {"updates": {"count": 3}}
-    without_depth, with_depth = lines(tmp_path / "ages.jsonl")
-    assert without_depth == {"t_s": 0.25, "age_ms": {"cam01": 12.346, "cam02": None}}
-    assert with_depth == {"t_s": 0.5, "age_ms": {"cam01": 12.0}, "depth_age_ms": {"cam01": 212.346}}
 
 
 def test_a_full_disk_costs_lines_not_the_edge(tmp_path, caplog):
@@ -124,20 +120,59 @@ def test_every_query_of_the_dashboard_names_a_metric_that_the_edge_exports():
     assert len({(x, y) for x, y, *_ in places}) == len(places) and all(x + w <= 24 for x, _, w, _ in places)
 
 
-def test_grafana_reads_all_of_the_dashboard():
-    """Grafana's published types leave out what they do not know; ``__inputs`` is for its import alone."""
-    models = pytest.importorskip("grafana_foundation_sdk.models.dashboard", reason="needs the extra dev")
-    from grafana_foundation_sdk.cog.encoder import JSONEncoder
-
-    dashboard = json.loads((ROOT / "deploy/grafana.json").read_text())
-    read = json.loads(json.dumps(models.Dashboard.from_json(dashboard), cls=JSONEncoder))
-    assert lost(dashboard, read) == ["/__inputs"]
+PUBLICATION = Publication(3, 1.5, 10**9, None, ("cam01", "cam02"), (10.0, 20.0), 15.0, 5.0, 7, 0.25)
+SENT = [(to_request(frame("cam01", number)), number) for number in range(40)]
 
 
-def lost(sent: Any, read: Any, where: str = "") -> list[str]:
-    """What of ``sent`` is not in ``read``, which may have more."""
-    if isinstance(sent, dict) and isinstance(read, dict):
-        return [each for k, v in sent.items() for each in lost(v, read.get(k), f"{where}/{k}")]
-    if isinstance(sent, list) and isinstance(read, list) and len(sent) == len(read):
-        return [each for k, pair in enumerate(zip(sent, read)) for each in lost(*pair, f"{where}/{k}")]
-    return [] if sent == read else [where]
+@pytest.fixture
+def mcap(tmp_path):
+    """The file of a recording."""
+    pytest.importorskip("mcap", reason="MCAP is not installed (extra mcap)")
+    return tmp_path / "a.mcap"
+
+
+def test_what_finds_no_room_in_a_recording_is_dropped_and_counted_and_nobody_waits(mcap, monkeypatch):
+    from freshfield.session.reader import Session
+
+    monkeypatch.setattr("edge_server.live.output.recorder._MAX_QUEUE_MESSAGES", 10)
+    recorder = Recorder(mcap, "test")
+    stuck, go_on = threading.Event(), threading.Event()
+    write = recorder._writer.frame
+
+    def slow_disk(request, arrived_ns: int) -> None:
+        stuck.set()
+        assert go_on.wait(10)
+        write(request, arrived_ns)
+
+    recorder._writer.frame = slow_disk
+    recorder.frame(*SENT[0])
+    assert stuck.wait(10)
+    for message in SENT[1:]:
+        recorder.frame(*message)
+    assert recorder.dropped == len(SENT) - 1 - 10
+    go_on.set()
+    recorder.close()
+    session = Session(mcap)
+    kept = [(f.arrived_ns, session.payload(f)) for f in session.frames["cam01"]]
+    assert kept == [(number, request.payload) for request, number in SENT[:11]]
+
+
+def test_a_full_disk_ends_the_recording_and_nothing_else(mcap, caplog):
+    recorder = Recorder(mcap, "test")
+    recorder._writer.frame = MagicMock(side_effect=OSError(28, "No space left on device"))
+    for message in SENT[:6]:
+        recorder.frame(*message)
+    recorder.close()
+    assert "recording ended: [Errno 28] No space left" in caplog.text
+    assert recorder.status() == {"file": "a.mcap", "written": 0, "dropped": 6, "failed": True}
+    recorder.published(PUBLICATION)
+    assert recorder.dropped == 7
+
+
+def test_a_server_that_starts_again_keeps_its_first_recording(mcap):
+    files = []
+    for _ in range(3):
+        recorder = Recorder(mcap, "test")
+        recorder.close()
+        files.append(recorder.file.name)
+    assert files == ["a.mcap", "a-2.mcap", "a-3.mcap"]

@@ -1,4 +1,4 @@
-"""``edge-server frontier``: repeatable, resumable, and its tables and figures say what was measured."""
+"""What accuracy costs in time: measured repeatably, told in tables and figures; the best point at a speed."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ import json
 from dataclasses import replace
 
 import pytest
+from msgspec import structs
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.frontier import from_scratch, frontier_command, update_time
-from edge_server.experiments.frontier.output import recommendation, table
+from edge_server.experiments.frontier.output import recommendation
 from edge_server.experiments.virtual import costs
-from edge_server.live.frontier import read_frontier
+from edge_server.live.frontier import best_point, read_frontier
+from edge_server.run_records import FrontierPoint
 from edge_server.settings import ComputeConfig
 from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS
+from tests.support import refused
 
 TINY = update_time.MovingScene(cameras=4, size=32)
-COMPUTE = ComputeConfig(ms_per_step=30.0, ms_per_update=10.0)
 
 
 def test_an_update_time_point_is_the_same_bit_for_bit_whatever_ran_before():
-    medium, layers = (
-        update_time.Variant("ngp", False, SMALL),
-        update_time.Variant("splat", True, {"gaussians": 64, "start": 32}),
-    )
-    run = update_time.MovingRun(TINY, 1.0, medium, 5, 0.1, 0.6, COMPUTE, lead_s=0.5)
+    medium = update_time.Variant("ngp", False, SMALL)
+    layers = update_time.Variant("splat", True, {"gaussians": 64, "start": 32})
+    run = update_time.MovingRun(TINY, 1.0, medium, 5, 0.1, 0.6, ComputeConfig(30.0, 10.0), lead_s=0.5)
     first = update_time.run_updates(run)
     update_time.run_updates(replace(run, update_s=0.4))
     assert update_time.run_updates(run) == first
@@ -40,14 +40,8 @@ def test_an_update_time_point_is_the_same_bit_for_bit_whatever_ran_before():
 def test_a_cycle_is_charged_a_frame_of_each_camera_and_layers_every_frame(layers, charged, monkeypatch):
     measured = {"ms_per_step": 0.5, "ms_per_update": 20.0, "ms_per_view": 2.0}
     monkeypatch.setattr(costs, "measure", lambda scenario, seconds: {"compute": measured})
-    assert (
-        tuple(
-            update_time.measure_compute(
-                update_time.Charged(TINY, 1.0, update_time.Variant("splat", layers, {}))
-            ).values()
-        )
-        == charged
-    )
+    of = update_time.Charged(TINY, 1.0, update_time.Variant("splat", layers, {}))
+    assert tuple(update_time.measure_compute(of).values()) == charged
 
 
 def test_the_front_is_what_nothing_beats_in_both():
@@ -55,8 +49,6 @@ def test_the_front_is_what_nothing_beats_in_both():
     rows = [{"planned_s": planned_s, "psnr_db": psnr_db} for planned_s, psnr_db in points]
     from_scratch.mark_front(rows)
     assert [row["on_front"] for row in rows] == [True, False, True, False, True]
-    measured = {"field": "ngp", "seconds": 1.0, "steps": 3, "ms_per_step": 2.0, "ssim": 0.5, "lpips": None}
-    assert "| ngp | 1.00 | 3 | 2.00 | 20.00 | 0.500 | - | * |" in table([{**rows[0], **measured}])
 
 
 def test_seeds_are_averaged_with_their_standard_error():
@@ -105,3 +97,40 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
     again = (tmp_path / "results.jsonl").read_text().splitlines()
     assert again == lines, "virtual time gives the same point again"
     assert json.loads((tmp_path / "frontier.json").read_text())["updates"] == data["updates"]
+
+
+# Milliseconds an update, dB of the whole image and of what moves, meters a second.
+POINTS = [
+    FrontierPoint(100.0, 20.0, 18.0, 1.0),
+    FrontierPoint(400.0, 21.0, 17.5, 1.0),
+    FrontierPoint(400.0, 24.0, 17.0, 1.0),
+    FrontierPoint(2000.0, 24.5, 14.0, 1.0),
+    FrontierPoint(100.0, 19.0, 17.0, 4.0),
+    FrontierPoint(400.0, 19.0, 13.0, 4.0),
+]
+
+
+def test_of_points_that_seeds_cannot_tell_apart_the_quickest_is_chosen():
+    assert best_point(POINTS, 1.0) == POINTS[2], "longer updates show an older world"
+    assert best_point(POINTS, 3.0) == POINTS[4], "the speed nearest in ratio"
+    unsure = [structs.replace(p, error_db=1.0) for p in POINTS]  # the best leads by 1.5, of which 1.4 may be chance
+    assert best_point(unsure, 1.0) == unsure[2]
+    unsure = [structs.replace(p, error_db=1.2) for p in POINTS]
+    assert best_point(unsure, 1.0) == unsure[0]
+    assert best_point(unsure, 3.0) == unsure[4]
+
+
+def test_points_are_read_and_errors_say_what_to_do(tmp_path):
+    shipped = read_frontier(None, "ngp")
+    assert len({p.update_ms for p in shipped}) >= 2 and all(p.update_ms > 0 for p in shipped)
+    refused(ValueError, "edge-server frontier --field nothing", read_frontier, None, "nothing")
+    for text in ("", "[]", '{"updates": [{}]}', '{"updates": [], "updates": []}'):
+        (tmp_path / "f.json").write_text(text)
+        refused(ValueError, r"f\.json: not a frontier", read_frontier, tmp_path / "f.json", "ngp")
+    row = {"field": "splat", "options": {}, "speed_m_per_s": 1.0, "update_s": 0.1, "psnr_db": 30.0}
+    row |= {"psnr_moving_db": 20.0, "shown_psnr_db": 25.0, "shown_psnr_moving_db": 15.0}
+    layers = row | {"options": {"layers": True}, "shown_psnr_db": 29.0}
+    (tmp_path / "f.json").write_text(json.dumps({"updates": [row, layers]}))
+    (plain,), (layered,) = (read_frontier(tmp_path / "f.json", "splat", layers=known) for known in (False, True))
+    assert plain.psnr_db == 25.0 and plain.mean_db == 20.0, "by what was shown"
+    assert layered.psnr_db == 29.0

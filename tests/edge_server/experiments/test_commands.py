@@ -1,0 +1,105 @@
+"""Commands: what they cannot do is refused in one line; ``compare`` pairs policies by seed, on anybody's channel."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from edge_server.cli import main
+from edge_server.experiments import compare
+from edge_server.experiments.common.arguments import OptionError
+from edge_server.experiments.common.channels import read_channel
+from edge_server.experiments.fitting import fit
+from edge_server.experiments.virtual import simulate
+from freshfield.scenario import ScenarioError
+from tests.edge_server.experiments.rollouts.small import RAW
+from tests.edge_server.experiments.sets import SMALL_WORDS, write_photos
+from tests.support import refusal, refused
+
+QUICK = {"fit": SMALL_WORDS, "frontier": ["--quick"], "study": ["--quick"]}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("compare SMALL hope", "hope"),
+        ("compare SMALL all --channel sms", "sms"),
+        ("compare nowhere all", "shipped scenarios"),
+        ("fit SET --option levels", "expected KEY=VALUE"),
+        ("fit SET --resume", "no fit to go on from"),
+        ("fit tile --scale 0", "--scale 0: expected more than 0"),
+        ("frontier --scene nowhere", "no such file or folder"),
+        ("frontier --field splot", "field 'splot' is not known (did you mean splat?); there are: ngp"),
+        ("run room --seconds=nan", "expected 0 to 1e+09"),
+        ("run room --checkpoint-every=1e300", "expected 0 to 1e+09"),
+        ("simulate SMALL --compute=-1:0", "--compute"),
+        ("simulate SMALL --seconds 0", "--seconds"),
+        ("study mat --jobs 0", "--jobs: expected at least 1"),
+        ("study mat --scene cell", "its camera moves"),
+        ("study ppo-wait --scene tower", "scenes of its own"),
+        ("train-scheduler room --parts age,smell", "no smell"),
+        ("train-scheduler room --omegas 20,60", "--kind select chooses cameras"),
+        ("train-scheduler room --kind wait --omegas 20,soon", "expected milliseconds such as"),
+        ("viewpoints tile --budget many", "expected views"),
+        ("viewpoints tile --budget 4 --selector ppo:none.npz", "not a viewpoint policy"),
+        ("viewpoints tower --budget 4", "its cameras look outward"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_one_line(words: str, said: str, tmp_path, capsys) -> None:
+    """SMALL: a scenario, SET: a data set."""
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(RAW))
+    if "SET" in words:
+        write_photos(tmp_path / "set", 3)
+    places = {"SMALL": str(tmp_path / "small.yaml"), "SET": str(tmp_path / "set")}
+    command, *given = [places.get(word, word) for word in words.split()]
+    out = tmp_path / "out"
+    written = ["--out", str(out)]
+    if command == "compare":  # results: a line for each run
+        written = ["--json", str(out / "scores.json"), "--results", str(out / "results.jsonl")]
+    assert said in refusal(capsys, main, command, *QUICK.get(command, []), *given, *written)
+    assert not out.is_file() and not any(path.is_file() and path.stat().st_size for path in out.rglob("*"))
+
+
+@pytest.mark.parametrize("check", [fit.check_seconds, simulate.check_seconds])
+def test_a_time_is_more_than_nothing_and_at_most_a_million_seconds(check):
+    check(1e-9)
+    check(1e6)
+    for seconds in (0.0, -1.0, 1e6 + 0.5, float("nan"), float("inf")):
+        refused((OptionError, ScenarioError), "more than 0 and at most 1e6", check, seconds)
+
+
+def test_a_channel_is_a_preset_a_scenario_or_a_section_alone(tmp_path: Path):
+    assert read_channel("ch5") == ({"preset": "ch5"}, "ch5")
+    (tmp_path / "delays.txt").write_text("10\n20\n")
+    section = {"service": "trace:delays.txt", "discipline": "fcfs"}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(section))
+    found, name = read_channel(str(tmp_path / "mine.yaml"))
+    assert name == "mine" and found["service"] == f"trace:{tmp_path / 'delays.txt'}"
+    (tmp_path / "whole.yaml").write_text(yaml.safe_dump({**RAW, "channel": section}))
+    assert read_channel(str(tmp_path / "whole.yaml"))[0] == found
+    (tmp_path / "wrong.yaml").write_text("{discipline: sometimes}")
+    for text in (str(tmp_path / "wrong.yaml"), str(tmp_path / "none.yaml"), "sms"):
+        refused(ScenarioError, "--channel", read_channel, text)
+
+
+def test_the_command_compares_and_goes_on(tmp_path: Path, capsys, monkeypatch):
+    monkeypatch.setattr(compare, "LEAD_S", 0.6)
+    edge = {**RAW["edge"], "steps": 2, "updates": "arrivals", "update_ms": 50, "compute": {"ms_per_step": 2.0}}
+    scenario, out = tmp_path / "small.yaml", tmp_path / "scores.json"
+    scenario.write_text(yaml.safe_dump({**RAW, "edge": edge}))
+    words = [str(scenario), "all", "freshest-k:2", "--seeds", "2", "--seconds", "0.5", "--jobs", "1"]
+    words += ["--json", str(out), "--results", str(tmp_path / "known.jsonl"), "--channel", "ch6-slow"]
+    monkeypatch.setattr("edge_server.embed.make_embedder", lambda _: pytest.fail("no policy looks at embeddings"))
+    assert compare.main(words) == 0
+    printed = capsys.readouterr().out
+    assert "freshest-k:2" in printed and "minus all" in printed
+    found = json.loads(out.read_text())
+    assert found["compute"]["ms_per_step"] == 2.0 and found["policies"]["freshest-k:2"]["views"][0] <= 2.0
+    everything, fresh = (found["policies"][name] for name in ("all", "freshest-k:2"))
+    assert everything["psnr_db"][0] > 5.0 and everything["psnr_db_over_all"] == [0.0, 0.0, 0.0]
+    assert fresh["psnr_db_over_all"][0] == pytest.approx(fresh["psnr_db"][0] - everything["psnr_db"][0])
+    known = (tmp_path / "known.jsonl").read_bytes()
+    assert compare.main(words) == 0 and (tmp_path / "known.jsonl").read_bytes() == known
