@@ -40,12 +40,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # waits for what has seconds to come: whoever runs beside it changes nothing but how long it takes.
 _ALONE = (
     "camera_node/robot/arm/test_drive.py",
-    "camera_node/robot/arm/test_joint_states.py",
     "camera_node/robot/simulated_controller/test_controller.py",
     "camera_node/robot/teleop/test_teleop_command.py",
-    "camera_node/robot/test_flange_camera.py",
     "camera_node/sources/devices/test_live.py",
-    "camera_node/test_capture.py",
     "camera_node/test_clock_offset.py",
     "camera_node/test_node.py",
     "deploy/test_up.py",

@@ -53,8 +53,7 @@ def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path,
     assert "valid" in printed(capsys, "scenario", "check", str(mine))
     assert "exists" in refused(capsys, "scenario", "init", str(mine))
     assert mine.read_text() == text
-    for odd in ("a: b.yaml", "mine.txt"):
-        assert "expected a name" in refused(capsys, "scenario", "init", str(tmp_path / odd))
+    assert "expected a name" in refused(capsys, "scenario", "init", str(tmp_path / "a: b.yaml"))
     number = tmp_path / "plain" / "123.yaml"  # which YAML would not read as text
     printed(capsys, "scenario", "init", str(number), "--like", "quad")
     assert "valid" in printed(capsys, "scenario", "check", str(number))
@@ -67,10 +66,8 @@ def test_check_reads_every_section(tmp_path, capsys):
     for section, wrong in (
         ("source: {kind: mcap, file: a.mcap}", "cameras.phase: spread is for source.kind world alone"),
         ("source: {kind: world, scene: castle}", "source: .*castle"),
-        ("source: {kind: world, effects: {rain: null}}", "source.effects: effect 'rain' is not known"),
         ("source: {kind: world, effects: {OWN:Darker: {counts: 256}}}", "Darker.counts: expected .*0 to 255, got 256"),
         ("source: {kind: OWN:Turning, level: 256}", "source.level: expected .*0 to 255, got 256"),
-        ("edge: {policy: {name: freshest}}", "edge.policy: policy 'freshest' is not known"),
         ("edge: {policy: {name: freshest-k, value: 0.5}}", "edge.policy: k: expected a whole number"),
         ("edge: {field: OWN:Flat, field_options: {level: 2}}", "edge.field: flat.level: expected .*0 to 1, got 2"),
         ("channel: {faults: {rain: 1}}", "channel.faults.rain"),
@@ -80,15 +77,6 @@ def test_check_reads_every_section(tmp_path, capsys):
         source = "" if section.startswith("source") else "source: {kind: world, scene: room}\n"
         file.write_text(f"cameras: {{count: 4, phase: spread}}\n{source}{section.replace('OWN', str(OWN))}\n")
         assert re.search(wrong, refused(capsys, "scenario", "check", str(file)))
-
-
-def test_keys_of_a_section_and_of_all(capsys):
-    everything = printed(capsys, "scenario", "keys")
-    keys = {"source": "source: {kind: realsense, ...}", "effects": "sensor_noise (acts on: image)"}
-    for section, key in {**keys, "edge": "edge.field_options of field splat"}.items():
-        part = printed(capsys, "scenario", "keys", section)
-        assert key in part and part.strip() in everything
-    assert "there are: cameras" in refused(capsys, "scenario", "keys", "camera")
 
 
 @pytest.mark.parametrize(
@@ -159,7 +147,7 @@ def test_every_camera_has_a_first_image(file):
     if isinstance(config, LiveConfig):
         pytest.skip("needs cameras: tests/camera_node/sources/devices has them")
     if getattr(config, "arm", None) is not None:
-        pytest.skip("needs an arm: tests/camera_node/robot/test_flange_camera.py has one")
+        pytest.skip("needs an arm: tests/camera_node/robot/simulated_controller has one")
     folder = getattr(config, "data", "")
     data = data_dir(folder.split("/")[0]).parent if folder else None
     # One trained and one held-out camera: a world takes a while to prepare each.

@@ -1,5 +1,6 @@
 """The launcher with the real processes: runs that end as asked, and runs in which a process dies; that of a simulated
-arm, and which processes start in which order."""
+arm, and which processes start in which order; the folders that a run may use, since a mistyped --out must never cost
+anybody a file; and the line that the launcher prints."""
 
 import json
 import os
@@ -10,7 +11,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,9 +23,10 @@ from freshfield_up.cli import main
 from freshfield_up.commands import ProcessSet
 from freshfield_up.demo_command import seconds
 from freshfield_up.deployment import DeploymentError
-from freshfield_up.folder import EARLIER, prepare
+from freshfield_up.folder import EARLIER, KEY, MARKER, FolderError, forget_earlier, prepare
 from freshfield_up.processes import Child
-from freshfield_up.status import read_json
+from freshfield_up.status import read_json, status_line
+from freshfield_up.summary import summarize
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde
 from tests.support import free_port, refused, wait_until
 
@@ -40,25 +41,6 @@ edge: {field: ngp, update_ms: 300, lpips: none}
 """
 SLEEPS = "import time; time.sleep(60)"
 pytestmark = pytest.mark.timeout(600)
-
-
-class Up:
-    """A running launcher; its output goes to a file."""
-
-    def __init__(self, folder: Path, *options: str, scenario: str = SMALL) -> None:
-        self.out = folder / "run"
-        self.port = free_port()
-        file = folder / "small.yaml"
-        file.write_text(scenario)
-        self._log = folder / "output.txt"
-        words = [str(file), "--out", str(self.out), "--port", str(self.port), *options]
-        with self._log.open("wb") as log:
-            command = [sys.executable, "-m", "freshfield_up.cli", "demo", *words]
-            self.process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
-
-    @property
-    def output(self) -> str:
-        return self._log.read_text()
 
 
 @pytest.fixture
@@ -88,18 +70,6 @@ def test_a_process_that_dies_ends_the_run_is_named_and_the_others_are_stopped(as
     assert not any(child.running for child in made.children) and made.emulator.process is None
     rows = [json.loads(line) for line in (run.options.out / "processes.jsonl").read_text().splitlines()]
     assert rows[0]["edge"]["pid"] == made.edge.pid and "machine" in rows[0]
-
-
-def test_a_trouble_is_said_once_of_each_camera_though_its_numbers_change(asleep):
-    run, said = asleep("pass"), []
-    run._say = said.append
-    run.options.out.mkdir()
-    first = [f"cam0{k}: its poses drift: the picture asks for 9 cm and .5 degrees" for k in range(2)]
-    plugin = "policy Mine failed 3 times: all views were used"
-    for troubles in ([*first, plugin], [first[0].replace("9 cm", "1e+03 cm"), plugin.replace("3", "14")]):
-        (run.options.out / "edge.json").write_text(json.dumps({"troubles": troubles}))
-        run._say_troubles()
-    assert said == [f"note: {line}" for line in (*first, plugin)]
 
 
 def test_a_recording_that_is_over_before_the_first_update_ends_the_run_well(asleep, capfd, monkeypatch):
@@ -135,26 +105,11 @@ def test_ctrl_c_ends_a_run_and_a_second_one_kills(asleep, capfd):
     assert "stopping (Ctrl-C)" in said and "the node did not end in time and was killed" in said
 
 
-def test_a_start_that_fails_says_why_and_costs_no_earlier_run(tmp_path):
-    prepare(tmp_path / "run", {}).close()
-    (tmp_path / "run" / "report.json").write_text("{}")
-    run = Up(tmp_path, "--policy", "foo")
-    assert run.process.wait(90.0) == 1
-    assert "'foo' is not known" in run.output and "ended by itself with exit code 2" in run.output
-    assert run.output.endswith(f"the run was never up; an earlier run's files are in {run.out / EARLIER}\n")
-    assert (run.out / EARLIER / "report.json").exists()
-
-
-def test_times_and_commands_are_read_and_written_as_people_write_them(asleep):
+def test_times_and_commands_are_read_and_written_as_people_write_them():
     assert [seconds(text) for text in ("60", "60s", "1.5m", "2h", "0")] == [60.0, 60.0, 90.0, 7200.0, 0.0]
     assert launcher.command_line(["/usr/bin/freshfield", "demo", "my file"]) == "freshfield demo 'my file'"
     assert launcher.command_line(["/lib/freshfield_up/__main__.py", "demo"]) == "freshfield demo"
     assert launcher.command_line(["examples/deployment.py", "card", "6"]) == "python examples/deployment.py card 6"
-    run = asleep("pass")
-    run._ready_s = 100.0
-    assert run._headline(112.9) == "12 of 60 s"
-    run.options = replace(run.options, duration_s=0.0)
-    assert run._headline(112.9) == "12 s"
 
 
 def test_what_cannot_run_is_refused_in_one_line_before_anything_starts(tmp_path, capsys):
@@ -164,8 +119,6 @@ def test_what_cannot_run_is_refused_in_one_line_before_anything_starts(tmp_path,
         assert said.count("\n") == 1 and not (tmp_path / "new").exists()
         return said
 
-    (typo := tmp_path / "typo.yaml").write_text(SMALL.replace("cameras:", "camera:"))
-    assert "did you mean 'cameras'?" in refusal(typo, free_port())
     assert "shipped scenarios: " in refusal("no-such-scenario", free_port())
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -206,21 +159,111 @@ def test_the_cell_runs_from_one_command(tmp_path):
     mount = CELL.path.parent / CELL.source["arm"]["cameras"]["hand"]
     text = CELL.path.read_text().replace("../lab/hand-eye-example.yaml", str(mount))
     text = re.sub(r"host: \S+", f"host: {own_address()}", text)
-    text = text.replace("width: 128", "width: 48").replace("height: 128", "height: 48")
-    run = Up(tmp_path, scenario=text)
+    (tmp_path / "cell.yaml").write_text(text.replace("width: 128", "width: 48").replace("height: 128", "height: 48"))
+    words = [str(tmp_path / "cell.yaml"), "--out", str(out := tmp_path / "run"), "--port", str(free_port())]
+    process = subprocess.Popen([sys.executable, "-m", "freshfield_up.cli", "demo", *words])
     try:
-        wait_until(
-            lambda: read_json(run.out / "edge.json").get("updates", {}).get("count", 0) >= 30, "no updates", 400.0
-        )
-        run.process.terminate()
-        assert run.process.wait(300.0) == 0, run.output
+        wait_until(lambda: read_json(out / "edge.json").get("updates", {}).get("count", 0) >= 30, "no updates", 400.0)
+        process.terminate()
+        assert process.wait(300.0) == 0
     finally:
-        run.process.kill()
-    frames = read_json(run.out / "report.json")["frames"]
+        process.kill()
+    frames = read_json(out / "report.json")["frames"]
     assert frames["closes"] and frames["by_camera"]["hand"]["delivered"] > 5
-    assert "43 viewpoints in 62 stops\n" in (run.out / "log-driver.txt").read_text()
+    assert "43 viewpoints in 62 stops\n" in (out / "log-driver.txt").read_text()
     # The arm sets out when the field can learn: after the emulator, which waits for the edge to serve.
     # All may begin within one row; but processes are numbered in their order.
-    last = json.loads((run.out / "processes.jsonl").read_text().splitlines()[-1])
+    last = json.loads((out / "processes.jsonl").read_text().splitlines()[-1])
     numbers = int(Path("/proc/sys/kernel/pid_max").read_text())
     assert 0 < (last["driver"]["pid"] - last["emulator"]["pid"]) % numbers < numbers // 2
+
+
+def test_an_earlier_run_outlives_starts_that_fail(tmp_path):
+    prepare(tmp_path, {"run": 1}).close()
+    (tmp_path / "report.json").write_text("good")
+    for failed in (2, 3):
+        prepare(tmp_path, {"run": failed}).close()
+        (tmp_path / "log-edge.txt").write_text(f"start {failed} failed")
+    assert [p.name for p in (tmp_path / EARLIER).iterdir()] == ["report.json"]
+    assert {p.name for p in tmp_path.iterdir()} == {MARKER, EARLIER, "log-edge.txt"}
+
+
+def test_a_start_that_is_killed_before_its_marker_is_written_or_while_it_moves_files_loses_none(tmp_path):
+    (tmp_path / MARKER).touch()
+    prepare(tmp_path, {"run": 1}).close()
+    for name in ("field.npz", "edge.json"):
+        (tmp_path / name).write_text(name)
+    part = tmp_path / f".{EARLIER}"
+    part.mkdir()
+    (tmp_path / "edge.json").rename(part / "edge.json")
+    prepare(tmp_path, {"run": 2}).close()
+    assert {p.name for p in (tmp_path / EARLIER).iterdir()} == {"field.npz", "edge.json"} and not part.exists()
+
+
+def test_an_earlier_run_is_replaced_and_a_link_in_it_is_not_followed(tmp_path):
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    (precious / "photo").write_text("keep")
+    out = tmp_path / "out"
+    prepare(out, {"run": 1}).close()
+    for name in ("ledger-edge-edge-1.tsv", "frontier.json", ".edge.json.4f.part"):
+        (out / name).write_text("old")
+    (out / "decisions").symlink_to(precious)
+    prepare(out, {"run": 2}).close()
+    forget_earlier(out)
+    assert list(out.iterdir()) == [out / MARKER] and (precious / "photo").read_text() == "keep"
+    assert json.loads((out / MARKER).read_text()) == {KEY: [], "run": 2}
+
+
+@pytest.mark.parametrize(
+    ("marker", "error"),
+    [
+        (None, "not an earlier run's"),
+        (json.dumps({KEY: [1]}), "not of a run of this version"),
+        ("", "not of a run of this version"),
+        (json.dumps({KEY: []}), "holds thesis.tex, which no run wrote"),
+    ],
+)
+def test_anything_else_is_refused_and_left_alone(tmp_path, marker, error):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    (tmp_path / "edge.json").write_text("{}")
+    if marker is not None:
+        (tmp_path / MARKER).write_text(marker)
+    before = {path.name: path.read_text() for path in tmp_path.iterdir()}
+    refused(FolderError, error, prepare, tmp_path, {})
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == before
+
+
+def test_a_run_that_is_still_going_on_and_a_file_in_the_place_of_the_folder_are_refused(tmp_path):
+    with prepare(tmp_path, {"run": 1}), pytest.raises(FolderError, match="another run is writing"):
+        prepare(tmp_path, {"run": 2})
+    assert json.loads((tmp_path / MARKER).read_text()) == {KEY: [], "run": 1}
+    refused(FolderError, "cannot use", prepare, tmp_path / MARKER, {})
+
+
+def test_the_line_says_what_the_processes_wrote_and_what_is_missing_or_damaged_leaves_gaps(tmp_path):
+    nothing = "0/13 cameras; no update yet; no channel yet"
+    assert status_line(tmp_path, 13) == nothing
+    cameras, channel = [{"age_ms": 80.0 + 300 * i} for i in range(13)], {"preset": "ch6", "counts": {"forwarded": 481}}
+    edge = {"cameras": cameras, "updates": {"count": 9, "ms_p50": 812.0}, "scores": {"psnr_db": 25.125}}
+    for name, said in (("edge.json", edge), ("channel.json", channel)):
+        (tmp_path / name).write_text(json.dumps(said))
+    assert status_line(tmp_path, 13) == (
+        "13/13 cameras, age 1880 ms (median); 9 updates, 812 ms each, PSNR 25.12 dB, moving - dB, policy -; "
+        "ch6, forwarded 481, delay error p99 - ms"
+    )
+    (tmp_path / "channel.json").write_text("[1, 2")
+    (tmp_path / "edge.json").write_text(json.dumps({"cameras": "none", "updates": {"count": "many"}}))
+    assert status_line(tmp_path, 13) == nothing
+
+
+def test_the_summary_is_the_conclusion_and_whether_all_frames_are_accounted_for(tmp_path):
+    lost = {"closes": False, "doubts": ["2,014 lines of the ledgers were lost", "another"]}
+    for found, expected in (
+        ({"closes": True, "cut_off": 2}, "; all accounted for, 2 of them cut off by the end of a process\n"),
+        (lost, "; NOT ALL ACCOUNTED FOR: 2,014 lines of the ledgers were lost; another\n"),
+    ):
+        frames, sentences = {"captured": 3, "sent": 3, "delivered": 3, "rejected": {}, **found}, ["Good.", "Late."]
+        (tmp_path / "report.json").write_text(json.dumps({"conclusion": sentences, "frames": frames}))
+        said = summarize(tmp_path)
+        assert said.startswith("\nGood.\nLate.\nframes     3 captured, 3 sent") and expected in said

@@ -1,4 +1,4 @@
-"""Geometry against OpenCV, against SciPy, and against itself."""
+"""Geometry against OpenCV, SciPy and itself; what fixed cameras see, against what can be reckoned by hand."""
 
 import cv2
 import numpy as np
@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from freshfield import geometry
+from freshfield.coverage import MOST_OBLIQUE_DEG, PLAN, plan_svg, reckon
 from freshfield.geometry import (
     GeometryError,
     Pinhole,
@@ -43,11 +44,8 @@ def test_quaternions_and_matrices_agree_with_scipy(q):
 
 @given(quaternions, quaternions)
 def test_products_compose_rotations(a, b):
-    np.testing.assert_allclose(
-        quaternion_to_matrix(geometry.quaternion_multiply(a, b)),
-        quaternion_to_matrix(a) @ quaternion_to_matrix(b),
-        atol=1e-9,
-    )
+    product, whole = quaternion_to_matrix(geometry.quaternion_multiply(a, b)), scipy(a) * scipy(b)
+    np.testing.assert_allclose(product, whole.as_matrix(), atol=1e-9)
 
 
 def test_normalising_survives_any_scale_and_refuses_what_has_no_direction():
@@ -117,15 +115,6 @@ def test_look_at_looks_at(eye, target):
     refused(GeometryError, "", look_at, eye, eye)
 
 
-def test_a_pose_on_a_sphere_looks_at_its_middle_or_away_from_it():
-    away = np.array([0.75**0.5, 0.0, 0.5])
-    for outward, sign in ((False, -1.0), (True, 1.0)):
-        pose = geometry.on_sphere([1.0, 2.0, 3.0], 2.0, 90.0, 30.0, outward)
-        assert pose[:3, 3] == pytest.approx(np.array([1.0, 2.0, 3.0]) + 2.0 * away)
-        assert pose[:3, 2] == pytest.approx(sign * away)
-    assert geometry.on_sphere(np.zeros(3), 1.0, 0.0, 0.0)[:3, 3] == pytest.approx([0.0, -1.0, 0.0])
-
-
 def test_rays_converge_where_least_squares_says():
     rng = np.random.default_rng(0)
     origins = rng.standard_normal((5, 3)) * 4.0
@@ -191,3 +180,53 @@ def test_from_fov_and_world_rays():
     assert directions.shape == (50, 100, 3)
     np.testing.assert_allclose(directions[24:26, 49:51].mean((0, 1)), [0, 1, 0], atol=1e-3)
     assert directions[0, 0] @ [1, 0, 0] < 0 < directions[0, 0] @ [0, 0, 1]  # top left: to -x, upwards
+
+
+LENS = Pinhole.from_fov(100, 100, 70.0)
+# Share of the directions of the sphere within an angle of one of them.
+FACING = (1.0 - np.cos(np.deg2rad(MOST_OBLIQUE_DEG))) / 2.0
+
+
+def camera(azimuth_deg, distance=3.0, height=0.0, lens=LENS):
+    a = np.deg2rad(azimuth_deg)
+    return lens, look_at((distance * np.sin(a), -distance * np.cos(a), height), (0.0, 0.0, 0.0))
+
+
+def test_one_camera_sees_what_faces_it():
+    found = reckon([camera(0)])
+    assert found.seen_by[1] == pytest.approx(FACING, abs=0.02)
+    assert found.parallax_deg is None and found.distance_m == pytest.approx(3.0)
+    assert (found.plan[PLAN // 2, PLAN // 2], found.plan.max(), found.plan.min()) == (1, 1, 0)
+    # One more helps most from behind, where it sees as much again.
+    assert found.further.pose[:3, 3] @ [0, -1, 0] < -2.0
+    assert found.further.seen_by[0] == pytest.approx(1 - 2 * FACING, abs=0.03)
+
+
+def test_two_opposite_cameras_share_nothing_and_two_at_one_place_everything():
+    apart = reckon([camera(0), camera(180)])
+    assert apart.seen_by[2] < 0.02  # beside the axis the two are less than 180 degrees apart
+    assert apart.seen_by[1] == pytest.approx(2 * FACING, abs=0.03)
+    same = reckon([camera(0), camera(0)])
+    assert same.seen_by[1] == 0.0 and same.parallax_deg == pytest.approx(0.0, abs=1e-5)
+    # The parallax is the angle between the cameras.
+    wide, narrow = (reckon([camera(-a), camera(a)]).parallax_deg for a in (20, 10))
+    assert wide / narrow == pytest.approx(2.0, rel=0.1) and 30.0 < wide < 45.0
+    lens = Pinhole.from_fov(100, 100, 20.0)
+    assert reckon([camera(a, lens=lens) for a in (-20, 20)]).seen_by[0] > reckon([camera(-20), camera(20)]).seen_by[0]
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    "poses",
+    [
+        [np.eye(4)],
+        [look_at((0, 0, 3.0), (0, 0, 0), (0, 1, 0))] * 2,  # straight down
+        [look_at((0, 0, 0), (1, 0, 0)), look_at((0, 0, 0), (-1, 0, 0))],  # away from each other
+        [np.eye(4), np.block([[np.eye(3), np.full((3, 1), 1e6)], [np.array([[0, 0, 0, 1.0]])]])],
+    ],
+)
+def test_odd_rigs_give_finite_numbers(poses):
+    found = reckon([(LENS, np.asarray(pose, np.float64)) for pose in poses])
+    assert sum(found.seen_by) == pytest.approx(1.0) and np.isfinite(found.further.pose).all()
+    assert "nan" not in plan_svg({str(k): (LENS, p) for k, p in enumerate(poses)}, found) and "nan" not in found.words
+    refused(ValueError, "no camera", reckon, [])

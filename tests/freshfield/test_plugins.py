@@ -37,7 +37,6 @@ def test_a_module_and_an_entry_point(monkeypatch):
     "name, message",
     [
         ("{file}:Yours", "no class Yours in it; there are: Mine"),
-        ("{folder}/none.py:Mine", "none.py: there is no such file"),
         ("no_such_package:Mine", "cannot be imported: ModuleNotFoundError"),
         ("{folder}/broken.py:Mine", "broken.py: cannot be imported: ZeroDivisionError"),
         ("threshhold", r"policy 'threshhold' is not known \(did you mean threshold\?\); there are: all, threshold"),

@@ -1,9 +1,14 @@
-"""Scenes as their users see them, and their frames on disk. How they look is in golden."""
+"""Scenes as their users see them, their frames on disk, and how they look: five small views of each beside the images
+in ``golden``, so that figures measured on a scene stay figures of that scene. After a wanted change:
+
+    python -m tests.camera_node.synthetic.test_scenes
+"""
 
 import os
 from fractions import Fraction
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,11 +17,11 @@ from camera_node.synthetic import source as source_module
 from camera_node.synthetic.frame_cache import prune
 from camera_node.synthetic.person import loop_length_m, make_walk, walking_person
 from camera_node.synthetic.placement import MovingBody
+from camera_node.synthetic.render import Image
 from camera_node.synthetic.shapes import Box
 from camera_node.synthetic.source import WorldSource
 from freshfield import payload
 from freshfield.geometry import Pinhole, Pose, look_at, world_rays
-from freshfield.settings import ScenarioError
 from tests.support import refused
 
 SMALL = {"width": 48, "height": 48, "supersample": 1}
@@ -57,14 +62,6 @@ def test_the_person_and_the_cart_move_at_the_speed_asked_for(speed):
         assert np.allclose(centers[0], centers[-1], atol=1e-9), "it joins up at the end of the loop"
 
 
-def test_an_invalid_scene_is_refused():
-    for name, params, message in (
-        ("rooom", {}, "valid scenes: drawn_room, room, tile, tower"),
-        ("room", {"people": 5}, "people: expected .*0 to 4"),
-    ):
-        refused(ScenarioError, message, make_scene, name, params)
-
-
 @pytest.mark.parametrize("name", ["room", "tower"])
 def test_a_motion_that_is_drawn_follows_from_its_seed_alone(name):
     def seen(**params) -> np.ndarray:
@@ -76,13 +73,10 @@ def test_a_motion_that_is_drawn_follows_from_its_seed_alone(name):
     assert not any(np.allclose(one, other) for k, one in enumerate(drawn) for other in (own, *drawn[:k]))
 
 
-def test_motions_that_are_drawn_differ_in_speed_direction_start_and_path_and_face_forward():
+def test_walks_that_are_drawn_differ_in_speed_and_direction_and_face_forward():
     walks = [make_walk((0.0, 0.95), (0.74, 0.54), 1.0, seed) for seed in range(40)]
     speeds = [loop_length_m(w) / w.period_s for w in walks]
-    assert 0.68 < min(speeds) < 0.85 and 1.15 < max(speeds) < 1.42
-    assert {w.direction for w in walks} == {1.0, -1.0}
-    assert np.ptp([w.start_s / w.period_s for w in walks]) > 0.8
-    assert np.ptp([w.center[0] for w in walks]) > 0.3 and np.ptp([w.radii[1] for w in walks]) > 0.15
+    assert 0.68 < min(speeds) < 0.85 and 1.15 < max(speeds) < 1.42 and {w.direction for w in walks} == {1.0, -1.0}
     for walk in walks[:9]:
         step = np.subtract(walk.at(0.3 + 1e-6), walk.at(0.3 - 1e-6))
         assert np.allclose(step / np.linalg.norm(step), walk.heading(0.3), atol=1e-5)
@@ -230,3 +224,43 @@ def test_the_first_frame_a_process_writes_makes_room_and_the_longest_unused_goes
     monkeypatch.setattr(frame_cache, "MAX_DISK_BYTES", 1000)
     source(folder=tmp_path).prepare(lambda: False)
     assert not (tmp_path / f"{0:032x}").exists() and len(files(tmp_path)) == 9 + 2
+
+
+GOLDEN = Path(__file__).parent / "golden"
+SHOWN = {
+    "drawn_room": ("drawn_room", {"layout_seed": 2}),
+    "room": ("room", {"people": 2}),
+    "tower": ("tower", {}),
+    "tile": ("tile", {}),
+    "bench": ("tile", {"bench": True}),
+}
+VIEWS = (("cam00", 0.0), ("cam04", 1.3), ("cam08", 2.9), ("cam12", 5.0), ("cam05", 3.7))
+
+
+# A ray that just hits or misses a moving part does the other a nanosecond earlier or later, as on another kind of
+# processor, which rounds the last bits differently.
+INSTANTS_S = (0.0, 1e-9, -1e-9)
+
+
+def views(name: str, later_s: float = 0.0) -> Image:
+    """Five views of a scene, side by side."""
+    kind, params = SHOWN[name]
+    scene = make_scene(kind, {**params, "width": 96, "height": 72})
+    return np.hstack([scene.render(camera, t_s + later_s) for camera, t_s in VIEWS])
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_a_scene_looks_as_it_did(name):
+    """Of the instants the nearest counts at each pixel, to a level of gray."""
+    golden = cv2.imread(str(GOLDEN / f"{name}.png"))[..., ::-1].astype(np.int16)
+    off = np.full(golden.shape[:2], 255)
+    for later_s in INSTANTS_S:
+        off = np.minimum(off, np.abs(views(name, later_s).astype(np.int16) - golden).max(axis=2))
+        if (off > 1).sum() <= 3:
+            return
+    pytest.fail(f"{(off > 1).sum()} pixels differ")
+
+
+if __name__ == "__main__":
+    for scene in SHOWN:
+        cv2.imwrite(str(GOLDEN / f"{scene}.png"), views(scene)[..., ::-1])

@@ -1,6 +1,5 @@
 """Poses and lenses of a rig of fixed cameras, against known ones."""
 
-import dataclasses
 import itertools
 import json
 import time
@@ -17,9 +16,11 @@ from camera_node.robot.calibration.rig.rig_calibration import calibrate_rig
 from camera_node.robot.calibration.targets import Corners, parse_target
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.clock import WallClock
-from freshfield.geometry import Pinhole, look_at, matrix_to_quaternion, se3, se3_inverse, so3_exp, so3_log
+from freshfield.geometry import Pinhole, look_at, se3, se3_inverse, so3_exp, so3_log
 from tests.camera_node.robot.calibration import known_truth
+from tests.camera_node.sources.datasets import sets
 from tests.camera_node.sources.devices.mjpeg import NetworkCamera, camera_file, number_of
+from tests.support import refusal
 
 BOARD = "charuco:8x5:60mm:45mm"
 TARGET = parse_target(BOARD)
@@ -90,10 +91,6 @@ def test_a_rig_is_exact_from_exact_corners_and_stands_where_the_target_lay():
     for name, pose in found.poses.items():
         np.testing.assert_allclose(pose, shift @ POSES[name], atol=1e-4)
         np.testing.assert_allclose(found.lenses[name].distortion, LENSES[name].distortion, atol=1e-3)
-    assert "note" not in found.show()
-    shared = {("cam0", "cam1"): 9, ("cam1", "cam2"): 6, ("cam2", "cam3"): 2}
-    notes = [line for line in dataclasses.replace(found, shared=shared).show().splitlines() if "note" in line]
-    assert len(notes) == 1 and notes[0].startswith("note: cam3: shares few moments with any other camera")
     # With lenses that are known, and the origin elsewhere.
     known = calibrate_rig(sightings(0.0, 8), LENSES, False, "04")
     to_board = np.diag([1.0, -1.0, -1.0, 1.0]) @ se3_inverse(boards(8)[4])
@@ -228,11 +225,8 @@ def test_what_cannot_be_used_is_refused_in_one_line(tmp_path, capsys):
         (tmp_path / name).mkdir()
         cv2.imwrite(str(tmp_path / name / "1.png"), np.zeros((48, 64), np.uint8))
     for words, message in (
-        ([], "expected one of FOLDER"),
-        ([tmp_path], "--board SPEC"),
         ([tmp_path / "cam0", "--board", BOARD], "for each of at least two cameras, found 0"),
         ([tmp_path, "--board", BOARD], "cam0 never sees the target: charuco:8x5:60mm:45mm not found: no markers"),
-        (["--colmap", tmp_path], "--length CAM CAM METERS"),
         (["--live", "room", "--board", BOARD], "expected camera, oak or realsense"),
     ):
         assert main(["calibrate", "rig", *map(str, words)]) == 2
@@ -241,20 +235,14 @@ def test_what_cannot_be_used_is_refused_in_one_line(tmp_path, capsys):
 
 
 def test_a_colmap_model_is_scaled_by_a_known_length(tmp_path, capsys):
-    (tmp_path / "images").mkdir()
-    lines = []
-    for k, (name, pose) in enumerate(POSES.items(), 1):
-        cv2.imwrite(str(tmp_path / "images" / f"{name}.png"), np.zeros((480, 640), np.uint8))
-        to_camera = se3_inverse(pose)
-        numbers = [*matrix_to_quaternion(to_camera[:3, :3]), *(to_camera[:3, 3] * 4)]
-        lines += [f"{k} {' '.join(map(str, numbers))} 1 {name}.png", ""]
-    (tmp_path / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
-    (tmp_path / "images.txt").write_text("\n".join(lines) + "\n")
+    lens, black = Pinhole.from_fov(sets.WIDTH, sets.HEIGHT, 60.0), np.zeros((sets.HEIGHT, sets.WIDTH), np.uint8)
+    places = {name: se3(pose[:3, :3], 4 * pose[:3, 3]) for name, pose in POSES.items()}
+    cameras = [sets.Taken(name, lens, place, lambda k: black) for name, place in places.items()]
+    sets.write_colmap(tmp_path, cameras, "PINHOLE", binary=False)
     apart, out = np.linalg.norm(POSES["cam0"][:3, 3] - POSES["cam2"][:3, 3]), tmp_path / "rig.json"
-    words = ["calibrate", "rig", "--colmap", str(tmp_path), "--out", str(out), "--length", "cam0"]
-    assert main([*words, "cam2", f"{apart}"]) == 0
+    words = ["calibrate", "rig", "--colmap", str(tmp_path), "--out", str(out), "--length", "cam0 x"]
+    assert main([*words, "cam2 x", f"{apart}"]) == 0
     assert "a unit of the model is 0.25 m" in capsys.readouterr().out
     for name, camera in load_calibration(out).items():
-        np.testing.assert_allclose(camera.pose.matrix(), POSES[name], atol=1e-6)
-    assert main([*words, "cam9", f"{apart}"]) == 2
-    assert "no camera cam9; it has cam0" in capsys.readouterr().err
+        np.testing.assert_allclose(camera.pose.matrix(), POSES[name[:4]], atol=1e-6)
+    assert "no camera cam9; it has cam0" in refusal(capsys, main, *words, "cam9", apart)
