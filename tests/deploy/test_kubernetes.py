@@ -132,10 +132,9 @@ def test_the_emulator_is_the_only_way_from_a_camera_to_the_edge(documents):
             chosen = policy["spec"]["podSelector"].get("matchLabels", {}).items()
             if chosen <= labels[name].items():
                 for rule in policy["spec"].get(way, ()):
-                    matching = [
-                        p["podSelector"]["matchLabels"].items() <= labels[other].items() for p in rule.get(peers, ())
-                    ]
-                    if port in [each["port"] for each in rule["ports"]] and (any(matching) or not rule.get(peers)):
+                    named = [p["podSelector"]["matchLabels"].items() for p in rule.get(peers, ())]
+                    matching = not named or any(each <= labels[other].items() for each in named)
+                    if port in [each["port"] for each in rule["ports"]] and matching:
                         return True
         return False
 

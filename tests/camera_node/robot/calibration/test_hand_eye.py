@@ -31,7 +31,7 @@ from freshfield.geometry import Pinhole, Pose, se3, se3_inverse, so3_exp
 from freshfield.scenario import load
 from tests.camera_node.robot.calibration import known_truth
 from tests.camera_node.robot.calibration.known_truth import BOARD, LENS, noisy_samples, taken
-from tests.camera_node.robot.calibration.test_targets import printed
+from tests.camera_node.robot.calibration.test_rig import printed
 from tests.conftest import data_dir
 from tests.support import refusal, refused
 
@@ -117,9 +117,7 @@ def test_a_board_of_another_size_than_said_is_told_and_its_size_found(setup, fac
     assert calibrate(right, fit_size=True).warnings == calibrate(right).warnings == ()
 
 
-@pytest.mark.parametrize(
-    ("scale", "says"), [(1e-3, "targets seem to be in millimeters"), (1e3, "flanges in millimeters")]
-)
+@pytest.mark.parametrize(("scale", "says"), [(1e-3, "targets seem to be in millimeters"), (1e3, "meters, flanges in")])
 def test_meters_and_millimeters_do_not_mix(scale, says):
     refused(CalibrationError, says, calibrate, noisy_samples(12, np.random.default_rng(3)).rescaled(scale))
 

@@ -25,7 +25,7 @@ from freshfield.scenario import parse
 from tests.camera_node.sources.datasets import sets
 from tests.camera_node.sources.datasets.photos import fails, opened, write_photos
 from tests.camera_node.sources.datasets.rgbd import test_rgbd_formats as rgbd
-from tests.camera_node.sources.datasets.test_video import write_rig
+from tests.camera_node.sources.datasets.test_transforms import write_rig
 from tests.support import refused
 
 BENT = Pinhole(64, 48, 60.0, 61.0, 31.2, 24.9, (-0.08, 0.02, 0.002, -0.003))
@@ -154,17 +154,10 @@ def test_eyeful_sees_points_where_they_are_and_straightens_lenses_that_are_none_
     assert dataset.cameras == ("10", "11", "12") and not dataset.moving
     agree([dataset.of(name)[0] for name in dataset.cameras], cameras)
     assert dataset.held_out == {"10/10_DSC0000", "10/10_DSC0001"}
-    for number, (model, distortion, bends) in enumerate(
-        (
-            (
-                "RadialAndTangential",
-                [0.1, 0.2, 3e-3, 4e-3, 0.5],
-                {"radial": (0.1, 0.2, 0.5), "tangential": (3e-3, 4e-3)},
-            ),
-            ("Fisheye", [-0.02, 4e-3, 0, 0, 0, 0, 0, 0], {"radial": (-0.02, 4e-3, 0.0), "fisheye": True}),
-        )
-    ):
-        record = eyeful.load_dataset(sets.write_eyeful(tmp_path / str(number), cameras, 1, model, distortion))[1]
+    bent = [0.1, 0.2, 3e-3, 4e-3, 0.5], {"radial": (0.1, 0.2, 0.5), "tangential": (3e-3, 4e-3)}
+    round_ = [-0.02, 4e-3, 0, 0, 0, 0, 0, 0], {"radial": (-0.02, 4e-3, 0.0), "fisheye": True}
+    for model, (distortion, bends) in (("RadialAndTangential", bent), ("Fisheye", round_)):
+        record = eyeful.load_dataset(sets.write_eyeful(tmp_path / model, cameras, 1, model, distortion))[1]
         assert record.intrinsics == pinhole(Lens(64, 48, 60.0, 61.0, 31.2, 24.9, **bends)) and record.path is None
 
 
@@ -364,10 +357,7 @@ DAMAGE: dict[str, list[tuple[Change, str]]] = {
         (in_krt(lambda e: e.update(distortion=[0.1])), "RadialAndTangential' with 1 coefficients"),
         (in_krt(lambda e: e.update(cameraId="../../x")), "does not lie within the folder"),
         (in_json("cameras.json", lambda data: [entry.update(width=100) for entry in data["KRT"]]), "another shape"),
-        (
-            lambda folder: (folder / "images-jpeg-2k").rename(folder / "images"),
-            "has no folder images-jpeg-1k or images-",
-        ),
+        (lambda folder: (folder / "images-jpeg-2k").rename(folder / "images"), "has no folder images-jpeg-1k or"),
     ],
     "colmap text": [
         (replaced("sparse/0/cameras.txt", b"PINHOLE", b"OPENCV"), "OPENCV has 8 parameters, not 4"),

@@ -17,7 +17,7 @@ from edge_server.live.output.prometheus import EdgeCollector
 from edge_server.live.state import CameraView, Publication
 from tests.conftest import ROOT
 from tests.edge_server.page.preview import bare_state
-from tests.freshfield.test_files import no_file_longer_than
+from tests.freshfield.test_ledger import no_file_longer_than
 
 
 def publication(number: int, psnr: float | None = None) -> Publication:
