@@ -10,7 +10,7 @@ import pytest
 from camera_node.capture import Camera, build_cameras
 from camera_node.settings import source_config
 from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
-from camera_node.sources.datasets.streamer import Timeline, split_photos
+from camera_node.sources.datasets.streamer import Timeline
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects import NAMES
 from camera_node.synthetic.walk import walks_through
@@ -61,30 +61,11 @@ def test_a_jpeg_of_the_right_size_is_sent_as_it_lies_unless_it_is_cut(tmp_path):
     refused(DatasetError, r"006\.jpg: damaged or cut short", source.read, 5)
 
 
-def test_photos_are_dealt_in_turn_and_each_eighth_or_the_sets_own_is_held_out():
-    assert split_photos(10, ["a", "b"], ["d"]) == {"d": [0, 8], "a": [1, 3, 5, 7], "b": [2, 4, 6, 9]}
-    assert split_photos(6, ["a", "b"], ["d"], [1, 4]) == {"d": [1, 4], "a": [0, 3], "b": [2, 5]}
-    assert split_photos(6, ["a", "b"], [], [1, 4]) == {"a": [0, 3], "b": [2, 5]}
-    refused(DatasetError, "3 images are too few", split_photos, 3, ["a", "b", "c"], ["d"])
-
-
-def recorded(**times: list[float]) -> Dataset:
-    images = (
-        PosedImage(f"{camera}{k}", camera, time_s, np.eye(4), Pinhole(8, 8, 8, 8, 4, 4), lambda: None)
-        for camera, stamps in times.items()
-        for k, time_s in enumerate(stamps)
-    )
-    return Dataset(tuple(images))
-
-
 def test_a_timeline_holds_what_all_cameras_have_at_the_fastest_ones_rate():
-    found = recorded(fast=[0.2, 0.3, 0.4, 0.6, 0.7, 0.8], slow=[0.0, 0.2, 0.4, 0.6], once=[5.0])
-    timeline = Timeline.of(found, Path("set"))
-    assert timeline == Timeline(0.2, 5, Fraction(10))
-    assert list(timeline.nearest(found.of("fast"))) == [0, 1, 2, 2, 3]  # 0.5 s was dropped: the earlier of two
-    assert list(timeline.nearest(found.of("slow"))) == [1, 1, 2, 2, 3]
-    assert list(timeline.nearest(found.of("once"))) == [0] * 5
-    assert list(Timeline(0.0, 0, Fraction(10)).nearest(found.of("slow"))) == [0, 1, 2, 3]
+    times = {"fast": [0.2, 0.3, 0.4, 0.6, 0.7, 0.8], "slow": [0.0, 0.2, 0.4, 0.6], "once": [5.0]}
+    rows, lens = [(camera, t_s) for camera in times for t_s in times[camera]], Pinhole(8, 8, 8, 8, 4, 4)
+    images = (PosedImage(f"{camera}{t_s}", camera, t_s, np.eye(4), lens, lambda: None) for camera, t_s in rows)
+    assert Timeline.of(Dataset(tuple(images)), Path("set")) == Timeline(0.2, 5, Fraction(10))
 
 
 WORLD = {"kind": "world", "width": 16, "height": 12, "fps": 10, "carried": ["hand"], "params": {"people": 0}}

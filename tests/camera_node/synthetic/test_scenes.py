@@ -21,8 +21,8 @@ from camera_node.synthetic.depth import DepthRenderer
 from camera_node.synthetic.frame_cache import prune
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.person import loop_length_m, make_walk, walking_person
-from camera_node.synthetic.placement import MovingBody, Part, at, facing, place_static
-from camera_node.synthetic.render import CameraRenderer, Image, World, cast_rays
+from camera_node.synthetic.placement import MovingBody, Part, at, facing
+from camera_node.synthetic.render import CameraRenderer, Image, World
 from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere, capsule, nearest_hit
 from camera_node.synthetic.source import WorldSource
 from camera_node.synthetic.textures import Checker, Plain
@@ -158,14 +158,6 @@ def source(scene=None, fps=15, camera="cam01", **options) -> WorldSource:
 
 def files(folder: Path) -> list[Path]:
     return sorted(p for p in folder.rglob("*") if p.is_file())
-
-
-@pytest.mark.parametrize(("fps", "frames"), [(15, 9), (Fraction(100, 3), 20), (24, 72), (29.97, None)])
-def test_the_sequence_repeats_after_whole_periods(fps, frames):
-    """Frame numbers count to the first common multiple of period and frame time (29.97: 8991 are too many)."""
-    made = source(fps=fps)
-    assert made.repeats_after == made.contents == frames
-    assert source(make_scene("tile", {"width": 32, "height": 32})).contents == 1, "a static scene is one frame"
 
 
 def test_a_frame_is_the_scene_at_its_instant_for_ever(tmp_path):
@@ -348,21 +340,6 @@ def test_rays_along_the_axes_from_everywhere_are_finite_or_miss(shape):
 # Ambient only: every surface shows its albedo.
 FLAT = Light(np.array([[0.0, 0.0, 50.0]]), 0.0, 1.0, (1.0, 1.0, 1.0), (1.0, 1.0, 1.0))
 WHITE = Plain((1.0, 1.0, 1.0))
-
-
-def test_culling_leaves_out_no_ray_that_hits():
-    """The culled cast equals every ray tried on every part."""
-    rng = np.random.default_rng(0)
-    parts = [Part(Sphere(0.3), WHITE, at(*rng.uniform(-1, 1, 3))) for _ in range(6)]
-    parts += [Part(Box(tuple(rng.uniform(0.1, 0.5, 3))), WHITE, at(*rng.uniform(-1, 1, 3))) for _ in range(6)]
-    d = rng.standard_normal((3, 4000))
-    d /= np.linalg.norm(d, axis=0)
-    for origin in (np.array([2.0, 1.0, 0.5]), np.array([0.1, 0.0, 0.0]), parts[0].matrix[:3, 3]):
-        t, which = cast_rays(origin, d, place_static(parts), np.full(4000, np.inf))
-        every = np.stack([nearest_hit(p.shape, (origin - p.matrix[:3, 3])[:, None], d) for p in parts])
-        assert np.allclose(t, every.min(axis=0))
-        hit = np.isfinite(t)
-        assert np.array_equal(which[hit], every.argmin(axis=0)[hit]) and (which[~hit] == -1).all()
 
 
 @pytest.mark.stability

@@ -68,22 +68,6 @@ def check(q):
     return found
 
 
-def test_the_inverse_finds_the_posture_and_only_such_as_reach_the_target():
-    counts = set()
-    for q in POSTURES:
-        found = check(q)
-        counts.add(len(found))
-        assert np.abs(found[0] - q).max() < 1e-9
-        assert min((np.abs(a - b).max() for a in found for b in found if a is not b), default=1.0) > 1e-4
-    assert counts <= {2, 4, 6, 8} and 8 in counts
-    # Turned to be near and within the limits.
-    q = np.array([3.5, -4.0, 1.0, -5.0, 2.0, 6.2])
-    found = check(q)
-    assert np.abs(found[0] - q).max() < 1e-9 and np.abs(found).max() <= 2 * math.pi + 1e-9
-    for out_of_reach in ([0.7, 0.0, 0.2], [0.05, 0.0, 0.3]):
-        assert UR3E.inverse(se3(np.eye(3), out_of_reach)) == []
-
-
 def test_singular_postures_are_named_and_a_joint_turns_a_full_turn_either_way():
     assert np.degrees((UR3E.lower_rad, UR3E.upper_rad)) == pytest.approx(np.array([[-360.0] * 6, [360.0] * 6]))
     free = np.array([0.3, -1.2, 1.1, -0.9, 1.4, 0.2])
