@@ -1,6 +1,6 @@
 """The launcher with the real processes: runs that end as asked, and runs in which a process dies; that of a simulated
 arm, and which processes start in which order; the folders that a run may use, since a mistyped --out must never cost
-anybody a file; the line that it prints; starting and stopping processes; commands at Ctrl-C and without a reader."""
+anybody a file; the line that it prints; commands at Ctrl-C and without a reader; the health check of containers."""
 
 import json
 import os
@@ -13,13 +13,17 @@ import threading
 import time
 import tomllib
 from collections.abc import Callable
+from concurrent import futures
 from pathlib import Path
 
+import grpc
 import pytest
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
 import freshfield as ff
 from freshfield.scenario import ScenarioError, load
 from freshfield_up import commands, console, processes
+from freshfield_up import healthy as health_check
 from freshfield_up import run as launcher
 from freshfield_up.cli import main
 from freshfield_up.commands import ProcessSet
@@ -122,7 +126,6 @@ def test_what_cannot_run_is_refused_in_one_line_before_anything_starts(tmp_path,
         assert said.count("\n") == 1 and not (tmp_path / "new").exists()
         return said
 
-    assert "shipped scenarios: " in refusal("no-such-scenario", free_port())
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -373,3 +376,39 @@ def test_output_that_nobody_reads_ends_it_without_a_word(command, words, unbuffe
 def test_the_status_of_a_command_is_passed_on():
     process = start("freshfield", ["demo", "no-such-scenario"], stdout=subprocess.DEVNULL)
     assert b"no-such-scenario" in process.communicate(timeout=30)[1] and process.returncode == 2
+
+
+def healthy(*words: str, camera: str | None = None) -> bool:
+    """What the check says, given its words and the camera of its container."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["healthy", *words])
+        patch.delenv("CAMERA", raising=False)
+        if camera:
+            patch.setenv("CAMERA", camera)
+        return health_check.main() == 0
+
+
+def test_a_server_is_healthy_while_it_says_so():
+    server = grpc.server(futures.ThreadPoolExecutor(1))
+    servicer = health.HealthServicer()
+    health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
+    try:
+        servicer.set("", health_pb2.HealthCheckResponse.SERVING)
+        assert healthy("--serving", f"127.0.0.1:{port}")
+        servicer.set("", health_pb2.HealthCheckResponse.NOT_SERVING)
+        assert not healthy("--serving", f"127.0.0.1:{port}")
+    finally:
+        server.stop(None).wait()
+    assert not healthy("--serving", f"127.0.0.1:{port}")
+
+
+def test_a_node_is_healthy_while_its_own_status_is_fresh(tmp_path):
+    assert not healthy("--node", str(tmp_path))
+    (tmp_path / "node-cam01.json").write_text("{}")
+    assert healthy("--node", str(tmp_path)) and healthy("--node", str(tmp_path), camera="cam01")
+    assert not healthy("--node", str(tmp_path), camera="cam02"), "a neighbor's file is not this one's"
+    old = time.time() - 60
+    os.utime(tmp_path / "node-cam01.json", (old, old))
+    assert not healthy("--node", str(tmp_path), camera="cam01")
