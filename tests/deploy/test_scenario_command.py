@@ -72,6 +72,7 @@ def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path,
 def test_check_reads_every_section(tmp_path, capsys):
     for section, wrong in (
         ("source: {kind: mcap, file: a.mcap}", "cameras.phase: spread is for source.kind world alone"),
+        ("source: {kind: world, scene: castle}", "source: .*castle"),
         ("source: {kind: world, effects: {OWN:Darker: {counts: 256}}}", "Darker.counts: expected .*0 to 255, got 256"),
         ("source: {kind: OWN:Turning, level: 256}", "source.level: expected .*0 to 255, got 256"),
         ("edge: {policy: {name: freshest-k, value: 0.5}}", "edge.policy: k: expected a whole number"),
