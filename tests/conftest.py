@@ -39,12 +39,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # What has the machine to itself: whole deployments, and what compares instants of the wall clock. All else computes, or
 # waits for what has seconds to come: whoever runs beside it changes nothing but how long it takes.
 _FILES = {
-    "camera_node/robot/arm": "drive joint_states",
+    "camera_node/robot/arm": "drive",
     "camera_node/robot/simulated_controller": "controller",
     "camera_node/robot/teleop": "teleop_command",
-    "camera_node/robot": "flange_camera",
     "camera_node/sources/devices": "live",
-    "camera_node": "capture clock_offset node",
+    "camera_node": "clock_offset node",
     "deploy": "up",
     "edge_server/live": "loop scoring_thread server",
     "edge_server/page/splats": "stream",

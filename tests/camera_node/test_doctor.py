@@ -27,7 +27,7 @@ from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole, Pose, so3_exp
 from freshfield.scenario import load, parse
 from freshfield.transport import Transport
 from tests.camera_node.depth_source import POSE
-from tests.camera_node.robot.arm.simulated import simulated_arm, write_cell
+from tests.camera_node.robot.arm.simulated import write_cell
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 from tests.camera_node.sources.devices.mjpeg import CALIBRATION, NetworkCamera, camera_file
 from tests.integration.peer import Peer
@@ -51,18 +51,6 @@ def test_without_a_scenario_the_machine_is_examined(capsys, tmp_path):
     _, parts = examined(capsys, "--out", str(tmp_path / "not" / "there" / "yet"))
     assert parts["python"][0] and parts["disk"][0] and "synchronized" in parts["clock"][1]
     assert parts["network"][0] is None and parts["scenario"][0] is None
-    main(["doctor"])
-    said = capsys.readouterr().out
-    assert "ok     python" in said and "-      scenario" in said
-
-
-@pytest.mark.slow  # 7 s
-def test_an_arm_that_is_well(capsys, tmp_path, host):
-    with simulated_arm(host):
-        _, parts = examined(capsys, cell_at(tmp_path, host, frequency_hz=10))
-    assert parts["arm"] == (True, parts["arm"][1]) and "running" in parts["arm"][1]
-    assert parts["package ur"][0] and parts["hand-eye"][1].endswith("hand eye-in-hand, 65 mm away")
-    assert parts["arm's path"][0] and "of 51 viewpoints" in parts["arm's path"][1]
 
 
 def test_a_tour_that_leaves_a_side_out_and_the_examples_calibration_are_wrong(capsys, tmp_path, host):
@@ -107,13 +95,11 @@ def test_a_camera_is_opened_and_watched(capsys, tmp_path):
     assert parts["camera eye"][0] is False and "no camera at http" in parts["camera eye"][1]
 
 
-@pytest.mark.parametrize("asked, ok", [(40, False), (4, True)])
-def test_a_camera_at_a_fraction_of_the_rate_that_was_asked_for_is_wrong(capsys, tmp_path, asked, ok):
+def test_a_camera_at_a_fraction_of_the_rate_that_was_asked_for_is_wrong(capsys, tmp_path):
     with closing(NetworkCamera(WallClock(), fps=12.0)) as camera:
-        _, parts = examined(capsys, str(camera_file(tmp_path, camera.address, fps=asked, first_frame_s=10)))
-    found, said = parts["camera eye"]
-    assert found is ok and 2.0 < float(re.search(r"([\d.]+) frames a second", said)[1]) < 16.0
-    assert ok or f"of the {asked} asked: is it too dark" in said
+        _, parts = examined(capsys, str(camera_file(tmp_path, camera.address, fps=40, first_frame_s=10)))
+    ok, said = parts["camera eye"]
+    assert not ok and 2.0 < float(re.search(r"([\d.]+) frames a second of the 40 asked: is it too dark", said)[1]) < 16
 
 
 async def test_a_peer_tells_its_time():

@@ -85,19 +85,9 @@ def test_files_and_modules_that_are_named_exist(page):
             assert importlib.util.find_spec(found) or hasattr(importlib.import_module(parent), last)
 
 
-def defaults(program: str) -> dict[str, str]:
-    """{option: HOST:PORT} of every option of ``run`` whose help names a default address."""
-    _, _, text = str(help_of(program, "run")).partition("options:")
-    found = {}
-    for entry in re.split(r"\n  (?=-)", text):
-        address = re.search(r"[\w.]+:\d{2,5}\b", entry)
-        if address:
-            found[entry.split()[0]] = address.group()
-    return found
-
-
 def test_each_command_sends_to_where_the_next_one_listens():
-    emulator, edge = defaults("channel-emu"), defaults("edge-server")
+    texts = (" ".join(str(help_of(program, "run")).split()) for program in ("channel-emu", "edge-server"))
+    emulator, edge = (dict(re.findall(r"(--listen|--to) HOST:PORT [^\[]*\[([\d.:]+)\]", text)) for text in texts)
     assert emulator["--to"] == edge["--listen"] != emulator["--listen"]
     # A camera is always told where to send: its examples name the emulator.
     ports = re.findall(r"camera-node run .*--to \S*:(\d+)", str(help_of("camera-node", "run")))

@@ -1,5 +1,7 @@
-"""``freshfield scenario``: what it lists, writes, checks and describes; every shipped one is valid."""
+"""``freshfield scenario``: what it lists, writes, checks and describes; every shipped one is valid. ``freshfield
+check-plugin``: what keeps its contract passes, and each check can fail."""
 
+import itertools
 import json
 import re
 from importlib.metadata import EntryPoint
@@ -8,17 +10,22 @@ from types import SimpleNamespace
 from typing import Any
 
 import jsonschema
+import numpy as np
 import pytest
 
 from camera_node.settings import LiveConfig, source_config
 from camera_node.sources.registry import open_sources
+from channel_emu.model import faults
+from edge_server.scheduler import POLICIES, SelectionWindow
 from freshfield import plugins
 from freshfield.scenario import SCENARIO_FOLDER, load
+from freshfield.settings import Settings
 from freshfield.untrusted import read_yaml
 from freshfield_up.cli import main
 from freshfield_up.keys import schema
 from freshfield_up.scenario_command import checked
 from tests.conftest import data_dir
+from tests.integration.own_classes import Darker, Flat, LastFirst, Late, Turning, Youngest
 from tests.support import refusal
 
 OWN = Path(__file__).parent.parent / "integration/own_classes.py"
@@ -53,8 +60,7 @@ def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path,
     assert "valid" in printed(capsys, "scenario", "check", str(mine))
     assert "exists" in refused(capsys, "scenario", "init", str(mine))
     assert mine.read_text() == text
-    for odd in ("a: b.yaml", "mine.txt"):
-        assert "expected a name" in refused(capsys, "scenario", "init", str(tmp_path / odd))
+    assert "expected a name" in refused(capsys, "scenario", "init", str(tmp_path / "a: b.yaml"))
     number = tmp_path / "plain" / "123.yaml"  # which YAML would not read as text
     printed(capsys, "scenario", "init", str(number), "--like", "quad")
     assert "valid" in printed(capsys, "scenario", "check", str(number))
@@ -67,28 +73,16 @@ def test_check_reads_every_section(tmp_path, capsys):
     for section, wrong in (
         ("source: {kind: mcap, file: a.mcap}", "cameras.phase: spread is for source.kind world alone"),
         ("source: {kind: world, scene: castle}", "source: .*castle"),
-        ("source: {kind: world, effects: {rain: null}}", "source.effects: effect 'rain' is not known"),
         ("source: {kind: world, effects: {OWN:Darker: {counts: 256}}}", "Darker.counts: expected .*0 to 255, got 256"),
         ("source: {kind: OWN:Turning, level: 256}", "source.level: expected .*0 to 255, got 256"),
-        ("edge: {policy: {name: freshest}}", "edge.policy: policy 'freshest' is not known"),
         ("edge: {policy: {name: freshest-k, value: 0.5}}", "edge.policy: k: expected a whole number"),
         ("edge: {field: OWN:Flat, field_options: {level: 2}}", "edge.field: flat.level: expected .*0 to 1, got 2"),
         ("channel: {faults: {rain: 1}}", "channel.faults.rain"),
-        ("edge: {update_ms: 1}", "edge.update_ms"),
     ):
         file = tmp_path / "mine.yaml"
         source = "" if section.startswith("source") else "source: {kind: world, scene: room}\n"
         file.write_text(f"cameras: {{count: 4, phase: spread}}\n{source}{section.replace('OWN', str(OWN))}\n")
         assert re.search(wrong, refused(capsys, "scenario", "check", str(file)))
-
-
-def test_keys_of_a_section_and_of_all(capsys):
-    everything = printed(capsys, "scenario", "keys")
-    keys = {"source": "source: {kind: realsense, ...}", "effects": "sensor_noise (acts on: image)"}
-    for section, key in {**keys, "edge": "edge.field_options of field splat"}.items():
-        part = printed(capsys, "scenario", "keys", section)
-        assert key in part and part.strip() in everything
-    assert "there are: cameras" in refused(capsys, "scenario", "keys", "camera")
 
 
 @pytest.mark.parametrize(
@@ -159,7 +153,7 @@ def test_every_camera_has_a_first_image(file):
     if isinstance(config, LiveConfig):
         pytest.skip("needs cameras: tests/camera_node/sources/devices has them")
     if getattr(config, "arm", None) is not None:
-        pytest.skip("needs an arm: tests/camera_node/robot/test_flange_camera.py has one")
+        pytest.skip("needs an arm: tests/camera_node/robot/simulated_controller has one")
     folder = getattr(config, "data", "")
     data = data_dir(folder.split("/")[0]).parent if folder else None
     # One trained and one held-out camera: a world takes a while to prepare each.
@@ -169,3 +163,98 @@ def test_every_camera_has_a_first_image(file):
     for source in sources.values():
         shot = source.read(source.content(0))
         assert (shot.intrinsics.width, shot.intrinsics.height) == (source.intrinsics.width, source.intrinsics.height)
+
+
+COUNT = itertools.count()
+# Effects: tests/camera_node/synthetic/effects/test_effects.py.
+BUILT_IN = [("policy", name) for name in POLICIES] + [("fault", name) for name in faults.NAMES]
+BUILT_IN += [("selector", name) for name in ("random", "coverage", "fisher")]
+FAULTS = {"loss": "probability=0.5", "duplication": "probability=0.5", "corruption": "probability=0.5 count=3"}
+FAULTS |= {"blackout": "windows_ms=[[0,50]]", "reset": "mean_interval_ms=100", "bandwidth": "megabits_per_s=1"}
+
+
+class OnlyOpen(LastFirst):
+    """Values nothing that is captured."""
+
+    def values(self, state):
+        return np.where(np.isin(np.arange(len(state.open)), state.order), np.nan, 1.0)
+
+
+def painted(level):
+    """A render of this level: a function of the field."""
+
+    def render(self, camera_to_world, intrinsics):
+        out = Flat.render(self, camera_to_world, intrinsics)
+        out.color[:] = level(self)
+        return out
+
+    return render
+
+
+def seen(self):
+    return self.views[0].image.mean() / 255 if self.views else 0.0
+
+
+def in_turn(self, transit):
+    self.asked = getattr(self, "asked", 0) + 1
+    return self.asked < 10
+
+
+def take_views(self, state):
+    self.views = state["level"].views
+
+
+def first_of(share):
+    return lambda self, epoch, window: tuple(epoch.generated_ns)[: share(epoch.generated_ns)]
+
+
+LATE = SelectionWindow(wait_until_ns=24 * 3600 * 10**9)
+NO_DEFAULT = type(Settings)("Params", (Settings,), {"__annotations__": {"ms": float}})
+NO_COPY = {"render": painted(seen), "state": lambda s: {"level": s}, "load_state": take_views}
+BASES = {"policy": Youngest, "effect": Darker, "fault": Late, "field": Flat, "selector": LastFirst, "source": Turning}
+OWN_CLASSES = [(kind, f"{OWN}:{good.__name__}") for kind, good in BASES.items()]
+# Kind -> name of a class -> how it differs from the good one, and what the command says.
+BROKEN = {
+    "source": {
+        "Fast": ({"fps": 10}, "the first frames: fps: expected a Fraction"),
+        "Ends": ({"contents": 3, "content": lambda s, tick: tick}, "the first frames: content: expected 0 to contents"),
+        "Picture": ({"read": lambda s, n: Turning.read(s, n).image}, "the first frames: read: expected a Shot"),
+    },
+    "policy": {
+        "Patient": ({"plan": lambda *_: LATE}, "six cameras: plan: it waits for more than an hour"),
+        "Nobody": ({"select": lambda *_: ("cam99",)}, "one camera: select: expected a tuple of cameras"),
+        "Nothing": ({"select": lambda *_: ()}, "one camera: select: expected a tuple of cameras, one at least"),
+        "Changes": ({"select": first_of(lambda names: next(COUNT) % 7 or 1)}, "six cameras: two runs differ"),
+        "AnyValue": ({"__init__": lambda s, value, rng: None}, "value out of range is refused: -1 is accepted"),
+    },
+    "effect": {
+        "Floats": ({"apply": lambda s, image, *_: image / 2}, "a black image: image: expected array uint8 (12, 16, 3)"),
+        "InPlace": ({"apply": lambda s, image, *_: np.subtract(image, 1, out=image)}, "a noisy image: an input was"),
+    },
+    "fault": {
+        "Early": ({"extra_ns": lambda *_: -1}, "usual messages: extra_ns: expected nanoseconds from 0"),
+        "InTurn": ({"loses": in_turn}, "does not depend on the order of questions: draw by the number"),
+        "Demanding": ({"Params": NO_DEFAULT}, "is constructed: ScenarioError"),
+    },
+    "field": {
+        "Bytes": ({"render": painted(lambda s: 255)}, "one camera: color: below 0, or above 1"),
+        "Forgets": ({"render": painted(seen)}, "snapshots stay and states go on: load_state: it renders"),
+        "Itself": (NO_COPY, "snapshots stay and states go on: snapshot: it changes"),
+        "AnyState": ({"load_state": lambda *_: None}, "snapshots stay and states go on: load_state: the state of"),
+    },
+    "selector": {"OneValue": ({"values": lambda *_: np.zeros(1)}, "half captured: values: expected one a candidate")},
+}
+ROWS = [(kind, name, *row) for kind, rows in BROKEN.items() for name, row in rows.items()]
+globals().update({name: type(BASES[kind])(name, (BASES[kind],), dict(has)) for kind, name, has, _ in ROWS})
+
+
+@pytest.mark.parametrize(("kind", "name"), [*BUILT_IN, *OWN_CLASSES, ("selector", f"{__file__}:OnlyOpen")])
+def test_what_keeps_its_contract_passes(kind, name, capsys):
+    words = FAULTS[name].split() if name in FAULTS else []
+    assert main(["check-plugin", kind, name, *words]) == 0, capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("kind", "name", "says"), [(kind, name, says) for kind, name, _, says in ROWS])
+def test_each_check_can_fail(kind, name, says, capsys):
+    assert main(["check-plugin", kind, f"{__file__}:{name}"]) == 1
+    assert f"FAILED  {says}" in capsys.readouterr().out

@@ -1,5 +1,6 @@
 """The launcher with the real processes: runs that end as asked, and runs in which a process dies; that of a simulated
-arm, and which processes start in which order."""
+arm, and which processes start in which order; the folders that a run may use, since a mistyped --out must never cost
+anybody a file; the line that it prints; commands at Ctrl-C and without a reader; the health check of containers."""
 
 import json
 import os
@@ -9,24 +10,31 @@ import socket
 import subprocess
 import sys
 import threading
+import time
+import tomllib
 from collections.abc import Callable
-from dataclasses import replace
+from concurrent import futures
 from pathlib import Path
 
+import grpc
 import pytest
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
 import freshfield as ff
 from freshfield.scenario import ScenarioError, load
-from freshfield_up import commands
+from freshfield_up import commands, console, processes
+from freshfield_up import healthy as health_check
 from freshfield_up import run as launcher
 from freshfield_up.cli import main
 from freshfield_up.commands import ProcessSet
 from freshfield_up.demo_command import seconds
 from freshfield_up.deployment import DeploymentError
-from freshfield_up.folder import EARLIER, prepare
+from freshfield_up.folder import EARLIER, KEY, MARKER, FolderError, forget_earlier, prepare
 from freshfield_up.processes import Child
-from freshfield_up.status import read_json
+from freshfield_up.status import read_json, status_line
+from freshfield_up.summary import summarize
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde
+from tests.conftest import ROOT
 from tests.support import free_port, refused, wait_until
 
 SMALL = """
@@ -40,25 +48,6 @@ edge: {field: ngp, update_ms: 300, lpips: none}
 """
 SLEEPS = "import time; time.sleep(60)"
 pytestmark = pytest.mark.timeout(600)
-
-
-class Up:
-    """A running launcher; its output goes to a file."""
-
-    def __init__(self, folder: Path, *options: str, scenario: str = SMALL) -> None:
-        self.out = folder / "run"
-        self.port = free_port()
-        file = folder / "small.yaml"
-        file.write_text(scenario)
-        self._log = folder / "output.txt"
-        words = [str(file), "--out", str(self.out), "--port", str(self.port), *options]
-        with self._log.open("wb") as log:
-            command = [sys.executable, "-m", "freshfield_up.cli", "demo", *words]
-            self.process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
-
-    @property
-    def output(self) -> str:
-        return self._log.read_text()
 
 
 @pytest.fixture
@@ -88,18 +77,6 @@ def test_a_process_that_dies_ends_the_run_is_named_and_the_others_are_stopped(as
     assert not any(child.running for child in made.children) and made.emulator.process is None
     rows = [json.loads(line) for line in (run.options.out / "processes.jsonl").read_text().splitlines()]
     assert rows[0]["edge"]["pid"] == made.edge.pid and "machine" in rows[0]
-
-
-def test_a_trouble_is_said_once_of_each_camera_though_its_numbers_change(asleep):
-    run, said = asleep("pass"), []
-    run._say = said.append
-    run.options.out.mkdir()
-    first = [f"cam0{k}: its poses drift: the picture asks for 9 cm and .5 degrees" for k in range(2)]
-    plugin = "policy Mine failed 3 times: all views were used"
-    for troubles in ([*first, plugin], [first[0].replace("9 cm", "1e+03 cm"), plugin.replace("3", "14")]):
-        (run.options.out / "edge.json").write_text(json.dumps({"troubles": troubles}))
-        run._say_troubles()
-    assert said == [f"note: {line}" for line in (*first, plugin)]
 
 
 def test_a_recording_that_is_over_before_the_first_update_ends_the_run_well(asleep, capfd, monkeypatch):
@@ -135,26 +112,11 @@ def test_ctrl_c_ends_a_run_and_a_second_one_kills(asleep, capfd):
     assert "stopping (Ctrl-C)" in said and "the node did not end in time and was killed" in said
 
 
-def test_a_start_that_fails_says_why_and_costs_no_earlier_run(tmp_path):
-    prepare(tmp_path / "run", {}).close()
-    (tmp_path / "run" / "report.json").write_text("{}")
-    run = Up(tmp_path, "--policy", "foo")
-    assert run.process.wait(90.0) == 1
-    assert "'foo' is not known" in run.output and "ended by itself with exit code 2" in run.output
-    assert run.output.endswith(f"the run was never up; an earlier run's files are in {run.out / EARLIER}\n")
-    assert (run.out / EARLIER / "report.json").exists()
-
-
-def test_times_and_commands_are_read_and_written_as_people_write_them(asleep):
+def test_times_and_commands_are_read_and_written_as_people_write_them():
     assert [seconds(text) for text in ("60", "60s", "1.5m", "2h", "0")] == [60.0, 60.0, 90.0, 7200.0, 0.0]
     assert launcher.command_line(["/usr/bin/freshfield", "demo", "my file"]) == "freshfield demo 'my file'"
     assert launcher.command_line(["/lib/freshfield_up/__main__.py", "demo"]) == "freshfield demo"
     assert launcher.command_line(["examples/deployment.py", "card", "6"]) == "python examples/deployment.py card 6"
-    run = asleep("pass")
-    run._ready_s = 100.0
-    assert run._headline(112.9) == "12 of 60 s"
-    run.options = replace(run.options, duration_s=0.0)
-    assert run._headline(112.9) == "12 s"
 
 
 def test_what_cannot_run_is_refused_in_one_line_before_anything_starts(tmp_path, capsys):
@@ -164,9 +126,6 @@ def test_what_cannot_run_is_refused_in_one_line_before_anything_starts(tmp_path,
         assert said.count("\n") == 1 and not (tmp_path / "new").exists()
         return said
 
-    (typo := tmp_path / "typo.yaml").write_text(SMALL.replace("cameras:", "camera:"))
-    assert "did you mean 'cameras'?" in refusal(typo, free_port())
-    assert "shipped scenarios: " in refusal("no-such-scenario", free_port())
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -206,21 +165,250 @@ def test_the_cell_runs_from_one_command(tmp_path):
     mount = CELL.path.parent / CELL.source["arm"]["cameras"]["hand"]
     text = CELL.path.read_text().replace("../lab/hand-eye-example.yaml", str(mount))
     text = re.sub(r"host: \S+", f"host: {own_address()}", text)
-    text = text.replace("width: 128", "width: 48").replace("height: 128", "height: 48")
-    run = Up(tmp_path, scenario=text)
+    (tmp_path / "cell.yaml").write_text(text.replace("width: 128", "width: 48").replace("height: 128", "height: 48"))
+    words = [str(tmp_path / "cell.yaml"), "--out", str(out := tmp_path / "run"), "--port", str(free_port())]
+    process = subprocess.Popen([sys.executable, "-m", "freshfield_up.cli", "demo", *words])
     try:
-        wait_until(
-            lambda: read_json(run.out / "edge.json").get("updates", {}).get("count", 0) >= 30, "no updates", 400.0
-        )
-        run.process.terminate()
-        assert run.process.wait(300.0) == 0, run.output
+        wait_until(lambda: read_json(out / "edge.json").get("updates", {}).get("count", 0) >= 30, "no updates", 400.0)
+        process.terminate()
+        assert process.wait(300.0) == 0
     finally:
-        run.process.kill()
-    frames = read_json(run.out / "report.json")["frames"]
+        process.kill()
+    frames = read_json(out / "report.json")["frames"]
     assert frames["closes"] and frames["by_camera"]["hand"]["delivered"] > 5
-    assert "43 viewpoints in 62 stops\n" in (run.out / "log-driver.txt").read_text()
+    assert "43 viewpoints in 62 stops\n" in (out / "log-driver.txt").read_text()
     # The arm sets out when the field can learn: after the emulator, which waits for the edge to serve.
     # All may begin within one row; but processes are numbered in their order.
-    last = json.loads((run.out / "processes.jsonl").read_text().splitlines()[-1])
+    last = json.loads((out / "processes.jsonl").read_text().splitlines()[-1])
     numbers = int(Path("/proc/sys/kernel/pid_max").read_text())
     assert 0 < (last["driver"]["pid"] - last["emulator"]["pid"]) % numbers < numbers // 2
+
+
+def test_an_earlier_run_outlives_starts_that_fail(tmp_path):
+    prepare(tmp_path, {"run": 1}).close()
+    (tmp_path / "report.json").write_text("good")
+    for failed in (2, 3):
+        prepare(tmp_path, {"run": failed}).close()
+        (tmp_path / "log-edge.txt").write_text(f"start {failed} failed")
+    assert [p.name for p in (tmp_path / EARLIER).iterdir()] == ["report.json"]
+    assert {p.name for p in tmp_path.iterdir()} == {MARKER, EARLIER, "log-edge.txt"}
+
+
+def test_a_start_that_is_killed_before_its_marker_is_written_or_while_it_moves_files_loses_none(tmp_path):
+    (tmp_path / MARKER).touch()
+    prepare(tmp_path, {"run": 1}).close()
+    for name in ("field.npz", "edge.json"):
+        (tmp_path / name).write_text(name)
+    part = tmp_path / f".{EARLIER}"
+    part.mkdir()
+    (tmp_path / "edge.json").rename(part / "edge.json")
+    prepare(tmp_path, {"run": 2}).close()
+    assert {p.name for p in (tmp_path / EARLIER).iterdir()} == {"field.npz", "edge.json"} and not part.exists()
+
+
+def test_an_earlier_run_is_replaced_and_a_link_in_it_is_not_followed(tmp_path):
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    (precious / "photo").write_text("keep")
+    out = tmp_path / "out"
+    prepare(out, {"run": 1}).close()
+    for name in ("ledger-edge-edge-1.tsv", "frontier.json", ".edge.json.4f.part"):
+        (out / name).write_text("old")
+    (out / "decisions").symlink_to(precious)
+    prepare(out, {"run": 2}).close()
+    forget_earlier(out)
+    assert list(out.iterdir()) == [out / MARKER] and (precious / "photo").read_text() == "keep"
+    assert json.loads((out / MARKER).read_text()) == {KEY: [], "run": 2}
+
+
+@pytest.mark.parametrize(
+    ("marker", "error"),
+    [
+        (None, "not an earlier run's"),
+        (json.dumps({KEY: [1]}), "not of a run of this version"),
+        ("", "not of a run of this version"),
+        (json.dumps({KEY: []}), "holds thesis.tex, which no run wrote"),
+    ],
+)
+def test_anything_else_is_refused_and_left_alone(tmp_path, marker, error):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    (tmp_path / "edge.json").write_text("{}")
+    if marker is not None:
+        (tmp_path / MARKER).write_text(marker)
+    before = {path.name: path.read_text() for path in tmp_path.iterdir()}
+    refused(FolderError, error, prepare, tmp_path, {})
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == before
+
+
+def test_a_run_that_is_still_going_on_and_a_file_in_the_place_of_the_folder_are_refused(tmp_path):
+    with prepare(tmp_path, {"run": 1}), pytest.raises(FolderError, match="another run is writing"):
+        prepare(tmp_path, {"run": 2})
+    assert json.loads((tmp_path / MARKER).read_text()) == {KEY: [], "run": 1}
+    refused(FolderError, "cannot use", prepare, tmp_path / MARKER, {})
+
+
+def test_the_line_says_what_the_processes_wrote_and_what_is_missing_or_damaged_leaves_gaps(tmp_path):
+    nothing = "0/13 cameras; no update yet; no channel yet"
+    assert status_line(tmp_path, 13) == nothing
+    cameras, channel = [{"age_ms": 80.0 + 300 * i} for i in range(13)], {"preset": "ch6", "counts": {"forwarded": 481}}
+    edge = {"cameras": cameras, "updates": {"count": 9, "ms_p50": 812.0}, "scores": {"psnr_db": 25.125}}
+    for name, said in (("edge.json", edge), ("channel.json", channel)):
+        (tmp_path / name).write_text(json.dumps(said))
+    assert status_line(tmp_path, 13) == (
+        "13/13 cameras, age 1880 ms (median); 9 updates, 812 ms each, PSNR 25.12 dB, moving - dB, policy -; "
+        "ch6, forwarded 481, delay error p99 - ms"
+    )
+    (tmp_path / "channel.json").write_text("[1, 2")
+    (tmp_path / "edge.json").write_text(json.dumps({"cameras": "none", "updates": {"count": "many"}}))
+    assert status_line(tmp_path, 13) == nothing
+
+
+def test_the_summary_is_the_conclusion_and_whether_all_frames_are_accounted_for(tmp_path):
+    lost = {"closes": False, "doubts": ["2,014 lines of the ledgers were lost", "another"]}
+    for found, expected in (
+        ({"closes": True, "cut_off": 2}, "; all accounted for, 2 of them cut off by the end of a process\n"),
+        (lost, "; NOT ALL ACCOUNTED FOR: 2,014 lines of the ledgers were lost; another\n"),
+    ):
+        frames, sentences = {"captured": 3, "sent": 3, "delivered": 3, "rejected": {}, **found}, ["Good.", "Late."]
+        (tmp_path / "report.json").write_text(json.dumps({"conclusion": sentences, "frames": frames}))
+        said = summarize(tmp_path)
+        assert said.startswith("\nGood.\nLate.\nframes     3 captured, 3 sent") and expected in said
+
+
+def python(tmp_path: Path, code: str, name: str = "one") -> Child:
+    return Child(name, f"process {name}", [sys.executable, "-c", code], tmp_path / f"log-{name}.txt")
+
+
+def test_a_child_becomes_its_command_and_runs_no_python_between_fork_and_exec(tmp_path, monkeypatch):
+    """There it might wait forever for a lock that another thread of the launcher held."""
+    options: list[str] = []
+    start = subprocess.Popen
+    monkeypatch.setattr(processes.subprocess, "Popen", lambda *a, **b: options.extend(b) or start(*a, **b))
+    child = python(tmp_path, "import os, signal, sys; print(os.getpid(), sys.argv, signal.getsignal(signal.SIGTERM))")
+    child.start()
+    wait_until(lambda: not child.running, "it did not end")
+    assert f"\n{child.pid} ['-c'] {int(signal.SIG_DFL)}\n" in child.log.read_text()
+    assert "preexec_fn" not in options and "start_new_session" in options
+
+
+def test_stop_terminates_first_and_kills_after_the_grace_time(tmp_path):
+    answers = {"obedient": "lambda *_: sys.exit(print('goodbye'))", "stubborn": "signal.SIG_IGN"}
+    code = "import signal, sys, time\nsignal.signal(signal.SIGTERM, {})\nprint('up')\ntime.sleep(60)"
+    obedient, stubborn = (python(tmp_path, code.format(answer), name) for name, answer in answers.items())
+    for child in (obedient, stubborn):
+        child.start()
+        wait_until(lambda child=child: "\nup\n" in child.log.read_text(), "it did not start")
+    began = time.monotonic()
+    processes.stop([obedient, stubborn], grace_s=1.0)
+    assert time.monotonic() - began < 5.0
+    assert not obedient.running and not stubborn.running
+    assert not obedient.killed and obedient.process.returncode == 0 and "goodbye" in obedient.log.read_text()
+    assert stubborn.killed and stubborn.process.returncode == -signal.SIGKILL
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells children that their parent is gone")
+def test_no_child_outlives_a_launcher_that_was_killed_outright(tmp_path):
+    launcher = """
+import sys, time
+from pathlib import Path
+from freshfield_up.processes import Child
+child = Child("c", "c", [sys.executable, "-c", "import time; time.sleep(60)"], Path(sys.argv[1]))
+child.start()
+print(child.pid, flush=True)
+time.sleep(60)
+"""
+    deploy = Path(processes.__file__).parents[1]
+    command = [sys.executable, "-c", launcher, str(tmp_path / "log.txt")]
+    with subprocess.Popen(command, cwd=deploy, stdout=subprocess.PIPE) as parent:
+        pid = int(parent.stdout.readline())
+        assert Path(f"/proc/{pid}").exists()
+        parent.kill()
+
+    def ended() -> bool:
+        try:
+            return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+        except FileNotFoundError:
+            return True
+
+    wait_until(ended, "the child outlived its parent")
+
+
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+
+
+def start(command: str, words: list[str], before: str = "", **streams: int) -> subprocess.Popen[bytes]:
+    """The command as its installed script starts it. before: Python that runs first."""
+    module, _, function = SCRIPTS[command].partition(":")
+    code = f"import sys; sys.argv = {[command, *words]}; {before}\nimport {module}; sys.exit({module}.{function}())"
+    return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, **streams)
+
+
+@pytest.mark.parametrize("after_s", [0.05, 0.4])
+def test_ctrl_c_while_it_starts_prints_no_traceback(after_s):
+    words = ["simulate", "--preset", "ch6", "--seconds", "1e6"]
+    process = start("channel-emu", words, "print(flush=True)", stdout=subprocess.PIPE)
+    process.stdout.readline()  # Python itself has started
+    time.sleep(after_s)
+    process.send_signal(signal.SIGINT)
+    errors = process.communicate(timeout=30)[1]
+    assert b"Traceback" not in errors and b"ignored" not in errors
+    if after_s == 0.05:
+        assert process.returncode == -signal.SIGINT  # it was still importing
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "unbuffered"),
+    [("freshfield", ["scenario", "keys", "effects"], ""), ("channel-emu", ["presets"], "1")],
+)
+def test_output_that_nobody_reads_ends_it_without_a_word(command, words, unbuffered, tmp_path, monkeypatch):
+    """Where it is buffered, the last of it is written at the end."""
+    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    monkeypatch.chdir(tmp_path)
+    reader, writer = os.pipe()
+    os.close(reader)
+    process = start(command, words, stdout=writer)
+    os.close(writer)
+    assert process.communicate(timeout=30)[1] == b""
+    assert process.returncode == console.NOBODY_READS
+
+
+def test_the_status_of_a_command_is_passed_on():
+    process = start("freshfield", ["demo", "no-such-scenario"], stdout=subprocess.DEVNULL)
+    assert b"no-such-scenario" in process.communicate(timeout=30)[1] and process.returncode == 2
+
+
+def healthy(*words: str, camera: str | None = None) -> bool:
+    """What the check says, given its words and the camera of its container."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["healthy", *words])
+        patch.delenv("CAMERA", raising=False)
+        if camera:
+            patch.setenv("CAMERA", camera)
+        return health_check.main() == 0
+
+
+def test_a_server_is_healthy_while_it_says_so():
+    server = grpc.server(futures.ThreadPoolExecutor(1))
+    servicer = health.HealthServicer()
+    health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
+    try:
+        servicer.set("", health_pb2.HealthCheckResponse.SERVING)
+        assert healthy("--serving", f"127.0.0.1:{port}")
+        servicer.set("", health_pb2.HealthCheckResponse.NOT_SERVING)
+        assert not healthy("--serving", f"127.0.0.1:{port}")
+    finally:
+        server.stop(None).wait()
+    assert not healthy("--serving", f"127.0.0.1:{port}")
+
+
+def test_a_node_is_healthy_while_its_own_status_is_fresh(tmp_path):
+    assert not healthy("--node", str(tmp_path))
+    (tmp_path / "node-cam01.json").write_text("{}")
+    assert healthy("--node", str(tmp_path)) and healthy("--node", str(tmp_path), camera="cam01")
+    assert not healthy("--node", str(tmp_path), camera="cam02"), "a neighbor's file is not this one's"
+    old = time.time() - 60
+    os.utime(tmp_path / "node-cam01.json", (old, old))
+    assert not healthy("--node", str(tmp_path), camera="cam01")

@@ -19,7 +19,7 @@ STREAMS = ("Push", "WatchDecisions", "ServerReflectionInfo")
 
 
 async def echo(request: bytes, context: grpc.aio.ServicerContext) -> bytes:
-    return b""
+    return request
 
 
 async def cameras(_: object, context: grpc.aio.ServicerContext) -> None:
@@ -39,11 +39,14 @@ async def one_answer(_: object, context: grpc.aio.ServicerContext):
 
 
 class Every(grpc.GenericRpcHandler):
-    """A handler of every method."""
+    """A handler of every method. push: of streams of frames."""
+
+    def __init__(self, push=cameras) -> None:
+        self._push = push
 
     def service(self, details: grpc.HandlerCallDetails) -> grpc.RpcMethodHandler:
         if details.method.endswith("Push"):
-            return grpc.stream_stream_rpc_method_handler(cameras)
+            return grpc.stream_stream_rpc_method_handler(self._push)
         if details.method.endswith(STREAMS):
             return grpc.stream_stream_rpc_method_handler(one_answer)
         return grpc.unary_unary_rpc_method_handler(echo)

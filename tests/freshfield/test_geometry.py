@@ -1,4 +1,4 @@
-"""Geometry against OpenCV, against SciPy, and against itself."""
+"""Geometry against OpenCV, SciPy and itself; what fixed cameras see, against what can be reckoned by hand."""
 
 import cv2
 import numpy as np
@@ -8,18 +8,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from freshfield import geometry
-from freshfield.geometry import (
-    GeometryError,
-    Pinhole,
-    Pose,
-    look_at,
-    matrix_to_quaternion,
-    quaternion_normalize,
-    quaternion_to_matrix,
-    se3_inverse,
-    so3_exp,
-    so3_log,
-)
+from freshfield.coverage import MOST_OBLIQUE_DEG, PLAN, plan_svg, reckon
+from freshfield.geometry import Pinhole, Pose, look_at, quaternion_normalize, quaternion_to_matrix, se3_inverse, so3_log
 from tests.support import refused
 
 finite = st.floats(-1e3, 1e3, allow_subnormal=True)
@@ -37,17 +27,14 @@ def test_quaternions_and_matrices_agree_with_scipy(q):
     np.testing.assert_allclose(m, scipy(q).as_matrix(), atol=1e-12)
     np.testing.assert_allclose(m @ m.T, np.eye(3), atol=1e-12)
     # Up to sign: a half turn has w = 0, where both are normal.
-    assert abs(matrix_to_quaternion(m) @ quaternion_normalize(q)) == pytest.approx(1.0, abs=1e-12)
-    np.testing.assert_allclose(quaternion_to_matrix(matrix_to_quaternion(m)), m, atol=1e-12)
+    assert abs(geometry.matrix_to_quaternion(m) @ quaternion_normalize(q)) == pytest.approx(1.0, abs=1e-12)
+    np.testing.assert_allclose(quaternion_to_matrix(geometry.matrix_to_quaternion(m)), m, atol=1e-12)
 
 
 @given(quaternions, quaternions)
 def test_products_compose_rotations(a, b):
-    np.testing.assert_allclose(
-        quaternion_to_matrix(geometry.quaternion_multiply(a, b)),
-        quaternion_to_matrix(a) @ quaternion_to_matrix(b),
-        atol=1e-9,
-    )
+    product, whole = quaternion_to_matrix(geometry.quaternion_multiply(a, b)), scipy(a) * scipy(b)
+    np.testing.assert_allclose(product, whole.as_matrix(), atol=1e-9)
 
 
 def test_normalising_survives_any_scale_and_refuses_what_has_no_direction():
@@ -55,19 +42,19 @@ def test_normalising_survives_any_scale_and_refuses_what_has_no_direction():
         np.testing.assert_allclose(quaternion_normalize([0.0, 3.0 * scale, -4.0 * scale, 0.0]), [0, 0.6, -0.8, 0])
     np.testing.assert_allclose(np.linalg.norm(quaternion_normalize([0.0, 5e-324, -5e-324, 0.0])), 1.0, rtol=1e-12)
     for none in ([0, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1]):
-        refused(GeometryError, "", quaternion_normalize, none)
+        refused(geometry.GeometryError, "", quaternion_normalize, none)
 
 
 @pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, -2, 3]])
 @pytest.mark.parametrize("angle", [0, 1e-12, 1e-5, 1e-4, 0.1, 3.0, np.pi - 1e-9, np.pi - 1e-5, np.pi])
 def test_half_turns_and_tiny_turns(axis, angle):
     w = np.array(axis) / np.linalg.norm(axis) * angle
-    m = so3_exp(w)
+    m = geometry.so3_exp(w)
     np.testing.assert_allclose(m, Rotation.from_rotvec(w).as_matrix(), atol=1e-9)
     back = so3_log(m)
     # At pi both signs are right.
     assert min(np.abs(back - w).max(), np.abs(back + w).max() if angle > 3.14 else np.inf) < 1e-7
-    np.testing.assert_allclose(so3_exp(back), m, atol=1e-9)
+    np.testing.assert_allclose(geometry.so3_exp(back), m, atol=1e-9)
 
 
 @given(quaternions, quaternions, st.floats(0, 1))
@@ -82,15 +69,6 @@ def test_slerp_goes_the_shorter_way_at_constant_speed(a, b, fraction):
     np.testing.assert_allclose(between.matrix()[:3, :3], middle, atol=1e-9)
 
 
-@given(quaternions, vectors)
-def test_poses_survive_the_way_through_a_matrix(q, t):
-    pose = Pose(tuple(quaternion_normalize(q)), t)
-    back = Pose.from_matrix(pose.matrix())
-    np.testing.assert_allclose(back.matrix(), pose.matrix(), atol=1e-9)
-    np.testing.assert_allclose(se3_inverse(pose.matrix()) @ pose.matrix(), np.eye(4), atol=1e-9)
-    assert Pose.from_matrix(pose.matrix()[:3]) == back
-
-
 def test_matrices_that_are_no_pose_are_refused():
     for spoil in (
         lambda m: m * [[-1], [1], [1], [1]],  # mirrored
@@ -100,7 +78,7 @@ def test_matrices_that_are_no_pose_are_refused():
         lambda m: m[:2],
         lambda m: m * [[1], [1], [1], [2]],
     ):
-        refused(GeometryError, "", Pose.from_matrix, spoil(look_at([1, 2, 3], [0, 0, 0])))
+        refused(geometry.GeometryError, "", Pose.from_matrix, spoil(look_at([1, 2, 3], [0, 0, 0])))
 
 
 @given(vectors, vectors)
@@ -114,16 +92,7 @@ def test_look_at_looks_at(eye, target):
     np.testing.assert_allclose(local[:3], [0, 0, distance], atol=1e-6 * max(1, distance, *map(abs, eye)))
     assert m[2, 1] <= 1e-9  # image-down never points up
     Pose.from_matrix(look_at(eye, np.subtract(eye, (0, 0, 1))))  # straight down
-    refused(GeometryError, "", look_at, eye, eye)
-
-
-def test_a_pose_on_a_sphere_looks_at_its_middle_or_away_from_it():
-    away = np.array([0.75**0.5, 0.0, 0.5])
-    for outward, sign in ((False, -1.0), (True, 1.0)):
-        pose = geometry.on_sphere([1.0, 2.0, 3.0], 2.0, 90.0, 30.0, outward)
-        assert pose[:3, 3] == pytest.approx(np.array([1.0, 2.0, 3.0]) + 2.0 * away)
-        assert pose[:3, 2] == pytest.approx(sign * away)
-    assert geometry.on_sphere(np.zeros(3), 1.0, 0.0, 0.0)[:3, 3] == pytest.approx([0.0, -1.0, 0.0])
+    refused(geometry.GeometryError, "", look_at, eye, eye)
 
 
 def test_rays_converge_where_least_squares_says():
@@ -191,3 +160,40 @@ def test_from_fov_and_world_rays():
     assert directions.shape == (50, 100, 3)
     np.testing.assert_allclose(directions[24:26, 49:51].mean((0, 1)), [0, 1, 0], atol=1e-3)
     assert directions[0, 0] @ [1, 0, 0] < 0 < directions[0, 0] @ [0, 0, 1]  # top left: to -x, upwards
+
+
+LENS = Pinhole.from_fov(100, 100, 70.0)
+# Share of the directions of the sphere within an angle of one of them.
+FACING = (1.0 - np.cos(np.deg2rad(MOST_OBLIQUE_DEG))) / 2.0
+
+
+def camera(azimuth_deg, distance=3.0, height=0.0, lens=LENS):
+    a = np.deg2rad(azimuth_deg)
+    return lens, look_at((distance * np.sin(a), -distance * np.cos(a), height), (0.0, 0.0, 0.0))
+
+
+def test_one_camera_sees_what_faces_it():
+    found = reckon([camera(0)])
+    assert found.seen_by[1] == pytest.approx(FACING, abs=0.02)
+    assert found.parallax_deg is None and found.distance_m == pytest.approx(3.0)
+    assert (found.plan[PLAN // 2, PLAN // 2], found.plan.max(), found.plan.min()) == (1, 1, 0)
+    # One more helps most from behind, where it sees as much again.
+    assert found.further.pose[:3, 3] @ [0, -1, 0] < -2.0
+    assert found.further.seen_by[0] == pytest.approx(1 - 2 * FACING, abs=0.03)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    "poses",
+    [
+        [np.eye(4)],
+        [look_at((0, 0, 3.0), (0, 0, 0), (0, 1, 0))] * 2,  # straight down
+        [look_at((0, 0, 0), (1, 0, 0)), look_at((0, 0, 0), (-1, 0, 0))],  # away from each other
+        [np.eye(4), np.block([[np.eye(3), np.full((3, 1), 1e6)], [np.array([[0, 0, 0, 1.0]])]])],
+    ],
+)
+def test_odd_rigs_give_finite_numbers(poses):
+    found = reckon([(LENS, np.asarray(pose, np.float64)) for pose in poses])
+    assert sum(found.seen_by) == pytest.approx(1.0) and np.isfinite(found.further.pose).all()
+    assert "nan" not in plan_svg({str(k): (LENS, p) for k, p in enumerate(poses)}, found) and "nan" not in found.words
+    refused(ValueError, "no camera", reckon, [])

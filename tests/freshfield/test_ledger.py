@@ -1,16 +1,23 @@
-"""The ledger: what was written is read, whatever killed the writer."""
+"""The ledger: what was written is read, whatever killed the writer; files are whole whenever somebody looks, and a full
+disk costs lines, not processes."""
 
+import argparse
+import json
+import os
+import resource
 import signal
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from freshfield.files import Lines, out_file, out_folder, write_json
 from freshfield.ledger import Event, Ledger, LedgerReader, read_all
-from tests.freshfield.test_files import no_file_longer_than
 from tests.support import refused
 
 
@@ -24,16 +31,6 @@ def write(out, events, closed=True):
 
 
 EVENTS = [Event(1, "cam00", "s", 0, "captured"), Event(2, "cam00", "s", 0, "answered", "rejected:crc_mismatch")]
-
-
-def test_events_come_back(tmp_path):
-    path = write(tmp_path, EVENTS)
-    file = LedgerReader(path)
-    assert path.name == "ledger-node-cam00-7.tsv"
-    assert file.events == (*EVENTS, Event(99, "", "", 0, "closed"))
-    assert (file.role, file.name, file.closed, file.torn) == ("node", "cam00", True, False)
-    assert not file.unfinished
-    assert [f.path for f in read_all(tmp_path)] == [path]
 
 
 @given(cut=st.integers(0, 200))
@@ -53,7 +50,8 @@ def test_damaged_lines_are_left_out_and_other_files_refused(tmp_path):
     path = write(tmp_path, EVENTS)
     path.write_bytes(path.read_bytes().replace(b"\tanswered\t", b"\0\xff"))
     file = LedgerReader(path)
-    assert file.events[0] == EVENTS[0] and file.torn and file.closed
+    assert file.events == (EVENTS[0], Event(99, "", "", 0, "closed")) and file.torn and file.closed
+    assert (path.name, file.role, file.name) == ("ledger-node-cam00-7.tsv", "node", "cam00") and not file.unfinished
     for data in (b"", b"hello\n", b"#freshfield-ledger 2 node cam00 1\n", b"\xff\xfe"):
         path.write_bytes(data)
         refused(ValueError, "not a freshfield ledger", LedgerReader, path)
@@ -118,3 +116,66 @@ def test_a_full_disk_costs_lines_and_the_ledger_says_how_many(tmp_path):
     assert lost == [1, 3, 6] and said == [1, 2, 3]
     assert [e.sequence for e in file.events if e.event == "captured"] == [0, 1, 2]
     assert file.events[-1].detail == "6" and file.closed and not file.complete
+
+
+@contextmanager
+def no_file_longer_than(size: int):
+    """A real limit: the kernel takes a part of the write that crosses it and refuses those after."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_json_is_replaced_whole_by_any_number_of_threads(tmp_path):
+    path = tmp_path / "status.json"
+
+    def write(who: int) -> None:
+        for _ in range(100):
+            write_json(path, {"who": who, "filling": [who] * 2000})
+
+    write(-1)
+    with ThreadPoolExecutor(4) as pool:
+        writers = [pool.submit(write, who) for who in range(4)]
+        while not all(writer.done() for writer in writers):
+            json.loads(path.read_text())
+    assert [writer.exception() for writer in writers] == [None] * 4 and os.listdir(tmp_path) == ["status.json"]
+
+
+def test_a_place_that_cannot_be_written_is_refused_with_its_option(tmp_path, capsys, monkeypatch):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    monkeypatch.setattr(os, "access", lambda path, _: path.name != "folder")
+    for option, place, said in (
+        (out_folder, "file/x", "file is a file, not a folder: name another"),
+        (out_file, "folder", "folder is a folder, not a file: name another"),
+        (out_folder, "folder/new/x", "folder cannot be written to: name another place"),
+        (out_folder, "a\udcff", r"a\udcff' is not UTF-8: name another"),
+    ):
+        parser = argparse.ArgumentParser()
+        parser.add_argument("--out", type=option)
+        refused(SystemExit, "2", parser.parse_args, ["--out", str(tmp_path / place)])
+        told = capsys.readouterr().err
+        assert "argument --out: " in told and f"{tmp_path}/{said}" in told
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_beside_it(tmp_path):
+    path = tmp_path / "status.json"
+    write_json(path, {"a": 1})
+    with no_file_longer_than(10), pytest.raises(OSError):
+        write_json(path, {"a": "x" * 1000})
+    refused(ValueError, "", write_json, path, {"a": float("nan")})
+    assert json.loads(path.read_text()) == {"a": 1} and os.listdir(tmp_path) == ["status.json"]
+
+
+def test_half_a_line_of_a_killed_writer_is_a_line_of_its_own(tmp_path):
+    (tmp_path / "rows.jsonl").write_text('{"a": 1}\n{"a": ')
+    lines = Lines(tmp_path / "rows.jsonl")
+    assert lines.write('{"a": 2}') and not lines.lost
+    lines.close()
+    assert not lines.write("late")
+    whole, half, new = (tmp_path / "rows.jsonl").read_text().splitlines()
+    assert (whole, new) == ('{"a": 1}', '{"a": 2}')
+    refused(ValueError, "", json.loads, half)

@@ -1,20 +1,15 @@
-"""What a measurement cost: this process's own cores and memory, and the machine's."""
+"""Wall and virtual clocks; what a measurement cost: this process's own cores and memory, and the machine's."""
 
 import os
 import resource
+import time
 
-import numpy as np
 import pytest
 
 from freshfield import machine_load
-from freshfield.machine_load import LoadMeter, cpu_s, outside_cores, outside_load, rss_mb
-
-
-def test_memory_and_processor_time_of_a_process_and_of_one_that_is_gone():
-    block = np.ones(8 * 2**20)  # 64 MB that are touched
-    assert rss_mb() > 60.0
-    assert cpu_s(os.getpid()) > 0.0 and block[0] == 1.0
-    assert rss_mb(2**22 + 1) is None and cpu_s(2**22 + 1) is None
+from freshfield.clock import VirtualClock, WallClock
+from freshfield.machine_load import LoadMeter, outside_cores, outside_load
+from tests.support import refused
 
 
 def use(cpu):
@@ -34,7 +29,7 @@ def test_a_row_has_the_cores_since_the_last_one(tmp_path, monkeypatch):
     monkeypatch.setattr(machine_load, "_PROC", tmp_path)
     monkeypatch.setattr(machine_load.time, "perf_counter", lambda: now_s[0])
     (tmp_path / "7").mkdir()
-    (tmp_path / "7" / "statm").write_text("900 500 3")
+    (tmp_path / "7" / "statm").write_text("90000 50000 3")
 
     def used(process_s: tuple[float, float], machine_s: tuple[float, ...]) -> None:
         numbers = " ".join(str(round(s * ticks)) for s in process_s)
@@ -47,6 +42,35 @@ def test_a_row_has_the_cores_since_the_last_one(tmp_path, monkeypatch):
     now_s[0] += 2.0
     used((3.0, 2.0), (11, 1, 11, 52, 6, 0.5, 0.5, 1))
     row = meter.row(2.0, {"edge": 7, "gone": 8})
-    memory_mb = round(500 * resource.getpagesize() / 1e6, 1)
+    memory_mb = round(50_000 * resource.getpagesize() / 1e6, 1)
     assert row == {"t_s": 2.0, "edge": {"rss_mb": memory_mb, "cpu": 1.5, "pid": 7}, "machine": {"cpu": 2.5}}
     assert outside_cores(row) == 1.0
+
+
+MS = 1_000_000
+
+
+def test_the_wall_clock_is_utc_and_never_steps_back(monkeypatch):
+    clock = WallClock()
+    assert abs(clock.now_ns() - time.time_ns()) < 50 * MS
+    monkeypatch.setattr(time, "time_ns", lambda: 0)  # somebody sets the machine's clock
+    readings = [clock.now_ns() for _ in range(1000)]
+    assert readings == sorted(readings) and readings[0] > 10**18
+
+
+def test_a_wrong_clock_is_wrong_as_told(monkeypatch):
+    monotonic = 10**12
+    monkeypatch.setattr(time, "monotonic_ns", lambda: monotonic)
+    right, wrong = WallClock(), WallClock(offset_ns=-3 * MS, drift_ppm=100.0)
+    begin = wrong.now_ns() - right.now_ns()
+    monotonic += 1000 * 10**9
+    assert begin == pytest.approx(-3 * MS, abs=MS)
+    assert wrong.now_ns() - right.now_ns() - begin == pytest.approx(100 * MS, abs=9)  # 100 ppm of 1000 s
+
+
+def test_virtual_time_only_goes_forward():
+    clock = VirtualClock(5)
+    clock.advance_to(5)
+    clock.advance_to(9)
+    assert clock.now_ns() == 9
+    refused(ValueError, "cannot go back", clock.advance_to, 8)

@@ -60,23 +60,6 @@ def write(path: Path, sent, decisions: int = 3) -> None:
     writer.close({"dropped": 0})
 
 
-def test_frames_are_read_as_they_were_sent(tmp_path):
-    sent = list(requests())
-    write(tmp_path / "a.mcap", sent)
-    session = Session(tmp_path / "a.mcap")
-    assert session.cut is None and set(session.frames) == {"cam00", "cam01"}
-    for camera, found in session.frames.items():
-        expected = [(r, t) for r, t in sent if r.header.camera_id == camera]
-        assert len(found) == len(expected)
-        for frame, (request, arrived_ns) in zip(found, expected):
-            assert frame.header == request.header and frame.arrived_ns == arrived_ns
-            assert session.payload(frame) == request.payload
-            sent_depth = wire.depth_of(request.depth) if request.HasField("depth") else None
-            assert session.depth(frame) == sent_depth
-    assert sum(session.depth(frame) is not None for frame in session.frames["cam01"]) == 4
-    session.close()
-
-
 def test_viewers_find_what_they_know(tmp_path):
     sent = list(requests(3))
     write(tmp_path / "a.mcap", sent)

@@ -17,13 +17,10 @@ from freshfield import transport
 from freshfield.limits import MAX_PAYLOAD_BYTES
 from freshfield.transport import Transport, TransportError, host_port, peer_text
 from tests.freshfield.serving import serving, status
+from tests.freshfield.test_access import Every
 from tests.support import refused
 
 CLOCK, FRAMES = "freshfield.v1.ClockService", "freshfield.v1.FrameStreamService"
-
-
-async def echo(request, context):
-    return request
 
 
 async def sizes(_, context):
@@ -33,15 +30,6 @@ async def sizes(_, context):
 
 async def nothing(_, context):
     await asyncio.sleep(30)
-
-
-def handlers(push=sizes) -> list[grpc.GenericRpcHandler]:
-    """Of a service that echoes, and of one that answers each message with its size."""
-    exchange, stream = grpc.unary_unary_rpc_method_handler(echo), grpc.stream_stream_rpc_method_handler(push)
-    return [
-        grpc.method_handlers_generic_handler(CLOCK, {"Exchange": exchange}),
-        grpc.method_handlers_generic_handler(FRAMES, {"Push": stream}),
-    ]
 
 
 async def ask(transport: Transport, port: int) -> bytes:
@@ -59,7 +47,7 @@ async def test_plain_text_and_messages_up_to_the_limit():
     """Larger ones are refused by who sends them, and where that is a stranger by the server, which lives on."""
     unbounded = [("grpc.max_send_message_length", -1)]
     async with (
-        serving(Transport(), *handlers()) as port,
+        serving(Transport(), Every(sizes)) as port,
         Transport().aio_channel(f"localhost:{port}") as channel,
         grpc.aio.insecure_channel(f"localhost:{port}", options=unbounded) as of_stranger,
     ):
@@ -111,11 +99,11 @@ async def test_tls_and_mutual_tls(pem):
     trusting, deceived = Transport(ca=pem / "ca.pem"), Transport(ca=pem / "stranger.pem")
     known = Transport(cert=pem / "client.pem", key=pem / "client.key", ca=pem / "ca.pem")
 
-    async with serving(server_tls, *handlers()) as port:
+    async with serving(server_tls, Every(sizes)) as port:
         assert await ask(trusting, port) == b"42"
         for client in (deceived, Transport()):
             assert await status(ask(client, port)) == "UNAVAILABLE"
-    async with serving(mutual, *handlers()) as port:
+    async with serving(mutual, Every(sizes)) as port:
         assert await ask(known, port) == b"42"
         assert await status(ask(trusting, port)) == "UNAVAILABLE"
         assert await status(ask(mutual, port)) == "UNAUTHENTICATED", "its name is no caller's"
@@ -141,7 +129,7 @@ async def test_connections_are_few_and_those_that_do_nothing_end(encrypted, pem,
         while await reader.read(4096):
             pass
 
-    async with serving(tls, *handlers()) as port:
+    async with serving(tls, Every(sizes)) as port:
         kept = [await asyncio.open_connection("localhost", port) for _ in range(4)]
         if not encrypted:
             for reader, writer in kept:
@@ -212,7 +200,7 @@ async def test_a_slow_reader_is_felt_at_once():
 
     written = 0
     plain = Transport()
-    async with serving(plain, *handlers(nothing)) as port, plain.aio_channel(f"localhost:{port}") as channel:
+    async with serving(plain, Every(nothing)) as port, plain.aio_channel(f"localhost:{port}") as channel:
         call = channel.stream_stream(f"/{FRAMES}/Push")()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(2):

@@ -198,8 +198,6 @@ def test_bad_lines_are_named(tmp_path):
     for text, message in (
         ("", "at least one sample"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 zero\n", ":2: expected t tx ty tz"),
-        ("0 0 0 0 0 0 0 0\n", ":1: quaternion"),
-        ("0 nan 0 0 0 0 0 1\n", ":1: expected"),
         ("0 0 0 0 0 0 0 1\n-1e300 0 0 0 0 0 0 1\n", ":2: the time -1e.* milliseconds or nanoseconds"),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "times that increase"),
     ):

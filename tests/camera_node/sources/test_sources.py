@@ -10,8 +10,7 @@ import pytest
 from camera_node.capture import Camera, build_cameras
 from camera_node.settings import source_config
 from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
-from camera_node.sources.datasets.streamer import Playback, Timeline, split_photos
-from camera_node.sources.registry import open_sources
+from camera_node.sources.datasets.streamer import Timeline
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects import NAMES
 from camera_node.synthetic.walk import walks_through
@@ -22,23 +21,8 @@ from edge_server.settings import read_config
 from freshfield import payload
 from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import Scenario, ScenarioError, parse
-from tests.camera_node.sources.datasets.photos import edited, photo_scenario, picture, pose_of, write_photos
+from tests.camera_node.sources.datasets.photos import edited, opened, photo_scenario, picture, pose_of, write_photos
 from tests.support import refused, small_world
-
-
-def opened(scenario, cameras=None, data: Path | None = None):
-    return open_sources(scenario, source_config(scenario), cameras or scenario.cameras, data)
-
-
-def test_photos_are_streamed_as_moving_cameras(tmp_path):
-    sources = opened(photo_scenario(write_photos(tmp_path, 24), cameras=3, fps=5))
-    held_out, first = sources["cam00"], sources["cam01"]
-    assert first.fps == 5 and held_out.contents == 3 and first.contents == 11
-    for tick, index in ((0, 0), (1, 8), (2, 16), (3, 8), (4, 0)):
-        shot = held_out.read(held_out.content(tick))
-        np.testing.assert_array_equal(shot.image, picture(index)[..., ::-1])
-        np.testing.assert_allclose(shot.pose.matrix(), pose_of(index), atol=1e-9)
-    np.testing.assert_array_equal(first.read(first.content(1)).image, picture(3)[..., ::-1])
 
 
 def test_a_recording_is_assigned_by_name(tmp_path):
@@ -51,7 +35,6 @@ def test_a_recording_is_assigned_by_name(tmp_path):
     np.testing.assert_array_equal(other["cam00"].read(1).image, picture(13)[..., ::-1])
     for count, assignment, message in (
         (4, {}, r"no camera 'cam03'.*cam00, cam01, cam02"),
-        (3, {"cam09": "cam00"}, r"assignment\.cam09"),
         (3, {"cam01": "cam00"}, "more than one camera shows cam00"),
     ):
         refused(ScenarioError, message, opened, photo_scenario(data, count, assignment=assignment))
@@ -67,49 +50,22 @@ def test_an_impossible_rate_of_a_recording_is_named(fps, time_unit_s, tmp_path):
     refused(DatasetError, r"transforms\.json: recorded .* expected 0\.01 to 1000", opened, photo_scenario(data, 2))
 
 
-def test_a_jpeg_of_the_right_size_is_sent_as_it_lies(tmp_path):
+def test_a_jpeg_of_the_right_size_is_sent_as_it_lies_unless_it_is_cut(tmp_path):
     data = write_photos(tmp_path, 8, suffix=".jpg")
     source = opened(photo_scenario(data, 2, codec="jpeg"), ["cam01"])["cam01"]
     assert source.read(4).image == (tmp_path / "images/005.jpg").read_bytes()
     shrunk = opened(photo_scenario(data, 2, codec="jpeg", scale=2), ["cam01"])["cam01"]
     assert not isinstance(shrunk.read(4).image, bytes) and shrunk.intrinsics.width == 16
-
-
-def test_back_and_forth_and_restart_at_a_recordings_own_pace():
-    there_and_back = Playback(4, Fraction(10), Fraction(10))
-    assert [there_and_back.frame(k) for k in range(9)] == [0, 1, 2, 3, 2, 1, 0, 1, 2]
-    restart = Playback(4, Fraction(10), Fraction(10), back_and_forth=False)
-    assert [restart.frame(k) for k in range(6)] == [0, 1, 2, 3, 0, 1]
-    assert [Playback(1, Fraction(10), Fraction(30)).frame(k) for k in range(3)] == [0, 0, 0]
-    assert [Playback(1000, Fraction(15), Fraction(60)).frame(k) for k in range(4)] == [0, 4, 8, 12]
-    fast = Playback(1000, Fraction(60), Fraction(20))
-    assert [fast.frame(k) for k in range(7)] == [0, 0, 1, 1, 1, 2, 2]  # the nearest, halves upwards
-
-
-def test_photos_are_dealt_in_turn_and_each_eighth_or_the_sets_own_is_held_out():
-    assert split_photos(10, ["a", "b"], ["d"]) == {"d": [0, 8], "a": [1, 3, 5, 7], "b": [2, 4, 6, 9]}
-    assert split_photos(6, ["a", "b"], ["d"], [1, 4]) == {"d": [1, 4], "a": [0, 3], "b": [2, 5]}
-    assert split_photos(6, ["a", "b"], [], [1, 4]) == {"a": [0, 3], "b": [2, 5]}
-    refused(DatasetError, "3 images are too few", split_photos, 3, ["a", "b", "c"], ["d"])
-
-
-def recorded(**times: list[float]) -> Dataset:
-    images = (
-        PosedImage(f"{camera}{k}", camera, time_s, np.eye(4), Pinhole(8, 8, 8, 8, 4, 4), lambda: None)
-        for camera, stamps in times.items()
-        for k, time_s in enumerate(stamps)
-    )
-    return Dataset(tuple(images))
+    whole = (tmp_path / "images/006.jpg").read_bytes()
+    (tmp_path / "images/006.jpg").write_bytes(whole[: len(whole) * 2 // 3])
+    refused(DatasetError, r"006\.jpg: damaged or cut short", source.read, 5)
 
 
 def test_a_timeline_holds_what_all_cameras_have_at_the_fastest_ones_rate():
-    found = recorded(fast=[0.2, 0.3, 0.4, 0.6, 0.7, 0.8], slow=[0.0, 0.2, 0.4, 0.6], once=[5.0])
-    timeline = Timeline.of(found, Path("set"))
-    assert timeline == Timeline(0.2, 5, Fraction(10))
-    assert list(timeline.nearest(found.of("fast"))) == [0, 1, 2, 2, 3]  # 0.5 s was dropped: the earlier of two
-    assert list(timeline.nearest(found.of("slow"))) == [1, 1, 2, 2, 3]
-    assert list(timeline.nearest(found.of("once"))) == [0] * 5
-    assert list(Timeline(0.0, 0, Fraction(10)).nearest(found.of("slow"))) == [0, 1, 2, 3]
+    times = {"fast": [0.2, 0.3, 0.4, 0.6, 0.7, 0.8], "slow": [0.0, 0.2, 0.4, 0.6], "once": [5.0]}
+    rows, lens = [(camera, t_s) for camera in times for t_s in times[camera]], Pinhole(8, 8, 8, 8, 4, 4)
+    images = (PosedImage(f"{camera}{t_s}", camera, t_s, np.eye(4), lens, lambda: None) for camera, t_s in rows)
+    assert Timeline.of(Dataset(tuple(images)), Path("set")) == Timeline(0.2, 5, Fraction(10))
 
 
 WORLD = {"kind": "world", "width": 16, "height": 12, "fps": 10, "carried": ["hand"], "params": {"people": 0}}
@@ -180,7 +136,6 @@ def test_a_walk_repeats_after_a_lap_and_neither_jumps_nor_leaves_the_room():
         (WORLD, 1, ("hand", "kept"), r"cameras.held_out_every: expected 2 or more, .* got 1, 1 of 2 held out"),
         (WORLD, 8, ("hand", "other", "kept"), r"as many held-out cameras as training cameras"),
         (WORLD, 7, ("hand", "kept"), r"hand's path repeats after 192 captures, expected a multiple of 7"),
-        ({**WORLD, "carried": ["foot"]}, 8, ("hand", "kept"), r"source.carried: expected cameras .* got foot"),
         ({"kind": "camera"}, 8, ("hand", "kept"), r"needs a recorded data set or a synthetic world"),
     ],
 )
@@ -202,18 +157,18 @@ def cameras(effects: dict[str, Any], count: int = 3, scene: str = "tower", seed:
 
 @pytest.mark.parametrize("name", sorted(set(NAMES) - {"clock_drift", "depth_sensor", "pose_delay"}))
 def test_an_effect_reaches_the_frames_but_not_the_truth(name):
-    """Deterministic by the seed, whoever else is there; in_truth reaches the held-out camera, too."""
+    """Deterministic by the seed, whoever else is there, in any order; in_truth reaches the held-out camera, too."""
     plain, affected, truth = cameras({}), cameras({name: {}}), cameras({name: {"in_truth": True}})
-    fewer = cameras({name: {}}, count=2)
+    fewer, ticks = cameras({name: {}}, count=2), (0, 7, 123_456)
 
-    def frames(camera: Camera) -> list[tuple[bytes, Pose]]:
-        shots = [camera.capture(tick) for tick in (0, 7, 123_456)]
+    def frames(camera: Camera, ticks: tuple[int, ...] = ticks) -> list[tuple[bytes, Pose]]:
+        shots = [camera.capture(tick) for tick in ticks]
         return [(s.payload, s.pose) for s in shots]
 
     assert frames(affected["cam00"]) == frames(plain["cam00"])
     assert frames(affected["cam01"]) != frames(plain["cam01"])
     assert frames(truth["cam00"]) != frames(plain["cam00"])
-    assert frames(truth["cam01"]) == frames(affected["cam01"]) == frames(fewer["cam01"])
+    assert frames(truth["cam01"]) == frames(affected["cam01"]) == frames(fewer["cam01"], ticks[::-1])[::-1]
 
 
 def test_a_depth_sensor_measures_with_every_camera_but_the_held_out_one_and_changes_no_image():

@@ -7,13 +7,13 @@ import time
 import numpy as np
 import pytest
 
-from edge_server.fields import Budget
+from edge_server.fields import Budget, FitReport
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.loop import UpdateLoop
 from edge_server.live.state import Controls
 from edge_server.scheduler import make_policy
-from freshfield.clock import WallClock
+from freshfield.clock import Clock, VirtualClock, WallClock
 from tests.edge_server.fields_for_tests import tiny_field
 from tests.edge_server.frames import frame
 from tests.support import refused, wait_until
@@ -106,9 +106,9 @@ def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
 class Running:
     """A loop on the wall clock, with what it published and its status lines."""
 
-    def __init__(self, u: FieldUpdater, grace_ms: float = 0.0) -> None:
+    def __init__(self, u: FieldUpdater, grace_ms: float = 0.0, clock: Clock | None = None) -> None:
         self.published, self.lines, self.saved = [], [], []
-        self.clock = WallClock()
+        self.clock = clock or WallClock()
         self.controls = Controls(u.policy.name, u.policy.value)
         told = (lambda p, r, v: self.published.append((p, r)), self.lines.append, self.saved.append, lambda event: None)
         self.loop = UpdateLoop(u, self.clock, self.controls, 100.0, grace_ms, *told)
@@ -166,3 +166,16 @@ def test_a_field_that_fails_ends_the_loop_and_tells_who_asked_for_a_checkpoint(w
     assert isinstance(run.loop.failure, RuntimeError)
     if where == "checkpoint":
         refused(RuntimeError, "thread has failed", future.result, 30)
+
+
+@pytest.mark.parametrize(("learns_each", "expected"), [(100, [10, 40, 70]), (2, [19, 49]), (4, [13, 43, 73]), (1, [])])
+def test_updates_without_time_to_learn_are_warned_of_again_every_half_minute(learns_each, expected, caplog):
+    """Also where one learns now and then."""
+    clock = VirtualClock()
+    starved = Running(updates(), clock=clock).loop
+    told = []
+    for second in range(75):  # one update a second
+        clock.advance_to(second * 1000 * MS)
+        starved._warn_without_steps(FitReport(0, 0.1, 0.0, 0, 0, short=second % learns_each > 0))
+        told += [second] * (len(caplog.records) - len(told))
+    assert told == expected

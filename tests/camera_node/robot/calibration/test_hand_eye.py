@@ -1,31 +1,37 @@
-"""Hand-eye calibration on samples whose truth is known, on real ones whose answer was published, and on pairs of poses
-as programs save them."""
+"""Hand-eye calibration on samples whose truth is known, on real ones whose answer was published, on pairs of poses as
+programs save them, and guided, with the real detector on rendered images."""
 
 import json
 import re
-import sys
 import warnings
+from fractions import Fraction
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
 from camera_node.cli import main
+from camera_node.robot.arm.camera_poses import base_matrix, camera_poses
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND, read_hand_eye
-from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration import CalibrationError, guided
+from camera_node.robot.calibration.guided import HandEyeSession, missing_turn
 from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, calibrate
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, solve
-from camera_node.robot.calibration.hand_eye.refinement import flange_residuals, refine
+from camera_node.robot.calibration.hand_eye.refinement import refine
 from camera_node.robot.calibration.hand_eye.samples import Samples, angle_deg, distance_mm, diversity
 from camera_node.robot.calibration.inputs import read_visp_folder
 from camera_node.robot.calibration.pose_pairs import read_pairs
-from camera_node.robot.calibration.targets import parse_target
-from freshfield.geometry import se3, se3_inverse, so3_exp
+from camera_node.robot.calibration.targets import WHICH_PRINT, parse_target
+from camera_node.settings import source_config
+from camera_node.sources.base import Shot, Source
+from freshfield.geometry import Pinhole, Pose, se3, se3_inverse, so3_exp
+from freshfield.scenario import load
 from tests.camera_node.robot.calibration import known_truth
-from tests.camera_node.robot.calibration.known_truth import noisy_samples
-from tests.camera_node.sources.datasets.photos import BOMB
+from tests.camera_node.robot.calibration.known_truth import BOARD, LENS, noisy_samples, taken
+from tests.camera_node.robot.calibration.test_rig import printed
 from tests.conftest import data_dir
 from tests.support import refusal, refused
 
@@ -46,13 +52,10 @@ def test_every_method_is_exact_on_exact_samples(setup):
 
 def test_residuals_have_units():
     """Of a target put 3 mm aside in one of four samples, and of one turned by 0.02 rad."""
-    moved = np.array([np.eye(4)] * 4)
-    targets = moved.copy()
+    still = np.array([np.eye(4)] * 4)
+    targets = still.copy()
     targets[0, 0, 3], targets[1, :3, :3] = 0.003, so3_exp([0.0, 0.0, 0.02])
-    off = Residuals.of(Samples(moved, targets), np.eye(4), np.eye(4))
-    np.testing.assert_allclose(off.mm, [3.0, 0.0, 0.0, 0.0], atol=1e-9)
-    np.testing.assert_allclose(off.deg, [0.0, np.degrees(0.02), 0.0, 0.0], atol=1e-9)
-    assert off.rms[0] == pytest.approx(1.5)
+    assert Residuals.of(Samples(still, targets), still[0], still[0]).rms == pytest.approx((1.5, np.degrees(0.01)))
     # A rotation counts as the motion of a point at 330 mm.
     assert Residuals(np.array([2.0]), np.array([np.degrees(0.01)])).score_mm == pytest.approx(2.0 + 3.3)
 
@@ -69,13 +72,6 @@ def test_how_much_the_flange_must_turn():
         flanges = np.array([se3(so3_exp(np.radians(turn)), np.zeros(3)) for turn in turns_deg])
         found = diversity(Samples(flanges, flanges)).reason
         assert found is None if reason is None else reason in str(found)
-
-
-def test_the_flanges_residual_is_the_motion_from_the_reported_to_the_predicted_pose():
-    exact = noisy_samples(4, np.random.default_rng(1), 0.0, 0.0)
-    off = se3(so3_exp([0.01, -0.02, 0.03]), [0.001, 0.002, -0.003])
-    found = flange_residuals(Samples(exact.flange @ np.linalg.inv(off), exact.target), X, Y)
-    np.testing.assert_allclose(found, [[0.01, -0.02, 0.03, 0.001, 0.002, -0.003]] * 4, atol=1e-9)
 
 
 def test_with_noise_on_the_arm_the_refinement_is_as_exact_as_can_be_and_says_so():
@@ -121,9 +117,7 @@ def test_a_board_of_another_size_than_said_is_told_and_its_size_found(setup, fac
     assert calibrate(right, fit_size=True).warnings == calibrate(right).warnings == ()
 
 
-@pytest.mark.parametrize(
-    ("scale", "says"), [(1e-3, "targets seem to be in millimeters"), (1e3, "flanges in millimeters")]
-)
+@pytest.mark.parametrize(("scale", "says"), [(1e-3, "targets seem to be in millimeters"), (1e3, "meters, flanges in")])
 def test_meters_and_millimeters_do_not_mix(scale, says):
     refused(CalibrationError, says, calibrate, noisy_samples(12, np.random.default_rng(3)).rescaled(scale))
 
@@ -203,99 +197,49 @@ def test_numbers_that_are_none_are_refused():
         refused(CalibrationError, "finite", Samples, samples.flange, samples.target)
 
 
-X = known_truth.CAMERA_IN_FLANGE
-
-
 def hand_eye(*arguments) -> int:
     return main(["calibrate", "hand-eye", *map(str, arguments)])
 
 
-def write_pairs(file, samples) -> None:
-    pairs = [[flange.tolist(), target.tolist()] for flange, target in zip(samples.flange, samples.target)]
-    file.write_text(json.dumps(pairs))
-
-
-@pytest.fixture
-def pairs(tmp_path):
-    file = tmp_path / "pairs.json"
-    write_pairs(file, noisy_samples(15, np.random.default_rng(1)))
-    return file
-
-
-def test_json_is_the_answer_and_what_it_is_worth_and_is_not_lost_with_its_file(pairs, tmp_path, capsys):
-    assert hand_eye("--pairs", pairs, "--json") == 0
-    said = capsys.readouterr()
-    found = json.loads(said.out)
-    keys = "transform residual_mm residual_deg method std_mm std_deg warnings"
-    assert list(found) == keys.split()
-    assert 0.0 < found["std_mm"] < 1.0 and 0.0 < found["std_deg"] < 0.2 and found["warnings"] == []
-    assert found["method"] == "refined" and said.err == ""
-    assert distance_mm(np.array(found["transform"]), X) < 1.5
-    (tmp_path / "no").touch()
-    assert hand_eye("--pairs", pairs, "--json", "--out", tmp_path / "no" / "hand.yaml") == 2
-    said = capsys.readouterr()
-    assert json.loads(said.out) == found and said.err.startswith("camera-node: --out: ")
-
-
-def test_the_table_and_the_file(pairs, tmp_path, capsys):
-    out = tmp_path / "hand.yaml"
+def test_the_table_the_file_and_json_which_is_not_lost_with_its_file(tmp_path, capsys):
+    pairs, out = tmp_path / "pairs.json", tmp_path / "hand.yaml"
+    samples = noisy_samples(15, np.random.default_rng(1))
+    pairs.write_text(json.dumps([[h.tolist(), t.tolist()] for h, t in zip(samples.flange, samples.target)]))
     assert hand_eye("--pairs", pairs, "--out", out) == 0
     said = capsys.readouterr().out
-    assert all(name in said for name in ("tsai", "park", "horaud", "andreff", "daniilidis", "refined"))
-    assert "standard deviation" in said and "the arm's noise, estimated" in said
+    assert all(name in said for name in ALL_METHODS) and "standard deviation" in said
     loaded = read_hand_eye(out)
     assert distance_mm(loaded.transform, X) < 1.5
     assert loaded.details["poses"] == 15 and 0.2 < loaded.details["arm_noise_mm"] < 1.0
+    assert hand_eye("--pairs", pairs, "--json", "--out", pairs / "hand.yaml") == 2
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    assert said.err.startswith("camera-node: --out: ")
+    assert list(found) == ["transform", "residual_mm", "residual_deg", "method", "std_mm", "std_deg", "warnings"]
+    expected, said = calibrate(samples), [found[key] for key in ("residual_mm", "residual_deg", "std_mm", "std_deg")]
+    assert said == pytest.approx([*expected.residuals.rms, expected.refined.std_mm, expected.refined.std_deg])
+    np.testing.assert_allclose(found["transform"], loaded.transform, atol=1e-8)
 
 
-def test_nonsense_is_refused_and_not_an_answer(tmp_path, capsys):
-    good, out = noisy_samples(15, np.random.default_rng(1)), tmp_path / "hand.yaml"
+def test_nonsense_is_refused_and_not_an_answer():
+    good = noisy_samples(15, np.random.default_rng(1))
     millimeters = Samples(good.flange.copy(), good.target.copy())
     for poses in (millimeters.flange, millimeters.target):
         poses[:, :3, 3] *= 1e3
     for samples in (Samples(good.flange, se3_inverse(good.target)), millimeters):
-        write_pairs(tmp_path / "pairs.json", samples)
-        assert hand_eye("--pairs", tmp_path / "pairs.json", "--json", "--out", out) == 2
-        said = capsys.readouterr()
-        assert "not their inverses, in meters" in said.err and said.out == "" and not out.exists()
+        refused(CalibrationError, "not their inverses, in meters", calibrate, samples)
 
 
-def test_a_real_folder(capsys):
-    folder = data_dir("handeye_visp_franka")
-    assert hand_eye(folder, "--board", "chessboard:9x6:23.6mm", "--method", "park", "--json") == 0
-    said = capsys.readouterr()
-    found = json.loads(said.out)
-    assert found["residual_mm"] == pytest.approx(5.411, abs=0.001)
-    assert found["residual_deg"] == pytest.approx(0.456, abs=0.001)
-    assert found["warnings"][0] in said.err and "8 poses" in said.err
+CHESSBOARD = ("--board", "chessboard:9x6:10mm")
 
 
-BOARD = ("--board", "chessboard:9x6:10mm")
-
-
-def test_mistakes_are_one_line(tmp_path, capsys, pairs):
+def test_mistakes_are_one_line(capsys):
     for words, why in (
-        ((), "expected one of FOLDER"),
-        (("--pairs", "PAIRS", "--live", "room"), "expected one of FOLDER"),
-        (("--pairs", "PAIRS", "--lens", "x"), "--lens: goes with FOLDER or --live SCENARIO, not with"),
-        (("FOLDER", *BOARD, "--camera", "1"), "--camera: goes with --live SCENARIO, not with"),
-        (("--pairs", "PAIRS", "--method", "magic"), "--method: expected one of tsai"),
-        (("FOLDER",), "--board SPEC"),
-        (("FOLDER", *BOARD), "has 0 camera XML files"),
-        (("--live", "room", "--camera", "cam00", *BOARD, "--seconds", "-1"), "positive"),
+        (("--pairs", "x", "--live", "room"), "expected one of FOLDER"),
+        (("--pairs", "x", "--lens", "x"), "--lens: goes with FOLDER or --live SCENARIO, not with"),
+        (("--live", "room", "--camera", "cam00", *CHESSBOARD, "--seconds", "-1"), "positive"),
     ):
-        given = {"PAIRS": pairs, "FOLDER": tmp_path}
-        said = refusal(capsys, main, "calibrate", "hand-eye", *(given.get(word, word) for word in words))
-        assert said.startswith("camera-node: ") and why in said
-
-
-def test_numbers_and_images_beyond_bounds_are_one_line(tmp_path, capsys):
-    (tmp_path / "bomb.png").write_bytes(BOMB)
-    for words, message in (
-        ("target charuco:7x5:30mm:22mm --out board.png --dpi nan", "--dpi: makes a picture nan pixels wide"),
-        (f"intrinsics {tmp_path} --board chessboard:9x6:10mm", "bomb.png: cannot be read as a picture, or is larger"),
-    ):
-        assert message in refusal(capsys, main, "calibrate", *words.split())
+        assert why in refusal(capsys, main, "calibrate", "hand-eye", *words)
 
 
 @pytest.mark.parametrize(
@@ -313,12 +257,8 @@ def test_a_printed_target_measures_what_is_said(spec, size, tmp_path, capsys):
     # Pixels a meter, over the whole target: what --dpi says.
     pixels = np.ptp(corners.pixels[:, 0]) / np.ptp(corners.points[:, 0])
     assert pixels == pytest.approx(200 / 0.0254, rel=0.001)
-
-
-def test_without_scipy_it_says_what_to_install(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "scipy", None)
-    assert hand_eye("--pairs", "x") == 2
-    assert "pip install 'freshfield[calibrate]'" in capsys.readouterr().err
+    words = ["calibrate", "target", spec, "--out", file, "--dpi", "nan"]
+    assert "--dpi: makes a picture nan pixels wide" in refusal(capsys, main, *words)
 
 
 FLANGES = np.array([se3(so3_exp([0.1 * k, 0.2, -0.3]), [0.1, 0.2 * k, 0.3]) for k in range(3)])
@@ -377,14 +317,86 @@ def test_easy_handeye_saves_the_base_in_the_flange_for_a_camera_that_stands(tmp_
 def test_what_is_none_of_them_is_refused_by_name(tmp_path):
     for data, says in (
         ("{", "cannot be read as JSON"),
-        ({"poses": []}, "expected a list of pairs .*or the samples of MoveIt's panel or easy_handeye"),
         ({"hand_world_samples": {"transforms": [1]}, "camera_marker_samples": {"transforms": []}}, "expected a list"),
-        ([[1]], "pair 1"),
         ([[[[10**400] * 4] * 4] * 2], "pair 1"),
-        ([{"robot": named(FLANGES[0])}], "pair 1: .*tracking"),
         ([[[0.0] * 6 + [1.02], seven(TARGETS[0])]], "pair 1: .*no unit quaternion"),
         ([[seven(FLANGES[0])[:6], seven(TARGETS[0])]], "pair 1: .*4 x 4"),
     ):
         file = tmp_path / "pairs.json"
         file.write_text(data if isinstance(data, str) else json.dumps(data))
         refused(CalibrationError, f"pairs.json: {says}", read_pairs, file, EYE_IN_HAND)
+
+
+def test_it_waits_for_stillness_keeps_what_is_new_and_says_when_there_is_enough():
+    images, flanges = taken()
+    flanges = known_truth.add_noise(flanges, np.random.default_rng(0), 1e-4, 2e-4)
+    session = HandEyeSession(parse_target(BOARD), EYE_IN_HAND)
+    steps = []
+    for image, flange in zip(images, flanges):
+        assert session.offer(image, LENS, flange).outcome == "arm moving"
+        steps.append(session.offer(image, LENS, flange))
+        assert steps[-1].outcome == "kept"
+        assert session.offer(image, LENS, flange).outcome == f"like pose {len(steps)}"
+    assert [len(steps), len(session.samples)] == [12, 12]
+    assert not steps[0].enough and "turn the flange by 20" in steps[0].advice
+    assert steps[-1].enough and steps[-1].advice == "enough"
+    found = calibrate(session.samples)
+    assert distance_mm(found.transform, X) < 3 * found.refined.std_mm < 1.5
+    assert angle_deg(found.transform, X) < 0.1
+    step = session.offer(np.ascontiguousarray(images[-1][:, ::-1]), LENS, flanges[-1])
+    assert step.outcome == "target not found" and "the picture is mirrored" in step.advice
+    # The axis that is missing.
+    turns = [[0, 0, 0], [0.4, 0, 0], [0, 0.3, 0], [0.3, 0.3, -0.1]]
+    poses = np.array([se3(so3_exp(turn), np.zeros(3)) for turn in turns])
+    assert "about its +z" in missing_turn(poses) and "about its +y" in missing_turn(poses[:2])
+    assert "bring the target" in missing_turn(poses[:0])
+
+
+def test_it_asks_for_all_of_a_board_whose_part_fits_two_prints():
+    whole = printed(5, 8, legacy=True)
+    part = whole.copy()
+    part[:, 40 + 80 * 4 :] = 255
+    session = HandEyeSession(parse_target("charuco:5x8:30mm:22mm"), EYE_IN_HAND)
+    lens = Pinhole(480, 720, 600.0, 600.0, 240.0, 360.0)
+    steps = [session.offer(image, lens, np.eye(4)) for image in (part, part, whole, part)]
+    assert [step.outcome for step in steps] == ["arm moving", "target unclear", "kept", "like pose 1"]
+    assert steps[1].advice == WHICH_PRINT and len(session.samples) == 1
+
+
+class Recording(Source):
+    """Rendered images, each twice, with poses (N, 4, 4) as a scenario's arm gives them: it holds still."""
+
+    camera, fps, intrinsics = "eye", Fraction(500), LENS
+
+    def __init__(self, poses):
+        self._images = [cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) for image in taken()[0]]
+        self._poses, self.contents = poses, 2 * len(poses)
+
+    def read(self, content):
+        if content == 1:
+            raise ValueError("no pose near enough")
+        return Shot(self._images[content // 2], Pose.from_matrix(self._poses[content // 2]), LENS)
+
+
+def test_what_it_saves_is_what_the_node_takes_it_for(tmp_path, monkeypatch, capsys):
+    """Of a camera that stands, in the axes of the arm's base, wherever that stands in the world."""
+    file, out = tmp_path / "bench.yaml", tmp_path / "eye.yaml"
+    arm = {"host": "127.0.0.9", "base_m": [0.4, -0.3, 0.1], "base_yaw_deg": 30.0, "cameras": {"eye": None}}
+    source = {"kind": "world", "scene": "tile", "codec": "png", "arm": {**arm, "simulated": True}}
+    file.write_text(yaml.safe_dump({"cameras": {"ids": ["eye"]}, "source": source}))
+    plan = load(str(file))
+    config = source_config(plan).arm
+    base = base_matrix(config)
+    recording = Recording(base @ se3_inverse(taken()[1]))
+    monkeypatch.setattr(guided, "open_sources", lambda *_: {"eye": recording})
+    words = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--out", str(out), "--eye-to-hand", "--json"]
+    assert main(["calibrate", "hand-eye", *words]) == 0
+    said = capsys.readouterr()
+    assert "no pose near enough" in said.err and said.err.splitlines()[-1].endswith("kept: enough")
+    found = np.array(json.loads(said.out)["transform"])
+    assert distance_mm(found, X) < 0.6 and angle_deg(found, X) < 0.1
+    used = msgspec.structs.replace(config, cameras={"eye": str(out)})
+    place = camera_poses(plan, used, ["eye"])["eye"].at(0)[0].matrix()
+    assert distance_mm(place, base @ X) < 0.6
+    file.write_text(file.read_text().replace("eye: null", "eye: eye.yaml"))
+    assert "source.arm.cameras: set eye: null for" in refusal(capsys, main, "calibrate", "hand-eye", *words)

@@ -1,7 +1,7 @@
 """Small data sets written on the spot: real files for real sources, without a download."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from camera_node.settings import source_config
+from camera_node.sources.base import Source
 from camera_node.sources.datasets.records import DatasetError
+from camera_node.sources.registry import open_sources
 from freshfield.geometry import OPENGL_TO_OPENCV, look_at
 from freshfield.scenario import Scenario, parse
 from tests.support import refused
@@ -58,6 +61,11 @@ def edited(file: Path, change: Callable[[Any], Any] | None = None, **top: Any) -
 
 
 fails = partial(refused, DatasetError)
+
+
+def opened(scenario: Scenario, cameras: Sequence[str] = (), data: Path | None = None) -> dict[str, Source]:
+    """The sources of a scenario's cameras, or of those named."""
+    return open_sources(scenario, source_config(scenario), cameras or scenario.cameras, data)
 
 
 def photo_scenario(data: Path, cameras: int = 3, file: Path = Path("test.yaml"), **source: Any) -> Scenario:

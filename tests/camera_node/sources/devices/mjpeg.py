@@ -49,9 +49,8 @@ def number_of(image: np.ndarray) -> int:
 class NetworkCamera:
     """Serves until ``close``; ``sent_ns`` says when each picture was handed to the network (clock's ns)."""
 
-    def __init__(self, clock, fps=20.0, port=0):
+    def __init__(self, clock, fps=20.0):
         self.sent_ns: dict[int, int] = {}
-        self.silent = threading.Event()
         self._stop = threading.Event()
         camera = self
 
@@ -62,12 +61,11 @@ class NetworkCamera:
                 self.end_headers()
                 try:
                     while not camera._stop.is_set():
-                        if not camera.silent.is_set():
-                            number = len(camera.sent_ns) % 256
-                            data = cv2.imencode(".jpg", picture(number))[1].tobytes()
-                            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
-                            camera.sent_ns[len(camera.sent_ns)] = clock.now_ns()
-                            self.wfile.write(head.encode() + data + b"\r\n")
+                        number = len(camera.sent_ns) % 256
+                        data = cv2.imencode(".jpg", picture(number))[1].tobytes()
+                        head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+                        camera.sent_ns[len(camera.sent_ns)] = clock.now_ns()
+                        self.wfile.write(head.encode() + data + b"\r\n")
                         time.sleep(1.0 / fps)
                 except OSError:
                     pass
@@ -75,7 +73,7 @@ class NetworkCamera:
             def log_message(self, *arguments):
                 pass
 
-        self._server = http.server.ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        self._server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self._server.daemon_threads = True
         self.port = self._server.server_address[1]
         self.address = f"http://127.0.0.1:{self.port}/stream.mjpeg"

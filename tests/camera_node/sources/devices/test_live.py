@@ -93,40 +93,26 @@ class Feed:
         raise RuntimeError("it is gone")
 
 
-def test_a_camera_that_is_silent_gives_no_old_frames_and_is_opened_again():
-    """As drivers of OAK and RealSense are, without an error."""
+def test_a_camera_that_is_silent_or_breaks_gives_no_old_frames_and_is_opened_again():
+    """As drivers of OAK and RealSense are, without an error or with any."""
+    trouble = RuntimeError("failed to set power state")
+    feeds = [Feed(breaks_after=1), None, Feed(breaks_after=3, trouble=trouble), Feed()]
     opened = []
 
     def open_feed():
-        opened.append(Feed(breaks_after=1))
+        opened.append(feeds[len(opened)])
+        if opened[-1] is None:
+            raise trouble
         return opened[-1]
 
     source = LiveSource("eye", Fraction(10), open_feed, STANDING, None, 0.05)
     stamps = [source.read(0).captured_ns]
-    with pytest.raises(CameraError, match="eye: no new frame"):
-        for _ in range(20):
-            source.read(0)
+    refused(CameraError, "eye: no new frame", lambda: [source.read(0) for _ in range(4)])
+    stamps += [patiently(lambda: source.read(0)).captured_ns]
+    wait_until(lambda: len(opened) == 4, "it is not opened again")
     stamps += [patiently(lambda: source.read(0)).captured_ns for _ in range(2)]
     source.close()
-    assert stamps == sorted(set(stamps)) and len(opened) >= 3 and opened[0].closed and opened[1].closed
-
-
-@pytest.mark.parametrize("where", ["opening", "grabbing"])
-def test_whatever_a_driver_raises_the_camera_is_opened_again(where):
-    trouble = RuntimeError("failed to set power state")
-    opened = []
-
-    def open_feed():
-        opened.append(Feed(breaks_after=3, trouble=CameraError("eye: gone") if where == "opening" else trouble))
-        if len(opened) == 2 and where == "opening":
-            raise trouble
-        return opened[-1]
-
-    source = LiveSource("eye", Fraction(30), open_feed, STANDING)
-    wait_until(lambda: len(opened) >= 4, "it is not opened again")
-    assert opened[0].closed
-    assert patiently(lambda: source.read(0)).intrinsics == LENS
-    source.close()
+    assert stamps == sorted(set(stamps)) and feeds[0].closed and feeds[2].closed
 
 
 def test_whatever_a_driver_raises_at_the_start_is_one_line():
@@ -206,12 +192,8 @@ def test_the_camera_that_is_meant_is_the_one_named_or_the_only_one():
         return select_device("eye", "OAK", device, lambda: there, "is it plugged in?").handle
 
     assert chosen(None, "a") == "A" and chosen("b", "a", "b") == "B"
-    for device, serials, message in (
-        (None, "ab", r"^eye: several OAK cameras, name one in source.devices: a, b$"),
-        ("c", "ab", r"^eye: no OAK camera c; there are a, b$"),
-        (None, "", r"^eye: no OAK camera found: is it plugged in\?$"),
-    ):
-        refused(CameraError, message, chosen, device, *serials)
+    for device, serials in ((None, "ab"), ("c", "ab"), (None, "")):
+        refused(CameraError, "^eye: (several|no) OAK camera", chosen, device, *serials)
 
 
 def test_video_devices_are_listed_with_the_name_that_lasts(tmp_path):

@@ -21,7 +21,7 @@ from freshfield.frame import to_request
 from tests.conftest import ROOT
 from tests.edge_server.frames import frame
 from tests.edge_server.page.preview import bare_state
-from tests.freshfield.test_files import no_file_longer_than
+from tests.freshfield.test_ledger import no_file_longer_than
 
 
 def publication(number: int, psnr: float | None = None) -> Publication:

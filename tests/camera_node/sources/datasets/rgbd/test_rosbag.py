@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 
 from camera_node.cli import _recording, main
-from camera_node.settings import source_config
 from camera_node.sources.datasets.formats import open_dataset
-from camera_node.sources.registry import open_sources
 from edge_server.experiments.scenes.recorded import load_recorded
 from freshfield.geometry import Pose, look_at
-from tests.camera_node.sources.datasets.photos import fails
+from tests.camera_node.sources.datasets.photos import fails, opened
 
 mcap = pytest.importorskip("mcap_protobuf.writer", reason="needs the extra mcap")
 rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="needs the extra ros")
@@ -209,7 +207,7 @@ def test_a_bag_is_played_without_a_scenario(tmp_path, capsys):
     left.append(("/tf", 0, transforms(transform(START_NS, "base", "left", MOUNT))))
     bag = write(tmp_path / "run", [*robot(), *pictures(), *left])
     scenario = _recording(bag, f"hand={EYE},left", 3)
-    sources = open_sources(scenario, source_config(scenario), scenario.cameras)
+    sources = opened(scenario)
     assert set(sources) == {"hand", "left"} and scenario.seed == 3
     shot = sources["hand"].read(1)
     assert np.array_equal(shot.image, PICTURE) and shot.pose.translation_m == pytest.approx((10.15, 0.0, 0.3))
