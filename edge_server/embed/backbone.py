@@ -11,7 +11,6 @@ The file may come from anywhere: it is checked before anything in it is run or a
 from __future__ import annotations
 
 import ast
-import base64
 import hashlib
 import math
 from dataclasses import dataclass
@@ -20,11 +19,11 @@ from pathlib import Path
 import numpy as np
 import onnx
 from google.protobuf.message import DecodeError
-from numpy.typing import NDArray
 from onnx import TensorProto, helper
 from onnx.utils import Extractor
 
 from edge_server.embed import EmbeddingError
+from edge_server.embed.projection import Projection, stored_projection
 from freshfield.untrusted import read_bytes
 
 OUTPUT = "pooled"
@@ -37,8 +36,6 @@ MAX_SIDE = 2048
 MAX_NODES = 10_000
 # The training size of these detectors, unless the file states another.
 USUAL_SIDE = 640
-# Written by edge-server train-detector of tag v0.1-all: mean (C,) and axes (C, K) of the pooled features.
-PROJECTION_KEY = "freshfield.projection"
 
 _ENLARGE = ("Resize", "Upsample")
 _PER_IMAGE = "DynamicQuantizeLinear"
@@ -100,14 +97,6 @@ _TYPES: dict[int, type[np.floating]] = {TensorProto.FLOAT: np.float32, TensorPro
 
 
 @dataclass(frozen=True)
-class Projection:
-    """A model's learned projection: embeddings are (features - mean) @ axes. mean: (C,). axes: (C, K)."""
-
-    mean: NDArray[np.float32]
-    axes: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
 class Backbone:
     """A detector up to its backbone's end: images (n, 3, height, width) in [0, 1] -> ``pooled`` (n,
     channels).
@@ -152,7 +141,7 @@ def load_backbone(path: Path) -> Backbone:
         height=height,
         width=width,
         digest=hashlib.sha256(data).hexdigest()[:8],
-        projection=_projection(meta, channels, path),
+        projection=stored_projection(meta, channels, path),
     )
 
 
@@ -316,17 +305,3 @@ def _check_shapes(cut: onnx.ModelProto, batch: int, height: int, width: int, pat
             f"{path}: the backbone's end is not a feature map (n, channels, height, width) but {pooled or 'unknown'}"
         )
     return int(pooled[1])
-
-
-def _projection(meta: dict[str, str], channels: int, path: Path) -> Projection | None:
-    """The projection that a model of ours carries in its metadata; None without one."""
-    if PROJECTION_KEY not in meta:
-        return None
-    try:
-        values = np.frombuffer(base64.b64decode(meta[PROJECTION_KEY], validate=True), "<f4")
-        mean, axes = values[:channels], values[channels:].reshape(channels, -1)
-    except ValueError:
-        raise EmbeddingError(f"{path}: its projection is damaged: fetch the file again") from None
-    if len(mean) != channels or not np.isfinite(values).all():
-        raise EmbeddingError(f"{path}: its projection is damaged: fetch the file again")
-    return Projection(mean.astype(np.float32), axes.astype(np.float32))

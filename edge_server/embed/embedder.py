@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from edge_server.embed import EmbeddingError
 from edge_server.embed.backbone import MAX_FILE_BYTES, OUTPUT, Backbone, parse_model
 from edge_server.embed.letterbox import GRAY, blob, checked
+from edge_server.embed.projection import mean_and_axes
 from freshfield.limits import MAX_MODEL_BYTES
 from freshfield.untrusted import read_bytes
 
 # Images per run if the model takes any number: larger batches exceed the caches and take longer per image.
 _BATCH = 4
-# Fixed, so that a model's embeddings do not depend on the scenario's seed.
-_PROJECTION_SEED = 20240631
 # What ONNX Runtime calls the types of images that are fed to models.
 INPUT_TYPES: dict[str, type[np.floating]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
@@ -37,7 +36,8 @@ class Embedder:
         """dim: as in ``EmbeddingConfig``. Raises EmbeddingError if ``dim`` exceeds the backbone's channels,
         or the model does not run."""
         self.backbone, self.dim = backbone, dim
-        self._mean, self._axes = _projection(backbone, dim)
+        of = backbone.name if backbone.projection is not None else backbone.tap
+        self._mean, self._axes = mean_and_axes(backbone.projection, backbone.channels, dim, of)
         self.failed = 0
         self.name = f"{backbone.name}-{backbone.digest} {backbone.tap} {backbone.width}x{backbone.height} d{dim}"
         self._session = open_session(backbone.model, backbone.name)
@@ -139,20 +139,3 @@ def reason_of(error: Exception, doing: str = "run") -> str:
     if "bfc_arena" in text or "bad allocation" in text or "bad_alloc" in text:
         text = f"ONNX models may take {MAX_MODEL_BYTES >> 20} MB of memory together, and it asks for more"
     return f"ONNX Runtime cannot {doing} it: {text[:200]}"
-
-
-def _projection(backbone: Backbone, dim: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean (C,) and axes (C, dim): the model's own, else fixed, random and orthonormal, which keeps distances
-    as well as any projection that ignores the data."""
-    channels = backbone.channels
-    if backbone.projection is not None:
-        mean, axes = backbone.projection.mean, backbone.projection.axes
-        if dim > axes.shape[1]:
-            raise EmbeddingError(f"dim: {backbone.name} has {axes.shape[1]} axes, {dim} were asked for")
-        return mean, np.ascontiguousarray(axes[:, :dim])
-    if dim > channels:
-        raise EmbeddingError(f"dim: {backbone.tap} has {channels} channels, {dim} numbers were asked for")
-    draw = np.random.default_rng(_PROJECTION_SEED).standard_normal((channels, dim))
-    q, r = np.linalg.qr(draw)
-    # QR is unique only up to signs: fixed, they are the same in all libraries.
-    return np.zeros(channels, np.float32), (q * np.sign(np.diag(r))).astype(np.float32)
