@@ -176,3 +176,22 @@ def test_a_server_that_starts_again_keeps_its_first_recording(mcap):
         recorder.close()
         files.append(recorder.file.name)
     assert files == ["a.mcap", "a-2.mcap", "a-3.mcap"]
+
+
+def test_grafana_reads_all_of_the_dashboard():
+    """Grafana's published types leave out what they do not know; ``__inputs`` is for its import alone."""
+    models = pytest.importorskip("grafana_foundation_sdk.models.dashboard", reason="needs the extra dev")
+    from grafana_foundation_sdk.cog.encoder import JSONEncoder
+
+    dashboard = json.loads((ROOT / "deploy/grafana.json").read_text())
+    read = json.loads(json.dumps(models.Dashboard.from_json(dashboard), cls=JSONEncoder))
+    assert lost(dashboard, read) == ["/__inputs"]
+
+
+def lost(sent: Any, read: Any, where: str = "") -> list[str]:
+    """What of ``sent`` is not in ``read``, which may have more."""
+    if isinstance(sent, dict) and isinstance(read, dict):
+        return [each for k, v in sent.items() for each in lost(v, read.get(k), f"{where}/{k}")]
+    if isinstance(sent, list) and isinstance(read, list) and len(sent) == len(read):
+        return [each for k, pair in enumerate(zip(sent, read)) for each in lost(*pair, f"{where}/{k}")]
+    return [] if sent == read else [where]
