@@ -45,7 +45,7 @@ _FILES = {
     "camera_node/sources/devices": "live",
     "camera_node": "clock_offset node",
     "deploy": "up",
-    "edge_server/live": "loop scoring_thread server",
+    "edge_server/live": "loop scoring server",
     "edge_server/page/splats": "stream",
     "edge_server/page": "access_guard browser foxglove_live network_control page preferences",
 }

@@ -8,7 +8,7 @@ PIXELS_A_POINT = 1000
 """At most, of the depth that points are drawn from: 20 million pixels take 8 s of processor time."""
 
 SAME = 0.01
-"""Tolerance of the depth at which maps see the same point, share of the distance."""
+"""Tolerance of depth within which two maps see the same point of a sparse model, share of the distance."""
 
 DEFAULT_HEIGHT_PX = 480
 """Of a rendering, at the shape of the cameras' images."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -36,6 +36,7 @@ class FrameBuffer:
         self.held_back = 0
         self._unselected: dict[str, deque[Frame]] | None = None
         self._takes = 0
+        self._held: Counter[str] = Counter()  # by camera, of ``held_back``
         self._last_take = dict.fromkeys(self.cameras, 0.0)  # the last one that took a frame of each camera
 
     def put(self, frame: Frame, received_ns: int) -> None:
@@ -54,7 +55,9 @@ class FrameBuffer:
                 self._newest[frame.camera] = item
             if self._unselected is not None:
                 waiting = self._unselected[frame.camera]
-                self.shed += len(waiting) == tuned.MOST_UNSELECTED and self._takes > 0
+                if len(waiting) == tuned.MOST_UNSELECTED and self._takes > 0:
+                    self.shed += 1
+                    self._held[frame.camera] -= self._held[frame.camera] > 0
                 waiting.append(item)
             self.arrivals += 1
             self._arrived.notify_all()
@@ -84,7 +87,7 @@ class FrameBuffer:
         (``FADES_MS``); among equals, the camera that has waited longest. What exceeds ``most`` waits on, after
         the next ``take``'s newer frames: a burst is worked off later. The oldest of more than
         ``MOST_UNSELECTED`` of a camera are dropped and counted in ``shed``. Frames of cameras that were not
-        selected are dropped.
+        selected are dropped; those of them that had waited for lack of time are counted, too.
         """
         until_ns = max((item.received_ns for item in selected), default=0)
         own = {item.camera: item for item in selected}
@@ -99,7 +102,9 @@ class FrameBuffer:
                 arrived: list[Frame] = []
                 while waiting and waiting[0].received_ns <= until_ns:
                     arrived.append(waiting.popleft())
-                if camera in own:
+                if camera not in own:
+                    self.shed += min(self._held[camera], len(arrived))
+                else:
                     arrived.sort(key=lambda item: (-item.generated_edge_ns, item is not own[item.camera]))
                     last, share = self._last_take[camera], (moving or {}).get(camera, 1.0)
                     waits_on = self._takes - last <= tuned.LONGEST_WAIT
@@ -113,14 +118,11 @@ class FrameBuffer:
             for k, item in enumerate(taken):  # within one take, the first camera has waited longest
                 self._last_take[item.camera] = self._takes + k / len(taken)
             left = ordered[len(taken) :]
-            self.held_back = 0
+            self._held = Counter()
             for item in sorted(left, key=lambda item: -item.received_ns):
-                waiting = self._unselected[item.camera]
-                if len(waiting) < tuned.MOST_UNSELECTED:
-                    waiting.appendleft(item)
-                    self.held_back += 1
-                else:
-                    self.shed += 1
+                self._unselected[item.camera].appendleft(item)
+                self._held[item.camera] += 1
+            self.held_back = self._held.total()
         others = [item for item in taken if item is not own[item.camera]]
         left_out = {id(item) for item in left}
         used = tuple(item for item in selected if id(item) not in left_out)

@@ -264,7 +264,8 @@ class FieldUpdater:
         self._motion, self._if_moving = CameraMotion(), if_moving
 
     def reset(self) -> None:
-        """Forget the scene."""
+        """Forget the scene, and the frames of it that wait."""
+        self.buffer.keep_every_frame(False)  # until the next selection
         self.field.reset()
         if self.keyframes is not None:
             self.keyframes.clear()

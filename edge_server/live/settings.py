@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 # --- frames that wait in the buffer ---
-MOST_UNSELECTED = 16  # most frames of a camera that wait for a field that wants every frame: half a second
+MOST_UNSELECTED = (
+    16  # most frames of a camera that wait for a field that wants every frame: half a second at 30 a second
+)
 # After this many takes without a frame of a camera, its next one goes first, however old (after a blackout).
 LONGEST_WAIT = 16
 AS_YOUNG_NS = 1_000_000  # ages, measured from the youngest frame, are compared in steps of this length

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.surface import SurfaceError, settings
+from edge_server.surface import SurfaceError
 from edge_server.surface import settings as tuned
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.fuse import CELLS, SIDE
@@ -73,27 +73,27 @@ def _optimize(
     chances = (trust.double() / trust.double().sum()).cumsum(0)
     size = tuple(int(n) for n in grid.blocks * SIDE)
     # All distances start slightly positive; the sides term and the surface points make the inside negative.
-    values = torch.full((1, 1, *_coarse_shape(size, settings.SDF_LEVELS - 1)), 0.5 * grid.band_m)
-    for level in range(settings.SDF_LEVELS):
-        scale = 2 ** (settings.SDF_LEVELS - 1 - level)
+    values = torch.full((1, 1, *_coarse_shape(size, tuned.SDF_LEVELS - 1)), 0.5 * grid.band_m)
+    for level in range(tuned.SDF_LEVELS):
+        scale = 2 ** (tuned.SDF_LEVELS - 1 - level)
         voxel = grid.voxel_m * scale
-        shape = _coarse_shape(size, settings.SDF_LEVELS - 1 - level)
+        shape = _coarse_shape(size, tuned.SDF_LEVELS - 1 - level)
         if level:
             values = interpolate(values, size=shape, mode="trilinear", align_corners=True)
         values = values.detach().clone().requires_grad_()
         extent = torch.tensor([(n - 1) * voxel for n in shape])
-        optimizer = torch.optim.Adam([values], lr=settings.SDF_RATE * voxel, betas=(0.9, 0.95))
-        for step in range(settings.SDF_STEPS):
+        optimizer = torch.optim.Adam([values], lr=tuned.SDF_RATE * voxel, betas=(0.9, 0.95))
+        for step in range(tuned.SDF_STEPS):
             # Sample by trust; searchsorted does what multinomial would, without its limit of 2^24.
-            tickets = torch.rand(settings.SDF_POINTS, generator=generator, dtype=torch.float64)
+            tickets = torch.rand(tuned.SDF_POINTS, generator=generator, dtype=torch.float64)
             drawn = torch.searchsorted(chances, tickets).clamp_(max=len(chances) - 1)
             loss = _loss(values, extent, voxel, grid.band_m, points[drawn], rays[drawn], cosine[drawn], generator)
-            optimizer.param_groups[0]["lr"] = settings.SDF_RATE * voxel * 0.1 ** (step / settings.SDF_STEPS)
+            optimizer.param_groups[0]["lr"] = tuned.SDF_RATE * voxel * 0.1 ** (step / tuned.SDF_STEPS)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
             if say is not None and (step + 1) % 20 == 0:
-                say("sdf", (level + (step + 1) / settings.SDF_STEPS) / settings.SDF_LEVELS)
+                say("sdf", (level + (step + 1) / tuned.SDF_STEPS) / tuned.SDF_LEVELS)
     found: NDArray[np.float32] = values.detach().numpy()[0, 0]
     return found
 
@@ -124,7 +124,7 @@ def _loss(values, extent, voxel, band, points, rays, cosine, generator):
     domain = torch.cat([points, before, behind])[torch.randperm(3 * len(points), generator=generator)[: len(points)]]
     steep = gradient_norm(values, domain, extent, voxel)
     eikonal = ((steep - 1.0) ** 2).mean()
-    return on.abs().mean() / voxel + settings.SDF_SIDES * sides / voxel + settings.SDF_EIKONAL * eikonal
+    return on.abs().mean() / voxel + tuned.SDF_SIDES * sides / voxel + tuned.SDF_EIKONAL * eikonal
 
 
 def sample_grid(values, points, extent):

@@ -18,10 +18,19 @@ def read(text: str, folder: Path = Path()):
 
 def test_presets_hold_the_thesis_numbers():
     ch5, ch6 = read("preset: ch5"), read("preset: ch6")
-    assert (ch5.arrivals.period_ms, ch5.mean_delay_ms, ch5.discipline) == (30.0, 60.0, "drop-new")
-    assert ch6.arrivals.rate_per_ms == pytest.approx([1 / 120, 1 / 30]) and ch6.discipline == "newest-waits"
-    weighted = read("{service: 'exp:30ms,exp:60ms', chain: 'mu1=1/100,mu2=1/50'}")  # by the states' shares
-    assert (ch6.mean_delay_ms, weighted.mean_delay_ms) == (pytest.approx(45), pytest.approx(40))
+    assert (ch5.arrivals.period_ms, ch5.service.law, ch5.service.mean_ms) == (30.0, "exponential", 60.0)
+    assert ch5.discipline == "drop-new" and ch5.chain is None
+    assert ch6.chain is not None and ch6.chain.scope == "shared" and ch6.state_names == ["low", "high"]
+    assert ch6.chain.mu1_per_ms == ch6.chain.mu2_per_ms == pytest.approx(1 / 30)
+    assert ch6.arrivals.rate_per_ms == pytest.approx([1 / 120, 1 / 30])
+    assert ch6.service.mean_ms == [30.0, 60.0]
+    assert (ch6.service_state, ch6.discipline) == ("at-start", "newest-waits")
+    high, low, slow = read("preset: ch6-high"), read("preset: ch6-low"), read("preset: ch6-slow")
+    assert (high.arrivals.rate_per_ms, high.service.mean_ms) == (pytest.approx(1 / 60), 60.0)
+    assert (low.arrivals.rate_per_ms, low.service.mean_ms) == (pytest.approx(1 / 120), 30.0)
+    assert slow.chain is not None and slow.chain.mu1_per_ms == pytest.approx(1 / 3000)
+    ideal = read("{}")
+    assert (ideal.preset, ideal.service.law, ideal.arrivals.process) == ("ideal", "none", "as-offered")
 
 
 def test_the_short_notation_stands_for_sections(tmp_path):

@@ -101,6 +101,10 @@ def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
         assert u.buffer.held_back == left
     assert (len(decoded), u.buffer.shed) == (24, 0)
     assert u.select(u.plan(63 * MS), 63 * MS, short) is None
+    for at in (70, 80):
+        u.buffer.put(frame(cameras[0], sequence=at, generated_ns=at * MS), at * MS)
+    u.reset()
+    assert len(u.select(u.plan(90 * MS), 90 * MS).others) == 0  # frames of the scene that was forgotten
 
 
 class Running:

@@ -23,6 +23,7 @@ from edge_server.cli import main as edge_server
 from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
 from edge_server.fields.splat.carried_camera.carried_field import CarriedField
+from edge_server.live.loop import UpdateLoop
 from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.live.settings import STOP_S
 from edge_server.scheduler.learned.actor import Actor
@@ -330,3 +331,21 @@ def test_a_learned_policy_decides_by_what_cameras_see_and_its_decisions_are_kept
     used = [c for c, chosen in zip(found.state.cameras, found.action) if chosen]
     assert list(next(p for p in server.state.publications() if p.number == 1).selected) == used
     assert np.isfinite(found.state.embeddings).any()
+
+
+def test_a_final_checkpoint_that_is_not_written_is_said(serve, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(UpdateLoop.stop, "__defaults__", (0.1,))
+    run = serve().fed()
+    begun, goes_on, fit = threading.Event(), threading.Event(), run.server.updater.fit
+
+    def long_update(*arguments):
+        begun.set()
+        goes_on.wait(30)
+        return fit(*arguments)
+
+    monkeypatch.setattr(run.server.updater, "fit", long_update)
+    assert begun.wait(30)
+    run.end()
+    goes_on.set()
+    assert not (tmp_path / "out" / "field.npz").exists()
+    assert "field.npz: not written: the last update did not end" in caplog.text

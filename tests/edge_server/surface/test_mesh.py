@@ -159,3 +159,8 @@ def test_noise_averages_out_and_single_pixels_of_nonsense_do_not_spread():
     # 2 mm of noise a pixel; a voxel hears of some dozens of them.
     assert abs(np.median(found) - balls.RADIUS_M) < 0.001
     assert np.percentile(np.abs(found - balls.RADIUS_M), 95) < 0.003
+
+
+def test_what_nobody_saw_stays_open():
+    seen_from_above = fuse_maps(GRID, [m for m in balls.ball_maps(40) if m.camera_to_world[2, 3] > 0.1])
+    assert extract_mesh(seen_from_above).vertices[:, 2].min() > -0.09  # the ball's lower end is missing

@@ -18,6 +18,7 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function
+from edge_server.fields.common.kernels.mlp import PADDING
 from edge_server.fields.common.kernels.radiance_model import has, sample_rays
 from edge_server.fields.common.kernels.rays import interval, slab, unit_cube
 from edge_server.fields.common.kernels.simd import exp32, is_finite
@@ -275,7 +276,7 @@ def _sample_rays(encoding, space, o, travel, active, count, x, line, first):
         size, n, zero = encoding.sampling.bins, np.int64(0), np.int64(0)
         bins, scratch = bin_memory(size), bin_scratch(size)
         for k in range(count):
-            if k > 0 and n + 2 * encoding.sampling.samples + 1 > x.shape[1]:
+            if k > 0 and n + 2 * encoding.sampling.samples + 1 > x.shape[1] - PADDING:
                 return k
             r = active[k]
             d = travel[r, 0], travel[r, 1], travel[r, 2]

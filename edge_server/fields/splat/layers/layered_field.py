@@ -341,11 +341,11 @@ class LayeredField:
         if view.camera not in self.cameras:
             self.cameras[view.camera] = FixedCamera.begin(view, self.caller)
         camera = self.cameras[view.camera]
-        overtaken = any(known_ns > view.generated_ns for known_ns in camera.taken)
+        late = camera.is_late(view)
         camera.taken.append(view.generated_ns)
+        if late:
+            return
         if not camera.stands_at(view):
-            if overtaken:
-                return  # it shows where the camera stood before
             if not camera.leaves_for(view):
                 self.refused |= {view.camera}
                 return
@@ -375,7 +375,7 @@ class LayeredField:
         log.info("%s stands somewhere else: its plate begins anew", view.camera)
         self.supervision.forget_camera(view.camera)
         before, camera = self.cameras[view.camera], FixedCamera.begin(view, self.caller)
-        camera.taken, camera.moves, camera.anew = before.taken, before.moves, True
+        camera.taken, camera.moves, camera.anew, camera.began_ns = before.taken, before.moves, True, view.generated_ns
         camera.correct_exposure(before.plate.gain)
         self.cameras[view.camera] = camera
         self.observations.forget_camera(view.camera)

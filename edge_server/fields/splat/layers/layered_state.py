@@ -27,12 +27,12 @@ from freshfield.geometry import Pinhole
 Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
-VERSION = 11
+VERSION = 12
 COUNTERS = ("layered", "origin_ns")  # of the field
 # Of its supervision.
 SUPERVISED = ("plates_s", "fine_s", "fine", "exposure_rounds", "anew", "with_depth", "early", "plain", "layers_shown")
 TRACKED = ("anchors_s", "seeded_s", "fits")  # of its tracker
-OF_CAMERA = ("newest_s", "rendered_step", "moves", "anew", "depth_scale", "looked_ns")
+OF_CAMERA = ("newest_s", "rendered_step", "moves", "anew", "depth_scale", "looked_ns", "began_ns")
 ARRAYS_OF_CAMERA = ("away", "depth_m", "reported", "bumped")  # or None
 
 

@@ -43,6 +43,7 @@ class FixedCamera:
     bumped: float64 (4, 4), where it stands by its own pictures since it was bumped; None: where its frames say.
     turns: of the latest frames in a row that are its plate, turned: ``bump.find_turn``, oldest first.
     looked_ns: ``generated_ns`` of the frame in which a turn was last looked for.
+    began_ns: that of the first frame since it was knocked or bumped; 0 of one that never was.
     """
 
     view: View
@@ -62,6 +63,7 @@ class FixedCamera:
     bumped: NDArray[np.float64] | None = None
     turns: list[NDArray[np.float64]] = field(default_factory=list)
     looked_ns: int = 0
+    began_ns: int = 0
 
     @classmethod
     def begin(cls, view: View, pool: Pool) -> FixedCamera:
@@ -69,6 +71,13 @@ class FixedCamera:
         whole = None if view.whole is None else view.whole()
         plate = Plate(view.image.shape[0], view.image.shape[1], pool)
         return cls(replace(view, whole=None, depth=None), plate, fine=None if whole is None else FinePlate(whole))
+
+    def is_late(self, view: View) -> bool:
+        """Whether a frame waited, or was overtaken, and may show where the camera stood before it was knocked or
+        bumped: one from before that, or while newer ones tell of it."""
+        tells = self.away is not None or bool(self.turns)
+        overtaken = tells and any(known_ns > view.generated_ns for known_ns in self.taken)
+        return overtaken or view.generated_ns < self.began_ns
 
     def stands_at(self, view: View) -> bool:
         """Whether a frame was taken from the camera's place."""

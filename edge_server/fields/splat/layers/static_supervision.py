@@ -216,7 +216,8 @@ class StaticSupervision:
         """
         begun, now_s = self.times.now(), observations.newest_s
         # A thread beside learns slowly: what begins anew at once would not be better than what is shown for long.
-        learned = self.layers_shown and self.static.field.step >= tuned.EARLY_STEPS
+        # With depth it is better soon, and its cameras' poses are corrected then.
+        learned = self.layers_shown and (self.with_depth or self.static.field.step >= tuned.EARLY_STEPS)
         learned = learned or not beside or now_s >= tuned.PLATES_SURE_S
         certain = self.early and now_s >= tuned.PLATE_S and learned
         more = tuned.STEREO_CAMERAS < len(cameras) <= tuned.PLAIN_CAMERAS

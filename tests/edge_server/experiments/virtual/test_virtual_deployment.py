@@ -256,3 +256,24 @@ def test_newest_and_all_held_out_frames_are_scored_each_two_seconds_and_reported
     shown = [json.loads(line) for line in (run / "shown.jsonl").read_text().splitlines()]
     assert [row.get("so_far") is not None for row in shown] == [row["t_s"] >= 2.0 for row in shown]
     assert shown[-1]["so_far"] == last and build_report(run)["fidelity"]["so_far"] == last
+
+
+@pytest.mark.slow
+def test_at_twice_the_load_frames_are_left_out_and_what_is_shown_does_not_age() -> None:
+    """A processor that takes in less than 100 frames a second; sixty of them, and twice as many."""
+    options = {"layers": True, "gaussians": 300, "start": 200, "seed_cells": 12, "threads": 1}
+    edge = {"field": "splat", "field_options": options, "policy": {"name": "all"}, "updates": "arrivals"}
+    settings = RunSettings(
+        steps=1, compute=ComputeConfig(ms_per_update=5.0, ms_per_view=10.0), epoch_ms=40.0, score_every_ms=None
+    )
+    ages = []
+    for fps in (15.0, 30.0):
+        deployment = run(scenario({}, edge=edge, source=small_world(fps=fps)), settings, seconds=6.0)
+        late = [p for p in deployment.publications if p.t_s > 2.0]
+        assert max(p.update_ms for p in late) <= 80.0
+        halves = [np.mean([p.aaoi_ms for p in late if (p.t_s > 4.0) is second]) for second in (False, True)]
+        assert halves[1] < 1.1 * halves[0]
+        ages.append(np.mean(halves))
+        assert closes(deployment.frames())
+    assert deployment.updates.buffer.shed > 0.1 * deployment.updates.buffer.arrivals
+    assert ages[1] < 2.0 * ages[0]

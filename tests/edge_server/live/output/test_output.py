@@ -7,6 +7,7 @@ import re
 import threading
 from collections import Counter
 from types import SimpleNamespace
+from typing import Any
 from unittest.mock import MagicMock
 
 import pytest

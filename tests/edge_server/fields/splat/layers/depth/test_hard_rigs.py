@@ -158,7 +158,7 @@ def _recovered_s(curve: Array, over: int) -> float:
 
 
 # Of the others each rule is held by itself: what contradicts in ``test_surfaces``, poses and scales in
-# ``test_registration``.
+# ``test_stereo_and_registration``.
 @pytest.mark.parametrize("name", [pytest.param(c, marks=[pytest.mark.slow] * (c != "mirror")) for c in CASES])
 def test_depth_is_worth_something_where_sensors_are_deceived(name: str) -> None:
     case = CASES[name]

@@ -18,7 +18,7 @@ from edge_server.fields.splat.layers.layered_field import LayeredField
 from tests.edge_server.fields.small import same_state
 from tests.edge_server.fields.splat.layers.ball import SMALL, Rig
 from tests.edge_server.fields.splat.layers.depth.room_plates import relative_of, room_plates
-from tests.edge_server.fields.splat.layers.depth.test_registration import filled
+from tests.edge_server.fields.splat.layers.depth.test_stereo_and_registration import filled
 
 Image = NDArray[np.float32]
 NAMES = ["cam01", "cam02", "cam03"]

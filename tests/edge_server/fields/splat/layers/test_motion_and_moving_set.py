@@ -101,19 +101,33 @@ def test_rows_that_are_not_finite_or_too_old_are_left_out():
     np.testing.assert_array_equal(motion._knots, twin._knots)
 
 
-def test_a_reversal_is_followed_within_the_window():
-    """Errors of the displacement at each update, shown one period after the newest view."""
-    speed, period_s, motion, rng = 1.0 / REACH_M, 1 / 15, moving(), np.random.default_rng(5)
-    rows, errors = [], []
-    for k in range(1, 31):
-        t = 10.0 + k * period_s
+def followed(path, seconds: float, period_s: float = 1 / 15, cameras: int = 6):
+    """Errors of the displacement at each update, shown one period after the newest view; the motion."""
+    motion, rng = moving(), np.random.default_rng(5)
+    rows, errors, t = [], [], 10.0
+    while t < 10.0 + seconds:
+        t += period_s
         motion.slide(t)
-        for taken in t - rng.uniform(0, 1.5 * period_s, 6):
-            rows.append(row(motion, taken, np.full((6, 3), speed * (1.0 - abs(taken - 11.0))), rng))
+        for _ in range(cameras):
+            taken = t - rng.uniform(0, 1.5 * period_s)
+            rows.append(row(motion, taken, path(taken), rng))
         rows = [r for r in rows if r.instant_s >= motion.oldest_s]
         motion.solve(rows)
-        errors.append(np.abs(motion.at(t) - speed * (1.0 - abs(t - 11.0))).max())
-    assert max(errors[8:14]) < 0.01 and max(errors[-10:]) < 0.01
+        errors.append(np.abs(motion.at(t) - path(t)).max())
+    return np.array(errors), motion
+
+
+def test_a_reversal_is_followed_within_the_window():
+    speed = 1.0 / REACH_M
+    errors, _ = followed(lambda t: np.full((6, 3), speed * (1.0 - abs(t - 11.0))), 2.0)
+    assert errors[8:14].max() < 0.01
+    assert errors[-10:].max() < 0.01
+
+
+def test_two_minutes_neither_drift_nor_lose_precision():
+    errors, motion = followed(lambda t: walk(t, 6), 120.0, cameras=2)
+    assert errors[-300:].max() < 2 * errors[100:400].max()
+    assert np.isfinite(motion._knots).all()
 
 
 def test_displacements_pass_through_the_knots_and_go_straight_on():
