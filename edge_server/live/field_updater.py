@@ -100,6 +100,7 @@ class FieldUpdater:
         self.keyframes = keyframes
         self.start_ns = start_ns
         self.number = 0
+        self._update_s = 0.0  # of the latest update
         self._motion: CameraMotion | None = None
         self._if_moving: Callable[[str], None] | None = None
         self._follow_field()
@@ -220,7 +221,9 @@ class FieldUpdater:
         frame_s = self.field.frame_s
         if not frame_s or budget is None or budget.seconds is None:
             return None if frame_s is None else most_new
-        return max(int(tuned.INTAKE_SHARE * budget.seconds / frame_s), tuned.LEAST_TAKEN)
+        # Of an update that takes longer than its budget, on a slow machine, frames take their share as well.
+        seconds = max(budget.seconds, self._update_s)
+        return max(int(tuned.INTAKE_SHARE * seconds / frame_s), tuned.LEAST_TAKEN)
 
     def fit(self, selection: Selection, budget: Budget) -> tuple[list[View], FitReport] | None:
         """Decode the selected views and train on them.
@@ -292,6 +295,7 @@ class FieldUpdater:
             network_ms=float(np.mean(network)) / 1e6 if network else None,
         )
         self.number += 1
+        self._update_s = publication.update_ms / 1e3
         return publication
 
 

@@ -90,6 +90,7 @@ def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
         u.buffer.put(frame(camera, sequence=50, generated_ns=50 * MS), 50 * MS)
     u.field.moving_shares = {camera: 0.01 * k for k, camera in enumerate(cameras)}
     u.on_arrivals, short = True, Budget(seconds=1e-3)
+    assert [u._most_new(short, None), u._most_new(budget, None)] == [4, 10]
     views, _ = u.fit(u.select(u.plan(60 * MS), 60 * MS, short), short)
     assert [v.camera for v in views] == list(cameras[4:])  # before which most moves
     # The newest frames of the others wait, before older ones, and are taken although nothing has arrived since.
@@ -101,6 +102,8 @@ def test_what_there_is_no_time_for_is_neither_decoded_nor_used():
         assert u.buffer.held_back == left
     assert (len(decoded), u.buffer.shed) == (24, 0)
     assert u.select(u.plan(63 * MS), 63 * MS, short) is None
+    u.publication(selection, views, FitReport(0, 0.1, 0.0, 0, 0), selection.now_ns + 210 * MS)
+    assert u._most_new(short, None) == 12, "an update that takes longer than its budget takes in more"
     for at in (70, 80):
         u.buffer.put(frame(cameras[0], sequence=at, generated_ns=at * MS), at * MS)
     u.reset()
