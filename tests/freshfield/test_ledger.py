@@ -8,7 +8,6 @@ import resource
 import signal
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
@@ -79,9 +78,9 @@ def test_what_was_written_survives_sigkill(tmp_path):
         "while True:\n    ledger.write(k, 'cam00', 's', k, 'delivered'); k += 1\n    print(k, flush=True)\n"
     )
     with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE) as child:
-        time.sleep(0.5)
+        seen = [child.stdout.readline() for _ in range(20)]
         child.send_signal(signal.SIGKILL)
-        promised = int(child.stdout.read().decode().splitlines()[-1])
+        promised = int([*seen, *child.stdout.read().splitlines()][-1])
     (file,) = read_all(tmp_path)
     assert not file.closed and len(file.events) >= promised > 10
     assert [e.sequence for e in file.events] == list(range(len(file.events)))
