@@ -36,9 +36,6 @@ In the help of a command, [x] after an option is its default.
   channel-emu fit trace.jsonl --plot fit.png --out fitted.yaml
 """
 
-# Counts of delivered frames, with the fault that makes them: shown, 0 too, where it is asked for.
-_OF_DELIVERED = {"duplicated": "duplication", "corrupted": "corruption"}
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line. argv: arguments without the program's name; None: those of the process.
@@ -87,15 +84,10 @@ def _add_run(commands: Any) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     from channel_emu.live.frame_proxy import FrameProxy
-    from channel_emu.live.priority import raise_priority
 
     plan = scenario.load(args.scenario, args.seed)
     config = channel_from_mapping(plan.channel, f"{plan.path}: channel", plan.path.parent)
-    priority = "normal" if args.no_priority else raise_priority()
-    status, _ = _serve(
-        args, partial(FrameProxy, cameras=plan.cameras, out=args.out, priority=priority), config, plan.seed
-    )
-    return status
+    return _serve(args, partial(FrameProxy, cameras=plan.cameras, out=args.out), config, plan.seed)[0]
 
 
 def _add_live_options(sub: argparse.ArgumentParser, what: str) -> None:
@@ -105,7 +97,6 @@ def _add_live_options(sub: argparse.ArgumentParser, what: str) -> None:
     )
     sub.add_argument("--trace", type=out_file, metavar="FILE", help=f"record the fate of every {what} in FILE")
     sub.add_argument("--replay", type=Path, metavar="FILE", help="repeat the decisions of a recorded --trace")
-    sub.add_argument("--no-priority", action="store_true", help="run at normal scheduling priority, not raised")
     transport.add_arguments(sub)
 
 
@@ -114,8 +105,9 @@ def _serve(
 ) -> tuple[int, Report | None]:
     """Run the proxy that ``make`` returns until SIGINT or SIGTERM. Returns the exit status, and the report if nothing
     failed."""
-    from channel_emu.live.priority import SWITCH_INTERVAL_S, return_freed_memory
+    from channel_emu.live.priority import raise_priority, return_freed_memory
     from channel_emu.live.proxy import EmulatorFailed, ProxyOptions
+    from channel_emu.live.settings import SWITCH_INTERVAL_S
     from channel_emu.model import trace
 
     chosen = ProxyOptions(
@@ -126,6 +118,7 @@ def _serve(
         replay=trace.read(args.replay) if args.replay else None,
         **options,
     )
+    logging.getLogger("channel-emu").info("scheduling priority: %s", raise_priority())
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     return_freed_memory()
 
@@ -182,33 +175,22 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
         help="channel, one that channel-emu presets lists; the options below change it [%(default)s]",
     )
     source.add_argument("--scenario", help="the channel section of a scenario instead")
-    sub.add_argument(
-        "--arrivals",
-        metavar="SPEC",
-        help="when frames arrive: as-offered, periodic:30ms, "
-        "poisson:1/30ms, or a rate for each state, mmpp:1/120ms,1/30ms; mmpp alone takes these "
-        "rates (thesis 6.4.2)",
-    )
-    sub.add_argument(
-        "--service",
-        metavar="SPEC",
-        help="delay: none, exp:60ms, det:10ms, gamma:60ms:SHAPE, "
-        "lognormal:60ms:SIGMA, trace:FILE; a mean for each state: exp:30ms,exp:60ms",
-    )
+    specifications = {
+        "arrivals": "when frames arrive: as-offered, periodic:30ms, poisson:1/30ms, or a rate for each state, "
+        "mmpp:1/120ms,1/30ms; mmpp alone takes these rates (thesis 6.4.2)",
+        "service": "delay: none, exp:60ms, det:10ms, gamma:60ms:SHAPE, lognormal:60ms:SIGMA, trace:FILE; a mean for "
+        "each state: exp:30ms,exp:60ms",
+        "chain": "Markov chain of two states: mu1=1/30,mu2=1/30 (rates per ms), states=low/high, scope=per-camera, "
+        "initial=low; more states in a scenario",
+    }
+    for name, text in specifications.items():
+        sub.add_argument(f"--{name}", metavar="SPEC", help=text)
     sub.add_argument(
         "--fault",
         metavar="NAME:VALUE",
         action="append",
-        help=f"{', '.join(faults.NAMES)}; "
-        "e.g. loss:0.1, loss:[0.01, 0.5] by state, reset:{at_ms: [50]}; "
+        help=f"{', '.join(faults.NAMES)}; e.g. loss:0.1, loss:[0.01, 0.5] by state, reset:{{at_ms: [50]}}; "
         "may be repeated",
-    )
-    sub.add_argument(
-        "--chain",
-        metavar="SPEC",
-        help="Markov chain of states: mu1=1/30,mu2=1/30 (rates per "
-        "ms), states=low/high, scope=per-camera, initial=low, or "
-        "{generator_per_ms: [[..]]}",
     )
     sub.add_argument(
         "--service-state",
@@ -242,8 +224,7 @@ def _simulate(args: argparse.Namespace) -> int:
         "mean age (ms)": result["mean_age_ms"],
         "peak age (ms)": result["peak_age_ms"],
         **{f"drawn delay, {name} (ms)": value for name, value in result["delay_ms"].items()},
-        **{key: result[key] for key in ("offered", "delivered", *OUTCOMES[1:], "in_flight") if result[key]},
-        **{key: result[key] for key, fault in _OF_DELIVERED.items() if result[key] or fault in config.faults},
+        **{key: result[key] for key in ("offered", *OUTCOMES, "in_flight", "duplicated", "corrupted") if result[key]},
         **{f"share of state {name}": share for name, share in result["state_share"].items() if share < 1},
         **{key: result[key] for key in ("cameras", "seconds", "seed")},
     }
@@ -319,13 +300,10 @@ def _add_proxy(commands: Any) -> None:
 
 
 def _proxy(args: argparse.Namespace) -> int:
-    from channel_emu.live.priority import raise_priority
     from channel_emu.live.proxy import Proxy
     from channel_emu.live.report import show
 
     config = _config_of(args)
-    if not args.no_priority:
-        raise_priority()
     proxy: Callable[..., Proxy] = Proxy
     if args.tcp:
         from channel_emu.live.tcp_proxy import TcpProxy as proxy

@@ -31,18 +31,14 @@ instants. When a test fails, pytest shows each link's seed and statistics in a s
 from __future__ import annotations
 
 import asyncio
-import json
 import threading
 from collections.abc import Coroutine
-from pathlib import Path
 from typing import Any, TypeVar
 
 from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.live.report import Report, show
-from channel_emu.model import trace as traces
 from channel_emu.model.settings import ChannelConfig, channel_from_mapping
 from channel_emu.pytest_plugin import channel
-from freshfield.transport import Transport
 
 __all__ = ["EmulatedLink", "channel"]
 
@@ -57,32 +53,18 @@ class EmulatedLink:
     to: HOST:PORT of the service.
     seed: of the link's decisions.
     direction: the messages that pass the link: up (to the service), down (its answers) or both.
-    listen: HOST:PORT of the link; port 0 takes any free one.
-    trace: record to this file.
-    replay: repeat the decisions of a trace file.
-    transport: TLS and tokens of both sides; None: plain text.
-    Raises ScenarioError, TraceError or TransportError (all ValueErrors) with one line that says what to change.
+    Raises ScenarioError or TransportError (both ValueErrors) with one line that says what to change.
 
     ``address`` is HOST:PORT to which clients connect.
     """
 
     def __init__(
-        self,
-        channel: str | dict[str, Any] | ChannelConfig,
-        *,
-        to: str,
-        seed: int = 0,
-        direction: str = "up",
-        listen: str = "127.0.0.1:0",
-        trace: Path | None = None,
-        replay: Path | None = None,
-        transport: Transport | None = None,
+        self, channel: str | dict[str, Any] | ChannelConfig, *, to: str, seed: int = 0, direction: str = "up"
     ) -> None:
         section: Any = {"preset": channel} if isinstance(channel, str) else channel
         self.config = section if isinstance(section, ChannelConfig) else channel_from_mapping(section)
         self.seed = seed
-        replayed = traces.read(replay) if replay is not None else None
-        self.options = ProxyOptions(listen, to, transport or Transport(), direction, trace, replayed)
+        self.options = ProxyOptions("127.0.0.1:0", to, direction=direction)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="channel", daemon=True)
         self._thread.start()
@@ -92,8 +74,7 @@ class EmulatedLink:
         except BaseException:
             self._end()
             raise
-        host = listen.rpartition(":")[0] or "127.0.0.1"
-        self.address = f"{host}:{self._proxy.port}"
+        self.address = f"127.0.0.1:{self._proxy.port}"
 
     def report(self) -> Report:
         """Ages, losses and delays so far, in total and by method; after ``close`` the last report. Raises
@@ -121,17 +102,10 @@ class EmulatedLink:
     def describe(self) -> str:
         """Text with the call that makes the same link again, and with the report of this one."""
         report = self._last or self._await(self._report(checked=False))
-        head = (
-            f"channel({self._channel_argument()}, to={self.options.to!r}, seed={self.seed}, "
-            f"direction={self.options.direction!r})"
-        )
-        return f"{head}\n{show(report)}"
-
-    def _channel_argument(self) -> str:
-        preset = self.config.preset
-        if preset is not None and channel_from_mapping({"preset": preset}) == self.config:
-            return repr(preset)
-        return json.dumps(self.config.to_mapping())
+        preset, to, direction = self.config.preset, self.options.to, self.options.direction
+        plain = preset is not None and channel_from_mapping({"preset": preset}) == self.config
+        channel = preset if plain else self.config.to_mapping()
+        return f"channel({channel!r}, {to=!r}, seed={self.seed}, {direction=!r})\n{show(report)}"
 
     async def _start(self) -> Proxy:
         proxy = Proxy(self.config, self.seed, self.options)

@@ -105,14 +105,13 @@ class Fit:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """One of the models that BIC chooses from. law: of the delays, see ``two_states.step``. model: None for one
-    state, which ``one`` describes."""
+    """One of the models that BIC chooses from. law: of the delays, see ``two_states.step``. model: of one state, two
+    that are alike."""
 
     states: int
     law: str
     bic: float
-    one: dict[str, float]
-    model: TwoStates | None = None
+    model: TwoStates
 
 
 def fit(path: Path, states: str = "auto", *, discipline: str | None = None, samples: int = SAMPLES) -> Fit:
@@ -134,7 +133,7 @@ def fit(path: Path, states: str = "auto", *, discipline: str | None = None, samp
     warnings = _data_warnings(recording, constant, loses, states)
     data = two_states.segments(sent, bool(np.isnan(delay_ms[lost == 1.0]).all()))
     laws = ("constant",) if constant else ("exponential", "gamma")
-    best = {1: min((_one_state(delays_ms, lost, law) for law in laws), key=lambda each: each.bic)}
+    best = {1: min((_one_state(data, delays_ms, lost, law) for law in laws), key=lambda each: each.bic)}
     if states != "1" and (loses or not constant):
         best[2] = min((_two_states(data, delays_ms, lost, law) for law in laws), key=lambda each: each.bic)
     chosen = best[1]
@@ -148,7 +147,7 @@ def fit(path: Path, states: str = "auto", *, discipline: str | None = None, samp
     parameters, drawn_ms = _with_intervals(chosen, data, delays_ms, lost, samples)
     if any(value.interval is None for value in parameters.values()):
         warnings.append("the recording does not determine the parameters that stand without an interval")
-    if chosen.law != "constant":
+    if len(drawn_ms):
         warnings += _misfit_warnings(delays_ms, drawn_ms)
     kind, period_ms = _arrivals(recording)
     if kind == "poisson":
@@ -170,30 +169,23 @@ def fit(path: Path, states: str = "auto", *, discipline: str | None = None, samp
         channel,
         warnings,
         sent,
-        None if chosen.model is None else _second_state(chosen.model, data, len(lost), chosen.law),
+        _second_state(chosen, data, len(lost)) if chosen.states == 2 else None,
     )
 
 
 def _usable_delays_ms(recording: Recording) -> NDArray[np.float64]:
     delays_ms = recording.delays_ms()
-    came = sum(int(camera.delivered().sum()) for camera in recording.cameras)
-    if not len(delays_ms):
-        raise RecordingError(
-            f"{recording.path}: none of its {recording.frames} frames came through in less than "
-            f"{MAX_DELAY_MS:g} ms: there is no delay to fit"
-        )
     if len(delays_ms) < MIN_DELAYS:
+        came = sum(int(camera.delivered().sum()) for camera in recording.cameras)
         raise RecordingError(
-            f"{recording.path}: {len(delays_ms)} delays ({recording.frames} frames, {came} came); at least "
-            f"{MIN_DELAYS} are needed, and hundreds for two states: record longer"
+            f"{recording.path}: {len(delays_ms)} delays below {MAX_DELAY_MS:g} ms ({recording.frames} frames, {came} "
+            f"came); at least {MIN_DELAYS} are needed, and hundreds for two states: record longer"
         )
     return delays_ms
 
 
 def _data_warnings(recording: Recording, constant: bool, loses: bool, states: str) -> list[str]:
     notes = []
-    if recording.too_long:
-        notes.append(f"{recording.too_long} frames took longer than {MAX_DELAY_MS:g} ms: left out")
     waits = recording.discipline in ("fcfs", "parallel")
     if recording.inferred and loses and not waits:
         notes.append(
@@ -211,61 +203,56 @@ def _data_warnings(recording: Recording, constant: bool, loses: bool, states: st
     return notes
 
 
-def _one_state(delays_ms: NDArray[np.float64], lost: NDArray[np.float64], law: str) -> _Candidate:
-    one = _one_state_parameters(delays_ms, lost, law)
-    log_likelihood = sum(math.log(p) * n for p, n in _fates(one["loss"], lost) if n)
-    if law != "constant":
-        delays_ms = np.maximum(delays_ms, 1e-6)
-        density = two_states.log_density(delays_ms, np.array(max(one["mean_ms"], 1e-6)), np.array(one["shape"]))
-        log_likelihood += float(density.sum())
-    free = (law != "constant") + (law == "gamma") + bool((lost == 1.0).any())
-    return _Candidate(1, law, free * math.log(len(lost)) - 2 * log_likelihood, one)
+def _one_state(data: Segments, delays_ms: NDArray[np.float64], lost: NDArray[np.float64], law: str) -> _Candidate:
+    mean_ms, loss, shape = _one_state_parameters(delays_ms, lost, law)
+    model = TwoStates(np.ones((1, 2)), np.full((1, 2), mean_ms), np.full((1, 2), loss), np.array([shape]))
+    free = (law != "constant") + (law == "gamma") + bool(loss)
+    log_likelihood = float(two_states.step(model, data, law)[1][0])
+    return _Candidate(1, law, free * math.log(len(lost)) - 2 * log_likelihood, model)
 
 
-def _fates(loss: float, lost: NDArray[np.float64]) -> list[tuple[float, int]]:
-    return [(loss, int((lost == 1.0).sum())), (1.0 - loss, int((lost == 0.0).sum()))]
-
-
-def _one_state_parameters(delays_ms: NDArray[np.float64], lost: NDArray[np.float64], law: str) -> dict[str, float]:
-    mean_ms = float(delays_ms.mean())
-    known = lost[~np.isnan(lost)]
-    spread = math.log(max(mean_ms, 1e-6)) - float(np.log(np.maximum(delays_ms, 1e-6)).mean())
+def _one_state_parameters(
+    delays_ms: NDArray[np.float64], lost: NDArray[np.float64], law: str
+) -> tuple[float, float, float]:
+    """Mean delay (at least two_states.MIN_DELAY_MS, unless it is constant), loss and shape."""
+    known, positive_ms = lost[~np.isnan(lost)], np.maximum(delays_ms, two_states.MIN_DELAY_MS)
+    mean_ms = float((delays_ms if law == "constant" else positive_ms).mean())
+    spread = math.log(float(positive_ms.mean())) - float(np.log(positive_ms).mean())
     shape = float(two_states.gamma_shape(np.array(spread))) if law == "gamma" else 1.0
-    return {"mean_ms": mean_ms, "loss": float(known.mean()) if len(known) else 0.0, "shape": shape}
+    return mean_ms, float(known.mean()) if len(known) else 0.0, shape
 
 
 def _two_states(data: Segments, delays_ms: NDArray[np.float64], lost: NDArray[np.float64], law: str) -> _Candidate:
     """The most likely model of two states: a few steps from several models on the first part of the data, then from
     the best of them to the maximum."""
-    one = _one_state_parameters(delays_ms, lost, law)
+    mean_ms, loss, shape = _one_state_parameters(delays_ms, lost, law)
     head = data.head(_START_SEGMENTS)
     frames = max(int((~np.isnan(data.lost) | ~np.isnan(data.delay_ms)).sum()), 1)
     between_ms = max(float(data.span_ms.sum()) / frames, 1e-9)
-    contrasts = [(0.6, 1.6), (1.6, 0.6)] if one["loss"] and law != "constant" else [(0.6, 1.6)]
+    contrasts = [(0.6, 1.6), (1.6, 0.6)] if loss and law != "constant" else [(0.6, 1.6)]
     starts = [(n, contrast) for n in _START_FRAMES for contrast in contrasts]
     begin = TwoStates(
         np.array([[1 / (n * between_ms)] * 2 for n, _ in starts]),
-        max(one["mean_ms"], 1e-6) * np.array([[0.6, 1.6]] * len(starts)),
-        np.minimum(one["loss"] * np.array([contrast for _, contrast in starts]), 0.99),
-        np.full(len(starts), one["shape"]),
+        max(mean_ms, two_states.MIN_DELAY_MS) * np.array([[0.6, 1.6]] * len(starts)),
+        np.minimum(loss * np.array([contrast for _, contrast in starts]), 0.99),
+        np.full(len(starts), shape),
     )
     tried, value = two_states.maximize(begin, head, law, _START_STEPS)
     model, log_likelihood = two_states.maximize(tried.take([int(np.argmax(value))]), data, law)
-    free = 2 + 2 * (law != "constant") + (law == "gamma") + 2 * bool(one["loss"])
+    free = 2 + 2 * (law != "constant") + (law == "gamma") + 2 * bool(loss)
     bic = free * math.log(len(lost)) - 2 * float(log_likelihood[0])
-    return _Candidate(2, law, bic, one, model.ordered(law != "constant"))
+    return _Candidate(2, law, bic, model.ordered(law != "constant"))
 
 
-def _second_state(model: TwoStates, data: Segments, count: int, law: str) -> NDArray[np.float64]:
+def _second_state(found: _Candidate, data: Segments, count: int) -> NDArray[np.float64]:
     """Probability of the second state at each of ``count`` transmissions."""
-    return np.asarray(two_states.step(model, data, law)[2][0].ravel()[:count])
+    return np.asarray(two_states.step(found.model, data, found.law)[2][0].ravel()[:count])
 
 
 def _reject_two_states(found: _Candidate, data: Segments, sent: Transmissions) -> str | None:
     """The reason to reject two states whatever their likelihood, or None."""
-    assert found.model is not None
     start_ms, _, _ = sent
-    second = _second_state(found.model, data, len(start_ms), found.law)
+    second = _second_state(found, data, len(start_ms))
     frames = min(float(second.sum()), float((1 - second).sum()))
     if frames < _MIN_FRAMES:
         return f"one of them rests on {frames:.0f} frames"
@@ -279,30 +266,25 @@ def _reject_two_states(found: _Candidate, data: Segments, sent: Transmissions) -
 def _with_intervals(
     chosen: _Candidate, data: Segments, delays_ms: NDArray[np.float64], lost: NDArray[np.float64], count: int
 ) -> tuple[dict[str, IntervalEstimate], NDArray[np.float64]]:
-    """The parameters with their intervals by ``count`` samples, and delays drawn from the fitted distributions."""
-    rng, model = np.random.default_rng(0), chosen.model
-    if model is None:
-        values = {name: np.array([value]) for name, value in chosen.one.items()}
-        shape, fates = chosen.one["shape"], int((~np.isnan(lost)).sum())
-        if chosen.law == "constant":
-            drawn = rng.choice(delays_ms, (count, len(delays_ms)))
-        else:
-            drawn = rng.gamma(shape, chosen.one["mean_ms"] / shape, (count, len(delays_ms)))
-        drawn_ms = drawn.ravel()
-        losses = rng.binomial(fates, chosen.one["loss"], count) / max(fates, 1)
-        again = [_one_state_parameters(d, np.array([loss]), chosen.law) for d, loss in zip(drawn, losses)]
-        samples = {name: np.array([each[name] for each in again]) for name in values}
+    """The parameters with their intervals by ``count`` samples, and delays drawn from the fitted distributions (none of
+    constant ones)."""
+    rng, model, law = np.random.default_rng(0), chosen.model, chosen.law
+    many = two_states.draw(model, data, count, rng)
+    if chosen.states == 1:
+        given = zip(many.delay_ms, many.lost)
+        each = [_one_state_parameters(delay[~np.isnan(delay)], fate.ravel(), law) for delay, fate in given]
+        mean_ms, loss, shape = np.array(each).T
+        again = TwoStates(np.ones((count, 2)), np.stack([mean_ms] * 2, 1), np.stack([loss] * 2, 1), shape)
     else:
-        many = two_states.draw(model, data, count, rng)
-        second = two_states.step(model, data, chosen.law)[2][~np.isnan(data.delay_ms)]
+        again = two_states.maximize(model.take([0] * count), many, law, 40)[0]
+    values, samples = (_named(each, chosen.states, law) for each in (model, again))
+    drawn_ms = np.empty(0)
+    if law == "constant":
+        values["mean_ms"] = samples["mean_ms"] = np.array([float(delays_ms.mean())])
+    else:
+        second = two_states.step(model, data, law)[2][~np.isnan(data.delay_ms)]
         means_ms = model.mean_ms[0][(rng.random((count, len(second))) < second).astype(int)].ravel()
         drawn_ms = rng.gamma(model.shape[0], means_ms / model.shape[0])
-        values = _named(model, chosen.law)
-        samples = _named(two_states.maximize(model.repeat(count), many, chosen.law, 40)[0], chosen.law)
-        if chosen.law == "constant":
-            values["mean_ms"] = samples["mean_ms"] = np.array([float(delays_ms.mean())])
-    if chosen.law != "gamma":
-        del values["shape"]
     if not (lost == 1.0).any():
         values = {name: value for name, value in values.items() if not name.startswith("loss")}
     return {
@@ -311,34 +293,27 @@ def _with_intervals(
     }, drawn_ms
 
 
-def _named(model: TwoStates, law: str) -> dict[str, NDArray[np.float64]]:
+def _named(model: TwoStates, states: int, law: str) -> dict[str, NDArray[np.float64]]:
     """The parameters of each sample by name; a loss of nearly nothing is none."""
-    pairs = {
-        "mu{}_per_ms": model.leave_per_ms,
-        "mean_{}_ms": model.mean_ms,
-        "loss_{}": np.where(model.loss < 1e-6, 0.0, model.loss),
-    }
+    loss = np.where(model.loss < 1e-6, 0.0, model.loss)
+    pairs = {"mu{}_per_ms": model.leave_per_ms, "mean_{}_ms": model.mean_ms, "loss_{}": loss}
+    if states == 1:
+        found = {"mean_ms": model.mean_ms[:, 0], "loss": loss[:, 0]}
+    else:
+        found = {name.format(k + 1): pair[:, k] for name, pair in pairs.items() for k in (0, 1)}
     if law == "constant":
-        del pairs["mean_{}_ms"]
-    return {name.format(k + 1): pair[:, k] for name, pair in pairs.items() for k in (0, 1)} | {"shape": model.shape}
+        found = {name: values for name, values in found.items() if not name.startswith("mean")}
+    return found | ({"shape": model.shape} if law == "gamma" else {})
 
 
 def _interval(value: float, samples: NDArray[np.float64], chance: bool) -> Interval:
-    """The interval of an estimate by the spread of its samples: of their logarithms, or of a chance's log odds."""
+    """The interval of an estimate by the spread of its samples' logarithms."""
     if value <= 0.0:
         return None if chance else (value, value)
-
-    def spread(x: NDArray[np.float64] | float) -> NDArray[np.float64]:
-        x = np.clip(x, 1e-300, 1 - 1e-12 if chance else 1e300)
-        return np.asarray(np.log(x / (1 - x)) if chance else np.log(x))
-
-    at, reach = float(spread(value)), _Z_95 * float(spread(samples).std())
+    reach = _Z_95 * float(np.log(np.maximum(samples, 1e-300)).std())
     if not reach < _Z_95 * _MAX_LOG_SD:
         return None
-    low, high = (math.exp(at + sign * reach) for sign in (-1, 1))
-    if chance:
-        low, high = low / (1 + low), high / (1 + high)
-    return min(low, value), max(high, value)
+    return value * math.exp(-reach), min(value * math.exp(reach), 1.0 if chance else math.inf)
 
 
 def _misfit_warnings(delays_ms: NDArray[np.float64], drawn_ms: NDArray[np.float64]) -> list[str]:

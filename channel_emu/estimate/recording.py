@@ -75,8 +75,6 @@ class Recording:
     cameras: list[Camera]
     discipline: str
     sampled: bool
-    too_long: int = 0
-    """Number of delays left out because they exceed MAX_DELAY_MS."""
     inferred: bool = False
     """Whether lost and dropped frames were told apart by what was in service, for lack of a column outcome."""
 
@@ -117,18 +115,17 @@ def from_trace(path: Path, found: trace.Trace) -> Recording:
         raise RecordingError(f"{path}: there is no frame in it")
     sampled = any(r.outcome == EventKind.SKIPPED for r in found.records)
     first_ns = min(r.offered_ns for r in found.records)
-    cameras, too_long = [], 0
+    cameras = []
     for name, records in found.by_camera().items():
         started = _ms([r.started_ns for r in records], first_ns)
         drawn = [None if r.drawn_ns is None or (r.due_ns or 0) >= NEVER_NS else r.drawn_ns for r in records]
         delay = _ms(drawn, 0)
-        too_long += sum(r.drawn_ns is not None for r in records) - int((delay <= MAX_DELAY_MS).sum())
         delay[~(delay <= MAX_DELAY_MS)] = math.nan
         offered = _ms([r.offered_ns for r in records], first_ns)
         outcome = np.array([r.outcome or "" for r in records])
         arrived = _ms([r.arrived_ns for r in records], first_ns) if sampled else offered
         cameras.append(Camera(name, offered, arrived, started, delay, outcome))
-    return Recording(path, cameras, found.config.discipline, sampled, too_long)
+    return Recording(path, cameras, found.config.discipline, sampled)
 
 
 def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:
@@ -161,31 +158,20 @@ def _from_rows(path: Path, discipline: str) -> Recording:
                 raise TableError(
                     f"line {line}: delivered_ms is not earlier than offered_ms, or blank: {', '.join(row):.100}"
                 )
+            then = math.nan if then - at > MAX_DELAY_MS else then
             why = row[outcome] if outcome is not None else ""
             rows.setdefault((row[camera] if camera is not None else "") or "cam00", []).append((at, then, why))
     except TableError as error:
         raise RecordingError(f"{path}: {error}") from None
     if not rows:
         raise RecordingError(f"{path}: there is no frame in it")
-    tables: dict[str, NDArray[np.float64]] = {}
-    too_long = 0
-    first = min(offered for given in rows.values() for offered, *_ in given)
-    never_sent: dict[str, NDArray[np.str_]] = {}
-    for name, given in rows.items():
-        given.sort(key=lambda row: row[0])
-        table = np.array([row[:2] for row in given]) - first
-        never_sent[name] = np.array([row[2] if row[2] in _NEVER_SENT else "" for row in given])
-        too_long += int((table[:, 1] - table[:, 0] > MAX_DELAY_MS).sum())
-        table[table[:, 1] - table[:, 0] > MAX_DELAY_MS, 1] = math.nan
-        tables[name] = table
-    instants = np.concatenate([table.ravel() for table in tables.values()])
-    delays = np.concatenate([table[:, 1] - table[:, 0] for table in tables.values()])
+    each = [row for given in rows.values() for row in given]
+    first = min(at for at, _, _ in each)
+    last = max(at if math.isnan(then) else then for at, then, _ in each)
     # On a parallel link, frames offered from this instant on may still be in service.
-    sure_ms = float(np.nanmax(instants)) - float(np.nanmax(delays, initial=0.0))
-    cameras = [
-        _camera_of_rows(name, t[:, 0], t[:, 1], never_sent[name], discipline, sure_ms) for name, t in tables.items()
-    ]
-    return Recording(path, cameras, discipline, False, too_long, inferred=outcome is None)
+    sure_ms = last - first - max((then - at for at, then, _ in each if not math.isnan(then)), default=0.0)
+    cameras = [_camera_of_rows(name, given, first, discipline, sure_ms) for name, given in rows.items()]
+    return Recording(path, cameras, discipline, False, inferred=outcome is None)
 
 
 def _check_drop_new(recording: Recording) -> None:
@@ -208,26 +194,24 @@ def _check_drop_new(recording: Recording) -> None:
 
 
 def _camera_of_rows(
-    name: str,
-    offered: NDArray[np.float64],
-    delivered: NDArray[np.float64],
-    never_sent: NDArray[np.str_],
-    discipline: str,
-    sure_ms: float,
+    name: str, rows: list[tuple[float, float, str]], first: float, discipline: str, sure_ms: float
 ) -> Camera:
-    """Infer starts and outcomes. Transmission starts at the offer, or when the link becomes free.
+    """Infer starts and outcomes of rows (offered, delivered, why not). Transmission starts at the offer, or when the
+    link becomes free.
 
-    An undelivered frame was dropped if ``never_sent`` (N,) says so or an earlier one was in service, and lost
+    An undelivered frame was dropped if its row says so or an earlier one was in service, and lost
     otherwise. After the last delivery, and on a parallel link from ``sure_ms`` on, it may still be in service:
     outcome unknown.
     """
+    rows = sorted(rows, key=lambda row: row[0])
+    offered, delivered = np.array([row[:2] for row in rows]).T - first
     n = len(offered)
     started, outcome = np.full(n, math.nan), np.full(n, str(EventKind.LOST), dtype="U16")
     free = -math.inf
     for i in range(n):
         if math.isnan(delivered[i]):
-            if never_sent[i]:
-                outcome[i] = never_sent[i]
+            if rows[i][2] in _NEVER_SENT:
+                outcome[i] = rows[i][2]
             elif discipline != "parallel" and offered[i] < free:
                 newest = discipline == "newest-waits"
                 outcome[i] = str(EventKind.SUPERSEDED if newest else EventKind.DROPPED_BUSY)

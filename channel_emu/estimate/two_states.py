@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 SEGMENT = 256
 MIN_SHAPE, MAX_SHAPE = 0.05, 1e4
 _MIN_RATE, _MAX_RATE = 1e-12, 1e6
-_MIN_DELAY_MS = 1e-6
+MIN_DELAY_MS = 1e-6
 _LEAST = 1e-80
 """Least probability of a state, so that no scale under- or overflows."""
 _MOST_STEPS, _TOLERANCE, _MAX_REACH = 100, 3e-3, 64.0
@@ -67,10 +67,6 @@ class TwoStates:
         """Some of the samples."""
         return TwoStates(self.leave_per_ms[samples], self.mean_ms[samples], self.loss[samples], self.shape[samples])
 
-    def repeat(self, samples: int) -> TwoStates:
-        """The first model, as many times."""
-        return self.take([0] * samples)
-
     def stationary(self) -> Array:
         """Share of time in each state, (R, 2)."""
         return self.leave_per_ms[:, ::-1] / self.leave_per_ms.sum(1, keepdims=True)
@@ -85,18 +81,14 @@ class TwoStates:
 
 def segments(frames: tuple[Array, Array, Array], hides_lost: bool) -> Segments:
     """Cut frames (start_ms, delay_ms, lost), in the order of their starts, into one sample of segments."""
-    start, delay, lost = frames
-    rows: list[tuple[Array, Array, Array]] = []
-    for first in range(0, len(start), SEGMENT):
-        part = slice(first, first + SEGMENT)
-        rows.append((np.diff(start[part], prepend=start[first]), delay[part], lost[part]))
-    longest = max(len(span) for span, _, _ in rows)
-    columns = [np.full((1, len(rows), longest), fill) for fill in (0.0, np.nan, np.nan)]
-    for n, row in enumerate(rows):
-        for column, values in zip(columns, row):
-            column[0, n, : len(values)] = values
-    columns[1] = np.maximum(columns[1], _MIN_DELAY_MS)
-    return Segments(columns[0], columns[1], columns[2], hides_lost)
+    start, delay_ms, lost = frames
+    length = min(SEGMENT, len(start))
+    span_ms = np.diff(start, prepend=start[0])
+    span_ms[::length] = 0.0
+    filled = ((span_ms, 0.0), (np.maximum(delay_ms, MIN_DELAY_MS), np.nan), (lost, np.nan))
+    padding = (0, -len(start) % length)
+    cut = [np.pad(column, padding, constant_values=fill).reshape(1, -1, length) for column, fill in filled]
+    return Segments(cut[0], cut[1], cut[2], hides_lost)
 
 
 def step(model: TwoStates, data: Segments, law: str) -> tuple[TwoStates, Array, Array]:
@@ -189,7 +181,7 @@ def draw(model: TwoStates, data: Segments, samples: int, rng: np.random.Generato
         second = share + (state[:, :, k - 1] - share) * decay[:, k]
         state[:, :, k] = chance[k] < second
     shape = model.shape[0]
-    delay = np.maximum(rng.gamma(shape, model.mean_ms[0][state] / shape), _MIN_DELAY_MS)
+    delay = np.maximum(rng.gamma(shape, model.mean_ms[0][state] / shape), MIN_DELAY_MS)
     lost = np.where(np.isnan(data.lost), np.nan, rng.random(state.shape) < model.loss[0][state])
     unknown = np.isnan(data.delay_ms) & (data.lost != 1.0)
     return Segments(
@@ -273,7 +265,7 @@ def _delay_parameters(model: TwoStates, data: Segments, states: Array, law: str)
     weight = np.where(np.isnan(delay), 0.0, 1.0)[..., None] * states
     count = np.maximum(weight.sum((1, 2)), 1e-300)
     mean = (np.nan_to_num(delay)[..., None] * weight).sum((1, 2)) / count
-    mean = np.maximum(mean, _MIN_DELAY_MS)
+    mean = np.maximum(mean, MIN_DELAY_MS)
     if law == "exponential":
         return mean, model.shape
     logs = (np.nan_to_num(np.log(delay))[..., None] * weight).sum((1, 2, 3))

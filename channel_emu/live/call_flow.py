@@ -1,4 +1,4 @@
-"""Passes the messages of one direction of one gRPC call through a link, without parsing them."""
+"""Passes the messages of one direction of a call, or of a connection, through a link, without parsing them."""
 
 from __future__ import annotations
 
@@ -9,14 +9,9 @@ from typing import Any
 
 import grpc.aio
 
-from channel_emu.live.live_link import STREAM_ENDED, LiveLink, Message
+from channel_emu.live.live_link import STREAM_ENDED, Ends, LiveLink, Message
+from channel_emu.live.settings import MOST_BEHIND, MOST_READY
 from channel_emu.model.link import EventKind
-from freshfield.streams import ServedCall
-
-# Maximum number of messages read ahead of the one being written; then the sender waits. Behind a message that
-# is still in the link more are read, because the link must decide about each at its arrival. Dropped ones are
-# kept without their bytes.
-_MOST_READY, _MOST_BEHIND = 64, 10_000
 
 Read = Callable[[], Awaitable[Any]]
 Write = Callable[[bytes], Awaitable[None]]
@@ -27,12 +22,14 @@ class CallFlow:
 
     Messages of one stream keep their order: one that is due before its predecessor waits for it.
 
-    number: of the call. call: ended by a reset of the link. link: None passes all messages on at once.
+    name: of the call. call: ended by a reset of the link. link: None passes all messages on at once.
     now_ns: the channel's clock.
     """
 
-    def __init__(self, number: int, call: ServedCall, link: LiveLink | None, now_ns: Callable[[], int]) -> None:
-        self._number = number
+    most_ready, most_behind = MOST_READY, MOST_BEHIND
+
+    def __init__(self, name: str, call: Ends, link: LiveLink | None, now_ns: Callable[[], int]) -> None:
+        self._name = name
         self._call = call
         self._link = link
         self._now_ns = now_ns
@@ -104,24 +101,27 @@ class CallFlow:
                     break
                 if raw is grpc.aio.EOF:
                     break
-                message = Message(raw, f"call{self._number}", self._read, self)
+                message = Message(raw, self._name, self._read, self)
                 self._read += 1
                 self._call.use()
                 self._messages.append(message)
-                if self._link is None:
-                    self.settle(message, EventKind.DELIVERED)
-                elif not self._link.has_room(raw):
-                    self._link.overfull += 1
-                    self.settle(message, EventKind.DROPPED_BUSY)
-                else:
-                    self._link.offer(message, self._now_ns())
+                self._offer(message)
                 inside = self._messages and self._messages[0].delivered is None
-                if len(self._messages) >= (_MOST_BEHIND if inside else _MOST_READY):
+                if len(self._messages) >= (self.most_behind if inside else self.most_ready):
                     self._not_full.clear()
                     await self._not_full.wait()
             self._ended = True
         finally:
             self._wake.set()
+
+    def _offer(self, message: Message) -> None:
+        if self._link is None:
+            self.settle(message, EventKind.DELIVERED)
+        elif not self._link.has_room(message.raw):
+            self._link.overfull += 1
+            self.settle(message, EventKind.DROPPED_BUSY)
+        else:
+            self._link.offer(message, self._now_ns())
 
     async def _pass(self, message: Message, write: Write) -> None:
         if not message.delivered:
@@ -133,5 +133,5 @@ class CallFlow:
             # A unary method takes one message, so the only message of a call is not written twice.
             if message.duplicated and self._read > 1:
                 await write(message.raw)
-        if len(self._messages) < _MOST_READY:
+        if len(self._messages) < self.most_ready:
             self._not_full.set()

@@ -13,6 +13,7 @@ import grpc.aio
 import numpy as np
 from google.protobuf.message import DecodeError
 
+from channel_emu.live import settings as tuned
 from channel_emu.live.live_link import STREAM_ENDED, LiveLink, Message
 from channel_emu.model.link import EventKind
 from freshfield.clock import Clock
@@ -24,13 +25,6 @@ from freshfield.v1 import frames_pb2 as pb
 log = logging.getLogger("channel-emu")
 
 PUSH = "/freshfield.v1.FrameStreamService/Push"
-# Maximum number of unanswered frames. More than one, so that waiting for an answer does not delay the next
-# frame; few, so that a stalled edge is noticed at once.
-CREDITS = 8
-# Answers to no frame that was sent, before the stream ends: a hostile edge would keep the emulator busy.
-_MOST_STRANGE = 100
-FIRST_BACKOFF_S = 0.1
-MAX_BACKOFF_S = 1.0
 
 
 class CameraStream:
@@ -131,7 +125,7 @@ class CameraStream:
             finally:
                 self._end()
             failures = 0 if answered else failures + 1
-            await asyncio.sleep(backoff_s(failures, FIRST_BACKOFF_S, MAX_BACKOFF_S, self._jitter))
+            await asyncio.sleep(backoff_s(failures, tuned.FIRST_BACKOFF_S, tuned.MAX_BACKOFF_S, self._jitter))
 
     async def _session(self) -> bool:
         """Run one stream until it fails. Returns whether the edge answered anything on it."""
@@ -182,7 +176,7 @@ class CameraStream:
                 response = pb.PushResponse.FromString(data)
                 if not any(frame.sequence == response.sequence for frame in self._unanswered):
                     strange += 1
-                    if strange > _MOST_STRANGE:
+                    if strange > tuned.MOST_STRANGE:
                         raise DecodeError
                     continue
                 while self._unanswered.popleft().sequence != response.sequence:
@@ -213,7 +207,7 @@ class CameraStream:
     def _full(self, frame: Message) -> bool:
         """Whether the credits are used up: CREDITS frames, or MAX_MESSAGE_BYTES in more than one frame."""
         out = [len(each.raw) for each in (*self._outbox, *self._unanswered)]
-        return len(out) >= CREDITS or (bool(out) and sum(out) + len(frame.raw) > MAX_MESSAGE_BYTES)
+        return len(out) >= tuned.CREDITS or (bool(out) and sum(out) + len(frame.raw) > MAX_MESSAGE_BYTES)
 
     def _hand_on(self, frame: Message) -> None:
         now_ns = self._clock.now_ns()

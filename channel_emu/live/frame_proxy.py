@@ -1,4 +1,4 @@
-"""The proxy of freshfield's frame stream: nodes stream to the emulator, the emulator to the edge.
+"""The proxy of freshfield's frame stream: nodes stream to the emulator, the emulator to the edge; and its status.
 
 Frames are opaque bytes: only their headers are read. A node's answer is its link's decision. The edge's
 answers are counted here and not passed on.
@@ -11,6 +11,7 @@ import contextlib
 import gc
 import logging
 import threading
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,14 @@ import grpc
 import grpc.aio
 import numpy as np
 
+from channel_emu.live import settings as tuned
 from channel_emu.live.camera_stream import PUSH, CameraStream
 from channel_emu.live.channel_service import ChannelService
+from channel_emu.live.histogram import Histogram
 from channel_emu.live.live_link import Flips
 from channel_emu.live.proxy import Proxy, ProxyOptions
-from channel_emu.live.status import snapshot
 from channel_emu.model.counter_rng import stream_key
+from channel_emu.model.link import EventKind
 from channel_emu.model.settings import ChannelConfig
 from freshfield.files import write_json
 from freshfield.frame import FrameRejected, counted_ids, parse, valid_id
@@ -40,11 +43,8 @@ SERVICE = frames_pb2.DESCRIPTOR.services_by_name["FrameStreamService"].full_name
 CLOCK_SERVICE = clock_pb2.DESCRIPTOR.services_by_name["ClockService"].full_name
 CONTROL_SERVICE = channel_pb2.DESCRIPTOR.services_by_name["ChannelService"].full_name
 _EXCHANGE = f"/{CLOCK_SERVICE}/Exchange"
-_EXCHANGE_TIMEOUT_S = 5.0
-# After this long without the edge, warn once.
-_WARN_AFTER_NS = 3 * 10**9
-# Nodes are admitted when the streams to the edge are open, or after this long without them.
-_FIRST_WAIT_S = 2.0
+SET_BY_HAND = "set by hand"
+"""The state while an operator's delays and losses are in force."""
 
 
 class FrameProxy(Proxy):
@@ -52,7 +52,6 @@ class FrameProxy(Proxy):
 
     cameras: ids of the scenario's cameras; others are refused.
     out: folder of ``channel.json`` and the ledger.
-    priority: result of ``priority.raise_priority``, for the status.
     Further arguments as of ``Proxy``. Raises OSError if the ledger cannot be created.
     """
 
@@ -60,13 +59,7 @@ class FrameProxy(Proxy):
     streams_last = True
 
     def __init__(
-        self,
-        config: ChannelConfig,
-        seed: int,
-        options: ProxyOptions,
-        cameras: Sequence[str],
-        out: Path,
-        priority: str = "normal",
+        self, config: ChannelConfig, seed: int, options: ProxyOptions, cameras: Sequence[str], out: Path
     ) -> None:
         most_streams = MAX_STREAMS_PER_CAMERA * len(cameras)
         super().__init__(config, seed, options, most_streams + MAX_OTHER_CALLS)
@@ -76,11 +69,10 @@ class FrameProxy(Proxy):
         self._sessions = SessionStreams(cameras)
         self._out = out
         self._status_lock, self._status_is_final = threading.Lock(), False
-        self._priority = priority
         self._ledger = Ledger(out, "emulator", "channel", self.origin_ns)
         self._metadata = options.transport.metadata()
         self._exchange = self.service_channel.unary_unary(_EXCHANGE)
-        self._warn_at_ns = self.origin_ns + _WARN_AFTER_NS
+        self._warn_at_ns = self.origin_ns + tuned.WARN_AFTER_NS
         self.flows = {camera: self._flow(camera) for camera in cameras}
         self._control = ChannelService(self)
         self._handlers = {
@@ -93,14 +85,14 @@ class FrameProxy(Proxy):
         return self._handlers.get(details.method)
 
     async def prepare(self, server: grpc.aio.Server) -> None:
-        """Connect to the edge. Returns when all streams are open, or after _FIRST_WAIT_S."""
+        """Connect to the edge. Returns when all streams are open, or after FIRST_WAIT_S."""
         channel_pb2_grpc.add_ChannelServiceServicer_to_server(self._control, server)
         await serve_health(server, (SERVICE, CLOCK_SERVICE, CONTROL_SERVICE))
         for flow in self.flows.values():
             self.spawn(flow.run())
         # Frames that came before the streams to the edge were open would be broken, but not by the channel.
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_FIRST_WAIT_S):
+            async with asyncio.timeout(tuned.FIRST_WAIT_S):
                 for flow in self.flows.values():
                     await flow.opened.wait()
         # Scanning old objects makes the garbage collector's long pauses, and nearly all of them exist by now.
@@ -175,7 +167,7 @@ class FrameProxy(Proxy):
             return self._reject(header, error.reason, str(error)), flow
         if not flow.link.has_room(raw):
             return self._reject(header, "queue_full", "the emulator holds as many bytes as it may"), flow
-        self.streams.use(call)
+        call.use()
         try:
             return flow.take(raw, header), flow
         except Exception as error:
@@ -193,7 +185,7 @@ class FrameProxy(Proxy):
     async def _pass_exchange(self, request: bytes, context: grpc.aio.ServicerContext) -> bytes:
         """Pass a clock exchange on without delay: it is for measuring, not part of the emulated network."""
         try:
-            return await self._exchange(request, timeout=_EXCHANGE_TIMEOUT_S, metadata=self._metadata)
+            return await self._exchange(request, timeout=tuned.EXCHANGE_TIMEOUT_S, metadata=self._metadata)
         except grpc.aio.AioRpcError as error:
             await context.abort(error.code(), f"edge: {error.details()}")
             raise AssertionError("abort raises") from None
@@ -205,9 +197,46 @@ class FrameProxy(Proxy):
                 write_json(self._out / "channel.json", state)
 
     def _snapshot(self, final: bool = False) -> dict[str, Any]:
-        flows, now_ns = list(self.flows.values()), self.events.now_ns()
-        changes = self._control.changes
-        return snapshot(self.channel, flows, self.stats, self.rejected, now_ns, self._priority, final, changes)
+        """The status as plain values. final: whether the emulator is ending.
+
+        ``state`` is that of the shared chain, or SET_BY_HAND; with one chain a camera, ``by_camera`` has the states.
+        ``counts`` are sums over all cameras; ``broken`` counts frames broken by a reset or a missing edge.
+        """
+        channel, now = self.channel, max(self.events.now_ns(), 0)
+        by_hand, chain, names = channel.by_hand, channel.chain, channel.config.state_names
+        totals, edge_rejected = Counter[str](), Counter[str]()
+        by_camera: dict[str, Any] = {}
+        for camera, flow in self.flows.items():
+            counts = _counts(flow)
+            totals.update(counts)
+            edge_rejected.update(flow.rejected)
+            by_camera[camera] = {**counts, "connected": flow.connected, "streams": len(flow.link.calls)}
+            if by_hand is None and chain is None and flow.link.model.chain is not None:
+                by_camera[camera]["state"] = names[flow.link.model.chain.state(now)]
+        return {
+            "running": not final,
+            "preset": channel.config.preset,
+            "discipline": channel.config.discipline,
+            "seed": channel.seed,
+            "uptime_s": round(now / 1e9, 3),
+            "states": names,
+            "state": SET_BY_HAND if by_hand else None if chain is None else names[chain.state(now)],
+            "by_hand": None if by_hand is None else {"delay_ms": by_hand[0], "loss": by_hand[1]},
+            "changes": list(self._control.changes),
+            "state_share": self._shares(now),
+            "drawn_delay_ms": _figures(self.stats.drawn, shape=True),
+            "delay_error_ms": _figures(self.stats.error, shape=final),
+            "counts": dict(totals),
+            "rejected": dict(self.rejected),
+            "edge_rejected": dict(edge_rejected),
+            "by_camera": by_camera,
+        }
+
+    def _shares(self, now_ns: int) -> dict[str, float]:
+        chains = [self.channel.chain] if self.channel.chain else [link.model.chain for link in self.links.values()]
+        shares = [chain.occupancy(now_ns) for chain in chains if chain is not None]
+        means = zip(self.channel.config.state_names, zip(*shares))
+        return {name: round(sum(share) / len(share), 6) for name, share in means}
 
 
 def damage_payload(raw: bytes, flips: Flips) -> bytes:
@@ -217,3 +246,28 @@ def damage_payload(raw: bytes, flips: Flips) -> bytes:
     request = frames_pb2.PushRequest.FromString(raw)
     damage_frame(request, flips)
     return request.SerializeToString()
+
+
+def _counts(flow: CameraStream) -> dict[str, int]:
+    link = flow.link.model
+    return {
+        "received": link.offered + flow.held_out,
+        "held_out": flow.held_out,
+        "forwarded": flow.forwarded,
+        **{str(kind): link.counts[kind] for kind in EventKind if kind is not EventKind.STARTED},
+        # Frames are broken by a reset of the stream, and by an edge that is not connected.
+        "broken": link.counts[EventKind.BROKEN] + flow.broken,
+        "in_flight": link.in_flight + flow.pending,
+        "clock_backwards": link.clock_backwards,
+    }
+
+
+def _figures(histogram: Histogram, shape: bool) -> dict[str, Any]:
+    figures: dict[str, Any] = {
+        "count": histogram.count,
+        **{name: None if value is None else round(value, 4) for name, value in histogram.summary().items()},
+    }
+    if shape:
+        edges_ms, counts = histogram.linear()
+        figures["histogram"] = {"edges_ms": edges_ms, "counts": counts}
+    return figures

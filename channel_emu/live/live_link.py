@@ -36,8 +36,9 @@ class Receiver(Protocol):
 
 
 class Ends(Protocol):
-    """A call, or a connection, that a reset of the link ends."""
+    """A call, or a connection, that a reset of the link ends. ``use``: it carried a message."""
 
+    def use(self) -> None: ...
     def end(self, code: grpc.StatusCode, details: str) -> None: ...
 
 

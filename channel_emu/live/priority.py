@@ -13,12 +13,9 @@ import ctypes
 import os
 import platform
 
+from channel_emu.live.settings import SLICE_NS
+
 _SYS_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
-SWITCH_INTERVAL_S = 0.0005
-"""The event loop takes the interpreter's lock back from another thread after this long at most
-(``sys.setswitchinterval``)."""
-# A thread that asks for short slices is scheduled sooner when it wakes (Linux 6.12 and later).
-_SLICE_NS = 100_000
 _M_MMAP_THRESHOLD = -3
 
 
@@ -36,8 +33,7 @@ class _Attributes(ctypes.Structure):
 
 
 def raise_priority() -> str:
-    """Take the best scheduling that the system permits; returns which: ``realtime``, ``short-slice``,
-    ``nice`` or ``normal``.
+    """Take the best scheduling that the system permits; returns which: ``realtime``, ``short-slice`` or ``normal``.
 
     Threads started later inherit it. Call it before gRPC starts its threads: one that is preempted while it
     holds the interpreter's lock delays the others. Real time needs CAP_SYS_NICE; the kernel still reserves 5
@@ -47,11 +43,7 @@ def raise_priority() -> str:
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
             return "realtime"
-    reached = "normal"
-    with contextlib.suppress(OSError):
-        os.nice(-5)
-        reached = "nice"
-    return "short-slice" if _shorten_slice() else reached
+    return "short-slice" if _shorten_slice() else "normal"
 
 
 def return_freed_memory() -> None:
@@ -65,6 +57,6 @@ def _shorten_slice() -> bool:
     number = _SYS_SCHED_SETATTR.get(platform.machine())
     if number is None or platform.system() != "Linux":
         return False
-    attributes = _Attributes(size=ctypes.sizeof(_Attributes), runtime_ns=_SLICE_NS)
+    attributes = _Attributes(size=ctypes.sizeof(_Attributes), runtime_ns=SLICE_NS)
     attributes.nice = os.getpriority(os.PRIO_PROCESS, 0)
     return ctypes.CDLL(None).syscall(number, 0, ctypes.byref(attributes), 0) == 0

@@ -23,6 +23,7 @@ from typing import Any, ClassVar
 import grpc
 import grpc.aio
 
+from channel_emu.live import settings as tuned
 from channel_emu.live.call_flow import CallFlow
 from channel_emu.live.event_queue import EventQueue
 from channel_emu.live.live_link import STREAM_ENDED, ByteBudget, DelayStats, Flips, LiveLink
@@ -40,13 +41,7 @@ log = logging.getLogger("channel-emu")
 
 DIRECTIONS = ("up", "down", "both")
 _NOT_PASSED_ON = ("user-agent", "content-type", "te")
-MOST_CALLS = 1000
-_MOST_METHODS = 64  # with links of their own; all others share one
 _OTHERS = "(other methods)"
-_STOP_GRACE_S = 0.5
-_REFRESH_EVERY_S = 0.5
-# How much of the chain's past path is kept; no event is processed later than this.
-_KEEP_PATH_NS = 60 * 10**9
 
 
 class EmulatorFailed(RuntimeError):
@@ -91,7 +86,9 @@ class Proxy(grpc.GenericRpcHandler):
         (key, value) for key, value in CLIENT_OPTIONS if "keepalive" not in key and "ping" not in key
     ]
 
-    def __init__(self, config: ChannelConfig, seed: int, options: ProxyOptions, most_calls: int = MOST_CALLS) -> None:
+    def __init__(
+        self, config: ChannelConfig, seed: int, options: ProxyOptions, most_calls: int = tuned.MOST_CALLS
+    ) -> None:
         self.options = options
         self.clock = WallClock()
         self.origin_ns = self.clock.now_ns()
@@ -154,7 +151,7 @@ class Proxy(grpc.GenericRpcHandler):
                 for call in {call for link in self.links.values() for call in link.calls}:
                     if isinstance(call, ServedCall):
                         call.end(grpc.StatusCode.UNAVAILABLE, "the channel emulator ends")
-            await self._server.stop(_STOP_GRACE_S)
+            await self._server.stop(tuned.STOP_GRACE_S)
             await self.service_channel.close()
 
     def fail(self, error: BaseException) -> None:
@@ -245,8 +242,9 @@ class Proxy(grpc.GenericRpcHandler):
     async def _carry(self, method: str, context: grpc.aio.ServicerContext, served: ServedCall) -> None:
         """Pass one call of any kind on."""
         self._calls += 1
-        up = CallFlow(self._calls, served, self._link_of("up", method), self.events.now_ns)
-        down = CallFlow(self._calls, served, self._link_of("down", method), self.events.now_ns)
+        name = f"call{self._calls}"
+        up = CallFlow(name, served, self._link_of("up", method), self.events.now_ns)
+        down = CallFlow(name, served, self._link_of("down", method), self.events.now_ns)
         metadata = _passed_on(context.invocation_metadata())
         call = self.service_channel.stream_stream(method)(metadata=metadata, timeout=context.time_remaining())
         parts = [
@@ -280,7 +278,7 @@ class Proxy(grpc.GenericRpcHandler):
         if self.options.direction not in (direction, "both"):
             return None
         name = f"{direction} {method}"
-        if name not in self.links and len(self.links) >= _MOST_METHODS:
+        if name not in self.links and len(self.links) >= tuned.MOST_METHODS:
             name = f"{direction} {_OTHERS}"
         return self.link(name)
 
@@ -297,12 +295,12 @@ class Proxy(grpc.GenericRpcHandler):
     async def _refresh(self) -> None:
         while True:
             await self.refresh()
-            before_ns = self.events.now_ns() - _KEEP_PATH_NS
+            before_ns = self.events.now_ns() - tuned.KEEP_PATH_NS
             self.channel.forget(before_ns)
             for link in self.links.values():
                 if link.model.chain is not None:
                     link.model.chain.forget(before_ns)
-            await asyncio.sleep(_REFRESH_EVERY_S)
+            await asyncio.sleep(tuned.REFRESH_EVERY_S)
 
 
 async def _carry_up(flow: CallFlow, context: grpc.aio.ServicerContext, call: grpc.aio.StreamStreamCall) -> None:

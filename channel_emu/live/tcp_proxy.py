@@ -10,12 +10,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+import grpc.aio
 from msgspec.structs import replace
 
+from channel_emu.live.call_flow import CallFlow
 from channel_emu.live.live_link import Flips, LiveLink, Message
 from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.model.link import EventKind
@@ -34,72 +35,54 @@ MOST_CONNECTIONS = 256
 _CONNECT_TIMEOUT_S = 10.0
 
 
-class Pipe:
-    """One direction of one connection. number: of the connection. link: None passes everything on at once."""
+class Connection:
+    """Two sockets that a reset of the link closes. writers: to the service and to its client."""
 
-    def __init__(self, number: int, proxy: TcpProxy, link: LiveLink | None, writer: asyncio.StreamWriter) -> None:
-        self._name, self._proxy, self._link, self._writer = f"connection{number}", proxy, link, writer
-        self._pieces: deque[Message] = deque()
-        self._read, self._closed, self._ended = 0, False, False
-        self._room = asyncio.Semaphore(BEHIND)
-        self._empty = asyncio.Event()
-        if link is not None:
-            link.calls.add(self)
+    def __init__(self, *writers: asyncio.StreamWriter) -> None:
+        self._writers = writers
 
-    async def carry(self, reader: asyncio.StreamReader) -> None:
-        """Pass on what ``reader`` brings, until its end has been passed on too."""
-        while data := await reader.read(PIECE_BYTES):
-            if self._link is None:
-                self._writer.write(data)
-            else:
-                await self._room.acquire()
-                piece = Message(data, self._name, self._read, self)
-                self._pieces.append(piece)
-                self._link.offer(piece, self._proxy.events.now_ns())
-            self._read += 1
-            await self._writer.drain()
-        self._ended = True
-        if self._pieces:
-            await self._empty.wait()
-        with contextlib.suppress(OSError):
-            self._writer.write_eof()
-
-    def settle(self, message: Message, kind: EventKind) -> None:
-        """See ``Receiver``."""
-        if kind is EventKind.DUPLICATED:
-            return  # TCP discards a copy
-        flips = message.transit is not None and bool(message.transit.flips)
-        if kind is not EventKind.DELIVERED or flips:
-            if not self._closed:
-                asyncio.get_running_loop().call_later(TIMEOUT_S, self._again, message)
-            return
-        message.delivered = True
-        assert self._link is not None
-        while self._pieces and self._pieces[0].delivered:
-            piece = self._pieces.popleft()
-            self._link.hand_on(piece, self._proxy.events.now_ns())
-            self._writer.write(piece.raw)
-            self._room.release()
-        if self._ended and not self._pieces:
-            self._empty.set()
-
-    def _again(self, lost: Message) -> None:
-        if self._closed or self._link is None:
-            return
-        piece = Message(lost.raw, lost.session, lost.sequence, self)
-        self._pieces[self._pieces.index(lost)] = piece
-        self._link.offer(piece, self._proxy.events.now_ns())
+    def use(self) -> None:
+        """Connections are not ended for lack of use."""
 
     def end(self, *_: Any) -> None:
-        """Break the connection: the link was reset."""
-        self._writer.transport.abort()
+        """Break the connection."""
+        for writer in self._writers:
+            writer.transport.abort()
 
-    def close(self) -> None:
-        """Forget the link: what it still delivers counts as cancelled."""
-        self._closed = True
-        if self._link is not None:
-            self._link.calls.discard(self)
-            self._link.cancelled += sum(bool(piece.delivered) for piece in self._pieces)
+
+class Pipe(CallFlow):
+    """One direction of one connection."""
+
+    most_ready = most_behind = BEHIND
+
+    def settle(self, message: Message, kind: EventKind) -> None:
+        """What is lost or damaged is offered again after a while, and a copy is discarded, as TCP does it."""
+        damaged = message.transit is not None and bool(message.transit.flips)
+        if kind is EventKind.DUPLICATED or (kind is EventKind.DELIVERED and not damaged):
+            message.duplicated = False
+            super().settle(message, kind)
+        elif not self._closed:
+            asyncio.get_running_loop().call_later(TIMEOUT_S, self._again, message)
+
+    def _again(self, lost: Message) -> None:
+        if not self._closed:
+            piece = Message(lost.raw, lost.session, lost.sequence, self)
+            self._messages[self._messages.index(lost)] = piece
+            self._offer(piece)
+
+    async def pass_on(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Pass on what ``reader`` brings, until its end has been passed on too."""
+
+        async def read() -> Any:
+            return await reader.read(PIECE_BYTES) or grpc.aio.EOF
+
+        async def write(piece: bytes) -> None:
+            writer.write(piece)
+            await writer.drain()
+
+        await self.carry(read, write)
+        with contextlib.suppress(OSError):
+            writer.write_eof()
 
 
 class TcpProxy(Proxy):
@@ -166,9 +149,10 @@ class TcpProxy(Proxy):
         except OSError as error:  # TimeoutError is one
             log.warning("%s does not answer: %s", self.options.to, error or "timeout")
             return
-        up = Pipe(self._connections, self, self._link_of("up", "bytes"), back)
-        down = Pipe(self._connections, self, self._link_of("down", "bytes"), writer)
-        parts = [asyncio.create_task(up.carry(reader)), asyncio.create_task(down.carry(there))]
+        name, both = f"connection{self._connections}", Connection(back, writer)
+        up = Pipe(name, both, self._link_of("up", "bytes"), self.events.now_ns)
+        down = Pipe(name, both, self._link_of("down", "bytes"), self.events.now_ns)
+        parts = [asyncio.create_task(up.pass_on(reader, back)), asyncio.create_task(down.pass_on(there, writer))]
         try:
             with contextlib.suppress(ConnectionError):
                 await asyncio.gather(*parts)
@@ -176,6 +160,4 @@ class TcpProxy(Proxy):
             for part in parts:
                 part.cancel()
             await asyncio.gather(*parts, return_exceptions=True)
-            up.close()
-            down.close()
             back.transport.abort()

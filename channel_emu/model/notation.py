@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from channel_emu.model.table import Column, TableError, read_table
-from freshfield import untrusted
-from freshfield.untrusted import UntrustedError, read_yaml
+from freshfield.untrusted import UntrustedError, read_text, read_yaml
 
 _UNITS_MS = {"": 1.0, "us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
 _DISTRIBUTIONS = {
@@ -21,7 +20,6 @@ _DISTRIBUTIONS = {
     "trace": "trace",
     "none": "none",
 }
-_MAX_CHARS = 2**26  # in a file: millions of delays
 _PARAMETER = {"gamma": "shape", "lognormal": "sigma"}
 
 
@@ -45,33 +43,22 @@ def rate_per_ms(text: str) -> float:
     """Parse ``1/30ms``, ``1/30``, ``0.033/ms``, ``5/s`` or a bare number per ms. Raises NotationError."""
     above, slash, below = text.partition("/")
     try:
-        value = float(above)
-        if slash:
-            span = 1.0 if below.strip() == "ms" else 1e3 if below.strip() == "s" else span_ms(below)
-            value = value / span
+        span = 1.0 if not slash else _UNITS_MS.get(below.strip()) or span_ms(below)
+        value = float(above) / span
     except (ValueError, ZeroDivisionError):
-        raise NotationError(f"{text!r} is not a rate: expected something like 1/30ms or 0.03/ms") from None
+        value = math.nan
     if not (math.isfinite(value) and value >= 0):
-        raise NotationError(f"{text!r} is not a rate: expected a finite number of at least 0")
+        raise NotationError(f"{text!r} is not a rate: expected something like 1/30ms or 0.03/ms")
     return value
 
 
 def section(key: str, text: str, folder: Path) -> dict[str, Any]:
     """Parse a section of ``channel:`` from its short notation.
 
-    key: ``arrivals``, ``service`` or ``chain``.
-    text: as the function of that name takes it, or a YAML mapping in braces.
+    key: ``arrivals``, ``service`` or ``chain``; text: as the function of that name takes it.
     folder: what file names are relative to.
     Raises NotationError.
     """
-    if text.lstrip().startswith("{"):
-        try:
-            found = read_yaml(text)
-        except UntrustedError:
-            found = None
-        if not isinstance(found, dict):
-            raise NotationError(f"{text[:200]!r}: not a mapping; write {{generator_per_ms: [[-1, 1], [2, -2]]}}")
-        return found
     if key == "service":
         return service(text, folder)
     return arrivals(text) if key == "arrivals" else chain(text)
@@ -152,18 +139,6 @@ def chain(text: str) -> dict[str, Any]:
     return found
 
 
-def read_text(path: Path) -> str:
-    """Read a file named on the command line or in a scenario. Raises NotationError if it cannot be read or is
-    too long."""
-    try:
-        text = untrusted.read_text(path)
-    except (OSError, UnicodeDecodeError) as error:
-        raise NotationError(f"{path}: cannot be read: {error}") from None
-    if len(text) > _MAX_CHARS:
-        raise NotationError(f"{path}: more than {_MAX_CHARS} characters")
-    return text
-
-
 def delays_ms(path: Path) -> list[float]:
     """One-way delays in ms from a file: one number a line, or a table (``table``) with a header that names the
     delay and its unit, such as ``delay_ms``. Rows that a column ``lost`` marks, or without a delay, are left out.
@@ -179,8 +154,10 @@ def delays_ms(path: Path) -> list[float]:
             raise TableError("expected one delay in ms a line, with a decimal point, or a header that names delay_ms")
         times = table.times_ms(column or Column("the delay", 0, 1.0))
         found = [time for time, lost in zip(times, table.lost()) if not lost and not math.isnan(time)]
+        if not found:
+            raise TableError("holds no delay")
+        return found
     except TableError as error:
         raise NotationError(f"{path}: {error}") from None
-    if not found:
-        raise NotationError(f"{path}: holds no delay")
-    return found
+    except (OSError, UnicodeDecodeError) as error:
+        raise NotationError(f"{path}: cannot be read: {error}") from None

@@ -25,6 +25,8 @@ from freshfield.plugins import PluginError
 from freshfield.settings import ScenarioError, Settings, about, as_mapping, read_settings, within
 
 NotNegative = Annotated[float, Meta(ge=0)]
+NOTATIONS = ("arrivals", "service", "chain")
+"""Keys that may be written as on the command line (``exp:60ms``)."""
 
 
 class ArrivalsConfig(Settings, frozen=True):
@@ -69,10 +71,8 @@ class ChainConfig(Settings, frozen=True):
             generator = self.generator()
         except ValueError as error:
             raise ValueError(f"generator_per_ms: {error}") from None
-        if self.states and len(self.states) != len(generator):
-            raise ValueError(f"states: expected {len(generator)} names, got {len(self.states)}")
-        if len(set(self.names())) != len(generator):
-            raise ValueError("states: the same name twice")
+        if len(set(self.names())) != len(generator) or len(self.names()) != len(generator):
+            raise ValueError(f"states: expected {len(generator)} different names, got {', '.join(self.states)}")
         if self.initial is None:
             try:
                 stationary(generator)
@@ -173,9 +173,7 @@ class ChannelConfig(Settings, frozen=True):
 
     def to_mapping(self) -> dict[str, Any]:
         """The resolved section: reading it again gives this configuration."""
-        plain = _without_none(as_mapping(replace(self, preset=None, faults={})))
-        plain["faults"] = {name: _without_none(as_mapping(p)) for name, p in self.faults.items()}
-        return plain
+        return {key: value for key, value in as_mapping(self).items() if key != "preset"}
 
 
 def channel_from_mapping(mapping: Any, where: str = "channel", folder: Path = Path()) -> ChannelConfig:
@@ -215,7 +213,7 @@ def from_notation(key: Any, value: Any, where: str = "channel", folder: Path = P
 
     Other values are returned unchanged. Raises ScenarioError.
     """
-    if key not in ("arrivals", "service", "chain") or not isinstance(value, str):
+    if key not in NOTATIONS or not isinstance(value, str):
         return value
     try:
         return section(key, value, folder)
@@ -252,8 +250,3 @@ def _belongs(key: str, value: Any, wanted: bool, owner: str) -> None:
         raise ValueError(f"{key}: missing ({owner} needs it)")
     if value is not None and not wanted:
         raise ValueError(f"{key}: belongs to {owner} only")
-
-
-def _without_none(mapping: dict[str, Any]) -> dict[str, Any]:
-    clean = {k: _without_none(v) if isinstance(v, dict) else v for k, v in mapping.items()}
-    return {k: v for k, v in clean.items() if v is not None and v != []}

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from channel_emu.model.ages import RunningAge, mean_of_known
 from channel_emu.model.channel import Channel
 from channel_emu.model.link import MAX_SIZE_BYTES, EventKind, Link, Transit
-from channel_emu.model.settings import ChannelConfig
+from channel_emu.model.settings import ChannelConfig, channel_from_mapping
 from channel_emu.model.traffic import PoissonArrivals
 from freshfield.files import write_csv
 
@@ -51,15 +52,6 @@ class LinkRun:
         """The age over time."""
         return RunningAge((arrived, captured) for captured, arrived in self.deliveries_ns().tolist())
 
-    def corrupted(self) -> int:
-        """How many of the delivered frames a fault has damaged."""
-        return sum(t.outcome is EventKind.DELIVERED and bool(t.flips) for t in self.transits)
-
-    def delays_ms(self) -> list[float]:
-        """The drawn delay of every frame that started and was due within the run."""
-        due = [t for t in self.transits if t.due_ns is not None and t.due_ns <= self.end_ns]
-        return [(t.drawn_ns or 0) / 1e6 for t in due]
-
 
 @dataclass(frozen=True)
 class Simulation:
@@ -88,7 +80,9 @@ class Simulation:
         """Results as plain values, as the command prints them with --json."""
         ages = [run.age() for run in self.runs]
         mean_ages = [age.mean_age_ms(run.end_ns) for age, run in zip(ages, self.runs)]
-        delays = np.concatenate([run.delays_ms() for run in self.runs])
+        frames = [(run.end_ns, t) for run in self.runs for t in run.transits]
+        due = [t for end_ns, t in frames if t.due_ns is not None and t.due_ns <= end_ns]
+        delays = np.array([(t.drawn_ns or 0) / 1e6 for t in due])
         chains = [run.link.chain for run in self.runs]
         share = np.mean([[1.0] if c is None else c.occupancy(r.end_ns) for c, r in zip(chains, self.runs)], 0)
         counts = Counter[str]()
@@ -101,7 +95,7 @@ class Simulation:
             "in_flight": sum(run.link.in_flight for run in self.runs),
             "dropped": sum(counts[kind] for kind in OUTCOMES if kind is not EventKind.DELIVERED),
             **{str(kind): counts[kind] for kind in (*OUTCOMES, EventKind.DUPLICATED)},
-            "corrupted": sum(run.corrupted() for run in self.runs),
+            "corrupted": sum(t.outcome is EventKind.DELIVERED and bool(t.flips) for _, t in frames),
             "state_share": dict(zip(self.config.state_names, (round(float(s), 6) for s in share))),
             "delay_ms": {
                 "mean": float(delays.mean()) if len(delays) else None,
@@ -199,3 +193,44 @@ def offer_all(
     for link in links.values():
         link.advance(end_ns)
     return links, transits
+
+
+class VirtualChannel:
+    """A channel as a library has it: ages and deliveries of its cameras as arrays, from one seed.
+
+    config: the channel, with all defaults.
+    cameras, seed, frame_period_ms: see ``simulate``.
+    """
+
+    def __init__(
+        self,
+        preset: str = "ideal",
+        *,
+        cameras: int | list[str] = 1,
+        seed: int = 0,
+        frame_period_ms: float | None = None,
+        **section: Any,
+    ) -> None:
+        """preset: name of a channel (``channel-emu presets``). section: keys of a scenario's ``channel:`` in place of
+        the preset's, in short or full notation: ``service="exp:60ms"``, ``arrivals="periodic:30ms"``,
+        ``discipline="newest-waits"``, ``faults={"loss": 0.1}``. Raises ScenarioError for an unknown preset or key."""
+        self.config = channel_from_mapping({"preset": preset, **section})
+        self.cameras, self.seed, self.frame_period_ms = cameras, seed, frame_period_ms
+        self._simulated = lru_cache(maxsize=1)(self._simulate)
+
+    def ages(self, seconds: float, every_ms: float = 10.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The sawtooth of ages: instants (T,) in seconds, and ages (cameras, T) in milliseconds, see
+        ``Simulation.ages_ms``. Raises SimulationError."""
+        return self.simulate(seconds).ages_ms(every_ms)
+
+    def deliveries(self, seconds: float) -> dict[str, NDArray[np.float64]]:
+        """Camera -> (n, 2): when each delivered frame was captured and when it arrived, in milliseconds, in the order
+        of arrival. Raises SimulationError."""
+        return {run.camera: run.deliveries_ns() / 1e6 for run in self.simulate(seconds).runs}
+
+    def simulate(self, seconds: float) -> Simulation:
+        """The first ``seconds`` of virtual time; equal calls give equal results. Raises SimulationError."""
+        return self._simulated(seconds)
+
+    def _simulate(self, seconds: float) -> Simulation:
+        return simulate(self.config, self.cameras, seconds, self.seed, frame_period_ms=self.frame_period_ms)

@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import re
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from pathlib import Path
 
 from freshfield.scenario import ScenarioError
-from freshfield_up import check_plugin, demo_command, scenario_command
-from freshfield_up.commands import MissingCommand
+from freshfield_up import check_plugin, scenario_command
+from freshfield_up.commands import MissingCommand, Options
+from freshfield_up.deployment import open_launcher
 from freshfield_up.folder import FolderError
 
 EXAMPLES = """examples:
@@ -71,7 +74,7 @@ def parser() -> argparse.ArgumentParser:
         "end. Ctrl-C, --for or the end of a replayed recording ends it. Exit status: 0 ended so, 1 a process died, "
         "2 it could not start.",
     )
-    demo_command.add_arguments(demo)
+    _add_demo_arguments(demo)
     scenario_command.add_arguments(
         commands.add_parser("scenario", help="list, show, start, check scenario files; their keys")
     )
@@ -90,6 +93,62 @@ def parser() -> argparse.ArgumentParser:
     completion.add_argument("shell", choices=("bash", "zsh", "tcsh"))
     completion.set_defaults(run=_completion)
     return found
+
+
+def _demo(args: argparse.Namespace) -> int:
+    """Run the scenario and return the exit status. Raises ScenarioError, FolderError or MissingCommand where the run
+    cannot start."""
+    options = Options(args.out, args.duration_s, args.port, args.data, args.seed, args.policy)
+    return open_launcher(args.scenario, options).run()
+
+
+def seconds(text: str) -> float:
+    """``90``, ``90s``, ``1.5m``, ``2h``; 0 means no end."""
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|min|h|)", text.strip())
+    if not found:
+        raise argparse.ArgumentTypeError(f"expected a time such as 60s, 5m or 0 (no end), got {text!r}")
+    return float(found[1]) * {"": 1, "s": 1, "m": 60, "min": 60, "h": 3600}[found[2]]
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 65535:
+        raise argparse.ArgumentTypeError(f"expected a port from 1 to 65535, got {text!r}")
+    return int(text)
+
+
+def _add_demo_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``freshfield demo``."""
+    add = parser.add_argument
+    add(
+        "scenario",
+        nargs="?",
+        default="card",
+        help="scenario file, or the name of a shipped one (freshfield scenario list) [%(default)s]",
+    )
+    add(
+        "--for",
+        dest="duration_s",
+        type=seconds,
+        default=60.0,
+        metavar="TIME",
+        help="end after this long: 90s, 5m, 2h; 0: on Ctrl-C [60s]",
+    )
+    add(
+        "--out",
+        type=Path,
+        default=Path("runs/demo"),
+        metavar="DIR",
+        help="folder to write; replaces an earlier run in it [%(default)s]",
+    )
+    add("--port", type=_port, default=8080, help="port of the page on 127.0.0.1 [%(default)s]")
+    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    add("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
+    add(
+        "--policy",
+        metavar="NAME[:VALUE]",
+        help="in place of the scenario's: all, threshold:120, bandit:FILE, FILE.py:CLASS (docs/scheduling.md)",
+    )
+    parser.set_defaults(run=_demo)
 
 
 def _completion(args: argparse.Namespace) -> int:

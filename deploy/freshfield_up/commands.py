@@ -29,6 +29,25 @@ class MissingCommand(RuntimeError):
 
 
 @dataclass(frozen=True)
+class Options:
+    """How a run is made.
+
+    out: folder of the run.
+    duration_s: seconds after everything is up; 0: no end.
+    port: loopback port of the page.
+    data: folder of recorded data, if any.
+    seed, policy: in place of the scenario's.
+    """
+
+    out: Path
+    duration_s: float = 60.0
+    port: int = 8080
+    data: Path | None = None
+    seed: int | None = None
+    policy: str | None = None
+
+
+@dataclass(frozen=True)
 class ProcessSet:
     """The processes of one scenario.
 
@@ -57,64 +76,27 @@ class ProcessSet:
         return [self.drivers, [self.node], self.arms, [self.emulator], [self.edge]]
 
 
-def process_set(
-    scenario: Scenario,
-    out: Path,
-    page_port: int,
-    data: Path | None = None,
-    seed: int | None = None,
-    edge_options: Sequence[str] = (),
-) -> ProcessSet:
-    """The processes of a run, not started yet, with their commands, addresses and log files.
-
-    out: folder of the run.
-    page_port: loopback port of the page.
-    data: folder of recorded data, if any.
-    seed: replaces the scenario's.
-    edge_options: further arguments for the edge server.
-    Raises MissingCommand.
-    """
-    edge_port, emulator_port = free_ports(2)
-    edge_address, emulator_address = f"{LOOPBACK}:{edge_port}", f"{LOOPBACK}:{emulator_port}"
-    common = ["--out", str(out), *(["--seed", str(seed)] if seed is not None else [])]
-    recorded = ["--data", str(data)] if data is not None else []
+def process_set(scenario: Scenario, options: Options) -> ProcessSet:
+    """The processes of a run, not started yet, with their commands, addresses and log files. Raises MissingCommand."""
+    edge_address, emulator_address = (f"{LOOPBACK}:{port}" for port in free_ports(2))
+    common = [f"--out={options.out}", *([] if options.seed is None else [f"--seed={options.seed}"])]
+    recorded = [] if options.data is None else [f"--data={options.data}"]
+    policy = [] if options.policy is None else [f"--policy={options.policy}"]
     limits = _unless_set(_THREADS, 1)
 
     def child(name: str, role: str, command: str, action: str, *arguments: str) -> Child:
         words = [program(command), action, str(scenario.path), *arguments]
-        return Child(name, role, words, out / f"log-{name}.txt", limits)
+        return Child(name, role, words, options.out / f"log-{name}.txt", limits)
 
-    edge = child(
-        "edge",
-        "the edge server",
-        "edge-server",
-        "run",
-        "--listen",
-        edge_address,
-        "--page-host",
-        LOOPBACK,
-        "--page-port",
-        str(page_port),
-        "--emulator",
-        emulator_address,
-        *common,
-        *recorded,
-        *edge_options,
-    )
+    listens = [f"--listen={edge_address}", f"--page-host={LOOPBACK}", f"--page-port={options.port}"]
+    listens.append(f"--emulator={emulator_address}")
+    edge = child("edge", "the edge server", "edge-server", "run", *listens, *common, *recorded, *policy)
     edge.environment = _unless_set(_EDGE_THREADS, usable_cores())
-    emulator = child(
-        "emulator",
-        "the channel emulator",
-        "channel-emu",
-        "run",
-        "--listen",
-        emulator_address,
-        "--to",
-        edge_address,
-        *common,
+    between = f"--listen={emulator_address}", f"--to={edge_address}"
+    emulator = child("emulator", "the channel emulator", "channel-emu", "run", *between, *common)
+    node = child(
+        "node", "the camera node", "camera-node", "run", "--all", f"--to={emulator_address}", *common, *recorded
     )
-
-    node = child("node", "the camera node", "camera-node", "run", "--all", "--to", emulator_address, *common, *recorded)
     arm = scenario.source.get("arm")
     if not isinstance(arm, dict) or not arm.get("simulated"):
         return ProcessSet(edge, emulator, node, edge_address, emulator_address)

@@ -15,37 +15,28 @@ from types import TracebackType
 from typing import Any
 
 from freshfield import scenario as scenarios
+from freshfield.files import read_status
 from freshfield.scenario import ScenarioError
+from freshfield_up.commands import Options
 from freshfield_up.net import LOOPBACK, free_ports, is_free
-from freshfield_up.run import Launcher, Options, print_line
-from freshfield_up.status import read_json
+from freshfield_up.run import Launcher, print_line
 
 
 class DeploymentError(RuntimeError):
     """The processes did not start, or one of them died; the message says which and names its log."""
 
 
-def open_launcher(
-    scenario: str | Path,
-    out: Path,
-    seconds: float,
-    port: int,
-    data: Path | None = None,
-    seed: int | None = None,
-    policy: str | None = None,
-    say: Callable[[str], None] = print_line,
-) -> Launcher:
-    """A launcher, checked and not started. The arguments are those of ``freshfield demo``; say: see ``Launcher``.
-    Raises ScenarioError."""
-    opened = scenarios.load(scenario, seed)
-    if not is_free(port):
-        raise ScenarioError(f"port {port} is taken by another program; choose one with --port (PORT=)")
-    if data is not None and not data.is_dir():
-        raise ScenarioError(f"{data}: no such folder of recorded data (--data)")
-    if _is_inside(policy, out):
-        raise ScenarioError(f"--policy {policy}: {out} is emptied first; choose another --out")
-    edge = () if policy is None else (f"--policy={policy}",)
-    return Launcher(opened, Options(out, seconds, port, data, seed, edge), say)
+def open_launcher(scenario: str | Path, options: Options, say: Callable[[str], None] = print_line) -> Launcher:
+    """A launcher, checked and not started. scenario: file or name. say: see ``Launcher``. Raises ScenarioError."""
+    opened = scenarios.load(scenario, options.seed)
+    if not is_free(options.port):
+        raise ScenarioError(f"port {options.port} is taken by another program; choose one with --port (PORT=)")
+    if options.data is not None and not options.data.is_dir():
+        raise ScenarioError(f"{options.data}: no such folder of recorded data (--data)")
+    kind, _, file = (options.policy or "").partition(":")
+    if kind == "bandit" and Path(file).expanduser().resolve().is_relative_to(options.out.resolve()):
+        raise ScenarioError(f"--policy {options.policy}: {options.out} is emptied first; choose another --out")
+    return Launcher(opened, options, say)
 
 
 class Deployment:
@@ -73,7 +64,7 @@ class Deployment:
         self.out = Path(out)
         port = free_ports(1)[0] if port is None else port
         self.page = f"http://{LOOPBACK}:{port}"
-        self._launcher = open_launcher(scenario, self.out, seconds, port, data, seed, policy, say)
+        self._launcher = open_launcher(scenario, Options(self.out, seconds, port, data, seed, policy), say)
         self._thread = threading.Thread(target=self._run, name="deployment")
         self._ended = threading.Event()
         self._error: Exception | None = None
@@ -105,7 +96,7 @@ class Deployment:
     def status(self) -> dict[str, Any]:
         """What the edge server says of itself now: ``cameras``, ``updates``, ``scores``, ``policy`` and others, as in
         edge.json."""
-        return read_json(self.out / "edge.json")
+        return read_status(self.out / "edge.json")
 
     @property
     def report(self) -> dict[str, Any]:
@@ -132,9 +123,3 @@ class Deployment:
         if self._launcher.failures:
             self._end()
             raise DeploymentError("; ".join(self._launcher.failures))
-
-
-def _is_inside(policy: str | None, out: Path) -> bool:
-    """Whether the learned policy is a file of the earlier run that this one replaces."""
-    kind, _, file = (policy or "").partition(":")
-    return kind == "bandit" and Path(file).expanduser().resolve().is_relative_to(out.resolve())

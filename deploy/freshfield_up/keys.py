@@ -13,14 +13,10 @@ import msgspec
 from camera_node.settings import MODELS, SourceConfig, own_class
 from camera_node.synthetic import effects
 from channel_emu.model import faults, presets
-from channel_emu.model.settings import ChannelConfig
+from channel_emu.model.settings import NOTATIONS, ChannelConfig
 from freshfield import plugins
 from freshfield.scenario import Cameras, ScenarioFile
 from freshfield.settings import ScenarioError, Settings, bare_type, describe
-
-NOTATIONS = ("arrivals", "chain", "service")
-"""Keys of ``channel`` that may be written as on the command line (``exp:60ms``)."""
-
 
 REFERENCE = ":"
 """JSON Schema's pattern of FILE.py:CLASS and MODULE:CLASS, whose parameters no schema of ours knows."""

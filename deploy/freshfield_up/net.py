@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import os
 import socket
+import urllib.request
 
 # Child processes are started by fork and exec. gRPC's fork handlers would first stop gRPC's threads, which
 # sometimes hangs the launcher. A process that calls exec does not need the handlers.
@@ -65,11 +66,9 @@ def accepts(address: str) -> bool:
 
 def page_answers(port: int) -> bool:
     """Whether the page on the loopback port answers with a document."""
-    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=1.0)
+    direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
-        connection.request("GET", "/")
-        return connection.getresponse().status == 200
+        with direct.open(f"http://{LOOPBACK}:{port}/", timeout=1.0) as answer:
+            return bool(answer.status == 200)
     except (OSError, http.client.HTTPException):
         return False
-    finally:
-        connection.close()

@@ -8,14 +8,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-GRACE_S = 30.0
-"""Time for a process to end after SIGTERM before it is killed: the edge server waits up to 20 s for its last update."""
+from freshfield_up.settings import GRACE_S, LAST_LINES
 
-_TAIL_BYTES = 16_384
 # Asks Linux to end the process when its parent is gone (prctl's PR_SET_PDEATHSIG), and becomes the command. Not between
 # fork and exec: there a process with gRPC's threads may not run Python.
 _DIE_WITH_PARENT = """
@@ -77,14 +76,11 @@ class Child:
         """How the process ended, and the last lines of its log. It must have ended."""
         assert self.process is not None and self.process.returncode is not None
         age_s = time.monotonic() - self.started_s
-        lines = [f"{self.role} {describe_exit(self.process.returncode)}, {age_s:.1f} s after its start."]
-        last = tail(self.log, 12)
-        if last:
-            lines.append(f"The last lines of {self.log}:")
-            lines.extend(f"  | {line}" for line in last)
-        else:
-            lines.append(f"It wrote nothing ({self.log} is empty).")
-        return "\n".join(lines)
+        said = f"{self.role} {describe_exit(self.process.returncode)}, {age_s:.1f} s after its start."
+        last = [f"  | {line}" for line in tail(self.log, LAST_LINES)]
+        return "\n".join(
+            [said, f"The last lines of {self.log}:" if last else f"It wrote nothing to {self.log}.", *last]
+        )
 
 
 def stop(children: Sequence[Child], grace_s: float = GRACE_S) -> None:
@@ -122,27 +118,15 @@ def describe_exit(returncode: int) -> str:
         name = signal.Signals(-returncode).name
     except ValueError:
         name = f"signal {-returncode}"
-    why = {
-        "SIGKILL": " (by a person, or by the system because memory ran out)",
-        "SIGSEGV": " (a crash in native code)",
-        "SIGABRT": " (a native library gave up)",
-        "SIGILL": " (an instruction this processor does not have)",
-        "SIGBUS": " (memory or disk behind a mapped file is gone)",
-    }.get(name, "")
+    why = " (by a person, or by the system because memory ran out)" if name == "SIGKILL" else ""
     return f"was killed by {name}{why}"
 
 
 def tail(path: Path, lines: int) -> list[str]:
-    """The last non-empty lines of a log that may be large, be missing, or end in half a character."""
+    """The last non-empty lines of a log that may be missing, or end in half a character."""
     try:
-        with path.open("rb") as file:
-            file.seek(0, os.SEEK_END)
-            size = file.tell()
-            file.seek(max(0, size - _TAIL_BYTES))
-            text = file.read().decode(errors="replace")
+        with path.open(errors="replace") as file:
+            written = (line.rstrip() for line in file if line.strip() and not line.startswith("$ "))
+            return list(deque(written, lines))
     except OSError:
         return []
-    found = [line.rstrip() for line in text.splitlines() if line.strip()]
-    if size > _TAIL_BYTES and found:
-        found = found[1:]  # the first line is incomplete
-    return [line for line in found if not line.startswith("$ ")][-lines:]

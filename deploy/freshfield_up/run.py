@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import signal
 import subprocess
@@ -11,46 +12,20 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+from freshfield.files import read_status
 from freshfield.machine_load import LoadMeter
 from freshfield.scenario import Scenario
 from freshfield_up import console, folder, net
-from freshfield_up.commands import ProcessSet, process_set, program
-from freshfield_up.processes import GRACE_S, Child, kill, stop
-from freshfield_up.status import read_json, status_line
-from freshfield_up.summary import summarize
+from freshfield_up import settings as tuned
+from freshfield_up.commands import Options, ProcessSet, process_set, program
+from freshfield_up.processes import Child, kill, stop
+from freshfield_up.status import status_line, summarize
 
-TICK_S = 0.25
-LINE_EVERY_S = 5.0
-SAMPLE_EVERY_S = 2.0
-"""Of memory and processor time of every process, in ``processes.jsonl``."""
-READY_WITHIN_S = 600.0
-"""A first start compiles the field's kernels: a minute, or more on a busy machine."""
 _LOADING, _COMPILING = "loading", "compiling"
 """Starts of the edge's status text until it can make a first update."""
-REPORT_WITHIN_S = 300.0
-
-
-@dataclass(frozen=True)
-class Options:
-    """How a run is made.
-
-    out: folder of the run.
-    duration_s: seconds after everything is up; 0: no end.
-    port: loopback port of the page.
-    data, seed: see ``commands.process_set``.
-    edge: further arguments for the edge server.
-    """
-
-    out: Path
-    duration_s: float = 60.0
-    port: int = 8080
-    data: Path | None = None
-    seed: int | None = None
-    edge: tuple[str, ...] = ()
 
 
 def print_line(text: str) -> None:
@@ -68,20 +43,6 @@ def command_line(argv: Sequence[str]) -> str:
     script = Path(argv[0])
     ours = script.name == "freshfield" or script.parent.name == "freshfield_up"  # python -m freshfield_up
     return shlex.join(["freshfield", *argv[1:]] if ours else ["python", *argv])
-
-
-def _without_numbers(text: str) -> str:
-    """The words of ``text`` but numbers. The first stays: it may be a camera, whose name may be a number."""
-    words = text.split()
-    return " ".join(words[:1] + [word for word in words[1:] if not _is_number(word.strip("(),:;%"))])
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 class Launcher:
@@ -109,7 +70,7 @@ class Launcher:
         """Run to the end: until ``stop``, the run's duration or, in the main thread, a signal. Returns the exit code.
         Raises FolderError or MissingCommand before any process starts."""
         options = self.options
-        self.processes = process_set(self.scenario, options.out, options.port, options.data, options.seed, options.edge)
+        self.processes = process_set(self.scenario, options)
         about = {"scenario": str(self.scenario.path), "seed": self.scenario.seed, "port": options.port}
         about["command"] = command_line(sys.argv)
         lock = folder.prepare(options.out, about)
@@ -149,7 +110,7 @@ class Launcher:
         if not self.processes.arms:
             self.processes.node.start()
         load, next_line_s, next_sample_s = LoadMeter(), 0.0, 0.0
-        while not self._stop_requested.wait(TICK_S):
+        while not self._stop_requested.wait(tuned.TICK_S):
             now_s = time.monotonic()
             # A short recording may be over while kernels are compiled, before the first update.
             node = self.processes.node.process
@@ -163,12 +124,12 @@ class Launcher:
                 if self.failures:
                     return
             if now_s >= next_sample_s:
-                next_sample_s = now_s + SAMPLE_EVERY_S
+                next_sample_s = now_s + tuned.SAMPLE_EVERY_S
                 running = {child.name: child.pid for child in self.processes.children if child.running and child.pid}
                 with (self.options.out / "processes.jsonl").open("a") as file:
                     file.write(json.dumps(load.row(now_s - self._began_s, running)) + "\n")
             if now_s >= next_line_s:
-                next_line_s = now_s + LINE_EVERY_S
+                next_line_s = now_s + tuned.LINE_EVERY_S
                 line = status_line(self.options.out, len(self.scenario.cameras))
                 self._say(f"[{self._headline(now_s)}] {line}")
                 self._say_troubles()
@@ -177,8 +138,9 @@ class Launcher:
 
     def _say_troubles(self) -> None:
         """Say what the edge finds wrong with frames and poses, each kind once: numbers within change."""
-        for line in read_json(self.options.out / "edge.json").get("troubles") or ():
-            kind = _without_numbers(str(line))
+        for line in read_status(self.options.out / "edge.json").get("troubles") or ():
+            camera, _, words = str(line).partition(" ")
+            kind = f"{camera} {re.sub(r'[0-9.,]+', '', words)}"
             if kind not in self._troubles_said:
                 self._troubles_said.add(kind)
                 self._say(f"note: {line}")
@@ -207,8 +169,8 @@ class Launcher:
             folder.forget_earlier(self.options.out)
             for driver in self.processes.drivers:
                 driver.start()  # last: the arm must not begin its tour before the field can learn
-        elif now_s - self._began_s > READY_WITHIN_S:
-            self._fail(f"{waited_for.role} was not ready after {READY_WITHIN_S:.0f} s; see {waited_for.log}")
+        elif now_s - self._began_s > tuned.READY_WITHIN_S:
+            self._fail(f"{waited_for.role} was not ready after {tuned.READY_WITHIN_S:.0f} s; see {waited_for.log}")
 
     def _waiting_for(self) -> Child | None:
         """The process that is not ready yet, if any."""
@@ -216,14 +178,14 @@ class Launcher:
             return self.processes.edge
         if not net.is_serving(self.processes.emulator_address):
             return self.processes.emulator
-        phases = [read_json(file).get("phase") for file in self.options.out.glob("node-*.json")]
+        phases = [read_status(file).get("phase") for file in self.options.out.glob("node-*.json")]
         if "streaming" not in phases:
             return self.processes.node
         return self.processes.edge if self._edge_doing().startswith((_LOADING, _COMPILING)) else None
 
     def _edge_doing(self) -> str:
         """What the edge server says that it does."""
-        return str(read_json(self.options.out / "edge.json").get("doing") or _LOADING)
+        return str(read_status(self.options.out / "edge.json").get("doing") or _LOADING)
 
     def _check_alive(self) -> bool:
         """Whether no process has ended."""
@@ -254,7 +216,7 @@ class Launcher:
         reason = f" ({why[self._signals[0]]})" if self._signals else ""
         self._say(f"stopping{reason}: cameras, channel, edge")
         for group in self.processes.groups:
-            stop(group, 0.0 if len(self._signals) > 1 else GRACE_S)
+            stop(group, 0.0 if len(self._signals) > 1 else tuned.GRACE_S)
             for child in group:
                 if child.killed:
                     self._say(f"{child.role} did not end in time and was killed; see {child.log}")
@@ -272,10 +234,10 @@ class Launcher:
         report.start()
         assert report.process is not None
         try:
-            code = report.process.wait(REPORT_WITHIN_S)
+            code = report.process.wait(tuned.REPORT_WITHIN_S)
         except subprocess.TimeoutExpired:
             kill(report)
-            self._fail(f"the report was not ready after {REPORT_WITHIN_S:.0f} s; see {report.log}")
+            self._fail(f"the report was not ready after {tuned.REPORT_WITHIN_S:.0f} s; see {report.log}")
             return
         if code != 0:
             self._fail(report.exit_summary())

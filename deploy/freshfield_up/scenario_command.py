@@ -12,8 +12,6 @@ from freshfield import plugins
 from freshfield.frame import valid_id
 from freshfield.scenario import SCENARIO_FOLDER, Scenario, ScenarioError, load
 
-COMMANDS = ("list", "show", "init", "check", "keys", "schema")
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The commands below ``freshfield scenario``."""
@@ -75,8 +73,7 @@ def _init(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
-    scenario = load(args.scenario)
-    print("\n".join(checked(scenario)))
+    print("\n".join(checked(load(args.scenario))))
     return 0
 
 

@@ -232,7 +232,7 @@ class Ingest:
                 sequence=header.sequence, outcome=pb.OUTCOME_REJECTED, reason=error.reason, detail=str(error)
             )
         if stream is not None:
-            self.streams.use(stream)
+            stream.use()
         if frame.held_out:
             self.newest_held_out[frame.camera] = frame
             self._on_held_out(frame)

@@ -39,7 +39,7 @@ from edge_server.run_records import DepthCounts, DepthStatus, EdgeStatus, Update
 from edge_server.scheduler import LivePolicies, short_name
 from edge_server.settings import EdgeConfig, cameras_move, described, embedding_for, read_config
 from freshfield.clock import WallClock
-from freshfield.files import ReplacedJson, write_json
+from freshfield.files import read_status, write_json
 from freshfield.ledger import Ledger
 from freshfield.limits import MAX_SNAPSHOTS
 from freshfield.scenario import Scenario, ScenarioError
@@ -178,7 +178,7 @@ class EdgeServer:
             now_ns=self.clock.now_ns,
             set_policy=self._set_policy,
             save_snapshot=self._save_snapshot,
-            channel=ReplacedJson((options.emulator_out or options.out) / "channel.json").read,
+            channel=partial(read_status, (options.emulator_out or options.out) / "channel.json"),
             frontier=self.frontier,
             field_name=config.field,
             chosen=described(scenario, config, self._moving),

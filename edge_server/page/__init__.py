@@ -136,8 +136,7 @@ class _Refresher(PageThread):
     def _step(self) -> float:
         began, state = perf_counter(), self._state
         cameras = state.cameras()
-        channel = state.channel()
-        channel = channel if isinstance(channel, dict) else None
+        channel = state.channel() or None
         self._history.sample(state.now_s(), cameras, channel)
         watched = bool(self._server.get_clients())
         self._scene.refresh(cameras, watched)

@@ -11,7 +11,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from channel_emu.virtual.virtual_channel import VirtualChannel as Channel
+    from channel_emu.virtual.simulate import VirtualChannel as Channel
     from edge_server.experiments.fitting.fit import Fit as Fit
     from edge_server.experiments.fitting.fit import fit as fit
     from edge_server.experiments.fitting.fit import load as load
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _LIBRARY = {
-    "Channel": "channel_emu.virtual.virtual_channel:VirtualChannel",
+    "Channel": "channel_emu.virtual.simulate:VirtualChannel",
     "Fit": "edge_server.experiments.fitting.fit:Fit",
     "Policy": "edge_server.scheduler:Policy",
     "Trial": "edge_server.experiments.virtual.try_policy:Trial",

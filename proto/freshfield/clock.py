@@ -17,19 +17,13 @@ class Clock(Protocol):
 
 
 class WallClock:
-    """UTC nanoseconds that never step: the wall clock, read once, plus the monotonic clock since then.
+    """UTC nanoseconds that never step: the wall clock, read once, plus the monotonic clock since then."""
 
-    offset_ns, drift_ppm: errors of a deliberately wrong clock.
-    """
-
-    def __init__(self, offset_ns: int = 0, drift_ppm: float = 0.0) -> None:
-        self._start = time.monotonic_ns()
-        self._wall = time.time_ns() + offset_ns
-        self._drift = drift_ppm * 1e-6
+    def __init__(self) -> None:
+        self._ahead = time.time_ns() - time.monotonic_ns()
 
     def now_ns(self) -> int:
-        elapsed = time.monotonic_ns() - self._start
-        return self._wall + elapsed + int(elapsed * self._drift)
+        return self._ahead + time.monotonic_ns()
 
 
 class SystemClock:

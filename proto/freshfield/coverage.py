@@ -33,33 +33,23 @@ Camera = tuple[Pinhole, Array]
 
 
 @dataclass(frozen=True)
-class FurtherCamera:
-    """Where one more camera would help most. pose: camera-to-world (4, 4). seen_by: ``Coverage.seen_by`` with it."""
-
-    pose: Array
-    seen_by: tuple[float, ...]
-
-
-@dataclass(frozen=True)
 class Coverage:
     """What cameras see.
 
     seen_by: share of all surfaces that exactly 0, 1, 2, ... cameras see.
     parallax_deg: median over the surfaces that several cameras see of the widest angle between two of these cameras;
         None where no surface is seen by two.
-    further: the best place for one more camera.
-    center_m: (3,), the point the cameras look at. distance_m: theirs to it, median.
-    up: (3,), away from the ground, as the cameras are held.
+    further_pose: camera-to-world (4, 4), the best place for one more camera. further_seen_by: ``seen_by`` with it.
+    center_m: (3,), the point the cameras look at.
     plan: int (PLAN, PLAN), number of cameras whose image contains each place of the horizontal plane through the
         center; ``plan_axes`` (2, 3) are its right and its upper edge's direction, ``plan_m`` its side.
     """
 
     seen_by: tuple[float, ...]
     parallax_deg: float | None
-    further: FurtherCamera
+    further_pose: Array
+    further_seen_by: tuple[float, ...]
     center_m: Array
-    distance_m: float
-    up: Array
     plan: NDArray[np.int64]
     plan_axes: Array
     plan_m: float
@@ -67,11 +57,11 @@ class Coverage:
     @property
     def words(self) -> str:
         """Two sentences for people."""
-        x, y, z = self.further.pose[:3, 3]
+        x, y, z = self.further_pose[:3, 3]
         angle = "" if self.parallax_deg is None else f", {self.parallax_deg:.0f} degrees apart"
         return (
             f"of all surfaces around the point that the cameras look at, {_shares_in_words(self.seen_by)}{angle}. One "
-            f"more camera helps most at ({x:.2f}, {y:.2f}, {z:.2f}) m: then {_shares_in_words(self.further.seen_by)}"
+            f"more camera helps most at ({x:.2f}, {y:.2f}, {z:.2f}) m: then {_shares_in_words(self.further_seen_by)}"
         )
 
 
@@ -99,15 +89,12 @@ def reckon(cameras: Sequence[Camera]) -> Coverage:
     places, normals = _surfaces(center, REACH * distance)
     seen = np.stack([_sees(camera, places, normals) for camera in cameras])
     right, forward = _ground_axes(poses, center, up)
-    further = _further(cameras, seen, places, normals, (center, up, right, forward))
     side = 2.4 * max(float(np.linalg.norm(poses[:, :3, 3] - center, axis=1).max()), distance)
     return Coverage(
         _shares(seen),
         _parallax_deg(poses, seen, places),
-        further,
+        *_further(cameras, seen, places, normals, (center, up, right, forward)),
         center,
-        distance,
-        up,
         _plan(cameras, center, side, right, forward),
         np.stack([right, forward]),
         side,
@@ -185,7 +172,7 @@ def _further(
     places: Array,
     normals: Array,
     frame: tuple[Array, Array, Array, Array],
-) -> FurtherCamera:
+) -> tuple[Array, tuple[float, ...]]:
     """The best of places around the scene, as far and as high as the cameras stand and with the lens of the first. A
     surface counts once if it is seen, and half as much again if by two."""
     center, up, right, forward = frame
@@ -202,8 +189,8 @@ def _further(
         shares = _shares(both)
         gain = 1.5 * (1.0 - shares[0]) - 0.5 * shares[1]
         if gain > most + 1e-9:
-            best, most = FurtherCamera(pose, shares), gain
-    return best or FurtherCamera(cameras[0][1], _shares(np.concatenate([seen, seen[:1]])))
+            best, most = (pose, shares), gain
+    return best or (cameras[0][1], _shares(np.concatenate([seen, seen[:1]])))
 
 
 def _plan(cameras: Sequence[Camera], center: Array, side: float, right: Array, forward: Array) -> NDArray[np.int64]:
@@ -242,7 +229,7 @@ def plan_svg(cameras: dict[str, Camera], coverage: Coverage) -> str:
         for row, column in np.argwhere(coverage.plan)
     ]
     drawn = [triangle(pose, "#e8a33d", _escaped(name)) for name, (_, pose) in cameras.items()]
-    drawn.append(triangle(coverage.further.pose, "#d24d57", "one more camera helps most here"))
+    drawn.append(triangle(coverage.further_pose, "#d24d57", "one more camera helps most here"))
     return (
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 100 100"><rect width="100" height="100" fill="#888" '
         f'fill-opacity="0.15"/><g fill="#2a9d8f">{"".join(cells)}</g>{"".join(drawn)}</svg>\n'

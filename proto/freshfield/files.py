@@ -27,6 +27,15 @@ def write_json(path: Path, data: Any, indent: int | None = None) -> None:
     write_text(path, json.dumps(data, allow_nan=False, indent=indent) + "\n")
 
 
+def read_status(path: Path) -> dict[str, Any]:
+    """The contents of a JSON file that a process of ours replaces from time to time; {} if it cannot be read."""
+    try:
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def write_text(path: Path, text: str) -> None:
     """Replace ``path`` by ``text``; see ``write_bytes``."""
     write_bytes(path, text.encode())
@@ -153,22 +162,3 @@ class Lines:
         self.lost += 1
         if self.lost == 1:
             log.warning("%s: cannot be written (%s); lines are lost until it can be again", self.path, why)
-
-
-class ReplacedJson:
-    """A JSON file that another process replaces from time to time."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._modified_ns = -1
-        self._data: Any = None
-
-    def read(self) -> Any:
-        """The newest content that could be read, None before the first. Parses only if the file changed."""
-        try:
-            modified_ns = self._path.stat().st_mtime_ns
-            if modified_ns != self._modified_ns:
-                self._data, self._modified_ns = json.loads(self._path.read_text()), modified_ns
-        except (OSError, ValueError):
-            pass
-        return self._data

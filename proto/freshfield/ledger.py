@@ -151,14 +151,12 @@ class LedgerReader:
     @property
     def complete(self) -> bool:
         """Whether the process exited cleanly and lost no line, so that missing events did not happen."""
-        last = self.last()
-        return last is not None and last.event == "closed" and not last.detail
+        return (last := self.last()) is not None and (last.event, last.detail) == ("closed", "")
 
     @property
     def closed(self) -> bool:
         """Whether the process exited cleanly."""
-        last = self.last()
-        return last is not None and last.event == "closed"
+        return (last := self.last()) is not None and last.event == "closed"
 
 
 def read_all(out: Path) -> list[LedgerReader]:

@@ -67,6 +67,13 @@ MAX_YAML_CHARS = 2**17
 """Length of a scenario or other YAML file: a thousand cameras with the longest ids need half of it, and
 reading as many characters takes 2 s."""
 
+MIN_YAML_VALUES, MAX_YAML_DEPTH = 100_000, 50
+"""Number of values allowed in any YAML file, however short: anchors may well repeat cameras and lenses. Depth of nested
+collections; the parser's work for every token grows with it."""
+
+MAX_FILE_BYTES = 2**30
+"""Size of any file that is read whole, unless a reader says otherwise."""
+
 MAX_ERROR_CHARS = 1000
 """Length of a quotation from a file in an error message."""
 

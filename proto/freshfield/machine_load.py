@@ -17,8 +17,7 @@ _PROC = Path("/proc")
 
 
 class LoadMeter:
-    """Measures the cores that processes and the whole machine used since the last call of ``row`` or
-    ``outside_cores``.
+    """Measures the cores that processes and the whole machine used since the last call of ``row``.
 
     name: key of this process in the rows.
     """
@@ -44,10 +43,6 @@ class LoadMeter:
             row["machine"] = {"cpu": self._cores(0, busy_s)}
         return row
 
-    def outside_cores(self) -> float | None:
-        """Cores that other processes kept busy; None if unknown."""
-        return outside_cores(self.row(0.0))
-
     def _cores(self, key: int, used_s: float) -> float:
         now_s = time.perf_counter()
         then_s, before_s = self._last.get(key, (now_s, used_s))
@@ -57,8 +52,7 @@ class LoadMeter:
 
 def outside_cores(row: Mapping[str, Any]) -> float | None:
     """Cores that other processes kept busy: the row's machine minus the row's processes; None if unknown."""
-    found = _outside(row)
-    return None if found is None else round(found, 2)
+    return round(max(0.0, row["machine"]["cpu"] - _ours(row)), 2) if _has_cpu(row.get("machine")) else None
 
 
 def outside_load(processes: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -68,7 +62,7 @@ def outside_load(processes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     row has the machine's use) and by the run's own, and how ``cores`` was measured.
     """
     ours = [_ours(row) for row in processes]
-    others = [cores for row in processes if (cores := _outside(row)) is not None]
+    others = [cores for row in processes if (cores := outside_cores(row)) is not None]
     return {
         "cores": round(statistics.median(others), 2) if others else None,
         "ours": round(statistics.median(ours), 2) if ours else None,
@@ -83,39 +77,33 @@ def usable_cores() -> int:
 
 def rss_mb(pid: int | str = "self") -> float | None:
     """Resident memory of a process in MB (10^6 bytes); None if it cannot be read."""
-    try:
-        pages = int((_PROC / str(pid) / "statm").read_text().split()[1])
-    except (OSError, ValueError, IndexError):
-        return None
-    return round(pages * resource.getpagesize() / 1e6, 1)
+    words = _words(f"{pid}/statm")
+    return round(int(words[1]) * resource.getpagesize() / 1e6, 1) if words else None
 
 
 def cpu_s(pid: int) -> float | None:
     """Processor time that a process has used, in core-seconds; None if it cannot be read."""
-    try:
-        words = (_PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()
-        return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
-    except (OSError, ValueError, IndexError):
-        return None
+    words = _words(f"{pid}/stat")
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK") if words else None
 
 
 def _busy_s() -> float | None:
     """Core-seconds that the whole machine has been busy since it started."""
+    words = _words("stat")
+    # Without idle and iowait; user includes guest.
+    return sum(map(int, words[1:4] + words[6:9])) / os.sysconf("SC_CLK_TCK") if words else None
+
+
+def _words(name: str) -> list[str]:
+    """The first line of a file below /proc, without a process's name in parentheses; empty if it cannot be read."""
     try:
-        words = (_PROC / "stat").read_text().split("\n", 1)[0].split()
-        # Without idle and iowait; user includes guest.
-        user, nice, system, _, _, *interrupts_and_steal = map(int, words[1:9])
-    except (OSError, ValueError, IndexError):
-        return None
-    return (user + nice + system + sum(interrupts_and_steal)) / os.sysconf("SC_CLK_TCK")
+        return (_PROC / name).read_text().partition("\n")[0].rpartition(")")[2].split()
+    except OSError:
+        return []
 
 
 def _ours(row: Mapping[str, Any]) -> float:
     return sum(v["cpu"] for k, v in row.items() if k != "machine" and _has_cpu(v))
-
-
-def _outside(row: Mapping[str, Any]) -> float | None:
-    return max(0.0, row["machine"]["cpu"] - _ours(row)) if _has_cpu(row.get("machine")) else None
 
 
 def _has_cpu(value: Any) -> bool:

@@ -159,10 +159,6 @@ class OpenStreams:
         for call in [*self._silent, *self._used]:
             call.end(grpc.StatusCode.UNAVAILABLE, why)
 
-    def use(self, call: ServedCall) -> None:
-        """Mark a stream as used: it carried a frame that was accepted."""
-        call.use()
-
     def note_use(self, call: ServedCall) -> None:
         """See ``ServedCall.use``."""
         if call.open and (call in self._silent or call in self._used):

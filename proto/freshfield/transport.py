@@ -253,21 +253,18 @@ class Transport:
 def add_arguments(parser: argparse.ArgumentParser, listens: bool = True) -> None:
     """Add the security options that all processes share. listens: whether this one is a server."""
     group = parser.add_argument_group("security", "off unless given; all processes take the same options")
-    group.add_argument("--tls-cert", type=Path, metavar="PEM", help="certificate of this process")
-    group.add_argument("--tls-key", type=Path, metavar="PEM", help="private key of this process")
-    group.add_argument(
-        "--tls-ca",
-        type=Path,
-        metavar="PEM",
-        help="trusted CA certificate: a client then uses TLS, a server demands client certificates",
-    )
-    group.add_argument(
-        "--token-file",
-        type=Path,
-        metavar="FILE",
-        help="file of lines NAME TOKEN; NAME: operator, viewer, camera:ID[,ID] or camera:*. A client sends "
-        "the first token (NAME may be left out), a server accepts all",
-    )
+    for option, metavar, text in (
+        ("--tls-cert", "PEM", "certificate of this process"),
+        ("--tls-key", "PEM", "private key of this process"),
+        ("--tls-ca", "PEM", "trusted CA certificate: a client then uses TLS, a server demands client certificates"),
+        (
+            "--token-file",
+            "FILE",
+            "file of lines NAME TOKEN; NAME: operator, viewer, camera:ID[,ID] or camera:*. A client sends the first "
+            "token (NAME may be left out), a server accepts all",
+        ),
+    ):
+        group.add_argument(option, type=Path, metavar=metavar, help=text)
     group.add_argument(
         "--insecure",
         action="store_true",

@@ -18,13 +18,7 @@ from typing import Any
 
 import yaml
 
-from freshfield.limits import MAX_YAML_CHARS
-
-LEAST_VALUES = 100_000  # allowed in any YAML file, however short: anchors may well repeat cameras and lenses
-
-
-MAX_FILE_BYTES = 2**30  # of any file that is read whole, unless a reader says otherwise
-MOST_NESTED = 50  # depth of nested collections; the parser's work for every token grows with it
+from freshfield.limits import MAX_FILE_BYTES, MAX_YAML_CHARS, MAX_YAML_DEPTH, MIN_YAML_VALUES
 
 
 class UntrustedError(ValueError):
@@ -33,7 +27,7 @@ class UntrustedError(ValueError):
 
 class _Loader(yaml.SafeLoader):
     def fetch_more_tokens(self) -> Any:
-        if self.flow_level + len(self.indents) > MOST_NESTED:
+        if self.flow_level + len(self.indents) > MAX_YAML_DEPTH:
             raise UntrustedError("not YAML: nested too deeply")
         return super().fetch_more_tokens()
 
@@ -135,7 +129,7 @@ def read_yaml(text: str) -> Any:
         node = loader.get_single_node()
         if node is None:
             return None
-        refuse_expansion(node, max(LEAST_VALUES, 20 * len(text)), _node_parts)
+        refuse_expansion(node, max(MIN_YAML_VALUES, 20 * len(text)), _node_parts)
         return loader.construct_document(node)
     except UntrustedError:
         raise

@@ -30,7 +30,7 @@ from tests.camera_node.depth_source import POSE
 from tests.camera_node.robot.arm.simulated import write_cell
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 from tests.camera_node.sources.devices.mjpeg import CALIBRATION, NetworkCamera, camera_file
-from tests.integration.peer import Peer
+from tests.integration.peer import ClockAhead, Peer
 from tests.support import refused
 
 
@@ -103,7 +103,7 @@ def test_a_camera_at_a_fraction_of_the_rate_that_was_asked_for_is_wrong(capsys, 
 
 
 async def test_a_peer_tells_its_time():
-    peer = await Peer(clock=WallClock(offset_ns=3_000_000_000)).start()
+    peer = await Peer(clock=ClockAhead(3_000_000_000)).start()
     found, bound = await doctor._exchange(peer.address, Transport())
     await peer.stop()
     assert abs(found - 3000.0) <= bound + 1.0

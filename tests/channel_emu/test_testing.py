@@ -9,7 +9,7 @@ from concurrent import futures
 import grpc
 import pytest
 
-from channel_emu.live import call_flow, proxy
+from channel_emu.live import call_flow, proxy, settings
 from channel_emu.testing import EmulatedLink, channel
 from tests.support import refused, wait_until
 
@@ -162,7 +162,7 @@ def test_cancellation_reaches_the_service_and_frees_the_link(channel, greeter):
 
 
 def test_behind_a_message_in_the_link_no_more_are_read_than_the_bound(channel, greeter, monkeypatch):
-    monkeypatch.setattr(call_flow, "_MOST_BEHIND", 10)
+    monkeypatch.setattr(call_flow.CallFlow, "most_behind", 10)
     link = channel({"service": "det:300ms", "discipline": "fcfs", "queue_limit": 1000}, to=greeter.address)
     answers = client(link).stream_stream(ECHO)(paced(100, 0.0), timeout=20)
     wait_until(lambda: link.report().offered == 10, "messages do not come")
@@ -191,7 +191,7 @@ def test_damage_and_doubles(channel, greeter):
 
 
 def test_methods_that_a_client_invents_share_one_link(channel, greeter, monkeypatch):
-    monkeypatch.setattr(proxy, "_MOST_METHODS", 2)
+    monkeypatch.setattr(settings, "MOST_METHODS", 2)
     link = channel("ideal", to=greeter.address)
     for n in range(5):
         code_of(client(link).unary_unary(f"/a.B/C{n}"), b"")  # the service has none of them

@@ -13,10 +13,10 @@ import pytest
 from edge_server.report.frame_accounting import account_frames
 from freshfield import ledger
 from freshfield import scenario as scenarios
-from freshfield_up.commands import process_set
+from freshfield.files import read_status
+from freshfield_up.commands import Options, process_set
 from freshfield_up.net import free_ports, is_serving
 from freshfield_up.processes import Child, kill, stop
-from freshfield_up.status import read_json
 from tests.deploy.test_up import SMALL
 from tests.support import wait_until
 
@@ -26,7 +26,7 @@ RECOVERY_S, LASTS_S, EVERY_S, READY_S = 2.0, 2.0, 6.0, 400.0
 
 def streams(out: Path) -> bool:
     """Whether a frame of every camera was delivered, and the edge has made two updates."""
-    edge = read_json(out / "edge.json")
+    edge = read_status(out / "edge.json")
     cameras = edge.get("cameras") or []
     return cameras and all(c.get("delivered") for c in cameras) and (edge.get("updates") or {}).get("count", 0) >= 2
 
@@ -58,7 +58,7 @@ def recovery_s(out: Path, kind: str, role: str, over_ns: int) -> float:
 @pytest.mark.alone
 def test_real_processes_recover_from_kills_and_a_stop(tmp_path):
     (file := tmp_path / "small.yaml").write_text(SMALL)
-    found = process_set(scenarios.load(file), tmp_path, free_ports(1)[0])
+    found = process_set(scenarios.load(file), Options(tmp_path, port=free_ports(1)[0]))
     children = dict(zip(ROLES, (found.node, found.emulator, found.edge)))
     late = {}
     try:

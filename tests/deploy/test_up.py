@@ -21,18 +21,17 @@ import pytest
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
 import freshfield as ff
+from freshfield.files import read_status
 from freshfield.scenario import ScenarioError, load
 from freshfield_up import commands, console, processes
 from freshfield_up import healthy as health_check
 from freshfield_up import run as launcher
-from freshfield_up.cli import main
+from freshfield_up.cli import main, seconds
 from freshfield_up.commands import ProcessSet
-from freshfield_up.demo_command import seconds
 from freshfield_up.deployment import DeploymentError
 from freshfield_up.folder import EARLIER, KEY, MARKER, FolderError, forget_earlier, prepare
 from freshfield_up.processes import Child
-from freshfield_up.status import read_json, status_line
-from freshfield_up.summary import summarize
+from freshfield_up.status import status_line, summarize
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde
 from tests.conftest import ROOT
 from tests.support import free_port, refused, wait_until
@@ -61,7 +60,7 @@ def asleep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., lau
         processes = ProcessSet(*made, "127.0.0.1:1", "")
         monkeypatch.setattr(launcher, "process_set", lambda *_: processes)
         (tmp_path / "small.yaml").write_text(SMALL)
-        run = launcher.Launcher(load(tmp_path / "small.yaml"), launcher.Options(tmp_path / "run", port=free_port()))
+        run = launcher.Launcher(load(tmp_path / "small.yaml"), commands.Options(tmp_path / "run", port=free_port()))
         run.processes = processes
         return run
 
@@ -152,7 +151,7 @@ CELL = load("cell")
 
 def test_a_simulated_arm_and_its_driver_belong_to_the_run(monkeypatch, tmp_path):
     monkeypatch.setattr(commands, "program", lambda name: name)
-    found = commands.process_set(CELL, tmp_path, 8080)
+    found = commands.process_set(CELL, commands.Options(tmp_path))
     assert [child.command[1] for child in found.arms + found.drivers] == ["simulate-arm", "drive-arm"]
     assert found.arm_address == "127.0.0.2:30004"
     # Senders stop before receivers: driver, cameras, arm, channel, edge.
@@ -169,12 +168,12 @@ def test_the_cell_runs_from_one_command(tmp_path):
     words = [str(tmp_path / "cell.yaml"), "--out", str(out := tmp_path / "run"), "--port", str(free_port())]
     process = subprocess.Popen([sys.executable, "-m", "freshfield_up.cli", "demo", *words])
     try:
-        wait_until(lambda: read_json(out / "edge.json").get("updates", {}).get("count", 0) >= 30, "no updates", 400.0)
+        wait_until(lambda: read_status(out / "edge.json").get("updates", {}).get("count", 0) >= 30, "no updates", 400.0)
         process.terminate()
         assert process.wait(300.0) == 0
     finally:
         process.kill()
-    frames = read_json(out / "report.json")["frames"]
+    frames = read_status(out / "report.json")["frames"]
     assert frames["closes"] and frames["by_camera"]["hand"]["delivered"] > 5
     assert "43 viewpoints in 62 stops\n" in (out / "log-driver.txt").read_text()
     # The arm sets out when the field can learn: after the emulator, which waits for the edge to serve.
@@ -255,7 +254,7 @@ def test_the_line_says_what_the_processes_wrote_and_what_is_missing_or_damaged_l
     for name, said in (("edge.json", edge), ("channel.json", channel)):
         (tmp_path / name).write_text(json.dumps(said))
     assert status_line(tmp_path, 13) == (
-        "13/13 cameras, age 1880 ms (median); 9 updates, 812 ms each, PSNR 25.12 dB, moving - dB, policy -; "
+        "13/13 cameras, age 1880 ms (median); 9 updates, 812 ms each, PSNR 25.12 dB; "
         "ch6, forwarded 481, delay error p99 - ms"
     )
     (tmp_path / "channel.json").write_text("[1, 2")

@@ -1,6 +1,5 @@
 """Scenario files and their sections: strict, with one clear line for everything that is wrong."""
 
-import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,14 +11,6 @@ from freshfield.limits import MAX_IMAGE_SIDE_PX
 from freshfield.scenario import ScenarioError, load, parse
 from freshfield.settings import Settings, as_mapping, read_settings, within
 from tests.support import refused
-
-
-@pytest.fixture
-def file(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "loaded", 0, raising=False)
-    (tmp_path / "mine.py").write_text("import sys\nsys.loaded += 1\nclass Mine:\n    pass\n")
-    return tmp_path / "mine.py"
-
 
 FILE = Path("s.yaml")
 

@@ -26,7 +26,7 @@ async def echoing(streams: OpenStreams):
             await context.send_initial_metadata(())
             while (message := await context.read()) is not grpc.aio.EOF:
                 if message == b"use":
-                    streams.use(call)
+                    call.use()
                 await call.write(message)
 
     async def pour(_, context):

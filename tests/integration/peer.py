@@ -36,6 +36,14 @@ async def wrong_number(request: pb.PushRequest) -> pb.PushResponse:
     return pb.PushResponse(sequence=request.header.sequence + 17, outcome=pb.OUTCOME_ACCEPTED)
 
 
+class ClockAhead(WallClock):
+    """A clock that is wrong."""
+
+    def __init__(self, by_ns: int) -> None:
+        super().__init__()
+        self._ahead += by_ns
+
+
 @dataclass
 class Peer:
     """frames: every frame that arrived, checked; arrived_ns: when, on ``clock``. most_unanswered: the most

@@ -18,11 +18,10 @@ from camera_node.capture import build_cameras
 from camera_node.node import Node, NodeOptions
 from camera_node.settings import source_config
 from freshfield import ledger, payload
-from freshfield.clock import WallClock
 from freshfield.limits import MAX_CAPTURE_AGE_NS
 from freshfield.transport import Transport
 from tests.camera_node.sources.datasets.photos import photo_scenario, picture, write_photos
-from tests.integration.peer import Peer, answer, silence, wrong_number
+from tests.integration.peer import ClockAhead, Peer, answer, silence, wrong_number
 from tests.support import until
 
 
@@ -156,7 +155,7 @@ async def test_answers_much_later_than_before_mean_a_dead_stream_and_a_slow_link
 
 def test_offset_of_a_wrong_clock_is_estimated(tmp_path):
     ahead_ns = 7_000_000_000
-    peer = Peer(clock=WallClock(offset_ns=ahead_ns))
+    peer = Peer(clock=ClockAhead(ahead_ns))
     drift = {"effects": {"clock_drift": {"offset_ms": -1500.0, "offset_spread_ms": 100.0}}}
     run_against(peer, tmp_path, frames=60, source=drift)
     newest = {f.camera: f for f in peer.frames}
@@ -170,7 +169,7 @@ def test_offset_of_a_wrong_clock_is_estimated(tmp_path):
 
 
 def test_the_first_frame_waits_for_the_clock_and_is_the_newest(tmp_path):
-    peer = Peer(clock=WallClock(offset_ns=7_000_000_000), clock_delay_s=0.4)
+    peer = Peer(clock=ClockAhead(7_000_000_000), clock_delay_s=0.4)
     run_against(peer, tmp_path, frames=20)
     assert max(f.clock_uncertainty_ns for f in peer.frames) < 1_000_000_000
     assert min(f.clock_offset_ns for f in peer.frames) > 6_000_000_000

@@ -17,7 +17,7 @@ from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import PerceptualMetric, Scorer
 from edge_server.fields import Budget
 from edge_server.fields.registry import make_field
-from freshfield.machine_load import LoadMeter
+from freshfield.machine_load import LoadMeter, outside_cores
 
 _MEDIANS = ("seconds", "steps", "ms_per_step", "psnr_db", "ssim", "lpips")
 
@@ -76,7 +76,7 @@ def fit_from_scratch(fit: Fit, weights: Path | None = None) -> dict[str, Any]:
     model.warm_up()
     load = LoadMeter()
     report = model.fit(still.training, Budget(seconds=fit.seconds))
-    outside = load.outside_cores()
+    outside = outside_cores(load.row(0.0))
     score, _ = score_views(model, still.held_out, Scorer(lpips_of(weights), background=still.background))
     return {
         "seconds": report.seconds,

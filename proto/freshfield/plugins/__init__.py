@@ -57,7 +57,8 @@ def find(kind: str, name: str, built_in: Iterable[str]) -> Any:
     there is, ``built_in`` first."""
     match = _FILE.fullmatch(name) or _MODULE.fullmatch(name)
     if match is not None:
-        module = _file_module(kind, Path(match["where"])) if match.re is _FILE else _module(kind, match["where"])
+        where, load = match["where"], _file_module if match.re is _FILE else importlib.import_module
+        module = _imported(kind, where, lambda: load(where))
         found = getattr(module, match["name"], None)
         if not isinstance(found, type):
             there = [each for each, value in vars(module).items() if isinstance(value, type)]
@@ -168,29 +169,20 @@ def refuse_foreign(kind: str, name: str, source: str, allowed: bool) -> None:
         )
 
 
-def _module(kind: str, name: str) -> ModuleType:
-    found: ModuleType = _imported(kind, name, lambda: importlib.import_module(name))
-    return found
-
-
-def _file_module(kind: str, file: Path) -> ModuleType:
+def _file_module(path: str) -> ModuleType:
     """The module of a file, executed once a process."""
-    file = file.expanduser().absolute()
-    if not file.is_file():
-        raise PluginError(f"{kind} {file}: there is no such file")
+    file = Path(path).expanduser().absolute()
     name = f"freshfield_plugin_{file.stem}_{hashlib.sha256(str(file).encode()).hexdigest()[:12]}"
-    if name in sys.modules:
-        return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(name, file)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    try:
-        _imported(kind, str(file), lambda: spec.loader.exec_module(module))  # type: ignore[union-attr]
-    except PluginError:
-        del sys.modules[name]
-        raise
-    return module
+    if name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(name, file)
+        assert spec is not None and spec.loader is not None
+        sys.modules[name] = importlib.util.module_from_spec(spec)
+        try:
+            spec.loader.exec_module(sys.modules[name])
+        except BaseException:
+            del sys.modules[name]
+            raise
+    return sys.modules[name]
 
 
 def _imported(kind: str, name: str, load: Any) -> Any:

@@ -8,7 +8,7 @@ import struct
 import threading
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -120,7 +120,15 @@ class Session:
 
     def _read_all(self) -> int | None:
         """Index every complete message. Returns the end of the complete part, None for a closed file."""
-        heads, end = self._heads()
+        heads: list[tuple[int, int, int]] = []
+        end: int | None = len(MCAP0_MAGIC)
+        for opcode, at, size in _heads(self._at, len(MCAP0_MAGIC), self._size):
+            heads.append((opcode, at, size))
+            if at + size <= self._size:
+                end = at + size
+                if opcode == Opcode.FOOTER:
+                    end = None
+                    break
         # Channels first: a closed file repeats them at its end, so a damaged chunk loses only its messages.
         for wanted in (Opcode.CHANNEL, None):
             for opcode, at, size in heads:
@@ -130,21 +138,6 @@ class Session:
                 elif whole and opcode == (wanted or Opcode.MESSAGE):
                     self._record(opcode, self._at(at, size), _Location(at, size))
         return end
-
-    def _heads(self) -> tuple[list[tuple[int, int, int]], int | None]:
-        """(opcode, offset, size) of the file's records, the last perhaps truncated; and the end of the
-        complete ones, None for a closed file."""
-        heads: list[tuple[int, int, int]] = []
-        at = len(MCAP0_MAGIC)
-        while at + _RECORD_HEAD.size <= self._size:
-            opcode, size = _RECORD_HEAD.unpack(self._at(at, _RECORD_HEAD.size))
-            heads.append((opcode, at + _RECORD_HEAD.size, size))
-            if at + _RECORD_HEAD.size + size > self._size:
-                break
-            if opcode == Opcode.FOOTER:
-                return heads, None
-            at += _RECORD_HEAD.size + size
-        return heads, at
 
     def _chunk(self, at: int, size: int, whole: bool) -> None:
         if size < _CHUNK_HEAD.size:
@@ -158,7 +151,9 @@ class Session:
         if whole and crc and zlib.crc32(data[begin:]) != crc:
             self._damaged += 1
             return
-        for opcode, offset, length in _framed(data, begin):
+        for opcode, offset, length in _heads(lambda start, count: data[start : start + count], begin, len(data)):
+            if offset + length > len(data):
+                return
             if opcode not in _IN_CHUNKS:
                 self._damaged += 1
                 return
@@ -197,15 +192,13 @@ class Session:
                     self.frames.setdefault(camera, []).append(SessionFrame(before[2], before[0], location, depth))
 
 
-def _framed(data: bytes, at: int) -> Iterator[tuple[int, int, int]]:
-    """(opcode, offset, size) of the complete records of a chunk from ``at`` on."""
-    while at + _RECORD_HEAD.size <= len(data):
-        opcode, size = _RECORD_HEAD.unpack_from(data, at)
-        at += _RECORD_HEAD.size
-        if at + size > len(data):
-            return
-        yield opcode, at, size
-        at += size
+def _heads(read: Callable[[int, int], bytes], at: int, end: int) -> Iterator[tuple[int, int, int]]:
+    """(opcode, offset, size) of the records from ``at`` to ``end``, the last perhaps truncated. read: (offset, size) to
+    bytes."""
+    while at + _RECORD_HEAD.size <= end:
+        opcode, size = _RECORD_HEAD.unpack(read(at, _RECORD_HEAD.size))
+        yield opcode, at + _RECORD_HEAD.size, size
+        at += _RECORD_HEAD.size + size
 
 
 def _message(body: bytes) -> Message:

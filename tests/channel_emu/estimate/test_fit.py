@@ -118,8 +118,8 @@ def test_what_is_still_on_its_way_is_not_lost(tmp_path):
 def test_nothing_to_fit_is_said_in_one_line(tmp_path):
     for rows, why in (
         (HEAD, "there is no frame in it"),
-        (HEAD + "0,5\n30,40\n", "2 delays .2 frames, 2 came.; at least 20 are needed"),
-        (HEAD + "".join(f"{30 * n},\n" for n in range(100)), "none of its 100 frames came through"),
+        (HEAD + "0,5\n30,40\n", "2 delays below .* .2 frames, 2 came.; at least 20 are needed"),
+        (HEAD + "".join(f"{30 * n},\n" for n in range(100)), "0 delays below 1e.09 ms .100 frames, 0 came."),
         (HEAD + "0,5\n30,20\n", "line 3: delivered_ms is not earlier than offered_ms, or blank: 30, 20"),
         (HEAD + "0,5\n1e12,\n1.1e12,\n", "line 4: offered_ms is decades away from the first: 1.1e12, "),
         (HEAD + '"' + 140_000 * "0", "cannot be read as a table: field larger than"),
@@ -150,7 +150,6 @@ def test_a_few_huge_delays_are_no_state(tmp_path):
     found = fit(path, discipline="parallel")
     assert found.states == 1
     assert any("rests on 2 frames" in w for w in found.warnings)
-    assert any("1 frames took longer than 1e+09 ms" in w for w in found.warnings)
 
 
 def test_the_command_writes_a_scenario_and_a_picture(tmp_path, capsys):

@@ -1,7 +1,6 @@
-"""The small parts of the live emulator: timer, histogram, priority."""
+"""The small parts of the live emulator: timer, histogram."""
 
 import asyncio
-import os
 import sys
 import time
 
@@ -10,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from channel_emu.live import priority, timer
+from channel_emu.live import timer
 from channel_emu.live.histogram import Histogram
 from channel_emu.live.timer import LoopTimer
 
@@ -56,18 +55,3 @@ def test_histogram_percentiles_are_within_a_bin(values, percent):
         assert exact * 0.999999 <= found <= max(exact * 1.0234, 1e-4)
     assert histogram.count == len(values) and histogram.max_ms == counted.max()
     assert histogram.mean_ms == pytest.approx(counted.mean())
-
-
-@pytest.mark.parametrize("short_slice", [True, False])
-def test_without_real_time_the_priority_is_raised(monkeypatch, short_slice):
-    def forbidden(*_: object) -> None:
-        raise PermissionError
-
-    asked: list[int] = []
-    monkeypatch.setattr(os, "sched_setscheduler", forbidden, raising=False)
-    monkeypatch.setattr(os, "nice", asked.append)
-    monkeypatch.setattr(priority, "_shorten_slice", lambda: short_slice)
-    assert priority.raise_priority() == ("short-slice" if short_slice else "nice")
-    assert len(asked) == 1 and asked[0] < 0
-    monkeypatch.setattr(os, "nice", forbidden)
-    assert priority.raise_priority() == ("short-slice" if short_slice else "normal")

@@ -138,9 +138,9 @@ def test_a_bomb_of_depth_is_refused_and_loses_nothing_else(ingest):
 def test_another_stream_cannot_use_up_the_numbers_of_a_session(ingest):
     class Stream:
         open, caller = True, access.caller.get()
+        use = staticmethod(lambda: None)
 
     mine, spoofer = Stream(), Stream()
-    ingest.streams.use = lambda stream: None
     assert ingest.take(to_request(good(1)), mine).outcome == pb.OUTCOME_ACCEPTED
     last = frame(sequence=2**63, generated_ns=NOW)
     assert ingest.take(to_request(last), spoofer).reason == "session_in_use"

@@ -21,7 +21,7 @@ from edge_server.report.run_files import continuous, read_run_files
 from edge_server.run_records import AgesRow, EdgeStatus, UpdateCounts, UpdateRow
 from freshfield.scenario import NOTHING_HELD_OUT
 from freshfield.untrusted import read_json
-from freshfield_up.summary import summarize
+from freshfield_up.status import summarize
 from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, EDGE, SECONDS, page_of, publication, write_run
 from tests.support import refusal
 

@@ -1,0 +1,27 @@
+"""Numbers of the live emulator that somebody may want to change; those of ``--tcp`` stand in ``tcp_proxy``."""
+
+MOST_CALLS = 1000  # open at once through ``channel-emu proxy``; each takes 30 kB
+MOST_METHODS = 64  # with links of their own; all others share one
+MOST_READY, MOST_BEHIND = 64, 10_000
+"""Number of messages read ahead of the one being written; then the sender waits. Behind a message that is still in
+the link more are read, because the link must decide about each at its arrival. Dropped ones are kept without their
+bytes."""
+
+CREDITS = 8
+"""Maximum number of a camera's unanswered frames. More than one, so that waiting for an answer does not delay the next
+frame; few, so that a stalled edge is noticed at once."""
+MOST_STRANGE = 100
+"""Answers to no frame that was sent, before the stream ends: a hostile edge would keep the emulator busy."""
+FIRST_BACKOFF_S, MAX_BACKOFF_S = 0.1, 1.0  # before a stream to the edge is opened again
+
+FIRST_WAIT_S = 2.0  # nodes are admitted when the streams to the edge are open, or after this long without them
+WARN_AFTER_NS = 3 * 10**9  # without the edge: warn once
+EXCHANGE_TIMEOUT_S = 5.0  # of a clock exchange that is passed on
+STOP_GRACE_S = 0.5
+REFRESH_EVERY_S = 0.5  # of the status
+KEEP_PATH_NS = 60 * 10**9  # how much of the chain's past path is kept; no event is processed later than this
+
+SWITCH_INTERVAL_S = 0.0005
+"""The event loop takes the interpreter's lock back from another thread after this long at most
+(``sys.setswitchinterval``)."""
+SLICE_NS = 100_000  # a thread that asks for short slices is scheduled sooner when it wakes (Linux 6.12 and later)

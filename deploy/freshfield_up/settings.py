@@ -1,0 +1,17 @@
+"""Times of the launcher that somebody may want to change."""
+
+TICK_S = 0.25  # between looks at the processes
+LINE_EVERY_S = 5.0  # a line for people
+SAMPLE_EVERY_S = 2.0
+"""Of memory and processor time of every process, in ``processes.jsonl``."""
+
+READY_WITHIN_S = 600.0
+"""A first start compiles the field's kernels: a minute, or more on a busy machine."""
+REPORT_WITHIN_S = 300.0
+
+GRACE_S = 30.0
+"""Time for a process to end after SIGTERM before it is killed: the edge server waits up to 20 s for its last update."""
+LAST_LINES = 12  # of the log of a process that died
+
+FRESH_S = 10.0
+"""Age of a node's status file up to which its container is healthy; it is written twice a second."""
