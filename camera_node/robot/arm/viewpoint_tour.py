@@ -67,9 +67,11 @@ def plan_tour(arm: ArmModel, base: Array, mount: Array, path: PathConfig, start:
     Raises ArmError if the arm can visit fewer than three viewpoints.
     """
     poses = viewpoints(path)
-    begin = None if start is None else np.asarray(start, dtype=np.float64)
-    joints, places = _free_postures(arm, base, mount, path, poses, begin)
-    order = np.arange(len(joints)) if begin is None else np.argsort(np.abs(joints - begin).max(axis=1), kind="stable")
+    joints, places = _free_postures(arm, base, mount, path, poses)
+    order, begin = np.arange(len(joints)), None if start is None else np.asarray(start, dtype=np.float64)
+    if begin is not None:
+        joints, far_rad = _turned_towards(arm, joints, begin)
+        order = np.argsort(far_rad, kind="stable")
     best, visited = Tour([], []), np.zeros(len(joints), np.bool_)
     for k in order:
         # Every posture that an earlier tour came through leads to the same viewpoints.
@@ -95,7 +97,7 @@ def reachable(arm: ArmModel, base: Array, mount: Array, path: PathConfig, poses:
     Other arguments as in ``plan_tour``; of ``path`` only rolls_deg and floor_m are used.
     """
     out = np.zeros(len(poses), np.bool_)
-    out[_free_postures(arm, base, mount, path, poses, None)[1]] = True
+    out[_free_postures(arm, base, mount, path, poses)[1]] = True
     return out
 
 
@@ -117,7 +119,7 @@ def is_free(arm: ArmModel, base: Array, a: Array, b: Array, floor_m: float) -> N
 
 
 def _free_postures(
-    arm: ArmModel, base: Array, mount: Array, path: PathConfig, poses: Sequence[Array], near: Array | None
+    arm: ArmModel, base: Array, mount: Array, path: PathConfig, poses: Sequence[Array]
 ) -> tuple[Array, NDArray[np.int64]]:
     """Joint angles (N, 6) that bring the camera to ``poses``, not singular and free, and each pose's number."""
     camera_to_flange, base_inverse = se3_inverse(mount), se3_inverse(base)
@@ -125,13 +127,22 @@ def _free_postures(
         (joints, k)
         for k, pose in enumerate(poses)
         for roll in np.deg2rad(path.rolls_deg)
-        for joints in arm.inverse(base_inverse @ pose @ se3(so3_exp([0, 0, roll]), [0, 0, 0]) @ camera_to_flange, near)
-        if not arm.singularities(joints)
+        for joints in arm.inverse(base_inverse @ pose @ se3(so3_exp([0, 0, roll]), [0, 0, 0]) @ camera_to_flange)
+        if not arm.singular(joints)
     ]
     postures = np.reshape([joints for joints, _ in found], (-1, 6))
     places = np.array([k for _, k in found], dtype=np.int64)
     free = is_free(arm, base, postures, postures, path.floor_m) if found else np.zeros(0, np.bool_)
     return postures[free], places[free]
+
+
+def _turned_towards(arm: ArmModel, joints: Array, at: Array) -> tuple[Array, Array]:
+    """``joints`` (N, 6), each shifted by full turns towards ``at`` (6,) as far as its limits allow, and the largest
+    turn of a joint from there (N,)."""
+    turn = 2.0 * np.pi
+    near = joints + turn * np.round((at - joints) / turn)
+    near = np.where((near < arm.lower_rad) | (near > arm.upper_rad), joints, near)
+    return near, np.abs(near - at).max(axis=1)
 
 
 def _extend_tour(
@@ -141,7 +152,6 @@ def _extend_tour(
 
     Depth first: from each stop to the nearest posture of a viewpoint left; back where there is none.
     """
-    low, high = np.array(arm.lower_rad), np.array(arm.upper_rad)
     stops, visited = [joints[first]], [int(places[first])]
     used = np.zeros(len(joints), np.bool_)
     used[first] = True
@@ -149,10 +159,8 @@ def _extend_tour(
     back: list[Array] = []
     while trail:
         at = trail[-1]
-        # Shifted by full turns towards the present posture.
-        near = joints + 2.0 * np.pi * np.round((at - joints) / (2.0 * np.pi))
-        far_rad = np.abs(near - at).max(axis=1)
-        left = ~np.isin(places, visited) & np.all((near >= low) & (near <= high), axis=1) & (far_rad <= FARTHEST_RAD)
+        near, far_rad = _turned_towards(arm, joints, at)
+        left = ~np.isin(places, visited) & (far_rad <= FARTHEST_RAD)
         order = np.flatnonzero(left)[np.argsort(far_rad[left], kind="stable")]
         step = next((k for k in order if is_free(arm, base, at, near[k], floor_m)[0]), None)
         if step is None:

@@ -30,7 +30,7 @@ WORST_DEG, WORST_MM, FARTHEST_M = 15.0, 100.0, 5.0
 # The scale of distances to the target is told where it differs from 1 by more than this and by so many standard
 # deviations; a factor beyond the bound is no size of a board. With fewer poses there is nothing left to judge it by.
 NOTABLE_SCALE, SURE, LARGEST_SCALE, POSES_FOR_SCALE = 0.005, 5.0, 2.0, 5
-MILLIMETERS = (800.0, 1250.0)  # scale where one of the two is in millimeters
+MILLIMETERS_M = 20.0  # median distance beyond which poses are in millimeters
 
 # Targets. With fewer corners of a board its orientation is too uncertain; fewer markers may be read into noise.
 MIN_CORNERS, MIN_MARKERS = 6, 3

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
-from camera_node.robot.calibration.hand_eye.closed_form import robust_start
+from camera_node.robot.calibration.hand_eye.closed_form import start as closed_form_start
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, rotation_vectors
 from camera_node.robot.calibration.settings import OUTLIER_WEIGHT
 from freshfield.geometry import se3, se3_inverse
@@ -61,8 +61,7 @@ class Refinement:
 
 def refine(samples: Samples, with_scale: bool = False) -> Refinement:
     """Maximize the likelihood of X and Y, and of the scale if asked to. Raises CalibrationError."""
-    scale = scale_start(samples) if with_scale else 1.0
-    x, y = robust_start(samples.rescaled(scale))
+    scale, (x, y) = 1.0, closed_form_start(samples)
     start = np.zeros(13 if with_scale else 12)
 
     def residuals(step: Array) -> Array:
@@ -90,21 +89,6 @@ def refine(samples: Samples, with_scale: bool = False) -> Refinement:
     deg, mm = float(np.degrees(turn)), shift * 1e3
     scale_std = scale * float(np.sqrt(covariance[12, 12])) if with_scale else 0.0
     return Refinement(x, y, deg, mm, float(noise[0]), float(noise[1]), _weights(e, noise), scale, scale_std)
-
-
-def scale_start(samples: Samples) -> float:
-    """First estimate of said by true distance to the target: with X's rotation known, G_i X T_i = Y is linear in its
-    inverse and in the translations of X and Y. Samples that fit badly count less. Raises CalibrationError."""
-    turn = robust_start(samples)[0][:3, :3]
-    moved = samples.moved[:, :3, :3]
-    seen = moved @ turn @ samples.target[:, :3, 3:]
-    rows = np.concatenate([seen, moved, np.broadcast_to(-np.eye(3), moved.shape)], axis=2)
-    wanted, weights = -samples.moved[:, :3, 3], np.ones((len(samples), 1))
-    for _ in range(_ROUNDS):
-        found = np.linalg.lstsq((rows * weights[..., None]).reshape(-1, 7), (wanted * weights).ravel(), rcond=None)[0]
-        off = np.linalg.norm(rows @ found - wanted, axis=1)
-        weights = np.sqrt(1.0 / np.maximum(off, np.median(off) + _MIN_NOISE))[:, None]
-    return float(1.0 / found[0]) if found[0] > 0.0 else 1.0
 
 
 def flange_residuals(samples: Samples, x: Array, y: Array) -> Array:
