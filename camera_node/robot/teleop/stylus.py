@@ -36,19 +36,11 @@ KEYS = """\
   space clutch: press, release   q     end"""
 
 _STEP_M, _STEP_RAD = 0.005, 0.02
+# Key -> axis and sign of its step.
 _MOVES = {
-    "w": (0, 1),
-    "s": (0, -1),
-    "a": (1, 1),
-    "d": (1, -1),
-    "r": (2, 1),
-    "f": (2, -1),
-    "o": (3, 1),
-    "u": (3, -1),
-    "k": (4, 1),
-    "i": (4, -1),
-    "j": (5, 1),
-    "l": (5, -1),
+    key: (axis, sign)
+    for axis, keys in enumerate(("ws", "ad", "rf", "ou", "ki", "jl"))
+    for key, sign in zip(keys, (1, -1))
 }
 _ESCAPE, _END_OF_FILE, _MAX_BYTES = "\x1b", "\x04", 32
 MAX_BYTES = 2048

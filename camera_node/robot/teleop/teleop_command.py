@@ -131,7 +131,6 @@ def _status_line(operator: Teleoperator) -> str:
     refused = [f"{name} {n}" for name, n in operator.limiter.refused.items() if n]
     held = f", held by {', '.join(refused)}" if refused else ""
     return (
-        f"{operator.state}: flange at {x:.3f} {y:.3f} {z:.3f} m, {counts.taken} messages, "
-        f"clutch pressed {counts.engaged} times, "
-        f"{counts.unsound + counts.backwards} refused, {counts.jumps} jumps{held}"
+        f"{operator.state}: flange at {x:.3f} {y:.3f} {z:.3f} m, {counts['taken']} messages, "
+        f"clutch pressed {counts['pressed']} times, {counts['refused']} refused, {counts['jumps']} jumps{held}"
     )

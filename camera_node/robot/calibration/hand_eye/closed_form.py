@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, angle_deg, distance_mm
+from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, angle_deg, distance_mm, medoid
 from freshfield.geometry import se3
 
 METHODS = {
@@ -81,6 +81,4 @@ def start(samples: Samples) -> tuple[Array, Array]:
     others. Raises CalibrationError."""
     few = samples.subsample(MAX_CLOSED_FORM)
     x = solve(few, "park")
-    places = target_at_rest(few, x)
-    distance = np.linalg.norm(places[:, None, :3, :] - places[None, :, :3, :], axis=(2, 3))
-    return x, places[int(np.argmin(np.median(distance, axis=1)))]
+    return x, medoid(target_at_rest(few, x))

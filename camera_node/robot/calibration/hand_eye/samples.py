@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, SETUPS
@@ -89,6 +89,13 @@ def angle_deg(a: Array, b: Array) -> Array:
 def distance_mm(a: Array, b: Array) -> Array:
     """Distances (...) between the origins of transforms (..., 4, 4) in meters."""
     return np.asarray(np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1) * 1e3)
+
+
+def medoid(poses: ArrayLike) -> Array:
+    """The pose (4, 4) of several (N, 4, 4) that is nearest to all others: one that is wrong does not move it."""
+    given = np.asarray(poses, dtype=np.float64)
+    distance = np.linalg.norm(given[:, None] - given, axis=(2, 3))
+    return given[int(np.argmin(np.median(distance, axis=1)))]
 
 
 @dataclass(frozen=True)

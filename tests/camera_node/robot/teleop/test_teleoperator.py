@@ -182,7 +182,7 @@ def test_limits_hold_while_an_operator_pulls_everywhere(seed):
         assert_within_limits(config, commands)
         runs.append(np.array([c.joints for c in commands]))
     assert np.array_equal(*runs) and np.abs(runs[0] - HOME).max() > 0.05
-    assert operator.mapping.counts.engaged > 0
+    assert operator.mapping.counts["pressed"] > 0
 
 
 @pytest.mark.stability
@@ -255,7 +255,7 @@ def test_pressing_the_clutch_commands_no_motion_wherever_the_stylus_is():
     mapping.add_sample(sample(61 * MS, (0.6, 0.0, 0.0)), FLANGE)
     assert mapping.target is not None and np.allclose(mapping.target, FLANGE)
     mapping.add_sample(sample(62 * MS, (0.0, 0.0, 0.0)), FLANGE)
-    assert mapping.counts.jumps == 1 and np.allclose(mapping.target, FLANGE), "found elsewhere, it is anchored anew"
+    assert mapping.counts["jumps"] == 1 and np.allclose(mapping.target, FLANGE), "found elsewhere, it is anchored anew"
 
 
 def test_silence_lets_go_and_asks_for_a_new_press_on_any_clock():
@@ -263,7 +263,7 @@ def test_silence_lets_go_and_asks_for_a_new_press_on_any_clock():
     mapping.add_sample(sample(10**15, (0.3, 0.1, 0.2)), FLANGE)
     mapping.silence()
     mapping.silence()
-    assert mapping.counts.silences == 1 and mapping.target is None
+    assert mapping.counts["silences"] == 1 and mapping.target is None
     assert mapping.add_sample(sample(5), FLANGE), "the stylus was started anew: its clock begins again"
     assert mapping.target is None
     mapping.add_sample(sample(6, clutch=False), FLANGE)
@@ -281,9 +281,9 @@ def test_what_is_no_pose_and_what_is_old_is_counted_and_changes_nothing(change):
     before = mapping.target.copy()
     bad = {"t": 5, "p": (0.0, 0.0, 0.0), "q": (1.0, 0.0, 0.0, 0.0), **change}
     assert not mapping.add_sample(StylusSample(bad["t"], bad["p"], bad["q"], True), FLANGE)
-    assert mapping.counts.unsound == 1
+    assert mapping.counts["refused"] == 1
     assert not mapping.add_sample(sample(2), FLANGE) and not mapping.add_sample(sample(1), FLANGE)
-    assert mapping.counts.backwards == 2 and np.array_equal(mapping.target, before)
+    assert mapping.counts["refused"] == 3 and np.array_equal(mapping.target, before)
 
 
 def test_the_target_waits_at_the_wall():
