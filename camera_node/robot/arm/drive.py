@@ -21,7 +21,6 @@ import numpy as np
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, mount_on_flange, require_arm
 from camera_node.robot.arm.control import (
-    STOP_RAD_S2,
     confirm_motion,
     connect_control,
     joints_in_motion,
@@ -30,15 +29,18 @@ from camera_node.robot.arm.control import (
     stop_within_timeout,
 )
 from camera_node.robot.arm.joint_states import ArmStream
-from camera_node.robot.arm.viewpoint_tour import FARTHEST_RAD, Tour, plan_tour
+from camera_node.robot.arm.settings import (
+    ARRIVED_RAD,
+    FARTHEST_RAD,
+    MOVED_RAD,
+    POLL_S,
+    STALLED_RAD,
+    STALLED_S,
+    STOP_RAD_S2,
+)
+from camera_node.robot.arm.viewpoint_tour import Tour, plan_tour
 from camera_node.settings import PathConfig, errors_of
 from freshfield.scenario import ScenarioError, load
-
-_ARRIVED_RAD = 1e-3
-# Within this time even a slow arm turns by more than its encoder noise.
-_STALLED_S, _STALLED_RAD = 5.0, 1e-3
-_POLL_S = 0.05
-_MOVED_RAD = 0.01
 
 
 def run(args: argparse.Namespace) -> int:
@@ -68,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
             )
         if not (args.yes or config.simulated or confirm_motion(config.host, "move")):
             return 2
-        if np.abs(stream.now() - start).max() > _MOVED_RAD:
+        if np.abs(stream.now() - start).max() > MOVED_RAD:
             raise ArmError(f"arm at {config.host}: it has been moved since the tour was printed: start again")
         return _drive(stream, tour.stops, config.path, args.rounds)
     finally:
@@ -135,12 +137,12 @@ def _reason(stream: ArmStream) -> str:
 def _wait_until_arrived(stream: ArmStream, control: Any, goal: np.ndarray, stop_requested: threading.Event) -> bool:
     """Wait until the joints reach ``goal``; False if asked to stop. Raises ArmError if the arm's state is too
     old, or if it stalls or its program ends on the way."""
-    patience_s = max(_STALLED_S, stream.stale_s)
+    patience_s = max(STALLED_S, stream.stale_s)
     at, moved_s = np.full(6, np.inf), 0.0
-    while not stop_requested.wait(_POLL_S):
+    while not stop_requested.wait(POLL_S):
         joints, now_s = joints_in_motion(stream), time.monotonic()
         left_rad = float(np.abs(joints - goal).max())
-        if left_rad < _ARRIVED_RAD:
+        if left_rad < ARRIVED_RAD:
             return True
         where = f"{np.rad2deg(left_rad):.1f} degrees from its goal"
         if not (control.isProgramRunning() and control.kickWatchdog()):
@@ -148,7 +150,7 @@ def _wait_until_arrived(stream: ArmStream, control: Any, goal: np.ndarray, stop_
                 f"arm at {stream.host}: its program was ended {where}: at the pendant, by a fault, or by "
                 "leaving remote control"
             )
-        if np.abs(joints - at).max() > _STALLED_RAD:
+        if np.abs(joints - at).max() > STALLED_RAD:
             at, moved_s = joints, now_s
         elif now_s - moved_s > patience_s:
             raise ArmError(

@@ -27,20 +27,16 @@ from camera_node.pose.pairing import SampleBuffer, interpolate_joints
 from camera_node.pose.providers import PoseGapError
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.arm.rtde_process import CONNECT_S, SAMPLE
+from camera_node.robot.arm.rtde_process import SAMPLE
+from camera_node.robot.arm.settings import BACKOFF_S, CONNECT_S, PROBE_S, STALE_S
 from freshfield.clock import Clock
 from freshfield.geometry import Array, Pose
 
 log = logging.getLogger("camera-node.arm")
 
 RTDE_PORT = 30004
-PROBE_S = 2.0
-"""Time for a controller to answer ``probe``."""
-STALE_S = 0.5
-"""Default age at which a state counts as stale."""
 READER = (sys.executable, "-m", "camera_node.robot.arm.rtde_process")
 """The process that reads joint states; host and frequency follow."""
-BACKOFF_S = (0.25, 0.5, 1.0, 2.0, 5.0)
 _ROBOT_MODES = (
     "no controller, disconnected, confirm safety, booting, powered off, powered on: brakes engaged, "
     "idle: brakes engaged, backdrive, running"

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node.robot.arm import ArmError
+from camera_node.robot.arm.settings import SINGULAR_DEG, SINGULAR_M
 from freshfield.geometry import Array, se3_inverse, so3_log
 from freshfield.untrusted import read_text
 
@@ -36,8 +37,6 @@ _REACH_TOLERANCE = 1e-9
 _NEWTON_STEPS = 6  # from a posture of the nominal arm, millimeters away; each doubles the number of right digits
 _REACHED_M = 1e-7
 _REACHED_RAD = 1e-7
-_SINGULAR_SIN = math.sin(math.radians(5.0))
-_SINGULAR_M = 0.02
 
 
 @dataclass(frozen=True)
@@ -98,7 +97,7 @@ class ArmModel:
         _, q2, q3, q4, q5, _ = np.moveaxis(_check_joints(joints), -1, 0)
         reach_m = base.a_m[1] * np.cos(q2) + base.a_m[2] * np.cos(q2 + q3) + base.d_m[4] * np.sin(q2 + q3 + q4)
         bent = np.minimum(np.abs(np.sin(q3)), np.abs(np.sin(q5)))
-        return np.asarray((np.abs(reach_m) < _SINGULAR_M) | (bent < _SINGULAR_SIN))
+        return np.asarray((np.abs(reach_m) < SINGULAR_M) | (bent < math.sin(math.radians(SINGULAR_DEG))))
 
     def inverse(self, target: ArrayLike) -> list[Array]:
         """All postures (6,), at most eight, that bring the flange to a target, base-from-flange (4, 4): angles in

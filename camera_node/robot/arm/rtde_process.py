@@ -16,10 +16,11 @@ import struct
 import sys
 import time
 
+from camera_node.robot.arm.settings import CONNECT_S
+
 SAMPLE = struct.Struct("<d6d2i")
 """Controller's time in seconds, six joint angles in radians, robot mode, safety mode."""
 VARIABLES = ["timestamp", "actual_q", "robot_mode", "safety_mode"]
-CONNECT_S = 2.5
 _LIBRARY_MISSING = 3
 _LONGEST_MESSAGE = 1000  # characters: a pipe holds more
 

@@ -18,14 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.robot.arm.settings import CHECKED_POSTURES, FARTHEST_RAD, MARGIN_M, TOOL_M, TOOL_RADIUS_M
 from camera_node.settings import PathConfig
 from freshfield.geometry import Array, on_sphere, se3, se3_inverse, so3_exp
-
-FARTHEST_RAD = 2.0
-"""Largest turn of a joint in one move."""
-_CHECKED_POSTURES = 24  # tested along a path
-_TOOL_M, _TOOL_RADIUS_M = 0.08, 0.04  # as in TeleopConfig: the camera and its mount
-_MARGIN_M = 0.01  # between parts of the arm, whose capsules are rounded up
 
 
 def viewpoints(path: PathConfig) -> list[Array]:
@@ -110,12 +105,12 @@ def is_free(arm: ArmModel, base: Array, a: Array, b: Array, floor_m: float) -> N
     floor_m: height of the floor in the world.
     """
     a, b = np.broadcast_arrays(np.atleast_2d(a), np.atleast_2d(b))
-    share = np.linspace(0.0, 1.0, _CHECKED_POSTURES)[:, None, None]
+    share = np.linspace(0.0, 1.0, CHECKED_POSTURES)[:, None, None]
     frames = arm.nominal_model.link_frames((a + share * (b - a)).reshape(-1, 6))
     lowest_m = (base @ frames)[:, 2:, 2, 3].min(axis=1)
-    apart_m = CapsuleModel(arm, _TOOL_M, _TOOL_RADIUS_M).clearance(frames)[0].min(axis=1)
-    free = (lowest_m >= floor_m) & (apart_m >= _MARGIN_M)
-    return np.asarray(free.reshape(_CHECKED_POSTURES, -1).all(axis=0))
+    apart_m = CapsuleModel(arm, TOOL_M, TOOL_RADIUS_M).clearance(frames)[0].min(axis=1)
+    free = (lowest_m >= floor_m) & (apart_m >= MARGIN_M)
+    return np.asarray(free.reshape(CHECKED_POSTURES, -1).all(axis=0))
 
 
 def _free_postures(

@@ -16,7 +16,7 @@ from camera_node.robot.arm.control import confirm_motion, open_stream, stop_even
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.simulated_controller.controller import HOME_RAD
-from camera_node.robot.teleop.settings import TeleopConfig
+from camera_node.robot.teleop.settings import LONGEST_STOP_S, SHOW_S, TeleopConfig
 from camera_node.robot.teleop.sinks import ServoSink, Sink, TrajectoryFile
 from camera_node.robot.teleop.stylus import Stylus, open_stylus
 from camera_node.robot.teleop.teleoperator import Teleoperator
@@ -24,10 +24,6 @@ from camera_node.settings import ArmConfig
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario, load
 from freshfield.settings import read_settings
-
-_SHOW_S = 0.5
-# Within the limits of a TeleopConfig no stop takes longer.
-_LONGEST_STOP_S = 3.0
 
 
 def run(args: argparse.Namespace) -> int:
@@ -95,7 +91,7 @@ def _run_loop(operator: Teleoperator, stylus: Stylus, sink: Sink, seconds: float
             now_s = time.monotonic()
             if seconds is not None and now_s - started_s >= seconds:
                 break
-            if now_s - shown_s >= _SHOW_S and sys.stderr.isatty():
+            if now_s - shown_s >= SHOW_S and sys.stderr.isatty():
                 shown_s = now_s
                 print(f"\r{_status_line(operator)}\x1b[K", end="", file=sys.stderr, flush=True)
             next_s += period_s
@@ -116,7 +112,7 @@ def _run_loop(operator: Teleoperator, stylus: Stylus, sink: Sink, seconds: float
 
 
 def _come_to_rest(operator: Teleoperator, sink: Sink, period_s: float) -> None:
-    for _ in range(round(_LONGEST_STOP_S / period_s)):
+    for _ in range(round(LONGEST_STOP_S / period_s)):
         begun_s = time.monotonic()
         command, at_rest = operator.stop()
         sink.send(operator.ticks * period_s, command)

@@ -9,6 +9,7 @@ import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, angle_deg, distance_mm, medoid
+from camera_node.robot.calibration.settings import MAX_CLOSED_FORM
 from freshfield.geometry import se3
 
 METHODS = {
@@ -18,8 +19,6 @@ METHODS = {
     "andreff": cv2.CALIB_HAND_EYE_ANDREFF,
     "daniilidis": cv2.CALIB_HAND_EYE_DANIILIDIS,
 }
-# OpenCV pairs every sample with every other: more samples take seconds and gain nothing.
-MAX_CLOSED_FORM = 60
 
 
 @dataclass(frozen=True)
