@@ -19,7 +19,7 @@ from camera_node.robot.calibration.hand_eye.samples import (
     Samples,
     angle_deg,
     distance_mm,
-    require_diversity,
+    diversity,
     rotation_vectors,
 )
 from camera_node.robot.calibration.settings import (
@@ -131,7 +131,9 @@ def calibrate(
     fit_size: take the target's size from the arm's motion, where that shows another one than was said.
     Raises CalibrationError if the samples do not determine X.
     """
-    spread = require_diversity(samples)
+    spread = diversity(samples)
+    if spread.reason is not None:
+        raise CalibrationError(spread.reason)
     for what, poses in (("targets", samples.target), ("flanges", samples.flange)):
         if np.median(np.linalg.norm(poses[:, :3, 3], axis=1)) > MILLIMETERS_M:
             raise CalibrationError(f"{what} seem to be in millimeters: targets and flanges must be in meters")
