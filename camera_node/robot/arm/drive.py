@@ -13,7 +13,6 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -86,56 +85,41 @@ def _print_tour(tour: Tour, start: np.ndarray, first_rad: float) -> None:
 
 
 def _drive(stream: ArmStream, stops: list[np.ndarray], path: PathConfig, rounds: int) -> int:
+    """Move the arm to each of ``stops`` (joint angles (6,), radians) in turn, there and back, then bring it to rest,
+    also after an error. Returns 0; ends the process after an error."""
     control = connect_control(stream.host)
     stop_requested = stop_event()
-    # There and back, so that each round begins where the last one ended.
-    each = itertools.count() if rounds == 0 else range(rounds)
-    there_and_back = (joints for k in each for joints in (stops if k % 2 == 0 else stops[::-1]))
-    try:
-        visit_stops(control, stream, there_and_back, path, stop_requested)
-    except ArmError as error:
-        print(f"camera-node: {error}", file=sys.stderr, flush=True)
-        os._exit(1)  # the library's destructor would wait for an arm that may be gone
-    return 0
-
-
-def visit_stops(
-    control: Any, stream: ArmStream, stops: Iterable[np.ndarray], path: PathConfig, stop_requested: threading.Event
-) -> None:
-    """Move the arm to each of ``stops`` in turn, then bring it to rest, also after an error.
-
-    control: from ``connect_control``.
-    stream: joint states of the same arm.
-    stops: joint angles (6,), radians.
-    path: gives speed and acceleration.
-    stop_requested: set by another thread to end the drive.
-    Raises ArmError.
-    """
 
     def stop() -> None:
         control.stopJ(STOP_RAD_S2)
         control.stopScript()
 
     try:
-        if not control.setWatchdog(1.0 / stream.stale_s):
-            raise ArmError(f"arm at {stream.host}: it takes no watchdog: {_reason(stream)}")
-        for joints in stops:
-            if stop_requested.is_set():
-                return
-            if not control.moveJ(joints.tolist(), path.speed_rad_s, path.acceleration_rad_s2, True):
-                raise ArmError(f"arm at {stream.host}: it refuses to move: {_reason(stream)}")
-            if not _wait_until_arrived(stream, control, joints, stop_requested):
-                return
-    finally:
-        stop_within_timeout(stop)
+        try:
+            if not control.setWatchdog(1.0 / stream.stale_s):
+                raise ArmError(f"arm at {stream.host}: it takes no watchdog: {_reason(stream)}")
+            # There and back, so that each round begins where the last one ended.
+            for k in itertools.count() if rounds == 0 else range(rounds):
+                for joints in stops if k % 2 == 0 else stops[::-1]:
+                    if stop_requested.is_set():
+                        return 0
+                    if not control.moveJ(joints.tolist(), path.speed_rad_s, path.acceleration_rad_s2, True):
+                        raise ArmError(f"arm at {stream.host}: it refuses to move: {_reason(stream)}")
+                    _wait_until_arrived(stream, control, joints, stop_requested)
+        finally:
+            stop_within_timeout(stop)
+    except ArmError as error:
+        print(f"camera-node: {error}", file=sys.stderr, flush=True)
+        os._exit(1)  # the library's destructor would wait for an arm that may be gone
+    return 0
 
 
 def _reason(stream: ArmStream) -> str:
     return stream.trouble or "see the pendant"
 
 
-def _wait_until_arrived(stream: ArmStream, control: Any, goal: np.ndarray, stop_requested: threading.Event) -> bool:
-    """Wait until the joints reach ``goal``; False if asked to stop. Raises ArmError if the arm's state is too
+def _wait_until_arrived(stream: ArmStream, control: Any, goal: np.ndarray, stop_requested: threading.Event) -> None:
+    """Wait until the joints reach ``goal``, or until asked to stop. Raises ArmError if the arm's state is too
     old, or if it stalls or its program ends on the way."""
     patience_s = max(STALLED_S, stream.stale_s)
     at, moved_s = np.full(6, np.inf), 0.0
@@ -143,7 +127,7 @@ def _wait_until_arrived(stream: ArmStream, control: Any, goal: np.ndarray, stop_
         joints, now_s = joints_in_motion(stream), time.monotonic()
         left_rad = float(np.abs(joints - goal).max())
         if left_rad < ARRIVED_RAD:
-            return True
+            return
         where = f"{np.rad2deg(left_rad):.1f} degrees from its goal"
         if not (control.isProgramRunning() and control.kickWatchdog()):
             raise ArmError(
@@ -156,4 +140,3 @@ def _wait_until_arrived(stream: ArmStream, control: Any, goal: np.ndarray, stop_
             raise ArmError(
                 f"arm at {stream.host}: it stands still, {where}: is it paused, or the speed slider at zero?"
             )
-    return False
