@@ -17,7 +17,6 @@ import configparser
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -137,26 +136,19 @@ def apply_calibration(model: ArmModel, file: Path) -> ArmModel:
         parser.read_string(read_text(file))
     except (OSError, UnicodeDecodeError, configparser.Error) as error:
         raise ArmError(f"{file}: cannot be read: {' '.join(str(error).split())}") from None
-    deltas: dict[str, Six] = {}
+    changed: dict[str, Six] = {}
     for section in parser.sections():
-        for key in ("theta", "a", "d", "alpha"):
+        for key, name in (("theta", "theta_rad"), ("a", "a_m"), ("d", "d_m"), ("alpha", "alpha_rad")):
             if f"delta_{key}" in parser[section]:
-                where = f"{file}: [{section}] delta_{key}"
-                deltas[key] = _parse_six(parser[section][f"delta_{key}"], where)
-    if not deltas:
+                deltas = _parse_six(parser[section][f"delta_{key}"], f"{file}: [{section}] delta_{key}")
+                changed[name] = tuple(v + x for v, x in zip(getattr(model, name), deltas))  # type: ignore[assignment]
+    if not changed:
         raise ArmError(f"{file}: has no delta_theta, delta_a, delta_d or delta_alpha")
-
-    def add_deltas(values: Sequence[float], key: str) -> Six:
-        return tuple(v + x for v, x in zip(values, deltas.get(key, _ZEROS)))  # type: ignore[return-value]
-
     return dataclasses.replace(
         model,
         name=f"{model.name} ({file.name})",
-        d_m=add_deltas(model.d_m, "d"),
-        a_m=add_deltas(model.a_m, "a"),
-        alpha_rad=add_deltas(model.alpha_rad, "alpha"),
-        theta_rad=add_deltas(model.theta_rad, "theta"),
         nominal=model.nominal or model,
+        **changed,  # type: ignore[arg-type]
     )
 
 

@@ -45,24 +45,16 @@ def read_lens(file: Path) -> Pinhole:
             raise CalibrationError(f"{file}: has {len(cameras)} cameras, expected one")
         return next(iter(cameras.values())).intrinsics
     try:
-        camera = ElementTree.parse(file).getroot().find(".//camera")
+        camera = ElementTree.parse(file).find(".//camera")
         if camera is None:
             raise ValueError("no camera")
-        models = {(m.findtext("type") or "").strip(): m for m in camera.iter("model")}
-        name = next(n for n in ("perspectiveProjWithDistortion", "perspectiveProjWithoutDistortion") if n in models)
-
-        def number(key: str, default: str | None = None) -> float:
-            return float(models[name].findtext(key) or default or "missing")
-
-        return Pinhole(
-            int(camera.findtext("image_width") or 0),
-            int(camera.findtext("image_height") or 0),
-            number("px"),
-            number("py"),
-            number("u0") + 0.5,
-            number("v0") + 0.5,
-            (number("kud", "0"), 0.0, 0.0, 0.0),
-        )
+        kinds = ("perspectiveProjWithDistortion", "perspectiveProjWithoutDistortion")
+        model = next(each for kind in kinds for each in camera.iterfind(f"model[type='{kind}']"))
+        numbers = {key: float(model.findtext(key, "missing")) for key in ("px", "py", "u0", "v0")}
+        width, height = (int(camera.findtext(key, "0")) for key in ("image_width", "image_height"))
+        center = numbers["u0"] + 0.5, numbers["v0"] + 0.5
+        distortion = float(model.findtext("kud", "0")), 0.0, 0.0, 0.0
+        return Pinhole(width, height, numbers["px"], numbers["py"], *center, distortion)
     except (OSError, ElementTree.ParseError, StopIteration, ValueError) as error:
         raise CalibrationError(
             f"{file}: expected ViSP's camera XML with px, py, u0, v0: {error or 'no model known'}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
 import time
@@ -36,11 +37,11 @@ def run(args: argparse.Namespace) -> int:
     if args.seconds is not None and not args.seconds > 0:
         raise ArmError("--seconds: expected a positive number")
     stream: ArmStream | None = None
-    stylus: Stylus | None = None
-    try:
-        joints = np.array(HOME_RAD)
+    joints = np.array(HOME_RAD)
+    with contextlib.ExitStack() as at_the_end:
         if args.dry_run is None:
             stream = open_stream(arm_config, arm_config.frequency_hz)
+            at_the_end.callback(stream.stop)
             stream.start()
             joints = stream.now()
         operator = Teleoperator(model, config, joints)
@@ -49,13 +50,8 @@ def run(args: argparse.Namespace) -> int:
             return 2
         # After the question, because a keyboard stylus switches the terminal's line mode off.
         stylus = open_stylus(args.stylus)
-        sink = _sink(args.dry_run, stream, model, config)
-        status = _run_loop(operator, stylus, sink, args.seconds)
-    finally:
-        if stylus is not None:
-            stylus.close()
-        if stream is not None:
-            stream.stop()
+        at_the_end.callback(stylus.close)
+        status = _run_loop(operator, stylus, _sink(args.dry_run, stream, model, config), args.seconds)
     if status and stream is not None:
         sys.stdout.flush()
         os._exit(status)  # the library's destructor would wait for an arm that may be gone
