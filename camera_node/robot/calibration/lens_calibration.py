@@ -102,8 +102,8 @@ def calibrate_lens(views: Mapping[str, Corners], size: tuple[int, int], unused: 
         )
     counts = [len(c.points) for c in usable.values()]
     error_px = float(np.sqrt(np.average(np.square(errors), weights=counts)))
-    seen = np.concatenate([c.pixels for c in usable.values()])
-    covered = float(np.mean(np.histogram2d(*seen.T, bins=6, range=[(0, side) for side in size])[0] > 0))
+    cells = [np.clip(c.pixels / size * 6, 0, 5).astype(int) for c in usable.values()]
+    covered = len(np.unique(np.concatenate(cells), axis=0)) / 36
     found = dict(zip(usable, errors.tolist()))
     return LensCalibration(lens, std, error_px, found, tilt_deg, covered, unused)
 

@@ -181,7 +181,7 @@ def test_videos_give_the_moments_at_which_the_target_stood_still(tmp_path):
                 board[:3, 3] += [0.0, 0.3 * part, 0.0]
             video.write(cv2.cvtColor(taken_of(name, board, 2.0, k), cv2.COLOR_GRAY2BGR))
         video.release()
-    views = rig_inputs.read_folder(tmp_path, TARGET, lambda done: None)
+    views = rig_inputs.read_folder(tmp_path, TARGET)
     assert views.sizes == {"cam1": (640, 480), "cam2": (640, 480)}
     assert all(seen and set(seen) <= {"0.0s", "1.0s"} for seen in views.corners.values())
     assert set(views.corners["cam1"]) & set(views.corners["cam2"])
@@ -261,7 +261,7 @@ LENS = Pinhole(400, 300, 330.0, 332.0, 203.0, 148.0, (-0.05, 0.02, 0.001, -0.001
 
 
 def found_in(folder, spec):
-    return find_corners(list_images(folder), parse_target(spec), None, lambda done: None)
+    return find_corners(list_images(folder), parse_target(spec))
 
 
 @pytest.mark.parametrize(("spec", "origin_m"), [("charuco:7x5:24mm:18mm", 0.0), ("chessboard:7x4:20mm", 2 * 0.02)])
