@@ -8,7 +8,7 @@ import logging
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from camera_node.robot import arm_cli
 from camera_node.robot.calibration import CalibrationError, calibrate_command
@@ -50,14 +50,7 @@ def main(arguments: list[str] | None = None, prog: str = "camera-node") -> int:
         description="Streams timestamped, posed frames of one or several cameras to the next hop.",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_run(
-        commands.add_parser(
-            "run",
-            help="stream cameras of a scenario",
-            epilog=EXAMPLES,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-    )
+    _add_run(commands)
     calibrate_command.add_arguments(commands.add_parser("calibrate", help="hand-eye and intrinsic calibration"))
     devices = commands.add_parser(
         "devices",
@@ -67,14 +60,7 @@ def main(arguments: list[str] | None = None, prog: str = "camera-node") -> int:
     )
     devices.set_defaults(run=_devices)
     arm_cli.add_commands(commands)
-    _add_doctor(
-        commands.add_parser(
-            "doctor",
-            help="check this machine's part of a setup: what is wrong, and how to fix it",
-            description="Checks one by one the packages, cameras, arm, clock, network, disk and files "
-            "that a scenario needs on this machine. Moves nothing. Exit code 1 if something is wrong.",
-        )
-    )
+    _add_doctor(commands)
     args = parser.parse_args(arguments)
     try:
         return int(args.run(args))
@@ -83,51 +69,48 @@ def main(arguments: list[str] | None = None, prog: str = "camera-node") -> int:
         return 2
 
 
-def _add_run(run: argparse.ArgumentParser) -> None:
+def _add_run(commands: Any) -> None:
+    raw = argparse.RawDescriptionHelpFormatter
+    run = commands.add_parser("run", help="stream cameras of a scenario", epilog=EXAMPLES, formatter_class=raw)
     run.set_defaults(run=_run)
     run.add_argument("scenario", help="scenario file, or the name of a shipped one")
-    who = run.add_mutually_exclusive_group(required=True)
-    who.add_argument("--camera", metavar="ID[,ID]", help="cameras of the scenario to stream")
-    who.add_argument(
-        "--camera-index", type=int, metavar="N", help="the camera of this number in the scenario, from 0 (of a pod)"
+    add = run.add_mutually_exclusive_group(required=True).add_argument
+    add("--camera", metavar="ID[,ID]", help="cameras of the scenario to stream")
+    add("--camera-index", type=int, metavar="N", help="the camera of this number in the scenario, from 0 (of a pod)")
+    add("--all", action="store_true", help="all cameras of the scenario")
+    names = (
+        "in place of a scenario, play a recording or data set: as camera ID, which in the recording is NAME "
+        "[the only one]; none is held out: that takes a scenario with cameras.held_out (docs/data.md)"
     )
-    who.add_argument("--all", action="store_true", help="all cameras of the scenario")
-    who.add_argument(
-        "--as",
-        dest="names",
-        metavar="ID[=NAME][,...]",
-        help="in place of a scenario, play a recording or data set: as camera ID, which in the recording is NAME "
-        "[the only one]; none is held out: that takes a scenario with cameras.held_out (docs/data.md)",
-    )
-    run.add_argument("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
-    run.add_argument("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
-    run.add_argument("--to", required=True, metavar="HOST:PORT", help="address of the channel emulator or edge server")
-    run.add_argument(
-        "--out", type=out_folder, metavar="DIR", help="folder to write the ledger and status file to [not written]"
-    )
-    run.add_argument("--seconds", type=float, metavar="S", help="end after S seconds of capture [on Ctrl-C]")
-    run.add_argument("-q", "--quiet", action="store_true", help="print only warnings")
+    add("--as", dest="names", metavar="ID[=NAME][,...]", help=names)
+    add = run.add_argument
+    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    add("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
+    add("--to", required=True, metavar="HOST:PORT", help="address of the channel emulator or edge server")
+    add("--out", type=out_folder, metavar="DIR", help="folder to write the ledger and status file to [not written]")
+    add("--seconds", type=float, metavar="S", help="end after S seconds of capture [on Ctrl-C]")
+    add("-q", "--quiet", action="store_true", help="print only warnings")
     transport.add_arguments(run, listens=False)
 
 
-def _add_doctor(doctor: argparse.ArgumentParser) -> None:
+def _add_doctor(commands: Any) -> None:
+    doctor = commands.add_parser(
+        "doctor",
+        help="check this machine's part of a setup: what is wrong, and how to fix it",
+        description="Checks one by one the packages, cameras, arm, clock, network, disk and files "
+        "that a scenario needs on this machine. Moves nothing. Exit code 1 if something is wrong.",
+    )
     doctor.set_defaults(run=_doctor)
-    doctor.add_argument(
-        "scenario", nargs="?", help="scenario file, or the name of a shipped one [check what every scenario needs]"
-    )
-    doctor.add_argument("--to", metavar="HOST:PORT", help="address of the channel emulator or edge server")
-    doctor.add_argument("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
-    doctor.add_argument(
-        "--out",
-        type=Path,
-        default=Path("runs"),
-        metavar="DIR",
-        help="folder that runs will be written to [%(default)s]",
-    )
-    doctor.add_argument(
-        "--plan", type=Path, metavar="FILE.svg", help="draw what fixed cameras see, and where one more helps most"
-    )
-    doctor.add_argument("--json", action="store_true", help="print the result as one JSON object")
+    add = doctor.add_argument
+    scenario = "scenario file, or the name of a shipped one [check what every scenario needs]"
+    add("scenario", nargs="?", help=scenario)
+    add("--to", metavar="HOST:PORT", help="address of the channel emulator or edge server")
+    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    runs = "folder that runs will be written to [%(default)s]"
+    add("--out", type=Path, default=Path("runs"), metavar="DIR", help=runs)
+    plan = "draw what fixed cameras see, and where one more helps most"
+    add("--plan", type=Path, metavar="FILE.svg", help=plan)
+    add("--json", action="store_true", help="print the result as one JSON object")
     transport.add_arguments(doctor, listens=False)
 
 

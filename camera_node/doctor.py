@@ -22,6 +22,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 from camera_node.pose.providers import Closable, PoseGapError
 from camera_node.settings import (
@@ -91,16 +92,16 @@ def run(args: argparse.Namespace) -> int:
 def _checks(args: argparse.Namespace, security: transport.Transport) -> Iterator[CheckResult]:
     yield _check("python", _python)
     yield _check("clock", _clock)
-    yield _check("disk", lambda: _disk(args.out))
+    yield _check("disk", _disk, args.out)
     if args.to is None:
         yield CheckResult("network", None, "not examined: give --to HOST:PORT of the emulator or the edge")
     else:
-        yield _check("network", lambda: _network(args.to, security))
+        yield _check("network", _network, args.to, security)
     if args.scenario is None:
         yield CheckResult("scenario", None, "none given: cameras, arm and files are not examined")
         return
     opened: list[tuple[Scenario, SourceConfig]] = []
-    yield _check("scenario", lambda: _scenario(args.scenario, opened))
+    yield _check("scenario", _scenario, args.scenario, opened)
     for scenario, config in opened:
         with _notes_said_once(config):
             yield from _source(scenario, config, args.data, args.plan)
@@ -129,28 +130,28 @@ def _source(scenario: Scenario, config: SourceConfig, data: Path | None, plan: P
     extras = [config.kind] if config.kind in _PACKAGES else []
     arm: ArmConfig | None = getattr(config, "arm", None)
     for extra in [*extras, *(["ur"] if arm is not None else [])]:
-        yield _check(f"package {extra}", lambda extra=extra: _package(extra))  # type: ignore[misc]
+        yield _check(f"package {extra}", _package, extra)
     if isinstance(config, RecordedConfig):
-        opened = _check("data", lambda: _data(scenario, config, data))
+        opened = _check("data", _data, scenario, config, data)
         yield opened
         if not opened.ok:
             yield CheckResult("poses and coverage", None, "not examined: they need the data")
             return
-        yield _check("poses", lambda: _poses(scenario, config, data))
+        yield _check("poses", _poses, scenario, config, data)
     if isinstance(config, LiveConfig):
         if config.calibration is not None:
-            yield _check("calibration", lambda: _calibration(scenario, config))
+            yield _check("calibration", _calibration, scenario, config)
         for camera in scenario.cameras:
-            yield _check(f"camera {camera}", lambda camera=camera: _camera(scenario, camera, config))  # type: ignore[misc]
+            yield _check(f"camera {camera}", _camera, scenario, camera, config)
         if (tracker := config.trajectory) is not None:
-            yield _check("tracker", lambda: _tracker(scenario, tracker))
+            yield _check("tracker", _tracker, scenario, tracker)
     if arm is not None:
         from camera_node.robot.arm import checks
 
-        yield _check("hand-eye", lambda: checks.hand_eye(scenario, arm))
-        yield _check("arm", lambda: checks.joint_states(arm))
+        yield _check("hand-eye", checks.hand_eye, scenario, arm)
+        yield _check("arm", checks.joint_states, arm)
         if (path := arm.path) is not None:
-            yield _check("arm's path", lambda: checks.path(scenario, arm, path))
+            yield _check("arm's path", checks.path, scenario, arm, path)
     if config.depth_every and arm is None and not isinstance(config, LiveConfig | McapConfig):
         yield from _depth(scenario, config, data)
     if config.kind == "mcap":
@@ -159,7 +160,7 @@ def _source(scenario: Scenario, config: SourceConfig, data: Path | None, plan: P
     else:
         from camera_node import coverage_check
 
-        yield _check("coverage", lambda: coverage_check.check(scenario, config, data, plan))
+        yield _check("coverage", coverage_check.check, scenario, config, data, plan)
 
 
 def _depth(scenario: Scenario, config: SourceConfig, data: Path | None) -> Iterator[CheckResult]:
@@ -173,12 +174,12 @@ def _depth(scenario: Scenario, config: SourceConfig, data: Path | None) -> Itera
         return
     for view in views:
         others = [other for other in views if other is not view]
-        yield _check(f"depth {view.camera}", lambda view=view, others=others: depth_check.check(view, others))  # type: ignore[misc]
+        yield _check(f"depth {view.camera}", depth_check.check, view, others)
 
 
-def _check(part: str, check: Callable[[], str]) -> CheckResult:
+def _check(part: str, check: Callable[..., str], *arguments: Any) -> CheckResult:
     try:
-        return CheckResult(part, True, check())
+        return CheckResult(part, True, check(*arguments))
     except (ValueError, OSError) as error:
         return CheckResult(part, False, " ".join(str(error).split()).removeprefix(f"{part.split()[-1]}: "))
     except Exception as error:  # device libraries raise anything; the other parts must still be checked

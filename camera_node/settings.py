@@ -381,21 +381,12 @@ def find_data(name: str, scenario: Scenario, base: Path | None, key: str = "data
     if (near := beside(scenario, name)).exists():
         return near
     if not path.is_absolute():
-        folder = base or (Path(os.environ["FRESHFIELD_DATA"]) if os.environ.get("FRESHFIELD_DATA") else None)
-        if (
-            scenario.source.get("kind") == "video"
-            and path.suffix == ".json"
-            and not (folder and (folder / path).exists())
-        ):
-            raise ScenarioError(
-                f"{where}: {name}: neither beside {scenario.path.name} nor in the data folder (--data DIR or "
-                "FRESHFIELD_DATA); camera-node calibrate rig writes it"
-            )
-        if folder is None:
-            raise ScenarioError(
-                f"{where}: {name!r} is looked for in the data folder: give --data DIR or set FRESHFIELD_DATA"
-            )
-        path = folder / path
+        given = base or os.environ.get("FRESHFIELD_DATA")
+        if given is None or not (Path(given) / path).exists():
+            rig = "; camera-node calibrate rig writes it" if path.suffix == ".json" else ""
+            folder = f"the data folder ({given or 'none given'}: --data DIR or FRESHFIELD_DATA)"
+            raise ScenarioError(f"{where}: {name}: neither beside {scenario.path.name} nor in {folder}{rig}")
+        path = Path(given) / path
     if not path.exists():
-        raise ScenarioError(f"{where}: {path} does not exist; --data or FRESHFIELD_DATA names the folder above")
+        raise ScenarioError(f"{where}: {path} does not exist")
     return path

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import bisect
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from freshfield.geometry import Array
@@ -36,7 +36,6 @@ class SampleBuffer(Generic[T]):
     restart_after: number of consecutive samples, ascending but too old, after which they replace the buffer:
         the sender's clock was set back, or a wrong stamp had emptied the buffer.
     received: number of samples that came.
-    Raises ValueError for a value out of range.
     """
 
     def __init__(
@@ -46,8 +45,6 @@ class SampleBuffer(Generic[T]):
         keep_ns: int = 2_000_000_000,
         restart_after: int = 8,
     ) -> None:
-        if max_gap_ns < 0 or keep_ns <= 0 or restart_after < 1:
-            raise ValueError("max_gap_ns cannot be negative, keep_ns and restart_after must be positive")
         self.received = 0
         self._interpolate = interpolate
         self._max_gap_ns, self._keep_ns, self._restart_after = max_gap_ns, keep_ns, restart_after
@@ -72,9 +69,23 @@ class SampleBuffer(Generic[T]):
             return True
 
     def at(self, t_ns: int) -> tuple[T, int]:
-        """The sample for an instant, and the time (ns) to the nearest sample; see ``sample_at``."""
+        """The sample for an instant, and the time (ns) to the nearest sample. Raises PoseGapError if none is within
+        ``max_gap_ns``."""
         with self._lock:
-            return sample_at(self._times, self._samples, t_ns, self._max_gap_ns, self._interpolate)
+            times, samples = self._times, self._samples
+            if not times:
+                raise PoseGapError("there is no pose yet")
+            after = min(bisect.bisect_left(times, t_ns), len(times) - 1)
+            before = max(0, after - 1)
+            nearest = min(before, after, key=lambda k: abs(times[k] - t_ns))
+            gap = abs(times[nearest] - t_ns)
+            if gap > self._max_gap_ns:
+                limit_ms = self._max_gap_ns / 1e6
+                raise PoseGapError(f"the nearest pose is {gap / 1e6:.1f} ms away, more than {limit_ms:g} ms")
+            if self._interpolate is None or gap == 0 or not times[before] < t_ns < times[after]:
+                return samples[nearest], gap
+            fraction = (t_ns - times[before]) / (times[after] - times[before])
+            return self._interpolate(samples[before], samples[after], fraction), gap
 
     def ready(self, t_ns: int) -> bool:
         """Whether a sample at or after the instant has come; before that, ``at`` cannot interpolate."""
@@ -97,35 +108,3 @@ class SampleBuffer(Generic[T]):
         if self._times[0] < self._times[-1] - self._keep_ns * 9 // 8:
             first = bisect.bisect_left(self._times, self._times[-1] - self._keep_ns)
             del self._times[:first], self._samples[:first]
-
-
-def sample_at(
-    times_ns: Sequence[int],
-    samples: Sequence[T],
-    t_ns: int,
-    max_gap_ns: int,
-    interpolate: Callable[[T, T, float], T] | None,
-) -> tuple[T, int]:
-    """The sample for an instant, and the time (ns) from that instant to the nearest sample.
-
-    times_ns: of the samples, increasing.
-    t_ns: the instant.
-    interpolate: makes a sample at a fraction of the way from a first to a second; None takes the nearest.
-    Raises PoseGapError if no sample is within ``max_gap_ns``.
-    """
-    if not times_ns:
-        raise PoseGapError("there is no pose yet")
-    after = bisect.bisect_left(times_ns, t_ns)
-    before = after - 1
-    last = after == len(times_ns)
-    if last or (before >= 0 and t_ns - times_ns[before] <= times_ns[after] - t_ns):
-        nearest = before
-    else:
-        nearest = after
-    gap = abs(times_ns[nearest] - t_ns)
-    if gap > max_gap_ns:
-        raise PoseGapError(f"the nearest pose is {gap / 1e6:.1f} ms away, more than {max_gap_ns / 1e6:g} ms")
-    if interpolate is None or gap == 0 or before < 0 or last:
-        return samples[nearest], gap
-    fraction = (t_ns - times_ns[before]) / (times_ns[after] - times_ns[before])
-    return interpolate(samples[before], samples[after], fraction), gap

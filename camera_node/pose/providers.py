@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -100,13 +101,5 @@ def read_sample(line: str, where: str) -> tuple[int, Pose] | None:
         raise DatasetError(f"{where}: expected t tx ty tz qx qy qz qw") from None
     if abs(t) > MAX_STAMP_S:
         raise DatasetError(f"{where}: the time {t:g} cannot be in seconds: is it in milliseconds or nanoseconds?")
-    return _nanoseconds(fields[0]), Pose(tuple(map(float, q)), (x, y, z))  # type: ignore[arg-type]
-
-
-def _nanoseconds(seconds: str) -> int:
     # Stamps in UTC seconds have more digits than a float holds: 1305031102.175304 is off by 100 ns.
-    whole, _, part = seconds.partition(".")
-    if part.isdigit() and whole.lstrip("-").isdigit():
-        value = int(whole.lstrip("-")) * 10**9 + int(part[:9].ljust(9, "0"))
-        return -value if whole.startswith("-") else value
-    return round(float(seconds) * 1e9)
+    return int(Decimal(fields[0]) * 10**9), Pose(tuple(map(float, q)), (x, y, z))  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ import yaml
 
 from camera_node import coverage_check, doctor, pose_check
 from camera_node.cli import main
-from camera_node.depth_check import DepthView, check, edge_contrast, first_views
+from camera_node.depth_check import DepthView, check, first_views
 from camera_node.settings import source_config
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.depth import DepthRenderer
@@ -215,15 +215,6 @@ def test_cameras_that_see_nothing_in_common_and_blank_images_are_described():
     away = replace(rig()[1], pose=Pose((1.0, 0.0, 0.0, 0.0), (500.0, 0.0, 0.0)))
     line = check(replace(rig()[0], image=np.zeros_like(rig()[0].image)), [away])
     assert line.startswith("128 x 128, ") and "agrees" not in line and "edges" not in line
-
-
-@pytest.mark.parametrize(("count", "is_said"), [(199, False), (200, True)])
-def test_edges_of_fewer_than_200_pixels_say_nothing(count, is_said):
-    halves, lens = np.indices((count, 64))[1] // 32, Pinhole.from_fov(64, count, 60.0)
-    image = np.repeat(200 * halves[..., None], 3, axis=-1).astype(np.uint8)
-    depth = DepthImage((1000 + 1000 * halves).astype(np.uint16), 0.001)
-    found = edge_contrast(DepthView("cam01", image, lens, Pose.from_matrix(np.eye(4)), depth))
-    assert (found is not None) == is_said
 
 
 @pytest.mark.parametrize(("name", "cameras"), [("duo", ["cam01", "cam02"]), ("room", [])])

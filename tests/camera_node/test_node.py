@@ -297,12 +297,12 @@ def test_data_is_found_below_the_folder_that_was_given(tmp_path, monkeypatch):
     scenario = parse({"cameras": {"count": 2}}, Path("s.yaml"))
     (tmp_path / "set").mkdir()
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
-    refused(ScenarioError, "--data DIR or set FRESHFIELD_DATA", find_data, "set", scenario, None)
+    refused(ScenarioError, "none given: --data DIR or FRESHFIELD_DATA", find_data, "set", scenario, None)
     assert find_data("set", scenario, tmp_path) == tmp_path / "set"
     assert find_data(str(tmp_path / "set"), scenario, None) == tmp_path / "set"
     monkeypatch.setenv("FRESHFIELD_DATA", str(tmp_path))
     assert find_data("set", scenario, None) == tmp_path / "set"
-    refused(ScenarioError, "does not exist", find_data, "other", scenario, None)
+    refused(ScenarioError, "neither beside s.yaml nor in the data folder", find_data, "other", scenario, None)
     # What lies beside the scenario comes first.
     (tmp_path / "mine/set").mkdir(parents=True)
     mine = parse({"cameras": {"count": 2}}, tmp_path / "mine/s.yaml")

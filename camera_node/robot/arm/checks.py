@@ -8,13 +8,11 @@ import numpy as np
 
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes, mount_on_flange
 from camera_node.robot.arm.joint_states import ArmStream
+from camera_node.robot.arm.settings import LEAST_REACHED, LISTEN_S
 from camera_node.robot.arm.viewpoint_tour import plan_tour, viewpoints
 from camera_node.settings import ArmConfig, PathConfig
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario
-
-_LISTEN_S = 0.5
-_LEAST_REACHED = 0.6  # of a tour's viewpoints; with fewer, a side of the target stays unseen
 
 
 def hand_eye(scenario: Scenario, arm: ArmConfig) -> str:
@@ -42,8 +40,8 @@ def joint_states(arm: ArmConfig) -> str:
     stream.start()
     try:
         before = stream.received
-        time.sleep(_LISTEN_S)
-        samples, trouble = (stream.received - before) / _LISTEN_S, stream.trouble
+        time.sleep(LISTEN_S)
+        samples, trouble = (stream.received - before) / LISTEN_S, stream.trouble
     finally:
         stream.stop()
     if trouble:
@@ -61,6 +59,6 @@ def path(scenario: Scenario, arm: ArmConfig, tour_path: PathConfig) -> str:
     tour = plan_tour(model, base, mount, tour_path)
     count = len(viewpoints(tour_path))
     summary = f"the arm reaches {tour.reached} of {count} viewpoints"
-    if tour.reached >= _LEAST_REACHED * count:
+    if tour.reached >= LEAST_REACHED * count:
         return summary
     raise ValueError(f"{summary}: change radius_m, elevations_deg, azimuths_deg or where the base stands")

@@ -15,23 +15,18 @@ from typing import Any
 import numpy as np
 
 from camera_node.robot.arm import ArmError
-from camera_node.robot.arm.joint_states import STALE_S, ArmStream, probe
+from camera_node.robot.arm.joint_states import ArmStream, probe
+from camera_node.robot.arm.settings import CONTROL_S, SIMULATED_STALE_S, STALE_S, STOPPING_S
 from camera_node.settings import ArmConfig
 from freshfield.clock import WallClock
 
 log = logging.getLogger("camera-node.arm")
 
-STOP_RAD_S2 = 2.0
-"""Deceleration of every stop."""
-_CONTROL_S = 8  # longest connection of the control interface
-_STOPPING_S = 5.0
-_SIMULATED_STALE_S = 10.0
-
 
 def open_stream(config: ArmConfig, frequency_hz: float = 50.0) -> ArmStream:
     """Joint-state stream of an arm that will be moved, not started yet. A simulated arm hits nothing, so its
     state may be older before it is stopped."""
-    stale_s = _SIMULATED_STALE_S if config.simulated else STALE_S
+    stale_s = SIMULATED_STALE_S if config.simulated else STALE_S
     return ArmStream(config.host, WallClock(), frequency_hz, False, max_gap_ms=1e3 * stale_s, stale_s=stale_s)
 
 
@@ -55,12 +50,12 @@ def stop_event() -> threading.Event:
 
 
 def stop_within_timeout(stop: Callable[[], None]) -> None:
-    """Call ``stop`` to stop an arm, but give up after ``_STOPPING_S``: the library has no timeout."""
+    """Call ``stop`` to stop an arm, but give up after ``STOPPING_S``: the library has no timeout."""
     # The default action ends this process even if the library holds Python's lock.
-    signal.setitimer(signal.ITIMER_REAL, 2 * _STOPPING_S)
+    signal.setitimer(signal.ITIMER_REAL, 2 * STOPPING_S)
     thread = threading.Thread(target=stop, daemon=True)
     thread.start()
-    thread.join(_STOPPING_S)
+    thread.join(STOPPING_S)
     signal.setitimer(signal.ITIMER_REAL, 0)
 
 
@@ -82,8 +77,8 @@ def connect_control(host: str) -> Any:
     from rtde_control import RTDEControlInterface
 
     probe(host)
-    log.info("arm at %s: taking control, within %d s or not at all", host, _CONTROL_S)
-    signal.alarm(_CONTROL_S)
+    log.info("arm at %s: taking control, within %d s or not at all", host, CONTROL_S)
+    signal.alarm(CONTROL_S)
     try:
         return RTDEControlInterface(host)
     except RuntimeError as error:

@@ -13,7 +13,6 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ import numpy as np
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, mount_on_flange, require_arm
 from camera_node.robot.arm.control import (
-    STOP_RAD_S2,
     confirm_motion,
     connect_control,
     joints_in_motion,
@@ -30,15 +28,18 @@ from camera_node.robot.arm.control import (
     stop_within_timeout,
 )
 from camera_node.robot.arm.joint_states import ArmStream
-from camera_node.robot.arm.viewpoint_tour import FARTHEST_RAD, Tour, plan_tour
+from camera_node.robot.arm.settings import (
+    ARRIVED_RAD,
+    FARTHEST_RAD,
+    MOVED_RAD,
+    POLL_S,
+    STALLED_RAD,
+    STALLED_S,
+    STOP_RAD_S2,
+)
+from camera_node.robot.arm.viewpoint_tour import Tour, plan_tour
 from camera_node.settings import PathConfig, errors_of
 from freshfield.scenario import ScenarioError, load
-
-_ARRIVED_RAD = 1e-3
-# Within this time even a slow arm turns by more than its encoder noise.
-_STALLED_S, _STALLED_RAD = 5.0, 1e-3
-_POLL_S = 0.05
-_MOVED_RAD = 0.01
 
 
 def run(args: argparse.Namespace) -> int:
@@ -68,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
             )
         if not (args.yes or config.simulated or confirm_motion(config.host, "move")):
             return 2
-        if np.abs(stream.now() - start).max() > _MOVED_RAD:
+        if np.abs(stream.now() - start).max() > MOVED_RAD:
             raise ArmError(f"arm at {config.host}: it has been moved since the tour was printed: start again")
         return _drive(stream, tour.stops, config.path, args.rounds)
     finally:
@@ -84,74 +85,58 @@ def _print_tour(tour: Tour, start: np.ndarray, first_rad: float) -> None:
 
 
 def _drive(stream: ArmStream, stops: list[np.ndarray], path: PathConfig, rounds: int) -> int:
+    """Move the arm to each of ``stops`` (joint angles (6,), radians) in turn, there and back, then bring it to rest,
+    also after an error. Returns 0; ends the process after an error."""
     control = connect_control(stream.host)
     stop_requested = stop_event()
-    # There and back, so that each round begins where the last one ended.
-    each = itertools.count() if rounds == 0 else range(rounds)
-    there_and_back = (joints for k in each for joints in (stops if k % 2 == 0 else stops[::-1]))
-    try:
-        visit_stops(control, stream, there_and_back, path, stop_requested)
-    except ArmError as error:
-        print(f"camera-node: {error}", file=sys.stderr, flush=True)
-        os._exit(1)  # the library's destructor would wait for an arm that may be gone
-    return 0
-
-
-def visit_stops(
-    control: Any, stream: ArmStream, stops: Iterable[np.ndarray], path: PathConfig, stop_requested: threading.Event
-) -> None:
-    """Move the arm to each of ``stops`` in turn, then bring it to rest, also after an error.
-
-    control: from ``connect_control``.
-    stream: joint states of the same arm.
-    stops: joint angles (6,), radians.
-    path: gives speed and acceleration.
-    stop_requested: set by another thread to end the drive.
-    Raises ArmError.
-    """
 
     def stop() -> None:
         control.stopJ(STOP_RAD_S2)
         control.stopScript()
 
     try:
-        if not control.setWatchdog(1.0 / stream.stale_s):
-            raise ArmError(f"arm at {stream.host}: it takes no watchdog: {_reason(stream)}")
-        for joints in stops:
-            if stop_requested.is_set():
-                return
-            if not control.moveJ(joints.tolist(), path.speed_rad_s, path.acceleration_rad_s2, True):
-                raise ArmError(f"arm at {stream.host}: it refuses to move: {_reason(stream)}")
-            if not _wait_until_arrived(stream, control, joints, stop_requested):
-                return
-    finally:
-        stop_within_timeout(stop)
+        try:
+            if not control.setWatchdog(1.0 / stream.stale_s):
+                raise ArmError(f"arm at {stream.host}: it takes no watchdog: {_reason(stream)}")
+            # There and back, so that each round begins where the last one ended.
+            for k in itertools.count() if rounds == 0 else range(rounds):
+                for joints in stops if k % 2 == 0 else stops[::-1]:
+                    if stop_requested.is_set():
+                        return 0
+                    if not control.moveJ(joints.tolist(), path.speed_rad_s, path.acceleration_rad_s2, True):
+                        raise ArmError(f"arm at {stream.host}: it refuses to move: {_reason(stream)}")
+                    _wait_until_arrived(stream, control, joints, stop_requested)
+        finally:
+            stop_within_timeout(stop)
+    except ArmError as error:
+        print(f"camera-node: {error}", file=sys.stderr, flush=True)
+        os._exit(1)  # the library's destructor would wait for an arm that may be gone
+    return 0
 
 
 def _reason(stream: ArmStream) -> str:
     return stream.trouble or "see the pendant"
 
 
-def _wait_until_arrived(stream: ArmStream, control: Any, goal: np.ndarray, stop_requested: threading.Event) -> bool:
-    """Wait until the joints reach ``goal``; False if asked to stop. Raises ArmError if the arm's state is too
+def _wait_until_arrived(stream: ArmStream, control: Any, goal: np.ndarray, stop_requested: threading.Event) -> None:
+    """Wait until the joints reach ``goal``, or until asked to stop. Raises ArmError if the arm's state is too
     old, or if it stalls or its program ends on the way."""
-    patience_s = max(_STALLED_S, stream.stale_s)
+    patience_s = max(STALLED_S, stream.stale_s)
     at, moved_s = np.full(6, np.inf), 0.0
-    while not stop_requested.wait(_POLL_S):
+    while not stop_requested.wait(POLL_S):
         joints, now_s = joints_in_motion(stream), time.monotonic()
         left_rad = float(np.abs(joints - goal).max())
-        if left_rad < _ARRIVED_RAD:
-            return True
+        if left_rad < ARRIVED_RAD:
+            return
         where = f"{np.rad2deg(left_rad):.1f} degrees from its goal"
         if not (control.isProgramRunning() and control.kickWatchdog()):
             raise ArmError(
                 f"arm at {stream.host}: its program was ended {where}: at the pendant, by a fault, or by "
                 "leaving remote control"
             )
-        if np.abs(joints - at).max() > _STALLED_RAD:
+        if np.abs(joints - at).max() > STALLED_RAD:
             at, moved_s = joints, now_s
         elif now_s - moved_s > patience_s:
             raise ArmError(
                 f"arm at {stream.host}: it stands still, {where}: is it paused, or the speed slider at zero?"
             )
-    return False

@@ -27,42 +27,25 @@ from camera_node.pose.pairing import SampleBuffer, interpolate_joints
 from camera_node.pose.providers import PoseGapError
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.arm.rtde_process import CONNECT_S, SAMPLE
+from camera_node.robot.arm.rtde_process import SAMPLE
+from camera_node.robot.arm.settings import BACKOFF_S, CONNECT_S, PROBE_S, STALE_S
 from freshfield.clock import Clock
 from freshfield.geometry import Array, Pose
 
 log = logging.getLogger("camera-node.arm")
 
 RTDE_PORT = 30004
-PROBE_S = 2.0
-"""Time for a controller to answer ``probe``."""
-STALE_S = 0.5
-"""Default age at which a state counts as stale."""
 READER = (sys.executable, "-m", "camera_node.robot.arm.rtde_process")
 """The process that reads joint states; host and frequency follow."""
-BACKOFF_S = (0.25, 0.5, 1.0, 2.0, 5.0)
-_ROBOT_MODES = {
-    -1: "no controller",
-    0: "disconnected",
-    1: "confirm safety",
-    2: "booting",
-    3: "powered off",
-    4: "powered on, brakes engaged",
-    5: "idle: brakes engaged",
-    6: "backdrive",
-    7: "running",
-}
-_SAFETY_MODES = {
-    1: "normal",
-    2: "reduced",
-    3: "protective stop",
-    4: "recovery",
-    5: "safeguard stop",
-    6: "system emergency stop",
-    7: "robot emergency stop",
-    8: "safety violation",
-    9: "safety fault",
-}
+_ROBOT_MODES = (
+    "no controller, disconnected, confirm safety, booting, powered off, powered on: brakes engaged, "
+    "idle: brakes engaged, backdrive, running"
+)
+_SAFETY_MODES = (
+    "normal, reduced, protective stop, recovery, safeguard stop, system emergency stop, robot emergency stop, "
+    "safety violation, safety fault"
+)
+_MODE_NAMES = dict(enumerate(_ROBOT_MODES.split(", "), -1)), dict(enumerate(_SAFETY_MODES.split(", "), 1))
 
 
 def probe(host: str) -> None:
@@ -228,9 +211,9 @@ class ArmStream:
         """Report modes in which the arm cannot move; joint angles are valid in every mode."""
         wrong = []
         if mode != 7:
-            wrong.append(f"robot mode: {_ROBOT_MODES.get(mode, mode)}")
+            wrong.append(f"robot mode: {_MODE_NAMES[0].get(mode, mode)}")
         if safety not in (1, 2):
-            wrong.append(f"safety: {_SAFETY_MODES.get(safety, safety)}")
+            wrong.append(f"safety: {_MODE_NAMES[1].get(safety, safety)}")
         self._set_trouble(f"arm at {self.host}: {', '.join(wrong)}" if wrong else "")
 
     def _set_trouble(self, trouble: str) -> None:

@@ -4,7 +4,7 @@ An arm by Universal Robots is a chain of standard Denavit-Hartenberg links,
 ``T_{i-1}^i = Rz(theta_i) Tz(d_i) Tx(a_i) Rx(alpha_i)``. Forward kinematics is the product of six links.
 Inverse kinematics has up to eight solutions (postures), found in closed form (Hawkins 2013, "Analytic
 inverse kinematics for the Universal Robots UR-5/UR-10 arms"). The links of a calibrated arm do not
-have the closed form's exact geometry, so each posture is then refined by damped least squares.
+have the closed form's exact geometry, so each posture is then corrected by Newton's steps.
 
 The arm loses a direction of motion where the Jacobian's determinant vanishes; for these arms it is
 ``a2 a3 sin(q5) sin(q3) (a2 cos(q2) + a3 cos(q2 + q3) + d5 sin(q2 + q3 + q4))`` up to its sign, whose three
@@ -17,14 +17,14 @@ import configparser
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from camera_node.robot.arm import ArmError
+from camera_node.robot.arm.settings import SINGULAR_DEG, SINGULAR_M
 from freshfield.geometry import Array, se3_inverse, so3_log
 from freshfield.untrusted import read_text
 
@@ -33,13 +33,9 @@ Six = tuple[float, float, float, float, float, float]
 _ZEROS: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 # A target beyond the reach by no more than this rounding error counts as at its edge.
 _REACH_TOLERANCE = 1e-9
-# Below this sin(q5), q6 would be rounding noise: it is free and gets a chosen value.
-_WRIST_FREE_SIN = 1e-9
-_REFINE_ITERATIONS = 50
+_NEWTON_STEPS = 6  # from a posture of the nominal arm, millimeters away; each doubles the number of right digits
 _REACHED_M = 1e-7
 _REACHED_RAD = 1e-7
-_SINGULAR_SIN = math.sin(math.radians(5.0))
-_SINGULAR_M = 0.02
 
 
 @dataclass(frozen=True)
@@ -93,76 +89,27 @@ class ArmModel:
         levers = links[6, :3, 3] - links[:6, :3, 3]
         return np.concatenate([np.cross(axes, levers).T, axes.T])
 
-    def singularities(self, joints: ArrayLike) -> tuple[str, ...]:
-        """Names of the singularities near joint angles (6,): ``shoulder`` (the wrist's center within 2 cm of
-        the base's axis), ``elbow`` and ``wrist`` (within 5 degrees)."""
+    def singular(self, joints: ArrayLike) -> NDArray[np.bool_]:
+        """Whether joint angles (..., 6) are near a singularity, (...): of the shoulder (the wrist's center within 2 cm
+        of the base's axis), the elbow or the wrist (within 5 degrees)."""
         base = self.nominal_model
-        q = _check_joints(joints)
-        reach_m = (
-            base.a_m[1] * math.cos(q[1])
-            + base.a_m[2] * math.cos(q[1] + q[2])
-            + base.d_m[4] * math.sin(q[1] + q[2] + q[3])
-        )
-        factors = {"shoulder": reach_m / _SINGULAR_M, "elbow": math.sin(q[2]) / _SINGULAR_SIN}
-        factors["wrist"] = math.sin(q[4]) / _SINGULAR_SIN
-        return tuple(name for name, factor in factors.items() if abs(factor) < 1.0)
+        _, q2, q3, q4, q5, _ = np.moveaxis(_check_joints(joints), -1, 0)
+        reach_m = base.a_m[1] * np.cos(q2) + base.a_m[2] * np.cos(q2 + q3) + base.d_m[4] * np.sin(q2 + q3 + q4)
+        bent = np.minimum(np.abs(np.sin(q3)), np.abs(np.sin(q5)))
+        return np.asarray((np.abs(reach_m) < SINGULAR_M) | (bent < math.sin(math.radians(SINGULAR_DEG))))
 
-    def inverse(self, target: ArrayLike, near: ArrayLike | None = None) -> list[Array]:
-        """All postures (6,), at most eight, that bring the flange to a target; none if the joint limits
-        exclude it.
-
-        target: base-from-flange (4, 4).
-        near: joint angles (6,); each joint is shifted by full turns towards them within the limits, and the
-            nearest posture comes first. If the wrist is singular, joint 6 keeps this angle (else 0) and joint
-            4 compensates.
-        """
+    def inverse(self, target: ArrayLike) -> list[Array]:
+        """All postures (6,), at most eight, that bring the flange to a target, base-from-flange (4, 4): angles in
+        [-pi, pi]. If the wrist is singular, joints 4 and 6 share their turn in one of many ways."""
         wanted = np.asarray(target, dtype=np.float64)
         if wanted.shape != (4, 4) or not np.all(np.isfinite(wanted)):
             raise ArmError("the target must be a finite 4 x 4 matrix")
-        start = np.zeros(6) if near is None else _check_joints(near)
-        base = self.nominal_model
-        found: list[Array] = []
-        for q in _closed_form(base, wanted, float(start[5])):
-            solution = q if self.nominal is None else self.refine(wanted, q)
-            if solution is None or not _reaches(self.forward(solution), wanted):
-                continue
-            placed = self._unwrap_near(solution, start)
-            if placed is None or any(np.abs(placed - p).max() < 1e-7 for p in found):
-                continue
-            found.append(placed)
-        if near is not None:
-            found.sort(key=lambda p: float(np.abs(p - start).max()))
-        return found
-
-    def refine(self, target: ArrayLike, start: ArrayLike) -> Array | None:
-        """The posture (6,) near ``start`` that brings the flange to ``target``, by damped least squares
-        (Levenberg-Marquardt); None if it does not come within 1e-7 m and rad."""
-        wanted, q = np.asarray(target, dtype=np.float64), _check_joints(start).copy()
-        error = pose_difference(self.forward(q), wanted)
-        damping = 1e-6
-        for _ in range(_REFINE_ITERATIONS):
-            if np.abs(error).max() < 1e-12:
-                break
-            j = self.jacobian(q)
-            step = np.linalg.solve(j.T @ j + damping * np.eye(6), j.T @ error)
-            tried = q + step
-            after = pose_difference(self.forward(tried), wanted)
-            if np.linalg.norm(after) < np.linalg.norm(error):
-                q, error, damping = tried, after, max(damping * 0.1, 1e-12)
-            else:
-                damping *= 10.0
-                if damping > 1e6:
-                    break
-        return q if _reaches(self.forward(q), wanted) else None
-
-    def _unwrap_near(self, joints: Array, near: Array) -> Array | None:
-        """``joints`` shifted by full turns towards ``near`` within the limits; None if that is impossible."""
-        low, high = np.array(self.lower_rad), np.array(self.upper_rad)
-        turn = 2 * math.pi
-        q = joints + turn * np.round((near - joints) / turn)
-        q = np.where(q > high, q - turn * np.ceil((q - high) / turn), q)
-        q = np.where(q < low, q + turn * np.ceil((low - q) / turn), q)
-        return q if np.all((q >= low - _REACH_TOLERANCE) & (q <= high + _REACH_TOLERANCE)) else None
+        found = _closed_form(self.nominal_model, wanted)
+        if self.nominal is not None:
+            for _ in range(_NEWTON_STEPS):
+                left = [pose_difference(self.forward(q), wanted) for q in found]
+                found = [q + np.linalg.lstsq(self.jacobian(q), off, rcond=1e-6)[0] for q, off in zip(found, left)]
+        return [_wrapped(q) for q in found if _reaches(self.forward(q), wanted)]
 
 
 # Universal Robots' data sheet (https://www.universal-robots.com/articles/ur/application-installation/
@@ -189,31 +136,24 @@ def apply_calibration(model: ArmModel, file: Path) -> ArmModel:
         parser.read_string(read_text(file))
     except (OSError, UnicodeDecodeError, configparser.Error) as error:
         raise ArmError(f"{file}: cannot be read: {' '.join(str(error).split())}") from None
-    deltas: dict[str, Six] = {}
+    changed: dict[str, Six] = {}
     for section in parser.sections():
-        for key in ("theta", "a", "d", "alpha"):
+        for key, name in (("theta", "theta_rad"), ("a", "a_m"), ("d", "d_m"), ("alpha", "alpha_rad")):
             if f"delta_{key}" in parser[section]:
-                where = f"{file}: [{section}] delta_{key}"
-                deltas[key] = _parse_six(parser[section][f"delta_{key}"], where)
-    if not deltas:
+                deltas = _parse_six(parser[section][f"delta_{key}"], f"{file}: [{section}] delta_{key}")
+                changed[name] = tuple(v + x for v, x in zip(getattr(model, name), deltas))  # type: ignore[assignment]
+    if not changed:
         raise ArmError(f"{file}: has no delta_theta, delta_a, delta_d or delta_alpha")
-
-    def add_deltas(values: Sequence[float], key: str) -> Six:
-        return tuple(v + x for v, x in zip(values, deltas.get(key, _ZEROS)))  # type: ignore[return-value]
-
     return dataclasses.replace(
         model,
         name=f"{model.name} ({file.name})",
-        d_m=add_deltas(model.d_m, "d"),
-        a_m=add_deltas(model.a_m, "a"),
-        alpha_rad=add_deltas(model.alpha_rad, "alpha"),
-        theta_rad=add_deltas(model.theta_rad, "theta"),
         nominal=model.nominal or model,
+        **changed,  # type: ignore[arg-type]
     )
 
 
-def _closed_form(arm: ArmModel, target: Array, free_rad: float) -> list[Array]:
-    """Joint angles (6,) of every posture of an uncalibrated arm. free_rad: angle of joint 6 if it is free."""
+def _closed_form(arm: ArmModel, target: Array) -> list[Array]:
+    """Joint angles (6,) of every posture of an uncalibrated arm."""
     (d1, _, _, d4, d5, d6), (_, a2, a3, *_) = arm.d_m, arm.a_m
     r = target[:3, :3]
     wrist = target[:3, 3] - d6 * r[:, 2]
@@ -229,7 +169,7 @@ def _closed_form(arm: ArmModel, target: Array, free_rad: float) -> list[Array]:
         sin5, cos5 = math.hypot(x6, y6), r[0, 2] * s1 - r[1, 2] * c1
         for sign in (1.0, -1.0):
             q5 = math.atan2(sign * sin5, cos5)
-            q6 = free_rad if sin5 < _WRIST_FREE_SIN else math.atan2(sign * y6, sign * x6)
+            q6 = math.atan2(sign * y6, sign * x6)
             first = _dh_transform(q1, d1, 0.0, math.pi / 2)
             last = _dh_transform(q5, d5, 0.0, -math.pi / 2) @ _dh_transform(q6, d6, 0.0, 0.0)
             middle = se3_inverse(first) @ target @ se3_inverse(last)
@@ -243,7 +183,7 @@ def _closed_form(arm: ArmModel, target: Array, free_rad: float) -> list[Array]:
                 elbow = _dh_transform(q2, 0.0, a2, 0.0) @ _dh_transform(q3, 0.0, a3, 0.0)
                 turned = elbow[:3, :3].T @ middle[:3, :3]
                 q4 = math.atan2(turned[1, 0], turned[0, 0])
-                postures.append(_wrapped(np.array([q1, q2, q3, q4, q5, q6])))
+                postures.append(np.array([q1, q2, q3, q4, q5, q6]))
     return postures
 
 

@@ -16,11 +16,11 @@ import struct
 import sys
 import time
 
+from camera_node.robot.arm.settings import CONNECT_S
+
 SAMPLE = struct.Struct("<d6d2i")
 """Controller's time in seconds, six joint angles in radians, robot mode, safety mode."""
 VARIABLES = ["timestamp", "actual_q", "robot_mode", "safety_mode"]
-CONNECT_S = 2.5
-_LIBRARY_MISSING = 3
 _LONGEST_MESSAGE = 1000  # characters: a pipe holds more
 
 
@@ -29,10 +29,8 @@ def main(host: str, frequency_hz: float) -> int:
     # The default action needs no Python: it ends a process that is stuck inside the library.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.setitimer(signal.ITIMER_REAL, CONNECT_S)
-    try:
-        from rtde_receive import RTDEReceiveInterface
-    except ImportError:
-        return _LIBRARY_MISSING
+    from rtde_receive import RTDEReceiveInterface
+
     # The library prints to both of its outputs, which must carry samples and one message only.
     pipe, messages = os.dup(1), os.dup(2)
     for output in (1, 2):

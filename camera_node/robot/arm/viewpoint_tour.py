@@ -18,14 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.robot.arm.settings import CHECKED_POSTURES, FARTHEST_RAD, MARGIN_M, TOOL_M, TOOL_RADIUS_M
 from camera_node.settings import PathConfig
 from freshfield.geometry import Array, on_sphere, se3, se3_inverse, so3_exp
-
-FARTHEST_RAD = 2.0
-"""Largest turn of a joint in one move."""
-_CHECKED_POSTURES = 24  # tested along a path
-_TOOL_M, _TOOL_RADIUS_M = 0.08, 0.04  # as in TeleopConfig: the camera and its mount
-_MARGIN_M = 0.01  # between parts of the arm, whose capsules are rounded up
 
 
 def viewpoints(path: PathConfig) -> list[Array]:
@@ -67,9 +62,11 @@ def plan_tour(arm: ArmModel, base: Array, mount: Array, path: PathConfig, start:
     Raises ArmError if the arm can visit fewer than three viewpoints.
     """
     poses = viewpoints(path)
-    begin = None if start is None else np.asarray(start, dtype=np.float64)
-    joints, places = _free_postures(arm, base, mount, path, poses, begin)
-    order = np.arange(len(joints)) if begin is None else np.argsort(np.abs(joints - begin).max(axis=1), kind="stable")
+    joints, places = _free_postures(arm, base, mount, path, poses)
+    order, begin = np.arange(len(joints)), None if start is None else np.asarray(start, dtype=np.float64)
+    if begin is not None:
+        joints, far_rad = _turned_towards(arm, joints, begin)
+        order = np.argsort(far_rad, kind="stable")
     best, visited = Tour([], []), np.zeros(len(joints), np.bool_)
     for k in order:
         # Every posture that an earlier tour came through leads to the same viewpoints.
@@ -95,7 +92,7 @@ def reachable(arm: ArmModel, base: Array, mount: Array, path: PathConfig, poses:
     Other arguments as in ``plan_tour``; of ``path`` only rolls_deg and floor_m are used.
     """
     out = np.zeros(len(poses), np.bool_)
-    out[_free_postures(arm, base, mount, path, poses, None)[1]] = True
+    out[_free_postures(arm, base, mount, path, poses)[1]] = True
     return out
 
 
@@ -108,16 +105,16 @@ def is_free(arm: ArmModel, base: Array, a: Array, b: Array, floor_m: float) -> N
     floor_m: height of the floor in the world.
     """
     a, b = np.broadcast_arrays(np.atleast_2d(a), np.atleast_2d(b))
-    share = np.linspace(0.0, 1.0, _CHECKED_POSTURES)[:, None, None]
+    share = np.linspace(0.0, 1.0, CHECKED_POSTURES)[:, None, None]
     frames = arm.nominal_model.link_frames((a + share * (b - a)).reshape(-1, 6))
     lowest_m = (base @ frames)[:, 2:, 2, 3].min(axis=1)
-    apart_m = CapsuleModel(arm, _TOOL_M, _TOOL_RADIUS_M).clearance(frames)[0].min(axis=1)
-    free = (lowest_m >= floor_m) & (apart_m >= _MARGIN_M)
-    return np.asarray(free.reshape(_CHECKED_POSTURES, -1).all(axis=0))
+    apart_m = CapsuleModel(arm, TOOL_M, TOOL_RADIUS_M).clearance(frames)[0].min(axis=1)
+    free = (lowest_m >= floor_m) & (apart_m >= MARGIN_M)
+    return np.asarray(free.reshape(CHECKED_POSTURES, -1).all(axis=0))
 
 
 def _free_postures(
-    arm: ArmModel, base: Array, mount: Array, path: PathConfig, poses: Sequence[Array], near: Array | None
+    arm: ArmModel, base: Array, mount: Array, path: PathConfig, poses: Sequence[Array]
 ) -> tuple[Array, NDArray[np.int64]]:
     """Joint angles (N, 6) that bring the camera to ``poses``, not singular and free, and each pose's number."""
     camera_to_flange, base_inverse = se3_inverse(mount), se3_inverse(base)
@@ -125,13 +122,22 @@ def _free_postures(
         (joints, k)
         for k, pose in enumerate(poses)
         for roll in np.deg2rad(path.rolls_deg)
-        for joints in arm.inverse(base_inverse @ pose @ se3(so3_exp([0, 0, roll]), [0, 0, 0]) @ camera_to_flange, near)
-        if not arm.singularities(joints)
+        for joints in arm.inverse(base_inverse @ pose @ se3(so3_exp([0, 0, roll]), [0, 0, 0]) @ camera_to_flange)
+        if not arm.singular(joints)
     ]
     postures = np.reshape([joints for joints, _ in found], (-1, 6))
     places = np.array([k for _, k in found], dtype=np.int64)
     free = is_free(arm, base, postures, postures, path.floor_m) if found else np.zeros(0, np.bool_)
     return postures[free], places[free]
+
+
+def _turned_towards(arm: ArmModel, joints: Array, at: Array) -> tuple[Array, Array]:
+    """``joints`` (N, 6), each shifted by full turns towards ``at`` (6,) as far as its limits allow, and the largest
+    turn of a joint from there (N,)."""
+    turn = 2.0 * np.pi
+    near = joints + turn * np.round((at - joints) / turn)
+    near = np.where((near < arm.lower_rad) | (near > arm.upper_rad), joints, near)
+    return near, np.abs(near - at).max(axis=1)
 
 
 def _extend_tour(
@@ -141,7 +147,6 @@ def _extend_tour(
 
     Depth first: from each stop to the nearest posture of a viewpoint left; back where there is none.
     """
-    low, high = np.array(arm.lower_rad), np.array(arm.upper_rad)
     stops, visited = [joints[first]], [int(places[first])]
     used = np.zeros(len(joints), np.bool_)
     used[first] = True
@@ -149,10 +154,8 @@ def _extend_tour(
     back: list[Array] = []
     while trail:
         at = trail[-1]
-        # Shifted by full turns towards the present posture.
-        near = joints + 2.0 * np.pi * np.round((at - joints) / (2.0 * np.pi))
-        far_rad = np.abs(near - at).max(axis=1)
-        left = ~np.isin(places, visited) & np.all((near >= low) & (near <= high), axis=1) & (far_rad <= FARTHEST_RAD)
+        near, far_rad = _turned_towards(arm, joints, at)
+        left = ~np.isin(places, visited) & (far_rad <= FARTHEST_RAD)
         order = np.flatnonzero(left)[np.argsort(far_rad[left], kind="stable")]
         step = next((k for k in order if is_free(arm, base, at, near[k], floor_m)[0]), None)
         if step is None:

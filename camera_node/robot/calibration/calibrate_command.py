@@ -169,7 +169,7 @@ def _samples(args: argparse.Namespace, board: Any) -> Any:
         if args.camera is None:
             raise CalibrationError("--camera ID: say which of the scenario's cameras")
         return live_samples(args, board, lens, setup)
-    samples, unused = inputs.read_visp_folder(args.folder, board, lens, setup, rig_command.print_progress)
+    samples, unused = inputs.read_visp_folder(args.folder, board, lens, setup)
     for name, why in unused.items():
         print(f"{name}: {why}", file=sys.stderr)
     return samples
@@ -181,7 +181,7 @@ def _intrinsics(args: argparse.Namespace) -> int:
     from camera_node.robot.calibration.targets import parse_target
 
     board = parse_target(args.board)
-    found, unused, size = inputs.find_corners(inputs.list_images(args.folder), board, None, rig_command.print_progress)
+    found, unused, size = inputs.find_corners(inputs.list_images(args.folder), board)
     lens = calibrate_lens(found, size, unused)
     rig_command.show(args, lens.show(), lens.to_json(args.camera))
     return 0

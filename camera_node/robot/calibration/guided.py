@@ -93,23 +93,15 @@ def _base_from_world(loaded: scenario.Scenario, arm: ArmConfig, camera: str) -> 
     return se3_inverse(base_matrix(arm))
 
 
-def _ticks(fps: float, seconds: float | None) -> Iterator[int]:
-    """Ticks of a frame rate, each at its time, until ``seconds`` are over."""
-    start = time.monotonic()
-    for tick in itertools.count():
-        if seconds is not None and tick / fps > seconds:
-            return
-        time.sleep(max(0.0, start + tick / fps - time.monotonic()))
-        yield tick
-
-
 def _shots(source: Source, codec: str, seconds: float | None) -> Iterator[tuple[Image, Pinhole, Array]]:
     """Images, lenses and poses (4, 4) of a source. A shot that cannot be read is reported and skipped."""
     # A source that never repeats follows the time of day, as in a node.
     first = 0 if source.contents is not None else round(WallClock().now_ns() * source.fps / 10**9)
-    for tick in _ticks(float(source.fps), seconds):
-        if source.contents is not None and tick >= source.contents:
+    start_s, fps = time.monotonic(), float(source.fps)
+    for tick in itertools.count() if source.contents is None else range(source.contents):
+        if seconds is not None and tick / fps > seconds:
             return
+        time.sleep(max(0.0, start_s + tick / fps - time.monotonic()))
         try:
             shot = source.read(source.content(first + tick))
         except ValueError as error:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -45,24 +46,16 @@ def read_lens(file: Path) -> Pinhole:
             raise CalibrationError(f"{file}: has {len(cameras)} cameras, expected one")
         return next(iter(cameras.values())).intrinsics
     try:
-        camera = ElementTree.parse(file).getroot().find(".//camera")
+        camera = ElementTree.parse(file).find(".//camera")
         if camera is None:
             raise ValueError("no camera")
-        models = {(m.findtext("type") or "").strip(): m for m in camera.iter("model")}
-        name = next(n for n in ("perspectiveProjWithDistortion", "perspectiveProjWithoutDistortion") if n in models)
-
-        def number(key: str, default: str | None = None) -> float:
-            return float(models[name].findtext(key) or default or "missing")
-
-        return Pinhole(
-            int(camera.findtext("image_width") or 0),
-            int(camera.findtext("image_height") or 0),
-            number("px"),
-            number("py"),
-            number("u0") + 0.5,
-            number("v0") + 0.5,
-            (number("kud", "0"), 0.0, 0.0, 0.0),
-        )
+        kinds = ("perspectiveProjWithDistortion", "perspectiveProjWithoutDistortion")
+        model = next(each for kind in kinds for each in camera.iterfind(f"model[type='{kind}']"))
+        numbers = {key: float(model.findtext(key, "missing")) for key in ("px", "py", "u0", "v0")}
+        width, height = (int(camera.findtext(key, "0")) for key in ("image_width", "image_height"))
+        center = numbers["u0"] + 0.5, numbers["v0"] + 0.5
+        distortion = float(model.findtext("kud", "0")), 0.0, 0.0, 0.0
+        return Pinhole(width, height, numbers["px"], numbers["py"], *center, distortion)
     except (OSError, ElementTree.ParseError, StopIteration, ValueError) as error:
         raise CalibrationError(
             f"{file}: expected ViSP's camera XML with px, py, u0, v0: {error or 'no model known'}"
@@ -80,12 +73,11 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def find_corners(
-    files: Sequence[Path], target: Target, size: tuple[int, int] | None, progress: Callable[[int], None]
+    files: Sequence[Path], target: Target, size: tuple[int, int] | None = None
 ) -> tuple[dict[str, Corners], dict[str, str], tuple[int, int]]:
     """Find the target in images.
 
     size: width and height of every image in pixels; None: those of the first one.
-    progress: called with the number of images done.
     Returns the corners by image name, the reason for every image without them, and the size. Raises
     CalibrationError.
     """
@@ -103,7 +95,7 @@ def find_corners(
             raise CalibrationError(f"{file}: is {width} x {height}, expected {size[0]} x {size[1]}")
         grays[file.name] = np.asarray(image, dtype=np.uint8)
         target.find(grays[file.name])  # which of two prints it is, all pictures together tell
-        progress(k + 1)
+        show_progress(f"{k + 1} pictures")
     for name, gray in grays.items():
         corners = target.find(gray)
         if corners is None:
@@ -116,13 +108,16 @@ def find_corners(
     return found, unused, size or (0, 0)
 
 
-def read_visp_folder(
-    folder: Path, target: Target, lens: Pinhole | None, setup: str, progress: Callable[[int], None]
-) -> tuple[Samples, dict[str, str]]:
+def show_progress(done: str) -> None:
+    """Say on a terminal how far it is."""
+    if sys.stderr.isatty():
+        print(f"\r{done} ", end="", file=sys.stderr, flush=True)
+
+
+def read_visp_folder(folder: Path, target: Target, lens: Pinhole | None, setup: str) -> tuple[Samples, dict[str, str]]:
     """Samples from images ``*-N.png`` with poses ``*_N.yaml`` of the flange, matched by number.
 
     lens: None reads the folder's XML file.
-    progress: see ``find_corners``.
     Returns the reason for every unused image too, by name. Raises CalibrationError.
     """
     if lens is None:
@@ -135,7 +130,7 @@ def read_visp_folder(
     paired = [f for f in files if _number(f) in poses]
     if not paired:
         raise CalibrationError(f"{folder}: no picture has a pose file of its number (NAME_3.yaml, NAME-3.png)")
-    found, unused, _ = find_corners(paired, target, (lens.width, lens.height), progress)
+    found, unused, _ = find_corners(paired, target, (lens.width, lens.height))
     unused |= {f.name: "no pose file of its number" for f in files if _number(f) not in poses}
     seen: dict[str, Array] = {}
     for name, corners in found.items():

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array
@@ -103,18 +102,10 @@ def calibrate_lens(views: Mapping[str, Corners], size: tuple[int, int], unused: 
         )
     counts = [len(c.points) for c in usable.values()]
     error_px = float(np.sqrt(np.average(np.square(errors), weights=counts)))
-    covered = float(_coverage_grid(usable.values(), size).mean())
+    cells = [np.clip(c.pixels / size * 6, 0, 5).astype(int) for c in usable.values()]
+    covered = len(np.unique(np.concatenate(cells), axis=0)) / 36
     found = dict(zip(usable, errors.tolist()))
     return LensCalibration(lens, std, error_px, found, tilt_deg, covered, unused)
-
-
-def _coverage_grid(views: Iterable[Corners], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Cells (6, 6) of the image, rows first, in which corners were seen."""
-    cells = np.zeros((6, 6), dtype=np.bool_)
-    for corners in views:
-        at = np.clip(corners.pixels / size * 6, 0, 5).astype(int)
-        cells[at[:, 1], at[:, 0]] = True
-    return cells
 
 
 def _solve(views: Mapping[str, Corners], size: tuple[int, int]) -> tuple[Pinhole, tuple[float, ...], Array, Array]:

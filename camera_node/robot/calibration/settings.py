@@ -17,6 +17,13 @@ NEW_DEG, STILL_MM, STILL_DEG = 8.0, 0.5, 0.1
 MIN_TO_SOLVE = 4
 EXPLAIN_EVERY = 50  # of the pictures without the target
 
+# OpenCV pairs every sample with every other: more samples take seconds and gain nothing.
+MAX_CLOSED_FORM = 60
+# The refinement: Student's t of so many degrees of freedom, rounds, and the relative change of the noise that ends
+# them.
+DEGREES_OF_FREEDOM, ROUNDS, SETTLED = 8.0, 20, 1e-4
+MIN_NOISE = 1e-7  # perfect data would make the likelihood infinite
+
 # Residuals of a hand-eye calibration: medians to warn about, and those of a sample that does not fit the others (less
 # is the detector's noise, beside an arm that has nearly none).
 LARGE_RESIDUAL_DEG, LARGE_RESIDUAL_MM = 3.0, 20.0
@@ -30,7 +37,7 @@ WORST_DEG, WORST_MM, FARTHEST_M = 15.0, 100.0, 5.0
 # The scale of distances to the target is told where it differs from 1 by more than this and by so many standard
 # deviations; a factor beyond the bound is no size of a board. With fewer poses there is nothing left to judge it by.
 NOTABLE_SCALE, SURE, LARGEST_SCALE, POSES_FOR_SCALE = 0.005, 5.0, 2.0, 5
-MILLIMETERS = (800.0, 1250.0)  # scale where one of the two is in millimeters
+MILLIMETERS_M = 20.0  # median distance beyond which poses are in millimeters
 
 # Targets. With fewer corners of a board its orientation is too uncertain; fewer markers may be read into noise.
 MIN_CORNERS, MIN_MARKERS = 6, 3

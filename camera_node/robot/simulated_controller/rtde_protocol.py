@@ -7,6 +7,7 @@ Exchange (RTDE) Guide".) Only the variables that the client library and ``rtde_p
 
 from __future__ import annotations
 
+import itertools
 import re
 import struct
 from collections.abc import Mapping, Sequence
@@ -78,13 +79,11 @@ class Recipe:
     def unpack(self, payload: bytes) -> dict[str, Any]:
         """Variables by name, from a payload without the recipe's number. Raises struct.error for a wrong
         size."""
-        flat = list(struct.unpack(">" + "".join(_FORMATS[kind] for kind in self.types), payload))
-        values: dict[str, Any] = {}
-        for name, kind in zip(self.names, self.types):
-            count = 6 if kind == "VECTOR6D" else 1
-            taken, flat = flat[:count], flat[count:]
-            values[name] = tuple(taken) if kind == "VECTOR6D" else taken[0]
-        return values
+        flat = iter(struct.unpack(">" + "".join(_FORMATS[kind] for kind in self.types), payload))
+        return {
+            name: tuple(itertools.islice(flat, 6)) if kind == "VECTOR6D" else next(flat)
+            for name, kind in zip(self.names, self.types)
+        }
 
 
 def packet(kind: int, payload: bytes) -> bytes:

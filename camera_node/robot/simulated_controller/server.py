@@ -13,7 +13,6 @@ are this machine too.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import logging
 import struct
@@ -40,46 +39,39 @@ _DASHBOARD = {
 }
 
 
+def _guarded(handler: Handler) -> Handler:
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            await handler(reader, writer)
+        except (OSError, asyncio.IncompleteReadError) as error:
+            log.debug("a client disconnected: %s", error)
+        except (asyncio.LimitOverrunError, ValueError) as error:
+            log.warning("simulated arm: disconnecting a client whose message is invalid: %s", error)
+        finally:
+            writer.close()
+
+    return serve
+
+
 class ControllerServer:
-    """Serves ``controller`` at ``host`` until stopped, in the time of ``clock``."""
+    """Serves ``controller`` at ``host``, in the time of ``clock``, while ``run`` runs."""
 
     def __init__(self, controller: Controller, host: str, clock: Clock) -> None:
         self.controller, self.host, self.clock = controller, host, clock
         self.clients: set[_Client] = set()
-        self._servers: list[asyncio.Server] = []
-        self._writers: set[asyncio.StreamWriter] = set()
-        self._task: asyncio.Task[None] | None = None
 
-    async def start(self) -> None:
-        """Open every port. Raises OSError if one of them is taken."""
+    async def run(self, started: Callable[[], None]) -> None:
+        """Open every port, call ``started``, and serve until cancelled; the loop's end closes all connections. Raises
+        OSError if a port is taken."""
         handlers: dict[int, Handler] = {
             RTDE_PORT: self._serve_rtde,
             DASHBOARD_PORT: self._serve_dashboard,
             TRUTH_PORT: self._serve_truth,
             SCRIPT_PORT: self._serve_script,
         }
-        try:
-            for port, handler in handlers.items():
-                self._servers.append(await asyncio.start_server(self._guarded(handler), self.host, port))
-        except OSError:
-            await self.stop()
-            raise
-        self._task = asyncio.ensure_future(self._run())
-
-    async def stop(self) -> None:
-        """Close the ports and every connection."""
-        if self._task is not None:
-            self._task.cancel()
-        for server in self._servers:
-            server.close()
-        for writer in list(self._writers):
-            writer.close()
-        for server in self._servers:
-            with contextlib.suppress(asyncio.CancelledError):
-                await server.wait_closed()
-        self._servers.clear()
-
-    async def _run(self) -> None:
+        for port, handler in handlers.items():
+            await asyncio.start_server(_guarded(handler), self.host, port)
+        started()
         while True:
             self.controller.advance_to(self.clock.now_ns(), self._publish)
             # Wake up as often as the fastest client needs. Each time, all steps that are due are executed.
@@ -92,21 +84,6 @@ class ControllerServer:
             values = self.controller.values()
             for client in due:
                 client.send(values)
-
-    def _guarded(self, handler: Handler) -> Handler:
-        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            self._writers.add(writer)
-            try:
-                await handler(reader, writer)
-            except (OSError, asyncio.IncompleteReadError) as error:
-                log.debug("a client disconnected: %s", error)
-            except (asyncio.LimitOverrunError, ValueError) as error:
-                log.warning("simulated arm: disconnecting a client whose message is invalid: %s", error)
-            finally:
-                self._writers.discard(writer)
-                writer.close()
-
-        return serve
 
     async def _serve_rtde(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         client = _Client(writer)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import math
 import signal
 import sys
@@ -31,14 +32,14 @@ def run(args: argparse.Namespace) -> int:
     server = ControllerServer(controller, host, clock)
 
     async def serve() -> None:
-        stopping = asyncio.Event()
+        serving = asyncio.ensure_future(
+            server.run(lambda: print(f"a simulated {arm.name} stands at {host}; Ctrl-C ends it", flush=True))
+        )
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, stopping.set)
-        await server.start()
-        print(f"a simulated {arm.name} stands at {host}; Ctrl-C ends it", flush=True)
-        await stopping.wait()
-        await server.stop()
+            loop.add_signal_handler(number, serving.cancel)
+        with contextlib.suppress(asyncio.CancelledError):
+            await serving
 
     try:
         asyncio.run(serve())

@@ -1,18 +1,10 @@
 """Limits of every tick: joint speeds that keep all limits now, and from which the arm can always stop.
 
-Time advances in ticks of ``dt``. A state is (q, v); a tick chooses v' and sets q' = q + v' dt.
-
-*Each joint by itself.* Stopping from v takes ``stop_way(v) = dt (v + (v - a dt) + (v - 2 a dt) + ...)`` over
-the positive terms, the first of which is v itself. The rule is: choose v' with |v' - v| <= a dt, |v'| <=
-v_max, and ``stop_way(v') <= upper - q`` (likewise for the lower limit). This is always possible: if v obeys
-the rule, then v' = v - a dt (or 0, if that is negative) has
-``stop_way(v') = stop_way(v) - v dt <= upper - q_before - v dt = upper - q``. At rest the rule holds for every
-q within its limits. So by induction no joint ever leaves them.
-
-*All joints together.* Box, floor, the flange's speed and the distance between the arm's parts depend on all
-joints. There the stop itself is the proof: before a tick is accepted, every tick of the stop that would
-follow it (each joint at its full deceleration) is computed and checked. If one of them breaks a limit,
-smaller steps are tried, and finally the stop that was checked with the tick before.
+Time advances in ticks of ``dt``. A state is (q, v); a tick chooses v' within the limits of speed and acceleration, and
+sets q' = q + v' dt. Joint limits, box, floor, the flange's speed and the distance between the arm's parts are kept by
+one rule, whose proof is the stop itself: before a tick is accepted, every tick of the stop that would follow it (each
+joint at its full deceleration) is computed and checked. If one of them breaks a limit, smaller steps are tried, and
+finally the stop that was checked with the tick before. So by induction the arm can always stop within its limits.
 """
 
 from __future__ import annotations
@@ -31,53 +23,46 @@ _ROUNDING = 1e-9
 _STEP_FRACTIONS = (1.0, 0.5, 0.2)
 
 
-class JointLimits:
-    """Limits of each joint by itself.
+class JointRates:
+    """Limits of the joints' speeds and accelerations.
 
-    low, high: joint limits (n,), radians.
+    low, high: joint limits (n,), radians, before which the joints slow down.
     speed, acceleration: of every joint, rad/s and rad/s^2.
     dt_s: length of a tick.
     """
 
-    def __init__(self, low: ArrayLike, high: ArrayLike, speed: float, acceleration: float, dt_s: float) -> None:
-        self.low = np.asarray(low, dtype=np.float64) + _ROUNDING
-        self.high = np.asarray(high, dtype=np.float64) - _ROUNDING
-        self.dt_s = dt_s
+    def __init__(self, low: Array, high: Array, speed: float, acceleration: float, dt_s: float) -> None:
+        self.low, self.high, self.dt_s = low, high, dt_s
         self._speed = speed * (1.0 - _ROUNDING)
         self._change = acceleration * dt_s * (1.0 - _ROUNDING)
 
     def clamp(self, q: Array, v: Array, wanted: Array) -> Array:
         """Speeds (n,) of the next tick, as close to ``wanted`` as the limits allow."""
-        up = np.minimum(self._speed, self._max_stoppable_speed(self.high - q))
-        down = np.maximum(-self._speed, -self._max_stoppable_speed(q - self.low))
+        up, down = self._stoppable(self.high - q), -self._stoppable(q - self.low)
         change = np.minimum(np.maximum(wanted, down), up) - v
         # All changes are scaled alike, by the largest one, so that the flange keeps its direction.
         most = float(np.abs(change).max())
         change *= min(1.0, self._change / most) if most > 0.0 else 1.0
         allowed = np.minimum(np.maximum(v + change, down), up)
-        # This clamp comes last, because by the proof above it corrects rounding only.
         return np.minimum(np.maximum(allowed, v - self._change), v + self._change)
 
     def stopping(self, v: Array) -> Array:
         """Speeds (n,) of the first tick of a stop."""
         return np.sign(v) * np.maximum(np.abs(v) - self._change, 0.0)
 
-    def stop(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Joints and speeds (T, n) of a stop from (q, v), beginning with that state."""
+    def stop(self, q: Array, v: Array) -> Array:
+        """Joints (T, n) of a stop from (q, v), beginning with that state."""
         ticks = int(np.ceil(np.abs(v).max() / self._change)) if v.any() else 0
-        left = np.abs(v) - self._change * np.arange(ticks + 1)[:, None]
-        speeds = np.sign(v) * np.maximum(left, 0.0)
-        moved = np.cumsum(speeds[1:], axis=0) * self.dt_s
-        return np.concatenate([q[None], q + moved]), speeds
+        left = np.abs(v) - self._change * np.arange(1, ticks + 1)[:, None]
+        moved = np.cumsum(np.sign(v) * np.maximum(left, 0.0), axis=0) * self.dt_s
+        return np.concatenate([q[None], q + moved])
 
-    def _max_stoppable_speed(self, room: Array) -> Array:
-        """The largest v with ``stop_way(v) <= room``. If v is n whole steps of deceleration and a remainder,
-        stop_way is ``dt ((n + 1) v - a dt n (n + 1) / 2)``; at v = n a dt it is ``a dt^2 n (n + 1) / 2``."""
-        room = np.maximum(room, 0.0)
-        unit = self._change * self.dt_s
-        n = np.floor((np.sqrt(1.0 + 8.0 * room / unit) - 1.0) / 2.0)
-        fastest: Array = room / ((n + 1.0) * self.dt_s) + self._change * n / 2.0
-        return fastest
+    def _stoppable(self, room: Array) -> Array:
+        """Speeds (n,) from which the joints stop within ``room`` (n,): the root of v^2 / (2 a) + v dt / 2 + a dt^2 / 8,
+        which is at least the way of the stop's ticks."""
+        half = self._change / 2.0
+        fastest = np.sqrt(np.maximum(2.0 * self._change * room / self.dt_s, half**2)) - half
+        return np.minimum(fastest, self._speed)
 
 
 class Limiter:
@@ -91,11 +76,11 @@ class Limiter:
     def __init__(self, arm: ArmModel, config: TeleopConfig, joints: ArrayLike) -> None:
         self.config, self.dt_s = config, 1.0 / config.rate_hz
         margin = config.joint_margin_rad
-        low, high = np.array(arm.lower_rad) + margin, np.array(arm.upper_rad) - margin
+        low, high = np.array(arm.lower_rad) + margin + _ROUNDING, np.array(arm.upper_rad) - margin - _ROUNDING
         speed = min(config.speed_rad_s, *arm.speed_rad_s)
-        self.joint_limits = JointLimits(low, high, speed, config.acceleration_rad_s2, self.dt_s)
+        self.rates = JointRates(low, high, speed, config.acceleration_rad_s2, self.dt_s)
         self.shape = CapsuleModel(arm, config.tool_m, config.tool_radius_m)
-        self.refused = dict.fromkeys(("box", "floor", "speed", "near", "unsound"), 0)
+        self.refused = dict.fromkeys(("joint", "box", "floor", "speed", "near", "unsound"), 0)
         self._low_m = np.array(config.workspace_low_m) + _ROUNDING
         self._high_m = np.array(config.workspace_high_m) - _ROUNDING
         self.q: Array = np.array(joints, dtype=np.float64)
@@ -109,7 +94,7 @@ class Limiter:
         if speeds.shape != (6,) or not np.isfinite(speeds).all():
             self.refused["unsound"] += 1
             speeds = np.zeros(6)
-        limits = self.joint_limits
+        limits = self.rates
         asked, stopping = limits.clamp(self.q, self.v, speeds), limits.stopping(self.v)
         chosen = stopping
         for k, share in enumerate(_STEP_FRACTIONS):
@@ -125,8 +110,10 @@ class Limiter:
 
     def _violated_limit(self, q: Array, v: Array) -> str | None:
         """The limit that a stop from (q, v) would break, or None."""
-        path, _ = self.joint_limits.stop(q, v)
-        arm = self.shape.arm
+        path, arm = self.rates.stop(q, v), self.shape.arm
+        # A joint that rests at its end, to a rounding error, holds no other.
+        if np.maximum(self.rates.low - path, path - self.rates.high).max() > 0.5 * _ROUNDING:
+            return "joint"
         frames = arm.link_frames(np.concatenate([self.q[None], path]))
         flange = frames[:, 6, :3, 3]
         if np.any(flange[1:] < self._low_m) or np.any(flange[1:] > self._high_m):
@@ -147,13 +134,6 @@ class Limiter:
         q = self.q
         if q.shape != (6,) or not np.isfinite(q).all():
             raise ArmError("the arm gives no joint angles")
-        limits = self.joint_limits
-        if np.any(q < limits.low) or np.any(q > limits.high):
-            joint = int(np.argmax(np.maximum(limits.low - q, q - limits.high)))
-            raise ArmError(
-                f"joint {joint + 1} stands at {np.degrees(q[joint]):.1f} degrees, within joint_margin_rad of "
-                "its limit: turn it back with the pendant"
-            )
         violated = self._violated_limit(q, self.v)
         if violated is not None:
             raise ArmError(
@@ -161,8 +141,12 @@ class Limiter:
             )
 
     def _show_violation(self, limit: str) -> str:
-        """How the arm, at rest, breaks ``limit`` (box, floor or near): for people."""
+        """How the arm, at rest, breaks ``limit`` (joint, box, floor or near): for people."""
         config, arm = self.config, self.shape.arm
+        if limit == "joint":
+            joint = int(np.argmax(np.maximum(self.rates.low - self.q, self.q - self.rates.high)))
+            stands = f"joint {joint + 1} stands at {np.degrees(self.q[joint]):.1f} degrees"
+            return f"{stands}, within joint_margin_rad of its limit"
         if limit == "box":
             at = np.round(arm.forward(self.q)[:3, 3], 3).tolist()
             low, high = list(config.workspace_low_m), list(config.workspace_high_m)

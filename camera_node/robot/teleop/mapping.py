@@ -8,6 +8,7 @@ the next, or that was silent, gets new references too.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,28 +20,16 @@ from freshfield.geometry import Array, matrix_to_quaternion, quaternion_to_matri
 
 
 @dataclass
-class MessageCounts:
-    """Numbers of messages and events.
-
-    taken: messages used; unsound, backwards: refused ones, because they are invalid or older than the last.
-    jumps: stylus found elsewhere. engaged: clutch pressed. silences: watchdog expired.
-    """
-
-    taken: int = 0
-    unsound: int = 0
-    backwards: int = 0
-    jumps: int = 0
-    engaged: int = 0
-    silences: int = 0
-
-
-@dataclass
 class Mapping:
-    """Turns samples into targets. target: base-from-flange (4, 4), or None to stay."""
+    """Turns samples into targets. target: base-from-flange (4, 4), or None to stay.
+
+    counts: messages taken and refused (invalid, or older than the last), jumps (stylus found elsewhere), how often the
+        clutch was pressed, and silences (watchdog expired).
+    """
 
     config: TeleopConfig
     target: Array | None = None
-    counts: MessageCounts = field(default_factory=MessageCounts)
+    counts: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
         yaw = math.radians(self.config.yaw_deg)
@@ -58,19 +47,15 @@ class Mapping:
     def add_sample(self, sample: StylusSample, flange: Array) -> bool:
         """Process a message. flange: the commanded pose (4, 4). Returns False for a message that is invalid or
         older than the last one, which is counted and otherwise ignored."""
-        if not sample.is_valid():
-            self.counts.unsound += 1
-            return False
-        if self._last is not None and sample.t_ns <= self._last[0]:
-            self.counts.backwards += 1
+        if not sample.is_valid() or (self._last is not None and sample.t_ns <= self._last[0]):
+            self.counts["refused"] += 1
             return False
         position, quaternion = sample.arrays()
         jumped = self._last is not None and self._jumped(position, quaternion)
         dt_s = 0.0 if self._last is None else (sample.t_ns - self._last[0]) / 1e9
         self._last = (sample.t_ns, position, quaternion)
-        self.counts.taken += 1
-        if jumped:
-            self.counts.jumps += 1
+        self.counts["taken"] += 1
+        self.counts["jumps"] += jumped
         if jumped or not sample.clutch:
             self._release()
         if not sample.clutch:
@@ -83,7 +68,7 @@ class Mapping:
         """Stop following, because no message came for too long. The clutch must then be pressed again, and
         the stylus's clock may restart."""
         if self._last is not None:
-            self.counts.silences += 1
+            self.counts["silences"] += 1
         self._release()
         self._last, self._released = None, False
 
@@ -102,7 +87,7 @@ class Mapping:
         rotation = quaternion_to_matrix(quaternion)
         if self._reference is None:
             self._reference = flange.copy(), position.copy(), rotation
-            self.counts.engaged += 1
+            self.counts["pressed"] += 1
         flange_0, position_0, rotation_0 = self._reference
         target = flange_0.copy()
         moved = flange_0[:3, 3] + self._scale * (self._axes @ (position - position_0))

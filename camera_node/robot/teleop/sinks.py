@@ -9,16 +9,13 @@ from typing import Any
 import numpy as np
 
 from camera_node.robot.arm import ArmError
-from camera_node.robot.arm.control import STOP_RAD_S2, connect_control, joints_in_motion, stop_within_timeout
+from camera_node.robot.arm.control import connect_control, joints_in_motion, stop_within_timeout
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.robot.arm.settings import STOP_RAD_S2
+from camera_node.robot.teleop.settings import LOOKAHEAD_S, MAX_LAG_RAD, SERVO_GAIN
 from camera_node.robot.teleop.teleoperator import Command
 
-# servoJ's own filter: lookahead time and gain (UR's script manual: 0.03 to 0.2 s, 100 to 2000). The gain is
-# the lowest that still follows well, because the targets are smooth already.
-_LOOKAHEAD_S, _SERVO_GAIN = 0.1, 300.0
-# An arm that lags more than this behind its target is held by something, or has stopped.
-_MAX_LAG_RAD = 0.35
 HEADER = "t_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,x_m,y_m,z_m,state"
 
 
@@ -56,12 +53,12 @@ class ServoSink:
         del t_s
         # An arm that was stopped must get no target: its program would jump there when it is released.
         lag_rad = float(np.abs(joints_in_motion(self._stream) - command.joints).max())
-        if lag_rad > _MAX_LAG_RAD:
+        if lag_rad > MAX_LAG_RAD:
             raise ArmError(
                 f"arm at {self._stream.host}: {np.degrees(lag_rad):.0f} degrees behind its target: stopped; "
                 "is something in its way, or is its speed slider down?"
             )
-        if not self._control.servoJ(command.joints.tolist(), 0.0, 0.0, self._period_s, _LOOKAHEAD_S, _SERVO_GAIN):
+        if not self._control.servoJ(command.joints.tolist(), 0.0, 0.0, self._period_s, LOOKAHEAD_S, SERVO_GAIN):
             raise ArmError(f"arm at {self._stream.host}: it refuses to move: see the pendant")
 
     def close(self) -> None:

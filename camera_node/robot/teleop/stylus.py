@@ -23,37 +23,25 @@ import msgspec
 import numpy as np
 
 from camera_node.robot.arm import ArmError
+from camera_node.robot.teleop.settings import FARTHEST_M, MAX_MESSAGES, OWNED_NS, STEP_M, STEP_RAD
 from freshfield.geometry import Array, matrix_to_quaternion, quaternion_multiply, quaternion_normalize, so3_exp
 
 log = logging.getLogger("camera-node.teleop")
 
-FARTHEST_M = 10.0
-"""Positions farther from the origin are invalid."""
 KEYS = """\
   w s   forwards, back (x)       i k   tip up, down
   a d   left, right (y)          j l   turn left, right
   r f   up, down (z)             u o   roll
   space clutch: press, release   q     end"""
 
-_STEP_M, _STEP_RAD = 0.005, 0.02
+# Key -> axis and sign of its step.
 _MOVES = {
-    "w": (0, 1),
-    "s": (0, -1),
-    "a": (1, 1),
-    "d": (1, -1),
-    "r": (2, 1),
-    "f": (2, -1),
-    "o": (3, 1),
-    "u": (3, -1),
-    "k": (4, 1),
-    "i": (4, -1),
-    "j": (5, 1),
-    "l": (5, -1),
+    key: (axis, sign)
+    for axis, keys in enumerate(("ws", "ad", "rf", "ou", "ki", "jl"))
+    for key, sign in zip(keys, (1, -1))
 }
 _ESCAPE, _END_OF_FILE, _MAX_BYTES = "\x1b", "\x04", 32
 MAX_BYTES = 2048
-_MAX_MESSAGES = 64  # per poll, so that a flood does not delay the arm
-_OWNED_NS = 1_000_000_000
 
 
 class StylusSample(msgspec.Struct, frozen=True, rename={"position_m": "p", "quaternion": "q"}):
@@ -128,7 +116,7 @@ class KeyboardStylus:
                 self._clutch = not self._clutch
             elif key in _MOVES:
                 axis, sign = _MOVES[key]
-                step[axis] += sign * (_STEP_M if axis < 3 else _STEP_RAD)
+                step[axis] += sign * (STEP_M if axis < 3 else STEP_RAD)
         half = 0.5 * FARTHEST_M  # with the clutch open it may move without end
         self._position = np.clip(self._position + step[:3], -half, half)
         turned = matrix_to_quaternion(so3_exp(step[3:]))
@@ -186,12 +174,12 @@ class NetworkStylus:
     def poll(self, now_ns: int) -> list[StylusSample]:
         """See ``Stylus``."""
         found = []
-        for _ in range(_MAX_MESSAGES):
+        for _ in range(MAX_MESSAGES):
             try:
                 data, sender = self._socket.recvfrom(MAX_BYTES + 1)
             except OSError:
                 break  # nothing there
-            if self._owner is not None and sender[:2] != self._owner and now_ns - self._heard_ns < _OWNED_NS:
+            if self._owner is not None and sender[:2] != self._owner and now_ns - self._heard_ns < OWNED_NS:
                 continue
             sample = parse(data)
             if sample is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
 import time
@@ -16,7 +17,7 @@ from camera_node.robot.arm.control import confirm_motion, open_stream, stop_even
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.simulated_controller.controller import HOME_RAD
-from camera_node.robot.teleop.settings import TeleopConfig
+from camera_node.robot.teleop.settings import LONGEST_STOP_S, SHOW_S, TeleopConfig
 from camera_node.robot.teleop.sinks import ServoSink, Sink, TrajectoryFile
 from camera_node.robot.teleop.stylus import Stylus, open_stylus
 from camera_node.robot.teleop.teleoperator import Teleoperator
@@ -24,10 +25,6 @@ from camera_node.settings import ArmConfig
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario, load
 from freshfield.settings import read_settings
-
-_SHOW_S = 0.5
-# Within the limits of a TeleopConfig no stop takes longer.
-_LONGEST_STOP_S = 3.0
 
 
 def run(args: argparse.Namespace) -> int:
@@ -40,11 +37,11 @@ def run(args: argparse.Namespace) -> int:
     if args.seconds is not None and not args.seconds > 0:
         raise ArmError("--seconds: expected a positive number")
     stream: ArmStream | None = None
-    stylus: Stylus | None = None
-    try:
-        joints = np.array(HOME_RAD)
+    joints = np.array(HOME_RAD)
+    with contextlib.ExitStack() as at_the_end:
         if args.dry_run is None:
             stream = open_stream(arm_config, arm_config.frequency_hz)
+            at_the_end.callback(stream.stop)
             stream.start()
             joints = stream.now()
         operator = Teleoperator(model, config, joints)
@@ -53,13 +50,8 @@ def run(args: argparse.Namespace) -> int:
             return 2
         # After the question, because a keyboard stylus switches the terminal's line mode off.
         stylus = open_stylus(args.stylus)
-        sink = _sink(args.dry_run, stream, model, config)
-        status = _run_loop(operator, stylus, sink, args.seconds)
-    finally:
-        if stylus is not None:
-            stylus.close()
-        if stream is not None:
-            stream.stop()
+        at_the_end.callback(stylus.close)
+        status = _run_loop(operator, stylus, _sink(args.dry_run, stream, model, config), args.seconds)
     if status and stream is not None:
         sys.stdout.flush()
         os._exit(status)  # the library's destructor would wait for an arm that may be gone
@@ -95,7 +87,7 @@ def _run_loop(operator: Teleoperator, stylus: Stylus, sink: Sink, seconds: float
             now_s = time.monotonic()
             if seconds is not None and now_s - started_s >= seconds:
                 break
-            if now_s - shown_s >= _SHOW_S and sys.stderr.isatty():
+            if now_s - shown_s >= SHOW_S and sys.stderr.isatty():
                 shown_s = now_s
                 print(f"\r{_status_line(operator)}\x1b[K", end="", file=sys.stderr, flush=True)
             next_s += period_s
@@ -116,7 +108,7 @@ def _run_loop(operator: Teleoperator, stylus: Stylus, sink: Sink, seconds: float
 
 
 def _come_to_rest(operator: Teleoperator, sink: Sink, period_s: float) -> None:
-    for _ in range(round(_LONGEST_STOP_S / period_s)):
+    for _ in range(round(LONGEST_STOP_S / period_s)):
         begun_s = time.monotonic()
         command, at_rest = operator.stop()
         sink.send(operator.ticks * period_s, command)
@@ -131,7 +123,6 @@ def _status_line(operator: Teleoperator) -> str:
     refused = [f"{name} {n}" for name, n in operator.limiter.refused.items() if n]
     held = f", held by {', '.join(refused)}" if refused else ""
     return (
-        f"{operator.state}: flange at {x:.3f} {y:.3f} {z:.3f} m, {counts.taken} messages, "
-        f"clutch pressed {counts.engaged} times, "
-        f"{counts.unsound + counts.backwards} refused, {counts.jumps} jumps{held}"
+        f"{operator.state}: flange at {x:.3f} {y:.3f} {z:.3f} m, {counts['taken']} messages, "
+        f"clutch pressed {counts['pressed']} times, {counts['refused']} refused, {counts['jumps']} jumps{held}"
     )

@@ -12,14 +12,14 @@ import yaml
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration import DEFAULT_METHOD, CalibrationError
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, solve
-from camera_node.robot.calibration.hand_eye.refinement import Refinement, refine, scale_start
+from camera_node.robot.calibration.hand_eye.refinement import Refinement, refine
 from camera_node.robot.calibration.hand_eye.samples import (
     Array,
     Diversity,
     Samples,
     angle_deg,
     distance_mm,
-    require_diversity,
+    diversity,
     rotation_vectors,
 )
 from camera_node.robot.calibration.settings import (
@@ -28,7 +28,7 @@ from camera_node.robot.calibration.settings import (
     LARGE_RESIDUAL_DEG,
     LARGE_RESIDUAL_MM,
     LARGEST_SCALE,
-    MILLIMETERS,
+    MILLIMETERS_M,
     NOTABLE_DEG,
     NOTABLE_MM,
     NOTABLE_SCALE,
@@ -131,8 +131,12 @@ def calibrate(
     fit_size: take the target's size from the arm's motion, where that shows another one than was said.
     Raises CalibrationError if the samples do not determine X.
     """
-    spread = require_diversity(samples)
-    _require_one_unit(samples)
+    spread = diversity(samples)
+    if spread.reason is not None:
+        raise CalibrationError(spread.reason)
+    for what, poses in (("targets", samples.target), ("flanges", samples.flange)):
+        if np.median(np.linalg.norm(poses[:, :3, 3], axis=1)) > MILLIMETERS_M:
+            raise CalibrationError(f"{what} seem to be in millimeters: targets and flanges must be in meters")
     scaled = _refined_with_scale(samples) if fit_size else None
     if scaled is not None:
         samples = samples.rescaled(scaled.scale)
@@ -154,14 +158,6 @@ def calibrate(
     size = () if scaled is None else (_about_size(scaled, refined, square_m, fit_size),)
     warnings = (*size, *_warnings(samples, refined, off, spread))
     return Calibration(samples, method, chosen, off, results, refined, spread, warnings)
-
-
-def _require_one_unit(samples: Samples) -> None:
-    """Raise CalibrationError where meters and millimeters are mixed."""
-    scale = scale_start(samples)
-    for factor, target, flange in ((scale, "millimeters", "meters"), (1.0 / scale, "meters", "millimeters")):
-        if MILLIMETERS[0] < factor < MILLIMETERS[1]:
-            raise CalibrationError(f"targets seem to be in {target}, flanges in {flange}: both must be in meters")
 
 
 def _refined_with_scale(samples: Samples) -> Refinement | None:

@@ -21,16 +21,10 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
-from camera_node.robot.calibration.hand_eye.closed_form import robust_start
+from camera_node.robot.calibration.hand_eye.closed_form import start as closed_form_start
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, rotation_vectors
-from camera_node.robot.calibration.settings import OUTLIER_WEIGHT
+from camera_node.robot.calibration.settings import DEGREES_OF_FREEDOM, MIN_NOISE, OUTLIER_WEIGHT, ROUNDS, SETTLED
 from freshfield.geometry import se3, se3_inverse
-
-_DEGREES_OF_FREEDOM = 8.0
-_ROUNDS = 20
-_SETTLED = 1e-4  # relative change of the noise
-# Lower bound of the noise: perfect data would make the likelihood infinite.
-_MIN_NOISE = 1e-7
 
 
 @dataclass(frozen=True)
@@ -61,8 +55,7 @@ class Refinement:
 
 def refine(samples: Samples, with_scale: bool = False) -> Refinement:
     """Maximize the likelihood of X and Y, and of the scale if asked to. Raises CalibrationError."""
-    scale = scale_start(samples) if with_scale else 1.0
-    x, y = robust_start(samples.rescaled(scale))
+    scale, (x, y) = 1.0, closed_form_start(samples)
     start = np.zeros(13 if with_scale else 12)
 
     def residuals(step: Array) -> Array:
@@ -70,7 +63,7 @@ def refine(samples: Samples, with_scale: bool = False) -> Refinement:
         return flange_residuals(seen, _retract(x, step[:6]), _retract(y, step[6:12]))
 
     noise = _robust_scale(residuals(start))
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         widths = np.repeat(noise, 3)
         solved = least_squares(
             lambda step, widths=widths: (residuals(step) / widths).ravel(),
@@ -83,28 +76,13 @@ def refine(samples: Samples, with_scale: bool = False) -> Refinement:
         x, y = _retract(x, solved.x[:6]), _retract(y, solved.x[6:12])
         scale *= float(np.exp(solved.x[12])) if with_scale else 1.0
         before, noise = noise, _noise(e, noise)
-        if np.abs(noise / before - 1.0).max() < _SETTLED:
+        if np.abs(noise / before - 1.0).max() < SETTLED:
             break
     covariance = np.linalg.pinv(solved.jac.T @ solved.jac, hermitian=True)
     turn, shift = (float(np.sqrt(np.trace(covariance[k : k + 3, k : k + 3]))) for k in (0, 3))
     deg, mm = float(np.degrees(turn)), shift * 1e3
     scale_std = scale * float(np.sqrt(covariance[12, 12])) if with_scale else 0.0
     return Refinement(x, y, deg, mm, float(noise[0]), float(noise[1]), _weights(e, noise), scale, scale_std)
-
-
-def scale_start(samples: Samples) -> float:
-    """First estimate of said by true distance to the target: with X's rotation known, G_i X T_i = Y is linear in its
-    inverse and in the translations of X and Y. Samples that fit badly count less. Raises CalibrationError."""
-    turn = robust_start(samples)[0][:3, :3]
-    moved = samples.moved[:, :3, :3]
-    seen = moved @ turn @ samples.target[:, :3, 3:]
-    rows = np.concatenate([seen, moved, np.broadcast_to(-np.eye(3), moved.shape)], axis=2)
-    wanted, weights = -samples.moved[:, :3, 3], np.ones((len(samples), 1))
-    for _ in range(_ROUNDS):
-        found = np.linalg.lstsq((rows * weights[..., None]).reshape(-1, 7), (wanted * weights).ravel(), rcond=None)[0]
-        off = np.linalg.norm(rows @ found - wanted, axis=1)
-        weights = np.sqrt(1.0 / np.maximum(off, np.median(off) + _MIN_NOISE))[:, None]
-    return float(1.0 / found[0]) if found[0] > 0.0 else 1.0
 
 
 def flange_residuals(samples: Samples, x: Array, y: Array) -> Array:
@@ -127,15 +105,15 @@ def _student_t(squares: Array) -> Array:
     """scipy's loss (3, 6 N) for squared whitened residuals (6 N,): its value, of which each of a sample's six
     numbers has a sixth, and its slope, which is the sample's weight. The second derivative is taken as 0."""
     total = squares.reshape(-1, 6).sum(axis=1)
-    value = (_DEGREES_OF_FREEDOM + 6.0) * np.log1p(total / _DEGREES_OF_FREEDOM) / 6.0
-    slope = (_DEGREES_OF_FREEDOM + 6.0) / (_DEGREES_OF_FREEDOM + total)
+    value = (DEGREES_OF_FREEDOM + 6.0) * np.log1p(total / DEGREES_OF_FREEDOM) / 6.0
+    slope = (DEGREES_OF_FREEDOM + 6.0) / (DEGREES_OF_FREEDOM + total)
     return np.stack([np.repeat(value, 6), np.repeat(slope, 6), np.zeros(len(squares))])
 
 
 def _weights(e: Array, noise: Array) -> Array:
     """Weights (N,) of the samples under Student's t."""
     whitened = e / np.repeat(noise, 3)
-    return np.asarray((_DEGREES_OF_FREEDOM + 6.0) / (_DEGREES_OF_FREEDOM + (whitened**2).sum(axis=1)))
+    return np.asarray((DEGREES_OF_FREEDOM + 6.0) / (DEGREES_OF_FREEDOM + (whitened**2).sum(axis=1)))
 
 
 def _noise(e: Array, noise: Array) -> Array:
@@ -145,8 +123,8 @@ def _noise(e: Array, noise: Array) -> Array:
     freedom = max(3 * len(e) - 6, 1)
     for _ in range(100):
         before = noise
-        noise = np.maximum(np.sqrt(_weights(e, noise) @ squares / freedom), _MIN_NOISE)
-        if np.abs(noise / before - 1.0).max() < 0.1 * _SETTLED:
+        noise = np.maximum(np.sqrt(_weights(e, noise) @ squares / freedom), MIN_NOISE)
+        if np.abs(noise / before - 1.0).max() < 0.1 * SETTLED:
             break
     return noise
 
@@ -154,4 +132,4 @@ def _noise(e: Array, noise: Array) -> Array:
 def _robust_scale(e: Array) -> Array:
     """Robust first estimate of the arm's noise (rad, m), by median absolute deviation."""
     scale = [1.4826 * float(np.median(np.abs(part))) for part in (e[:, :3], e[:, 3:])]
-    return np.maximum(scale, _MIN_NOISE)
+    return np.maximum(scale, MIN_NOISE)

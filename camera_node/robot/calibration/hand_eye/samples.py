@@ -7,11 +7,10 @@ in flange.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, SETUPS
@@ -57,12 +56,6 @@ class Samples:
     def name(self, index: int) -> str:
         return self.names[index] if self.names else f"pose {index + 1}"
 
-    def take(self, chosen: Sequence[int] | NDArray[np.intp]) -> Samples:
-        """The samples with these indices."""
-        at = np.asarray(chosen, dtype=np.intp)
-        names = tuple(self.names[i] for i in at) if self.names else ()
-        return replace(self, flange=self.flange[at], target=self.target[at], names=names)
-
     def rescaled(self, scale: float) -> Samples:
         """The samples with distances to the target divided by ``scale``."""
         target = self.target.copy()
@@ -70,9 +63,11 @@ class Samples:
         return replace(self, target=target)
 
     def subsample(self, most: int) -> Samples:
-        """At most ``most`` samples, evenly spaced over the recording."""
+        """At most ``most`` samples, evenly spaced over the recording, without their names."""
+        if len(self) <= most:
+            return self
         at = np.linspace(0, len(self) - 1, most).round().astype(np.intp)
-        return self if len(self) <= most else self.take(at)
+        return replace(self, flange=self.flange[at], target=self.target[at], names=())
 
 
 def rotation_vectors(rotations: Array) -> Array:
@@ -89,6 +84,13 @@ def angle_deg(a: Array, b: Array) -> Array:
 def distance_mm(a: Array, b: Array) -> Array:
     """Distances (...) between the origins of transforms (..., 4, 4) in meters."""
     return np.asarray(np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1) * 1e3)
+
+
+def medoid(poses: ArrayLike) -> Array:
+    """The pose (4, 4) of several (N, 4, 4) that is nearest to all others: one that is wrong does not move it."""
+    given = np.asarray(poses, dtype=np.float64)
+    distance = np.linalg.norm(given[:, None] - given, axis=(2, 3))
+    return given[int(np.argmin(np.median(distance, axis=1)))]
 
 
 @dataclass(frozen=True)
@@ -141,14 +143,6 @@ def diversity(samples: Samples) -> Diversity:
             "needed): moving without turning says nothing about the translation; turn it by 20 to 90 degrees"
         )
     return Diversity(len(angles_deg), int(half.sum()), float(angles_deg.max()), spread_deg, reason)
-
-
-def require_diversity(samples: Samples) -> Diversity:
-    """The samples' diversity. Raises CalibrationError if they do not determine X."""
-    found = diversity(samples)
-    if found.reason is not None:
-        raise CalibrationError(found.reason)
-    return found
 
 
 def _too_few(count: int) -> str:

@@ -59,58 +59,58 @@ def adjust(
     cameras, boards: start values, as in ``Bundle``; the first camera stays where it is.
     refine_lenses: whether lenses are estimated, too.
     """
-    layout = _Layout(sightings, list(cameras), list(boards), lenses, refine_lenses)
-    start = np.concatenate(
-        [
-            *(_six(cameras[name]) for name in layout.cameras[1:]),
-            *(_six(pose) for pose in boards.values()),
-            *(_lens_numbers(lenses[name]) for name in layout.cameras if refine_lenses),
-        ]
+    names, moments = list(cameras), list(boards)
+    lenses_at = 6 * (len(names) + len(moments))
+    problem = _Problem(
+        [(names.index(s.camera), moments.index(s.moment), s.corners) for s in sightings],
+        len(names),
+        lenses_at,
+        slice(6, None if refine_lenses else lenses_at),
     )
-    found = _minimize(layout, start)
-    residuals, jacobian = layout.residuals(found), layout.jacobian(found)
-    freedom = max(1, len(residuals) - len(found))
+    poses = [_six(pose) for pose in (*cameras.values(), *boards.values())]
+    found = _minimize(problem, np.concatenate([*poses, *(_lens_numbers(lenses[name]) for name in names)]))
+    residuals, jacobian = problem.residuals(found), problem.jacobian(found)
+    freedom = max(1, len(residuals) - jacobian.shape[1])
     scale = (1.4826 * np.median(np.abs(residuals))) ** 2 * len(residuals) / freedom  # outliers do not count
     variance = np.diag(np.linalg.pinv((jacobian.T @ jacobian).toarray())) * scale
+    std = np.sqrt(np.maximum(variance[: 6 * (len(names) - 1)], 0.0)).reshape(-1, 6)
     ends = np.cumsum([2 * len(s.corners.points) for s in sightings])
     squares = [float(np.mean(part**2)) * 2 for part in np.split(residuals, ends[:-1])]
-    std = np.sqrt(np.maximum(variance[: 6 * (len(cameras) - 1)], 0.0)).reshape(-1, 6)
-    numbers = layout.unpacked(found)
+    in_cameras, in_boards, in_lenses = problem.parts(found)
+    sizes = [(lenses[name].width, lenses[name].height) for name in names]
     return Bundle(
-        {name: _matrix(numbers[0][k]) for k, name in enumerate(layout.cameras)},
-        {name: _matrix(numbers[1][k]) for k, name in enumerate(layout.moments)},
-        {
-            name: Pinhole.from_opencv(lenses[name].width, lenses[name].height, *_opencv(numbers[2][k]))
-            for k, name in enumerate(layout.cameras)
-        },
+        dict(zip(names, map(_matrix, in_cameras))),
+        dict(zip(moments, map(_matrix, in_boards))),
+        {n: Pinhole.from_opencv(*size, *_opencv(lens)) for n, size, lens in zip(names, sizes, in_lenses)},
         np.sqrt(squares),
-        dict(zip(layout.cameras, np.concatenate([np.zeros((1, 6)), std]))),
+        dict(zip(names, np.concatenate([np.zeros((1, 6)), std]))),
     )
 
 
-def _minimize(layout: _Layout, start: Array) -> Array:
+def _minimize(problem: _Problem, start: Array) -> Array:
     """Levenberg's and Marquardt's descent of Huber's loss, by normal equations.
 
     These have a few hundred unknowns, however many corners were seen. scipy's solver for sparse problems does not come
-    to an end here, and the one for dense ones takes seconds.
+    to an end here, and the one for dense ones takes a minute.
     """
     values, damping = start, FIRST_DAMPING
-    residuals = layout.residuals(values)
+    residuals = problem.residuals(values)
     for _ in range(MOST_STEPS):
-        jacobian = layout.jacobian(values)
+        jacobian = problem.jacobian(values)
         weights = np.minimum(1.0, ROBUST_PX / np.maximum(np.abs(residuals), 1e-12))
         normal = (jacobian.T @ jacobian.multiply(weights[:, None])).toarray()
         gradient = jacobian.T @ (weights * residuals)
         before = _huber(residuals)
         while damping < LAST_DAMPING:
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient)
-            tried = layout.residuals(values + step)
+            stepped = values.copy()
+            stepped[problem.free] -= np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            tried = problem.residuals(stepped)
             if (loss := _huber(tried)) < before:
                 break
             damping *= 10
         else:
             break
-        values, residuals, damping = values + step, tried, damping / 10
+        values, residuals, damping = stepped, tried, damping / 10
         if before - loss < SMALLEST_GAIN * before:
             break
     return values
@@ -121,71 +121,54 @@ def _huber(residuals: Array) -> float:
     return float(np.where(size < ROBUST_PX, size**2, ROBUST_PX * (2 * size - ROBUST_PX)).sum())
 
 
-class _Layout:
-    """Where each unknown stands: cameras but the first (6 each), moments (6 each), lenses (8 each, if refined)."""
+@dataclass(frozen=True)
+class _Problem:
+    """What was seen, of values in one vector: poses of cameras and boards (6 each), lenses (8 each).
 
-    def __init__(
-        self,
-        sightings: Sequence[Sighting],
-        cameras: list[str],
-        moments: list[str],
-        lenses: Mapping[str, Pinhole],
-        refine_lenses: bool,
-    ) -> None:
-        self.cameras, self.moments = cameras, moments
-        self._lenses = np.array([_lens_numbers(lenses[name]) for name in cameras])
-        self._refine = refine_lenses
-        self._seen = [(cameras.index(s.camera), moments.index(s.moment), s.corners) for s in sightings]
-        self._boards_at = 6 * (len(cameras) - 1)
-        self._lenses_at = self._boards_at + 6 * len(moments)
-        self.size = self._lenses_at + (_LENS * len(cameras) if refine_lenses else 0)
+    seen: number of the camera, number of the board, corners. cameras: how many. lenses_at: where the lenses begin.
+    free: the values that are estimated; the first camera's pose is none.
+    """
 
-    def unpacked(self, values: Array) -> tuple[Array, Array, Array]:
+    seen: Sequence[tuple[int, int, Corners]]
+    cameras: int
+    lenses_at: int
+    free: slice
+
+    def parts(self, values: Array) -> tuple[Array, Array, Array]:
         """Poses of cameras (C, 6) and boards (M, 6), and lenses (C, 8)."""
-        first = np.zeros((1, 6))
-        cameras = np.concatenate([first, values[: self._boards_at].reshape(-1, 6)])
-        boards = values[self._boards_at : self._lenses_at].reshape(-1, 6)
-        lenses = values[self._lenses_at :].reshape(-1, _LENS) if self._refine else self._lenses
-        return cameras, boards, lenses
+        poses = values[: self.lenses_at].reshape(-1, 6)
+        return poses[: self.cameras], poses[self.cameras :], values[self.lenses_at :].reshape(-1, _LENS)
 
     def residuals(self, values: Array) -> Array:
         """Projected minus seen, pixels: x and y of each corner in turn."""
-        cameras, boards, lenses = self.unpacked(values)
-        parts = []
-        for camera, moment, corners in self._seen:
-            turn, shift = cv2.composeRT(
-                boards[moment, :3], boards[moment, 3:], cameras[camera, :3], cameras[camera, 3:]
-            )[:2]
-            pixels, _ = cv2.projectPoints(corners.points, turn, shift, *_opencv(lenses[camera]))
-            parts.append((pixels.reshape(-1, 2) - (corners.pixels - 0.5)).ravel())
-        return np.concatenate(parts)
+        cameras, boards, lenses = self.parts(values)
+        found = []
+        for c, b, corners in self.seen:
+            turn, shift = cv2.composeRT(boards[b, :3], boards[b, 3:], cameras[c, :3], cameras[c, 3:])[:2]
+            pixels, _ = cv2.projectPoints(corners.points, turn, shift, *_opencv(lenses[c]))
+            found.append((pixels.reshape(-1, 2) - (corners.pixels - 0.5)).ravel())
+        return np.concatenate(found)
 
     def jacobian(self, values: Array) -> csr_matrix:
-        """Derivatives of ``residuals`` by the unknowns."""
-        cameras, boards, lenses = self.unpacked(values)
+        """Derivatives of ``residuals`` by the free values."""
+        cameras, boards, lenses = self.parts(values)
         rows, columns, entries = [], [], []
         row = 0
-        for camera, moment, corners in self._seen:
-            turn, shift, *by = cv2.composeRT(
-                boards[moment, :3], boards[moment, 3:], cameras[camera, :3], cameras[camera, 3:]
-            )
+        for c, b, corners in self.seen:
+            turn, shift, *by = cv2.composeRT(boards[b, :3], boards[b, 3:], cameras[c, :3], cameras[c, 3:])
             # (6, 12): the composed pose by the board's and the camera's.
             composed = np.block([[by[0], by[1], by[2], by[3]], [by[4], by[5], by[6], by[7]]])
-            _, by_view = cv2.projectPoints(corners.points, turn, shift, *_opencv(lenses[camera]))
+            _, by_view = cv2.projectPoints(corners.points, turn, shift, *_opencv(lenses[c]))
             by_poses = by_view[:, :6] @ composed
-            blocks = [(self._boards_at + 6 * moment, by_poses[:, :6])]
-            if camera:
-                blocks.append((6 * (camera - 1), by_poses[:, 6:]))
-            if self._refine:
-                blocks.append((self._lenses_at + _LENS * camera, by_view[:, 6 : 6 + _LENS]))
-            for at, block in blocks:
+            at = [6 * (self.cameras + b), 6 * c, self.lenses_at + _LENS * c]
+            for first, block in zip(at, (by_poses[:, :6], by_poses[:, 6:], by_view[:, 6 : 6 + _LENS])):
                 height, width = block.shape
                 rows.append(np.repeat(np.arange(row, row + height), width))
-                columns.append(np.tile(np.arange(at, at + width), height))
+                columns.append(np.tile(np.arange(first, first + width), height))
                 entries.append(block.ravel())
             row += len(by_view)
         where = np.concatenate(rows), np.concatenate(columns)
-        return coo_matrix((np.concatenate(entries), where), shape=(row, self.size)).tocsr()
+        return coo_matrix((np.concatenate(entries), where), shape=(row, len(values))).tocsr()[:, self.free]
 
 
 def _six(pose: Array) -> Array:

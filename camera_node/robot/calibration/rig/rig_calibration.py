@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.hand_eye.samples import medoid
 from camera_node.robot.calibration.rig.bundle_adjustment import Bundle, Sighting, adjust
 from camera_node.robot.calibration.settings import FEW_SHARED, LARGEST_PX, MIN_SHARED, OUTLIER_ERROR, OUTLIER_PX
 from camera_node.robot.calibration.targets import Array, Corners, estimate_pose
 from camera_node.sources.rig_calibration import calibration_entry
-from freshfield.geometry import Pinhole, se3_inverse, so3_log
+from freshfield.geometry import Pinhole, se3_inverse
 
 # From a target's axes (y down, z away from the viewer) to the world's (z up where the target lies on the floor).
 _UP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -96,7 +97,7 @@ def calibrate_rig(
     cameras = _chain(list(views), shared, seen)
     # A moment that one camera alone saw tells of its lens, not of the rig.
     moments = sorted({moment for _, moment in seen}, key=_natural)
-    boards = {m: _medoid([se3_inverse(cameras[c]) @ seen[c, m] for c in cameras if (c, m) in seen]) for m in moments}
+    boards = {m: medoid([se3_inverse(cameras[c]) @ seen[c, m] for c in cameras if (c, m) in seen]) for m in moments}
     sightings = [Sighting(c, m, views[c][m]) for c in cameras for m in moments if (c, m) in seen]
     bundle = adjust(sightings, cameras, boards, lenses, refine_lenses)
     usual_px = float(np.median(bundle.error_px))
@@ -118,7 +119,9 @@ def calibrate_rig(
         sightings, bundle = kept, adjust(kept, bundle.cameras, boards, bundle.lenses, refine_lenses)
     origin = next(iter(bundle.boards)) if origin is None else origin
     if origin not in bundle.boards:
-        raise CalibrationError(f"--origin {origin}: no camera saw the target then; there are {_some(bundle.boards)}")
+        raise CalibrationError(
+            f"--origin {origin}: no camera saw the target then; there are {', '.join([*bundle.boards][:8])}"
+        )
     return _result(list(views), bundle, sightings, origin, unused)
 
 
@@ -167,27 +170,10 @@ def _chain(
         pair = max(ways, key=lambda each: ways[each])
         known, new = pair if pair[0] in placed else pair[::-1]
         both = [m for c, m in seen if c == known and (new, m) in seen]
-        placed[new] = _medoid([seen[new, m] @ se3_inverse(seen[known, m]) for m in both]) @ placed[known]
+        placed[new] = medoid([seen[new, m] @ se3_inverse(seen[known, m]) for m in both]) @ placed[known]
     return placed
-
-
-def _medoid(poses: list[Array]) -> Array:
-    """The pose of several that is nearest to all others: one that is wrong does not move it."""
-    if len(poses) == 1:
-        return poses[0]
-    size = max(1e-6, float(np.median([np.linalg.norm(p[:3, 3]) for p in poses])))
-    apart = np.zeros((len(poses), len(poses)))
-    for (i, a), (k, b) in itertools.combinations(enumerate(poses), 2):
-        turned = np.linalg.norm(so3_log(a[:3, :3].T @ b[:3, :3]))
-        apart[i, k] = apart[k, i] = turned + np.linalg.norm(a[:3, 3] - b[:3, 3]) / size
-    return poses[int(np.argmin(apart.sum(axis=1)))]
 
 
 def _natural(name: str) -> list[tuple[float, str]]:
     """Key that sorts names by the numbers in them: 9 before 10."""
     return [(float(part), "") if part.isdecimal() else (-1.0, part) for part in re.split(r"(\d+)", name)]
-
-
-def _some(names: Mapping[str, Any]) -> str:
-    listed = list(names)
-    return ", ".join(listed[:8]) + (", ..." if len(listed) > 8 else "")

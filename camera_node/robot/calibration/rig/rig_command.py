@@ -105,12 +105,6 @@ def show(args: argparse.Namespace, text: str, data: dict[str, Any]) -> None:
             raise CalibrationError(f"--out: {args.out}: {error.strerror}") from None
 
 
-def print_progress(done: int) -> None:
-    """Say on a terminal how many pictures are done."""
-    if sys.stderr.isatty():
-        print(f"\r{done} pictures ", end="", file=sys.stderr, flush=True)
-
-
 def _from_target(args: argparse.Namespace) -> Any:
     from camera_node.robot.calibration.lens_calibration import calibrate_lens
     from camera_node.robot.calibration.rig import rig_inputs
@@ -126,7 +120,7 @@ def _from_target(args: argparse.Namespace) -> Any:
         finally:
             close()
     else:
-        views = rig_inputs.read_folder(args.folder, board, print_progress)
+        views = rig_inputs.read_folder(args.folder, board)
     if args.lens is None:
         lenses = {}
         for camera, seen in views.corners.items():

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.inputs import find_corners, list_images
+from camera_node.robot.calibration.inputs import find_corners, list_images, show_progress
 from camera_node.robot.calibration.settings import LIVE_WAIT_S, MOMENT_S, NEW_SHARE, STILL_PX, UNKNOWN_FOV_DEG
 from camera_node.robot.calibration.targets import Corners, GrayImage, Target, to_gray
 from camera_node.sources.datasets.video import Clip
@@ -32,7 +32,7 @@ class RigViews:
     unused: dict[str, dict[str, str]] = field(default_factory=dict)
 
 
-def read_folder(folder: Path, target: Target, progress: Callable[[int], None]) -> RigViews:
+def read_folder(folder: Path, target: Target) -> RigViews:
     """Views of a folder with one folder of pictures (``cam00/0007.png``: pictures of one moment have one name) or one
     video (``cam00.mp4``; all begin at the same instant) a camera. Raises CalibrationError."""
     if not folder.is_dir():
@@ -45,13 +45,12 @@ def read_folder(folder: Path, target: Target, progress: Callable[[int], None]) -
             f"{len(cameras)}: cam00/0001.png, cam01/0001.png, or cam00.mp4, cam01.mp4"
         )
     views = RigViews()
-    done = itertools.count(1)
     for entry in cameras:
         name = entry.stem if entry.is_file() else entry.name
         if entry.is_file():
-            views.corners[name], views.sizes[name] = _of_video(entry, target, lambda: progress(next(done)))
+            views.corners[name], views.sizes[name] = _of_video(entry, target)
             continue
-        found, views.unused[name], size = find_corners(list_images(entry), target, None, lambda _: progress(next(done)))
+        found, views.unused[name], size = find_corners(list_images(entry), target)
         views.corners[name] = {Path(file).stem: corners for file, corners in found.items()}
         views.sizes[name] = size
     for name, seen in views.corners.items():
@@ -61,7 +60,7 @@ def read_folder(folder: Path, target: Target, progress: Callable[[int], None]) -
     return views
 
 
-def _of_video(file: Path, target: Target, progress: Callable[[], None]) -> tuple[dict[str, Corners], tuple[int, int]]:
+def _of_video(file: Path, target: Target) -> tuple[dict[str, Corners], tuple[int, int]]:
     """Corners by moment, each MOMENT_S, at which the target stood still between two frames; and the images' size."""
     found: dict[str, Corners] = {}
     with closing(Clip(file)) as clip:
@@ -69,7 +68,7 @@ def _of_video(file: Path, target: Target, progress: Callable[[], None]) -> tuple
         for moment_s in np.arange(0.0, times_s[-1], MOMENT_S):
             first = int(np.abs(times_s[:-1] - moment_s).argmin())
             before, now = (target.find(to_gray(clip.frame(index, *size))) for index in (first, first + 1))
-            progress()
+            show_progress(f"{file.name} {moment_s:.1f} s")
             if before is not None and now is not None and moved_px(before, now) < STILL_PX:
                 found[f"{moment_s:.1f}s"] = now
     return found, size

@@ -50,16 +50,6 @@ def test_every_method_is_exact_on_exact_samples(setup):
     assert Residuals.of(exact, X).rms[0] < 1e-9 and found.refined.std_mm < 1e-3
 
 
-def test_residuals_have_units():
-    """Of a target put 3 mm aside in one of four samples, and of one turned by 0.02 rad."""
-    still = np.array([np.eye(4)] * 4)
-    targets = still.copy()
-    targets[0, 0, 3], targets[1, :3, :3] = 0.003, so3_exp([0.0, 0.0, 0.02])
-    assert Residuals.of(Samples(still, targets), still[0], still[0]).rms == pytest.approx((1.5, np.degrees(0.01)))
-    # A rotation counts as the motion of a point at 330 mm.
-    assert Residuals(np.array([2.0]), np.array([np.degrees(0.01)])).score_mm == pytest.approx(2.0 + 3.3)
-
-
 def test_how_much_the_flange_must_turn():
     for turns_deg, reason in (
         ([[0, 0, 0], [5.1, 0, 0], [0, 5.1, 0]], None),
@@ -117,15 +107,10 @@ def test_a_board_of_another_size_than_said_is_told_and_its_size_found(setup, fac
     assert calibrate(right, fit_size=True).warnings == calibrate(right).warnings == ()
 
 
-@pytest.mark.parametrize(("scale", "says"), [(1e-3, "targets seem to be in millimeters"), (1e3, "meters, flanges in")])
-def test_meters_and_millimeters_do_not_mix(scale, says):
-    refused(CalibrationError, says, calibrate, noisy_samples(12, np.random.default_rng(3)).rescaled(scale))
-
-
 def test_a_real_arm_whose_calibration_was_published():
     folder = data_dir("handeye_visp_franka")
     board = parse_target("chessboard:9x6:23.6mm")
-    samples, unused = read_visp_folder(folder, board, None, EYE_IN_HAND, lambda done: None)
+    samples, unused = read_visp_folder(folder, board, None, EYE_IN_HAND)
     assert len(samples) == 8 and not unused
     published = np.loadtxt(folder / "expected_eMc.txt")
     found = calibrate(samples)
@@ -223,11 +208,12 @@ def test_the_table_the_file_and_json_which_is_not_lost_with_its_file(tmp_path, c
 
 def test_nonsense_is_refused_and_not_an_answer():
     good = noisy_samples(15, np.random.default_rng(1))
-    millimeters = Samples(good.flange.copy(), good.target.copy())
-    for poses in (millimeters.flange, millimeters.target):
-        poses[:, :3, 3] *= 1e3
-    for samples in (Samples(good.flange, se3_inverse(good.target)), millimeters):
-        refused(CalibrationError, "not their inverses, in meters", calibrate, samples)
+    inverted = Samples(good.flange, se3_inverse(good.target))
+    refused(CalibrationError, "not their inverses, in meters", calibrate, inverted)
+    flange, target = (poses * [[1, 1, 1, 1e3]] for poses in (good.flange, good.target))
+    flange[:, 3, 3] = target[:, 3, 3] = 1.0
+    for samples, what in ((Samples(good.flange, target), "targets"), (Samples(flange, good.target), "flanges")):
+        refused(CalibrationError, f"{what} seem to be in millimeters", calibrate, samples)
 
 
 CHESSBOARD = ("--board", "chessboard:9x6:10mm")

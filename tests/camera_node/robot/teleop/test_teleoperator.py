@@ -16,7 +16,7 @@ from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import UR3E, apply_calibration
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from camera_node.robot.teleop.damped_least_squares import commanded_twist, joint_speeds
-from camera_node.robot.teleop.limits import JointLimits, Limiter
+from camera_node.robot.teleop.limits import JointRates, Limiter
 from camera_node.robot.teleop.mapping import Mapping
 from camera_node.robot.teleop.one_euro_filter import OneEuro
 from camera_node.robot.teleop.settings import TeleopConfig
@@ -63,32 +63,24 @@ def assert_within_limits(config: TeleopConfig, commands: Sequence[Command], star
     assert lowest.min() >= config.floor_m - EPS
 
 
-def stop_way(v: float, change: float, dt: float) -> float:
-    """The sum that the limiter inverts in closed form, added up."""
-    way = 0.0
-    while v > 0.0:
-        way += v * dt
-        v -= change
-    return way
-
-
-@given(room=st.floats(0.0, 20.0), acceleration=st.floats(0.05, 40.0), rate_hz=st.floats(20.0, 500.0))
-def test_the_fastest_speed_stops_exactly_within_the_room(room, acceleration, rate_hz):
-    dt = 1.0 / rate_hz
-    limits = JointLimits([0.0], [1.0], 1e9, acceleration, dt)
-    (fastest,) = limits._max_stoppable_speed(np.array([room]))
-    change = limits._change
-    assert stop_way(fastest, change, dt) <= room * (1 + 1e-9) + 1e-12
-    # And nothing faster does: the closed form is no bound but the value.
-    assert stop_way(fastest + 1e-6, change, dt) > room * (1 - 1e-9)
-
-
 def test_all_joints_change_in_proportion_so_that_the_flange_keeps_its_direction():
-    limits = JointLimits([-3.0] * 3, [3.0] * 3, 1.0, 2.0, 0.01)
+    limits = JointRates(np.full(3, -3.0), np.full(3, 3.0), 1.0, 2.0, 0.01)
     wanted = np.array([0.8, -0.4, 0.1])
     first = limits.clamp(np.zeros(3), np.zeros(3), wanted)
     assert np.allclose(first / wanted, first[0] / wanted[0])
     assert first[0] == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("rate_hz", [20.0, 125.0, 500.0])
+def test_a_joint_comes_to_rest_at_its_end_and_holds_no_other(rate_hz):
+    end = 2 * math.pi - 0.05
+    config, start = TeleopConfig(rate_hz=rate_hz), np.array([*HOME[:5], end - 0.5])
+    limiter, commands = Limiter(UR3E, config, start), list[Command]()
+    for _ in range(round(3 * rate_hz)):
+        commands.append(Command(*limiter.step([0.05, 0.0, 0.0, 0.0, 0.0, 0.8]), ""))
+    assert_within_limits(config, commands, start)
+    assert end - 1e-3 < limiter.q[5] <= end and limiter.q[0] == pytest.approx(HOME[0] + 0.15, abs=0.01)
+    assert not any(limiter.refused.values())
 
 
 @pytest.mark.parametrize("wanted", [[np.inf] * 6, np.zeros(5), None])
@@ -176,13 +168,13 @@ def test_limits_hold_while_an_operator_pulls_everywhere(seed):
         for k in range(250):
             way = rng.normal(0.0, 0.015, 3) if k % 25 == 0 else way
             position = np.clip(position + way, -0.5, 0.5)
-            clutch, late = k > 2 and (rng.random() > 0.02), int(rng.integers(0, 3)) * TICK_NS
-            sent = [] if rng.random() < 0.1 else [sample(k * TICK_NS + 1 - late, position, clutch)]
+            clutch, late = k > 2 and (rng.random() > 0.02), int(rng.integers(0, 3)) * TICK_NS * (k > 2)
+            sent = [] if rng.random() < 0.1 and k > 2 else [sample(k * TICK_NS + 1 - late, position, clutch)]
             commands += drive(operator, [(k * TICK_NS, sent)])
         assert_within_limits(config, commands)
         runs.append(np.array([c.joints for c in commands]))
     assert np.array_equal(*runs) and np.abs(runs[0] - HOME).max() > 0.05
-    assert operator.mapping.counts.engaged > 0
+    assert operator.mapping.counts["pressed"] > 0
 
 
 @pytest.mark.stability
@@ -255,7 +247,7 @@ def test_pressing_the_clutch_commands_no_motion_wherever_the_stylus_is():
     mapping.add_sample(sample(61 * MS, (0.6, 0.0, 0.0)), FLANGE)
     assert mapping.target is not None and np.allclose(mapping.target, FLANGE)
     mapping.add_sample(sample(62 * MS, (0.0, 0.0, 0.0)), FLANGE)
-    assert mapping.counts.jumps == 1 and np.allclose(mapping.target, FLANGE), "found elsewhere, it is anchored anew"
+    assert mapping.counts["jumps"] == 1 and np.allclose(mapping.target, FLANGE), "found elsewhere, it is anchored anew"
 
 
 def test_silence_lets_go_and_asks_for_a_new_press_on_any_clock():
@@ -263,7 +255,7 @@ def test_silence_lets_go_and_asks_for_a_new_press_on_any_clock():
     mapping.add_sample(sample(10**15, (0.3, 0.1, 0.2)), FLANGE)
     mapping.silence()
     mapping.silence()
-    assert mapping.counts.silences == 1 and mapping.target is None
+    assert mapping.counts["silences"] == 1 and mapping.target is None
     assert mapping.add_sample(sample(5), FLANGE), "the stylus was started anew: its clock begins again"
     assert mapping.target is None
     mapping.add_sample(sample(6, clutch=False), FLANGE)
@@ -281,16 +273,9 @@ def test_what_is_no_pose_and_what_is_old_is_counted_and_changes_nothing(change):
     before = mapping.target.copy()
     bad = {"t": 5, "p": (0.0, 0.0, 0.0), "q": (1.0, 0.0, 0.0, 0.0), **change}
     assert not mapping.add_sample(StylusSample(bad["t"], bad["p"], bad["q"], True), FLANGE)
-    assert mapping.counts.unsound == 1
+    assert mapping.counts["refused"] == 1
     assert not mapping.add_sample(sample(2), FLANGE) and not mapping.add_sample(sample(1), FLANGE)
-    assert mapping.counts.backwards == 2 and np.array_equal(mapping.target, before)
-
-
-def test_the_target_waits_at_the_wall():
-    mapping = Mapping(QUICK)
-    for k in range(200):
-        mapping.add_sample(sample((k + 1) * 10 * MS, (0.0, 0.01 * k, 0.0), k > 0), FLANGE)
-    assert mapping.target[1, 3] == 0.45
+    assert mapping.counts["refused"] == 3 and np.array_equal(mapping.target, before)
 
 
 @pytest.mark.parametrize("axis", np.eye(3))
@@ -315,14 +300,6 @@ def moved(q, shift, turn=(0.0, 0.0, 0.0)):
     """The flange's pose at ``q``, shifted and turned in the base's axes."""
     flange = UR3E.forward(q)
     return se3(so3_exp(turn) @ flange[:3, :3], flange[:3, 3] + shift)
-
-
-def test_the_twist_is_in_proportion_to_the_distance_up_to_its_limit():
-    near = commanded_twist(UR3E, TWIST, HOME, moved(HOME, [0.01, 0.0, -0.02], [0.0, 0.03, 0.0]))
-    np.testing.assert_allclose(near, [0.04, 0.0, -0.08, 0.0, 0.12, 0.0], atol=1e-9)
-    far = commanded_twist(UR3E, TWIST, HOME, moved(HOME, [0.3, 0.0, 0.4], [0.0, 0.5, 0.0]))
-    np.testing.assert_allclose(far, [0.12, 0.0, 0.16, 0.0, 0.2, 0.0], atol=1e-9)  # all of it, to a tenth
-    assert not commanded_twist(UR3E, TWIST, HOME, UR3E.forward(HOME)).any()
 
 
 @pytest.mark.parametrize("wrist", [np.pi / 2, 0.2, 0.05, 0.0])
