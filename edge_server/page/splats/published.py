@@ -27,12 +27,11 @@ class StaticRecords:
     """The static Gaussians, those of largest weight first.
 
     number: counts sets of other Gaussians; within one, row k stays the same Gaussian.
-    version: counts what was made. records: RECORD (N,). weight: float64 (N,). unseen: bool (N,), see
+    records: RECORD (N,). weight: float64 (N,). unseen: bool (N,), see
     ``SurfaceScene.unseen_points``; None without depth.
     """
 
     number: int
-    version: int
     scales: tuple[float, float]
     records: NDArray[np.void]
     weight: NDArray[np.float64]
@@ -61,7 +60,7 @@ class Publisher:
         self._behind = False  # whether static records are of an earlier snapshot, because it was too soon for new ones
         self._newest: Published | None = None
         self._box: SceneBox | None = None
-        self._fields = self._anchor_sets = self._sets = self._versions = 0
+        self._fields = self._anchor_sets = self._sets = 0
         self._anchors: NDArray[np.float64] | None = None
         self._order = np.zeros(0, np.intp)
         self._places = np.zeros((0, 3), np.float32)
@@ -108,7 +107,6 @@ class Publisher:
             self._sets += 1
             self._set_since_s = now_s
             self._order = np.argsort(-weights(params), kind="stable")
-        self._versions += 1
         self._places = params[:: max(len(params) // _SAMPLED, 1), :3].copy()
         params = params[self._order]
         scales = before.scales if before is not None and same else scale_range(params)
@@ -118,7 +116,7 @@ class Publisher:
             box = layered.box
             unseen = surfaces.unseen_points(params[:, :3] * box.radius_m + np.asarray(box.center_m))
         records = to_records(params, scales)
-        made = StaticRecords(self._sets, self._versions, scales, records, weights(params), unseen)
+        made = StaticRecords(self._sets, scales, records, weights(params), unseen)
         self._static_due_s = now_s + max(STATIC_EVERY_S, _BUSY * (perf_counter() - began))
         return made
 

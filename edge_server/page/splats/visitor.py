@@ -198,11 +198,6 @@ class Visitor:
         self._due: list[int] = []  # chunks
         self._unseen: NDArray[np.bool_] | None = None  # as sent
 
-    @property
-    def shown_static(self) -> int:
-        """Static Gaussians of the set that is sent."""
-        return len(self._sent)
-
     def acknowledged(self, number: int, now_s: float) -> None:
         """The visitor has read all messages up to this one."""
         self.link.acknowledged(number, now_s)

@@ -167,7 +167,7 @@ def test_a_slow_link_is_kept_short_and_shows_what_is_large(kilobytes, all_of_it,
     assert link.record_bytes() > 0.5 * 12.0 * link.there.rate  # and it is used
     link.there.rate = 2e6  # a link that becomes faster gets the rest
     link.run(ticks(16.0, 12.0))
-    assert link.visitor.shown_static == COUNT and len(link.reader.at(NEWEST_S)) == COUNT + 1000
+    assert len(link.visitor._sent) == COUNT and len(link.reader.at(NEWEST_S)) == COUNT + 1000
 
 
 def test_an_outage_during_a_probe_makes_no_link_one_whose_delays_scatter(publisher):
