@@ -66,6 +66,6 @@ LOOK_BACK_SHARE, LOOKS_A_SCORE = 0.03, 12
 STATUS_PERIOD_S, AGES_PERIOD_S = 0.5, 0.2
 SNAPSHOT_TIMEOUT_S = 30.0
 LAST_SCORES_S = 4.0  # for what waits at the end, and for all frames of held-out cameras that move: 64 take 2 s
-UPDATE_TIMES = 4096  # latest update times that percentiles are computed from
+UPDATE_TIMES, CHECK_TIMES = 4096, 4096  # latest times of updates, and of checks of frames, whose percentiles are told
 MOST_EVENTS = 200  # kept: each is in every edge.json
 SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages

@@ -149,20 +149,6 @@ def test_history_keeps_the_window_and_leaves_the_held_out_camera_aside():
     assert len(history.columns()[0]) == len(t), "time that goes back"
 
 
-def test_states_are_numbered_by_the_emulators_list_or_as_they_come_and_averaged_over_cameras():
-    history = History()
-    said = [{"state": "high", "states": ["low", "high"]}, {"state": "low"}, {}, None, {"state": 2}]
-    for i, status in enumerate([*said, {"state": [1]}]):
-        history.sample(float(i), views(), status)
-    assert history.state_names == ["low", "high", "2"]
-    state = history.columns()[3]
-    assert state[:2].tolist() == [1, 0] and np.isnan(state[[2, 3, 5]]).all() and state[4] == 2
-    chains = {"a": {"state": "low"}, "b": {"state": "high"}, "c": {}, "d": 3}
-    history.sample(9.0, views(), {"state": None, "by_camera": chains})
-    history.sample(10.0, views(), {"states": 7, "by_camera": [1], "state": None})
-    assert history.columns()[3][-2] == 0.5 and np.isnan(history.columns()[3][-1])
-
-
 def test_the_charts_show_ages_scored_updates_of_the_window_and_states_by_name():
     gui, made = MagicMock(), []
     gui.add_uplot.side_effect = lambda **props: made.append(MagicMock(**props)) or made[-1]

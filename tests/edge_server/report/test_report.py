@@ -204,18 +204,6 @@ def test_a_held_out_camera_that_moves_is_drawn_and_tabled_at_refined_poses(tmp_p
     assert_says(page, "0.812 SSIM of the same", "9 held-out frames so far, at refined poses 24.70 0.8125")
 
 
-def test_each_part_of_a_figure_is_drawn_and_ages_from_the_youngest_camera_to_the_oldest(run, tmp_path, monkeypatch):
-    files, bands, drawn = read_run_files(run[0]), [], []
-    monkeypatch.setattr("matplotlib.axes.Axes.fill_between", lambda axes, t, low, high, **_: bands.append((low, high)))
-    monkeypatch.setattr(figures, "label_lines", lambda at, *_, **__: drawn.append((len(at.patches), len(at.lines))))
-    for draw in (figures.draw_ages, figures.draw_channel, figures.draw_processes):
-        assert draw(run[1], files, tmp_path / "figure.png")
-    known = np.array([[row.age_ms[camera] for camera in CAMERAS[1:]] for row in files.ages])
-    np.testing.assert_array_equal(bands, [(known.min(axis=1), known.max(axis=1))])
-    # Two states; fifty delays and their mean; memory and processor time of edge, emulator and nodes.
-    assert drawn[2:] == [(2, 0), (50, 1), (0, 3), (0, 3)]
-
-
 @pytest.mark.stability
 @pytest.mark.parametrize(
     ("file", "text", "note"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import threading
-from collections import Counter
+from collections import Counter, deque
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
@@ -82,8 +82,7 @@ class Growing(Counter):
 
 
 def ingest(rejected, depth=None):
-    check_ms = SimpleNamespace(percentile=lambda percent: 1.0)
-    return SimpleNamespace(rejected=rejected, depth=depth or {}, buffer=SimpleNamespace(shed=2), check_ms=check_ms)
+    return SimpleNamespace(rejected=rejected, depth=depth or {}, buffer=SimpleNamespace(shed=2), check_ms=deque([1.0]))
 
 
 def test_a_reason_that_comes_while_metrics_are_read_does_not_fail_them():

@@ -177,14 +177,6 @@ def test_what_cannot_be_drawn_is_not_drawn_and_spoils_nothing(column, value):
     assert low < high and len(packing.to_records(params[:0], (low, high))) == 0
 
 
-def test_larger_nearer_and_denser_ones_weigh_more():
-    one = np.array([[0, 0, 0, -3, -3, -3, 1, 0, 0, 0, 0, 0, 0, 0]], np.float32)
-    others = np.tile(one, (4, 1))
-    others[[0, 1, 2, 3], [3, 10, 0, 0]] = -2.0, 2.0, 0.9, 4.0  # larger, denser, within the unit, far
-    larger, denser, within, far = packing.weights(others) / packing.weights(one)
-    assert larger > 2.0 and denser > 1.0 and within == 1.0 and far == pytest.approx(1 / 16)
-
-
 def test_what_is_noticed():
     before = packing.to_records(gaussians(6, 6), (-5.0, -2.0))
     now = before.copy()

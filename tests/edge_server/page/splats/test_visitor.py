@@ -141,16 +141,6 @@ def test_a_fast_link_has_everything_and_goes_on():
     assert [len(block.records) for block in link.of(messages.MovingBlock, since_s=3.0)].count(0) == 1
 
 
-def test_a_moving_set_that_found_no_room_lets_the_window_grow():
-    link, still = Link(Line(2e6)), snapshot(gaussians(COUNT, 0), movers=1000)
-    link.run(ticks(3.0), lambda now_s: still)  # all that stands still is there
-    window = link.visitor.link
-    window.window -= window.room - 1500.0
-    published = link.publisher.take(snapshot(gaussians(COUNT, 0), movers=1000, newest_s=NEWEST_S + 4.0), 4.0)
-    link.visitor.message(published, NEWEST_S, {}, 4.0)
-    assert window.short
-
-
 @pytest.mark.parametrize("kilobytes, all_of_it, lag_s", [(15, False, 0.65), (60, True, 0.35)])
 def test_a_slow_link_is_kept_short_and_shows_what_is_large(kilobytes, all_of_it, lag_s):
     link = Link(Line(1e3 * kilobytes))
