@@ -38,7 +38,6 @@ MAX_NODES = 10_000
 USUAL_SIDE = 640
 
 _ENLARGE = ("Resize", "Upsample")
-_PER_IMAGE = "DynamicQuantizeLinear"
 _CONVOLVE = ("Conv", "ConvInteger", "QLinearConv")
 # Operators of backbones. Those whose output size is in their data (Expand, Tile, ConstantOfShape, Range,
 # loops) are missing: a few bytes could request any amount of memory.
@@ -198,12 +197,6 @@ def _cut(model: onnx.ModelProto, image: str, tap: str, path: Path) -> onnx.Model
         raise EmbeddingError(
             f"{path}: the backbone holds {', '.join(unknown) or 'functions'}, which no YOLO backbone does"
         )
-    if any(node.op_type == _PER_IMAGE and tap in node.output for node in cut.graph.node):
-        raise EmbeddingError(
-            f"{path}: {tap} is quantised with another scale for every image: export the model without that"
-        )
-    if not any(node.op_type in _CONVOLVE for node in cut.graph.node):
-        raise EmbeddingError(f"{path}: no convolution lies between the images and {tap}")
     del cut.graph.value_info[:]
     del cut.graph.output[:]
     # A statically quantized map holds integers, with the same offset and scale in every image.

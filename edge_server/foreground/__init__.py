@@ -28,10 +28,6 @@ WHY = {
 }
 
 
-class ForegroundError(ValueError):
-    """A model or setting is unusable; the one-line message says what, where and what to do."""
-
-
 class ForegroundConfig(Settings, frozen=True):
     """The section ``edge.foreground`` of a scenario. Of several detections the surest counts."""
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError, onnx_libraries
-from edge_server.foreground import SHIPPED, WHY, ForegroundConfig, ForegroundError
+from edge_server.foreground import SHIPPED, WHY, ForegroundConfig
 
 if TYPE_CHECKING:
     from edge_server.foreground.detector import Detector
@@ -41,7 +41,7 @@ class Foreground:
         begun = time.perf_counter()
         try:
             found = self._mask(image)
-        except (ForegroundError, EmbeddingError):
+        except EmbeddingError:
             found = "failed"
         self.seconds += time.perf_counter() - begun
         counted = found if isinstance(found, str) else "masked"
@@ -84,16 +84,13 @@ class Foreground:
 
 
 def make_foreground(config: ForegroundConfig) -> Foreground:
-    """Create from a config. Raises ForegroundError: a library is not installed, or the model is unusable."""
-    try:
-        with onnx_libraries("the shipped model" if config.detector in SHIPPED else "an ONNX model"):
-            from edge_server.foreground.detector import Detector
-    except EmbeddingError as error:
-        raise ForegroundError(str(error)) from None
+    """Create from a config. Raises EmbeddingError: a library is not installed, or the model is unusable."""
+    with onnx_libraries("the shipped model" if config.detector in SHIPPED else "an ONNX model"):
+        from edge_server.foreground.detector import Detector
     detector = Detector(config.detector)
     known = set(detector.kinds.values())
     if known and (unknown := set(config.kinds) - known):
-        raise ForegroundError(
+        raise EmbeddingError(
             f"kinds: {detector.name} knows no {', '.join(sorted(unknown))}; it knows {', '.join(sorted(known))}"
         )
     return Foreground(config, detector)
