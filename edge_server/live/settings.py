@@ -62,6 +62,14 @@ FIRST_ALLOWANCE_S = 0.2
 # more. One publication, whose metrics cost some ten times that, is scored for so many of them.
 LOOK_BACK_SHARE, LOOKS_A_SCORE = 0.03, 12
 
+# --- what is written of a run ---
+FINAL_AFTER = 32  # newer publications after which one without scores will not get any: a second of updates at arrivals
+LINE_EVERY_S = 0.08  # between two lines of publications without scores, on average: there may be fifty a second
+INTERVAL_SHARE = 0.01  # weight of the newest interval in their running mean
+# Of the recorder's queue: the disk may stall for seconds. A node's frames are some tens of kilobytes.
+MOST_QUEUED_BYTES, MOST_QUEUED = 64 * 2**20, 4096
+RECORD_EVERY_S, MESSAGE_BYTES = 0.05, 1024  # between two looks at an empty queue; of a message beside its payloads
+
 # --- what is told of a run ---
 STATUS_PERIOD_S, AGES_PERIOD_S = 0.5, 0.2
 SNAPSHOT_TIMEOUT_S = 30.0

@@ -16,6 +16,8 @@ NOTICE_S = 8.0
 """For which an answer to a control stays."""
 SAY_EVERY_S = 60.0
 """Between two log lines of one kind of refused request."""
+FRUSTUM_OF_RADIUS, THUMBNAIL_WIDTH = 0.06, 112
+"""Size of a camera's frustum, in median distances of the cameras; pixels of the picture in it."""
 THUMBNAIL_EVERY_S = 1.0
 """Between two thumbnails of a camera."""
 THUMBNAIL_BUDGET_S = 0.03

@@ -40,6 +40,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from edge_server.report.settings import CUT_OFF_NS
 from freshfield.ledger import LedgerReader
 
 # Ends that the emulator's link gives a frame. ``broken`` is not one: a later process may know better.
@@ -47,9 +48,6 @@ LINK_ENDS = ("skipped", "dropped_busy", "superseded", "lost", "in_flight")
 ENDS = (*LINK_ENDS, "broken", "delivered", "rejected", "cut_off")
 _ON_THE_WAY = ("captured", "replaced", "waiting", "sent", "skipped", "dropped_busy", "superseded", "lost", "broken")
 _STATES = (*_ON_THE_WAY, "duplicated", "delivered", "rejected", "in_flight", "cut_off")
-# A killed process takes with it the frames that it wrote about in its last moments. The thesis's links hold a
-# frame for a second or two; a frame without a line this near to the end was lost by something else.
-CUT_OFF_NS = 10 * 10**9
 _EVENTS = {
     "node": {"captured", "replaced", "waiting", "sent", "broken", "answered"},
     "emulator": {"received", *LINK_ENDS, "rejected", "forwarded", "duplicated", "broken"},

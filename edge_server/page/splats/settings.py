@@ -26,6 +26,11 @@ STATIC_EVERY_S = 0.5
 """Between two looks at which static chunks have changed."""
 CHANGED_SHARE = 0.02
 """Share of a chunk's weight that has changed noticeably, from which it is sent again."""
+BUSY = 8.0
+"""Static records are made again after so many times what they took: an eighth of a core at most."""
+SAMPLED, SAME_WITHIN = 512, 0.02
+"""Gaussians by whose places two static sets are told apart, and scene units that half of them move at most, if the
+field goes on with the same ones."""
 NEW_SET_EVERY_S = 1.0
 """Between two static sets with other Gaussians, as while a field grows: each is sent whole."""
 NEW_SET_S = 3.0

@@ -15,9 +15,10 @@ from edge_server.live.output.journal import Journal
 from edge_server.report import figures
 from edge_server.report.build_report import METRICS, SERIES, assemble, build_report, fidelity, updates
 from edge_server.report.conclusion import conclusion
-from edge_server.report.events import MOST, silences
+from edge_server.report.events import silences
 from edge_server.report.figures import draw_fidelity, draw_frontier
 from edge_server.report.run_files import continuous, read_run_files
+from edge_server.report.settings import MOST_EVENTS
 from edge_server.run_records import AgesRow, EdgeStatus, UpdateCounts, UpdateRow
 from freshfield.scenario import NOTHING_HELD_OUT
 from freshfield.untrusted import read_json
@@ -232,12 +233,12 @@ def test_what_should_be_something_else_adds_a_note(tmp_path, file, text, note):
 def test_hostile_names_do_not_reach_the_page_as_markup_nor_many_events(tmp_path):
     write_run(tmp_path, publications=2, ages=2)
     evil = "<script>alert(1)</script>"
-    events = [{"t_s": t_s, "what": evil} for t_s in (-1.0, *range(3 * MOST))]
+    events = [{"t_s": t_s, "what": evil} for t_s in (-1.0, *range(3 * MOST_EVENTS))]
     edit_edge(tmp_path, scenario=evil, field=evil, lpips_missing=evil, chosen=evil, events=events)
     (tmp_path / "ages.jsonl").write_text(json.dumps({"t_s": 1, "age_ms": {evil: 3}}) + "\n")
     report, page = page_of(tmp_path)
-    assert "<script" not in page and page.count("&lt;script&gt;alert(1)") == 6 + MOST - 2  # two of the channel
-    assert len(report["events"]) == MOST and read_json((tmp_path / "report.json").read_text())
+    assert "<script" not in page and page.count("&lt;script&gt;alert(1)") == 6 + MOST_EVENTS - 2  # two of the channel
+    assert len(report["events"]) == MOST_EVENTS and read_json((tmp_path / "report.json").read_text())
 
 
 def test_the_run_stands_beside_the_measured_frontier(tmp_path, monkeypatch):
