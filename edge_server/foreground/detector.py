@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from edge_server.embed import EmbeddingError
 from edge_server.embed.backbone import MAX_SIDE, exported_size
 from edge_server.embed.embedder import INPUT_TYPES, open_model, reason_of
-from edge_server.embed.letterbox import blob, checked
+from edge_server.embed.letterbox import blob, checked, placed
 from edge_server.foreground import MODELS, SHIPPED
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ class Detector:
             raise EmbeddingError(f"{self.name}: gives {prototypes.shape}, not masks (1, n, height, width)")
         rows = decode(out, confidence, self.name, prototypes.shape[1], len(self.kinds), self._end_to_end)
         h, w = whole.shape[:2]
-        scale, _, (left, top) = self._placed((h, w))
+        scale, _, (left, top) = placed(h, w, self.height, self.width)
         found = []
         for x0, y0, x1, y1, score, kind, *weights in rows:
             box = ((x0 - left) / scale, (y0 - top) / scale, (x1 - left) / scale, (y1 - top) / scale)
@@ -90,18 +90,11 @@ class Detector:
             found.append(Detection(box, score, self.kinds.get(int(kind), str(int(kind))), mask))
         return found
 
-    def _placed(self, shape: tuple[int, int]) -> tuple[float, tuple[int, int], tuple[int, int]]:
-        """Scale of an image in the letterboxed input, and its size and left upper corner there."""
-        h, w = shape
-        scale = min(self.height / h, self.width / w)
-        size = max(1, round(w * scale)), max(1, round(h * scale))
-        return scale, size, ((self.width - size[0]) // 2, (self.height - size[1]) // 2)
-
     def _mask(self, weights: list[float], prototypes: Array, shape: tuple[int, int]) -> NDArray[np.bool_]:
         """Where the weighted sum of prototypes (n, h, w) is positive, as a mask of the image's ``shape``. The
         prototypes cover the model's input."""
         h, w = shape
-        _, size, (left, top) = self._placed(shape)
+        _, size, (left, top) = placed(h, w, self.height, self.width)
         logits = np.tensordot(np.asarray(weights, np.float32), prototypes.astype(np.float32), 1)
         logits = np.nan_to_num(logits, nan=-1.0)
         whole = cv2.resize(logits, (self.width, self.height), interpolation=cv2.INTER_LINEAR)

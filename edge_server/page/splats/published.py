@@ -91,26 +91,25 @@ class Publisher:
     def _static(
         self, params: NDArray[np.float32], before: StaticRecords | None, now_s: float, layered: LayeredSnapshot | None
     ) -> StaticRecords:
-        self._behind = before is not None and now_s < self._static_due_s
-        if self._behind and before is not None:
-            return before
-        same = before is not None and self._same(params)
-        self._behind = before is not None and not same and now_s < self._set_since_s + tuned.NEW_SET_EVERY_S
-        if self._behind and before is not None:
+        kept = before if before is not None and self._same(params) else None
+        due_s = self._static_due_s
+        if kept is None:
+            due_s = max(due_s, self._set_since_s + tuned.NEW_SET_EVERY_S)
+        self._behind = before is not None and now_s < due_s
+        if before is not None and now_s < due_s:
             return before
         began = perf_counter()
-        if before is None or not same:
+        if kept is None:
             self._sets += 1
             self._set_since_s = now_s
             self._order = np.argsort(-weights(params), kind="stable")
         self._places = params[:: max(len(params) // tuned.SAMPLED, 1), :3].copy()
         params = params[self._order]
-        scales = before.scales if before is not None and same else scale_range(params)
-        surfaces = None if layered is None else layered.surfaces
-        unseen = before.unseen if before is not None and same else None
-        if surfaces is not None and unseen is None and layered is not None:
+        scales = scale_range(params) if kept is None else kept.scales
+        unseen = None if kept is None else kept.unseen
+        if layered is not None and layered.surfaces is not None and unseen is None:
             box = layered.box
-            unseen = surfaces.unseen_points(params[:, :3] * box.radius_m + np.asarray(box.center_m))
+            unseen = layered.surfaces.unseen_points(params[:, :3] * box.radius_m + np.asarray(box.center_m))
         records = to_records(params, scales)
         made = StaticRecords(self._sets, scales, records, weights(params), unseen)
         self._static_due_s = now_s + max(tuned.STATIC_EVERY_S, tuned.BUSY * (perf_counter() - began))

@@ -20,8 +20,8 @@ from edge_server.page.splats.messages import (
     StaticBlock,
     StatusBlock,
     UnseenBlock,
-    join_blocks,
     write_block,
+    write_message,
 )
 from edge_server.page.splats.published import Published, StaticRecords
 from edge_server.page.splats.records import RECORD, noticeable
@@ -183,7 +183,7 @@ class Visitor:
             return None
         if told:
             self._status_s = now_s
-        data = join_blocks(self._number, present_s, blocks)
+        data = write_message(self._number, present_s, blocks)
         self.link.sent(self._number, len(data), now_s)
         self._number = (self._number + 1) & 0xFFFFFFFF
         return data

@@ -179,9 +179,6 @@ def test_the_charts_show_ages_scored_updates_of_the_window_and_states_by_name():
     history.sample(201.0, views(100.0, 500.0), None)
     charts.refresh(history, [])
     assert len(made) == 4 and len(made[3].data[0]) == 4
-    early = [replace(publications[0], t_s=190.0 + k, psnr_moving_db=None if k else 9.0) for k in range(11)]
-    charts.refresh(history, early)
-    assert len(made[-1].data) == 2  # nothing of what moves among the last ten
     for k in range(799):
         history.sample(202.0 + k, views(1000.0 + k), None)
     charts.refresh(history, [])

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.fidelity.scorer import SELECTED
+from edge_server.fidelity.scorer import METRICS, SELECTED
 from edge_server.live.output.journal import Journal
 from edge_server.report import figures
-from edge_server.report.build_report import METRICS, SERIES, assemble, build_report, fidelity, updates
+from edge_server.report.build_report import SERIES, assemble, build_report, fidelity, updates
 from edge_server.report.conclusion import conclusion
 from edge_server.report.events import silences
 from edge_server.report.figures import draw_fidelity, draw_frontier
