@@ -48,7 +48,6 @@ class Scene:
         self._seen = 0
         self._seen_at = 0.0
         self._placed: dict[int, NDArray[np.float64]] = {}
-        self._next_thumbnail = 0
         self._undecodable: set[str] = set()
 
     @property
@@ -136,15 +135,12 @@ class Scene:
         return pose if known is None else known.camera_to_world
 
     def _thumbnails(self, cameras: list[CameraView]) -> None:
-        """Update thumbnails in turn, within the time budget."""
+        """Update thumbnails within the time budget, those first that are oldest."""
         began = perf_counter()
-        for i in range(len(cameras)):
-            camera = cameras[(self._next_thumbnail + i) % len(cameras)]
-            frame, node = camera.newest, self._nodes[camera.camera]
+        for camera in sorted(cameras, key=lambda each: self._nodes[each.camera].thumbnail_at):
+            frame, node, now = camera.newest, self._nodes[camera.camera], perf_counter()
             assert frame is not None
-            now = perf_counter()
             if now - began > tuned.THUMBNAIL_BUDGET_S:
-                self._next_thumbnail = (self._next_thumbnail + i) % len(cameras)
                 return
             key = (frame.session, frame.sequence)
             if key == node.thumbnail_of or now - node.thumbnail_at < tuned.THUMBNAIL_EVERY_S:

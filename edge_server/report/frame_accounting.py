@@ -24,9 +24,9 @@ does not close: a sum that does not come out, statements that cannot all be true
 a frame both dropped and delivered), ledger lines that were lost, ledgers that cannot be read.
 
 A frame that only the emulator or the edge wrote about (its node's ledger is on another machine) counts as
-captured and sent, with a note. Where nodes' ledgers are present, a frame that was only ever refused, of a
-camera that no process accepted, of a session whose node did not write about it or with a garbled id, is of
-unknown origin and counted apart (``strangers`` in the report).
+captured and sent, with a note. Of unknown origin, and counted apart (``strangers`` in the report), is one with a
+garbled id; and where nodes' ledgers are present, one that was only ever refused, of a camera that no process accepted
+or of a session whose node did not write about it.
 
 Runs are long. Ledgers are therefore read line by line, and frames share a few dozen different histories, each of
 which is kept and evaluated once.
@@ -153,15 +153,13 @@ class _LedgerContents:
     """What all ledgers say.
 
     frames: each frame's history, by (camera, session) and sequence. accepted: cameras about which
-    some process wrote more than refusals. garbled: by camera, the reasons for which frames with a garbled id
-    were refused; each is one frame. unknown_events: how often each event that no role writes was read.
+    some process wrote more than refusals. unknown_events: how often each event that no role writes was read.
     near_end: frames written about near the end of a ledger without ``closed``; bit r: of one of role r.
     """
 
     ledgers: Sequence[LedgerReader]
     frames: dict[tuple[str, str], dict[int, History]] = field(default_factory=dict)
     accepted: set[str] = field(default_factory=set)
-    garbled: dict[str, Counter[str]] = field(default_factory=dict)
     unknown_events: Counter[str] = field(default_factory=Counter)
     near_end: dict[tuple[str, str, int], int] = field(default_factory=dict)
     complete: list[bool] = field(default_factory=list)
@@ -237,14 +235,6 @@ def account_frames(out: Path) -> FrameAccounting:
                     what = f"the end of {copies} sent copies" if copies > 0 else "what became of the capture"
                     said = [*contradictions, f"{what} is in no ledger"]
                 accounting.contradict(f"{camera} {session} {sequence}", said)
-    for camera, refusals in contents.garbled.items():
-        if has_node_ledger:
-            accounting.unknown_origin.update(refusals)
-        else:
-            count = refusals.total()
-            rejected = {f"rejected:{reason}": copies for reason, copies in refusals.items()}
-            accounting.add(camera, FrameCounts({"captured": count, "sent": count, **rejected}))
-            without_node += count
     if ledgers and not any(ledger.role == "edge" for ledger in ledgers):
         notes.append("no edge's ledger here: what the edge took has no end")
     if without_node:
@@ -301,7 +291,7 @@ def _read_ledger(
                 elif event == "rejected":
                     reason = e.detail or "unknown"
                     if _GARBLED in (e.camera, e.session):
-                        contents.garbled.setdefault(e.camera, Counter())[reason] += 1
+                        accounting.unknown_origin[reason] += 1
                         continue
                     event = f"rejected:{reason}"
                 if e.event != "rejected":

@@ -106,10 +106,11 @@ class LinkWindow:
         _, mean, mean_s, square, product = self._moments / self._moments[0]
         spread = square - mean**2
         if spread > (tuned.LEAST_SPREAD * mean) ** 2:
-            self._per_byte_s = max((product - mean * mean_s) / spread, 1e-12)
+            per_byte_s = (product - mean * mean_s) / spread
         else:  # all alike: nothing tells the two apart
-            self._per_byte_s = mean_s / mean
-        self.alone_s = max(mean_s - self._per_byte_s * mean, self.round_trip_s)
+            per_byte_s = mean_s / mean
+        self._per_byte_s = max(float(per_byte_s), 1e-12)
+        self.alone_s = max(float(mean_s - self._per_byte_s * mean), self.round_trip_s)
         full = (self.alone_s + tuned.QUEUE_S) / self._per_byte_s
         if full < self.window:
             self.window = max(full, tuned.BACK_OFF * self.window, tuned.LEAST_WINDOW)

@@ -177,20 +177,6 @@ def test_what_cannot_be_drawn_is_not_drawn_and_spoils_nothing(column, value):
     assert low < high and len(packing.to_records(params[:0], (low, high))) == 0
 
 
-def test_what_is_noticed():
-    before = packing.to_records(gaussians(6, 6), (-5.0, -2.0))
-    now = before.copy()
-    steps = {"place": 3, "scale": 3, "turn": 6, "color": 2}
-    for row, (name, step) in enumerate(steps.items()):
-        now[name][row, 1] += step
-    now["alpha"][4] -= 3
-    assert not packing.noticeable(before, now).any()
-    for row, name in enumerate(steps):
-        now[name][row, 1] += 1
-    now["alpha"][4] -= 1
-    np.testing.assert_array_equal(packing.noticeable(before, now), [True] * 5 + [False])
-
-
 START_NS, BEGIN_S = ORIGIN_NS - 3_500_000_000, 3.5  # the run began before the field's motion
 
 
