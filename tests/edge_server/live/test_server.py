@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import threading
 import time
 import urllib.request
@@ -35,7 +36,7 @@ from freshfield import scenario
 from freshfield.frame import to_request
 from freshfield.geometry import Pose, look_at
 from freshfield.ledger import read_all
-from freshfield.limits import MAX_SNAPSHOTS, MAX_WATCHERS
+from freshfield.limits import MAX_SCRAPES, MAX_SNAPSHOTS, MAX_WATCHERS
 from freshfield.transport import Transport, TransportError
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2_grpc
 from freshfield_up.processes import GRACE_S
@@ -205,6 +206,24 @@ def test_a_camera_that_moves_begins_the_field_anew_as_a_scan_and_a_resumed_run_k
     assert status["chosen"].startswith("splat as a scan, updated in a cycle for 100 ms: cam02 moves")
     again = serve(made, resume=tmp_path / "out" / "field.npz").server
     assert again.state.chosen == status["chosen"] and len(again.updater.field.views) > 0
+
+
+def test_metrics_hold_few_connections_and_answer_beside_half_requests(serve):
+    server = serve(metrics_port=(metrics := free_port())).server
+    until(lambda: server.loop.alive)
+    server.buffer.shed = 3
+    half = []
+    for _ in range(100):
+        half.append(socket.create_connection(("127.0.0.1", metrics)))
+        half[-1].sendall(b"GET /metrics HTTP/1.1\r\n")
+    with urllib.request.urlopen(f"http://127.0.0.1:{metrics}/metrics", timeout=10) as page:
+        text = page.read()
+    assert b"freshfield_frames_rejected" in text and b"freshfield_frames_shed_total 3.0" in text
+    assert server.status()["updates"]["shed"] == 3
+    # At once, and not only when the silent ones time out.
+    until(lambda: sum("process_request" in t.name for t in threading.enumerate()) <= MAX_SCRAPES, 2.0)
+    for connection in half:
+        connection.close()
 
 
 def test_watchers_are_few_and_a_new_one_always_finds_a_place(serve):
