@@ -48,13 +48,9 @@ class LinkWindow:
         self._sent: deque[tuple[int, int, float, int]] = deque()  # number, bytes, when, bytes under way then
         self._round_trips: deque[tuple[float, float]] = deque()  # when, seconds
         self._moments = np.zeros(5)  # weighted sums of 1, bytes, seconds, bytes^2, bytes * seconds
+        self.round_trip_s = 0.0  # the shortest of late
         self.alone_s, self._per_byte_s = 0.0, 1e-12  # that a message takes alone, on average, and each byte beside it
         self._since_s, self._acknowledged = 0.0, 0
-
-    @property
-    def round_trip_s(self) -> float:
-        """The shortest of late; 0 before the first."""
-        return min((trip for _, trip in self._round_trips), default=0.0)
 
     @property
     def scatters(self) -> bool:
@@ -94,6 +90,7 @@ class LinkWindow:
         while self._round_trips and self._round_trips[0][0] < now_s - tuned.FORGET_RTT_S:
             self._round_trips.popleft()
         self._round_trips.append((now_s, now_s - sent_s))
+        self.round_trip_s = min(trip for _, trip in self._round_trips)
         self._fit_window(size, under_way, now_s - sent_s)
 
     def _fit_window(self, size: int, under_way: int, round_trip_s: float) -> None:
