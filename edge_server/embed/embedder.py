@@ -29,7 +29,6 @@ class Embedder:
     """A frozen map from images to ``dim`` numbers each.
 
     name: identifies the map: what was learned with one embedder holds for any other of the same name.
-    failed: number of images for which the model gave NaN or infinity.
     """
 
     def __init__(self, backbone: Backbone, dim: int) -> None:
@@ -38,7 +37,6 @@ class Embedder:
         self.backbone, self.dim = backbone, dim
         of = backbone.name if backbone.projection is not None else backbone.tap
         self._mean, self._axes = mean_and_axes(backbone.projection, backbone.channels, dim, of)
-        self.failed = 0
         self.name = f"{backbone.name}-{backbone.digest} {backbone.tap} {backbone.width}x{backbone.height} d{dim}"
         self._session = open_session(backbone.model, backbone.name)
         self.step = backbone.batch or _BATCH
@@ -50,16 +48,14 @@ class Embedder:
         """Embeddings (n, dim), finite, of uint8 RGB images (H, W, 3) of any size; RGBA is composited over
         gray.
 
-        An image for which the model gives NaN or infinity has a row of zeros, which no other image has, and
-        is counted in ``failed``. EmbeddingError: an array is not an image.
+        An image for which the model gives NaN or infinity has a row of zeros, which no other image has.
+        EmbeddingError: an array is not an image.
         """
         features = self.pooled(images)
         # A finite feature beyond float32's square root may still overflow in the product.
         with np.errstate(over="ignore", invalid="ignore"):
             rows = np.asarray((features - self._mean) @ self._axes, dtype=np.float32)
-        bad = ~np.isfinite(rows).all(axis=1)
-        self.failed += int(bad.sum())
-        rows[bad] = 0.0
+        rows[~np.isfinite(rows).all(axis=1)] = 0.0
         return rows
 
     def pooled(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:

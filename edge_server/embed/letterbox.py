@@ -19,17 +19,22 @@ def letterbox(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.u
     h, w = image.shape[:2]
     if (h, w) == (height, width):
         return image
-    scale = min(height / h, width / w)
-    size = (max(1, round(w * scale)), max(1, round(h * scale)))
+    scale, size, (left, top) = placed(h, w, height, width)
     # YOLO interpolates linearly both ways; averaging keeps a shrunk image from flickering with aliasing.
     how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
     fitted = cv2.resize(image, size, interpolation=how)
     if size == (width, height):
         return np.asarray(fitted, dtype=np.uint8)
     out = np.full((height, width, 3), GRAY, dtype=np.uint8)
-    top, left = (height - size[1]) // 2, (width - size[0]) // 2
     out[top : top + size[1], left : left + size[0]] = fitted
     return out
+
+
+def placed(h: int, w: int, height: int, width: int) -> tuple[float, tuple[int, int], tuple[int, int]]:
+    """Scale of an image (h, w) within (height, width), its size (width first) and left upper corner there."""
+    scale = min(height / h, width / w)
+    size = max(1, round(w * scale)), max(1, round(h * scale))
+    return scale, size, ((width - size[0]) // 2, (height - size[1]) // 2)
 
 
 def checked(image: NDArray, number: int) -> NDArray[np.uint8]:

@@ -7,28 +7,12 @@ from ours (camera-to-world, OpenCV axes, meters, w-first quaternions).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from edge_server.fields import View
-from freshfield.geometry import Pinhole
 
 
 class ExportError(ValueError):
     """The export cannot be written as asked; the message says why and what to do."""
-
-
-@dataclass(frozen=True)
-class PosedImage:
-    """An image with its pose. name: file name without folder. image: uint8 (H, W, 3 or 4).
-    camera_to_world: (4, 4), OpenCV axes, meters."""
-
-    name: str
-    image: NDArray[np.uint8]
-    camera_to_world: NDArray[np.float64]
-    intrinsics: Pinhole
 
 
 _PICTURES = {"png": (3, 4), "jpg": (3,), "jpeg": (3,)}  # ending -> channels of what is written

@@ -14,22 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.export import ExportError, PosedImage
+from edge_server.fields import View
 from freshfield.files import write_text
 from freshfield.geometry import Pinhole, matrix_to_quaternion, se3_inverse
-
-_HEADS = {
-    "cameras": ("# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"),
-    "images": (
-        "# Image list with two lines of data per image:",
-        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
-        "#   POINTS2D[] as (X, Y, POINT3D_ID)",
-    ),
-    "points3D": (
-        "# 3D point list with one line of data per point:",
-        "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
-    ),
-}
 
 
 @dataclass(frozen=True)
@@ -42,10 +29,8 @@ class Cloud:
     seen: NDArray[np.bool_]
 
 
-def write_model(folder: Path, shots: Sequence[PosedImage], cloud: Cloud) -> None:
-    """Write cameras.txt, images.txt and points3D.txt to ``folder``, which is created. ExportError: no shots."""
-    if not shots:
-        raise ExportError("no camera has reported: there is nothing to write")
+def write_model(folder: Path, shots: Sequence[View], cloud: Cloud) -> None:
+    """Write cameras.txt, images.txt and points3D.txt to ``folder``, which is created. shots: see ``Exporter``."""
     folder.mkdir(parents=True, exist_ok=True)
     lenses = list(dict.fromkeys(shot.intrinsics for shot in shots))
     images: list[str] = []
@@ -57,7 +42,7 @@ def write_model(folder: Path, shots: Sequence[PosedImage], cloud: Cloud) -> None
         for place, point in enumerate(which):
             tracks[point].append(f"{number} {place}")
         pose = f"{_numbers(matrix_to_quaternion(inverse[:3, :3]))} {_numbers(inverse[:3, 3])}"
-        images.append(f"{number} {pose} {lenses.index(shot.intrinsics) + 1} {shot.name}")
+        images.append(f"{number} {pose} {lenses.index(shot.intrinsics) + 1} {shot.camera}")
         images.append(" ".join(f"{_numbers(pixel)} {point + 1}" for pixel, point in zip(pixels, which)))
     cameras = [
         f"{k} {_model(lens)[0]} {lens.width} {lens.height} {_numbers(_model(lens)[1])}"
@@ -68,7 +53,7 @@ def write_model(folder: Path, shots: Sequence[PosedImage], cloud: Cloud) -> None
         for k, (at, color, track) in enumerate(zip(cloud.points, cloud.color, tracks), 1)
     ]
     for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
-        write_text(folder / f"{name}.txt", "\n".join([*_HEADS[name], *lines]) + "\n")
+        write_text(folder / f"{name}.txt", "".join(f"{line}\n" for line in lines))
 
 
 def _model(lens: Pinhole) -> tuple[str, list[float]]:

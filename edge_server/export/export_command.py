@@ -9,7 +9,7 @@ from pathlib import Path
 
 from edge_server.command import command_parser, run_command
 from edge_server.export import ExportError
-from edge_server.export.exporter import KINDS, Exporter, check, check_installed
+from edge_server.export.exporter import KINDS, Exporter, check
 from edge_server.export.run_source import open_source
 from edge_server.export.settings import POINTS
 from edge_server.progress import ProgressLine
@@ -92,17 +92,15 @@ def _parser() -> argparse.ArgumentParser:
 
 def _export(args: argparse.Namespace, files: dict[str, Path]) -> None:
     """Check all options, then write every file. Raises ExportError, SurfaceError."""
+    settings = _mesh_settings(args)
     check(files, args.count)
     if args.run.suffix == SAVED_STREAM:
         from edge_server.export.splat_sequence import write_sequence
 
         if set(files) != {"splats"}:
             raise ExportError(f"{args.run}: a saved stream has Gaussians alone: give --splats FILE.ply only")
-        check_installed(files)
         print(f"{args.run}: {write_sequence(files['splats'], args.run)} frames", flush=True)
         return
-    settings = _mesh_settings(args)
-    check_installed(files)  # after the options: what is written wrong is told also where it is missing
     source = open_source(args.run, args.allow_plugins)
     print(f"{source.file}: {source.name}, {len(source.views)} cameras", flush=True)
     progress = ProgressLine(sys.stderr)

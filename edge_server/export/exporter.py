@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from edge_server.export import ExportError, PosedImage
+from edge_server.export import ExportError
 from edge_server.export.settings import PIXELS_A_POINT, POINTS
 from edge_server.fields import Field, View
 from edge_server.surface.settings import MeshSettings
@@ -29,7 +29,8 @@ _UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
 def check(files: Mapping[str, Path], count: int = POINTS) -> None:
-    """Check what can be checked before a run is opened. Raises ExportError and SurfaceError.
+    """Check what can be checked before a run is opened: the options, then what is installed. Raises ExportError,
+    SurfaceError.
 
     files, count: see ``Exporter``.
     """
@@ -38,10 +39,6 @@ def check(files: Mapping[str, Path], count: int = POINTS) -> None:
             raise ExportError(f"--{kind} {files[kind]}: expected a file that ends in {' or '.join(endings)}")
     if count < 1:
         raise ExportError(f"--count {count}: expected 1 or more")
-
-
-def check_installed(files: Mapping[str, Path]) -> None:
-    """Check that what the files need is installed. Raises SurfaceError, ExportError. files: see ``Exporter.write``."""
     if "splats" in files and files["splats"].suffix.lower() == ".spz":
         from edge_server.export.splats import import_gsply
 
@@ -55,7 +52,8 @@ def check_installed(files: Mapping[str, Path]) -> None:
 class Exporter:
     """Writes one field.
 
-    name: of the representation. field, views: what is exported. shots: the views with their file names and poses.
+    name: of the representation. field, views: what is exported. shots: the views at their poses,
+        each under a file's name.
     count: number of points in points, colmap and transforms.
     mesh: settings of a mesh.
     say: gets a line for each file. progress: gets the stage and the share that is done.
@@ -66,7 +64,7 @@ class Exporter:
         name: str,
         field: Field,
         views: Sequence[View],
-        shots: list[PosedImage],
+        shots: Sequence[View],
         *,
         count: int = POINTS,
         mesh: MeshSettings | None = None,
@@ -80,7 +78,6 @@ class Exporter:
     def write(self, files: Mapping[str, Path]) -> None:
         """Write every file. files: kind, one of KINDS -> its file or folder. Raises ExportError and SurfaceError."""
         check(files, self._count)
-        check_installed(files)
         if "mesh" not in files:
             # Sharpening takes minutes, and points are drawn from the depth as well as it is, and from a part of it.
             self._settings = replace(self._settings, sharpen=False)

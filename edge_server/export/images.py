@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.export import ExportError, PosedImage
+from edge_server.export import ExportError
 from edge_server.export.settings import JPEG_QUALITY
 from edge_server.fidelity.images import to_bytes
+from edge_server.fields import View
 
 Image = NDArray[np.uint8]
 IMAGE_ENDINGS, VIDEO_ENDINGS = (".png", ".jpg", ".jpeg"), (".mp4",)
@@ -19,12 +20,13 @@ IMAGE_ENDINGS, VIDEO_ENDINGS = (".png", ".jpg", ".jpeg"), (".mp4",)
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 
 
-def write_images(folder: Path, shots: Iterable[PosedImage]) -> None:
-    """Write every shot under its name, with transparency where it has some. ExportError: a file cannot be written."""
+def write_images(folder: Path, shots: Iterable[View]) -> None:
+    """Write every shot (see ``Exporter``) under its name, with transparency where it has some.
+    ExportError: a file cannot be written."""
     folder.mkdir(parents=True, exist_ok=True)
     for shot in shots:
         code = cv2.COLOR_RGBA2BGRA if shot.image.shape[2] == 4 else cv2.COLOR_RGB2BGR
-        file = folder / shot.name
+        file = folder / shot.camera
         options = () if file.suffix.lower() == ".png" else _JPEG
         if not cv2.imwrite(str(file), cv2.cvtColor(shot.image, code), options):
             raise ExportError(f"{file}: cannot be written")

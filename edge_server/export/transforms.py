@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from edge_server.export import ExportError, PosedImage
+from edge_server.fields import View
 from freshfield.files import write_json
 from freshfield.geometry import OPENGL_TO_OPENCV
 
 
-def write_transforms(folder: Path, shots: Sequence[PosedImage], points: str | None = None) -> Path:
+def write_transforms(folder: Path, shots: Sequence[View], points: str | None = None) -> Path:
     """Write ``folder``/transforms.json for images in ``folder``/images; returns its path. points: name of a
-    PLY file in ``folder`` from which nerfstudio initializes splats. ExportError: no shots."""
-    if not shots:
-        raise ExportError("no camera has reported: there is nothing to write")
+    PLY file in ``folder`` from which nerfstudio initializes splats. shots: see ``Exporter``."""
     folder.mkdir(parents=True, exist_ok=True)
     frames = []
     for shot in shots:
@@ -22,7 +20,7 @@ def write_transforms(folder: Path, shots: Sequence[PosedImage], points: str | No
         k1, k2, p1, p2 = lens.distortion
         frames.append(
             {
-                "file_path": f"images/{shot.name}",
+                "file_path": f"images/{shot.camera}",
                 "w": lens.width,
                 "h": lens.height,
                 "fl_x": lens.fx,

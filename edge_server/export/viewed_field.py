@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.export import ExportError, PosedImage, file_names
+from edge_server.export import ExportError, file_names
 from edge_server.export.camera_paths import Step, lens, orbit, vertical_fov_deg
 from edge_server.export.settings import DEFAULT_HEIGHT_PX, MOST_NAMED
 from edge_server.fields import SEPARATOR, Field, RefinesCameras, Rendering, View
@@ -110,11 +111,11 @@ class ViewedField:
         )
 
     @property
-    def shots(self) -> list[PosedImage]:
-        """The views as images to write, at the poses that belong to the field's Gaussians: corrected ones, if it
-        corrects them."""
+    def shots(self) -> list[View]:
+        """The views as images to write, each under the name of its file, at the poses that belong to the field's
+        Gaussians: corrected ones, if it corrects them."""
         named = zip(file_names(self.views), self.views)
-        return [PosedImage(name, v.image, self.pose(v), v.intrinsics) for name, v in named]
+        return [replace(view, camera=name, camera_to_world=self.pose(view)) for name, view in named]
 
     def pose(self, view: View) -> NDArray[np.float64]:
         """Camera to world (4, 4) of a view, corrected where the field corrects it."""

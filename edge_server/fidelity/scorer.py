@@ -22,6 +22,8 @@ from freshfield.scenario import NOTHING_HELD_OUT
 
 SHOWN = ("psnr_db", "psnr_moving_db", "psnr_still_db", "ssim", "lpips")
 """The scores that are reported of what was shown."""
+METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "psnr_refined_db", "ssim_refined")
+"""Those of what was published."""
 SELECTED = "selected"
 """Stands for a held-out camera's name where nothing is held out: a score on the views trained on."""
 

@@ -23,15 +23,9 @@ SHIPPED = {"tile": "tile_int8.onnx"}
 # Why an image is used whole, by the name of its count (``foreground.Foreground``).
 WHY = {
     "not_detected": "nothing was found in it",
-    "empty_box": "the box has no area within it",
-    "empty_mask": "no pixel of the box was found to be the object",
     "full_mask": "all of it was found to be the object",
     "failed": "the model failed on it",
 }
-
-
-class ForegroundError(ValueError):
-    """A model or setting is unusable; the one-line message says what, where and what to do."""
 
 
 class ForegroundConfig(Settings, frozen=True):

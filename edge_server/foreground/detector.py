@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from edge_server.embed import EmbeddingError
 from edge_server.embed.backbone import MAX_SIDE, exported_size
 from edge_server.embed.embedder import INPUT_TYPES, open_model, reason_of
-from edge_server.embed.letterbox import blob, checked
-from edge_server.foreground import MODELS, SHIPPED, ForegroundError
+from edge_server.embed.letterbox import blob, checked, placed
+from edge_server.foreground import MODELS, SHIPPED
 
 Array = NDArray[np.float64]
 
@@ -46,18 +46,15 @@ class Detection:
 
 class Detector:
     """A YOLO segmentation model. path: its ONNX file, or the name of a shipped one (``SHIPPED``).
-    ForegroundError: the file is missing or unusable, or its model gives no masks."""
+    EmbeddingError: the file is missing or unusable, or its model gives no masks."""
 
     def __init__(self, path: str) -> None:
         file = MODELS / SHIPPED[path] if path in SHIPPED else Path(path)
         self.name = file.name
-        try:
-            self._session = open_model(file)
-        except EmbeddingError as error:
-            raise ForegroundError(str(error)) from None
+        self._session = open_model(file)
         image = self._session.get_inputs()[0]
         if len(self._session.get_inputs()) != 1 or len(image.shape) != 4 or image.type not in INPUT_TYPES:
-            raise ForegroundError(f"{file}: expected a model of images (n, 3, height, width)")
+            raise EmbeddingError(f"{file}: expected a model of images (n, 3, height, width)")
         self._input, self._dtype = image.name, INPUT_TYPES[image.type]
         meta = self._session.get_modelmeta().custom_metadata_map
         self.height, self.width = _size(image.shape, meta, file)
@@ -66,26 +63,26 @@ class Detector:
         task = meta.get("task", "segment")
         if task != "segment" or len(outputs) != 2 or len(outputs[1].shape) != 4:
             what = f"it is a model of the task {task}" if "task" in meta else "its outputs are no boxes and prototypes"
-            raise ForegroundError(f"{file}: gives no masks: {what}; name a YOLO segmentation model: {_EXPORT}")
+            raise EmbeddingError(f"{file}: gives no masks: {what}; name a YOLO segmentation model: {_EXPORT}")
         self._outputs = [output.name for output in outputs]
         self._end_to_end = _end_to_end(meta)
         self.detect(np.zeros((8, 8, 3), np.uint8), 1.0)  # a model that cannot run fails here
 
     def detect(self, image: NDArray[np.uint8], confidence: float) -> list[Detection]:
         """Detect objects in uint8 ``image`` (H, W, 3 or 4): best score first, after non-maximum suppression
-        per class. confidence: minimum score. ForegroundError: the model fails, or its output is not that of a
+        per class. confidence: minimum score. EmbeddingError: the model fails, or its output is not that of a
         YOLO head."""
         whole = checked(image, 0)
         try:
             given = blob([whole], self.height, self.width, self._dtype)
             out, prototypes = map(np.asarray, self._session.run(self._outputs, {self._input: given}))
         except Exception as error:  # ONNX Runtime's exceptions share no base class
-            raise ForegroundError(f"{self.name}: {reason_of(error)}") from None
+            raise EmbeddingError(f"{self.name}: {reason_of(error)}") from None
         if len(prototypes) != 1:
-            raise ForegroundError(f"{self.name}: gives {prototypes.shape}, not masks (1, n, height, width)")
+            raise EmbeddingError(f"{self.name}: gives {prototypes.shape}, not masks (1, n, height, width)")
         rows = decode(out, confidence, self.name, prototypes.shape[1], len(self.kinds), self._end_to_end)
         h, w = whole.shape[:2]
-        scale, _, (left, top) = self._placed((h, w))
+        scale, _, (left, top) = placed(h, w, self.height, self.width)
         found = []
         for x0, y0, x1, y1, score, kind, *weights in rows:
             box = ((x0 - left) / scale, (y0 - top) / scale, (x1 - left) / scale, (y1 - top) / scale)
@@ -93,18 +90,11 @@ class Detector:
             found.append(Detection(box, score, self.kinds.get(int(kind), str(int(kind))), mask))
         return found
 
-    def _placed(self, shape: tuple[int, int]) -> tuple[float, tuple[int, int], tuple[int, int]]:
-        """Scale of an image in the letterboxed input, and its size and left upper corner there."""
-        h, w = shape
-        scale = min(self.height / h, self.width / w)
-        size = max(1, round(w * scale)), max(1, round(h * scale))
-        return scale, size, ((self.width - size[0]) // 2, (self.height - size[1]) // 2)
-
     def _mask(self, weights: list[float], prototypes: Array, shape: tuple[int, int]) -> NDArray[np.bool_]:
         """Where the weighted sum of prototypes (n, h, w) is positive, as a mask of the image's ``shape``. The
         prototypes cover the model's input."""
         h, w = shape
-        _, size, (left, top) = self._placed(shape)
+        _, size, (left, top) = placed(h, w, self.height, self.width)
         logits = np.tensordot(np.asarray(weights, np.float32), prototypes.astype(np.float32), 1)
         logits = np.nan_to_num(logits, nan=-1.0)
         whole = cv2.resize(logits, (self.width, self.height), interpolation=cv2.INTER_LINEAR)
@@ -128,7 +118,7 @@ def decode(
     name: the model's name in errors. kinds: number of classes that the model names, 0 if it names none. end_to_end:
     what its metadata say; None: nothing.
     Returns rows (left, top, right, bottom, score, kind, *coefficients), best score first, without those that
-    are not finite or have no area. Raises ForegroundError."""
+    are not finite or have no area. Raises EmbeddingError."""
     shaped = output.ndim == 3 and len(output) == 1
     if (
         shaped and end_to_end is None
@@ -136,7 +126,7 @@ def decode(
         fits = output.shape[2] == 6 + coefficients and output.shape[1] <= _MOST and kinds != 2
         end_to_end = fits and _whole(output[0, :, 5])
     if not shaped or (not end_to_end and min(output.shape[1:]) < 5 + coefficients):
-        raise ForegroundError(
+        raise EmbeddingError(
             f"{name}: gives {output.shape}, not the boxes and scores of a YOLO segmentation head; export it again: "
             f"{_EXPORT}"
         )
@@ -155,19 +145,19 @@ def decode(
         found = scores.argmax(axis=1).astype(np.float64)
         right = kinds in (0, scores.shape[1])
     if not right:
-        raise ForegroundError(
+        raise EmbeddingError(
             f"{name}: gives {output.shape} with {coefficients} mask weights, which fits no head of {kinds} classes; "
             f"export it again: {_EXPORT}"
         )
     known = scores[np.isfinite(scores)]
     if known.size and not _SCORES[0] <= known.min() <= known.max() <= _SCORES[1]:
-        raise ForegroundError(
+        raise EmbeddingError(
             f"{name}: its scores lie in {known.min():.3g} to {known.max():.3g}, not in 0 to 1: no head that is read; "
             f"export it again: {_EXPORT}"
         )
     most = np.abs(corners[np.isfinite(corners)]).max(initial=0.0)
     if not end_to_end and 0.0 < most <= 2.0:
-        raise ForegroundError(f"{name}: its boxes are not in pixels; export it again: {_EXPORT}")
+        raise EmbeddingError(f"{name}: its boxes are not in pixels; export it again: {_EXPORT}")
     surest = scores.max(axis=1)
     sound = np.isfinite(table).all(axis=1) & (surest >= confidence) & (corners[:, 2:] > corners[:, :2]).all(axis=1)
     best = np.flatnonzero(sound)
@@ -200,7 +190,7 @@ def _size(shape: list[Any], meta: dict[str, str], file: Path) -> tuple[int, int]
     if not (height and width):
         height, width = exported_size(meta)
     if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE):
-        raise ForegroundError(f"{file}: images of {width} x {height} are not within 1 to {MAX_SIDE} a side")
+        raise EmbeddingError(f"{file}: images of {width} x {height} are not within 1 to {MAX_SIDE} a side")
     return height, width
 
 

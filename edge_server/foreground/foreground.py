@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError, onnx_libraries
-from edge_server.foreground import SHIPPED, WHY, ForegroundConfig, ForegroundError
+from edge_server.foreground import SHIPPED, WHY, ForegroundConfig
 
 if TYPE_CHECKING:
     from edge_server.foreground.detector import Detector
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Image = NDArray[np.uint8]
-Box = tuple[int, int, int, int]
-"""Left, top, right, bottom: whole pixels within the image, not empty."""
 
 
 class Foreground:
@@ -43,7 +41,7 @@ class Foreground:
         begun = time.perf_counter()
         try:
             found = self._mask(image)
-        except (ForegroundError, EmbeddingError):
+        except EmbeddingError:
             found = "failed"
         self.seconds += time.perf_counter() - begun
         counted = found if isinstance(found, str) else "masked"
@@ -70,14 +68,13 @@ class Foreground:
             return "not_detected"
         x0, y0, x1, y1 = found[0].box
         dx, dy = c.margin * (x1 - x0), c.margin * (y1 - y0)
-        box = clipped((x0 - dx, y0 - dy, x1 + dx, y1 + dy), image.shape[1], image.shape[0])
-        if box is None:
-            return "empty_box"
         inside = np.zeros(image.shape[:2], np.bool_)
-        inside[box[1] : box[3], box[0] : box[2]] = True
+        left, top = (max(0, math.floor(at)) for at in (x0 - dx, y0 - dy))
+        right, bottom = (max(0, math.ceil(at)) for at in (x1 + dx, y1 + dy))
+        inside[top:bottom, left:right] = True
         mask: NDArray[np.bool_] = found[0].mask() & inside
         if not mask.any():
-            return "empty_mask"
+            return "not_detected"
         return "full_mask" if mask.all() else mask
 
     def status(self) -> dict[str, Any]:
@@ -86,27 +83,14 @@ class Foreground:
         return {**self.counts, "ms_per_image": 1e3 * self.seconds / images if images else None}
 
 
-def clipped(box: tuple[float, float, float, float], width: int, height: int) -> Box | None:
-    """Clip ``box`` to whole pixels of the image; None if it is empty."""
-    if not all(map(math.isfinite, box)):
-        return None
-    left, top = max(0, math.floor(box[0])), max(0, math.floor(box[1]))
-    right, bottom = min(width, math.ceil(box[2])), min(height, math.ceil(box[3]))
-    empty = right <= left or bottom <= top or box[2] <= box[0] or box[3] <= box[1]
-    return None if empty else (left, top, right, bottom)
-
-
 def make_foreground(config: ForegroundConfig) -> Foreground:
-    """Create from a config. Raises ForegroundError: a library is not installed, or the model is unusable."""
-    try:
-        with onnx_libraries("the shipped model" if config.detector in SHIPPED else "an ONNX model"):
-            from edge_server.foreground.detector import Detector
-    except EmbeddingError as error:
-        raise ForegroundError(str(error)) from None
+    """Create from a config. Raises EmbeddingError: a library is not installed, or the model is unusable."""
+    with onnx_libraries("the shipped model" if config.detector in SHIPPED else "an ONNX model"):
+        from edge_server.foreground.detector import Detector
     detector = Detector(config.detector)
     known = set(detector.kinds.values())
     if known and (unknown := set(config.kinds) - known):
-        raise ForegroundError(
+        raise EmbeddingError(
             f"kinds: {detector.name} knows no {', '.join(sorted(unknown))}; it knows {', '.join(sorted(known))}"
         )
     return Foreground(config, detector)

@@ -317,12 +317,11 @@ def open_updater(
     keyframes = _keyframes(config, resumed)
     foreground: Foreground | None = None
     if config.foreground is not None:
-        from edge_server.foreground import ForegroundError
         from edge_server.foreground.foreground import make_foreground
 
         try:
             foreground = make_foreground(config.foreground)
-        except ForegroundError as error:
+        except ValueError as error:
             raise ScenarioError(f"{scenario.path}: edge.foreground: {error}") from None
     try:
         if config.depth_network is not None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import Counter, OrderedDict
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
@@ -188,7 +188,7 @@ class Ingest:
         self.newest_held_out: dict[str, Frame] = {}
         self.depth: dict[str, DepthArrivals] = {}
         """Of the cameras that have sent depth."""
-        self.check_ms = RollingPercentiles(4096)
+        self.check_ms: deque[float] = deque(maxlen=tuned.CHECK_TIMES)
         cameras = self.admission.cameras
         self.streams = OpenStreams(limits.MAX_STREAMS_PER_CAMERA * len(cameras))
         self._sessions = SessionStreams(cameras)
@@ -244,25 +244,11 @@ class Ingest:
         self._ledger.write(now_ns, frame.camera, frame.session, frame.sequence, "delivered")
         if self._on_accepted is not None:
             self._on_accepted(request, now_ns)
-        self.check_ms.add((time.perf_counter() - start_s) * 1e3)
+        self.check_ms.append((time.perf_counter() - start_s) * 1e3)
         return pb.PushResponse(sequence=frame.sequence, outcome=pb.OUTCOME_ACCEPTED)
 
 
-class RollingPercentiles:
-    """Percentiles of the last ``size`` values."""
-
-    def __init__(self, size: int) -> None:
-        self._values = np.zeros(size)
-        self._added = 0
-
-    def add(self, value: float) -> None:
-        self._values[self._added % len(self._values)] = value
-        self._added += 1
-
-    def percentile(self, percent: float) -> float | None:
-        """The value that ``percent`` of the values (0 to 100) do not exceed; None without values."""
-        values = self._values[: self._added]
-        if not len(values):
-            return None
-        rank = min(len(values) - 1, int(len(values) * percent / 100))
-        return float(np.partition(values, rank)[rank])
+def percentile(values: deque[float], percent: float) -> float | None:
+    """The value that ``percent`` of ``values`` do not exceed; None without values. Another thread may add some."""
+    known = values.copy()
+    return float(np.percentile(known, percent, method="inverted_cdf")) if known else None

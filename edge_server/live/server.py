@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -28,7 +29,7 @@ from edge_server.live import settings as tuned
 from edge_server.live.field_updater import open_updater
 from edge_server.live.frontier import open_frontier
 from edge_server.live.grpc_services import GrpcThread
-from edge_server.live.ingest import Ingest, LastFrames, RollingPercentiles
+from edge_server.live.ingest import Ingest, LastFrames, percentile
 from edge_server.live.loop import UpdateLoop
 from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.output.journal import Journal
@@ -102,7 +103,7 @@ class EdgeServer:
         self.start_ns = self.clock.now_ns()
         self._run_facts = run_facts()
         self._stopping = threading.Event()
-        self._update_ms = RollingPercentiles(tuned.UPDATE_TIMES)
+        self._update_ms: deque[float] = deque(maxlen=tuned.UPDATE_TIMES)
         self._counts = UpdateCounts()
         self._snapshot_lock = threading.Lock()
         options.out.mkdir(parents=True, exist_ok=True)
@@ -263,7 +264,7 @@ class EdgeServer:
         counts = self._counts
         if counts.first_ms is None:
             counts.first_ms = publication.t_s * 1e3
-        self._update_ms.add(publication.update_ms)
+        self._update_ms.append(publication.update_ms)
         counts.without_step = self.loop.without_step
         for camera in publication.refused:
             counts.refused[camera] = counts.refused.get(camera, 0) + 1
@@ -375,13 +376,13 @@ class EdgeServer:
             "decisions_lost": self._decision_log.lost,
             "last_frames": self.ingest.admission.last_frames(),
             "stale_on_arrival": self.buffer.stale_on_arrival,
-            "check_ms": {f"p{p}": self.ingest.check_ms.percentile(p) for p in (50, 99)},
+            "check_ms": {f"p{p}": percentile(self.ingest.check_ms, p) for p in (50, 99)},
             "updates": msgspec.to_builtins(
                 msgspec.structs.replace(
                     self._counts,
                     count=self.updater.number,
-                    ms_p50=self._update_ms.percentile(50),
-                    ms_p95=self._update_ms.percentile(95),
+                    ms_p50=percentile(self._update_ms, 50),
+                    ms_p95=percentile(self._update_ms, 95),
                     undecodable=self.updater.decoder.undecodable + self.scoring.undecodable,
                     shed=self.buffer.shed,
                 )

@@ -31,8 +31,8 @@ RESTARTS_BELOW = 16  # viewpoints: the field begins anew each time their number 
 
 # --- the loop of updates ---
 LONGEST_SLEEP_S = 0.2  # before it looks at the controls again
-TOO_SHORT, TOO_SHORT_OF = 10, 30  # updates without a step, of the latest, after which a warning is due
-WARN_EVERY_S = 30.0  # between two warnings of one kind
+TOO_SHORT = 1 / 3  # share of the updates without a step from which a warning is due
+WARN_EVERY_S = 30.0  # between two warnings of one kind, and before the first
 # For the update in progress when the server ends, without which there is no checkpoint. On a machine with five times as
 # much to do as it has cores, updates of ``ngp`` at 640 x 480 take 6 s, the longest 18. The launcher kills the server
 # after ``freshfield_up.processes.GRACE_S``, of which the checkpoint and the last pictures need some.
@@ -62,10 +62,18 @@ FIRST_ALLOWANCE_S = 0.2
 # more. One publication, whose metrics cost some ten times that, is scored for so many of them.
 LOOK_BACK_SHARE, LOOKS_A_SCORE = 0.03, 12
 
+# --- what is written of a run ---
+FINAL_AFTER = 32  # newer publications after which one without scores will not get any: a second of updates at arrivals
+LINE_EVERY_S = 0.08  # between two lines of publications without scores, on average: there may be fifty a second
+INTERVAL_SHARE = 0.01  # weight of the newest interval in their running mean
+# Of the recorder's queue: the disk may stall for seconds. A node's frames are some tens of kilobytes.
+MOST_QUEUED_BYTES, MOST_QUEUED = 64 * 2**20, 4096
+RECORD_EVERY_S, MESSAGE_BYTES = 0.05, 1024  # between two looks at an empty queue; of a message beside its payloads
+
 # --- what is told of a run ---
 STATUS_PERIOD_S, AGES_PERIOD_S = 0.5, 0.2
 SNAPSHOT_TIMEOUT_S = 30.0
 LAST_SCORES_S = 4.0  # for what waits at the end, and for all frames of held-out cameras that move: 64 take 2 s
-UPDATE_TIMES = 4096  # latest update times that percentiles are computed from
+UPDATE_TIMES, CHECK_TIMES = 4096, 4096  # latest times of updates, and of checks of frames, whose percentiles are told
 MOST_EVENTS = 200  # kept: each is in every edge.json
 SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages

@@ -16,7 +16,7 @@ import numpy as np
 import viser
 
 from edge_server.live.state import EdgeState
-from edge_server.page.markup import frontier, note
+from edge_server.page.markup import frontier, html
 from edge_server.page.rendering import RenderLoop
 from edge_server.page.settings import NOTICE_S
 from edge_server.page.views import ERROR, HINT, PICTURE, TRUTH, VIEWS
@@ -67,7 +67,7 @@ class ControlPanel:
             if self._state.frontier is not None:
                 self.frontier.content = frontier(self._state.frontier, self._state.present())
             self.help.content = _help(controls.policy)
-            self.chosen.content = note(self._state.chosen)
+            self.chosen.content = html("note", self._state.chosen)
             if self._paused != controls.paused:
                 self._paused = controls.paused
                 self.buttons.options = ("resume" if controls.paused else "pause", "reset", "snapshot")
@@ -151,7 +151,7 @@ def _label(parameter: str | None) -> str:
 
 def _help(policy: str) -> str:
     """The scheduler's line of help on the policy, without equation numbers and values."""
-    return note(re.sub(r" \([\d.-]+\)", "", policy_help(policy).split("; value:")[0]))
+    return html("note", re.sub(r" \([\d.-]+\)", "", policy_help(policy).split("; value:")[0]))
 
 
 def notify(client: Any, title: str, body: str, bad: bool = False, seconds: float = NOTICE_S) -> None:

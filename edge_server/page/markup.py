@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,7 @@ from markupsafe import Markup
 
 from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.state import CameraView, Publication
-from edge_server.page.colors import HELD_OUT, MEASURED, PRESENT, RGB, age_color, css, scale_color
+from edge_server.page.colors import HELD_OUT, MEASURED, PRESENT, age_color, css, scale_color
 from edge_server.page.settings import FRESH_MS, STALE_MS
 from edge_server.run_records import Frontier
 from freshfield.scenario import NOTHING_HELD_OUT
@@ -22,31 +20,15 @@ from freshfield.scenario import NOTHING_HELD_OUT
 NAMED_CAMERAS = 3  # that a sentence names, of those that an update left out
 
 
-@dataclass(frozen=True)
-class Summary:
-    """The values of the tiles; None is shown as a dash. condition: live, waiting or paused."""
-
-    scenario: str
-    field: str
-    doing: str
-    condition: str
-    updates: int
-    update_ms: float | None
-    psnr_db: float | None
-    scored_on: str | None
-    mean_age_ms: float | None
-    worst_age_ms: float | None
-    reporting: int
-    cameras: int
-    t_s: float
-    age_parts_ms: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """The parts of the age of what is shown, by name; empty before there is anything to show."""
+def html(macro: str, *values: Any, **more: Any) -> str:
+    """A part of the panel, by the name of its macro in ``panel.html.j2``, which says what it takes."""
+    return str(getattr(_panel, macro)(*values, **more))
 
 
-def status(s: Summary) -> str:
-    """Status line, six tiles, and the parts of the age of what is shown."""
+def status(s: Mapping[str, Any]) -> str:
+    """Status line, six tiles, and the parts of the age of what is shown. s: of ``panel.summary``."""
     names = {None: "held-out views", SELECTED: NOTHING_HELD_OUT}
-    return str(_panel.status(s, names.get(s.scored_on, s.scored_on)))
+    return html("status", s, names.get(s["scored_on"], s["scored_on"]))
 
 
 def frontier(found: Frontier, present: tuple[float, float, float | None] | None) -> str:
@@ -54,7 +36,7 @@ def frontier(found: Frontier, present: tuple[float, float, float | None] | None)
     and the run's own point ``present`` (``EdgeState.present``). Without measured points, how to measure
     them."""
     if not found.points:
-        return note(f"What accuracy costs in time is not measured for this field. {found.about}")
+        return html("note", f"What accuracy costs in time is not measured for this field. {found.about}")
     now = [(present[0], db) for db in present[1:] if db is not None] if present is not None else []
     known = [(p.update_ms, db) for p in found.points for db in (p.psnr_db, p.psnr_moving_db)] + now
     times, levels = [math.log(max(ms, 1.0)) for ms, _ in known], [db for _, db in known]
@@ -74,23 +56,7 @@ def frontier(found: Frontier, present: tuple[float, float, float | None] | None)
         (30, 106, "start", f"{math.exp(left):.0f} ms an update"),
         (310, 106, "end", f"{math.exp(left + wide):.0f} ms"),
     )
-    return str(_panel.frontier(whole, moving, [at(ms, db).split(",") for ms, db in now], ends, found.about))
-
-
-def legend() -> str:
-    """The age scale and the color of held-out cameras."""
-    middle_ms = round((FRESH_MS * STALE_MS) ** 0.5, -1)
-    return str(_panel.legend(f"{FRESH_MS:g}", f"{middle_ms:g}", f"{STALE_MS / 1000:g}"))
-
-
-def table(cameras: Sequence[CameraView], selected: Sequence[str] = ()) -> str:
-    """One row for each camera: age, frames delivered and rejected. Cameras of the last update are ticked."""
-    return str(_panel.table(cameras, set(selected)))
-
-
-def coverage(plan: str, words: str) -> str:
-    """What fixed cameras see. plan: SVG of ``freshfield.coverage.plan_svg``."""
-    return str(_panel.coverage(plan, words[:1].upper() + words[1:]))
+    return html("frontier", whole, moving, [at(ms, db).split(",") for ms, db in now], ends, found.about)
 
 
 def decision_words(last: Publication, cameras: Sequence[CameraView], policy: str) -> str:
@@ -116,18 +82,7 @@ def decision_words(last: Publication, cameras: Sequence[CameraView], policy: str
     if last.refused:
         words += f"; refuses {', '.join(last.refused)}, which contradict the others"
     # Room for two lines, so that what is below stays where it is.
-    return str(_panel.note(f"Update {last.number + 1} {words}.", lines=2))
-
-
-def comparison_caption(camera: str, psnr_db: float | None, update: int, held_out: bool) -> str:
-    """The caption above the pair of images. held_out: the camera is."""
-    truth = "truth at the present" if held_out else NOTHING_HELD_OUT
-    return str(_panel.comparison_caption(camera, psnr_db, update, truth))
-
-
-def chart_caption(title: str, lines: Sequence[tuple[str, RGB]], remark: str = "") -> str:
-    """A chart's title on the left; on the right ``remark``, or the names of its lines in their colors."""
-    return str(_panel.chart_caption(title, lines, remark))
+    return html("note", f"Update {last.number + 1} {words}.", lines=2)
 
 
 def channel_line(channel: dict[str, Any]) -> str:
@@ -142,17 +97,7 @@ def channel_line(channel: dict[str, Any]) -> str:
         count = counts.get(key) if isinstance(counts, dict) else None
         if count:
             parts.append(f"{count} {key.replace('_', ' ')}")
-    return note(", ".join(parts))
-
-
-def note(text: str) -> str:
-    """One dimmed line."""
-    return str(_panel.note(text))
-
-
-def warning(text: str) -> str:
-    """Lines that must not be missed."""
-    return str(_panel.warning(text))
+    return html("note", ", ".join(parts))
 
 
 def number(value: float | None, digits: int = 0) -> str:
@@ -178,5 +123,5 @@ _environment.filters |= {
     "scale_css": lambda fraction: css(scale_color(fraction)),
 }
 _environment.globals |= {"measured": css(MEASURED), "present": css(PRESENT), "held_out": css(HELD_OUT)}
+_environment.globals |= {"fresh_ms": FRESH_MS, "stale_ms": STALE_MS}
 _panel: Any = _environment.get_template("panel.html.j2").module
-INTRO = str(_panel.intro())

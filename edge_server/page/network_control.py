@@ -16,7 +16,7 @@ import grpc
 import viser
 
 from edge_server.page.controls import notify
-from edge_server.page.markup import note
+from edge_server.page.markup import html
 from edge_server.page.settings import ANSWER_S, MAX_SLIDER_DELAY_MS, NETWORKS, SLIDER_SETTLES_S, STATUS_LAG_S
 from freshfield.transport import Transport, peer_text
 from freshfield.v1 import channel_pb2, channel_pb2_grpc
@@ -81,7 +81,7 @@ class NetworkControl:
                 in_force = float(status["by_hand"]["delay_ms"]), float(status["by_hand"]["loss"])
             except (KeyError, TypeError, ValueError):  # null: the scenario's; or another version's file
                 in_force = None
-        self.words.content = note(f"The network is {describe(in_force)}.")
+        self.words.content = html("note", f"The network is {describe(in_force)}.")
         # Of the scenario's own network what is known: a slider that is moved changes the other one's value too.
         self._place_sliders(*(in_force or (_drawn_ms(status), 0.0)))
 

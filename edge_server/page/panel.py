@@ -14,12 +14,14 @@ from edge_server.live.state import CameraView, Comparison, EdgeState, Publicatio
 from edge_server.page import markup, views
 from edge_server.page.controls import ControlPanel
 from edge_server.page.diagnosis import poor_picture
+from edge_server.page.markup import html
 from edge_server.page.network_control import EmulatorControl, NetworkControl
 from edge_server.page.rendering import browser_image
 from edge_server.page.settings import AGE_PARTS_OF, LEAST_SCENE_PX, POSE_NOISE
 from edge_server.page.timelines import History, Timelines
 from edge_server.run_records import age_parts_ms
 from freshfield import coverage
+from freshfield.scenario import NOTHING_HELD_OUT
 
 MAIN_WIDTH = 372
 SIDE_WIDTH = 356
@@ -35,9 +37,9 @@ class Panel:
         gui.set_panel_label("freshfield")
         gui.main_panel.dock_right()
         gui.main_panel.set_width(MAIN_WIDTH)
-        gui.add_html(markup.INTRO)
+        gui.add_html(html("intro"))
         if state.warnings:
-            gui.add_html(markup.warning(f"Insecure: {'; '.join(state.warnings)}."))
+            gui.add_html(html("warning", f"Insecure: {'; '.join(state.warnings)}."))
         self._troubles = gui.add_html("", visible=False)
         self._status = gui.add_html("")
         self._decision = gui.add_html("", visible=False)
@@ -47,7 +49,7 @@ class Panel:
         if network is not None:
             with gui.add_folder("Change the network"):
                 self._network = NetworkControl(gui, network)
-        self._caption = gui.add_html(markup.note("Waiting for a held-out frame to compare with."))
+        self._caption = gui.add_html(html("note", "Waiting for a held-out frame to compare with."))
         self._pair: Any = None
         self._compared_update: int | None = None
         self._refreshes = 0
@@ -56,12 +58,12 @@ class Panel:
         side = gui.add_panel()
         with side.add_tab("Timelines"):
             self._timelines = Timelines(gui)
-            self._waiting = gui.add_html(markup.note("Curves appear with the first frames and updates."))
+            self._waiting = gui.add_html(html("note", "Curves appear with the first frames and updates."))
             self._channel = gui.add_html("", visible=False)
-            gui.add_html(markup.legend())
+            gui.add_html(html("legend"))
             self._table = gui.add_html("")
         with side.add_tab("Coverage"):
-            self._coverage = gui.add_html(markup.note("Reckoned once every camera has sent a frame and stands still."))
+            self._coverage = gui.add_html(html("note", "Reckoned once every camera has sent a frame and stands still."))
             self._places: dict[str, coverage.Camera] = {}  # of the cameras at the last refresh
             self._reckoned_for: dict[str, coverage.Camera] = {}
             self._reckoned_with_depth = False
@@ -93,11 +95,11 @@ class Panel:
         poor = "" if learning else poor_picture(self._state.flat_db(), publications, cameras)
         troubles = [*self._state.troubles(), *([poor] if poor else [])]
         self._troubles.visible = bool(troubles)
-        self._troubles.content = markup.warning("; ".join(troubles)) if troubles else ""
+        self._troubles.content = html("warning", "; ".join(troubles)) if troubles else ""
         if last is not None:
             self._decision.content = markup.decision_words(last, cameras, self._state.controls.policy)
             self._decision.visible = True
-        self._table.content = markup.table(cameras, last.selected if last else ())
+        self._table.content = html("table", cameras, last.selected if last else ())
         self._waiting.visible = last is None
         if channel is not None:
             self._channel.content = markup.channel_line(channel)
@@ -127,14 +129,13 @@ class Panel:
         self._reckoned_for, self._reckoned_with_depth = known, depth
         found = coverage.reckon(list(known.values()))
         words = f"{found.words}. {coverage.reached(len(cameras), depth)}"
-        self._coverage.content = markup.coverage(coverage.plan_svg(known, found), words)
+        self._coverage.content = html("coverage", coverage.plan_svg(known, found), words)
 
     def _show_comparison(self, comparison: Comparison, publications: list[Publication], held_out: bool) -> None:
         self._compared_update = comparison.number
         scored = next((p for p in reversed(publications) if p.number == comparison.number), None)
-        self._caption.content = markup.comparison_caption(
-            comparison.camera, scored.psnr_db if scored else None, comparison.number, held_out
-        )
+        psnr_db, truth = scored.psnr_db if scored else None, "truth at the present" if held_out else NOTHING_HELD_OUT
+        self._caption.content = html("comparison_caption", comparison.camera, psnr_db, comparison.number, truth)
         rows, columns = comparison.truth.shape[:2]
         height = max(1, round(PAIR_WIDTH / 2 * rows / columns))
         pair = browser_image(views.compared(comparison, PAIR_WIDTH, height, error=False, labeled=False))
@@ -152,15 +153,15 @@ def _same_places(cameras: Mapping[str, coverage.Camera], others: Mapping[str, co
     )
 
 
-def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publication]) -> markup.Summary:
-    """The numbers of the tiles: the latest score, the current ages of the training cameras."""
+def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publication]) -> dict[str, Any]:
+    """The values of the tiles: the latest score, the current ages of the training cameras; None is shown as a dash."""
     ages = [c.age_ms for c in cameras if not c.held_out and c.age_ms is not None]
     last = publications[-1] if publications else None
     scored = next((p for p in reversed(publications) if p.psnr_db is not None), None)
     db, on = (scored.psnr_db, scored.scored_on) if scored else (None, None)
     if (moving := state.so_far()) is not None:
         db, on = moving.now_psnr_db, moving.words()
-    return markup.Summary(
+    return dict(
         scenario=state.scenario,
         field=state.field_name,
         doing="paused by the operator" if state.controls.paused else state.status_line,

@@ -14,17 +14,14 @@ from numpy.typing import NDArray
 
 from edge_server.fields import RefinesCameras, View
 from edge_server.live.state import CameraView, EdgeState
+from edge_server.page import settings as tuned
 from edge_server.page.colors import HELD_OUT, RGB, age_color
-from edge_server.page.settings import QUIET_S, SETTLE_S, THUMBNAIL_BUDGET_S, THUMBNAIL_EVERY_S
 from edge_server.page.viewpoint import VERTICAL_FOV_RAD, Viewpoint, initial_viewpoint
 from freshfield import payload
 from freshfield.frame import Frame
 from freshfield.geometry import Pose
 
 log = logging.getLogger(__name__)
-
-THUMBNAIL_WIDTH = 112
-FRUSTUM_OF_RADIUS = 0.06
 
 
 @dataclass
@@ -51,7 +48,6 @@ class Scene:
         self._seen = 0
         self._seen_at = 0.0
         self._placed: dict[int, NDArray[np.float64]] = {}
-        self._next_thumbnail = 0
         self._undecodable: set[str] = set()
 
     @property
@@ -87,7 +83,7 @@ class Scene:
 
     def _add(self, camera: CameraView, frame: Frame, color: RGB) -> _CameraNode:
         assert self._viewpoint is not None
-        k, size = frame.intrinsics, self._viewpoint.radius_m * FRUSTUM_OF_RADIUS
+        k, size = frame.intrinsics, self._viewpoint.radius_m * tuned.FRUSTUM_OF_RADIUS
         handle = self._server.scene.add_camera_frustum(
             f"/cameras/{camera.camera}",
             fov=float(2 * np.arctan(0.5 * k.height / k.fy)),
@@ -139,18 +135,15 @@ class Scene:
         return pose if known is None else known.camera_to_world
 
     def _thumbnails(self, cameras: list[CameraView]) -> None:
-        """Update thumbnails in turn, within the time budget."""
+        """Update thumbnails within the time budget, those first that are oldest."""
         began = perf_counter()
-        for i in range(len(cameras)):
-            camera = cameras[(self._next_thumbnail + i) % len(cameras)]
-            frame, node = camera.newest, self._nodes[camera.camera]
+        for camera in sorted(cameras, key=lambda each: self._nodes[each.camera].thumbnail_at):
+            frame, node, now = camera.newest, self._nodes[camera.camera], perf_counter()
             assert frame is not None
-            now = perf_counter()
-            if now - began > THUMBNAIL_BUDGET_S:
-                self._next_thumbnail = (self._next_thumbnail + i) % len(cameras)
+            if now - began > tuned.THUMBNAIL_BUDGET_S:
                 return
             key = (frame.session, frame.sequence)
-            if key == node.thumbnail_of or now - node.thumbnail_at < THUMBNAIL_EVERY_S:
+            if key == node.thumbnail_of or now - node.thumbnail_at < tuned.THUMBNAIL_EVERY_S:
                 continue
             node.thumbnail_of, node.thumbnail_at = key, now
             image = thumbnail(frame)
@@ -173,17 +166,17 @@ class Scene:
             self._first_seen = now
         if len(poses) > self._seen:
             self._seen, self._seen_at = len(poses), now
-        complete = len(poses) == len(cameras) or now - self._seen_at > QUIET_S
+        complete = len(poses) == len(cameras) or now - self._seen_at > tuned.QUIET_S
         box = getattr(self._state.renderer, "box", None)
         known = (len(poses), box is not None)
-        if known > self._placed_for and complete and now - self._first_seen < SETTLE_S:
+        if known > self._placed_for and complete and now - self._first_seen < tuned.SETTLE_S:
             self._placed_for = known
             self._viewpoint = initial_viewpoint(np.stack(poses), None if box is None else box.center_m)
             start, view = self._server.initial_camera, self._viewpoint
             self._server.scene.set_up_direction(view.up)
             start.position, start.look_at, start.up = view.position, view.look_at, view.up
             start.fov = VERTICAL_FOV_RAD
-            size = view.radius_m * FRUSTUM_OF_RADIUS
+            size = view.radius_m * tuned.FRUSTUM_OF_RADIUS
             for node in self._nodes.values():
                 node.handle.scale = size
         for number, client in self._server.get_clients().items():
@@ -210,14 +203,14 @@ class Scene:
 
 
 def thumbnail(frame: Frame) -> NDArray[np.uint8] | None:
-    """The frame's image as RGB, THUMBNAIL_WIDTH wide; None if it does not decode."""
+    """The frame's image as RGB, ``THUMBNAIL_WIDTH`` wide; None if it does not decode."""
     k = frame.intrinsics
     try:
         image = payload.decode(frame.payload, frame.codec, k.width, k.height)[..., :3]
     except payload.PayloadError:
         return None
-    height = max(1, round(THUMBNAIL_WIDTH * k.height / k.width))
-    if k.width <= THUMBNAIL_WIDTH:
+    height = max(1, round(tuned.THUMBNAIL_WIDTH * k.height / k.width))
+    if k.width <= tuned.THUMBNAIL_WIDTH:
         return np.ascontiguousarray(image)
-    small = cv2.resize(np.ascontiguousarray(image), (THUMBNAIL_WIDTH, height), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(np.ascontiguousarray(image), (tuned.THUMBNAIL_WIDTH, height), interpolation=cv2.INTER_AREA)
     return small.astype(np.uint8)

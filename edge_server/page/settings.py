@@ -16,6 +16,8 @@ NOTICE_S = 8.0
 """For which an answer to a control stays."""
 SAY_EVERY_S = 60.0
 """Between two log lines of one kind of refused request."""
+FRUSTUM_OF_RADIUS, THUMBNAIL_WIDTH = 0.06, 112
+"""Size of a camera's frustum, in median distances of the cameras; pixels of the picture in it."""
 THUMBNAIL_EVERY_S = 1.0
 """Between two thumbnails of a camera."""
 THUMBNAIL_BUDGET_S = 0.03
@@ -24,6 +26,11 @@ SETTLE_S = 20.0
 """For this long the starting viewpoint follows cameras that report late, for visitors who have not moved."""
 QUIET_S = 0.7
 """Cameras report one after the other: a viewpoint is chosen when no new one has reported for this long."""
+ABOVE_CAMERAS_DEG, ELEVATION_DEG = 10.0, (18.0, 55.0)
+"""A visitor's elevation exceeds that of the cameras by so much, within bounds."""
+DISTANCE = 1.9
+"""Of a visitor, in those of a median camera: three quarters of an arc of cameras are seen, and little of the space
+behind them, which a field knows little of."""
 POSE_NOISE = 0.02
 """Meters, and radians: a camera whose pose changes by less stands still."""
 NETWORKS = {"ideal": (0.0, 0.0), "good": (30.0, 0.01), "bad": (400.0, 0.2), "blackout": (0.0, 1.0)}

@@ -13,12 +13,10 @@ from numpy.typing import NDArray
 from edge_server.fidelity.scorer import fidelity_title
 from edge_server.live.state import CameraView, Publication
 from edge_server.page.colors import FRESH, HELD_OUT, MIDDLE, RGB, STALE, UNKNOWN, css
-from edge_server.page.markup import chart_caption
+from edge_server.page.markup import html
 from edge_server.page.settings import WINDOW_S
 
 LINE_PX = 1.6
-# A line without a value in the last so many rows, such as omega under a policy without one, is left out.
-RECENT = 10
 # More points than the chart has pixels would be sent but not seen.
 MAX_POINTS = 300
 HEIGHT = 104
@@ -124,7 +122,7 @@ class _Chart:
         if known.sum() < 2:
             return
         kept = _decimate(t[known], *(c[known] for c in curves))
-        shown = tuple(i for i, c in enumerate(kept[1:]) if np.isfinite(c[-RECENT:]).any())
+        shown = tuple(i for i, c in enumerate(kept[1:]) if np.isfinite(c).any())
         data = (kept[0], *(_forward_fill(kept[1 + i]) for i in shown))
         if self._stepped:
             data = _stairs(*data)
@@ -136,7 +134,7 @@ class _Chart:
                 self._chart = self._make([self._lines[i] for i in shown], data)
         else:
             self._chart.data = data
-        self._caption.content = chart_caption(self.title, [self._lines[i] for i in shown], remark)
+        self._caption.content = html("chart_caption", self.title, [self._lines[i] for i in shown], remark)
         self._caption.visible = True
 
     def _make(self, lines: Sequence[tuple[str, RGB]], data: tuple[NDArray, ...]) -> Any:

@@ -7,20 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from freshfield.geometry import Pinhole, converging_point, look_at, quaternion_to_matrix, world_up
+from edge_server.page.settings import ABOVE_CAMERAS_DEG, DISTANCE, ELEVATION_DEG
+from freshfield.geometry import Pinhole, converging_point, quaternion_to_matrix, world_up
 
 Array = NDArray[np.float64]
 
 VERTICAL_FOV_RAD = float(np.deg2rad(60.0))
-# The visitor's elevation exceeds that of the cameras by this much, within bounds.
-ABOVE_CAMERAS_DEG = 10.0
-ELEVATION_DEG = (18.0, 55.0)
-# The visitor stands at the nearest of DISTANCES (in multiples of the median camera distance) from which a
-# square window shows this share of the cameras. No farther: a field knows little of the space behind its
-# cameras, and artifacts there would hide the scene.
-SEEN_SHARE = 0.75
-MARGIN = 0.95
-DISTANCES = np.linspace(1.3, 2.2, 37)
 # A shorter mean of unit vectors has no meaning: cameras surround the scene, or roll freely.
 _SCATTERED = 0.25
 
@@ -55,12 +47,7 @@ def initial_viewpoint(poses: ArrayLike, center: ArrayLike | None = None) -> View
     radius = float(np.median(np.linalg.norm(eyes - center, axis=1)))
     radius = max(radius, 1e-2)
     direction = _outward(eyes - center, up, radius)
-    tangent = MARGIN * np.tan(0.5 * VERTICAL_FOV_RAD)
-    for distance in DISTANCES * radius:
-        position = center + direction * distance
-        if _share_seen(eyes, position, center, up, tangent) >= SEEN_SHARE:
-            break
-    return Viewpoint(position, center, up, radius)
+    return Viewpoint(center + direction * DISTANCE * radius, center, up, radius)
 
 
 def _outward(offsets: Array, up: Array, radius: float) -> Array:
@@ -78,13 +65,6 @@ def _outward(offsets: Array, up: Array, radius: float) -> Array:
     elevation = np.rad2deg(np.arcsin(np.clip(np.mean(heights), -1, 1))) + ABOVE_CAMERAS_DEG
     elevation = np.deg2rad(np.clip(elevation, *ELEVATION_DEG))
     return behind * np.cos(elevation) + up * np.sin(elevation)
-
-
-def _share_seen(eyes: Array, position: Array, center: Array, up: Array, tangent: float) -> float:
-    """Share of ``eyes`` within a square view whose half angle has this tangent."""
-    local = (eyes - position) @ look_at(position, center, up)[:3, :3]
-    inside = (local[:, 2] > 0) & (np.abs(local[:, :2]) < tangent * local[:, 2:]).all(axis=1)
-    return float(inside.mean())
 
 
 def visitor_camera(

@@ -10,11 +10,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from edge_server.fidelity.scorer import SHOWN
+from edge_server.fidelity.scorer import METRICS, SHOWN
 from edge_server.report.conclusion import conclusion
 from edge_server.report.events import events
 from edge_server.report.frame_accounting import account_frames
 from edge_server.report.run_files import RunFiles, read_run_files
+from edge_server.report.settings import FINAL_SHARE
 from edge_server.run_records import (
     AgesRow,
     Baseline,
@@ -28,10 +29,7 @@ from edge_server.run_records import (
 from freshfield.files import write_json, write_text
 from freshfield.machine_load import outside_load
 
-METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "psnr_refined_db", "ssim_refined")
 SERIES = ("t_s", *METRICS, "aaoi_ms", "selected", "update_ms", "truth_gap_ms")
-FINAL_SHARE = 0.2
-"""Of a run, its last: ``final`` and ``shown`` are means over it."""
 
 
 def build_report(out_dir: str | Path) -> dict[str, Any]:

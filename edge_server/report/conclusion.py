@@ -6,13 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from edge_server.fidelity.scorer import SELECTED
+from edge_server.report.settings import LITTLE_DB, WORTH_SAYING
 from freshfield.scenario import NOTHING_HELD_OUT
 
 Report = Mapping[str, Any]
-LITTLE_DB = 3.0
-"""Above an image of one mean color: below that, a field shows a blur, whatever the age."""
-SHARE = 0.05
-"""Of frames or updates: below that, what was lost or left out is not worth a clause."""
 
 
 def conclusion(report: Report) -> list[str]:
@@ -129,5 +126,5 @@ def _delivery(report: Report) -> list[str]:
             "longer updates, edge.update_ms, give them some)",
         ),
     )
-    said = [f"{part / whole:.0%} {what}" for part, whole, what in shares if whole and part >= SHARE * whole]
+    said = [f"{part / whole:.0%} {what}" for part, whole, what in shares if whole and part >= WORTH_SAYING * whole]
     return [", ".join(said) + "."] if said else []

@@ -7,19 +7,14 @@ from itertools import groupby
 from typing import Any
 
 from edge_server.report.run_files import RunFiles
+from edge_server.report.settings import MOST_EVENTS, SILENT_MS, TOGETHER_S
 from edge_server.run_records import AgesRow, ChannelChange, Event
 
-SILENT_MS = 3000.0
-"""Age from which on a camera counts as gone: longer than any frame of the shipped channels takes."""
-TOGETHER_S = 1.0
-"""Cameras that fall silent within that time are one event: a blackout, or a node that ended."""
-MOST = 40
-"""Events that are listed: a link that comes and goes would make the curves unreadable."""
 _NAMED = 3  # cameras in a line
 
 
 def events(files: RunFiles) -> list[dict[str, Any]]:
-    """[{t_s: seconds since the edge started, what: in words}], in order; the ``MOST`` first."""
+    """[{t_s: seconds since the edge started, what: in words}], in order; the ``MOST_EVENTS`` first."""
     restarted_s = files.restarts_s[-1] if files.restarts_s else 0.0  # the edge's events and start are the last one's
     found = [Event(event.t_s + restarted_s, event.what) for event in files.edge.events]
     if (began_ns := files.edge.started_ns) is not None:
@@ -28,7 +23,7 @@ def events(files: RunFiles) -> list[dict[str, Any]]:
     found += [Event(t_s, "the edge server started again") for t_s in files.restarts_s]
     found += silences(files.ages)
     found = sorted((event for event in found if event.t_s >= 0.0), key=lambda event: event.t_s)
-    return [{"t_s": round(event.t_s, 2), "what": event.what} for event in found[:MOST]]
+    return [{"t_s": round(event.t_s, 2), "what": event.what} for event in found[:MOST_EVENTS]]
 
 
 def silences(rows: Sequence[AgesRow]) -> list[Event]:

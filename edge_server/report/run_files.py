@@ -9,14 +9,12 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from edge_server.report.settings import LATE_S
 from edge_server.run_records import AgesRow, ChannelStatus, EdgeStatus, Frontier, Number, ShownRow, UpdateRow
 
 T = TypeVar("T")
 
 ProcessRow = dict[str, Number | dict[str, Number | None] | None]
-# Rows of one process are written in order but for the scores of what was shown: they wait for their held-out
-# cameras' frames. A process that starts again counts from zero, and takes longer than this to start.
-LATE_S = 1.0
 
 
 class _Started(msgspec.Struct):

@@ -21,16 +21,12 @@ import msgspec
 from msgspec.structs import asdict
 
 from edge_server.fidelity.scorer import SHOWN, Score
+from edge_server.live import settings as tuned
 from edge_server.live.state import Publication
 from edge_server.run_records import AgeParts, AgesRow, ShownRow, SoFarScores
 from freshfield.files import Lines, write_json
 
 log = logging.getLogger(__name__)
-
-# After this many newer publications, one without scores will not get any.
-_FINAL_AFTER = 32  # more than a second of updates at arrivals
-LINE_EVERY_S = 0.08  # on average: there may be fifty publications a second
-_INTERVAL_SHARE = 0.01  # weight of the newest interval in the running mean
 
 
 class Journal:
@@ -61,7 +57,7 @@ class Journal:
     def published(self, publication: Publication) -> None:
         with self._lock:
             self._open[publication.number] = publication
-            while len(self._open) > _FINAL_AFTER:
+            while len(self._open) > tuned.FINAL_AFTER:
                 self._write_oldest()
 
     def scored(self, publication: Publication, final: bool) -> None:
@@ -113,8 +109,8 @@ class Journal:
         if self._last_s is not None:
             interval_s = publication.t_s - self._last_s
             usual_s = interval_s if self._usual_s is None else self._usual_s
-            many = (self._without_line + 1) * usual_s < LINE_EVERY_S
-            self._usual_s = usual_s + _INTERVAL_SHARE * (interval_s - usual_s)
+            many = (self._without_line + 1) * usual_s < tuned.LINE_EVERY_S
+            self._usual_s = usual_s + tuned.INTERVAL_SHARE * (interval_s - usual_s)
         self._last_s = publication.t_s
         if publication.psnr_db is None and many:
             self._without_line += 1

@@ -8,7 +8,7 @@ from prometheus_client import CollectorRegistry, make_wsgi_app
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from edge_server.fidelity.scorer import fidelity_title
-from edge_server.live.ingest import Ingest
+from edge_server.live.ingest import Ingest, percentile
 from edge_server.live.output.guarded_http import serve_guarded
 from edge_server.live.state import EdgeState
 from freshfield.transport import Transport, TransportError
@@ -38,7 +38,7 @@ class EdgeCollector:
         yield CounterMetricFamily("freshfield_frames_shed", "frames left out for lack of time", value=shed)
         check = GaugeMetricFamily("freshfield_check_seconds", "time to check and buffer a frame", labels=["quantile"])
         for percent in (50, 99):
-            value = self._ingest.check_ms.percentile(percent)
+            value = percentile(self._ingest.check_ms, percent)
             if value is not None:
                 check.add_metric([str(percent / 100)], value / 1e3)
         yield check

@@ -11,26 +11,16 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
+from edge_server.live import settings as tuned
 from edge_server.live.state import Publication
 from freshfield.session import DECISIONS, SCORES
 from freshfield.v1 import frames_pb2 as pb
 
-if TYPE_CHECKING:
-    from freshfield.session.bag_writer import BagWriter
-    from freshfield.session.writer import SessionWriter
-
 log = logging.getLogger(__name__)
-
-# Bounds of the queue: the disk may stall for seconds. A node's frames are some tens of kilobytes.
-_MAX_QUEUE_BYTES = 64 * 2**20
-_MAX_QUEUE_MESSAGES = 4096
-_POLL_S = 0.05
-# Assumed size of a message beside its payloads.
-_MESSAGE_BYTES = 1024
 
 
 class Recorder:
@@ -45,7 +35,12 @@ class Recorder:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.file = _free_name(path)
         self.dropped = 0
-        self._writer = _writer_class(path)(self.file, {"scenario": scenario})
+        writer: Any
+        if path.suffix.lower() == ".mcap":
+            from freshfield.session.writer import SessionWriter as writer
+        else:
+            from freshfield.session.bag_writer import BagWriter as writer
+        self._writer = writer(self.file, {"scenario": scenario})
         self._queue: deque[tuple[int, Callable[[], None]]] = deque()
         self._queue_bytes = 0
         self._closing = False
@@ -61,7 +56,7 @@ class Recorder:
 
     def frame(self, request: pb.PushRequest, arrived_ns: int) -> None:
         """Record an accepted frame. The request must not be changed afterwards."""
-        size = len(request.payload) + len(request.depth.payload) + _MESSAGE_BYTES
+        size = len(request.payload) + len(request.depth.payload) + tuned.MESSAGE_BYTES
         self._put(size, lambda: self._writer.frame(request, arrived_ns))
 
     def published(self, publication: Publication) -> None:
@@ -86,11 +81,13 @@ class Recorder:
     def _decision(self, topic: str, publication: Publication, t_ns: int | None = None) -> None:
         at = publication.published_ns if t_ns is None else t_ns
         values = dataclasses.asdict(publication)
-        self._put(_MESSAGE_BYTES, lambda: self._writer.data(topic, "freshfield.Decision", self._schema, values, at))
+        self._put(
+            tuned.MESSAGE_BYTES, lambda: self._writer.data(topic, "freshfield.Decision", self._schema, values, at)
+        )
 
     def _put(self, size: int, write: Callable[[], None]) -> None:
         with self._changed:
-            full = len(self._queue) >= _MAX_QUEUE_MESSAGES or self._queue_bytes + size > _MAX_QUEUE_BYTES
+            full = len(self._queue) >= tuned.MOST_QUEUED or self._queue_bytes + size > tuned.MOST_QUEUED_BYTES
             if full or self._closing or self._failed:
                 self.dropped += 1
                 return
@@ -105,7 +102,7 @@ class Recorder:
                         if self._closing:
                             break
                         # Callers do not wake this thread: that would cost them more than all the rest.
-                        self._changed.wait(_POLL_S)
+                        self._changed.wait(tuned.RECORD_EVERY_S)
                         continue
                     size, write = self._queue.popleft()
                     self._queue_bytes -= size
@@ -125,16 +122,6 @@ class Recorder:
                 self._queue.clear()
             self._writer.abandon()
             log.error("%s: recording ended: %s", self.file, error)
-
-
-def _writer_class(path: Path) -> type[SessionWriter] | type[BagWriter]:
-    if path.suffix.lower() == ".mcap":
-        from freshfield.session.writer import SessionWriter
-
-        return SessionWriter
-    from freshfield.session.bag_writer import BagWriter
-
-    return BagWriter
 
 
 def _free_name(path: Path) -> Path:

@@ -115,14 +115,11 @@ class StatusBlock:
 Block = SceneBlock | StaticBlock | MovingBlock | KnotsBlock | UnseenBlock | StatusBlock
 
 
-def write_message(number: int, instant_s: float, blocks: list[Block]) -> bytes:
-    """A message. number: counts from 0, modulo 2^32. instant_s: the edge's present, seconds since the run began."""
-    return join_blocks(number, instant_s, map(write_block, blocks))
-
-
-def join_blocks(number: int, instant_s: float, blocks: Iterable[bytes]) -> bytes:
-    """``write_message`` of blocks that are written already."""
-    return HEAD.pack(number & 0xFFFFFFFF, instant_s) + b"".join(blocks)
+def write_message(number: int, instant_s: float, blocks: Iterable[Block | bytes]) -> bytes:
+    """A message. number: counts from 0, modulo 2^32. instant_s: the edge's present, seconds since the run began.
+    blocks: or what ``write_block`` made of them."""
+    written = (block if isinstance(block, bytes) else write_block(block) for block in blocks)
+    return HEAD.pack(number & 0xFFFFFFFF, instant_s) + b"".join(written)
 
 
 def write_block(block: Block) -> bytes:

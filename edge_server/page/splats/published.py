@@ -13,13 +13,9 @@ from edge_server.fields.splat.layers import settings as layers
 from edge_server.fields.splat.layers.motion import Motion
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
 from edge_server.fields.splat.snapshot import SplatSnapshot
+from edge_server.page.splats import settings as tuned
 from edge_server.page.splats.messages import KnotsBlock, MovingBlock, SceneBlock
 from edge_server.page.splats.records import scale_range, to_records, weights
-from edge_server.page.splats.settings import KNOTS_SENT, MOST_ANCHORS, NEW_SET_EVERY_S, STATIC_EVERY_S
-
-_SAMPLED = 512  # Gaussians by whose places two static sets are told apart
-_SAME = 0.02  # scene units that half of them move at most, if the field goes on with the same ones
-_BUSY = 8.0  # static records are made again after so many times what they took: an eighth of a core at most
 
 
 @dataclass(frozen=True)
@@ -27,12 +23,11 @@ class StaticRecords:
     """The static Gaussians, those of largest weight first.
 
     number: counts sets of other Gaussians; within one, row k stays the same Gaussian.
-    version: counts what was made. records: RECORD (N,). weight: float64 (N,). unseen: bool (N,), see
+    records: RECORD (N,). weight: float64 (N,). unseen: bool (N,), see
     ``SurfaceScene.unseen_points``; None without depth.
     """
 
     number: int
-    version: int
     scales: tuple[float, float]
     records: NDArray[np.void]
     weight: NDArray[np.float64]
@@ -61,7 +56,7 @@ class Publisher:
         self._behind = False  # whether static records are of an earlier snapshot, because it was too soon for new ones
         self._newest: Published | None = None
         self._box: SceneBox | None = None
-        self._fields = self._anchor_sets = self._sets = self._versions = 0
+        self._fields = self._anchor_sets = self._sets = 0
         self._anchors: NDArray[np.float64] | None = None
         self._order = np.zeros(0, np.intp)
         self._places = np.zeros((0, 3), np.float32)
@@ -96,42 +91,40 @@ class Publisher:
     def _static(
         self, params: NDArray[np.float32], before: StaticRecords | None, now_s: float, layered: LayeredSnapshot | None
     ) -> StaticRecords:
-        self._behind = before is not None and now_s < self._static_due_s
-        if self._behind and before is not None:
-            return before
-        same = before is not None and self._same(params)
-        self._behind = before is not None and not same and now_s < self._set_since_s + NEW_SET_EVERY_S
-        if self._behind and before is not None:
+        kept = before if before is not None and self._same(params) else None
+        due_s = self._static_due_s
+        if kept is None:
+            due_s = max(due_s, self._set_since_s + tuned.NEW_SET_EVERY_S)
+        self._behind = before is not None and now_s < due_s
+        if before is not None and now_s < due_s:
             return before
         began = perf_counter()
-        if before is None or not same:
+        if kept is None:
             self._sets += 1
             self._set_since_s = now_s
             self._order = np.argsort(-weights(params), kind="stable")
-        self._versions += 1
-        self._places = params[:: max(len(params) // _SAMPLED, 1), :3].copy()
+        self._places = params[:: max(len(params) // tuned.SAMPLED, 1), :3].copy()
         params = params[self._order]
-        scales = before.scales if before is not None and same else scale_range(params)
-        surfaces = None if layered is None else layered.surfaces
-        unseen = before.unseen if before is not None and same else None
-        if surfaces is not None and unseen is None and layered is not None:
+        scales = scale_range(params) if kept is None else kept.scales
+        unseen = None if kept is None else kept.unseen
+        if layered is not None and layered.surfaces is not None and unseen is None:
             box = layered.box
-            unseen = surfaces.unseen_points(params[:, :3] * box.radius_m + np.asarray(box.center_m))
+            unseen = layered.surfaces.unseen_points(params[:, :3] * box.radius_m + np.asarray(box.center_m))
         records = to_records(params, scales)
-        made = StaticRecords(self._sets, self._versions, scales, records, weights(params), unseen)
-        self._static_due_s = now_s + max(STATIC_EVERY_S, _BUSY * (perf_counter() - began))
+        made = StaticRecords(self._sets, scales, records, weights(params), unseen)
+        self._static_due_s = now_s + max(tuned.STATIC_EVERY_S, tuned.BUSY * (perf_counter() - began))
         return made
 
     def _same(self, params: NDArray[np.float32]) -> bool:
         """Whether these are the Gaussians of the last set, trained on: others came, went or changed places else."""
         if len(params) != len(self._order):
             return False
-        places = params[:: max(len(params) // _SAMPLED, 1), :3]
-        return bool(np.median(np.linalg.norm(places - self._places, axis=1)) < _SAME)
+        places = params[:: max(len(params) // tuned.SAMPLED, 1), :3]
+        return bool(np.median(np.linalg.norm(places - self._places, axis=1)) < tuned.SAME_WITHIN)
 
     def _moving(self, moving: MovingSnapshot) -> tuple[MovingBlock | None, KnotsBlock | None]:
         motion: Motion = moving.motion
-        if motion.anchors is None or not len(moving.params) or len(motion.anchors) > MOST_ANCHORS:
+        if motion.anchors is None or not len(moving.params) or len(motion.anchors) > tuned.MOST_ANCHORS:
             return None, None
         if motion.anchors is not self._anchors:
             self._anchors = motion.anchors
@@ -148,7 +141,7 @@ class Publisher:
             moving.anchor[order].astype(np.uint8),
             share[:, :2].astype(np.uint8),
         )
-        first, knots = motion.newest_knots(KNOTS_SENT)
+        first, knots = motion.newest_knots(tuned.KNOTS_SENT)
         rate, begin_s = float(layers.KNOTS_PER_S), (moving.origin_ns - self._start_ns) / 1e9
         instants = begin_s + first / rate, rate, begin_s + moving.newest_s
         return block, KnotsBlock(self._anchor_sets, *instants, layers.MAX_AHEAD_S, knots)

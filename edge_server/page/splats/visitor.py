@@ -1,9 +1,9 @@
 """What one visitor is sent, and when: never more than their link takes.
 
-The window of bytes under way follows delay, as in LEDBAT (RFC 6817): a link whose round trip grows beyond its
-shortest is full. A link whose delays scatter by themselves is sent few large messages, and is full where those take
-much longer than small ones that are sent alone. What does not fit is left out in this order: small Gaussians, static
-sets that changed little, moving sets; knots, which move what is there already, come last.
+The window of bytes under way follows delay, as in LEDBAT (RFC 6817): a link whose round trips grow with what is under
+way is full. A link whose delays scatter by themselves is sent few large messages. What does not fit is left out in
+this order: small Gaussians, static sets that changed little, moving sets; knots, which move what is there already,
+come last.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from edge_server.page.splats.messages import (
     StaticBlock,
     StatusBlock,
     UnseenBlock,
-    join_blocks,
     write_block,
+    write_message,
 )
 from edge_server.page.splats.published import Published, StaticRecords
 from edge_server.page.splats.records import RECORD, noticeable
@@ -29,11 +29,13 @@ from edge_server.page.splats.records import RECORD, noticeable
 _MOVING_BYTES = RECORD.itemsize + 5
 _HEADS = 32  # bytes of a static block beside its records
 EMPTY = MovingBlock(0, (-1.0, 0.0), np.zeros(0, RECORD), np.zeros((0, 3), np.uint8), np.zeros((0, 2), np.uint8))
-_LEAST_BYTES = tuned.CHUNK * RECORD.itemsize + _HEADS  # that a message may have
 
 
 class LinkWindow:
     """Bytes that may be under way, from the delays of what was acknowledged.
+
+    Round trips are fitted, by least squares, by a time that a message takes alone and a time for each byte under way:
+    what they take alone may scatter, what bytes add to it is a queue. The newest count most.
 
     short: whether there was more to send than the window took.
     """
@@ -43,104 +45,74 @@ class LinkWindow:
         self.window = float(tuned.FIRST_WINDOW)
         self.under_way = 0
         self.rate_bytes_per_s = 0.0
-        self._sent: deque[tuple[int, int, float]] = deque()  # number, bytes, when
+        self._sent: deque[tuple[int, int, float, int]] = deque()  # number, bytes, when, bytes under way then
         self._round_trips: deque[tuple[float, float]] = deque()  # when, seconds
-        self._last_trips_s: deque[float] = deque(maxlen=tuned.JITTER_OF)
-        self._probe_trips_s: deque[float] = deque(maxlen=tuned.PROBES_KEPT)
-        self._probe = -1  # number of the newest probe: a small message on an empty link
-        self._since_probe, self._probed_s = 0, -np.inf  # messages since then; when it was sent
-        self._backed_off_s = -np.inf
+        self._moments = np.zeros(5)  # weighted sums of 1, bytes, seconds, bytes^2, bytes * seconds
+        self.round_trip_s = 0.0  # the shortest of late
+        self.alone_s, self._per_byte_s = 0.0, 1e-12  # that a message takes alone, on average, and each byte beside it
         self._since_s, self._acknowledged = 0.0, 0
 
     @property
-    def round_trip_s(self) -> float:
-        """The shortest of late; 0 before the first."""
-        return min((trip for _, trip in self._round_trips), default=0.0)
+    def scatters(self) -> bool:
+        """Whether round trips scatter without a queue."""
+        return self.alone_s - self.round_trip_s > tuned.QUEUE_S
 
     @property
     def room(self) -> int:
-        """Bytes that may be sent now."""
-        free = max(int(self.window) - self.under_way, 0)
-        if not self.scatters:
-            return free
-        share = int(self.window) // tuned.SCATTERING_UNDER_WAY
-        return min(free, max(min(share, tuned.SCATTERING_MOST), tuned.LEAST_WINDOW))
+        """Bytes that may be sent now; of a link that scatters, in a few large messages."""
+        if self.scatters and len(self._sent) >= tuned.SCATTERING_UNDER_WAY:
+            return 0
+        return min(max(int(self.window) - self.under_way, 0), self.share if self.scatters else tuned.MOST_WINDOW)
+
+    @property
+    def share(self) -> int:
+        """Bytes of a message with what stands still: round trips tell something only where what is under way varies."""
+        share = int(self.window) // (tuned.SCATTERING_UNDER_WAY if self.scatters else tuned.UNDER_WAY)
+        return max(min(share, tuned.MOST_MESSAGE), tuned.LEAST_MESSAGE)
 
     def sent(self, number: int, size: int, now_s: float) -> None:
         """Note a message of so many bytes."""
         if not self._sent and not self._acknowledged:
             self._since_s = now_s
-        if self.probes(now_s):
-            self._probe, self._probed_s, self._since_probe = number, now_s, 0
-        else:
-            self._since_probe += 1
-        self._sent.append((number, size, now_s))
         self.under_way += size
+        self._sent.append((number, size, now_s, self.under_way))
 
     def acknowledged(self, number: int, now_s: float) -> None:
         """Note that the visitor has read all messages up to this one. A number that was not sent changes nothing."""
-        if not any(sent == number for sent, _, _ in self._sent):
+        if not any(sent == number for sent, *_ in self._sent):
             return
-        size, round_trip_s = 0, 0.0
-        while True:
-            sent, bytes_, sent_s = self._sent.popleft()
-            size, round_trip_s = size + bytes_, now_s - sent_s
-            if sent == number:
-                break
+        size, sent = 0, -1
+        while sent != number:
+            sent, bytes_, sent_s, under_way = self._sent.popleft()
+            size += bytes_
         self.under_way -= size
         self._count(size, now_s)
         while self._round_trips and self._round_trips[0][0] < now_s - tuned.FORGET_RTT_S:
             self._round_trips.popleft()
-        self._round_trips.append((now_s, round_trip_s))
-        self._last_trips_s.append(round_trip_s)
-        if number == self._probe:
-            self._probe_trips_s.append(round_trip_s)
-        self._fit_window(size, round_trip_s, now_s)
+        self._round_trips.append((now_s, now_s - sent_s))
+        self.round_trip_s = min(trip for _, trip in self._round_trips)
+        self._fit_window(size, under_way, now_s - sent_s)
 
-    def _fit_window(self, size: int, round_trip_s: float, now_s: float) -> None:
-        """Fit the window to the newest round trips, of which the last brought an acknowledgement of ``size`` bytes."""
-        if self.scatters:
-            # In small steps either way, so that what counts is their mean over many messages.
-            below = max(1.0 - (round_trip_s - self.round_trip_s) / self._full_s, -1.0)
-            if below < 0.0 or self.short:
-                window = self.window + tuned.SCATTERING_GAIN * below * size
-                self.window = min(max(window, tuned.LEAST_WINDOW), tuned.MOST_WINDOW)
-            return
-        # The least of the last few: a single late message says that the link jitters, not that it is full.
-        late_s = (round_trip_s if self.few else min(self._last_trips_s)) - self.round_trip_s
-        if late_s > tuned.QUEUE_S:
-            if now_s - self._backed_off_s > round_trip_s:
-                self._backed_off_s = now_s
-                # Until it is known whether round trips scatter, one message at a time is under way: no long queue.
-                least = tuned.LEAST_WINDOW if self._known else tuned.FIRST_WINDOW
-                self.window = max(self.window * tuned.BACK_OFF, least)
+    def _fit_window(self, size: int, under_way: int, round_trip_s: float) -> None:
+        """Fit the window to the newest round trip, of a message with which so many bytes were under way; it brought an
+        acknowledgement of ``size`` bytes."""
+        if self._moments[0]:  # an outage is none of the link's usual delays
+            round_trip_s = min(round_trip_s, tuned.OUTAGE * max(self._moments[2] / self._moments[0], tuned.QUEUE_S))
+        newest = np.array([1.0, under_way, round_trip_s, under_way**2, under_way * round_trip_s])
+        self._moments = tuned.KEPT_OF_ROUND_TRIPS * self._moments + newest
+        _, mean, mean_s, square, product = self._moments / self._moments[0]
+        spread = square - mean**2
+        if spread > (tuned.LEAST_SPREAD * mean) ** 2:
+            per_byte_s = (product - mean * mean_s) / spread
+        else:  # all alike: nothing tells the two apart
+            per_byte_s = mean_s / mean
+        self._per_byte_s = max(float(per_byte_s), 1e-12)
+        self.alone_s = max(float(mean_s - self._per_byte_s * mean), self.round_trip_s)
+        full = (self.alone_s + tuned.QUEUE_S) / self._per_byte_s
+        if full < self.window:
+            self.window = max(full, tuned.BACK_OFF * self.window, tuned.LEAST_WINDOW)
         elif self.short:  # a window that suffices says nothing of the link
-            self.window = min(self.window + size, tuned.MOST_WINDOW)
-
-    @property
-    def scatter_s(self) -> float:
-        """By how much a small message alone takes longer than the shortest round trip, on average."""
-        return max(float(np.mean(self._probe_trips_s)) - self.round_trip_s, 0.0) if self._probe_trips_s else 0.0
-
-    @property
-    def _known(self) -> bool:
-        """Whether there were enough probes to tell how far round trips scatter."""
-        return len(self._probe_trips_s) >= tuned.FIRST_PROBES
-
-    @property
-    def scatters(self) -> bool:
-        """Whether round trips scatter without a queue: most of them, as one outage makes a single probe very late."""
-        return self._known and float(np.median(self._probe_trips_s)) - self.round_trip_s > tuned.QUEUE_S
-
-    @property
-    def few(self) -> bool:
-        """Whether few large messages are sent: round trips scatter, or nothing tells yet whether they do."""
-        return not self._known or self.scatters
-
-    @property
-    def _full_s(self) -> float:
-        """Lateness from which the link counts as full."""
-        return tuned.QUEUE_S + (tuned.FULL_OF_SCATTER * self.scatter_s if self.scatters else 0.0)
+            self.window = min(self.window + size, full, tuned.MOST_WINDOW)
 
     def _count(self, size: int, now_s: float) -> None:
         self._acknowledged += size
@@ -150,30 +122,9 @@ class LinkWindow:
 
     @property
     def bound_bytes_per_s(self) -> float:
-        """What the window lets through: its bytes in a round trip that is as long as a full link's."""
-        return self.window / (self.round_trip_s + self._full_s if self._round_trips else 1.0)
-
-    @property
-    def lately_bytes_per_s(self) -> float:
-        """As ``bound_bytes_per_s``, and no more than in the longer of the last two round trips."""
-        longest_s = max([tuned.QUEUE_S, *self._last_trips_s])
-        return min(self.bound_bytes_per_s, self.window / longest_s)
-
-    def probes(self, now_s: float) -> bool:
-        """Whether the next message is to be a small one, whose round trip has no queue of ours in it."""
-        return self.under_way == 0 and self._probe_due(now_s)
-
-    def waits(self, now_s: float) -> bool:
-        """Whether to send nothing until what is under way has arrived."""
-        if not self._round_trips or not self._sent:
-            return False
-        most = tuned.SCATTERING_UNDER_WAY if self.scatters else 1
-        return self._probe_due(now_s) or (self.few and len(self._sent) >= most)
-
-    def _probe_due(self, now_s: float) -> bool:
-        if not self._known:
-            return self._since_probe >= 1
-        return self._since_probe >= tuned.PROBE_EVERY and now_s - self._probed_s > tuned.PROBE_EVERY_S
+        """What the link takes, and no more than the window in the time that one message takes alone, and a queue."""
+        within_s = self.alone_s + tuned.QUEUE_S if self._round_trips else 1.0
+        return min(self.window / within_s, 1.0 / self._per_byte_s)
 
 
 class Visitor:
@@ -198,11 +149,6 @@ class Visitor:
         self._due: list[int] = []  # chunks
         self._unseen: NDArray[np.bool_] | None = None  # as sent
 
-    @property
-    def shown_static(self) -> int:
-        """Static Gaussians of the set that is sent."""
-        return len(self._sent)
-
     def acknowledged(self, number: int, now_s: float) -> None:
         """The visitor has read all messages up to this one."""
         self.link.acknowledged(number, now_s)
@@ -218,40 +164,34 @@ class Visitor:
         if self.link.room < tuned.LEAST_WINDOW // 4:
             self.link.short = True
             return None
-        if self.link.waits(now_s):
-            return None
-        probes = self.link.probes(now_s)
-        room = tuned.PROBE_BYTES if probes else self.link.room
+        room = self.link.room
         self.link.short = False
         blocks: list[bytes] = []
         if published is not None and published.scene.field != self._field:
             self._field = published.scene.field
             self._forget_static()
             blocks.append(write_block(published.scene))
-        told = not probes and now_s >= self._status_s + tuned.STATUS_EVERY_S
+        told = now_s >= self._status_s + tuned.STATUS_EVERY_S
         if told:
             blocks.append(write_block(StatusBlock(status | {"link": self._link(published)})))
         room -= sum(map(len, blocks))
         if published is not None:
-            blocks += self._newest(published, room, now_s, probes)
-        if not blocks and not probes:
+            blocks += self._newest(published, room, now_s)
+        if not blocks:
             return None
         if told:
             self._status_s = now_s
-        data = join_blocks(self._number, present_s, blocks)
+        data = write_message(self._number, present_s, blocks)
         self.link.sent(self._number, len(data), now_s)
         self._number = (self._number + 1) & 0xFFFFFFFF
         return data
 
-    def _newest(self, published: Published, room: int, now_s: float, probes: bool) -> list[bytes]:
-        """Knots, moving set and static chunks, as far as there is room."""
-        blocks = self._moving(published, room, now_s)
-        room -= sum(map(len, blocks))
-        if not self.link.few:
-            # No more than the link takes until the next: what a message takes itself is not to be taken for a queue.
-            room = min(room, max(round(tuned.TICK_S * self.link.bound_bytes_per_s), _LEAST_BYTES))
-        blocks += self._static(published.static, room)
-        return blocks if probes else blocks + self._newly_unseen()
+    def _newest(self, published: Published, room: int, now_s: float) -> list[bytes]:
+        """Knots, moving set and static chunks, as far as there is room; the first static set alone."""
+        first = self._set == 0 or (self._set == 1 and not self._known.all())
+        blocks = [] if first else self._moving(published, room, now_s)
+        blocks += self._static(published.static, min(room - sum(map(len, blocks)), self.link.share))
+        return blocks + self._newly_unseen()
 
     def _moving(self, published: Published, room: int, now_s: float) -> list[bytes]:
         """Knots of a new publication, and the moving set when it is due."""
@@ -271,8 +211,7 @@ class Visitor:
         if cut is not None:
             blocks.append(write_block(cut))
             takes_s = len(blocks[-1]) / (tuned.MOVING_SHARE * self.link.bound_bytes_per_s)
-            # Each of few large messages has its share of moving Gaussians.
-            self._moving_s = now_s + (0.0 if self.link.few else max(tuned.MOVING_EVERY_S, takes_s))
+            self._moving_s = now_s + max(tuned.MOVING_EVERY_S, takes_s)
             # A set that was cut is sent again when the link takes more, even if it stays the newest.
             self._whole = moving if len(cut.records) == len(moving.records) else None
         return blocks
@@ -287,7 +226,7 @@ class Visitor:
     def _link(self, published: Published | None) -> dict[str, Any]:
         return {
             "bytes_per_s": round(self.link.rate_bytes_per_s),
-            "round_trip_ms": round(1e3 * (self.link.round_trip_s + self.link.scatter_s), 1),
+            "round_trip_ms": round(1e3 * self.link.alone_s, 1),
             "shortest_ms": round(1e3 * self.link.round_trip_s, 1),
             "static": [len(self._sent), 0 if published is None else len(published.static.records)],
         }
@@ -295,10 +234,10 @@ class Visitor:
     def _cut(self, moving: MovingBlock, room: int) -> MovingBlock | None:
         """The moving set's largest Gaussians, as many as the link takes in time; None: not now."""
         link = self.link
-        takes = tuned.MOVING_SHARE * (link.room if link.few else link.bound_bytes_per_s * tuned.MOVING_EVERY_S)
-        count = min(len(moving.records), max(int(takes) // _MOVING_BYTES, tuned.LEAST_MOVING))
+        takes = room if link.scatters else link.bound_bytes_per_s * tuned.MOVING_EVERY_S
+        count = min(len(moving.records), max(int(tuned.MOVING_SHARE * takes) // _MOVING_BYTES, tuned.LEAST_MOVING))
         if count * _MOVING_BYTES > room:
-            self.link.short = True
+            link.short = True
             return None
         parts = moving.records[:count], moving.anchor[:count], moving.share[:count]
         return MovingBlock(moving.anchors, moving.scales, *parts)
@@ -340,8 +279,7 @@ class Visitor:
 
     def _takes(self) -> int:
         """Static Gaussians that the link takes in the time of a new set."""
-        takes_s = tuned.SCATTERING_SET_S if self.link.scatters else tuned.NEW_SET_S
-        return int(takes_s * self.link.lately_bytes_per_s) // RECORD.itemsize
+        return int(tuned.NEW_SET_S * self.link.bound_bytes_per_s) // RECORD.itemsize
 
     def _take(self, newest: StaticRecords, wider: bool) -> None:
         """Find what of the newest records is to be sent: chunks that have changed, those with most weight in what

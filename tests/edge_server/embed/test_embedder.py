@@ -91,7 +91,7 @@ def test_the_real_yolo11n_and_the_shipped_detector_work_unchanged():
     assert (made.backbone.batch, made.backbone.height, made.backbone.channels) == (1, 320, 256)
     images = [image(90, 160), np.zeros((128, 128, 3), np.uint8), image(500, 500)]
     rows = made.embed(images)
-    assert np.isfinite(rows).all() and made.failed == 0
+    assert np.isfinite(rows).all()
     assert (rows == made.embed(images)).all()
     shipped = embedder("default", dim=32)
     assert shipped.backbone.tap.startswith("/model.7/") and shipped.backbone.projection is not None
@@ -140,7 +140,7 @@ def test_a_nan_of_one_frame_costs_no_other_frame_of_its_batch(tmp_path):
     made = make_embedder(EmbeddingConfig(str(path), CHANNELS))
     dark = HARD["black"]
     rows = made.embed([dark, HARD["white"], dark])
-    assert np.isfinite(rows).all() and made.failed == 1
+    assert np.isfinite(rows).all()
     assert rows[0].any() and not rows[1].any() and (rows[0] == rows[2]).all()
     cache, square = EmbeddingCache(made, ViewDecoder().view), Pinhole.from_fov(32, 32, 60.0)
     items = [
@@ -150,7 +150,6 @@ def test_a_nan_of_one_frame_costs_no_other_frame_of_its_batch(tmp_path):
     for _ in range(3):
         rows, ok = cache.of(items)
         assert ok.tolist() == [True, False, True] and np.isfinite(rows).all() and not rows[1].any()
-    assert cache.failed == 1, "counted once"
 
 
 def node(kind: str, read: list[str], write: str, **attributes):
@@ -234,24 +233,19 @@ class Means:
         return np.array([[*i.reshape(-1, 3).mean(0), 1.0] for i in images], np.float32)
 
 
-def cached(**more) -> tuple[Means, EmbeddingCache]:
-    means = Means()
-    return means, EmbeddingCache(means, ViewDecoder().view, **more)
-
-
 def buffered(camera: str = "cam01", sequence: int = 0, **other) -> Frame:
     return frame(camera, sequence, **{"generated_ns": sequence, "received_ns": sequence, **other})
 
 
 def test_a_frame_is_embedded_once_whoever_asks_again():
-    means, cache = cached()
+    cache = EmbeddingCache(means := Means(), ViewDecoder().view)
     items = [buffered("cam01"), buffered("cam02", 3)]
     first, ok = cache.of(items)
     again, _ = cache.of(list(reversed(items)))
     assert ok.tolist() == [True, True] and first.dtype == np.float32 and first.shape == (2, DIM)
     assert (again == first[::-1]).all()
-    assert means.asked == [2] and cache.computed == 2
-    cache.of([*items, buffered("cam01", 1)])
+    assert means.asked == [2]
+    cache.of([items[1], buffered("cam01", 1)])
     assert means.asked == [2, 1], "only what is new"
     cache.of([buffered("cam01", 1, session="s2")])
     assert means.asked == [2, 1, 1], "another session with the same number is another frame"
@@ -263,15 +257,4 @@ def test_a_frame_that_cannot_be_decoded_is_a_camera_without_embedding():
     for _ in range(3):
         rows, ok = cache.of([damaged_frame("cam01"), buffered("cam02")])
         assert ok.tolist() == [False, True] and (rows[0] == 0).all()
-    assert cache.failed == 1 and decoder.undecodable == 1 and means.asked == [1]
-
-
-def test_memory_is_bounded_and_the_latest_used_stay():
-    means, cache = cached(capacity=4)
-    kept = buffered("cam02")
-    for k in range(20):
-        cache.of([buffered("cam01", k), kept])
-    assert len(cache._rows) == 4
-    assert sum(means.asked) == 21, "the frame that every decision used was embedded once"
-    rows, ok = cache.of([buffered(f"cam{k:02d}") for k in range(9)])
-    assert ok.all() and len(rows) == 9 and len(cache._rows) == 4, "a larger decision is answered whole"
+    assert decoder.undecodable == 1 and means.asked == [1]

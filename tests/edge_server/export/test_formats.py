@@ -11,7 +11,7 @@ import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.scenes.recorded import load_recorded
-from edge_server.export import PosedImage, file_names, ply
+from edge_server.export import file_names, ply
 from edge_server.export.colmap import Cloud, write_model
 from edge_server.export.exporter import write_mesh
 from edge_server.export.images import write_images
@@ -32,11 +32,11 @@ from tests.support import refusal
 RNG = np.random.default_rng(5)
 
 
-def shots(count: int = 4) -> list[PosedImage]:
+def shots(count: int = 4) -> list[View]:
     maps = ball_maps(count)
     lenses = [LENS, DISTORTED_LENS]
     pictures = RNG.integers(0, 255, (count, 64, 64, 3), dtype=np.uint8)
-    return [PosedImage(f"view{k}.png", pictures[k], m.camera_to_world, lenses[k % 2]) for k, m in enumerate(maps)]
+    return [View(f"view{k}.png", pictures[k], m.camera_to_world, lenses[k % 2]) for k, m in enumerate(maps)]
 
 
 def numbered(name: str, count: int) -> list[str]:
@@ -47,7 +47,7 @@ def columns(data, names) -> np.ndarray:
     return np.stack([data[name] for name in names], axis=-1)
 
 
-def pixels(shot: PosedImage, points: np.ndarray) -> np.ndarray:
+def pixels(shot: View, points: np.ndarray) -> np.ndarray:
     inverse = se3_inverse(shot.camera_to_world)
     return shot.intrinsics.project(points @ inverse[:3, :3].T + inverse[:3, 3])
 
@@ -62,7 +62,7 @@ def test_colmap_opens_in_colmap(tmp_path):
     assert model.num_images() == 4 and model.num_points3D() == 50 and model.num_cameras() == 2
     images = {image.name: image for image in model.images.values()}
     for k, shot in enumerate(of):
-        image = images[shot.name]
+        image = images[shot.camera]
         matrix = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
         np.testing.assert_allclose(matrix, se3_inverse(shot.camera_to_world), atol=1e-12)
         which = np.flatnonzero(points.seen[:, k])
@@ -78,7 +78,7 @@ def test_colmap_opens_in_colmap(tmp_path):
 
 def test_transforms_read_back_as_they_were(tmp_path):
     of = shots()
-    clear = PosedImage("clear.png", RNG.integers(0, 255, (64, 64, 4), dtype=np.uint8), np.eye(4), LENS)
+    clear = View("clear.png", RNG.integers(0, 255, (64, 64, 4), dtype=np.uint8), np.eye(4), LENS)
     write_images(tmp_path / "images", [*of, clear])
     back = cv2.imread(str(tmp_path / "images" / "clear.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(cv2.cvtColor(back, cv2.COLOR_BGRA2RGBA), clear.image)
@@ -89,8 +89,7 @@ def test_transforms_read_back_as_they_were(tmp_path):
         np.testing.assert_array_equal(view.image, shot.image)
         assert view.intrinsics == shot.intrinsics
         point = RNG.uniform(-0.05, 0.05, (20, 3))
-        again = PosedImage("", view.image, view.camera_to_world, view.intrinsics)
-        assert np.abs(pixels(again, point) - pixels(shot, point)).max() < 0.01
+        assert np.abs(pixels(view, point) - pixels(shot, point)).max() < 0.01
     assert "ply_file_path" not in json.loads((tmp_path / "transforms.json").read_text())
 
 

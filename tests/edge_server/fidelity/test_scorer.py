@@ -17,7 +17,7 @@ from edge_server.fidelity.baselines import BaselineMean, baseline, mean_color_db
 from edge_server.fidelity.fetch_lpips import FetchError, convert
 from edge_server.fidelity.images import ImageError
 from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, open_lpips, weights_folder
-from edge_server.fidelity.moving_pixels import BOUND, NoiseEstimate, frames_at_lags, moving_mask, pair_noise
+from edge_server.fidelity.moving_pixels import BOUND, NoiseEstimate, frames_at_lags, moving_mask
 from edge_server.fidelity.psnr import PSNR_CEILING_DB, psnr
 from edge_server.fidelity.scorer import Scorer, mean_score
 from edge_server.fidelity.ssim import ssim
@@ -64,20 +64,6 @@ def test_noise_is_measured_through_8_bits_and_a_moving_third(sigma):
     upper = np.hypot(sigma, 1 / 255 / np.sqrt(12))
     assert 0.6 * sigma <= estimate.sigma <= 1.05 * upper
     assert estimate.bound == max(BOUND, 4 * estimate.sigma)
-
-
-def test_black_and_saturated_blocks_have_no_vote_and_noise_has_a_bound():
-    rng = np.random.default_rng(6)
-    a, b = np.zeros((64, 64, 3)), np.zeros((64, 64, 3))
-    assert pair_noise(a, b) is None
-    a[:16], b[:16] = 0.5 + rng.normal(0, 0.01, (2, 16, 64, 3))
-    assert pair_noise(a, b) == pytest.approx(0.01, rel=0.1)
-    a, b = rng.uniform(0.1, 0.9, (2, 32, 32, 3))
-    estimate = NoiseEstimate()
-    assert estimate.bound == BOUND
-    estimate.add(a, b)
-    assert estimate.bound == pytest.approx(0.2), "a moving camera does not pass for infinite noise"
-    assert pair_noise(np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 0.6)) is None, "smaller than a block"
 
 
 RNG = np.random.default_rng(5)

@@ -141,13 +141,6 @@ def test_frames_that_have_waited_keep_their_order_and_count_where_their_camera_i
     assert _taken(buffer)[1] == [("cam02", 2), *[("cam02", sequence) for sequence in range(4, MOST_UNSELECTED + 2)]]
 
 
-def test_of_two_frames_of_one_instant_the_selected_one_comes_first():
-    buffer = _keeping("cam01")
-    for sequence in range(3):  # the first is the newest, the others are no newer
-        _put(buffer, "cam01", sequence, 1)
-    assert _taken(buffer, 1)[0] == [("cam01", 0)]
-
-
 def test_of_equally_young_frames_those_of_who_has_waited_longest_are_taken():
     buffer = _keeping(*(f"cam{k:02d}" for k in range(6)))
     seen = Counter()

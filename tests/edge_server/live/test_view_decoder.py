@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.fields import View
 from edge_server.live import depth_in_image as module
 from edge_server.live.depth_in_image import depth_in_image
 from edge_server.live.view_decoder import ViewDecoder
 from freshfield.depth import DepthImage
-from freshfield.geometry import Pinhole, Pose, look_at
+from freshfield.geometry import Pinhole, Pose
 from freshfield.limits import MAX_DEPTH_POINTS, MOST_DEPTH_MOVED
 from tests.edge_server.frames import damaged_frame, frame
 
@@ -208,12 +207,3 @@ def test_lenses_that_differ_in_each_frame_do_not_fill_the_memory(monkeypatch):
     monkeypatch.setattr(module, "MAX_DEPTH_RAYS_BYTES", rays_bytes - 1)
     assert (depth_in_image(depth(counts, intrinsics=lenses[1]), IMAGE, 0) > 0).mean() > 0.6
     assert not module._kept
-
-
-LENS = Pinhole.from_fov(8, 8, 60.0)
-
-
-def view(camera, degrees, t_ms, radius_m=1.0, value=0):
-    a = np.deg2rad(degrees)
-    pose = look_at([radius_m * np.sin(a), -radius_m * np.cos(a), 0.5], [0, 0, 0])
-    return View(camera, np.full((8, 8, 3), value, np.uint8), pose, LENS, t_ms * 1_000_000)

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.fidelity.scorer import SELECTED
+from edge_server.fidelity.scorer import METRICS, SELECTED
 from edge_server.live.output.journal import Journal
 from edge_server.report import figures
-from edge_server.report.build_report import METRICS, SERIES, assemble, build_report, fidelity, updates
+from edge_server.report.build_report import SERIES, assemble, build_report, fidelity, updates
 from edge_server.report.conclusion import conclusion
-from edge_server.report.events import MOST, silences
+from edge_server.report.events import silences
 from edge_server.report.figures import draw_fidelity, draw_frontier
 from edge_server.report.run_files import continuous, read_run_files
+from edge_server.report.settings import MOST_EVENTS
 from edge_server.run_records import AgesRow, EdgeStatus, UpdateCounts, UpdateRow
 from freshfield.scenario import NOTHING_HELD_OUT
 from freshfield.untrusted import read_json
@@ -204,18 +205,6 @@ def test_a_held_out_camera_that_moves_is_drawn_and_tabled_at_refined_poses(tmp_p
     assert_says(page, "0.812 SSIM of the same", "9 held-out frames so far, at refined poses 24.70 0.8125")
 
 
-def test_each_part_of_a_figure_is_drawn_and_ages_from_the_youngest_camera_to_the_oldest(run, tmp_path, monkeypatch):
-    files, bands, drawn = read_run_files(run[0]), [], []
-    monkeypatch.setattr("matplotlib.axes.Axes.fill_between", lambda axes, t, low, high, **_: bands.append((low, high)))
-    monkeypatch.setattr(figures, "label_lines", lambda at, *_, **__: drawn.append((len(at.patches), len(at.lines))))
-    for draw in (figures.draw_ages, figures.draw_channel, figures.draw_processes):
-        assert draw(run[1], files, tmp_path / "figure.png")
-    known = np.array([[row.age_ms[camera] for camera in CAMERAS[1:]] for row in files.ages])
-    np.testing.assert_array_equal(bands, [(known.min(axis=1), known.max(axis=1))])
-    # Two states; fifty delays and their mean; memory and processor time of edge, emulator and nodes.
-    assert drawn[2:] == [(2, 0), (50, 1), (0, 3), (0, 3)]
-
-
 @pytest.mark.stability
 @pytest.mark.parametrize(
     ("file", "text", "note"),
@@ -244,12 +233,12 @@ def test_what_should_be_something_else_adds_a_note(tmp_path, file, text, note):
 def test_hostile_names_do_not_reach_the_page_as_markup_nor_many_events(tmp_path):
     write_run(tmp_path, publications=2, ages=2)
     evil = "<script>alert(1)</script>"
-    events = [{"t_s": t_s, "what": evil} for t_s in (-1.0, *range(3 * MOST))]
+    events = [{"t_s": t_s, "what": evil} for t_s in (-1.0, *range(3 * MOST_EVENTS))]
     edit_edge(tmp_path, scenario=evil, field=evil, lpips_missing=evil, chosen=evil, events=events)
     (tmp_path / "ages.jsonl").write_text(json.dumps({"t_s": 1, "age_ms": {evil: 3}}) + "\n")
     report, page = page_of(tmp_path)
-    assert "<script" not in page and page.count("&lt;script&gt;alert(1)") == 6 + MOST - 2  # two of the channel
-    assert len(report["events"]) == MOST and read_json((tmp_path / "report.json").read_text())
+    assert "<script" not in page and page.count("&lt;script&gt;alert(1)") == 6 + MOST_EVENTS - 2  # two of the channel
+    assert len(report["events"]) == MOST_EVENTS and read_json((tmp_path / "report.json").read_text())
 
 
 def test_the_run_stands_beside_the_measured_frontier(tmp_path, monkeypatch):

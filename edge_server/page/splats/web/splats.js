@@ -169,6 +169,7 @@ export class SplatRenderer {
     this.statics = this.movings = this.attached = this.order = this.unseen = null;
     this.moving = null;
     this.moverPlaces = new Float32Array(0);
+    this.counts = new Uint32Array(65537);
   }
 
   /** Bring the textures up to date with what a StreamReader has read. */
@@ -228,7 +229,6 @@ export class SplatRenderer {
     this.sorted = new Uint32Array(this.capacity);
     this.keys = new Uint16Array(this.capacity);
     this.depths = new Float32Array(this.capacity);
-    this.counts = new Uint32Array(65537);
   }
 
   /** Order Gaussians by depth, farthest first; returns how many lie before the camera. Counting sort by 1 / depth,

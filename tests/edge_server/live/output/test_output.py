@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import threading
-from collections import Counter
+from collections import Counter, deque
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
@@ -82,8 +82,7 @@ class Growing(Counter):
 
 
 def ingest(rejected, depth=None):
-    check_ms = SimpleNamespace(percentile=lambda percent: 1.0)
-    return SimpleNamespace(rejected=rejected, depth=depth or {}, buffer=SimpleNamespace(shed=2), check_ms=check_ms)
+    return SimpleNamespace(rejected=rejected, depth=depth or {}, buffer=SimpleNamespace(shed=2), check_ms=deque([1.0]))
 
 
 def test_a_reason_that_comes_while_metrics_are_read_does_not_fail_them():
@@ -135,7 +134,7 @@ def mcap(tmp_path):
 def test_what_finds_no_room_in_a_recording_is_dropped_and_counted_and_nobody_waits(mcap, monkeypatch):
     from freshfield.session.reader import Session
 
-    monkeypatch.setattr("edge_server.live.output.recorder._MAX_QUEUE_MESSAGES", 10)
+    monkeypatch.setattr("edge_server.live.settings.MOST_QUEUED", 10)
     recorder = Recorder(mcap, "test")
     stuck, go_on = threading.Event(), threading.Event()
     write = recorder._writer.frame

@@ -141,16 +141,6 @@ def test_a_fast_link_has_everything_and_goes_on():
     assert [len(block.records) for block in link.of(messages.MovingBlock, since_s=3.0)].count(0) == 1
 
 
-def test_a_moving_set_that_found_no_room_lets_the_window_grow():
-    link, still = Link(Line(2e6)), snapshot(gaussians(COUNT, 0), movers=1000)
-    link.run(ticks(3.0), lambda now_s: still)  # all that stands still is there
-    window = link.visitor.link
-    window.window -= window.room - 1500.0
-    published = link.publisher.take(snapshot(gaussians(COUNT, 0), movers=1000, newest_s=NEWEST_S + 4.0), 4.0)
-    link.visitor.message(published, NEWEST_S, {}, 4.0)
-    assert window.short
-
-
 @pytest.mark.parametrize("kilobytes, all_of_it, lag_s", [(15, False, 0.65), (60, True, 0.35)])
 def test_a_slow_link_is_kept_short_and_shows_what_is_large(kilobytes, all_of_it, lag_s):
     link = Link(Line(1e3 * kilobytes))
@@ -163,28 +153,22 @@ def test_a_slow_link_is_kept_short_and_shows_what_is_large(kilobytes, all_of_it,
     np.testing.assert_allclose(drawn[:, :3], places, atol=0.006)  # the largest ones, some of them not the newest
     sizes = {len(block.records) for block in link.of(messages.MovingBlock, since_s=4.0)}
     assert sizes and max(sizes) < 1000
-    assert len(link.of(messages.KnotsBlock, since_s=4.0)) > 3 * len(link.of(messages.MovingBlock, since_s=4.0)) > 3
+    assert len(link.of(messages.KnotsBlock, since_s=4.0)) > 2 * len(link.of(messages.MovingBlock, since_s=4.0)) > 3
     assert link.record_bytes() > 0.5 * 12.0 * link.there.rate  # and it is used
     link.there.rate = 2e6  # a link that becomes faster gets the rest
     link.run(ticks(16.0, 12.0))
-    assert link.visitor.shown_static == COUNT and len(link.reader.at(NEWEST_S)) == COUNT + 1000
+    assert len(link.visitor._sent) == COUNT and len(link.reader.at(NEWEST_S)) == COUNT + 1000
 
 
-def test_an_outage_during_a_probe_makes_no_link_one_whose_delays_scatter(publisher):
+def test_an_outage_makes_no_link_one_whose_delays_scatter(publisher):
     link, stall_s = Link(Line(60e3), publisher=publisher), 10.0
     link.run(ticks(12.0), tenths)
-    tick, probe = ticks(12.0).stop, link.visitor.link._probe
-    while link.visitor.link._probe == probe:
-        link.run(range(tick, tick + 1), tenths)
-        tick += 1
-    came_s, data = link.under_way.pop()
-    link.under_way.append((came_s + stall_s, data))
+    link.under_way[-1] = (link.under_way[-1][0] + stall_s, link.under_way[-1][1])
     link.there.free_s += stall_s
-    over = tick + ticks(stall_s).stop
-    link.run(range(tick, over), tenths)
+    link.run(ticks(22.0, 12.0), tenths)
     sent = len(link.lags_s)
-    link.run(range(over, over + ticks(60.0).stop), tenths)
-    assert np.quantile(link.lags_s[sent:], 0.9) < 0.35  # as without one; were the mean to decide, 3.9
+    link.run(ticks(82.0, 22.0), tenths)
+    assert np.quantile(link.lags_s[sent:], 0.9) < 0.35, "as without one"
 
 
 def test_a_link_whose_delays_scatter_gets_half_of_what_it_takes_and_has_no_long_queue(publisher):
