@@ -173,7 +173,6 @@ class RecordedConfig(SourceConfig, frozen=True, kw_only=True):
 
     data: Annotated[str, about("folder or file, absolute or below the data folder")] = ""
     scale: Annotated[float, within(1, math.inf, "image sizes are divided by it")] = 1.0
-    loop: Literal["back-and-forth", "restart"] = "back-and-forth"
     assignment: Annotated[dict[str, str], about("scenario camera -> the data's")] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -92,28 +92,16 @@ def bone_frames(start: Array, end: Array, side: Array) -> Array:
     z = end - start
     length = np.linalg.norm(z, axis=1, keepdims=True)
     z = np.where(length > 1e-12, z / np.maximum(length, 1e-12), [[0.0, 0.0, 1.0]])
-    y = _cross(z, side)
+    y = np.cross(z, side)
     norm = np.linalg.norm(y, axis=1, keepdims=True)
     # A bone along its side vector has no preferred roll: use any perpendicular.
-    fallback = _cross(z, np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
+    fallback = np.cross(z, np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
     y = np.where(norm < 1e-6, fallback, y)
     y /= np.linalg.norm(y, axis=1, keepdims=True)
     out = np.zeros((len(start), 4, 4))
-    out[:, :3, 0], out[:, :3, 1], out[:, :3, 2], out[:, :3, 3] = _cross(y, z), y, z, start
+    out[:, :3, 0], out[:, :3, 1], out[:, :3, 2], out[:, :3, 3] = np.cross(y, z), y, z, start
     out[:, 3, 3] = 1.0
     return out
-
-
-def _cross(a: Array, b: Array) -> Array:
-    # np.cross costs more than these nine products on small arrays.
-    return np.stack(
-        [
-            a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
-            a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2],
-            a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0],
-        ],
-        axis=1,
-    )
 
 
 def mean_path_m(points_at: Callable[[float], Array]) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from camera_node.synthetic import motion
 from camera_node.synthetic.motion import PERIOD_UNIT_S, Vector
 from camera_node.synthetic.placement import MovingBody, Part
-from camera_node.synthetic.shapes import RoundCone, Shape, Sphere, capsule
+from camera_node.synthetic.shapes import RoundCone, Shape, Sphere
 from camera_node.synthetic.textures import Bands, Plaid, Plain, Spots, Stripes, Texture
 from freshfield.geometry import Array
 
@@ -89,7 +89,7 @@ def _body_parts() -> list[tuple[str, Part]]:
     return [
         ("pelvis", Part(RoundCone(0.145, 0.135, 0.12), belt)),
         ("torso", Part(RoundCone(0.135, 0.165, 0.33), shirt)),
-        ("neck", Part(capsule(0.05, 0.12), skin)),
+        ("neck", Part(RoundCone(0.05, 0.05, 0.12), skin)),
         ("head", Part(Sphere(0.12), face)),
         ("hair", Part(Sphere(0.124), hair)),
         *((f"{name}_{side}", Part(shape, texture)) for name, shape, texture in limbs for side in "lr"),

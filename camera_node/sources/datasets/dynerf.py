@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from camera_node.sources.datasets.imaging import read_numbers
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, file_within
 from camera_node.sources.datasets.video import Clip, rig_dataset
@@ -41,22 +42,9 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
 
 
 def _rows(file: Path) -> np.ndarray:
-    if not file.is_file():
-        raise DatasetError(f"{file}: no such file")
-    try:
-        rows = np.load(file, allow_pickle=False)
-    except Exception as error:  # numpy reads a damaged header as Python, which raises anything
-        why = " ".join(str(error).split()) or type(error).__name__
-        raise DatasetError(f"{file}: cannot be read as numbers of numpy: {why}; is it complete?") from None
-    if (
-        not isinstance(rows, np.ndarray)
-        or rows.ndim != 2
-        or rows.shape[1:] != (17,)
-        or not len(rows)
-        or rows.dtype.kind not in "fiu"
-    ):
-        shape = getattr(rows, "shape", "several arrays")
-        raise DatasetError(f"{file}: expected numbers of shape (cameras, 17), got {shape}")
+    rows = read_numbers(file)
+    if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows) or rows.dtype.kind not in "fiu":
+        raise DatasetError(f"{file}: expected numbers of shape (cameras, 17), got {rows.shape}")
     rows = rows.astype(np.float64)
     if not np.all(np.isfinite(rows)):
         raise DatasetError(f"{file}: row {int(np.argmin(np.isfinite(rows).all(axis=1)))} is not finite")

@@ -18,7 +18,7 @@ from camera_node.synthetic.placement import MovingBody, Part, at, facing
 from camera_node.synthetic.render import World
 from camera_node.synthetic.scene import Fov, MovingParams, Scene, pinhole
 from camera_node.synthetic.scenes.shell import room_shell
-from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere, capsule
+from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere
 from freshfield.geometry import Array
 
 _MAST = (0.0, 0.0, 1.70)
@@ -80,7 +80,7 @@ def _cart(walk: Walk, speed_m_per_s: float) -> MovingBody:
         (Part(Box((0.55, 0.32, 0.05)), deck), at(0.0, 0.0, 0.25)),
         (Part(Box((0.24, 0.24, 0.24)), crate), at(-0.22, 0.0, 0.54)),
         (Part(Cylinder(0.17, 0.22), drum), at(0.30, 0.05, 0.52)),
-        (Part(capsule(0.025, 0.65), tx.Plain((0.25, 0.26, 0.30))), at(0.55, 0.0, 0.30)),
+        (Part(RoundCone(0.025, 0.025, 0.65), tx.Plain((0.25, 0.26, 0.30))), at(0.55, 0.0, 0.30)),
         *((Part(Sphere(0.11), tire), at(x, y, 0.11)) for x in (-0.38, 0.38) for y in (-0.27, 0.27)),
     ]
     local = np.stack([matrix for _, matrix in parts])

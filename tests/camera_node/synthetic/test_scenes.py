@@ -23,7 +23,7 @@ from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.person import loop_length_m, make_walk, walking_person
 from camera_node.synthetic.placement import MovingBody, Part, at, facing
 from camera_node.synthetic.render import CameraRenderer, Image, World
-from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere, capsule, nearest_hit
+from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere, nearest_hit
 from camera_node.synthetic.source import WorldSource
 from camera_node.synthetic.textures import Checker, Plain
 from freshfield import payload
@@ -266,7 +266,7 @@ SOLIDS = [
     Cylinder(0.4, 0.6),
     RoundCone(0.4, 0.1, 0.9),
     RoundCone(0.2, 0.4, 0.3),
-    capsule(0.3, 0.6),
+    RoundCone(0.3, 0.3, 0.6),
 ]
 TOLERANCE = 1e-9
 
