@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
-from camera_node.settings import SourceConfig, WorldConfig, errors_of
+from camera_node.settings import WORLD_FPS, WORLD_MAX_FRAMES, SourceConfig, WorldConfig, errors_of
 from camera_node.sources.base import Shot, Source, pixels, rate
 from camera_node.synthetic import Scene, make_scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects
@@ -28,10 +28,6 @@ from freshfield.settings import as_mapping
 
 if TYPE_CHECKING:
     from camera_node.synthetic.depth import DepthRenderer
-
-WORLD_FPS = 15.0
-# A sequence with more different frames counts as not repeating: frames are rendered on demand and not kept.
-MAX_FRAMES = 3000
 
 
 class Carrier(Protocol):
@@ -62,7 +58,7 @@ class WorldSource(Source):
     Raises ValueError for a rate that is not positive.
 
     Attributes:
-    repeats_after: frames until the scene repeats (1 for a static scene); None for more than MAX_FRAMES.
+    repeats_after: frames until the scene repeats (1 for a static scene); None for more than WORLD_MAX_FRAMES.
     cache: of the frames; None if they are rendered anew.
     """
 
@@ -86,7 +82,7 @@ class WorldSource(Source):
         if self.fps <= 0:
             raise ValueError(f"fps must be positive, got {fps}")
         self.intrinsics, matrix = self.scene.cameras[camera_id]
-        self._carrier = carrier
+        self._carrier, self._size = carrier, (self.intrinsics.width, self.intrinsics.height)
         self._moves = bool(effects.mount) or carrier is not None
         periods_s = [scene.period_s] if scene.moving else []
         if self._moves:
@@ -101,7 +97,7 @@ class WorldSource(Source):
         self._placed: tuple[Array, CameraRenderer] | None = None
         self.cache: FrameCache | None = None
         if folder is not None and self.repeats_after is not None:
-            self.cache = FrameCache(self.key(), self._codec, (self.intrinsics.width, self.intrinsics.height), folder)
+            self.cache = FrameCache(self.key(), self._codec, self._size, folder)
 
     def content(self, tick: int) -> int:
         return tick % self.contents if self.contents else tick
@@ -111,7 +107,8 @@ class WorldSource(Source):
         frame = content % self.repeats_after if self.repeats_after else content
         image: Image | bytes
         if self._effects.image:
-            image = self._effects.apply(self.image(frame), content, self._time_s(content))
+            exact = payload.decode(self._stored(frame), self._codec, *self._size)
+            image = self._effects.apply(exact, content, self._time_s(content))
         else:
             image = self._stored(frame)
         t_s, pose, gap_ns = self._time_s(content), self._pose, 0
@@ -130,12 +127,6 @@ class WorldSource(Source):
             self._depth = DepthRenderer(self.scene.world, self.intrinsics, self._true_pose(frame))
         exact = self._depth.depth(self._time_s(frame))
         return self._effects.depth[0].measure(exact, pixels(shot, self._codec), self.intrinsics, content)
-
-    def image(self, frame: int) -> Image:
-        """Frame before effects of kind image: uint8 (H, W, 3), exact."""
-        if self.cache is None or not self._effects.image:
-            return self._render(frame)
-        return payload.decode(self._stored(frame), self._codec, self.intrinsics.width, self.intrinsics.height)
 
     def prepare(self, stopped: Callable[[], bool]) -> None:
         for frame in range(self.repeats_after or 0):
@@ -206,7 +197,7 @@ def _repeats_after(periods_s: Sequence[float], fps: Fraction) -> int | None:
     period = math.lcm(*(round(s / PERIOD_UNIT_S) for s in periods_s)) * Fraction(PERIOD_UNIT_S).limit_denominator(10)
     # The numerator is the least number of frames that take a whole number of periods.
     frames = (period * fps).numerator
-    return frames if frames <= MAX_FRAMES else None
+    return frames if frames <= WORLD_MAX_FRAMES else None
 
 
 def open_sources(

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from camera_node.settings import SAME_SHAPE
 from camera_node.sources.datasets.imaging import read_numbers
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, file_within
@@ -21,8 +22,6 @@ from freshfield.geometry import Pinhole, Pose
 
 POSES = "poses_bounds.npy"
 FILES = (POSES,)
-# Tolerated difference between the aspect ratios of video and calibration images; both are rounded to pixels.
-_SAME_SHAPE = 0.02
 
 
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
@@ -57,7 +56,7 @@ def _camera(row: np.ndarray, clip: Clip, where: str) -> CalibratedCamera:
     if min(height, width, focal) <= 0:
         raise DatasetError(f"{where}: height, width, focal length are {height:g}, {width:g}, {focal:g}")
     x, y = clip.width / width, clip.height / height
-    if not abs(x / y - 1.0) <= _SAME_SHAPE:
+    if not abs(x / y - 1.0) <= SAME_SHAPE:
         raise DatasetError(
             f"{where}: is of images of {width:g} x {height:g}, {clip.path.name} has {clip.width} x {clip.height}"
         )

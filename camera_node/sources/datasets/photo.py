@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.settings import SAME_SHAPE
 from camera_node.sources.datasets.imaging import composite, image_size, read_image, resize, shrink
 from camera_node.sources.datasets.lens import Lens, exact, pinhole, undistort
 from camera_node.sources.datasets.records import (
@@ -27,9 +28,6 @@ from freshfield.depth import DepthImage
 from freshfield.geometry import Pose
 
 import cv2  # isort: skip
-
-# Tolerated difference of aspect ratio between an image and its original, due to rounding to whole pixels.
-_SAME_SHAPE = 0.02
 
 
 @dataclass(frozen=True)
@@ -113,7 +111,7 @@ def fitted(photo: Photo) -> Photo:
 
 
 def _same_shape(lens: Lens, size: tuple[int, int]) -> bool:
-    return abs((size[0] / lens.width) / (size[1] / lens.height) - 1.0) <= _SAME_SHAPE
+    return abs((size[0] / lens.width) / (size[1] / lens.height) - 1.0) <= SAME_SHAPE
 
 
 class NoImages(DatasetError):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from camera_node.pose.providers import PoseProvider
 from camera_node.pose.trajectories import trajectory_poses
-from camera_node.settings import FPS_RANGE, RecordedConfig, VideoConfig, find_data
+from camera_node.settings import FPS_RANGE, HOLD_OUT_EVERY, PHOTO_FPS, RecordedConfig, VideoConfig, find_data
 from camera_node.sources.base import Shot, Source, assign_cameras, rate
 from camera_node.sources.datasets.formats import open_configured
 from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
@@ -29,8 +29,6 @@ from freshfield.scenario import Scenario, ScenarioError
 
 log = logging.getLogger("camera-node")
 
-HOLD_OUT_EVERY = 8
-PHOTO_FPS = 10.0
 _SUFFIXES = {"jpeg": (".jpg", ".jpeg")}
 
 
@@ -175,17 +173,13 @@ class Timeline:
 
 
 def _recorded_fps(dataset: Dataset, images: Sequence[PosedImage], path: Path) -> Fraction:
-    if dataset.fps is not None:
-        return _recorded_rate(dataset.fps, path)
-    times = [image.time_s for image in images if image.time_s is not None]
-    if len(times) < 2 or times[-1] <= times[0]:
-        return rate(PHOTO_FPS)
-    usual_s = float(np.median(np.diff(times))) or (times[-1] - times[0]) / (len(times) - 1)
-    return _recorded_rate(1.0 / usual_s, path)
-
-
-def _recorded_rate(fps: float, path: Path) -> Fraction:
-    """A recording's rate as a fraction. Raises DatasetError if it is outside FPS_RANGE."""
+    """The rate of one camera's images. Raises DatasetError if it is outside FPS_RANGE."""
+    fps = dataset.fps
+    if fps is None:
+        times = [image.time_s for image in images if image.time_s is not None]
+        if len(times) < 2 or times[-1] <= times[0]:
+            return rate(PHOTO_FPS)
+        fps = 1.0 / (float(np.median(np.diff(times))) or (times[-1] - times[0]) / (len(times) - 1))
     lowest, highest = FPS_RANGE
     if not lowest <= fps <= highest:
         raise DatasetError(

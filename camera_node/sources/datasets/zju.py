@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from camera_node.settings import ZJU_FPS
 from camera_node.sources.datasets.imaging import image_size
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.npy import load_object
@@ -31,13 +32,11 @@ from camera_node.sources.datasets.records import (
 
 ANNOTATIONS = "annots.npy"
 FILES = (ANNOTATIONS,)
-# Assumed rate of the studio's cameras, which the files do not tell.
-FPS = 50.0
 _MM = 1e-3
 
 
 def load_dataset(
-    path: Path, options: ImageOptions = FULL_SIZE, masks: str | None = None, recorded_fps: float = FPS
+    path: Path, options: ImageOptions = FULL_SIZE, masks: str | None = None, recorded_fps: float = ZJU_FPS
 ) -> Dataset:
     """The images of all cameras, at instants 1 / ``recorded_fps`` apart; those without a file are counted as
     missing.

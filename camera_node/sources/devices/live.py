@@ -16,7 +16,7 @@ from fractions import Fraction
 from functools import partial
 
 from camera_node.pose.providers import Closable, FixedPose, PoseProvider
-from camera_node.settings import LiveConfig, beside
+from camera_node.settings import LIVE_FPS, REOPEN_AFTER_S, LiveConfig, beside
 from camera_node.sources.base import Shot, Source, rate
 from camera_node.sources.devices.feed import CameraError, Feed, Image, as_camera_error
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
@@ -27,8 +27,6 @@ from freshfield.scenario import Scenario, ScenarioError
 
 log = logging.getLogger("camera-node")
 
-DEFAULT_FPS = 15.0
-BACKOFF_S = (0.25, 0.5, 1.0, 2.0, 5.0)
 _GRAB_S = 0.5
 _JOIN_S = 2.0
 # kind -> its driver's module here and class
@@ -159,7 +157,7 @@ class LiveSource(Source):
                 if current is not None:
                     _close_quietly(current)
                     current = None
-                self._stop.wait(BACKOFF_S[min(failures, len(BACKOFF_S) - 1)])
+                self._stop.wait(REOPEN_AFTER_S[min(failures, len(REOPEN_AFTER_S) - 1)])
                 failures += 1
         if current is not None:
             _close_quietly(current)
@@ -190,7 +188,7 @@ def open_live(
         for camera in cameras:
             if camera not in config.devices:
                 raise ScenarioError(f"{scenario.path}: source.devices.{camera}: missing: which camera is it?")
-    fps, clock = rate(config.fps or DEFAULT_FPS), WallClock()
+    fps, clock = rate(config.fps or LIVE_FPS), WallClock()
     known = calibrations(scenario, config) if any_fov_deg is None else {}
     standing = FixedPose(Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     poses = _poses(scenario, config, cameras, known) if any_fov_deg is None else dict.fromkeys(cameras, standing)

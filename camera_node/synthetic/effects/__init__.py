@@ -33,7 +33,7 @@ from freshfield.depth import DepthImage
 from freshfield.geometry import Array, Pinhole, Pose
 from freshfield.settings import ScenarioError, Settings, about, read_settings
 
-NAMES = ("bump", "clock_drift", "depth_sensor", "exposure_drift", "pose_delay", "pose_noise", "sensor_noise")
+NAMES = ("bump", "clock_drift", "depth_sensor", "exposure_drift", "pose_delay", "pose_noise")
 
 
 class EffectParameters(Settings, frozen=True, kw_only=True):

@@ -15,7 +15,7 @@ from camera_node.pose.providers import FixedPose
 from camera_node.settings import CameraConfig, source_config
 from camera_node.sources.devices import live
 from camera_node.sources.devices import opencv as opencv_camera
-from camera_node.sources.devices.connected import Connected, connected
+from camera_node.sources.devices.connected import connected
 from camera_node.sources.devices.feed import CameraError, Plugged, select_device
 from camera_node.sources.devices.live import LiveSource
 from freshfield.clock import WallClock
@@ -207,8 +207,7 @@ def test_video_devices_are_listed_with_the_name_that_lasts(tmp_path):
     links = tmp_path / "dev/v4l/by-id"
     links.mkdir(parents=True)
     (links / "usb-HD_Webcam-video-index0").symlink_to("../../video0")
-    found = [camera for camera in connected(tmp_path) if camera.kind == "camera"]
-    assert found == [
-        Connected("camera", "0", "HD Webcam; the same at every start: /dev/v4l/by-id/usb-HD_Webcam-video-index0"),
-        Connected("camera", "10", "Other"),
+    assert [camera for kind, camera in connected(tmp_path) if kind == "camera"] == [
+        Plugged("0", "HD Webcam; the same at every start: /dev/v4l/by-id/usb-HD_Webcam-video-index0"),
+        Plugged("10", "Other"),
     ]

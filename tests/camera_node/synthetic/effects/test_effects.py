@@ -14,7 +14,6 @@ from camera_node.synthetic.effects.clock_drift import ClockDrift
 from camera_node.synthetic.effects.depth_sensor import DepthSensor, StereoDepth
 from camera_node.synthetic.effects.exposure_drift import ExposureDrift
 from camera_node.synthetic.effects.pose_noise import PoseNoise
-from camera_node.synthetic.effects.sensor_noise import SensorNoise
 from freshfield.geometry import Pinhole, Pose, look_at
 from freshfield_up import check_plugin
 
@@ -100,21 +99,6 @@ def test_exposure_is_a_sine_in_stops_and_a_stop_doubles_as_far_as_white():
     trough = drift.apply(image, 0, peak_s + 4.0).ravel().tolist()
     assert trough == [0, 0, 30, 50, 64, 64, 100, 127, 128]  # halves round to the nearest even count
     assert (drift.apply(np.full((1, 1, 4), 100, np.uint8), 0, peak_s)[..., 3:] == 100).all(), "transparency is no color"
-
-
-@pytest.mark.parametrize("level", [20, 220])
-def test_sensor_noise_has_the_stated_variance_and_is_white(level):
-    noise = start(SensorNoise(read_noise_counts=2.0, full_well_electrons=2000.0))
-    image = np.full((256, 256, 3), level, np.uint8)
-    a, b = (noise.apply(image, k).astype(float) - level for k in (0, 1))
-    assert a.mean() == pytest.approx(0.0, abs=0.05)
-    # Rounding to whole counts adds 1/12.
-    assert a.var() == pytest.approx(4.0 + level * 255 / 2000 + 1 / 12, rel=0.02)
-    for x, y in ((a, b), (a[..., 0], a[..., 1]), (a[1:], a[:-1]), (a[:, 1:], a[:, :-1])):
-        assert abs(np.corrcoef(x.ravel(), y.ravel())[0, 1]) < 0.01
-    for end in (0, 255):
-        out = start(SensorNoise(read_noise_counts=50.0)).apply(np.full((64, 64, 3), end, np.uint8), 0)
-        assert out.dtype == np.uint8 and (out == end).mean() > 0.4  # clipped, not wrapped around
 
 
 def errors(poses: list[Pose]) -> np.ndarray:
