@@ -112,8 +112,7 @@ class CameraRenderer:
 
     def __init__(self, world: World, camera: Pinhole, camera_to_world: Array, supersample: int = 1) -> None:
         self.world, self.supersample = world, supersample
-        self.camera = camera
-        self.width, self.height = camera.width, camera.height
+        self._width = camera.width
         fine = camera.scaled(supersample) if supersample > 1 else camera
         self._shape = (fine.height, fine.width)
         self._origin, directions = world_rays(fine, camera_to_world)
@@ -187,6 +186,6 @@ class CameraRenderer:
     def _to_image(self, colors: Colors) -> Image:
         image: NDArray = colors.reshape(-1, self._shape[1], 3)
         if self.supersample > 1:
-            size = (self.width, len(image) // self.supersample)
+            size = (self._width, len(image) // self.supersample)
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         return np.asarray(cv2.convertScaleAbs(np.clip(image, 0.0, 1.0), alpha=255.0), dtype=np.uint8)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
+import msgspec
 import numpy as np
 
 from camera_node.settings import WORLD_FPS, WORLD_MAX_FRAMES, SourceConfig, WorldConfig, errors_of
@@ -24,7 +24,6 @@ from freshfield import payload
 from freshfield.depth import DepthImage
 from freshfield.geometry import Array, Pose
 from freshfield.scenario import Scenario, ScenarioError
-from freshfield.settings import as_mapping
 
 if TYPE_CHECKING:
     from camera_node.synthetic.depth import DepthRenderer
@@ -141,22 +140,18 @@ class WorldSource(Source):
 
     def key(self) -> str:
         """Hash (hex) of everything that determines the frames' bytes."""
-        camera, pose = self.scene.cameras[self.camera_id]
-        what = {
-            "scene": self.scene.name,
-            "params": as_mapping(self.scene.params),
-            "camera": dataclasses.asdict(camera),
-            "pose": np.asarray(pose, dtype=np.float64).tolist(),
-            "fps": str(self.fps),
-            "codec": [self._codec, self._quality if self._codec == "jpeg" else None],
-            "renderer": renderer_version(),
-            "phase_ns": self.phase_ns,
-        }
-        if self._carrier is not None:
-            what["carrier"] = repr(self._carrier)
+        lens, pose = self.scene.cameras[self.camera_id]
         # ``count`` determines which cameras there are, not what one of them sees.
-        what["params"].pop("count")
-        return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+        shown = (
+            self.scene.name,
+            msgspec.structs.replace(self.scene.params, count=1),
+            lens,
+            pose.tolist(),
+            self._carrier,
+        )
+        codec = (self._codec, self._quality if self._codec == "jpeg" else None)
+        what = repr((shown, codec, self.fps, self.phase_ns, renderer_version()))
+        return hashlib.sha256(what.encode()).hexdigest()
 
     def _stored(self, frame: int) -> bytes:
         """The frame, encoded: from the cache, or rendered and kept there."""
@@ -216,22 +211,22 @@ def open_sources(
     names = _scene_cameras(scenario, scene)
     # Training of a scheduler draws hundreds of motions, each used once.
     folder = default_folder() if config.motion_seed is None else None
-    fps, made = rate(config.fps or WORLD_FPS), dict[str, WorldSource]()
-    carriers = _carriers(scenario, config, scene, cameras)
-    for camera in cameras:
-        made[camera] = WorldSource(
+    fps, carriers = config.fps or WORLD_FPS, _carriers(scenario, config, scene, cameras)
+    return {
+        camera: WorldSource(
             camera,
             scene,
             names[camera],
-            fps,
+            rate(fps),
             effects=effects.get(camera) or NO_EFFECTS,
             codec=config.codec,
             quality=config.quality,
-            phase_ns=scenario.phase_ns(camera, config.fps or WORLD_FPS),
+            phase_ns=scenario.phase_ns(camera, fps),
             folder=folder,
             carrier=carriers.get(camera),
         )
-    return {**made}
+        for camera in cameras
+    }
 
 
 def _carriers(scenario: Scenario, config: WorldConfig, scene: Scene, cameras: Sequence[str]) -> dict[str, Carrier]:

@@ -57,7 +57,8 @@ def load_dataset(
         f"ims[{k}]": len(names) for k, names in enumerate(instants) if len(names) != count
     }
     if count < 1 or not instants or set(counts.values()) != {count}:
-        raise DatasetError(f"{file}: the numbers of cameras differ: {_listed(counts)}")
+        listed = ", ".join(f"{key} {n}" for key, n in list(counts.items())[:6])
+        raise DatasetError(f"{file}: the numbers of cameras differ: {listed}")
     folder = file.parent
     if masks is not None and not (folder / masks).is_dir():
         raise DatasetError(f"{folder / masks}: no such folder of masks")
@@ -82,10 +83,6 @@ def load_dataset(
             time_s = k / recorded_fps
             found.add(f"{camera}/{k:06d}", picture, lens, pose, where, camera=camera, time_s=time_s, mask=mask)
     return found.dataset(recorded_fps)
-
-
-def _listed(counts: dict[str, int]) -> str:
-    return ", ".join(f"{key} {n}" for key, n in list(counts.items())[:6])
 
 
 def _path(name: Any, where: str) -> Path:
