@@ -30,8 +30,7 @@ _NOT_RENDERING = ("depth.py", "depth_sensor.py", "frame_cache.py", "source.py")
 
 def default_folder() -> Path:
     """The folder ``frames`` of $XDG_CACHE_HOME/freshfield, or of ~/.cache/freshfield."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "freshfield" / "frames"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "freshfield" / "frames"
 
 
 class FrameCache:

@@ -19,6 +19,7 @@ from camera_node.synthetic.shapes import RoundCone, Shape, Sphere
 from camera_node.synthetic.textures import Bands, Plaid, Plain, Spots, Stripes, Texture
 from freshfield.geometry import Array
 
+STILL_PHASE = 0.62  # of who stands still: mid-wave
 _CYCLES = 3  # gait cycles in one loop: strides of about 1.2 m
 _ANKLE_M = 0.07
 _THIGH_M, _SHIN_M = 0.42, 0.41
@@ -49,6 +50,8 @@ class Walk:
 
     def phase(self, t_s: float) -> float:
         """Phase in [0, 1) of an instant."""
+        if self.still:
+            return STILL_PHASE
         return motion.phase_of(t_s + self.start_s, self.period_s)
 
     def at(self, phase: float) -> tuple[float, float]:
@@ -106,15 +109,8 @@ _SCALES = {
     "hand_r": (0.7, 1.0, 1.25),
 }
 # Spheres that shade the floor: part and radius (m).
-_CONTACT = {
-    "foot_l": 0.10,
-    "foot_r": 0.10,
-    "shin_l": 0.08,
-    "shin_r": 0.08,
-    "thigh_l": 0.10,
-    "thigh_r": 0.10,
-    "pelvis": 0.14,
-}
+_LEG = {"foot": 0.10, "shin": 0.08, "thigh": 0.10}
+_CONTACT = {f"{part}_{side}": radius for part, radius in _LEG.items() for side in "lr"} | {"pelvis": 0.14}
 
 
 def _direction(*terms: tuple[float, Vector]) -> Vector:
@@ -195,9 +191,8 @@ def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:
         heel = _offset(ankle, (-0.03, ahead), (-0.01, up))
         starts[f"foot_{name}"], ends[f"foot_{name}"] = heel, _offset(heel, (1.0, ahead))
 
-    names = _NAMES
-    side = [sides.get(n, right) for n in names]
-    return np.array([starts[n] for n in names]), np.array([ends[n] for n in names]), np.array(side)
+    side = [sides.get(n, right) for n in _NAMES]
+    return np.array([starts[n] for n in _NAMES]), np.array([ends[n] for n in _NAMES]), np.array(side)
 
 
 _PARTS = _body_parts()
@@ -207,11 +202,10 @@ _SCALE_ROWS = np.array([_SCALES.get(n, (1.0, 1.0, 1.0)) for n in _NAMES])
 
 
 def walking_person(walk: Walk) -> MovingBody:
-    """The person as a body of the world. ``walk.still`` freezes it at phase 0.62, mid-wave."""
+    """The person as a body of the world."""
 
     def matrices(t_s: float) -> Array:
-        phase = 0.62 if walk.still else walk.phase(t_s)
-        out = motion.bone_frames(*bones(walk, phase))
+        out = motion.bone_frames(*bones(walk, walk.phase(t_s)))
         out[:, :3, :3] *= _SCALE_ROWS[:, None, :]
         return out
 

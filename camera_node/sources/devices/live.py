@@ -7,6 +7,7 @@ fails, or falls silent, is reopened after growing pauses; meanwhile its captures
 from __future__ import annotations
 
 import atexit
+import contextlib
 import importlib
 import logging
 import threading
@@ -45,12 +46,11 @@ def open_feed(camera: str, config: LiveConfig, fps: Fraction, clock: Clock) -> F
         raise as_camera_error(camera, error) from None
 
 
-def _close_quietly(feed: Feed) -> None:
-    """Close a feed, and ignore errors: a camera that is gone may raise once more."""
-    try:
-        feed.close()
-    except Exception as error:
-        log.debug("closing a camera: %s", error)
+def _close_quietly(feed: Feed | None) -> None:
+    """Close a feed, if there is one, and ignore errors: a camera that is gone may raise once more."""
+    with contextlib.suppress(Exception):
+        if feed is not None:
+            feed.close()
 
 
 class LiveSource(Source):
@@ -94,8 +94,7 @@ class LiveSource(Source):
             self.intrinsics = self._scaled(lens, first[1])
             self._newest = (*first, feed.depth)
         except BaseException as error:
-            if feed is not None:
-                _close_quietly(feed)
+            _close_quietly(feed)
             if isinstance(error, Exception):
                 raise as_camera_error(camera, error) from None
             raise
@@ -154,13 +153,11 @@ class LiveSource(Source):
                 if not failures:
                     log.warning("%s (trying again)", trouble)
                 self._trouble = str(trouble)
-                if current is not None:
-                    _close_quietly(current)
-                    current = None
+                _close_quietly(current)
+                current = None
                 self._stop.wait(REOPEN_AFTER_S[min(failures, len(REOPEN_AFTER_S) - 1)])
                 failures += 1
-        if current is not None:
-            _close_quietly(current)
+        _close_quietly(current)
 
     def _take(self, feed: Feed) -> bool:
         """Wait up to _GRAB_S for a frame and keep it. Returns whether one came."""
