@@ -94,13 +94,13 @@ def registered(counts: NDArray[np.uint16], lens: Lens, scale: float, where: str)
 def _numbers(path: Path) -> NDArray[Any]:
     """The file's numbers, (H, W), 16 bits or floating point. Raises DatasetError."""
     if path.suffix.lower() == ".npy":
-        values: NDArray[Any] | None = read_numbers(path)
+        found: NDArray[Any] | None = read_numbers(path)
     else:
         os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")  # asked when the first EXR file is read
-        values = decode_file(path, cv2.IMREAD_UNCHANGED)
-        if values is None:
-            raise DatasetError(f"{path}: missing, damaged, or no depth image that OpenCV can read")
-    values = np.squeeze(values)
+        found = decode_file(path, cv2.IMREAD_UNCHANGED)
+    if found is None:
+        raise DatasetError(f"{path}: missing, damaged, or no depth image that OpenCV can read")
+    values = np.squeeze(found)
     if values.ndim == 3 and values.dtype.kind == "f":  # EXR files may name their one channel R, or repeat it
         used = [c for c in range(values.shape[2]) if values[..., c].any()] or [0]
         if all(np.array_equal(values[..., used[0]], values[..., c], equal_nan=True) for c in used):
