@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, cast
 
 import msgspec
 import numpy as np
@@ -26,24 +26,11 @@ from freshfield.geometry import Array, Pose
 from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:
+    from camera_node.robot.flange_camera import FlangeMotion
     from camera_node.synthetic.depth import DepthRenderer
+    from camera_node.synthetic.walk import Walk
 
-
-class Carrier(Protocol):
-    """Carries a camera through the world: somebody who walks, or an arm."""
-
-    @property
-    def lap_s(self) -> float | None:
-        """Time after which its motion repeats; None: it does not."""
-        ...
-
-    def pose(self, t_s: float) -> Array:
-        """The camera's true camera-to-world (4, 4) at an instant. Raises PoseGapError if it is not known."""
-        ...
-
-    def measured(self, t_s: float) -> tuple[Pose, int]:
-        """The pose that is known of it, see ``PoseProvider.at``."""
-        ...
+    Carrier = Walk | FlangeMotion
 
 
 class WorldSource(Source):
@@ -53,7 +40,7 @@ class WorldSource(Source):
     effects: of this camera, from ``load_effects``.
     codec, quality: of the encoded frames.
     folder: root of the cache of rendered frames; None renders every frame anew.
-    carrier: moves the camera, instead of the scene's pose; None: it stands still.
+    carrier: moves the camera, instead of the scene's pose, and repeats after its ``lap_s``; None: it stands still.
     Raises ValueError for a rate that is not positive.
 
     Attributes:
