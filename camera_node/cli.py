@@ -151,8 +151,8 @@ def _recording(path: Path, names: str, seed: int | None) -> Scenario:
 def _devices(_: argparse.Namespace) -> int:
     from camera_node.sources.devices.connected import connected
 
-    for camera in connected():
-        print(f"{camera.kind:10} {camera.device or '-':24} {camera.about}")
+    for kind, device in connected():
+        print(f"{kind:10} {device.serial or '-':24} {device.about}")
     return 0
 
 

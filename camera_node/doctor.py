@@ -26,6 +26,7 @@ from typing import Any
 
 from camera_node.pose.providers import Closable, PoseGapError
 from camera_node.settings import (
+    LIVE_FPS,
     ArmConfig,
     LiveConfig,
     McapConfig,
@@ -332,10 +333,10 @@ def _tracker(scenario: Scenario, config: TrajectoryConfig) -> str:
 
 def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
     """Open the camera, take frames for as long as five should take (1 to 3 s), and close it."""
-    from camera_node.sources.devices.live import DEFAULT_FPS, calibrations, open_feed
+    from camera_node.sources.devices.live import calibrations, open_feed
 
     clock = WallClock()
-    asked_hz = config.fps or DEFAULT_FPS
+    asked_hz = config.fps or LIVE_FPS
     listen_s = min(max(_LISTEN_S, _JUDGED_FRAMES / asked_hz), _LISTEN_AT_MOST_S)
     measured: tuple[Image, DepthImage] | None = None
     feed = open_feed(camera, config, rate(asked_hz), clock)

@@ -30,6 +30,18 @@ FPS_RANGE = (0.01, 1000.0)
 """Bounds of a rate of captures or of a recording, frames a second."""
 MAX_GAP_MS = 3.6e6
 """Longest time between a frame and its pose sample: poses an hour away belong to another recording."""
+WORLD_FPS, LIVE_FPS, PHOTO_FPS = 15.0, 15.0, 10.0
+"""Captures a second where a scenario gives no rate: of a synthetic world, of a device, of photos without times."""
+ZJU_FPS = 50.0
+"""Assumed rate of ZJU-MoCap's studio, which its files do not tell."""
+WORLD_MAX_FRAMES = 3000
+"""A synthetic sequence with more different frames counts as not repeating: rendered on demand and not kept."""
+HOLD_OUT_EVERY = 8
+"""Of so many photos the first is held out, where the data set has no test images of its own."""
+SAME_SHAPE = 0.02
+"""Tolerated difference of aspect ratio between an image and what it was calibrated as: both are in whole pixels."""
+REOPEN_AFTER_S = (0.25, 0.5, 1.0, 2.0, 5.0)
+"""Pauses before a camera that failed is opened again: after the first failure, the second, ..."""
 DEPTH_STEP = 0x9E3779B9
 """2^32 by the golden ratio: shot k has depth where k * DEPTH_STEP mod 2^32 is below 2^32 / depth_every. That is one in
 depth_every shots, spread evenly (each fifth: 3, 5 or 8 apart), and also one in depth_every of each second, third, ...
@@ -173,7 +185,6 @@ class RecordedConfig(SourceConfig, frozen=True, kw_only=True):
 
     data: Annotated[str, about("folder or file, absolute or below the data folder")] = ""
     scale: Annotated[float, within(1, math.inf, "image sizes are divided by it")] = 1.0
-    loop: Literal["back-and-forth", "restart"] = "back-and-forth"
     assignment: Annotated[dict[str, str], about("scenario camera -> the data's")] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -252,7 +263,7 @@ class ZjuConfig(RecordedConfig, frozen=True, kw_only=True):
     """ZJU-MoCap. data: the folder with ``annots.npy`` and the cameras' folders of images. background: what goes
     behind the person."""
 
-    recorded_fps: Annotated[float, within(*FPS_RANGE, "of the recording, whose files do not tell")] = 50.0
+    recorded_fps: Annotated[float, within(*FPS_RANGE, "of the recording, whose files do not tell")] = ZJU_FPS
     masks: Annotated[str | None, about("a folder of masks (mask_cihp) that cut the person out")] = None
     background: Background = "black"
 

@@ -71,7 +71,7 @@ class TruthClient:
 
 @dataclass(frozen=True)
 class FlangeMotion:
-    """Motion of one camera on the flange, a ``Carrier`` of the synthetic world.
+    """Motion of one camera on the flange, which carries it through the synthetic world.
 
     poses: the camera's, as they are known of a real arm. truth: of the simulated one.
     base: true world-from-base (4, 4). mount: true flange-from-camera (4, 4).

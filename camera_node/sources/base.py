@@ -127,6 +127,31 @@ class Source(ABC):
         """Free decoders and renderers; ``read`` opens them again."""
 
 
+class Derived(Source):
+    """Another source's shots, some of them or changed."""
+
+    def __init__(self, source: Source, camera: str) -> None:
+        self.camera, self.intrinsics, self.contents = camera, source.intrinsics, source.contents
+        self.fps, self.phase_ns = source.fps, source.phase_ns
+        self._source = source
+
+    @property
+    def poses_refused(self) -> int:
+        return self._source.poses_refused
+
+    def read(self, content: int) -> Shot:
+        return self._source.read(content)
+
+    def depth(self, content: int, shot: Shot) -> DepthImage | None:
+        return self._source.depth(content, shot)
+
+    def prepare(self, stopped: Callable[[], bool]) -> None:
+        self._source.prepare(stopped)
+
+    def release(self) -> None:
+        self._source.release()
+
+
 def assign_cameras(
     scenario: Scenario, assignment: Mapping[str, str], cameras: Sequence[str], available: Sequence[str]
 ) -> dict[str, str]:

@@ -10,6 +10,7 @@ something is refused, unless it is known to be harmless: names and numbers of ca
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,16 +62,13 @@ def calibration_entry(lens: Pinhole, camera_to_world: Array | None = None) -> di
     return entry
 
 
-def _sizes(width: Any, height: Any) -> dict[str, tuple[Any, ...]]:
-    """Keys that may repeat the size -> what they may say."""
-    both = ([width, height],)
-    return {"image_size": both, "size": both, "resolution": both, "image_width": (width,), "image_height": (height,)}
-
-
 def _camera(entry: dict[str, Any], where: str) -> CalibratedCamera:
     entry = {key: value for key, value in entry.items() if value is not None}
-    repeated = dict.fromkeys(("camera_model", "model", "distortion_model"), _MODELS)
-    repeated |= {"units": _UNITS, "unit": _UNITS} | _sizes(entry.get("width"), entry.get("height"))
+    size = [entry.get(key) for key in ("width", "height")]
+    # Keys that may repeat what is read -> what they may say.
+    repeated: dict[str, Sequence[Any]] = dict.fromkeys(("camera_model", "model", "distortion_model"), _MODELS)
+    repeated |= {"units": _UNITS, "unit": _UNITS, "image_width": size[:1], "image_height": size[1:]}
+    repeated |= {key: [size] for key in ("image_size", "size", "resolution")}
     for key in sorted(entry.keys() - {*_HARMLESS.split(), *_READ}):
         if says_something(entry[key]) and entry[key] not in repeated.get(key, ()):
             raise DatasetError(
@@ -79,7 +77,6 @@ def _camera(entry: dict[str, Any], where: str) -> CalibratedCamera:
             )
     k = read_array(entry, "K", (3, 3), where)
     distortion = read_array(entry, "dist_k1k2p1p2", (4,), where) if "dist_k1k2p1p2" in entry else np.zeros(4)
-    size = [entry.get(key) for key in ("width", "height")]
     if not all(isinstance(v, int) and v > 0 for v in size):
         raise DatasetError(f"{where}: width and height are {size}, expected positive whole numbers")
     if k[0, 0] <= 0 or k[1, 1] <= 0 or abs(k[0, 1]) > 1e-6 * k[0, 0]:

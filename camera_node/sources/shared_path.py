@@ -6,16 +6,15 @@ and its held-out camera, with all its errors of pose and exposure (``cameras.hel
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from camera_node.capture_schedule import PartialSchedule, RateSchedule
 from camera_node.settings import McapConfig, SourceConfig
-from camera_node.sources.base import Shot, Source
-from freshfield.depth import DepthImage
+from camera_node.sources.base import Derived, Source
 from freshfield.scenario import Scenario, ScenarioError
 
 
-class PathShare(Source):
+class PathShare(Derived):
     """The captures of ``source`` that one of two cameras sends.
 
     every: of so many captures the first is held out.
@@ -23,10 +22,9 @@ class PathShare(Source):
     """
 
     def __init__(self, source: Source, camera: str, every: int, held_out: bool) -> None:
-        self.camera, self.intrinsics, self.contents = camera, source.intrinsics, source.contents
-        self.phase_ns = source.phase_ns
+        super().__init__(source, camera)
         self.fps = source.fps / every if held_out else source.fps
-        self._source, self._every = source, every
+        self._every = every
         self._others = None if held_out else PartialSchedule(source.fps, source.phase_ns, every)
 
     def rate_schedule(self) -> RateSchedule:
@@ -34,18 +32,6 @@ class PathShare(Source):
 
     def content(self, tick: int) -> int:
         return self._source.content(self._others.whole(tick) if self._others else tick * self._every)
-
-    def read(self, content: int) -> Shot:
-        return self._source.read(content)
-
-    def depth(self, content: int, shot: Shot) -> DepthImage | None:
-        return self._source.depth(content, shot)
-
-    def prepare(self, stopped: Callable[[], bool]) -> None:
-        self._source.prepare(stopped)
-
-    def release(self) -> None:
-        self._source.release()
 
 
 def check_divisible(scenario: Scenario, config: SourceConfig) -> None:

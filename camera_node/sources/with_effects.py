@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from camera_node.settings import SourceConfig, errors_of
-from camera_node.sources.base import Shot, Source, pixels
+from camera_node.sources.base import Derived, Shot, Source, pixels
 from freshfield.depth import DepthImage
 from freshfield.scenario import Scenario, ScenarioError
 
@@ -36,7 +35,7 @@ def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Eff
     return effects
 
 
-class AffectedSource(Source):
+class AffectedSource(Derived):
     """Another source's shots, changed by effects.
 
     Effects differ from tick to tick, so shots do not repeat, unless the only effect is a pose error that is
@@ -44,21 +43,13 @@ class AffectedSource(Source):
     """
 
     def __init__(self, source: Source, effects: Effects, codec: str) -> None:
-        self.camera = source.camera
-        self.fps = source.fps
-        self.intrinsics = source.intrinsics
+        super().__init__(source, source.camera)
         self._each_differs = bool(effects.image) or effects.pose_varies
         self.contents = None if self._each_differs else source.contents
-        self._source = source
-        self._effects = effects
-        self._codec = codec
+        self._effects, self._codec = effects, codec
 
     def content(self, tick: int) -> int:
         return tick if self._each_differs else self._source.content(tick)
-
-    @property
-    def poses_refused(self) -> int:
-        return self._source.poses_refused
 
     def read(self, content: int) -> Shot:
         shot = self._source.read(self._source.content(content) if self._each_differs else content)
@@ -79,9 +70,3 @@ class AffectedSource(Source):
         lens = exact.intrinsics or shot.intrinsics.scaled(width / shot.intrinsics.width)
         measured = self._effects.depth[0].measure(exact.meters(), np.asarray(image, np.uint8), lens, content)
         return dataclasses.replace(exact, counts=measured.counts, meters_per_count=measured.meters_per_count)
-
-    def prepare(self, stopped: Callable[[], bool]) -> None:
-        self._source.prepare(stopped)
-
-    def release(self) -> None:
-        self._source.release()

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from freshfield.geometry import Array, Pinhole, on_sphere
 
 PosedCameras = dict[str, tuple[Pinhole, Array]]
+Angles = tuple[float, float]  # azimuth and elevation, degrees
+
+
+def rings(held_out: Angles, rows: Sequence[tuple[float, Sequence[float]]]) -> list[Angles]:
+    """(Azimuth, elevation) of the held-out camera, and of those of each (elevation, azimuths)."""
+    return [held_out, *((azimuth, elevation) for elevation, row in rows for azimuth in row)]
 
 
 def spread_order(directions: Array) -> list[int]:
@@ -24,12 +32,7 @@ def spread_order(directions: Array) -> list[int]:
 
 
 def build_rig(
-    angles_deg: list[tuple[float, float]],
-    target: ArrayLike,
-    radius_m: float,
-    count: int,
-    camera: Pinhole,
-    outward: bool = False,
+    angles_deg: list[Angles], target: ArrayLike, radius_m: float, count: int, camera: Pinhole, outward: bool = False
 ) -> PosedCameras:
     """Cameras cam00, cam01, ... at (azimuth, elevation) around ``target``, looking at it or outward.
 

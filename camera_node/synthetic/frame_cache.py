@@ -30,8 +30,7 @@ _NOT_RENDERING = ("depth.py", "depth_sensor.py", "frame_cache.py", "source.py")
 
 def default_folder() -> Path:
     """The folder ``frames`` of $XDG_CACHE_HOME/freshfield, or of ~/.cache/freshfield."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "freshfield" / "frames"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "freshfield" / "frames"
 
 
 class FrameCache:
@@ -94,11 +93,9 @@ def prune(root: Path, keep: Path, limit_bytes: int) -> int:
     for folder in root.iterdir():
         if not _NAME.fullmatch(folder.name):
             continue  # none of ours
-        try:
+        with contextlib.suppress(OSError):  # somebody else deleted it
             sizes = [f.stat().st_size for f in os.scandir(folder) if f.is_file()]
             folders.append((folder.stat().st_mtime, sum(sizes), folder))
-        except OSError:
-            continue  # somebody else deleted it
     total, freed = sum(size for _, size, _ in folders), 0
     for _, size, folder in sorted(folders):
         if total - freed <= limit_bytes:

@@ -43,17 +43,13 @@ def shade_diffuse(light: Light, albedo: Array, points: Array, normals: Array, vi
     sources = light.points if visible is not None else light.points.mean(axis=0, keepdims=True)
     direct = np.zeros(points.shape[1])
     for k, source in enumerate(sources):
-        term = _lambert(source, light.falloff_m, points, normals)
+        to = source[:, None] - points
+        distance2 = (to * to).sum(axis=0)
+        cosine = np.maximum((to * normals).sum(axis=0), 0.0) / np.sqrt(np.maximum(distance2, 1e-12))
+        # Softer than the inverse square law: indirect light from walls leaves no black corners in a room.
+        term = cosine / (1.0 + distance2 / (light.falloff_m * light.falloff_m))
         direct += term if visible is None else term * visible[k]
     return albedo * (ambient + np.array(light.tint)[:, None] * (light.strength / len(sources)) * direct)
-
-
-def _lambert(source: Array, falloff_m: float, points: Array, normals: Array) -> Array:
-    to = source[:, None] - points
-    distance2 = (to * to).sum(axis=0)
-    cosine = np.maximum((to * normals).sum(axis=0), 0.0) / np.sqrt(np.maximum(distance2, 1e-12))
-    # Softer than the inverse square law: indirect light from walls leaves no black corners in a room.
-    return cosine / (1.0 + distance2 / (falloff_m * falloff_m))
 
 
 def contact_shadow(

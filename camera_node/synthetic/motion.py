@@ -58,19 +58,19 @@ def footstep_phase(phase: float, cycles: int, offset: float) -> tuple[float, flo
     return (at - offset) / cycles, swing
 
 
-def two_bone_ik(root: Vector, tip: Vector, upper: float, lower: float, pole: Vector) -> Vector:
-    """The joint between two bones from ``root`` to ``tip`` (law of cosines), bent towards ``pole``.
+def two_bone_ik(root: Array, tip: Array, upper: float, lower: float, pole: Array) -> Array:
+    """The joint (3,) between two bones from ``root`` to ``tip`` (law of cosines), bent towards ``pole``.
 
     upper, lower: lengths of the bones. pole: unit vector.
     The bones keep their lengths up to 9/10 of their reach. Beyond that both stretch a little: the bend is
     proportional to the square root of the remaining reach, so the joint would snap straight. They are never
     fully straight.
     """
-    dx, dy, dz = (tip[k] - root[k] for k in range(3))
-    distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+    to = tip - root
+    distance = math.sqrt((to * to).sum())
     if distance < 1e-9:
-        return (root[0] + upper * pole[0], root[1] + upper * pole[1], root[2] + upper * pole[2])
-    ux, uy, uz = dx / distance, dy / distance, dz / distance
+        return root + upper * pole
+    along_axis = to / distance
     soft, full = 0.9 * (upper + lower), 0.995 * (upper + lower)
     reach = max(distance, abs(upper - lower))
     if distance > soft:
@@ -78,12 +78,9 @@ def two_bone_ik(root: Vector, tip: Vector, upper: float, lower: float, pole: Vec
     stretch = max(1.0, distance / reach)
     along = (upper * upper - lower * lower + reach * reach) / (2.0 * reach)
     out = stretch * math.sqrt(max(0.0, upper * upper - along * along))
-    along *= stretch
-    across = pole[0] * ux + pole[1] * uy + pole[2] * uz
-    px, py, pz = pole[0] - across * ux, pole[1] - across * uy, pole[2] - across * uz
-    norm = math.sqrt(px * px + py * py + pz * pz) or 1.0
-    k = out / norm
-    return (root[0] + along * ux + k * px, root[1] + along * uy + k * py, root[2] + along * uz + k * pz)
+    across = pole - (pole * along_axis).sum() * along_axis
+    norm = math.sqrt((across * across).sum()) or 1.0
+    return root + stretch * along * along_axis + out / norm * across
 
 
 def bone_frames(start: Array, end: Array, side: Array) -> Array:
@@ -92,28 +89,16 @@ def bone_frames(start: Array, end: Array, side: Array) -> Array:
     z = end - start
     length = np.linalg.norm(z, axis=1, keepdims=True)
     z = np.where(length > 1e-12, z / np.maximum(length, 1e-12), [[0.0, 0.0, 1.0]])
-    y = _cross(z, side)
+    y = np.cross(z, side)
     norm = np.linalg.norm(y, axis=1, keepdims=True)
     # A bone along its side vector has no preferred roll: use any perpendicular.
-    fallback = _cross(z, np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
+    fallback = np.cross(z, np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
     y = np.where(norm < 1e-6, fallback, y)
     y /= np.linalg.norm(y, axis=1, keepdims=True)
     out = np.zeros((len(start), 4, 4))
-    out[:, :3, 0], out[:, :3, 1], out[:, :3, 2], out[:, :3, 3] = _cross(y, z), y, z, start
+    out[:, :3, 0], out[:, :3, 1], out[:, :3, 2], out[:, :3, 3] = np.cross(y, z), y, z, start
     out[:, 3, 3] = 1.0
     return out
-
-
-def _cross(a: Array, b: Array) -> Array:
-    # np.cross costs more than these nine products on small arrays.
-    return np.stack(
-        [
-            a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
-            a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2],
-            a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0],
-        ],
-        axis=1,
-    )
 
 
 def mean_path_m(points_at: Callable[[float], Array]) -> float:

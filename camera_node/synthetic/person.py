@@ -13,12 +13,13 @@ from functools import lru_cache
 import numpy as np
 
 from camera_node.synthetic import motion
-from camera_node.synthetic.motion import PERIOD_UNIT_S, Vector
+from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.placement import MovingBody, Part
-from camera_node.synthetic.shapes import RoundCone, Shape, Sphere, capsule
+from camera_node.synthetic.shapes import RoundCone, Shape, Sphere
 from camera_node.synthetic.textures import Bands, Plaid, Plain, Spots, Stripes, Texture
 from freshfield.geometry import Array
 
+STILL_PHASE = 0.62  # of who stands still: mid-wave
 _CYCLES = 3  # gait cycles in one loop: strides of about 1.2 m
 _ANKLE_M = 0.07
 _THIGH_M, _SHIN_M = 0.42, 0.41
@@ -49,6 +50,8 @@ class Walk:
 
     def phase(self, t_s: float) -> float:
         """Phase in [0, 1) of an instant."""
+        if self.still:
+            return STILL_PHASE
         return motion.phase_of(t_s + self.start_s, self.period_s)
 
     def at(self, phase: float) -> tuple[float, float]:
@@ -89,7 +92,7 @@ def _body_parts() -> list[tuple[str, Part]]:
     return [
         ("pelvis", Part(RoundCone(0.145, 0.135, 0.12), belt)),
         ("torso", Part(RoundCone(0.135, 0.165, 0.33), shirt)),
-        ("neck", Part(capsule(0.05, 0.12), skin)),
+        ("neck", Part(RoundCone(0.05, 0.05, 0.12), skin)),
         ("head", Part(Sphere(0.12), face)),
         ("hair", Part(Sphere(0.124), hair)),
         *((f"{name}_{side}", Part(shape, texture)) for name, shape, texture in limbs for side in "lr"),
@@ -106,98 +109,77 @@ _SCALES = {
     "hand_r": (0.7, 1.0, 1.25),
 }
 # Spheres that shade the floor: part and radius (m).
-_CONTACT = {
-    "foot_l": 0.10,
-    "foot_r": 0.10,
-    "shin_l": 0.08,
-    "shin_r": 0.08,
-    "thigh_l": 0.10,
-    "thigh_r": 0.10,
-    "pelvis": 0.14,
-}
+_LEG = {"foot": 0.10, "shin": 0.08, "thigh": 0.10}
+_CONTACT = {f"{part}_{side}": radius for part, radius in _LEG.items() for side in "lr"} | {"pelvis": 0.14}
 
 
-def _direction(*terms: tuple[float, Vector]) -> Vector:
-    """Normalized weighted sum of vectors."""
-    x, y, z = _offset((0.0, 0.0, 0.0), *terms)
-    n = math.sqrt(x * x + y * y + z * z) or 1.0
-    return x / n, y / n, z / n
-
-
-def _offset(p: Vector, *terms: tuple[float, Vector]) -> Vector:
-    """p plus a weighted sum of vectors."""
-    x = y = z = 0.0
-    for w, (vx, vy, vz) in terms:
-        x, y, z = x + w * vx, y + w * vy, z + w * vz
-    return p[0] + x, p[1] + y, p[2] + z
+def _unit(v: Array) -> Array:
+    return v / (math.sqrt((v * v).sum()) or 1.0)
 
 
 def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:
     """Start, end and side vectors (M, 3) of every part at a phase, in the order of the parts."""
-    up = (0.0, 0.0, 1.0)
     x, y = walk.at(phase)
     fx, fy = walk.heading(phase)
-    forward, right = (fx, fy, 0.0), (fy, -fx, 0.0)
+    forward, right, up = np.array([[fx, fy, 0.0], [fy, -fx, 0.0], [0.0, 0.0, 1.0]])
     gait = 2 * math.pi * _CYCLES * phase
     swing, bob = math.sin(gait), -0.025 * math.cos(2 * gait)  # lowest when the legs are apart
 
-    pelvis = (x, y, 0.845 + bob)
-    waist = _offset(pelvis, (0.10, up), (0.01, forward))
-    chest = _offset(waist, (0.33, up), (0.035, forward))
+    pelvis = np.array([x, y, 0.845 + bob])
+    waist = pelvis + (0.10 * up + 0.01 * forward)
+    chest = waist + (0.33 * up + 0.035 * forward)
     # Shoulders turn against the hips.
     twist = 0.16 * swing
-    shoulder_axis = _direction((math.cos(twist), right), (math.sin(twist), forward))
-    head = _offset(chest, (0.285, up), (0.03, forward))
-
-    starts: dict[str, Vector] = {"pelvis": _offset(pelvis, (-0.03, up)), "torso": waist}
-    ends: dict[str, Vector] = {"pelvis": _offset(pelvis, (0.12, up)), "torso": chest}
-    sides = {"pelvis": right, "torso": shoulder_axis}
-    starts["neck"], ends["neck"] = _offset(chest, (0.08, up)), head
-    starts["head"], ends["head"] = head, _offset(head, (1.0, up))
-    crown = _offset(head, (0.028, up), (-0.026, forward))
-    starts["hair"], ends["hair"] = crown, _offset(crown, (1.0, up))
+    shoulder_axis = _unit(math.cos(twist) * right + math.sin(twist) * forward)
+    head = chest + (0.285 * up + 0.03 * forward)
+    crown = head + (0.028 * up - 0.026 * forward)
+    ends = {
+        "pelvis": (pelvis - 0.03 * up, pelvis + 0.12 * up),
+        "torso": (waist, chest),
+        "neck": (chest + 0.08 * up, head),
+        "head": (head, head + up),
+        "hair": (crown, crown + up),
+    }
 
     # Wave with the right hand while the path faces the cameras (-y), smoothly blended in and out.
     wave = motion.smoothstep((-fy + 0.05) / 0.8)
     wave_side = math.sin(2 * gait)
     for name, sign in (("l", -1.0), ("r", 1.0)):
-        shoulder = _offset(chest, (0.205 * sign, shoulder_axis), (0.05, up))
+        shoulder = chest + (0.205 * sign * shoulder_axis + 0.05 * up)
         a = 0.55 * swing * sign
-        upper = _direction((-math.cos(a), up), (math.sin(a), forward), (0.16 * sign, right))
+        upper = _unit(-math.cos(a) * up + math.sin(a) * forward + 0.16 * sign * right)
         b = a + 0.55
-        lower = _direction((-math.cos(b), up), (math.sin(b), forward), (0.04 * sign, right))
+        lower = _unit(-math.cos(b) * up + math.sin(b) * forward + 0.04 * sign * right)
         if sign > 0 and wave > 0.0:
-            raised = _direction((0.25, up), (0.9, right), (0.25, forward))
-            waving = _direction((1.0, up), (0.55 * wave_side + 0.1, right), (0.2, forward))
+            raised = _unit(0.25 * up + 0.9 * right + 0.25 * forward)
+            waving = _unit(up + (0.55 * wave_side + 0.1) * right + 0.2 * forward)
             # Blend through the side: a straight blend from hanging to raised would pass through zero.
             keep, via = (1 - wave) ** 2, 2 * wave * (1 - wave)
-            upper = _direction((keep, upper), (via, right), (wave * wave, raised))
-            lower = _direction((keep, lower), (via, right), (via, forward), (wave * wave, waving))
-        elbow = _offset(shoulder, (_UPPER_ARM_M, upper))
-        wrist = _offset(elbow, (_FOREARM_M, lower))
-        hand = _offset(wrist, (0.05, lower))
-        starts[f"upper_arm_{name}"], ends[f"upper_arm_{name}"] = shoulder, elbow
-        starts[f"forearm_{name}"], ends[f"forearm_{name}"] = elbow, wrist
-        starts[f"hand_{name}"], ends[f"hand_{name}"] = hand, _offset(hand, (0.1, lower))
+            upper = _unit(keep * upper + via * right + wave * wave * raised)
+            lower = _unit(keep * lower + via * right + via * forward + wave * wave * waving)
+        elbow = shoulder + _UPPER_ARM_M * upper
+        wrist = elbow + _FOREARM_M * lower
+        hand = wrist + 0.05 * lower
 
-        hip = _offset(pelvis, (0.095 * sign, right))
+        hip = pelvis + 0.095 * sign * right
         at, lift = motion.footstep_phase(phase, _CYCLES, 0.0 if sign < 0 else 0.5)
         px, py = walk.at(at)
         hx, hy = walk.heading(at)
-        toes, out = (hx, hy, 0.0), (hy, -hx, 0.0)
+        toes, out = np.array([[hx, hy, 0.0], [hy, -hx, 0.0]])
         height = _ANKLE_M + 0.11 * math.sin(math.pi * lift) ** 2
-        ankle = _offset((px, py, height), (0.09 * sign, out))
+        ankle = np.array([px, py, height]) + 0.09 * sign * out
         knee = motion.two_bone_ik(hip, ankle, _THIGH_M, _SHIN_M, forward)
         pitch = -0.5 * math.sin(2 * math.pi * lift) if lift > 0.0 else 0.0
-        ahead = _direction((math.cos(pitch), toes), (math.sin(pitch) - 0.06, up))
-        starts[f"thigh_{name}"], ends[f"thigh_{name}"] = hip, knee
-        starts[f"shin_{name}"], ends[f"shin_{name}"] = knee, ankle
-        heel = _offset(ankle, (-0.03, ahead), (-0.01, up))
-        starts[f"foot_{name}"], ends[f"foot_{name}"] = heel, _offset(heel, (1.0, ahead))
+        ahead = _unit(math.cos(pitch) * toes + (math.sin(pitch) - 0.06) * up)
+        heel = ankle + (-0.03 * ahead - 0.01 * up)
+        ends[f"upper_arm_{name}"], ends[f"forearm_{name}"] = (shoulder, elbow), (elbow, wrist)
+        ends[f"hand_{name}"] = (hand, hand + 0.1 * lower)
+        ends[f"thigh_{name}"], ends[f"shin_{name}"] = (hip, knee), (knee, ankle)
+        ends[f"foot_{name}"] = (heel, heel + ahead)
 
-    names = _NAMES
-    side = [sides.get(n, right) for n in names]
-    return np.array([starts[n] for n in names]), np.array([ends[n] for n in names]), np.array(side)
+    side = [shoulder_axis if name == "torso" else right for name in _NAMES]
+    start, end = np.array([ends[name] for name in _NAMES]).transpose(1, 0, 2)
+    return start, end, np.array(side)
 
 
 _PARTS = _body_parts()
@@ -207,11 +189,10 @@ _SCALE_ROWS = np.array([_SCALES.get(n, (1.0, 1.0, 1.0)) for n in _NAMES])
 
 
 def walking_person(walk: Walk) -> MovingBody:
-    """The person as a body of the world. ``walk.still`` freezes it at phase 0.62, mid-wave."""
+    """The person as a body of the world."""
 
     def matrices(t_s: float) -> Array:
-        phase = 0.62 if walk.still else walk.phase(t_s)
-        out = motion.bone_frames(*bones(walk, phase))
+        out = motion.bone_frames(*bones(walk, walk.phase(t_s)))
         out[:, :3, :3] *= _SCALE_ROWS[:, None, :]
         return out
 

@@ -91,24 +91,15 @@ def surface_properties(
     return albedo, normals
 
 
-def blocked(source: Array, rays: Array, distance: Array, casters: PlacedParts) -> NDArray[np.bool_]:
-    """Whether the casters hide each point from a light point, (N,).
-
-    source: (3,), the light point. rays: (3, N), from it to the points. distance: (N,), lengths of the rays.
-    Because rays start at the light, they share an origin, and each part is tested with few of them.
-    """
-    far = np.maximum(distance, 1e-12)
-    _, hit = cast_rays(source, rays / far, casters, far * (1.0 - _SHADOW_BIAS))
-    return hit >= 0
-
-
 def light_visibility(world: World, points: Array) -> Array:
-    """(S, N): 0 if a static part hides the light point from the surface point (3, N), else 1."""
+    """(S, N): 0 if a static part hides the light point from the surface point (3, N), else 1. Rays start at the light:
+    they share an origin, and each part is tested with few of them."""
     casters = place_static([p for p in world.static_parts if p.casts_shadow])
     out = np.ones((len(world.light.points), points.shape[1]))
     for k, source in enumerate(world.light.points):
         rays = points - source[:, None]
-        out[k] = ~blocked(source, rays, np.sqrt((rays * rays).sum(axis=0)), casters)
+        distance = np.maximum(np.sqrt((rays * rays).sum(axis=0)), 1e-12)
+        out[k] = cast_rays(source, rays / distance, casters, distance * (1.0 - _SHADOW_BIAS))[1] < 0
     return out
 
 
@@ -121,8 +112,7 @@ class CameraRenderer:
 
     def __init__(self, world: World, camera: Pinhole, camera_to_world: Array, supersample: int = 1) -> None:
         self.world, self.supersample = world, supersample
-        self.camera = camera
-        self.width, self.height = camera.width, camera.height
+        self._width = camera.width
         fine = camera.scaled(supersample) if supersample > 1 else camera
         self._shape = (fine.height, fine.width)
         self._origin, directions = world_rays(fine, camera_to_world)
@@ -196,6 +186,6 @@ class CameraRenderer:
     def _to_image(self, colors: Colors) -> Image:
         image: NDArray = colors.reshape(-1, self._shape[1], 3)
         if self.supersample > 1:
-            size = (self.width, len(image) // self.supersample)
+            size = (self._width, len(image) // self.supersample)
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         return np.asarray(cv2.convertScaleAbs(np.clip(image, 0.0, 1.0), alpha=255.0), dtype=np.uint8)

@@ -247,8 +247,3 @@ class RoundCone:
         low, high = min(low, self.length - self.r1), max(high, self.r0)
         radius = max(0.5 * (high - low), self.r0, self.r1)
         return np.array([0.0, 0.0, 0.5 * (low + high)]), radius
-
-
-def capsule(radius: float, length: float) -> RoundCone:
-    """A capsule from the origin to (0, 0, length)."""
-    return RoundCone(radius, radius, length)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, cast
 
+import msgspec
 import numpy as np
 
-from camera_node.settings import SourceConfig, WorldConfig, errors_of
+from camera_node.settings import WORLD_FPS, WORLD_MAX_FRAMES, SourceConfig, WorldConfig, errors_of
 from camera_node.sources.base import Shot, Source, pixels, rate
 from camera_node.synthetic import Scene, make_scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects
@@ -24,31 +24,13 @@ from freshfield import payload
 from freshfield.depth import DepthImage
 from freshfield.geometry import Array, Pose
 from freshfield.scenario import Scenario, ScenarioError
-from freshfield.settings import as_mapping
 
 if TYPE_CHECKING:
+    from camera_node.robot.flange_camera import FlangeMotion
     from camera_node.synthetic.depth import DepthRenderer
+    from camera_node.synthetic.walk import Walk
 
-WORLD_FPS = 15.0
-# A sequence with more different frames counts as not repeating: frames are rendered on demand and not kept.
-MAX_FRAMES = 3000
-
-
-class Carrier(Protocol):
-    """Carries a camera through the world: somebody who walks, or an arm."""
-
-    @property
-    def lap_s(self) -> float | None:
-        """Time after which its motion repeats; None: it does not."""
-        ...
-
-    def pose(self, t_s: float) -> Array:
-        """The camera's true camera-to-world (4, 4) at an instant. Raises PoseGapError if it is not known."""
-        ...
-
-    def measured(self, t_s: float) -> tuple[Pose, int]:
-        """The pose that is known of it, see ``PoseProvider.at``."""
-        ...
+    Carrier = Walk | FlangeMotion
 
 
 class WorldSource(Source):
@@ -58,11 +40,11 @@ class WorldSource(Source):
     effects: of this camera, from ``load_effects``.
     codec, quality: of the encoded frames.
     folder: root of the cache of rendered frames; None renders every frame anew.
-    carrier: moves the camera, instead of the scene's pose; None: it stands still.
+    carrier: moves the camera, instead of the scene's pose, and repeats after its ``lap_s``; None: it stands still.
     Raises ValueError for a rate that is not positive.
 
     Attributes:
-    repeats_after: frames until the scene repeats (1 for a static scene); None for more than MAX_FRAMES.
+    repeats_after: frames until the scene repeats (1 for a static scene); None for more than WORLD_MAX_FRAMES.
     cache: of the frames; None if they are rendered anew.
     """
 
@@ -86,7 +68,7 @@ class WorldSource(Source):
         if self.fps <= 0:
             raise ValueError(f"fps must be positive, got {fps}")
         self.intrinsics, matrix = self.scene.cameras[camera_id]
-        self._carrier = carrier
+        self._carrier, self._size = carrier, (self.intrinsics.width, self.intrinsics.height)
         self._moves = bool(effects.mount) or carrier is not None
         periods_s = [scene.period_s] if scene.moving else []
         if self._moves:
@@ -101,7 +83,7 @@ class WorldSource(Source):
         self._placed: tuple[Array, CameraRenderer] | None = None
         self.cache: FrameCache | None = None
         if folder is not None and self.repeats_after is not None:
-            self.cache = FrameCache(self.key(), self._codec, (self.intrinsics.width, self.intrinsics.height), folder)
+            self.cache = FrameCache(self.key(), self._codec, self._size, folder)
 
     def content(self, tick: int) -> int:
         return tick % self.contents if self.contents else tick
@@ -111,7 +93,8 @@ class WorldSource(Source):
         frame = content % self.repeats_after if self.repeats_after else content
         image: Image | bytes
         if self._effects.image:
-            image = self._effects.apply(self.image(frame), content, self._time_s(content))
+            exact = payload.decode(self._stored(frame), self._codec, *self._size)
+            image = self._effects.apply(exact, content, self._time_s(content))
         else:
             image = self._stored(frame)
         t_s, pose, gap_ns = self._time_s(content), self._pose, 0
@@ -131,12 +114,6 @@ class WorldSource(Source):
         exact = self._depth.depth(self._time_s(frame))
         return self._effects.depth[0].measure(exact, pixels(shot, self._codec), self.intrinsics, content)
 
-    def image(self, frame: int) -> Image:
-        """Frame before effects of kind image: uint8 (H, W, 3), exact."""
-        if self.cache is None or not self._effects.image:
-            return self._render(frame)
-        return payload.decode(self._stored(frame), self._codec, self.intrinsics.width, self.intrinsics.height)
-
     def prepare(self, stopped: Callable[[], bool]) -> None:
         for frame in range(self.repeats_after or 0):
             if stopped() or self.cache is None or self.cache.error is not None:
@@ -150,22 +127,18 @@ class WorldSource(Source):
 
     def key(self) -> str:
         """Hash (hex) of everything that determines the frames' bytes."""
-        camera, pose = self.scene.cameras[self.camera_id]
-        what = {
-            "scene": self.scene.name,
-            "params": as_mapping(self.scene.params),
-            "camera": dataclasses.asdict(camera),
-            "pose": np.asarray(pose, dtype=np.float64).tolist(),
-            "fps": str(self.fps),
-            "codec": [self._codec, self._quality if self._codec == "jpeg" else None],
-            "renderer": renderer_version(),
-            "phase_ns": self.phase_ns,
-        }
-        if self._carrier is not None:
-            what["carrier"] = repr(self._carrier)
+        lens, pose = self.scene.cameras[self.camera_id]
         # ``count`` determines which cameras there are, not what one of them sees.
-        what["params"].pop("count")
-        return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+        shown = (
+            self.scene.name,
+            msgspec.structs.replace(self.scene.params, count=1),
+            lens,
+            pose.tolist(),
+            self._carrier,
+        )
+        codec = (self._codec, self._quality if self._codec == "jpeg" else None)
+        what = repr((shown, codec, self.fps, self.phase_ns, renderer_version()))
+        return hashlib.sha256(what.encode()).hexdigest()
 
     def _stored(self, frame: int) -> bytes:
         """The frame, encoded: from the cache, or rendered and kept there."""
@@ -206,7 +179,7 @@ def _repeats_after(periods_s: Sequence[float], fps: Fraction) -> int | None:
     period = math.lcm(*(round(s / PERIOD_UNIT_S) for s in periods_s)) * Fraction(PERIOD_UNIT_S).limit_denominator(10)
     # The numerator is the least number of frames that take a whole number of periods.
     frames = (period * fps).numerator
-    return frames if frames <= MAX_FRAMES else None
+    return frames if frames <= WORLD_MAX_FRAMES else None
 
 
 def open_sources(
@@ -225,22 +198,22 @@ def open_sources(
     names = _scene_cameras(scenario, scene)
     # Training of a scheduler draws hundreds of motions, each used once.
     folder = default_folder() if config.motion_seed is None else None
-    fps, made = rate(config.fps or WORLD_FPS), dict[str, WorldSource]()
-    carriers = _carriers(scenario, config, scene, cameras)
-    for camera in cameras:
-        made[camera] = WorldSource(
+    fps, carriers = config.fps or WORLD_FPS, _carriers(scenario, config, scene, cameras)
+    return {
+        camera: WorldSource(
             camera,
             scene,
             names[camera],
-            fps,
+            rate(fps),
             effects=effects.get(camera) or NO_EFFECTS,
             codec=config.codec,
             quality=config.quality,
-            phase_ns=scenario.phase_ns(camera, config.fps or WORLD_FPS),
+            phase_ns=scenario.phase_ns(camera, fps),
             folder=folder,
             carrier=carriers.get(camera),
         )
-    return {**made}
+        for camera in cameras
+    }
 
 
 def _carriers(scenario: Scenario, config: WorldConfig, scene: Scene, cameras: Sequence[str]) -> dict[str, Carrier]:

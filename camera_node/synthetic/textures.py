@@ -7,7 +7,7 @@ All have soft edges or are sums of a few sinusoids, so that images of a hundred 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -73,19 +73,14 @@ class Noise:
     seed: int = 0
     waves: int = 9
     stretch: float = 1.0  # wavelengths along v are longer by this factor
-    _k: Array = field(init=False, repr=False, compare=False)
-    _phase: Array = field(init=False, repr=False, compare=False)
 
-    def __post_init__(self) -> None:
+    def __call__(self, uv: Array) -> Array:
         rng = np.random.default_rng([self.seed, 7])
         angle = rng.uniform(0, 2 * np.pi, self.waves)
         k = 2 * np.pi / (self.wavelength * rng.uniform(1.0, 3.0, self.waves))
         vectors = np.stack([k * np.cos(angle), k * np.sin(angle) / self.stretch], axis=1)
-        object.__setattr__(self, "_k", vectors)
-        object.__setattr__(self, "_phase", rng.uniform(0, 2 * np.pi, self.waves)[:, None])
-
-    def __call__(self, uv: Array) -> Array:
-        value = np.sin(self._k @ uv + self._phase).sum(axis=0) / np.sqrt(self.waves)
+        phase = rng.uniform(0, 2 * np.pi, self.waves)[:, None]
+        value = np.sin(vectors @ uv + phase).sum(axis=0) / np.sqrt(self.waves)
         return np.clip(self.base(uv) * (1.0 + self.amount * value), 0.0, 1.0)
 
 

@@ -122,7 +122,7 @@ def test_cameras_may_be_renamed_or_wrong(session, tmp_path):
         (replay_scenario(file, assignment={"cam01": "nobody"}), r"no camera 'nobody'.*cam00"),
         (replay_scenario(tmp_path / "no.mcap"), r"source\.file: .*does not exist"),
         (replay_scenario(tmp_path / "empty.mcap"), "holds no frames"),
-        (replay_scenario(file, effects={"sensor_noise": None}), "replayed as it was"),
+        (replay_scenario(file, effects={"exposure_drift": None}), "replayed as it was"),
     ):
         refused(ValueError, why, camera_of, wrong)
 

@@ -9,8 +9,10 @@ are not read.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageFiles, ImageOptions
@@ -160,60 +162,54 @@ def _lines(file: Path) -> list[tuple[int, str]]:
 
 
 class _Bytes:
-    """A binary file, little-endian, read from front to back."""
+    """A binary file, little-endian, read from front to back. Beyond its end struct.error or ValueError is raised."""
 
     def __init__(self, file: Path) -> None:
-        self.file = file
-        try:
-            self._data = read_bytes(file)
-        except OSError as error:
-            raise DatasetError(f"{file}: cannot be read: {error}") from None
-        self._at = 0
+        self._data, self._at = read_bytes(file), 0
 
-    def take(self, layout: str) -> tuple:
+    def take(self, layout: str) -> tuple[Any, ...]:
         """The next fields, in the format characters of ``struct``."""
-        return struct.unpack("<" + layout, self.read(struct.calcsize("<" + layout)))
+        fields = struct.unpack_from("<" + layout, self._data, self._at)
+        self._at += struct.calcsize("<" + layout)
+        return fields
 
     def name(self) -> str:
         """Text up to a zero byte."""
-        end = self._data.find(b"\0", self._at)
-        text = self.read((end if end >= 0 else len(self._data)) + 1 - self._at)[:-1]
-        try:
-            return text.decode()
-        except UnicodeDecodeError:
-            raise DatasetError(f"{self.file}: a name at byte {self._at - len(text) - 1} is no text") from None
+        text = self._data[self._at : self._data.index(b"\0", self._at)]
+        self._at += len(text) + 1
+        return text.decode()
 
-    def read(self, size: int) -> bytes:
-        begin, self._at = self._at, self._at + size
-        if self._at > len(self._data):
-            raise DatasetError(f"{self.file}: ends at byte {len(self._data)}, in the middle of an entry: cut short?")
-        return self._data[begin : self._at]
+    def left(self) -> int:
+        return len(self._data) - self._at
 
-    def done(self) -> None:
-        if self._at != len(self._data):
-            raise DatasetError(
-                f"{self.file}: {len(self._data) - self._at} bytes follow its last entry: no COLMAP model?"
-            )
+
+Entry = TypeVar("Entry")
+
+
+def _entries(file: Path, read: Callable[[_Bytes], Entry]) -> list[Entry]:
+    """What ``read`` makes of each of a file's entries. Raises DatasetError."""
+    try:
+        data = _Bytes(file)
+        found = [read(data) for _ in range(data.take("Q")[0])]
+    except DatasetError:
+        raise
+    except (OSError, struct.error, ValueError) as error:
+        raise DatasetError(f"{file}: cannot be read as a COLMAP model: {error}; cut short?") from None
+    if data.left():
+        raise DatasetError(f"{file}: {data.left()} bytes follow its last entry: no COLMAP model?")
+    return found
 
 
 def _binary(file: Path) -> tuple[dict[int, Lens], list[_Image]]:
-    lenses: dict[int, Lens] = {}
-    data = _Bytes(file)
-    for _ in range(data.take("Q")[0]):
+    def camera(data: _Bytes) -> tuple[int, Lens]:
         number, model, width, height = data.take("iiQQ")
-        if model not in _MODELS:
-            known = ", ".join(name for name, _ in _MODELS.values())
-            raise DatasetError(f"{file}: camera {number}: model {model}: expected one of {known}; undistort the images")
-        name, count = _MODELS[model]
-        lenses[number] = _lens(name, width, height, list(data.take(f"{count}d")), f"{file}: camera {number}")
-    data.done()
-    images: list[_Image] = []
-    data = _Bytes(file.with_stem("images"))
-    for _ in range(data.take("Q")[0]):
+        name, count = _MODELS.get(model, (str(model), 0))
+        return number, _lens(name, width, height, list(data.take(f"{count}d")), f"{file}: camera {number}")
+
+    def image(data: _Bytes) -> _Image:
         _, *pose, camera = data.take("I7dI")
         name = data.name()
-        (points,) = data.take("Q")
-        data.read(24 * points)  # two coordinates and the number of a point each
-        images.append(_Image(name, camera, tuple(pose)))
-    data.done()
-    return lenses, images
+        data.take(f"{24 * data.take('Q')[0]}x")  # two coordinates and the number of a point each
+        return _Image(name, camera, tuple(pose))
+
+    return dict(_entries(file, camera)), _entries(file.with_stem("images"), image)

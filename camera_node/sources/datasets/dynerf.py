@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from camera_node.settings import SAME_SHAPE
+from camera_node.sources.datasets.imaging import read_numbers
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, file_within
 from camera_node.sources.datasets.video import Clip, rig_dataset
@@ -20,8 +22,6 @@ from freshfield.geometry import Pinhole, Pose
 
 POSES = "poses_bounds.npy"
 FILES = (POSES,)
-# Tolerated difference between the aspect ratios of video and calibration images; both are rounded to pixels.
-_SAME_SHAPE = 0.02
 
 
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
@@ -41,22 +41,9 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
 
 
 def _rows(file: Path) -> np.ndarray:
-    if not file.is_file():
-        raise DatasetError(f"{file}: no such file")
-    try:
-        rows = np.load(file, allow_pickle=False)
-    except Exception as error:  # numpy reads a damaged header as Python, which raises anything
-        why = " ".join(str(error).split()) or type(error).__name__
-        raise DatasetError(f"{file}: cannot be read as numbers of numpy: {why}; is it complete?") from None
-    if (
-        not isinstance(rows, np.ndarray)
-        or rows.ndim != 2
-        or rows.shape[1:] != (17,)
-        or not len(rows)
-        or rows.dtype.kind not in "fiu"
-    ):
-        shape = getattr(rows, "shape", "several arrays")
-        raise DatasetError(f"{file}: expected numbers of shape (cameras, 17), got {shape}")
+    rows = read_numbers(file)
+    if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows) or rows.dtype.kind not in "fiu":
+        raise DatasetError(f"{file}: expected numbers of shape (cameras, 17), got {rows.shape}")
     rows = rows.astype(np.float64)
     if not np.all(np.isfinite(rows)):
         raise DatasetError(f"{file}: row {int(np.argmin(np.isfinite(rows).all(axis=1)))} is not finite")
@@ -69,7 +56,7 @@ def _camera(row: np.ndarray, clip: Clip, where: str) -> CalibratedCamera:
     if min(height, width, focal) <= 0:
         raise DatasetError(f"{where}: height, width, focal length are {height:g}, {width:g}, {focal:g}")
     x, y = clip.width / width, clip.height / height
-    if not abs(x / y - 1.0) <= _SAME_SHAPE:
+    if not abs(x / y - 1.0) <= SAME_SHAPE:
         raise DatasetError(
             f"{where}: is of images of {width:g} x {height:g}, {clip.path.name} has {clip.width} x {clip.height}"
         )

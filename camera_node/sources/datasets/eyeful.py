@@ -13,7 +13,6 @@ is not read.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -49,8 +48,7 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
     for name, lens, camera_to_world in entries:
         pose, camera = _UPRIGHT @ camera_to_world, name.split("/")[0]
         found.add(name, name, lens, pose, f"{file}: {name}", endings=(".jpg", ".jpeg", ".png"), camera=camera)
-    dataset = found.dataset()
-    return replace(dataset, held_out=held_out & {image.name for image in dataset}, per_camera=True)
+    return found.dataset(held_out=held_out, per_camera=True)
 
 
 def _images(folder: Path, images: str | None) -> Path:

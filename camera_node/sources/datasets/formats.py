@@ -69,13 +69,18 @@ def recognize(file: Path) -> str:
     return next((name for name in FORMATS if file.name in reader(name).FILES), "transforms")
 
 
+def _candidates(path: Path, name: str | None = None) -> list[tuple[str, Path]]:
+    """Formats and describing files of what may be a data set, best first. name: the only format; None: any."""
+    if path.is_file():
+        return [(name or recognize(path), path)]
+    kinds = FORMATS if name is None else (name,)
+    return [(kind, file) for kind in kinds for file in find_files(path, reader(kind).FILES)]
+
+
 def find_format(path: Path) -> str:
     """The format of a describing file, or of a folder by its first describing file. Raises DatasetError."""
-    if path.is_file():
-        return recognize(path)
-    for name in FORMATS:
-        if find_files(path, reader(name).FILES):
-            return name
+    for kind, _ in _candidates(path):
+        return kind
     raise DatasetError(f"{path}: no data set or recording: no file or folder, or none of the known formats")
 
 
@@ -89,18 +94,14 @@ def open_dataset(path: Path, scale: float = 1.0, name: str | None = None) -> tup
     """
     if name is not None and name not in FORMATS:
         raise DatasetError(f"format {name!r}: expected one of {', '.join(FORMATS)}")
-    options = ImageOptions(scale)
-    if path.is_file():
-        return path, reader(name or recognize(path)).load_dataset(path, options)
-    if not path.is_dir():
+    if not path.exists():
         raise DatasetError(f"{path}: no such file or folder")
     errors: list[str] = []
-    for key in FORMATS if name is None else (name,):
-        for file in find_files(path, reader(key).FILES):
-            try:
-                return file, reader(key).load_dataset(file, options)
-            except DatasetError as error:
-                errors.append(str(error))
+    for kind, file in _candidates(path, name):
+        try:
+            return file, reader(kind).load_dataset(file, ImageOptions(scale))
+        except DatasetError as error:
+            errors.append(str(error))
     if errors:
         raise DatasetError(errors[0])
     if name is not None:

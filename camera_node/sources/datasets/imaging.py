@@ -30,6 +30,17 @@ def decode_file(path: Path, flags: int) -> NDArray[Any] | None:
         return None
 
 
+def read_numbers(path: Path) -> NDArray[Any]:
+    """The array of a ``.npy`` file, which holds no objects. Raises DatasetError."""
+    try:
+        check_file(path)
+        found = np.load(path, allow_pickle=False)
+        return found if isinstance(found, np.ndarray) else np.empty(0)  # several arrays are none here
+    except Exception as error:  # numpy reads a damaged header as Python, which raises anything
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise DatasetError(f"{path}: cannot be read as numbers of numpy: {why}; is it complete?") from None
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file as stored; of JPEG and PNG from the header. Raises DatasetError."""
     check_file(path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.settings import SAME_SHAPE
 from camera_node.sources.datasets.imaging import composite, image_size, read_image, resize, shrink
 from camera_node.sources.datasets.lens import Lens, exact, pinhole, undistort
 from camera_node.sources.datasets.records import (
@@ -18,18 +19,15 @@ from camera_node.sources.datasets.records import (
     DatasetError,
     Image,
     PosedImage,
-    dataset_of_files,
     errors_at,
     file_within,
+    missing_note,
 )
 from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pose
 
 import cv2  # isort: skip
-
-# Tolerated difference of aspect ratio between an image and its original, due to rounding to whole pixels.
-_SAME_SHAPE = 0.02
 
 
 @dataclass(frozen=True)
@@ -113,34 +111,11 @@ def fitted(photo: Photo) -> Photo:
 
 
 def _same_shape(lens: Lens, size: tuple[int, int]) -> bool:
-    return abs((size[0] / lens.width) / (size[1] / lens.height) - 1.0) <= _SAME_SHAPE
+    return abs((size[0] / lens.width) / (size[1] / lens.height) - 1.0) <= SAME_SHAPE
 
 
-def posed_photo(
-    photo: Photo, name: str, camera_to_world: np.ndarray, where: str, camera: str = "", time_s: float | None = None
-) -> PosedImage:
-    """A photo with its pose, as a data set's image.
-
-    photo: its lens may be that of a larger original (``fitted``).
-    name, camera, time_s: as in ``PosedImage``. camera_to_world: (4, 4) or (3, 4), OpenCV axes.
-    where: beginning of error messages. Raises DatasetError for an impossible pose or lens, or a file that does not fit.
-    """
-    with errors_at(where):
-        photo = fitted(photo)
-        pose = Pose.from_matrix(camera_to_world).matrix()
-        undistorted = pinhole(photo.lens)
-    stored = photo.options.scale == 1 and photo.mask is None and not photo.upright and exact(photo.lens)
-    return PosedImage(
-        name=name,
-        camera=camera,
-        time_s=time_s,
-        camera_to_world=pose,
-        intrinsics=shrink(undistorted, photo.options.scale),
-        read=photo.read,
-        path=photo.path if stored else None,
-        weight=photo.weight if photo.ignored is not None else None,
-        depth=None if photo.depth is None else partial(photo.depth, photo),
-    )
+class NoImages(DatasetError):
+    """A data set of which no image exists."""
 
 
 class ImageFiles:
@@ -154,10 +129,19 @@ class ImageFiles:
         self._found: list[PosedImage] = []
         self._missing: list[str] = []
 
+    def path(self, file: str, where: str, endings: Sequence[str] = ("",)) -> Path | None:
+        """The file below the folder, with the first of ``endings`` that exists; None: it is missing, which is noted.
+        where: beginning of error messages. Raises DatasetError as ``file_within``."""
+        with errors_at(where):
+            found = file_within(self._folder, file, endings)
+        if found is None:
+            self._missing.append(file + endings[0])
+        return found
+
     def add(
         self,
         name: str,
-        file: str,
+        file: str | Path,
         lens: Lens,
         camera_to_world: np.ndarray,
         where: str,
@@ -167,16 +151,49 @@ class ImageFiles:
         time_s: float | None = None,
         **more: Any,
     ) -> None:
-        """Add an entry. file: path below the folder, with the first of ``endings`` that exists. more: further keys of
-        ``Photo``. Others: see ``posed_photo``, which raises."""
-        with errors_at(where):
-            path = file_within(self._folder, file, endings)
-        if path is None:
-            self._missing.append(file + endings[0])
-            return
-        photo = Photo(path, lens, self._options, **more)
-        self._found.append(posed_photo(photo, name, camera_to_world, where, camera, time_s))
+        """Add an entry.
 
-    def dataset(self) -> Dataset:
-        """Raises DatasetError as ``dataset_of_files``."""
-        return dataset_of_files(self._found, self._missing, self._folder, self._where)
+        name, camera, time_s: as in ``PosedImage``. camera_to_world: (4, 4) or (3, 4), OpenCV axes.
+        file: its path, or what ``path`` finds. lens: may be that of a larger original (``fitted``). more: further keys
+            of ``Photo``.
+        where: beginning of error messages. Raises DatasetError for an impossible pose or lens, or a file that does not
+            fit.
+        """
+        path = file if isinstance(file, Path) else self.path(file, where, endings)
+        if path is None:
+            return
+        with errors_at(where):
+            photo = fitted(Photo(path, lens, self._options, **more))
+            pose = Pose.from_matrix(camera_to_world).matrix()
+            undistorted = pinhole(photo.lens)
+        stored = photo.options.scale == 1 and photo.mask is None and not photo.upright and exact(photo.lens)
+        self._found.append(
+            PosedImage(
+                name=name,
+                camera=camera,
+                time_s=time_s,
+                camera_to_world=pose,
+                intrinsics=shrink(undistorted, photo.options.scale),
+                read=photo.read,
+                path=path if stored else None,
+                weight=photo.weight if photo.ignored is not None else None,
+                depth=None if photo.depth is None else partial(photo.depth, photo),
+            )
+        )
+
+    def dataset(
+        self,
+        fps: float | None = None,
+        notes: Sequence[str] = (),
+        held_out: Iterable[str] = (),
+        per_camera: bool = False,
+    ) -> Dataset:
+        """The images that have a file, with a note on the others; see ``Dataset``. held_out: may name others, too.
+        Raises NoImages if no image has a file, DatasetError if two have the same name."""
+        count = len(self._found) + len(self._missing)
+        notes = [*([missing_note(self._missing, count, self._folder)] if self._missing else []), *notes]
+        if not self._found:
+            raise NoImages(f"{self._where}: none of its images exists: {'; '.join(notes) or 'it lists none'}")
+        with errors_at(self._where):
+            kept = frozenset(held_out) & {image.name for image in self._found}
+            return Dataset(tuple(self._found), len(self._missing), fps, kept, per_camera, notes=tuple(notes))

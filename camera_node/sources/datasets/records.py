@@ -151,18 +151,6 @@ def missing_note(names: Sequence[str], count: int, folder: Path) -> str:
     return f"{len(names)} of {count} images are missing, first {names[0]}; {near} holds {beside}{more}"
 
 
-def dataset_of_files(
-    images: Sequence[PosedImage], missing: Sequence[str], folder: Path, where: str, fps: float | None = None
-) -> Dataset:
-    """A data set of the images that have a file, with a note on the names that are missing in ``folder``. Raises
-    DatasetError, which begins with ``where``, if no image has one, or two have the same name."""
-    note = missing_note(missing, len(images) + len(missing), folder) if missing else ""
-    if not images:
-        raise DatasetError(f"{where}: none of its images exists: {note or 'it lists none'}")
-    with errors_at(where):
-        return Dataset(tuple(images), len(missing), fps, notes=(note,) if note else ())
-
-
 def find_files(folder: Path, patterns: Sequence[str]) -> list[Path]:
     """The files of a folder that match a pattern, in the order of the patterns, each once."""
     return list(dict.fromkeys(file for pattern in patterns for file in sorted(folder.glob(pattern))))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from camera_node.pose.providers import PoseProvider
 from camera_node.pose.trajectories import trajectory_poses
-from camera_node.settings import FPS_RANGE, RecordedConfig, VideoConfig, find_data
+from camera_node.settings import FPS_RANGE, HOLD_OUT_EVERY, PHOTO_FPS, RecordedConfig, VideoConfig, find_data
 from camera_node.sources.base import Shot, Source, assign_cameras, rate
 from camera_node.sources.datasets.formats import open_configured
 from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
@@ -29,8 +29,6 @@ from freshfield.scenario import Scenario, ScenarioError
 
 log = logging.getLogger("camera-node")
 
-HOLD_OUT_EVERY = 8
-PHOTO_FPS = 10.0
 _SUFFIXES = {"jpeg": (".jpg", ".jpeg")}
 
 
@@ -38,33 +36,30 @@ _SUFFIXES = {"jpeg": (".jpg", ".jpeg")}
 class Playback:
     """Maps ticks to frames.
 
-    count: number of frames. fps: rate of the ticks. recorded_fps: rate of the frames.
-    back_and_forth: 0 1 2 3 2 1 0 1 ..., so that motion never jumps; otherwise 0 1 2 3 0 1 ...
+    count: number of frames, which are shown back and forth, 0 1 2 3 2 1 0 1 ..., so that motion never jumps.
+    fps: rate of the ticks. recorded_fps: rate of the frames.
     """
 
     count: int
     fps: Fraction
     recorded_fps: Fraction
-    back_and_forth: bool = True
 
     def frame(self, tick: int) -> int:
         """Number of the frame nearest to the tick's instant."""
         position = (2 * tick * self.recorded_fps + self.fps) // (2 * self.fps)  # rounds half up, exactly
-        if not self.back_and_forth:
-            return int(position % self.count)
         place = int(position % self.period)
         return place if place < self.count else self.period - place
 
     @property
     def period(self) -> int:
         """Number of frames after which they repeat."""
-        return max(1, 2 * (self.count - 1)) if self.back_and_forth else self.count
+        return max(1, 2 * (self.count - 1))
 
     def whole_groups(self, size: int) -> list[int]:
         """The frames of the ticks of one pass, the last few left out so that ticks whose number is a multiple of
         ``size`` show the same frames in every later pass, too. Raises DatasetError for a pass of fewer ticks."""
         ticks = int((self.count - 1) * self.fps / self.recorded_fps) + 1
-        kept = (ticks - 1) // size * size + 1 if self.back_and_forth else ticks // size * size
+        kept = (ticks - 1) // size * size + 1
         if kept < size:
             raise DatasetError(f"of every {size} captures one is held out: {ticks} are too few")
         return [self.frame(tick) for tick in range(kept)]
@@ -110,11 +105,10 @@ def open_recorded(
             )
         shots = order.get(camera, range(len(shown[camera])))
         steps_per_s = timeline.fps if camera in order else fps
-        back_and_forth = config.loop == "back-and-forth"
-        playback = Playback(len(shots), rate(config.fps) if config.fps else fps, steps_per_s, back_and_forth)
+        playback = Playback(len(shots), rate(config.fps) if config.fps else fps, steps_per_s)
         if scenario.held_out_every:
             shots = [shots[n] for n in playback.whole_groups(scenario.held_out_every)]
-            playback = Playback(len(shots), playback.fps, playback.fps, back_and_forth)
+            playback = Playback(len(shots), playback.fps, playback.fps)
         sources[camera] = ImageSource(camera, shown[camera], shots, playback, config.codec, poses.get(camera))
     return sources
 
@@ -179,17 +173,13 @@ class Timeline:
 
 
 def _recorded_fps(dataset: Dataset, images: Sequence[PosedImage], path: Path) -> Fraction:
-    if dataset.fps is not None:
-        return _recorded_rate(dataset.fps, path)
-    times = [image.time_s for image in images if image.time_s is not None]
-    if len(times) < 2 or times[-1] <= times[0]:
-        return rate(PHOTO_FPS)
-    usual_s = float(np.median(np.diff(times))) or (times[-1] - times[0]) / (len(times) - 1)
-    return _recorded_rate(1.0 / usual_s, path)
-
-
-def _recorded_rate(fps: float, path: Path) -> Fraction:
-    """A recording's rate as a fraction. Raises DatasetError if it is outside FPS_RANGE."""
+    """The rate of one camera's images. Raises DatasetError if it is outside FPS_RANGE."""
+    fps = dataset.fps
+    if fps is None:
+        times = [image.time_s for image in images if image.time_s is not None]
+        if len(times) < 2 or times[-1] <= times[0]:
+            return rate(PHOTO_FPS)
+        fps = 1.0 / (float(np.median(np.diff(times))) or (times[-1] - times[0]) / (len(times) - 1))
     lowest, highest = FPS_RANGE
     if not lowest <= fps <= highest:
         raise DatasetError(

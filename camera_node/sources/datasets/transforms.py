@@ -21,15 +21,13 @@ import numpy as np
 from camera_node.settings import Background
 from camera_node.sources.datasets.imaging import image_size
 from camera_node.sources.datasets.lens import Lens
-from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageFiles, ImageOptions, NoImages
 from camera_node.sources.datasets.records import (
     Dataset,
     DatasetError,
-    PosedImage,
     errors_at,
     file_within,
     find_files,
-    missing_note,
     path_within,
     read_array,
     read_json,
@@ -57,11 +55,11 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
         raise DatasetError(f"{path}: no such file or folder")
     tried = []
     for file in [path] if path.is_file() else find_files(path, FILES):
-        dataset = _load(file, options)
-        if dataset.images:
-            return dataset
-        tried.append(f"{file.name}: {'; '.join(dataset.notes) or 'it lists no images'}")
-    raise DatasetError(f"{path}: no usable transforms JSON: {'; '.join(tried) or 'none found'}")
+        try:
+            return _load(file, options)
+        except NoImages as error:
+            tried.append(str(error))
+    raise DatasetError("; ".join(tried) or f"{path}: no transforms JSON")
 
 
 def _load(file: Path, options: ImageOptions) -> Dataset:
@@ -83,16 +81,13 @@ def _load(file: Path, options: ImageOptions) -> Dataset:
     if bad and not listed:
         notes.append(f"{len(bad)} of its frames are marked is_bad, and none is left")
     unknown = check_keys(data, str(file)).union(*(check_keys(frame, where) for _, frame, where in listed))
-    images: list[PosedImage] = []
-    missing: list[str] = []
+    found = ImageFiles(file.parent, options, str(file))
     without_depth: list[Path] = []
     sizes: dict[str, tuple[int, int]] = {}
     for (top, frame, where), camera in zip(listed, cameras):
         name = _name(frame, where)
-        with errors_at(where):
-            image = file_within(file.parent, name, _EXTENSIONS)
+        image = found.path(name, where, _EXTENSIONS)
         if image is None:
-            missing.append(name)
             continue
         lens = _lens({**top, **frame}, image, sizes, camera, where)
         depth = _depth(file.parent, {**top, **frame}, where)
@@ -100,19 +95,15 @@ def _load(file: Path, options: ImageOptions) -> Dataset:
             without_depth.append(depth.path)
             depth = None
         ignored = _ignored(file.parent, {**top, **frame}, image, where)
-        photo = Photo(image, lens, options, ignored=ignored, depth=depth.read if depth else None)
-        time_s = _number(frame, "time", where) if "time" in frame else None
-        images.append(posed_photo(photo, name, _pose(frame, where), where, camera, time_s))
-    if missing:
-        notes.append(missing_note(missing, len(listed), file.parent))
+        time_s, reader = _number(frame, "time", where) if "time" in frame else None, depth.read if depth else None
+        pose = _pose(frame, where)
+        found.add(name, image, lens, pose, where, camera=camera, time_s=time_s, ignored=ignored, depth=reader)
     if without_depth:
         notes.append(f"{len(without_depth)} of its depth files are missing, first {without_depth[0]}")
     if unknown:
         notes.append(unknown_note(unknown))
     fps = _number(data, "fps", str(file)) if "fps" in data else None
-    held_out &= {image.name for image in images}
-    with errors_at(str(file)):
-        return Dataset(tuple(images), len(missing), fps, frozenset(held_out), notes=tuple(notes))
+    return found.dataset(fps, notes, held_out)
 
 
 def _read(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:

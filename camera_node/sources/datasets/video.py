@@ -67,16 +67,15 @@ def load_dataset(
     found: dict[str, Path] = {}
     for name in cameras:
         if name in files:
-            video = calibration.parent / files[name] if (calibration.parent / files[name]).is_file() else None
-        else:
-            with errors_at(str(calibration)):
-                found_at = (file_within(calibration.parent, place.format(name)) for place in _PLACES)
-                video = next((file for file in found_at if file is not None), None)
+            found[name] = calibration.parent / files[name]
+            if not found[name].is_file():
+                raise DatasetError(f"{found[name]}: no such video (camera {name}), relative to {calibration.name}")
+            continue
+        with errors_at(str(calibration)):
+            places = (file_within(calibration.parent, place.format(name)) for place in _PLACES)
+            video = next((file for file in places if file is not None), None)
         if video is not None:
             found[name] = video
-        elif name in files:
-            missing = calibration.parent / files[name]
-            raise DatasetError(f"{missing}: no such video (camera {name}), relative to {calibration.name}")
     if not found:
         raise DatasetError(f"{calibration}: none of its cameras has a video at {' or '.join(_PLACES)}")
     return rig_dataset({name: (cameras[name], Clip(found[name])) for name in found}, path, options, require_poses)

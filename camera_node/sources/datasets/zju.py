@@ -16,16 +16,15 @@ from typing import Any
 
 import numpy as np
 
+from camera_node.settings import ZJU_FPS
 from camera_node.sources.datasets.imaging import image_size
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.npy import load_object
-from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageFiles, ImageOptions
 from camera_node.sources.datasets.records import (
     Dataset,
     DatasetError,
-    PosedImage,
     camera_to_world,
-    dataset_of_files,
     errors_at,
     file_within,
     path_within,
@@ -33,13 +32,11 @@ from camera_node.sources.datasets.records import (
 
 ANNOTATIONS = "annots.npy"
 FILES = (ANNOTATIONS,)
-# Assumed rate of the studio's cameras, which the files do not tell.
-FPS = 50.0
 _MM = 1e-3
 
 
 def load_dataset(
-    path: Path, options: ImageOptions = FULL_SIZE, masks: str | None = None, recorded_fps: float = FPS
+    path: Path, options: ImageOptions = FULL_SIZE, masks: str | None = None, recorded_fps: float = ZJU_FPS
 ) -> Dataset:
     """The images of all cameras, at instants 1 / ``recorded_fps`` apart; those without a file are counted as
     missing.
@@ -60,12 +57,12 @@ def load_dataset(
         f"ims[{k}]": len(names) for k, names in enumerate(instants) if len(names) != count
     }
     if count < 1 or not instants or set(counts.values()) != {count}:
-        raise DatasetError(f"{file}: the numbers of cameras differ: {_listed(counts)}")
+        listed = ", ".join(f"{key} {n}" for key, n in list(counts.items())[:6])
+        raise DatasetError(f"{file}: the numbers of cameras differ: {listed}")
     folder = file.parent
     if masks is not None and not (folder / masks).is_dir():
         raise DatasetError(f"{folder / masks}: no such folder of masks")
-    missing: list[str] = []
-    images: list[PosedImage] = []
+    found = ImageFiles(folder, options, str(file))
     for index in range(count):
         lens: Lens | None = None
         where = f"{file}: camera {index}"
@@ -73,25 +70,19 @@ def load_dataset(
         names = [_path(instant[index], where) for instant in instants]
         camera = names[0].parent.name
         for k, name in enumerate(names):
-            with errors_at(where):
-                picture = file_within(folder, str(name))
-                mask = None if masks is None else file_within(folder / masks, str(name.with_suffix(".png")))
+            picture, mask = found.path(str(name), where), None
             if picture is None:
-                missing.append(str(name))
                 continue
             if lens is None:  # the annotations do not have the images' size, so the first image tells it
                 lens = _lens(numbers["K"][index], numbers["D"][index], *image_size(picture), where)
-            if masks is not None and mask is None:
-                raise DatasetError(f"{(folder / masks / name).with_suffix('.png')}: missing, the mask of {name}")
-            photo = Photo(picture, lens, options, mask)
-            images.append(posed_photo(photo, f"{camera}/{k:06d}", pose, where, camera, k / recorded_fps))
-    if len({i.camera for i in images}) != len({(i.camera, i.camera_to_world.tobytes()) for i in images}):
-        raise DatasetError(f"{file}: two of its cameras keep their images in one folder")
-    return dataset_of_files(images, missing, folder, str(file), recorded_fps)
-
-
-def _listed(counts: dict[str, int]) -> str:
-    return ", ".join(f"{key} {n}" for key, n in list(counts.items())[:6])
+            if masks is not None:
+                with errors_at(where):
+                    mask = file_within(folder / masks, str(name.with_suffix(".png")))
+                if mask is None:
+                    raise DatasetError(f"{(folder / masks / name).with_suffix('.png')}: missing, the mask of {name}")
+            time_s = k / recorded_fps
+            found.add(f"{camera}/{k:06d}", picture, lens, pose, where, camera=camera, time_s=time_s, mask=mask)
+    return found.dataset(recorded_fps)
 
 
 def _path(name: Any, where: str) -> Path:

@@ -50,7 +50,8 @@ def as_camera_error(camera: str, error: Exception) -> CameraError:
 
 
 class Plugged(NamedTuple):
-    """A device that is there. about: its make, for people. handle: what its driver opens, where not the serial."""
+    """A device that is there. serial: its name in ``source.devices``; "" where there is none. about: its make, or why
+    there is none. handle: what its driver opens, where not the serial."""
 
     serial: str
     about: str

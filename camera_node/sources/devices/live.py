@@ -7,6 +7,7 @@ fails, or falls silent, is reopened after growing pauses; meanwhile its captures
 from __future__ import annotations
 
 import atexit
+import contextlib
 import importlib
 import logging
 import threading
@@ -16,7 +17,7 @@ from fractions import Fraction
 from functools import partial
 
 from camera_node.pose.providers import Closable, FixedPose, PoseProvider
-from camera_node.settings import LiveConfig, beside
+from camera_node.settings import LIVE_FPS, REOPEN_AFTER_S, LiveConfig, beside
 from camera_node.sources.base import Shot, Source, rate
 from camera_node.sources.devices.feed import CameraError, Feed, Image, as_camera_error
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
@@ -27,8 +28,6 @@ from freshfield.scenario import Scenario, ScenarioError
 
 log = logging.getLogger("camera-node")
 
-DEFAULT_FPS = 15.0
-BACKOFF_S = (0.25, 0.5, 1.0, 2.0, 5.0)
 _GRAB_S = 0.5
 _JOIN_S = 2.0
 # kind -> its driver's module here and class
@@ -47,12 +46,11 @@ def open_feed(camera: str, config: LiveConfig, fps: Fraction, clock: Clock) -> F
         raise as_camera_error(camera, error) from None
 
 
-def _close_quietly(feed: Feed) -> None:
-    """Close a feed, and ignore errors: a camera that is gone may raise once more."""
-    try:
-        feed.close()
-    except Exception as error:
-        log.debug("closing a camera: %s", error)
+def _close_quietly(feed: Feed | None) -> None:
+    """Close a feed, if there is one, and ignore errors: a camera that is gone may raise once more."""
+    with contextlib.suppress(Exception):
+        if feed is not None:
+            feed.close()
 
 
 class LiveSource(Source):
@@ -96,8 +94,7 @@ class LiveSource(Source):
             self.intrinsics = self._scaled(lens, first[1])
             self._newest = (*first, feed.depth)
         except BaseException as error:
-            if feed is not None:
-                _close_quietly(feed)
+            _close_quietly(feed)
             if isinstance(error, Exception):
                 raise as_camera_error(camera, error) from None
             raise
@@ -156,13 +153,11 @@ class LiveSource(Source):
                 if not failures:
                     log.warning("%s (trying again)", trouble)
                 self._trouble = str(trouble)
-                if current is not None:
-                    _close_quietly(current)
-                    current = None
-                self._stop.wait(BACKOFF_S[min(failures, len(BACKOFF_S) - 1)])
+                _close_quietly(current)
+                current = None
+                self._stop.wait(REOPEN_AFTER_S[min(failures, len(REOPEN_AFTER_S) - 1)])
                 failures += 1
-        if current is not None:
-            _close_quietly(current)
+        _close_quietly(current)
 
     def _take(self, feed: Feed) -> bool:
         """Wait up to _GRAB_S for a frame and keep it. Returns whether one came."""
@@ -190,7 +185,7 @@ def open_live(
         for camera in cameras:
             if camera not in config.devices:
                 raise ScenarioError(f"{scenario.path}: source.devices.{camera}: missing: which camera is it?")
-    fps, clock = rate(config.fps or DEFAULT_FPS), WallClock()
+    fps, clock = rate(config.fps or LIVE_FPS), WallClock()
     known = calibrations(scenario, config) if any_fov_deg is None else {}
     standing = FixedPose(Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     poses = _poses(scenario, config, cameras, known) if any_fov_deg is None else dict.fromkeys(cameras, standing)

@@ -60,7 +60,8 @@ class OakFeed(Feed):
             raise CameraError(f"{camera}: source.socket: expected one of {', '.join(sockets)}")
         self._device: Any = None
         self._pipeline: Any = None
-        self._depths: DepthQueue | None = None
+        self._depths: Any = None
+        self._camera, self._clock = camera, clock
         try:
             self._device = dai.Device(select_device(camera, "OAK", device, plugged_in, _ADVICE).handle)
             self._pipeline = dai.Pipeline(self._device)
@@ -76,10 +77,10 @@ class OakFeed(Feed):
             self.intrinsics, self.no_intrinsics = intrinsics_or_reason(lambda: lens(camera, calibration, socket, size))
             calibrated = self.intrinsics is not None
             output = node.requestOutput(size, dai.ImgFrame.Type.BGR888i, fps=float(fps), enableUndistortion=calibrated)
-            self._frames = FrameQueue(camera, output.createOutputQueue(maxSize=2, blocking=False), clock)
+            self._frames = output.createOutputQueue(maxSize=2, blocking=False)
             pairs = self._device.getStereoPairs() if config.depth_every and calibrated else []
             if pairs:
-                self._depths = DepthQueue(self._measure_depth(pairs[0], output, float(fps)), clock)
+                self._depths = self._measure_depth(pairs[0], output, float(fps))
             self._pipeline.start()
         except Exception as error:
             self.close()
@@ -105,8 +106,8 @@ class OakFeed(Feed):
         return registered.createOutputQueue(maxSize=2, blocking=False)
 
     def grab(self, timeout_s: float) -> tuple[int, Image] | None:
-        taken = self._frames.grab(timeout_s)
-        self.depth = self._depths.newest(taken[0]) if taken is not None and self._depths is not None else None
+        taken = next_frame(self._camera, self._frames, self._clock, timeout_s)
+        self.depth = newest_depth(self._depths, self._clock, taken[0]) if taken and self._depths is not None else None
         return taken
 
     def close(self) -> None:
@@ -116,37 +117,25 @@ class OakFeed(Feed):
             self._device.close()
 
 
-class FrameQueue:
-    """Frames of a depthai queue, as ``Feed.grab`` returns them."""
-
-    def __init__(self, camera: str, queue: Any, clock: Clock) -> None:
-        self._camera, self._queue, self._clock = camera, queue, clock
-        self._dai = library()
-
-    def grab(self, timeout_s: float) -> tuple[int, Image] | None:
-        try:
-            frame = self._queue.get(datetime.timedelta(seconds=timeout_s))
-        except (RuntimeError, self._dai.MessageQueue.QueueException) as error:
-            raise CameraError(f"{self._camera}: the OAK camera is gone: {_first_line(error)}") from None
-        if frame is None:
-            return None
-        return captured_ns(frame, self._clock), cast(Image, np.ascontiguousarray(frame.getCvFrame()[:, :, ::-1]))
+def next_frame(camera: str, queue: Any, clock: Clock, timeout_s: float) -> tuple[int, Image] | None:
+    """As ``Feed.grab``, of a depthai queue of color frames."""
+    try:
+        frame = queue.get(datetime.timedelta(seconds=timeout_s))
+    except (RuntimeError, library().MessageQueue.QueueException) as error:
+        raise CameraError(f"{camera}: the OAK camera is gone: {_first_line(error)}") from None
+    if frame is None:
+        return None
+    return captured_ns(frame, clock), cast(Image, np.ascontiguousarray(frame.getCvFrame()[:, :, ::-1]))
 
 
-class DepthQueue:
-    """Frames of a depthai queue of depth in millimeters, registered to the images."""
-
-    def __init__(self, queue: Any, clock: Clock) -> None:
-        self._queue, self._clock = queue, clock
-
-    def newest(self, image_ns: int) -> DepthImage | None:
-        """The newest frame that was not taken yet, for an image that was captured at ``image_ns``; None: none came.
-        That the device is gone is said by the images' queue."""
-        frames = self._queue.tryGetAll()
-        if not frames:
-            return None
-        counts = np.array(frames[-1].getFrame(), dtype=np.uint16)
-        return DepthImage(counts, METERS_PER_COUNT, after_image_ns=captured_ns(frames[-1], self._clock) - image_ns)
+def newest_depth(queue: Any, clock: Clock, image_ns: int) -> DepthImage | None:
+    """The newest frame of a depthai queue of depth in millimeters, registered to the images; None: none came since the
+    last one. image_ns: when its image was captured. That the device is gone is said by the images' queue."""
+    frames = queue.tryGetAll()
+    if not frames:
+        return None
+    counts = np.array(frames[-1].getFrame(), dtype=np.uint16)
+    return DepthImage(counts, METERS_PER_COUNT, after_image_ns=captured_ns(frames[-1], clock) - image_ns)
 
 
 def captured_ns(frame: Any, clock: Clock) -> int:

@@ -128,10 +128,11 @@ class RealsenseFeed(Feed):
         frame = frames.get_color_frame() if arrived else None
         if not frame:
             return None
-        taken = as_grabbed(frame, self._stamps)
+        captured_ns = self._stamps.captured_ns(frame)
         measured = frames.get_depth_frame() if self._sensor is not None else None
-        self.depth = self._sensor.image(measured, taken[0]) if self._sensor is not None and measured else None
-        return taken
+        self.depth = self._sensor.image(measured, captured_ns) if self._sensor is not None and measured else None
+        # The image is copied, because the library reuses its memory.
+        return captured_ns, cast(Image, np.array(frame.get_data(), dtype=np.uint8))
 
     def close(self) -> None:
         with contextlib.suppress(RuntimeError):  # it may be gone
@@ -183,12 +184,6 @@ def _since_exposed_ns(frame: Any) -> int:
         return 0
     readout_us, exposed_us = (frame.get_frame_metadata(key) for key in keys)
     return max(0, min(readout_us - exposed_us, _LONGEST_EXPOSURE_US)) * 1000
-
-
-def as_grabbed(frame: Any, stamps: FrameClock) -> tuple[int, Image]:
-    """The result of ``Feed.grab`` for an RGB frame. The image is copied, because the library reuses its
-    memory."""
-    return stamps.captured_ns(frame), cast(Image, np.array(frame.get_data(), dtype=np.uint8))
 
 
 def lens(camera: str, intrinsics: Any) -> Pinhole:

@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 
 from camera_node.synthetic import textures as tx
-from camera_node.synthetic.camera_rig import build_rig
+from camera_node.synthetic.camera_rig import build_rig, rings
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.person import make_walk, walking_person
 from camera_node.synthetic.placement import Part, at
@@ -24,13 +24,8 @@ from freshfield.settings import within
 
 _TARGET = (0.0, 0.75, 0.90)
 _RADIUS_M = 3.2
-# cam00, then three rows of six.
-_ANGLES_DEG = [(0.0, 20.0)] + [
-    (a * s, e)
-    for e, row in ((5.0, (12, 37, 62)), (22.0, (25, 46, 66)), (38.0, (12, 37, 62)))
-    for a in row
-    for s in (-1.0, 1.0)
-]
+_WIDE, _NARROW = (-12, 12, -37, 37, -62, 62), (-25, 25, -46, 46, -66, 66)
+_ANGLES_DEG = rings((0.0, 20.0), [(5.0, _WIDE), (22.0, _NARROW), (38.0, _WIDE)])
 _LOOP_CENTER, _LOOP_RADII_M = (0.0, 0.95), (0.74, 0.54)
 
 

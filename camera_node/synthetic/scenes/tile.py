@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera_node.synthetic import textures as tx
-from camera_node.synthetic.camera_rig import build_rig
+from camera_node.synthetic.camera_rig import build_rig, rings
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.placement import Part, at, facing
@@ -26,20 +26,9 @@ _TARGET = (0.0, 0.0, 0.03)
 _RADIUS_M = 0.85
 BOTTOM_M = -0.06
 _BENCH_BOUNDS = [[-1.6, -0.65, -0.4], [1.6, 0.72, 1.4]]
-# cam00, then three rings of the half-hemisphere on the -y side.
-_ANGLES_DEG = (
-    [(0.0, 40.0)]
-    + [
-        (a, e)
-        for e, row in (
-            (16.0, (-85, -51, -17, 17, 51, 85)),
-            (40.0, (-82, -56, -28, 28, 56, 82)),
-            (64.0, (-75, -25, 25, 75)),
-        )
-        for a in row
-    ]
-    + [(-40.0, 82.0), (140.0, 82.0)]
-)
+# The rings are of the half-hemisphere on the -y side.
+_LOW, _MIDDLE, _HIGH = (-85, -51, -17, 17, 51, 85), (-82, -56, -28, 28, 56, 82), (-75, -25, 25, 75)
+_ANGLES_DEG = rings((0.0, 40.0), [(16.0, _LOW), (40.0, _MIDDLE), (64.0, _HIGH), (82.0, (-40, 140))])
 
 
 class Params(BaseParams, frozen=True, kw_only=True):

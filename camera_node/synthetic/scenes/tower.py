@@ -11,32 +11,24 @@ import math
 import numpy as np
 
 from camera_node.synthetic import textures as tx
-from camera_node.synthetic.camera_rig import build_rig
+from camera_node.synthetic.camera_rig import build_rig, rings
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.person import Walk, make_walk, walking_person
 from camera_node.synthetic.placement import MovingBody, Part, at, facing
 from camera_node.synthetic.render import World
 from camera_node.synthetic.scene import Fov, MovingParams, Scene, pinhole
 from camera_node.synthetic.scenes.shell import room_shell
-from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere, capsule
+from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere
 from freshfield.geometry import Array
 
 _MAST = (0.0, 0.0, 1.70)
 _RADIUS_M = 0.55
-# cam00, then three rings, turned against each other.
-_ANGLES_DEG = [(0.0, 3.0)] + [
-    (a, e)
-    for e, row in (
-        (3.0, (28, 75, 128, 180, 232, 285, 332)),
-        (-25.0, (0, 52, 104, 156, 208, 256, 308)),
-        (26.0, (0, 90, 180, 270)),
-    )
-    for a in row
-]
+# The rings are turned against each other.
+_LEVEL, _DOWN, _UP = (28, 75, 128, 180, 232, 285, 332), (0, 52, 104, 156, 208, 256, 308), (0, 90, 180, 270)
+_ANGLES_DEG = rings((0.0, 3.0), [(3.0, _LEVEL), (-25.0, _DOWN), (26.0, _UP)])
 _HALF_M, _HEIGHT_M = 5.0, 4.0
 _WALK_CENTER, _WALK_RADII_M = (0.2, -2.75), (1.35, 0.75)
 _DRIVE_CENTER, _DRIVE_RADII_M = (0.0, 2.9), (1.9, 0.8)
-_STILL_PHASE = 0.62  # where the cart stands at speed 0, as the person does
 
 
 class Params(MovingParams, frozen=True, kw_only=True):
@@ -80,7 +72,7 @@ def _cart(walk: Walk, speed_m_per_s: float) -> MovingBody:
         (Part(Box((0.55, 0.32, 0.05)), deck), at(0.0, 0.0, 0.25)),
         (Part(Box((0.24, 0.24, 0.24)), crate), at(-0.22, 0.0, 0.54)),
         (Part(Cylinder(0.17, 0.22), drum), at(0.30, 0.05, 0.52)),
-        (Part(capsule(0.025, 0.65), tx.Plain((0.25, 0.26, 0.30))), at(0.55, 0.0, 0.30)),
+        (Part(RoundCone(0.025, 0.025, 0.65), tx.Plain((0.25, 0.26, 0.30))), at(0.55, 0.0, 0.30)),
         *((Part(Sphere(0.11), tire), at(x, y, 0.11)) for x in (-0.38, 0.38) for y in (-0.27, 0.27)),
     ]
     local = np.stack([matrix for _, matrix in parts])
@@ -92,7 +84,7 @@ def _cart(walk: Walk, speed_m_per_s: float) -> MovingBody:
         radii = radii * (speed_m_per_s * walk.period_s / length_m)
 
     def matrices(t_s: float) -> Array:
-        a = 2 * math.pi * (_STILL_PHASE if walk.still else walk.phase(t_s)) * walk.direction
+        a = 2 * math.pi * walk.phase(t_s) * walk.direction
         x, y = _DRIVE_CENTER[0] + radii[0] * math.cos(a), _DRIVE_CENTER[1] + radii[1] * math.sin(a)
         heading = math.atan2(radii[1] * math.cos(a) * walk.direction, -radii[0] * math.sin(a) * walk.direction)
         return np.asarray(at(x, y, 0.0, math.degrees(heading)) @ local, dtype=np.float64)

@@ -1,13 +1,12 @@
-"""Scenes as their users see them, their frames on disk, shapes and depth against geometry that the renderer does not
-use, and how scenes look: five small views of each beside the images in ``golden``, so that figures measured on a scene
-stay figures of that scene. After a wanted change:
+"""Scenes as their users see them, their frames on disk, depth against geometry that the renderer does not use, and how
+scenes look: five small views of each beside the images in ``golden``, so that figures measured on a scene stay figures
+of that scene. After a wanted change:
 
     python -m tests.camera_node.synthetic.test_scenes
 """
 
 import dataclasses
 import os
-from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
@@ -23,11 +22,11 @@ from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.person import loop_length_m, make_walk, walking_person
 from camera_node.synthetic.placement import MovingBody, Part, at, facing
 from camera_node.synthetic.render import CameraRenderer, Image, World
-from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere, capsule, nearest_hit
+from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere, nearest_hit
 from camera_node.synthetic.source import WorldSource
 from camera_node.synthetic.textures import Checker, Plain
 from freshfield import payload
-from freshfield.geometry import Array, Pinhole, Pose, look_at, world_rays
+from freshfield.geometry import Pinhole, Pose, look_at, world_rays
 from tests.support import refused
 
 SMALL = {"width": 48, "height": 48, "supersample": 1}
@@ -68,19 +67,9 @@ def test_the_person_and_the_cart_move_at_the_speed_asked_for(speed):
         assert np.allclose(centers[0], centers[-1], atol=1e-9), "it joins up at the end of the loop"
 
 
-@pytest.mark.parametrize("name", ["room", "tower"])
-def test_a_motion_that_is_drawn_follows_from_its_seed_alone(name):
-    def seen(**params) -> np.ndarray:
-        scene = make_scene(name, {"count": 3, **SMALL, **params})
-        return np.concatenate([m.matrices(0.3).ravel() for m in scene.world.moving_bodies])
-
-    own, *drawn = seen(), *(seen(motion_seed=seed) for seed in range(6))
-    assert np.array_equal(seen(motion_seed=2), drawn[2])
-    assert not any(np.allclose(one, other) for k, one in enumerate(drawn) for other in (own, *drawn[:k]))
-
-
 def test_walks_that_are_drawn_differ_in_speed_and_direction_and_face_forward():
     walks = [make_walk((0.0, 0.95), (0.74, 0.54), 1.0, seed) for seed in range(40)]
+    assert make_walk((0.0, 0.95), (0.74, 0.54), 1.0, 7) == walks[7]
     speeds = [loop_length_m(w) / w.period_s for w in walks]
     assert 0.68 < min(speeds) < 0.85 and 1.15 < max(speeds) < 1.42 and {w.direction for w in walks} == {1.0, -1.0}
     for walk in walks[:9]:
@@ -266,59 +255,8 @@ SOLIDS = [
     Cylinder(0.4, 0.6),
     RoundCone(0.4, 0.1, 0.9),
     RoundCone(0.2, 0.4, 0.3),
-    capsule(0.3, 0.6),
+    RoundCone(0.3, 0.3, 0.6),
 ]
-TOLERANCE = 1e-9
-
-
-def signed_distance(shape: object) -> Callable[[Array], Array]:
-    """Distance (N,) of points (3, N) to a shape's surface, negative inside (textbook formulae)."""
-    if isinstance(shape, Sphere):
-        return lambda p: np.linalg.norm(p, axis=0) - shape.radius
-    if isinstance(shape, Box):
-        return lambda p: _box(np.abs(p) - np.array(shape.half)[:, None])
-    if isinstance(shape, Cylinder):
-        return lambda p: _box(np.stack([np.hypot(p[0], p[1]) - shape.radius, np.abs(p[2]) - shape.half_height]))
-    assert isinstance(shape, RoundCone)
-    return lambda p: _round_cone(shape, p)
-
-
-def _box(q: Array) -> Array:
-    return np.linalg.norm(np.maximum(q, 0.0), axis=0) + np.minimum(q.max(axis=0), 0.0)
-
-
-def _round_cone(s: RoundCone, p: Array) -> Array:
-    """Quilez' formula: a ball at either end, and between them the cone that touches both."""
-    rho, slope = np.hypot(p[0], p[1]), (s.r0 - s.r1) / s.length
-    rise = np.sqrt(1.0 - slope**2)
-    along = rise * p[2] - slope * rho
-    first, second = np.hypot(rho, p[2]) - s.r0, np.hypot(rho, p[2] - s.length) - s.r1
-    return np.where(along < 0.0, first, np.where(along > rise * s.length, second, rise * rho + slope * p[2] - s.r0))
-
-
-@pytest.mark.parametrize("shape", SOLIDS, ids=repr)
-def test_hits_lie_on_the_surface_nothing_lies_before_them_and_normals_are_the_distances_gradient(shape):
-    sdf = signed_distance(shape)
-    origin = np.array([[1.7], [-1.1], [0.9]])
-    # Aim near the shape so that both hits and misses are frequent.
-    aim = np.random.default_rng(1).uniform(-0.9, 0.9, (3, 400)) - origin
-    d = aim / np.linalg.norm(aim, axis=0)
-    t = nearest_hit(shape, origin, d)
-    hit = np.isfinite(t)
-    assert 40 < hit.sum() < 360
-    p = origin + t[hit] * d[:, hit]
-    assert np.abs(sdf(p)).max() < TOLERANCE
-    for share in np.linspace(0.0, 0.999, 12):
-        assert sdf(origin + share * t[hit] * d[:, hit]).min() > -TOLERANCE
-    for distance in np.linspace(0.0, 4.0, 60):
-        assert sdf(origin + distance * d[:, ~hit]).min() > -TOLERANCE
-    inside = np.array([[0.01], [0.02], [0.03]])
-    p = inside + nearest_hit(shape, inside, d) * d
-    normal, h = shape.surface(p)[0], 1e-4
-    gradient = np.stack([sdf(p + h * e[:, None]) - sdf(p - h * e[:, None]) for e in np.eye(3)]) / (2 * h)
-    # Near an edge of a box or cylinder the difference straddles two faces.
-    assert np.quantile((normal * gradient).sum(axis=0) / np.linalg.norm(gradient, axis=0), 0.03) > 0.999
-    assert np.allclose(np.linalg.norm(normal, axis=0), 1.0)
 
 
 @pytest.mark.stability

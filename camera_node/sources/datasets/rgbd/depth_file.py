@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.sources.datasets.imaging import decode_file, shrink
+from camera_node.sources.datasets.imaging import decode_file, read_numbers, shrink
 from camera_node.sources.datasets.lens import Lens, pinhole, undistort
 from camera_node.sources.datasets.photo import Photo
 from camera_node.sources.datasets.records import DatasetError
 from freshfield.depth import USUAL_M, DepthImage
 from freshfield.geometry import Pinhole, Pose
-from freshfield.untrusted import check_file
 
 import cv2  # isort: skip
 
@@ -95,17 +94,13 @@ def registered(counts: NDArray[np.uint16], lens: Lens, scale: float, where: str)
 def _numbers(path: Path) -> NDArray[Any]:
     """The file's numbers, (H, W), 16 bits or floating point. Raises DatasetError."""
     if path.suffix.lower() == ".npy":
-        try:
-            check_file(path)
-            values = np.load(path, allow_pickle=False)
-        except Exception as error:  # numpy reads a damaged header as Python, which raises anything
-            raise DatasetError(f"{path}: cannot be read as numbers of numpy: {error}") from None
+        found: NDArray[Any] | None = read_numbers(path)
     else:
         os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")  # asked when the first EXR file is read
-        values = decode_file(path, cv2.IMREAD_UNCHANGED)
-        if values is None:
-            raise DatasetError(f"{path}: missing, damaged, or no depth image that OpenCV can read")
-    values = np.squeeze(values)
+        found = decode_file(path, cv2.IMREAD_UNCHANGED)
+    if found is None:
+        raise DatasetError(f"{path}: missing, damaged, or no depth image that OpenCV can read")
+    values = np.squeeze(found)
     if values.ndim == 3 and values.dtype.kind == "f":  # EXR files may name their one channel R, or repeat it
         used = [c for c in range(values.shape[2]) if values[..., c].any()] or [0]
         if all(np.array_equal(values[..., used[0]], values[..., c], equal_nan=True) for c in used):

@@ -52,9 +52,25 @@ class FoxgloveMessages(Messages):
     needs = (_CALIBRATION, _TRANSFORM)
 
     def read(self, topic: str | None = None, log_ns: int = 0) -> Iterator[tuple[str, int, Record]]:
-        chosen = {} if topic is None else {"topics": [topic], "starting_at": log_ns, "ending_at": log_ns}
-        for kind, message, at, t_ns in _messages(self.where, **chosen):
-            yield at, t_ns, _record(kind, message, t_ns)
+        try:
+            from google.protobuf.message import DecodeError
+            from mcap.exceptions import McapError
+            from mcap.reader import make_reader
+
+            kinds = (_CALIBRATION, _COMPRESSED, _RAW, _TRANSFORM)
+            classes = {k: getattr(import_module(f"foxglove_schemas_protobuf.{k}_pb2"), k) for k in kinds}
+        except ImportError:
+            raise DatasetError(INSTALL) from None
+        chosen: Any = {} if topic is None else {"topics": [topic], "starting_at": log_ns, "ending_at": log_ns}
+        try:
+            with self.where.open("rb") as stream:
+                for schema, channel, message in make_reader(stream).iter_messages(**chosen):
+                    kind, t_ns = "" if schema is None else schema.name.removeprefix("foxglove."), message.log_time
+                    if kind in classes:
+                        yield channel.topic, t_ns, _record(kind, classes[kind].FromString(message.data), t_ns)
+        except (OSError, McapError, DecodeError, ValueError, EOFError) as error:
+            why = error or type(error).__name__
+            raise DatasetError(f"{self.where}: cannot be read as MCAP: {why}; cut short?") from None
 
 
 def _of_ros(file: Path) -> bool:
@@ -78,24 +94,3 @@ def _record(kind: str, message: Any, log_ns: int) -> Record:
         return Picture(message.frame_id, stamp_ns, COMPRESSED, message.data, message.format)
     size = (message.width, message.height)
     return Picture(message.frame_id, stamp_ns, message.encoding, message.data, "", *size, message.step)
-
-
-def _messages(file: Path, **chosen: Any) -> Iterator[tuple[str, Any, str, int]]:
-    """Foxglove's messages: kind, message, topic, log time. Raises DatasetError."""
-    try:
-        from google.protobuf.message import DecodeError
-        from mcap.exceptions import McapError
-        from mcap.reader import make_reader
-
-        kinds = (_CALIBRATION, _COMPRESSED, _RAW, _TRANSFORM)
-        classes = {k: getattr(import_module(f"foxglove_schemas_protobuf.{k}_pb2"), k) for k in kinds}
-    except ImportError:
-        raise DatasetError(INSTALL) from None
-    try:
-        with file.open("rb") as stream:
-            for schema, channel, message in make_reader(stream).iter_messages(**chosen):
-                kind = "" if schema is None else schema.name.removeprefix("foxglove.")
-                if kind in classes:
-                    yield kind, classes[kind].FromString(message.data), channel.topic, message.log_time
-    except (OSError, McapError, DecodeError, ValueError, EOFError) as error:
-        raise DatasetError(f"{file}: cannot be read as MCAP: {error or type(error).__name__}; cut short?") from None

@@ -236,17 +236,11 @@ def _lens(record: Calibration, k: Sequence[float], terms: Sequence[float], where
 def _one_of_each_instant(name: str, camera: _Camera) -> list[str]:
     """Keep one image of each stamp; notes on what was left out."""
     before = Counter(topic for _, _, topic, _ in camera.images)
-    by_stamp: dict[int, tuple[int, int, str, int]] = {}
-    for image in camera.images:
-        by_stamp.setdefault(image[0], image)
-    camera.images = list(by_stamp.values())
+    camera.images = list({image[0]: image for image in reversed(camera.images)}.values())[::-1]
     after = Counter(topic for _, _, topic, _ in camera.images)
     taken = ", ".join(sorted(after))
-    return [
-        f"{count - after[topic]} images of {topic} are of the same instants as those of {taken}: left out"
-        for topic, count in before.items()
-        if count > after[topic]
-    ]
+    same = f"are of the same instants as those of {taken}: left out"
+    return [f"{count} images of {topic} {same}" for topic, count in (before - after).items()]
 
 
 def _chain(index: _Index, name: str, where: Path) -> tuple[list[PoseProvider], str]:

@@ -10,7 +10,6 @@ benchmark recommends ROS's defaults, and gives others for ``freiburg3``.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,8 +54,7 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
     left_out = f"{unposed} of {len(listed)} images have no pose within 20 ms: left out"
     if listed and unposed == len(listed):
         raise DatasetError(f"{folder}: {left_out}")
-    dataset = found.dataset()
-    return replace(dataset, notes=(*dataset.notes, left_out)) if unposed else dataset
+    return found.dataset(notes=[left_out] if unposed else [])
 
 
 def _listed(file: Path) -> list[tuple[int, str]]:

@@ -35,30 +35,28 @@ def sent(queue, values: np.ndarray, kind) -> None:
 
 def test_frames_come_as_rgb_with_their_time_on_our_clock_until_the_camera_is_gone():
     queue, clock = dai.MessageQueue("color", 4, False), WallClock()
-    frames = oak.FrameQueue("eye", queue, clock)
     image = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     stamps = []
     for _ in range(3):
         sent(queue, image[..., ::-1].copy(), dai.ImgFrame.Type.BGR888i)
-        captured_ns, found = frames.grab(10.0)
+        captured_ns, found = oak.next_frame("eye", queue, clock, 10.0)
         assert np.array_equal(found, image)
         assert -1_000_000 < clock.now_ns() - captured_ns < 1_000_000_000
         stamps.append(captured_ns)
-    assert stamps == sorted(set(stamps)) and frames.grab(0.001) is None
+    assert stamps == sorted(set(stamps)) and oak.next_frame("eye", queue, clock, 0.001) is None
     queue.close()
-    refused(CameraError, "eye: the OAK camera is gone", frames.grab, 10.0)
+    refused(CameraError, "eye: the OAK camera is gone", oak.next_frame, "eye", queue, clock, 10.0)
 
 
 def test_depth_is_the_newest_frame_in_millimeters_with_its_time():
     queue, clock = dai.MessageQueue("depth", 4, False), WallClock()
-    depths = oak.DepthQueue(queue, clock)
     for number in (1, 2):
         sent(queue, np.full((HEIGHT, WIDTH), 1000 * number, np.uint16), dai.ImgFrame.Type.RAW16)
-    measured = depths.newest(clock.now_ns() - 20_000_000)
+    measured = oak.newest_depth(queue, clock, clock.now_ns() - 20_000_000)
     assert measured.counts.shape == (HEIGHT, WIDTH) and (measured.counts == 2000).all()
     assert measured.meters_per_count == 0.001 and measured.intrinsics is None, "registered to the image"
     assert 10_000_000 < measured.after_image_ns < 30_000_000
-    assert depths.newest(0) is None, "each once"
+    assert oak.newest_depth(queue, clock, 0) is None, "each once"
 
 
 def calibration():
