@@ -7,10 +7,8 @@
 from edge_server.scheduler.policy import STATE_PARTS, Epoch, Policy, SelectionWindow
 from edge_server.scheduler.registry import (
     BANDIT,
-    OFFERED,
     POLICIES,
     LivePolicies,
-    make_live_policy,
     make_policy,
     parse_policy,
     policy_help,
@@ -20,14 +18,12 @@ from edge_server.scheduler.registry import (
 
 __all__ = [
     "BANDIT",
-    "OFFERED",
     "POLICIES",
     "STATE_PARTS",
     "Epoch",
     "LivePolicies",
     "Policy",
     "SelectionWindow",
-    "make_live_policy",
     "make_policy",
     "parse_policy",
     "policy_help",

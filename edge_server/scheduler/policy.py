@@ -56,14 +56,12 @@ class SelectionWindow:
     wait_until_ns: earliest instant of selection.
     generated_after_ns, received_after_ns: only frames generated, or arrived, later qualify (omega-wait); None
     admits all.
-    flush: abort what is in transit at the decision (virtual time only).
     """
 
     omega_ms: float | None = None
     wait_until_ns: int = 0
     generated_after_ns: int | None = None
     received_after_ns: int | None = None
-    flush: bool = False
 
 
 class Policy:

@@ -13,7 +13,7 @@ import numpy as np
 
 from edge_server.scheduler import fixed
 from edge_server.scheduler.policy import Policy
-from edge_server.scheduler.wait import Wait, WaitArrived, WaitFlush
+from edge_server.scheduler.wait import Wait, WaitArrived
 from freshfield import plugins
 from freshfield.limits import MAX_POLICY_CHARS
 from freshfield.scenario import SCENARIO_FOLDER
@@ -29,16 +29,10 @@ POLICIES: dict[str, tuple[type[Policy], str]] = {
     "threshold": (fixed.Threshold, "frames no older than omega (6.12-6.14); value: omega_ms"),
     "wait": (Wait, "wait omega, use only frames generated meanwhile (6.15-6.17); value: omega_ms"),
     "wait-arrived": (WaitArrived, "as wait, but frames that arrive meanwhile, however old (6.16)"),
-    "wait-flush": (WaitFlush, "as wait, but abort the transmissions under way at the decision (6.5)"),
 }
 
 # Prefix of a learned policy: the path of a learner's checkpoint follows.
 BANDIT = "bandit:"
-
-# A live edge cannot take back what the network carries; virtual time can, to show what the thesis assumes.
-VIRTUAL_ONLY = ("wait-flush",)
-# The choices shown to people.
-OFFERED: tuple[str, ...] = tuple(policy for policy in POLICIES if policy not in VIRTUAL_ONLY)
 
 
 def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
@@ -63,16 +57,6 @@ def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Pol
     if name not in POLICIES:
         policy.name = name  # by which every other process finds it too
     return policy
-
-
-def make_live_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
-    """``make_policy`` for a live edge. Raises ValueError also for what only virtual time can do."""
-    if name in VIRTUAL_ONLY:
-        raise ValueError(
-            f"policy {name!r} breaks off what the network carries, which a live edge cannot: it runs in "
-            "virtual time only (edge-server simulate, edge-server study); live, use wait"
-        )
-    return make_policy(name, value, rng)
 
 
 def parse_policy(text: str) -> tuple[str, float | None]:
@@ -128,8 +112,8 @@ class LivePolicies:
         """name, value: of the first policy. rng: gives the random stream of a policy's name. Raises ValueError
         for a policy that is not possible."""
         self._rng = rng
-        self.first = make_live_policy(name, value, rng(name))
-        self.offered = OFFERED if self.first.name in OFFERED else (self.first.name, *OFFERED)
+        self.first = make_policy(name, value, rng(name))
+        self.offered = tuple(POLICIES) if self.first.name in POLICIES else (self.first.name, *POLICIES)
 
     def make(self, name: str, value: float | None) -> Policy:
         """The policy that an operator asks for. Raises ValueError if it is not offered."""
@@ -139,4 +123,4 @@ class LivePolicies:
             outside = name.startswith(BANDIT) or plugins.is_reference(name)
             known = "what was learned, or is your own, is chosen at the start (--policy)"
             raise ValueError(f"policy {name!r}: {known if outside else 'choose one of ' + ', '.join(self.offered)}")
-        return make_live_policy(name, value, self._rng(name))
+        return make_policy(name, value, self._rng(name))

@@ -5,14 +5,11 @@ nothing qualifies at the end, the wait goes on until the first frame that does. 
 what qualifies: frames *generated* in the horizon (6.5: ``wait``), or those that *arrive* in it, however old
 (6.16 and algorithm 2: ``wait-arrived``).
 
-A frame in transit at the decision blocks a link that serves one frame at a time, though ``wait`` will not use
-it. ``wait-flush`` aborts it (6.5: "no packets are considered in transit"), and then both readings are the
-same.
+A frame in transit at the decision blocks a link that serves one frame at a time, though ``wait`` will not use it; the
+thesis considers none in transit (6.5).
 """
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow
 
@@ -38,16 +35,6 @@ class WaitArrived(Wait):
 
     def plan(self, epoch: Epoch) -> SelectionWindow:
         return wait_window(epoch.now_ns, self.value, arrived=True)
-
-
-class WaitFlush(Wait):
-    """``Wait``, after aborting what is in transit at the decision (6.5); virtual time only."""
-
-    name = "wait-flush"
-
-    def plan(self, epoch: Epoch) -> SelectionWindow:
-        window = super().plan(epoch)
-        return replace(window, flush=window.generated_after_ns is not None)
 
 
 def wait_window(now_ns: int, omega_ms: float, arrived: bool = False) -> SelectionWindow:

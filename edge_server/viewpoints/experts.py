@@ -49,9 +49,8 @@ class SimulatedExpert:
     """Answers by its taste and its habits.
 
     taste: one of ``TASTES``. scores: (N,), scores of the reconstructions, by ``judge``.
-    rng: draws mistakes and laziness.
+    rng: draws mistakes.
     wrong: share of answers that are the opposite of what the taste says.
-    lazy: share of pairs that it does not look at: it takes the first one.
     contradicts: whether it answers at random.
     """
 
@@ -59,7 +58,6 @@ class SimulatedExpert:
     scores: NDArray[np.float64]
     rng: np.random.Generator
     wrong: float = 0.0
-    lazy: float = 0.0
     contradicts: bool = False
     asked: list[Answer] = field(default_factory=list)
 
@@ -67,20 +65,13 @@ class SimulatedExpert:
     def label(self) -> str:
         """Who answered, for every record and figure."""
         habits = [f"{100 * self.wrong:g} % wrong"] if self.wrong else []
-        habits += [f"{100 * self.lazy:g} % lazy"] if self.lazy else []
         habits += ["contradicting"] if self.contradicts else []
         return f"simulated expert ({', '.join([self.taste, *habits])})"
 
-    def taste_prefers(self, first: int, second: int) -> bool:
-        """What it would say if it made no mistakes."""
-        return bool(self.scores[first] >= self.scores[second])
-
     def answer(self, first: int, second: int) -> Answer:
         """Its answer to a pair, kept in ``asked``."""
-        draw = self.rng.random(3)  # as many for every pair, whatever the habits
-        prefers = self.taste_prefers(first, second) != bool(draw[0] < self.wrong)
-        if draw[1] < self.lazy:
-            prefers = True
+        draw = self.rng.random(3)  # as many for every pair, whatever the habits: a seed keeps its answers
+        prefers = bool(self.scores[first] >= self.scores[second]) != bool(draw[0] < self.wrong)
         if self.contradicts:
             prefers = bool(draw[2] < 0.5)
         self.asked.append(Answer(first, second, prefers))

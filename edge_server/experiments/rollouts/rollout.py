@@ -39,13 +39,11 @@ PolicyMaker = Callable[[np.random.Generator], Policy]
 class Decided:
     """A decision and its outcome, as plain values.
 
-    slot: number of the decision; those of one slot in several samples of an episode are comparable.
     outcomes: by the camera that scored.
     features, action, logp: what a learned policy saw ((N, width)), its action ((N,) bool, or the index of an omega) and
         its log-probability; None and 0 for other policies.
     """
 
-    slot: int
     outcomes: dict[str, Outcome]
     features: list[list[float]] | None = None
     action: Any = None
@@ -54,7 +52,8 @@ class Decided:
 
 @dataclass(frozen=True)
 class Run:
-    """One sample of an episode: its single decisions, or of a running deployment the outcome of all of it."""
+    """One sample of an episode: its single decisions in turn, which are comparable with those of other samples, or of a
+    running deployment the outcome of all of it."""
 
     decided: list[Decided]
     whole: Outcome | None = None
@@ -84,7 +83,7 @@ def _single_decisions(factory: EpisodeFactory, seed: int, policy: Policy, camera
         seen: tuple[Any, ...] = ()
         if (last := policy.last_decision) is not None:  # of a learned policy
             seen = last.actor.spec.layout.features(last.state).tolist(), last.action.tolist(), last.logp
-        decided.append(Decided(number, outcomes, *seen))
+        decided.append(Decided(outcomes, *seen))
     return Run(decided)
 
 

@@ -14,7 +14,6 @@ from typing import Any
 
 from edge_server.experiments.common.seed_table import TRAINING, Row
 from edge_server.experiments.engine.content_key import code_digest
-from edge_server.experiments.rollouts import rollout
 from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
 from edge_server.experiments.studies.study import StudyRequest, open_engine
 from edge_server.experiments.studies.trial import Trial
@@ -139,7 +138,7 @@ def _train(
     samples = 2 if training.action == "select" else 3
     config = TrainingConfig(spec, _reward(choice, request), episodes, samples=samples, seed=run)
     # Trainings with other settings or code have separate folders.
-    about = code_digest(rollout.__name__) + setting.key + repr(dataclasses.asdict(config))
+    about = code_digest() + setting.key + repr(dataclasses.asdict(config))
     label = f"{name}-{case.name}-{training.policy}-{run}".replace(" ", "-").replace(",", "").replace("/", "-")
     folder = request.out / "training" / f"{label}-{hashlib.sha256(about.encode()).hexdigest()[:8]}"
     say = partial(print, f"  {label}:", flush=True)

@@ -41,7 +41,6 @@ ASKED = (10, 20, 40, 60)
 HABITS: dict[str, dict[str, float | bool]] = {
     "careful": {},
     "10 % wrong": {"wrong": 0.1},
-    "30 % lazy": {"lazy": 0.3},
     "contradicting": {"contradicts": True},
 }
 _UNSEEN = 400  # pairs
@@ -201,7 +200,7 @@ def ask(expert: SimulatedExpert, features: np.ndarray, answers: int) -> RewardMo
 
 
 def question(features: np.ndarray, scores: np.ndarray, taste: str, habit: str, seed: int) -> list[Row]:
-    """A row for each number of answers: agreement with the expert, and with its taste, on unseen pairs."""
+    """A row for each number of answers: agreement with the expert on unseen pairs."""
     rng = np.random.default_rng([seed, 1])
     order = rng.permutation(len(features))
     asked, unseen = order[len(order) // 3 :], order[: len(order) // 3]
@@ -212,23 +211,19 @@ def question(features: np.ndarray, scores: np.ndarray, taste: str, habit: str, s
     )
     said = np.array([other.answer(i, j).prefers_first for i, j in zip(first, second)])
     again = np.array([other.answer(i, j).prefers_first for i, j in zip(first, second)])
-    meant = np.array([other.taste_prefers(i, j) for i, j in zip(first, second)])
     rows = []
     for answers in ASKED:
         model = ask(expert, features[asked], answers)
         expects = model.probability(features[unseen], first, second) > 0.5
         rows.append(
             {
-                "expert": expert.label,
                 "taste": taste,
                 "habit": habit,
                 "seed": seed,
                 "answers": answers,
                 "agreement": float((expects == said).mean()),
-                "with_taste": float((expects == meant).mean()),
                 "with_itself": float((said == again).mean()),
                 "agreement_share": float((expects == said).mean() / max((said == again).mean(), 1e-9)),
-                "odds": model.odds,
                 "knows": model.knows,
                 "does_not_know": float(not model.knows),
             }

@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"== {name}: {study.title}", flush=True)
             for verdict in run_study(study, request):
                 print("  " + verdict.line())
-            print(f"  {time.monotonic() - began:.0f} s; {request.out / name}.md, .csv, .json and figures", flush=True)
+            print(f"  {time.monotonic() - began:.0f} s; {request.out / name}.md, .csv and figures", flush=True)
 
     errors = (ScenarioError, DatasetError, StudyError, EngineError, TrainingError, ViewpointError, EmbeddingError)
     stopped = f"what is finished is in {args.out}: run the same command again to resume"

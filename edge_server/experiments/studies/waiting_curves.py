@@ -22,7 +22,7 @@ CHANNELS: dict[str, Row] = {
     "low traffic": {"preset": "ch6-low"},
     "high traffic, parallel": {"preset": "ch6-high", "discipline": "parallel"},
 }
-WAITS = ("wait", "wait-arrived", "wait-flush")
+WAITS = ("wait", "wait-arrived")
 # Where the plateau of wait starts in the thesis (6.5.2): 62 ms in high traffic, 105 ms in low.
 PLATEAU_MS = {"high traffic": 62.0, "low traffic": 105.0, "high traffic, parallel": 62.0}
 # A curve is on its plateau if it is this near to its best value.
@@ -151,13 +151,6 @@ IMAGES = Study(
             trend("images", rises=True),
             where={"policy": "freshest-k"},
             metrics=("aaoi_ms",),
-        ),
-        Claim(
-            "some fewer, the freshest, are better than all (not in the thesis).",
-            interior("images"),
-            None,
-            {"policy": "freshest-k"},
-            ("lpips", "psnr_db", "psnr_moving_db"),
         ),
     ),
     ("scene", "field", "channel"),

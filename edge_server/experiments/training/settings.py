@@ -12,8 +12,7 @@ QUICK_FIELDS: dict[str, dict[str, Any]] = {
 ``splat``'s Gaussians, as many as an image of 64 x 64 has pixels, and a quarter of ``ngp``'s work a step."""
 
 FITS = 2
-"""Of every choice: the choice that is best in one is measured by the other, because the maximum of noisy fits is
-biased upwards."""
+"""Of every choice, whose mean is less noisy."""
 
 SMOOTHED_BATCHES = 9
 """Batches averaged in a point of the drawn learning curve: single ones differ by more than training changes them."""

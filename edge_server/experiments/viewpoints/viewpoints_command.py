@@ -102,7 +102,7 @@ def _run(args: argparse.Namespace) -> None:
     quality = {"psnr_db": score.psnr_db, "ssim": score.ssim, "lpips": score.lpips}
     about = {"scenario": stage.name, "seed": args.seed, "travel_weight": args.travel, "steps": args.steps}
     write_json(args.out / "plan.json", {**about, **plan.as_json(stage.candidates), "held_out": quality})
-    draw_plan(args.out / "plan.png", stage, [(plan.selector, plan)])
+    draw_plan(args.out / "plan.png", stage, plan)
     for n, stop in enumerate(plan.stops, 1):
         print(f"{n:3}  candidate {stop.candidate:3}  {1e3 * stop.seconds:6.0f} ms  {stop.why}")
     if plan.note:

@@ -150,11 +150,6 @@ class VirtualDeployment:
         self.clock.advance_to(end_ns)
         return self.publications[known:]
 
-    def flush(self) -> None:
-        """Abort transmissions now (thesis 6.5: nothing is considered to be in transit)."""
-        for link in self._links.values():
-            self._take(link.flush(self.clock.now_ns() - self._channel_origin_ns))
-
     def shown_now(self) -> Snapshot | None:
         """What a visitor sees: the newest publication, carried on to the clock's instant. None before the first, and if
         nothing shown is scored."""
@@ -318,8 +313,6 @@ class VirtualDeployment:
                 updates.policy, self.next_policy = self.next_policy, None
             decided_ns = self.decided_ns = self.clock.now_ns()
             plan = updates.plan(decided_ns)
-            if plan.flush:
-                self.flush()
             while (selection := updates.select(plan, self.clock.now_ns(), most_new=most_new)) is None:
                 waits = plan.wait_until_ns > self.clock.now_ns()
                 yield WakeCondition(plan.wait_until_ns) if waits else _AT_ARRIVAL

@@ -35,19 +35,11 @@ class DecisionWriter:
     thread-safe.
 
     embedding: settings of the embedder, to embed the frames again; None: nothing was embedded.
-    max_decisions, max_bytes: how much to keep on disk.
     """
 
-    def __init__(
-        self,
-        out: Path,
-        embedding: Mapping[str, Any] | None = None,
-        max_decisions: int = MAX_DECISIONS,
-        max_bytes: int = MAX_BYTES,
-    ) -> None:
+    def __init__(self, out: Path, embedding: Mapping[str, Any] | None = None) -> None:
         self._folder = out / FOLDER
         self._embedding = dict(embedding) if embedding else None
-        self._max_decisions, self._max_bytes = max_decisions, max_bytes
         # Decision's file, policy's file, bytes written for it; those of an earlier process first.
         self._kept = deque((p, "", p.stat().st_size) for p in _numbered(self._folder))
         self._policy: tuple[Actor, str] | None = None
@@ -86,7 +78,7 @@ class DecisionWriter:
 
     def _make_room(self) -> None:
         while len(self._kept) > 1 and (
-            len(self._kept) > self._max_decisions or sum(size for *_, size in self._kept) > self._max_bytes
+            len(self._kept) > MAX_DECISIONS or sum(size for *_, size in self._kept) > MAX_BYTES
         ):
             path, policy, _ = self._kept.popleft()
             path.unlink(missing_ok=True)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_server.scheduler import OFFERED, POLICIES, Epoch, LivePolicies, make_policy, policy_help
+from edge_server.scheduler import POLICIES, Epoch, LivePolicies, make_policy, policy_help
 from tests.support import MOST_MS, refused, work_ms
 
 MS = 1_000_000
@@ -46,10 +46,7 @@ def test_which_cameras_a_policy_chooses(name, value, at, chosen):
 def test_wait_counts_only_what_was_generated_after_the_decision_or_has_arrived_since():
     policy = make_policy("wait", 60, np.random.default_rng(0))
     window = policy.plan(AT)
-    assert (window.wait_until_ns, window.generated_after_ns, window.flush) == (260 * MS, 200 * MS, False)
-    for omega_ms in (0.0, 40.0):  # flushing is asked for only where something is waited for
-        flushing = make_policy("wait-flush", omega_ms, np.random.default_rng(0)).plan(AT)
-        assert flushing.flush == bool(omega_ms) and (flushing.wait_until_ns == 240 * MS) == bool(omega_ms)
+    assert (window.wait_until_ns, window.generated_after_ns) == (260 * MS, 200 * MS)
     assert policy.select(epoch(260, a=200, b=201, c=259, d=10), window) == ("b", "c")
     assert policy.select(epoch(260, a=190, b=80), window) == ()  # the wait goes on
     policy = make_policy("wait-arrived", 60, np.random.default_rng(0))
@@ -107,9 +104,9 @@ def test_a_value_out_of_range_is_refused_by_name_and_an_unknown_policy_lists_the
 
 def test_a_running_edge_offers_what_it_began_with_and_no_other_file():
     policies = LivePolicies("threshold", 70.0, lambda name: np.random.default_rng(len(name)))
-    assert (policies.first.name, policies.first.value, policies.offered) == ("threshold", 70.0, OFFERED)
+    assert (policies.first.name, policies.first.value, policies.offered) == ("threshold", 70.0, tuple(POLICIES))
     assert policies.make("freshest-k", 3.0).value == 3
-    for name in ("bandit:other.npz", "wait-flush", "best"):
+    for name in ("bandit:other.npz", "best"):
         refused(ValueError, name, policies.make, name, None)
 
     def ask():

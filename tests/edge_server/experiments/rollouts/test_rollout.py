@@ -181,7 +181,7 @@ def test_samples_have_actions_of_their_own_and_share_the_episode():
     assert len({str([d.features for d in run.decided]) for run in runs}) == 1
     state = factory.episode(3).points[1].state
     one = runs[0].decided[1]
-    assert one.features == SELECT.layout.features(state).tolist() and one.slot == 1
+    assert one.features == SELECT.layout.features(state).tolist()
     greedy = rollout(factory, 3, learned(actor), 2)
     assert greedy[0] == greedy[1] and greedy[0].decided[0].logp < 0.0
     fixed = rollout(factory, 3, named("all"))[0].decided
