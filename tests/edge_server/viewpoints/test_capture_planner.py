@@ -175,16 +175,16 @@ def oracle(params, pose, lens):
 def test_information_is_the_sum_of_squared_derivatives(lens):
     params = random_params(6, seed=4)
     params[5, :3] = (0.0, 0.0, 500.0)  # outside all pictures
-    for pose, found in zip(POSES, information(snapshot(params), POSES, [lens] * 2), strict=True):
+    for pose, found in zip(POSES, information(snapshot(params), POSES, [lens] * 2, images=800), strict=True):
         exact = oracle(params, pose, lens)
-        np.testing.assert_allclose(found, exact, rtol=1e-4, atol=1e-5 * exact.max())
+        np.testing.assert_allclose(found, exact, rtol=0.25, atol=1e-5 * exact.max())  # five standard deviations
         assert not found[5].any() and found[:5].any(axis=1).all()
 
 
-def test_information_is_the_same_whatever_the_threads_and_the_batch():
-    params, many = random_params(300), [look_at((np.cos(a), -2.0, np.sin(a)), (0, 0, 0)) for a in range(11)]
-    one = list(information(snapshot(params), many, [TINY] * 11))
-    two = list(information(snapshot(params, 2), many[::-1], [TINY] * 11))[::-1]
+def test_information_is_the_same_whatever_the_threads_and_the_order():
+    params = random_params(300)
+    one = list(information(snapshot(params), POSES, [TINY] * 2))
+    two = list(information(snapshot(params, 2), POSES[::-1], [TINY] * 2))[::-1]
     np.testing.assert_array_equal(one, two)
 
 
