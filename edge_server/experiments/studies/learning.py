@@ -19,7 +19,7 @@ from edge_server.experiments.studies.study import StudyRequest, open_engine
 from edge_server.experiments.studies.trial import Trial
 from edge_server.experiments.training.evaluation import Candidate, evaluate, fixed_candidates
 from edge_server.experiments.training.learning_curve import draw_curve
-from edge_server.experiments.training.settings import QUICK_FIELDS
+from edge_server.experiments.training.settings import QUICK_SPLAT
 from edge_server.experiments.training.trainer import TrainingConfig, read_log, train
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.settings import Action, Spec
@@ -89,7 +89,7 @@ def room(channel: Mapping[str, Any] | str = "ch5", **more: Any) -> Setting:
     """
     section = {"preset": channel} if isinstance(channel, str) else dict(channel)
     held_out = more.pop("held_out", ("cam00",))
-    scenario = Trial("room", 0, section, size=SIZE, field_options=QUICK_FIELDS["splat"]).scenario()
+    scenario = Trial("room", 0, section, size=SIZE, field_options=QUICK_SPLAT).scenario()
     apart = tuple(c for c in scenario.cameras if c in {*held_out, *REPORT})
     scenario = dataclasses.replace(scenario, held_out=apart)
     return Setting(scenario, report=REPORT, **{"steps": 50 if more.get("scratch") else 20, **more})

@@ -35,7 +35,7 @@ from edge_server.viewpoints.capture_planner import Budget, Plan, plan_capture
 from edge_server.viewpoints.experts import TASTES, SimulatedExpert
 from edge_server.viewpoints.features import StepFeatures
 from edge_server.viewpoints.policy import PolicyConfig, train_policy
-from edge_server.viewpoints.preference_model import RewardModel, fit_reward, next_pair
+from edge_server.viewpoints.preference_model import RewardModel, fit_reward, random_pair
 
 ASKED = (10, 20, 40, 60)
 HABITS: dict[str, dict[str, float | bool]] = {
@@ -191,12 +191,10 @@ def _tastes(stage: Stage, field: Field) -> Row:
 
 
 def ask(expert: SimulatedExpert, features: np.ndarray, answers: int) -> RewardModel:
-    """The reward model after so many answers, each to the pair that tells most."""
-    model = fit_reward(features, expert.asked)
+    """The reward model after so many answers."""
     while len(expert.asked) < answers:
-        expert.answer(*next_pair(model, features, expert.rng))
-        model = fit_reward(features, expert.asked)
-    return model
+        expert.answer(*random_pair(len(features), expert.rng))
+    return fit_reward(features, expert.asked)
 
 
 def question(features: np.ndarray, scores: np.ndarray, taste: str, habit: str, seed: int) -> list[Row]:
@@ -214,7 +212,8 @@ def question(features: np.ndarray, scores: np.ndarray, taste: str, habit: str, s
     rows = []
     for answers in ASKED:
         model = ask(expert, features[asked], answers)
-        expects = model.probability(features[unseen], first, second) > 0.5
+        rewards = model.reward(features[unseen])
+        expects = rewards[first] > rewards[second]
         rows.append(
             {
                 "taste": taste,

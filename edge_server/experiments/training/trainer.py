@@ -206,7 +206,7 @@ def _missing_reward_reason(outcomes: list[Outcome], found: list[RewardTerms]) ->
         return "nothing had arrived at any decision of the first batch: look at the scenario's channel"
     missing = list(dict.fromkeys(name for r in found for name in r.missing))
     hints = {
-        "lpips": "lpips: see edge.lpips and --lpips, or leave it out with --distance none",
+        "lpips": "lpips: see --lpips, or leave it out with edge.lpips: none",
         "psnr_moving": "psnr_moving: nothing moves where the held-out cameras look; --on whole",
     }
     return "no decision of the first batch has a reward, it lacks " + "; ".join(

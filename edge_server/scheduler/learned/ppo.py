@@ -73,12 +73,10 @@ class Diagnostics(UpdateFigures):
     """Figures of an update; all 0 for a batch without a usable decision.
 
     reward: mean of the finite ones. dropped: decisions whose reward or log-probability was not finite.
-    explained: share of the rewards' variance that V explained before the update (None where they do not vary).
     """
 
     reward: float | None
     dropped: int
-    explained: float | None
 
 
 class Learner:
@@ -140,7 +138,7 @@ class Learner:
         usable = (np.abs(batch.rewards) < _MAX_REWARD) & np.isfinite(batch.logps)
         dropped = int((~usable).sum())
         if not usable.any():
-            return Diagnostics(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, None, dropped, None)
+            return Diagnostics(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, None, dropped)
         rewards = batch.rewards[usable]
         mean = float(rewards.mean())
         rewards = self._rewards.clipped(rewards)
@@ -152,26 +150,24 @@ class Learner:
             self._cameras_seen += len(cameras)
             self._mean_features += (cameras - self._mean_features).sum(axis=0) / self._cameras_seen
         with one_torch_thread():
-            figures, explained = self._improve(
+            figures = self._improve(
                 torch.tensor(batch.features[usable]),
                 torch.tensor(batch.actions[usable]),
                 torch.tensor(batch.logps[usable]),
                 torch.tensor(self._rewards.standardized(rewards)),
             )
-        return Diagnostics(**asdict(figures), reward=mean, dropped=dropped, explained=explained)
+        return Diagnostics(**asdict(figures), reward=mean, dropped=dropped)
 
     def _improve(
         self, features: torch.Tensor, actions: torch.Tensor, logps: torch.Tensor, rewards: torch.Tensor
-    ) -> tuple[UpdateFigures, float | None]:
-        """``clipped_update``, and the share of the rewards' variance that V explained before it."""
+    ) -> UpdateFigures:
+        """``clipped_update`` with normalized advantages."""
         spec = self.spec
         with torch.no_grad():
             baseline = networks.value(torch, self._value, features)
         spread = rewards.std(correction=0).item()
-        left = (rewards - baseline).std(correction=0).item()
         # A single reward varies against those before it, which standardized it.
         varies = spread > _CONSTANT or (len(rewards) == 1 and self._rewards.variance > 0.0)
-        explained = 1.0 - (left / spread) ** 2 if spread > _CONSTANT else None
         # Where no action made a difference, only errors of V remain.
         advantages = self._normalized_advantages(rewards - baseline) if varies else torch.zeros_like(rewards)
 
@@ -181,7 +177,7 @@ class Learner:
             return now, entropy, networks.value(torch, self._value, features[some])
 
         acted = Acted(logps, advantages, rewards)
-        return clipped_update(spec, evaluate, acted, self._parameters, self._adam, self._rng["order"]), explained
+        return clipped_update(spec, evaluate, acted, self._parameters, self._adam, self._rng["order"])
 
     @staticmethod
     def _normalized_advantages(raw: torch.Tensor) -> torch.Tensor:

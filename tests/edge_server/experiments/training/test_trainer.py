@@ -98,13 +98,13 @@ def test_only_a_first_batch_without_a_reward_ends_a_training(tmp_path: Path, mon
 
 
 def test_a_reward_that_cannot_be_had_is_refused_after_the_first_batch(tmp_path):
-    with pytest.raises(TrainingError, match=r"lpips.*--distance none"):
+    with pytest.raises(TrainingError, match=r"lpips.*edge.lpips: none"):
         trained(tmp_path, config=dataclasses.replace(CONFIG, reward=make_reward("set")))
 
 
 def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, capsys):
     (tmp_path / "small.yaml").write_text(yaml.safe_dump(RAW))
-    asked = "--kind threshold --omegas 50,200 --episodes 2 --batch 1 --decisions 1 --fit-steps 2 --size 24 --jobs 1"
+    asked = "--kind threshold --omegas 50,200 --episodes 2 --size 24 --jobs 1"
     out = tmp_path / "out"
     words = [str(tmp_path / "small.yaml"), *asked.split(), "--out", str(out)]
     assert main(words) == 0
