@@ -20,9 +20,10 @@ class Wait(Policy):
     name = "wait"
     parameter = "omega_ms"
     value: float = 120.0
+    arrived = False
 
     def plan(self, epoch: Epoch) -> SelectionWindow:
-        return wait_window(epoch.now_ns, self.value)
+        return wait_window(epoch.now_ns, self.value, self.arrived)
 
     def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
         return qualified(epoch, window)
@@ -32,9 +33,7 @@ class WaitArrived(Wait):
     """Wait omega, then use the newest frames that arrived meanwhile, however old (6.16)."""
 
     name = "wait-arrived"
-
-    def plan(self, epoch: Epoch) -> SelectionWindow:
-        return wait_window(epoch.now_ns, self.value, arrived=True)
+    arrived = True
 
 
 def wait_window(now_ns: int, omega_ms: float, arrived: bool = False) -> SelectionWindow:

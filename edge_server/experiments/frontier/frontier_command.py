@@ -14,7 +14,7 @@ from typing import Any
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic.scene import SCENES
 from edge_server.command import command_parser, run_command
-from edge_server.experiments.common.arguments import add_lpips, add_workers, parse_options
+from edge_server.experiments.common.arguments import add_lpips, add_workers, at_least, parse_options
 from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.frontier import from_scratch, update_time
 from edge_server.experiments.frontier.from_scratch import Fit, Still
@@ -112,7 +112,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="KEY=VALUE",
         help="option of the field, as in fit; may be repeated",
     )
-    add("--seeds", type=int, metavar="N", help="number of seeds [1 with --quick, else 3]")
+    add("--seeds", type=at_least(1), metavar="N", help="number of seeds [1 with --quick, else 3]")
     add_workers(parser)
     add_lpips(parser)
     add("--out", type=out_folder, default="runs/frontier", metavar="DIR", help="folder to write [%(default)s]")
@@ -123,8 +123,6 @@ def _run(args: argparse.Namespace) -> None:
     """Measure the missing points, then write tables and figures."""
     sweep = QUICK if args.quick else FULL
     if args.seeds is not None:
-        if args.seeds < 1:
-            raise ValueError(f"--seeds {args.seeds}: expected 1 or more")
         sweep = replace(sweep, seeds=args.seeds)
     fields = field_names() if args.field == "all" else tuple(args.field.split(","))
     options = parse_options(args.option)
