@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.preference_model import Answer
+from edge_server.viewpoints.settings import DETAIL_PX, OBJECT_DIFFERS
 
 Picture = NDArray[np.float32]
-_OBJECT = 0.08  # difference of a color from the background's, from which a pixel shows the object
-_BLUR_PX = 2.0
 
 
 def edges(rendering: Picture, truth: Picture) -> float:
@@ -30,7 +29,7 @@ def whole_object(rendering: Picture, truth: Picture) -> float:
     """How well the object itself looks: the mean squared difference over its pixels, negated. The background
     is the color of the corners."""
     corners = np.stack([truth[0, 0], truth[0, -1], truth[-1, 0], truth[-1, -1]])
-    shows = np.abs(truth - np.median(corners, axis=0)).max(axis=-1) > _OBJECT
+    shows = np.abs(truth - np.median(corners, axis=0)).max(axis=-1) > OBJECT_DIFFERS
     difference = ((rendering - truth) ** 2).mean(axis=-1)
     return -float(difference[shows].mean() if shows.any() else difference.mean())
 
@@ -95,4 +94,4 @@ def _gradient(picture: Picture) -> Picture:
 
 
 def _detail(picture: Picture) -> Picture:
-    return picture - cv2.GaussianBlur(picture, (0, 0), _BLUR_PX)
+    return picture - cv2.GaussianBlur(picture, (0, 0), DETAIL_PX)

@@ -47,3 +47,11 @@ width is also the standard deviation of the reward difference of a usual pair.""
 LEAST_ODDS = 10.0
 """Against a coin, from which on answers count as informative. Answers by a coin reach them at most once in so many
 times (Markov's inequality, for exact evidence)."""
+
+# What step features and simulated experts look at.
+LIKENESS_RAD = (0.25, 0.5, 1.0)
+"""Widths of the likeness of two directions, exp(-(angle / width)^2): fine detail needs near views, the whole any."""
+OBJECT_DIFFERS = 0.08
+"""Difference of a color from the background's, from which a pixel shows the object."""
+DETAIL_PX = 2.0
+"""What a blur of this width removes is fine detail."""

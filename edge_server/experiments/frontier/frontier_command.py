@@ -28,6 +28,7 @@ from edge_server.experiments.frontier.update_time import (
     field_label,
     variants,
 )
+from edge_server.experiments.settings import LAYERS_S
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import FIELD, field_names, make_field
 from edge_server.machine import machine, versions
@@ -86,8 +87,6 @@ class Sweep:
 QUICK = Sweep(seeds=1, update_s=(0.1, 0.25, 0.5, 1.0, 2.0), run_s=4.0, moving=MovingScene(cameras=13, size=64))
 # Unlike QUICK, it measures the cost of a step with as many and as large views as the runs have.
 FULL = Sweep(seeds=3, update_s=(0.05, 0.1, 0.2, 0.5, 1.0, 2.0), run_s=8.0, moving=MovingScene(cameras=19, size=128))
-
-LAYERS_S = 0.02  # shortest update time of layers, as used in scenarios with layers
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -15,6 +15,7 @@ from typing import Any
 from edge_server.experiments.common.seed_table import TRAINING, Row
 from edge_server.experiments.engine.content_key import code_digest
 from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
+from edge_server.experiments.settings import TRAININGS
 from edge_server.experiments.studies.study import StudyRequest, open_engine
 from edge_server.experiments.studies.trial import Trial
 from edge_server.experiments.training.evaluation import Candidate, evaluate, fixed_candidates
@@ -28,8 +29,6 @@ SIZE = 64
 FOUR_VIEWPOINTS = ("cam00", "cam04", "cam09", "cam17")
 # Cameras that judge trained policies: they give no reward and no update uses them.
 REPORT = ("cam05", "cam08")
-# Number of repeated trainings, by whether it is a quick pass; their spread is part of the interval.
-TRAININGS = {True: 1, False: 3}
 
 
 @dataclass(frozen=True)

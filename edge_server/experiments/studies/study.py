@@ -13,13 +13,13 @@ from edge_server.experiments.common.seed_table import Row, SeedTable
 from edge_server.experiments.common.statistics import FALSE_DISCOVERY_RATE, Interval, all_of, discoveries
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.engine import Engine
+from edge_server.experiments.settings import LEAST_DB
 from edge_server.machine import commit
 from edge_server.progress import ProgressLine
 from edge_server.scheduler.learned.settings import W_S
 from freshfield.files import write_csv, write_text
 
 HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"
-LEAST_DB = 0.1
 
 
 class StudyError(RuntimeError):

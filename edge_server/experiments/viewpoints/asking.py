@@ -31,7 +31,6 @@ from freshfield.untrusted import read_bytes
 ANSWERS = "answers.json"
 SHOWN_S = 10.0  # time that the page has to fetch the plan, before the server ends
 ShowPlan = Callable[[list[str], bytes], None]
-VIEWS = 8  # views of a reconstruction, if the budget is only in meters
 
 
 def compare(

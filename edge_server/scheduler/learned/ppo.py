@@ -5,9 +5,9 @@ discount or bootstrapping. The two algorithms differ only in the action distribu
 categorical over omega), which the specification says.
 
     learner = Learner(Spec("select", StateLayout(("age",))), seed=1)
-    actions, logps = learner.act(states)
+    actions, logps = learner.actor.act(states, rng)
     rewards = [...]                                  # from fields that were actually fitted
-    learner.update(learner.batch(states, actions, logps, rewards))
+    learner.update(Batch(learner.spec.layout.batch(states), actions, logps, rewards))
 
 Same seed and same rewards give the same weights bit for bit: torch runs on one thread (the networks are too
 small for more), and random numbers are numpy's.
@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,6 @@ from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.actor import KIND, MAX_BYTES, Actor, read_spec
 from edge_server.scheduler.learned.clipped_update import Acted, UpdateFigures, clipped_update
 from edge_server.scheduler.learned.settings import Spec
-from edge_server.scheduler.learned.state import State
 from edge_server.torch_threads import one_torch_thread
 
 # Advantages that differ by less than this share of the rewards' standard deviation are errors of V.
@@ -48,6 +46,7 @@ _OUTLIER = 10.0
 _MEMORY = 4096
 # No measured reward is larger; its square would overflow.
 _MAX_REWARD = 1e100
+# Of random numbers; of "actions" nothing is drawn any more, and a seed keeps its others.
 _STREAMS = ("weights", "actions", "order")
 
 
@@ -106,28 +105,6 @@ class Learner:
         """The current actor, a copy in numpy that later updates do not change."""
         weights = {name: w.detach().numpy().copy() for name, w in self._actor.items()}
         return Actor(self.spec, weights, mean_features=self._mean_features.copy())
-
-    def act(self, states: Sequence[State], explore: bool = True) -> tuple[NDArray[Any], NDArray[np.float64]]:
-        """Actions, (B, N) bool or (B,) indices of omegas, and their log-probabilities (B,). Without
-        ``explore`` the most probable ones."""
-        return self.actor.act(states, self._rng["actions"] if explore else None)
-
-    def value(self, states: Sequence[State]) -> NDArray[np.float64]:
-        """V (B,), in the reward's unit."""
-        weights = {name: w.detach().numpy() for name, w in self._value.items()}
-        found = networks.value(np, weights, self.spec.layout.batch(states))
-        return self._rewards.mean + self._rewards.scale * found
-
-    def batch(
-        self,
-        states: Sequence[State],
-        actions: NDArray[Any],
-        logps: NDArray[np.float64],
-        rewards: Sequence[float | None] | NDArray[np.float64],
-    ) -> Batch:
-        """The batch for ``update``; arguments as in ``Batch``, a missing reward may be None."""
-        found = np.array([np.nan if r is None else r for r in rewards], np.float64)
-        return Batch(self.spec.layout.batch(states), np.asarray(actions), np.asarray(logps), found)
 
     # --- learning -----------------------------------------------------------------------------------
 

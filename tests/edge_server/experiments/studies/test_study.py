@@ -17,14 +17,14 @@ import yaml
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.common.statistics import Interval
+from edge_server.experiments.settings import TRAININGS
 from edge_server.experiments.studies import preferences, viewpoints
-from edge_server.experiments.studies import trial as trial_module
 from edge_server.experiments.studies.learned_schedulers import LEFT_OUT, WEIGHTED, WHICH_VIEWS
-from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT, TRAININGS
+from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT
 from edge_server.experiments.studies.registry import LEARNING, ON_A_CHANNEL, STUDIES
 from edge_server.experiments.studies.study import Claim, Finding, Study, StudyRequest, Verdict, judge, run_study
 from edge_server.experiments.studies.study_command import main
-from edge_server.experiments.studies.trial import Point, Trial, run_points, run_trial
+from edge_server.experiments.studies.trial import Trial, run_trial
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.rewards import f_w
 from tests.edge_server.experiments.rollouts.small import RAW
@@ -215,16 +215,6 @@ def test_the_readings_of_wait_differ_in_what_was_on_its_way():
     found = {p: run_trial(replace(slow, policy=p), NO_DATA) for p in ("wait", "wait-arrived")}
     assert found["wait-arrived"]["wait_ms"] == pytest.approx(240.0) and found["wait-arrived"]["views"] == 4.0
     assert found["wait"]["wait_ms"] > 300.0 and found["wait-arrived"]["aaoi_ms"] > 200.0
-
-
-def test_points_are_labeled_kept_and_not_run_again(tmp_path: Path, monkeypatch):
-    points = [Point({"x": v}, replace(TRIAL, value=v, steps=s)) for v, s in ((60.0, 4), (400.0, 4), (60.0, 5))]
-    rows = run_points(points, request(tmp_path))
-    assert [row["x"] for row in rows] == [60.0, 400.0, 60.0] and len({row["psnr_db"] for row in rows}) == 3
-    assert rows[0]["psnr_db"] == run_trial(points[0].trial, NO_DATA)["psnr_db"]
-    assert rows[0]["f_w"] is None, "without LPIPS"
-    monkeypatch.setattr(trial_module, "_decided", None)
-    assert run_points(points, request(tmp_path)) == rows
 
 
 def table_of(levels: Mapping[str, float], trainings: int = 3, seeds: int = 12, **labels: Any) -> SeedTable:

@@ -97,11 +97,6 @@ def test_only_a_first_batch_without_a_reward_ends_a_training(tmp_path: Path, mon
     assert not (tmp_path / "b/training.json").exists()
 
 
-def test_a_reward_that_cannot_be_had_is_refused_after_the_first_batch(tmp_path):
-    with pytest.raises(TrainingError, match=r"lpips.*edge.lpips: none"):
-        trained(tmp_path, config=dataclasses.replace(CONFIG, reward=make_reward("set")))
-
-
 def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, capsys):
     (tmp_path / "small.yaml").write_text(yaml.safe_dump(RAW))
     asked = "--kind threshold --omegas 50,200 --episodes 2 --size 24 --jobs 1"

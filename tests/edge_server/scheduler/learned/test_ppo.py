@@ -23,11 +23,14 @@ from tests.edge_server.scheduler.learned.problems import (
     OMEGAS_MS,
     FreshOnes,
     Waits,
+    act,
+    batch_of,
     collect,
     regret,
     same,
     state,
     teach,
+    value,
 )
 from tests.support import refused
 
@@ -54,9 +57,9 @@ def test_a_batch_of_one_decision_learns_against_the_value():
     teach(learner, Waits(), 1)
     for better in (1.0, -1.0):
         states = [Waits().draw(77).state]
-        actions, before = learner.act(states)
-        worth = learner.value(states) + better
-        learner.update(learner.batch(states, actions, before, worth))
+        actions, before = act(learner, states)
+        worth = value(learner, states) + better
+        learner.update(batch_of(learner, states, actions, before, worth))
         after = d.omega_log_probabilities(np, learner.actor.logits(learner.spec.layout.batch(states)))
         assert better * (after[0, actions[0]] - before[0]) > 0.0
 
@@ -72,7 +75,7 @@ def test_a_checkpoint_goes_on_bit_for_bit(tmp_path):
     assert same(through, resumed)
     assert (resumed.updates, resumed.decisions) == (4, 256)
     s = [state(6, np.random.default_rng(0))]
-    assert through.value(s) == resumed.value(s)
+    assert value(through, s) == value(resumed, s)
 
 
 @pytest.fixture(scope="module")
@@ -232,12 +235,12 @@ def finite(learner: Learner, diagnostics: Diagnostics | None = None) -> None:
 
 
 def decide_and_learn(learner: Learner, states: list[State], rewards=None) -> Diagnostics:
-    actions, logps = learner.act(states)
+    actions, logps = act(learner, states)
     assert np.isfinite(logps).all() and (logps <= 1e-9).all()
     given = np.random.default_rng(0).standard_normal(len(states)) if rewards is None else rewards
-    diagnostics = learner.update(learner.batch(states, actions, logps, given))
+    diagnostics = learner.update(batch_of(learner, states, actions, logps, given))
     finite(learner, diagnostics)
-    assert np.isfinite(learner.value(states)).all()
+    assert np.isfinite(value(learner, states)).all()
     return diagnostics
 
 
@@ -306,9 +309,9 @@ def test_ratios_that_overflow(spec, claimed):
     """Log-probabilities that another policy, or a damaged record, claims."""
     learner = Learner(spec, 0)
     states = [state(6, np.random.default_rng(i), d=4) for i in range(32)]
-    actions, _ = learner.act(states)
+    actions, _ = act(learner, states)
     rewards = np.random.default_rng(1).standard_normal(32)
     for _ in range(5):
-        finite(learner, learner.update(learner.batch(states, actions, np.full(32, claimed), rewards)))
-    diagnostics = learner.update(learner.batch(states, actions, np.full(32, np.nan), rewards))
+        finite(learner, learner.update(batch_of(learner, states, actions, np.full(32, claimed), rewards)))
+    diagnostics = learner.update(batch_of(learner, states, actions, np.full(32, np.nan), rewards))
     assert diagnostics.dropped == 32
