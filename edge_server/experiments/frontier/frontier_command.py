@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
-from camera_node.synthetic.scene import SCENES
 from edge_server.command import command_parser, run_command
 from edge_server.experiments.common.arguments import add_lpips, add_workers, at_least, parse_options
 from edge_server.experiments.engine import Engine, EngineError
@@ -139,10 +138,7 @@ def _run(args: argparse.Namespace) -> None:
         moves = args.scene == "room"
         charged, updates = _live(engine, workers, sweep, fields, options, weights) if moves else ({}, [])
     if not moves:
-        why = "it needs the exact truth at any instant, which only a synthetic scene has (--scene room)"
-        if args.scene in SCENES:
-            why = f"nothing moves in {args.scene}"
-        print(f"figure 2 left out: {why}", flush=True)
+        print("figure 2 left out: it needs a scene that moves, and its truth at any instant (--scene room)", flush=True)
     data = {
         "scene": still.describe(),
         "policy": POLICY,

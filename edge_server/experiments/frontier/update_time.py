@@ -126,7 +126,9 @@ class MovingRun:
     @property
     def steps(self) -> int:
         """Optimizer steps of an update: of layers those of its static field meanwhile."""
-        return static_steps(self.update_s) if self.variant.layers else steps_for(self.update_s, self.compute)
+        if self.variant.layers:
+            return max(1, round(STATIC_STEPS_PER_S * self.update_s))
+        return steps_for(self.update_s, self.compute)
 
     def setting(self) -> Setting:
         """The deployment that is run."""
@@ -170,11 +172,6 @@ def _factory(
 ) -> EpisodeFactory:
     run = MovingRun(moving, speed, Variant(field, layers, json.loads(options)), 0, 1.0, 1.0, ComputeConfig(1.0))
     return EpisodeFactory(run.setting(), Folders(lpips=weights))
-
-
-def static_steps(update_s: float) -> int:
-    """Steps of the static field of layers during one update."""
-    return max(1, round(STATIC_STEPS_PER_S * update_s))
 
 
 def steps_for(update_s: float, compute: ComputeConfig) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 
 from edge_server.experiments.common.seed_table import Curve, Row, SeedTable
 from edge_server.experiments.common.statistics import optimum
-from edge_server.experiments.studies.drawing import curves, draw_curve, instants
+from edge_server.experiments.studies.drawing import curves, instants
 from edge_server.experiments.studies.findings import interior, optimum_falls, optimum_grows
 from edge_server.experiments.studies.study import METRICS, Claim, Study, StudyRequest
 from edge_server.experiments.studies.trial import Point, recording, run_points, scenes_here, sweep
@@ -89,8 +89,8 @@ def _delay_cases(request: StudyRequest) -> list[Point]:
 
 def _draw_delay(request: StudyRequest, table: SeedTable) -> None:
     for (scene,) in table.distinct("scene"):
-        with figure(request.out / f"mat-delay-{scene}.png", 2, height_inch=2.8) as (_, axes):
-            top, bottom = axes[:, 0]
+        with figure(request.out / f"mat-delay-{scene}.png", 1, height_inch=3.6) as (_, axes):
+            at = axes[0, 0]
             delays = [delay for (delay,) in table.distinct("delay_ms")]
             for k, metric in enumerate(MAT_DELAY.metrics):
                 _, lower, _, least = METRICS[metric]
@@ -99,12 +99,8 @@ def _draw_delay(request: StudyRequest, table: SeedTable) -> None:
                 spread = [[o.x - o.low for o in best.values()], [o.high - o.x for o in best.values()]]
                 style: dict[str, Any] = {"marker": "o", "markersize": 4, "capsize": 2, "color": CYCLE[k]}
                 xs = [d * (1 + 0.02 * (k - 1.5)) for d in best]
-                top.errorbar(xs, [o.x for o in best.values()], spread, label=METRICS[metric].label, **style)
-            label_lines(top, "best threshold (ms)", None, f"{scene}: the best of the thresholds tried")
-            for k, delay in enumerate(delays):
-                curve = table.curve("gamma_ms", "psnr_moving_db", scene=scene, delay_ms=delay)
-                draw_curve(bottom, curve, f"{delay:g} ms", k)
-            label_lines(bottom, METRICS["psnr_moving_db"].label, "threshold (ms)")
+                at.errorbar(xs, [o.x for o in best.values()], spread, label=METRICS[metric].label, **style)
+            label_lines(at, "best threshold (ms)", "mean delay (ms)", f"{scene}: the best of the thresholds tried")
 
 
 MAT_DELAY = Study(

@@ -69,8 +69,6 @@ def _train(args: argparse.Namespace) -> None:
     config = _config(args, setting, folders)
     args.out.mkdir(parents=True, exist_ok=True)  # first, so that an error does not waste the work
     print(f"  rewarded from {', '.join(setting.rewarding)}")
-    if not setting.draws_motions:
-        print("  every episode has the same motion")
     say = partial(print, " ", flush=True)
     learner = train(setting, config, folders, args.jobs, args.out, say, args.ray)
     rows = read_log(args.out)

@@ -204,13 +204,10 @@ def _missing_reward_reason(outcomes: list[Outcome], found: list[RewardTerms]) ->
     """Why none of these outcomes has a reward, and what to change."""
     if not any(outcome.views for outcome in outcomes):
         return "nothing had arrived at any decision of the first batch: look at the scenario's channel"
-    missing = list(dict.fromkeys(name for r in found for name in r.missing))
-    hints = {
-        "lpips": "lpips: see --lpips, or leave it out with edge.lpips: none",
-        "psnr_moving": "psnr_moving: nothing moves where the held-out cameras look; --on whole",
-    }
-    return "no decision of the first batch has a reward, it lacks " + "; ".join(
-        hints.get(name, name) for name in missing
+    missing = dict.fromkeys(name for r in found for name in r.missing)
+    return (
+        f"no decision of the first batch has a reward, it lacks {', '.join(missing)} (lpips: see --lpips, or leave it "
+        "out with edge.lpips: none; psnr_moving: nothing moves where the held-out cameras look: --on whole)"
     )
 
 
@@ -243,18 +240,11 @@ class _Checkpoint:
             return None, []
         try:
             found = json.loads(path.read_text())
-            key, name, done = found["key"], str(found["weights"]), int(found["batches"])
-        except (ValueError, KeyError, TypeError):
-            raise TrainingError(f"{path}: damaged: choose another --out, or delete it") from None
-        if key != self.key:
-            raise TrainingError(
-                f"{self.out} holds a training with other settings or of another kind of processor: "
-                "choose another --out, or delete it"
-            )
-        try:
-            lines = (self.out / "training.jsonl").read_text().splitlines()[:done]
-            return Learner.load(self.out / name), [json.loads(line) for line in lines]
-        except (OSError, ValueError) as error:
+            if found["key"] != self.key:
+                raise ValueError("it is a training with other settings or of another kind of processor")
+            lines = (self.out / "training.jsonl").read_text().splitlines()[: int(found["batches"])]
+            return Learner.load(self.out / str(found["weights"])), [json.loads(line) for line in lines]
+        except (OSError, ValueError, KeyError, TypeError) as error:
             raise TrainingError(f"{self.out}: cannot go on: {error}: choose another --out, or delete it") from None
 
     def save(self, learner: Learner, rows: list[Row]) -> None:

@@ -9,7 +9,7 @@ from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, run_command
 from edge_server.experiments.common.arguments import OptionError, add_folders, at_least, folders_of
 from edge_server.experiments.settings import VIEWS
-from edge_server.experiments.viewpoints.asking import ANSWERS, compare, learn
+from edge_server.experiments.viewpoints.asking import ANSWERS, compare
 from edge_server.experiments.viewpoints.drawing import draw_plan
 from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
 from edge_server.fidelity.lpips_weights import open_lpips
@@ -17,7 +17,7 @@ from edge_server.fidelity.scorer import Scorer
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.capture_planner import Budget, plan_capture
 from edge_server.viewpoints.experts import TASTES
-from edge_server.viewpoints.policy import CandidatePolicy
+from edge_server.viewpoints.policy import CandidatePolicy, PolicyConfig, train_policy
 from edge_server.viewpoints.preference_session import PERSON
 from edge_server.viewpoints.registry import SELECTORS, make_selector
 from freshfield import transport
@@ -84,7 +84,7 @@ def _run(args: argparse.Namespace) -> None:
         agreed, repeated = session.agreement
         print(f"answered by {session.by}: {session.model.says()}; repeated pairs alike: {agreed} of {repeated}")
         if session.model.knows:
-            selector = learn(stage, session, views, args.seed)
+            selector, _ = train_policy(stage.candidates, session.model.reward, PolicyConfig(views=views), args.seed)
             selector.save(args.out / "policy.npz")
         else:
             print(f"planned by {selector.name} instead")

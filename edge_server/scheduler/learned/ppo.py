@@ -39,9 +39,6 @@ _MIN_ADVANTAGE_STD = 0.05
 # Rewards that vary by less than this share of their size, or of all rewards' standard deviation, are
 # constant.
 _CONSTANT = 1e-9
-# Rewards further from the mean than this many standard deviations are clipped to it. The deviation may grow
-# by the same factor in one batch, so that a real change of scale is followed.
-_OUTLIER = 10.0
 # Decisions that count in the running statistics, which follow a scene or a channel that changes.
 _MEMORY = 4096
 # No measured reward is larger; its square would overflow.
@@ -118,7 +115,6 @@ class Learner:
             return Diagnostics(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, None, dropped)
         rewards = batch.rewards[usable]
         mean = float(rewards.mean())
-        rewards = self._rewards.clipped(rewards)
         self._rewards.add(rewards)
         self.updates += 1
         self.decisions += len(rewards)
@@ -262,17 +258,6 @@ class _RunningMeanStd:
         """Standard deviation; 1 while nothing has varied."""
         spread = float(np.sqrt(self.variance))
         return spread if spread > _CONSTANT * abs(self.mean) else 1.0
-
-    def clipped(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """``values`` without outliers, judged by earlier ones; the first batch by its own median and
-        quartiles."""
-        middle, spread = self.mean, self.scale
-        if not self.count:
-            low, middle, high = np.percentile(values, (25, 50, 75))
-            spread = float(high - low)
-        if spread <= _CONSTANT * abs(middle) or (self.count and self.variance == 0.0):
-            return values
-        return np.clip(values, middle - _OUTLIER * spread, middle + _OUTLIER * spread)
 
     def standardized(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         return (values - self.mean) / self.scale
