@@ -23,7 +23,7 @@ Explain a decision of a learned policy (bandit:FILE): shares of the state's part
   edge-server explain runs/room                          # the newest decision
   edge-server explain runs/room --decision 123 --camera cam04
 
-A run keeps its newest decisions in RUN/decisions, and so does edge-server simulate with --out. Shares are
+A run keeps its newest decisions in RUN/decisions, and so does edge-server simulate with --out.
 Parts of the state have Shapley values of the action's logit, relative to the average camera in training: they
 sum to the difference. A camera's share is what the logit falls where it is an average one.
 Shares of regions are found by occluding them and embedding the image again; that needs a policy with
