@@ -23,8 +23,9 @@ Explain a decision of a learned policy (bandit:FILE): shares of the state's part
   edge-server explain runs/room                          # the newest decision
   edge-server explain runs/room --decision 123 --camera cam04
 
-A run keeps its newest decisions in RUN/decisions, and so does edge-server simulate with --out. Shares are
-Shapley values of the action's logit, relative to the average camera in training: they sum to the difference.
+A run keeps its newest decisions in RUN/decisions, and so does edge-server simulate with --out.
+Parts of the state have Shapley values of the action's logit, relative to the average camera in training: they
+sum to the difference. A camera's share is what the logit falls where it is an average one.
 Shares of regions are found by occluding them and embedding the image again; that needs a policy with
 embeddings in its state.
 """
@@ -103,13 +104,10 @@ def as_text(found: RecordedDecision, e: Explanation, camera: str | None, regions
         f"logit {e.logit:+.3f}; of average cameras {e.baseline_logit:+.3f})",
         "by part of the state",
         *(f"  {name:12} {share:+.3f}" for name, share in e.parts.items()),
-        "by camera (standard error)",
+        "by camera, if it were an average one",
     ]
     order = np.argsort(-np.abs(e.cameras))[:MAX_BARS]
-    lines += [f"  {e.names[i]:12} {e.cameras[i]:+.3f} ({e.cameras_error[i]:.3f})" for i in order]
-    if len(e.cameras) > MAX_BARS:
-        rest = e.cameras.sum() - e.cameras[order].sum()
-        lines.append(f"  {len(e.cameras) - MAX_BARS} others    {rest:+.3f}")
+    lines += [f"  {e.names[i]:12} {e.cameras[i]:+.3f}" for i in order]
     if camera is not None and regions is not None:
         row, column = np.unravel_index(int(np.abs(regions).argmax()), regions.shape)
         lines.append(
@@ -127,10 +125,10 @@ def draw(
     height = 1.4 + 0.16 * max(6, min(MAX_BARS, len(e.cameras)))
     with figure(path, 1, columns, height_inch=height) as (fig, axes):
         fig.suptitle(f"{e.action}: logit {e.logit:+.2f}, of average cameras {e.baseline_logit:+.2f}")
-        _bars(axes[0, 0], list(e.parts), np.array(list(e.parts.values())), None, "by part of the state")
+        _bars(axes[0, 0], list(e.parts), np.array(list(e.parts.values())), "by part of the state")
         order = np.argsort(-np.abs(e.cameras))[:MAX_BARS]
         names = [e.names[i] for i in order]
-        _bars(axes[0, 1], names, e.cameras[order], e.cameras_error[order], "by camera")
+        _bars(axes[0, 1], names, e.cameras[order], "by camera")
         if image is not None and regions is not None:
             at = axes[0, 2]
             at.imshow(image[..., :3])
@@ -142,10 +140,10 @@ def draw(
             at.set_axis_off()
 
 
-def _bars(axes: Any, names: list[str], shares: NDArray, errors: NDArray | None, title: str) -> None:
+def _bars(axes: Any, names: list[str], shares: NDArray, title: str) -> None:
     at = np.arange(len(names))
     colors = [BLUE if share >= 0 else VERMILION for share in shares]
-    axes.barh(at, shares, xerr=errors, color=colors, ecolor=GRAY, height=0.7)
+    axes.barh(at, shares, color=colors, height=0.7)
     axes.set_yticks(at, names)
     axes.invert_yaxis()
     axes.axvline(0.0, color=GRAY, linewidth=0.8)

@@ -96,7 +96,7 @@ class Threshold(Policy):
         return within_threshold(epoch, self.value)
 
 
-class Periodic(Policy):
+class Periodic(UseAll):
     """Periodic: use all views, but only at multiples of a period; what most systems do today."""
 
     name = "periodic"
@@ -109,9 +109,6 @@ class Periodic(Policy):
         if period_ns == 0:
             return SelectionWindow()
         return SelectionWindow(wait_until_ns=-(-epoch.now_ns // period_ns) * period_ns)
-
-    def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
-        return tuple(epoch.generated_ns)
 
 
 def freshest(epoch: Epoch, count: int) -> tuple[str, ...]:

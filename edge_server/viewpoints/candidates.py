@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 MOST_CANDIDATES = 10_000
+ELEVATIONS_DEG = 12.0, 80.0  # between which candidates lie
 
 
 class ViewpointError(ValueError):
@@ -66,14 +67,13 @@ def half_hemisphere(
     radius_m: float,
     lens: Pinhole,
     count: int,
-    elevations_deg: tuple[float, float] = (12.0, 80.0),
     azimuths_deg: tuple[float, float] = (-90.0, 90.0),
     offset: float = 0.5,
 ) -> Candidates:
     """``count`` viewpoints that cover a sector of a sphere evenly and look at its center.
 
     target: (3,) center of the sphere, meters. lens: intrinsics of the camera.
-    elevations_deg, azimuths_deg: of the sector; azimuth 0 is on the target's -y side, 90 on its +x side.
+    azimuths_deg: of the sector; azimuth 0 is on the target's -y side, 90 on its +x side.
     offset: shifts the azimuths, in parts of the sector: two sets of different offsets share no viewpoint.
 
     Raises ViewpointError unless ``count`` is 1 to MOST_CANDIDATES and ``radius_m`` is positive.
@@ -84,7 +84,7 @@ def half_hemisphere(
         )
     target = np.asarray(target, np.float64)
     k = np.arange(count)
-    low, high = np.sin(np.deg2rad(elevations_deg))
+    low, high = np.sin(np.deg2rad(ELEVATIONS_DEG))
     elevation = np.arcsin(low + (high - low) * (k + 0.5) / count)  # equal areas
     first, last = np.deg2rad(azimuths_deg)
     azimuth = first + (last - first) * ((offset + _GOLDEN * k) % 1.0)

@@ -123,7 +123,7 @@ def plan_capture(
     state = CaptureState(candidates, budget.views or len(reachable), rngs[1], fit)
     stops: list[Stop] = []
     refused: list[int] = []
-    free, equal = candidates.reachable.copy(), 0
+    free = candidates.reachable.copy()
     while len(stops) < state.views_wanted:
         travel = candidates.travel_m(stops[-1].candidate) if stops else np.zeros(len(candidates))
         left_m = np.inf if budget.path_m is None else budget.path_m - sum(s.travel_m for s in stops)
@@ -132,8 +132,7 @@ def plan_capture(
             break
         began = time.perf_counter()
         if stops:
-            k, stop, same = _choose(state, selector, travel, travel_weight)
-            equal += same
+            k, stop = _choose(state, selector, travel, travel_weight)
         else:
             k = first if free[first] else int(rngs[0].choice(np.flatnonzero(free)))
             stop = Stop(k, 0.0, 0.0, 0.0, "the first view")
@@ -150,14 +149,12 @@ def plan_capture(
         raise ViewpointError(
             f"all {len(refused)} reachable candidates were refused: is the camera working, and the way free?"
         )
-    note = _note(candidates, budget, stops, refused, equal)
+    note = _note(candidates, budget, stops, refused)
     return Plan(selector.name, tuple(stops), tuple(state.views), tuple(refused), note)
 
 
-def _choose(
-    state: CaptureState, selector: Selector, travel: NDArray[np.float64], weight: float
-) -> tuple[int, Stop, bool]:
-    """The next candidate, and whether all were of equal value: then the nearest one."""
+def _choose(state: CaptureState, selector: Selector, travel: NDArray[np.float64], weight: float) -> tuple[int, Stop]:
+    """The next candidate; where all are of equal value, the nearest one."""
     values = np.asarray(selector.values(state), np.float64)
     if values.shape != (len(state.candidates),):
         raise ViewpointError(
@@ -169,19 +166,14 @@ def _choose(
     same = bool(high - low <= _EQUAL * max(abs(low), abs(high), 1e-300))
     farthest = max(float(travel[state.open].max()), 1e-12)
     share = np.zeros(len(values)) if same else (values - low) / (high - low)
-    total = share - (weight or (1.0 if same else 0.0)) * travel / farthest
+    total = share - (weight or float(same)) * travel / farthest
     k = int(np.argmax(np.where(state.open, total, -np.inf)))
     rank = int((values[state.open] > values[k]).sum()) + 1
-    why = (
-        f"all {int(state.open.sum())} are of equal value: the nearest"
-        if same
-        else f"value {values[k]:.4g}, {rank}. of {int(state.open.sum())}; {travel[k]:.2f} m away"
-    )
-    shown = np.where(state.open, values, np.nan)
-    return k, Stop(k, float(values[k]), float(travel[k]), 0.0, why, shown), same
+    why = f"value {values[k]:.4g}, {rank}. of {int(state.open.sum())}; {travel[k]:.2f} m away"
+    return k, Stop(k, float(values[k]), float(travel[k]), 0.0, why, np.where(state.open, values, np.nan))
 
 
-def _note(candidates: Candidates, budget: Budget, stops: list[Stop], refused: list[int], equal: int) -> str:
+def _note(candidates: Candidates, budget: Budget, stops: list[Stop], refused: list[int]) -> str:
     """What people should know of a plan, in sentences."""
     words = []
     lost = int((~candidates.reachable).sum())
@@ -193,6 +185,4 @@ def _note(candidates: Candidates, budget: Budget, stops: list[Stop], refused: li
         used_up = budget.path_m is not None and len(stops) + len(refused) < int(candidates.reachable.sum())
         reason = "the path is used up" if used_up else "no candidate is left"
         words.append(f"Only {len(stops)} of {budget.views} views: {reason}.")
-    if equal and equal >= len(stops) - 1:
-        words.append("All candidates were of equal value: the nearest one was taken each time.")
     return " ".join(words)

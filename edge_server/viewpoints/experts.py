@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.preference_model import Answer
+from edge_server.viewpoints.settings import DETAIL_PX, OBJECT_DIFFERS
 
 Picture = NDArray[np.float32]
-_OBJECT = 0.08  # difference of a color from the background's, from which a pixel shows the object
-_BLUR_PX = 2.0
 
 
 def edges(rendering: Picture, truth: Picture) -> float:
@@ -30,7 +29,7 @@ def whole_object(rendering: Picture, truth: Picture) -> float:
     """How well the object itself looks: the mean squared difference over its pixels, negated. The background
     is the color of the corners."""
     corners = np.stack([truth[0, 0], truth[0, -1], truth[-1, 0], truth[-1, -1]])
-    shows = np.abs(truth - np.median(corners, axis=0)).max(axis=-1) > _OBJECT
+    shows = np.abs(truth - np.median(corners, axis=0)).max(axis=-1) > OBJECT_DIFFERS
     difference = ((rendering - truth) ** 2).mean(axis=-1)
     return -float(difference[shows].mean() if shows.any() else difference.mean())
 
@@ -49,9 +48,8 @@ class SimulatedExpert:
     """Answers by its taste and its habits.
 
     taste: one of ``TASTES``. scores: (N,), scores of the reconstructions, by ``judge``.
-    rng: draws mistakes and laziness.
+    rng: draws mistakes.
     wrong: share of answers that are the opposite of what the taste says.
-    lazy: share of pairs that it does not look at: it takes the first one.
     contradicts: whether it answers at random.
     """
 
@@ -59,7 +57,6 @@ class SimulatedExpert:
     scores: NDArray[np.float64]
     rng: np.random.Generator
     wrong: float = 0.0
-    lazy: float = 0.0
     contradicts: bool = False
     asked: list[Answer] = field(default_factory=list)
 
@@ -67,20 +64,13 @@ class SimulatedExpert:
     def label(self) -> str:
         """Who answered, for every record and figure."""
         habits = [f"{100 * self.wrong:g} % wrong"] if self.wrong else []
-        habits += [f"{100 * self.lazy:g} % lazy"] if self.lazy else []
         habits += ["contradicting"] if self.contradicts else []
         return f"simulated expert ({', '.join([self.taste, *habits])})"
 
-    def taste_prefers(self, first: int, second: int) -> bool:
-        """What it would say if it made no mistakes."""
-        return bool(self.scores[first] >= self.scores[second])
-
     def answer(self, first: int, second: int) -> Answer:
         """Its answer to a pair, kept in ``asked``."""
-        draw = self.rng.random(3)  # as many for every pair, whatever the habits
-        prefers = self.taste_prefers(first, second) != bool(draw[0] < self.wrong)
-        if draw[1] < self.lazy:
-            prefers = True
+        draw = self.rng.random(3)  # as many for every pair, whatever the habits: a seed keeps its answers
+        prefers = bool(self.scores[first] >= self.scores[second]) != bool(draw[0] < self.wrong)
         if self.contradicts:
             prefers = bool(draw[2] < 0.5)
         self.asked.append(Answer(first, second, prefers))
@@ -104,4 +94,4 @@ def _gradient(picture: Picture) -> Picture:
 
 
 def _detail(picture: Picture) -> Picture:
-    return picture - cv2.GaussianBlur(picture, (0, 0), _BLUR_PX)
+    return picture - cv2.GaussianBlur(picture, (0, 0), DETAIL_PX)

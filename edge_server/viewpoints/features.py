@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import Candidates
+from edge_server.viewpoints.settings import LIKENESS_RAD
 
 Array = NDArray[np.float64]
 
-# Widths of the likeness of two directions, exp(-(angle / width)^2): fine detail needs near views, the whole
-# needs any.
-_WIDTHS_RAD = (0.25, 0.5, 1.0)
 GEOMETRY = (
-    *(f"{n} within {w:g} rad" for w in _WIDTHS_RAD for n in ("first view", "second view")),
+    *(f"{n} within {w:g} rad" for w in LIKENESS_RAD for n in ("first view", "second view")),
     "way",
     "x",
     "y",
@@ -38,7 +36,7 @@ class StepFeatures:
     def __post_init__(self) -> None:
         d = self.candidates.directions
         angle = np.arccos(np.clip(d @ d.T, -1.0, 1.0))
-        alike = np.stack([np.exp(-((angle / width) ** 2)) for width in _WIDTHS_RAD])
+        alike = np.stack([np.exp(-((angle / width) ** 2)) for width in LIKENESS_RAD])
         way = np.stack([self.candidates.travel_m(k) for k in range(len(d))])
         at = self.candidates.poses[:, :3, 3] - self.candidates.target
         place = at / max(float(np.linalg.norm(at, axis=1).mean()), 1e-12)

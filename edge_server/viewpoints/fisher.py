@@ -1,4 +1,8 @@
-"""FisherRF (Jiang et al. 2024): prefers the view with most information about Gaussians still uncertain."""
+"""FisherRF (Jiang et al. 2024): prefers the view with most information about Gaussians still uncertain.
+
+With noise of variance 1 on every color of every pixel, the Fisher information about a parameter is the variance of its
+gradient of the squared error over random images: it is estimated from that of some black and white ones.
+"""
 
 from __future__ import annotations
 
@@ -8,49 +12,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.camera_rows import camera_rows
+from edge_server.fields.common.trainer_settings import BETA1
 from edge_server.fields.splat.buffers import RasterBuffers
+from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, age_corrections
+from edge_server.fields.splat.kernels.rasterize import Targets
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.viewpoints.candidates import ViewpointError
-from edge_server.viewpoints.kernels.fisher_information import MOMENTS, fisher_information
 from edge_server.viewpoints.registry import CaptureState
-from edge_server.viewpoints.settings import CAMERAS_A_RUN, PRIOR
+from edge_server.viewpoints.settings import PRIOR, RANDOM_IMAGES
 from freshfield.geometry import Pinhole
 
 
 def information(
-    snapshot: SplatSnapshot, poses: Sequence[NDArray[np.float64]], lenses: Sequence[Pinhole]
+    snapshot: SplatSnapshot,
+    poses: Sequence[NDArray[np.float64]],
+    lenses: Sequence[Pinhole],
+    images: int = RANDOM_IMAGES,
 ) -> Iterator[NDArray[np.float32]]:
-    """The diagonal of the Fisher information about N Gaussians of P parameters, float32 (N, P), for each
-    camera in turn: the sum over pixels and colors of squared derivatives, for noise of variance 1.
-
-    Raises ViewpointError for view-dependent colors.
-    """
-    gaussians = snapshot.gaussians
-    if gaussians.sh_degree > 0:
-        raise ViewpointError("Fisher information is known for splats with sh_degree: 0 only")
-    raster = RasterBuffers(snapshot.pool)
-    moments = np.zeros((snapshot.pool.threads, len(gaussians.params), MOMENTS))
-    for first in range(0, len(poses), CAMERAS_A_RUN):
-        some = slice(first, first + CAMERAS_A_RUN)
-        cams = camera_rows(poses[some], lenses[some], snapshot.box)
+    """The diagonal of the Fisher information about N Gaussians of P parameters, float32 (N, P), for each camera in
+    turn: the sum over pixels and colors of squared derivatives, as ``images`` random images estimate it."""
+    gaussians = snapshot.copied().gaussians  # a step clamps them
+    count, width = gaussians.params.shape
+    raster, still = RasterBuffers(snapshot.pool), np.zeros(width, np.float32)
+    rule = AdamParameters(still, age_corrections(), np.float32(1.0))
+    for pose, lens in zip(poses, lenses):
+        cams, pixels = camera_rows([pose], [lens], snapshot.box), lens.width * lens.height
         raster.project_and_bin(cams, gaussians)
-        found = np.empty((len(cams), *gaussians.params.shape), np.float32)
-        snapshot.pool.run(
-            fisher_information,
-            cams,
-            gaussians,
-            raster.columns,
-            raster.rows,
-            raster.projected,
-            raster.lists,
-            raster.sums,
-            snapshot.background,
-            raster.memory,
-            raster.saved,
-            moments,
-            found,
-        )
-        yield from found
+        rng, gradients = np.random.default_rng(0), np.empty((images, count, width), np.float32)
+        for gradient in gradients:
+            targets = Targets(
+                first=np.array([0, pixels]),
+                size=np.array([[lens.width, lens.height]]),
+                pixels=rng.integers(2, size=(pixels, 3), dtype=np.uint8) * np.uint8(255),
+                weight=np.zeros(0, np.float32),
+                behind=np.zeros((0, 3), np.float32),
+                background=snapshot.background,
+            )
+            raster.train(targets, 0)
+            sums = (np.zeros(count, np.float32) for _ in range(3))
+            first, second = np.zeros((2, count, width), np.float32)
+            raster.step(cams, gaussians, OptimizerState(first, second, np.zeros(count, np.int32), *sums), rule)
+            gradient[:] = first / (1.0 - BETA1)  # Adam's first moment after one step
+        yield gradients.var(axis=0, ddof=1)
 
 
 class FisherRF:

@@ -187,8 +187,8 @@ def train_policy(
     returns: list[float] = []
     with one_torch_thread():
         for _ in range(config.updates):
-            batch = _episodes(rows, reward, scale, config, _numpy(actor), _numpy(critic), spec, rng)
-            returns.append(batch["mean"])
+            mean, batch = _episodes(rows, reward, scale, config, _numpy(actor), _numpy(critic), spec, rng)
+            returns.append(mean)
             _improve(batch, actor, critic, adam, spec, rng)
     return CandidatePolicy(spec, _numpy(actor), embed), returns
 
@@ -202,13 +202,13 @@ def _episodes(
     critic: dict[str, Any],
     spec: Spec,
     rng: np.random.Generator,
-) -> dict[str, Any]:
-    """Episodes side by side: features, open candidates, actions, log-probabilities, returns and values of all
-    steps but the first, whose view is drawn."""
+) -> tuple[float, list[NDArray[Any]]]:
+    """Episodes side by side: their mean return; and features, closed candidates, actions, log-probabilities, returns
+    and values of all steps but the first, whose view is drawn."""
     count, way = config.episodes, GEOMETRY.index("way")
     usable = np.flatnonzero(rows.steps.candidates.reachable)
     orders = [[int(k)] for k in rng.choice(usable, count)]
-    kept: list[tuple[NDArray[Any], ...]] = []
+    steps: list[tuple[NDArray[Any], ...]] = []
     for _ in range(config.views - 1):
         features = np.stack([rows.features(order) for order in orders])
         closed = np.tile(~rows.steps.candidates.reachable, (count, 1))
@@ -220,26 +220,19 @@ def _episodes(
         taken = np.stack([rows.steps.actions(order)[k] for order, k in zip(orders, chosen)])
         gained = reward(taken) / scale - config.way * taken[:, way] / rows.far_m
         values = networks.value(np, critic, features)
-        kept.append((features, closed, chosen, logps[np.arange(count), chosen], gained, values))
+        steps.append((features, closed, chosen, logps[np.arange(count), chosen], gained, values))
         for order, k in zip(orders, chosen):
             order.append(int(k))
-    features, closed, chosen, logps, gained, values = (np.stack(part) for part in zip(*kept))
+    features, closed, chosen, logps, gained, values = (np.stack(part) for part in zip(*steps))
     total, returns = np.zeros(count), np.zeros_like(gained)
     for t in reversed(range(len(gained))):
         total = returns[t] = gained[t] + total
-    return {
-        "features": features.reshape(-1, *features.shape[2:]),
-        "closed": closed.reshape(-1, closed.shape[-1]),
-        "chosen": chosen.ravel(),
-        "logps": logps.ravel(),
-        "returns": returns.ravel(),
-        "values": values.ravel(),
-        "mean": float(gained.sum(axis=0).mean()),
-    }
+    kept = (features, closed, chosen, logps, returns, values)
+    return float(gained.sum(axis=0).mean()), [part.reshape(-1, *part.shape[2:]) for part in kept]
 
 
 def _improve(
-    batch: dict[str, Any],
+    batch: list[NDArray[Any]],
     actor: dict[str, Any],
     critic: dict[str, Any],
     adam: Any,
@@ -251,14 +244,9 @@ def _improve(
 
     from edge_server.scheduler.learned.clipped_update import Acted, clipped_update
 
-    raw = batch["returns"] - batch["values"]
-    acted = Acted(
-        torch.tensor(batch["logps"]),
-        torch.tensor((raw - raw.mean()) / max(raw.std(), 1e-9)),
-        torch.tensor(batch["returns"]),
-    )
-    features = torch.tensor(batch["features"])
-    closed, chosen = torch.tensor(batch["closed"]), torch.tensor(batch["chosen"])
+    features, closed, chosen, logps, returns, values = (torch.tensor(part) for part in batch)
+    raw = returns - values
+    acted = Acted(logps, (raw - raw.mean()) / max(raw.std(correction=0).item(), 1e-9), returns)
 
     def evaluate(some: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         logits = networks.logits(torch, spec, actor, features[some])

@@ -1,8 +1,7 @@
 """Reward model of pairwise preferences: Bradley-Terry (4.11-4.13), linear, with Laplace's approximation.
 
 The reward of a step is w . phi(s, a), so that a trajectory's is w . x with x = sum_t phi (4.12). The weights
-have a normal prior, whose width the answers themselves choose (evidence); the posterior is normal about the
-best weights. From it follow how sure a prediction is, which pair to ask next, and whether the answers say
+have a normal prior, whose width the answers themselves choose (evidence). From it follows whether the answers say
 anything at all: whether they are likelier under the model than under a coin.
 """
 
@@ -19,9 +18,6 @@ from edge_server.viewpoints.settings import LEAST_ODDS, WIDTHS
 Array = NDArray[np.float64]
 
 _NEWTON_STEPS = 50
-_UNBIASED = 3
-_NODES, _NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
-_NODE_WEIGHTS = _NODE_WEIGHTS / _NODE_WEIGHTS.sum()
 
 
 @dataclass(frozen=True)
@@ -36,17 +32,16 @@ class Answer:
 
 @dataclass(frozen=True)
 class RewardModel:
-    """The posterior after some answers.
+    """The most probable weights after some answers.
 
     scale: (d,) by which features are divided.
-    mean, covariance: (d,) and (d, d), of the weights of scaled features.
+    weights: (d,), of scaled features.
     odds: how much likelier the answers are under the model than by a coin.
     answers: number of answers.
     """
 
     scale: Array
-    mean: Array
-    covariance: Array
+    weights: Array
     odds: float
     answers: int
 
@@ -68,30 +63,12 @@ class RewardModel:
         )
 
     def reward(self, features: Array) -> Array:
-        """(...) the mean reward of features (..., d): of steps, or of whole trajectories."""
-        return (features / self.scale) @ self.mean
-
-    def probability(self, features: Array, first: NDArray[np.int64], second: NDArray[np.int64]) -> Array:
-        """(M,) probability that each first trajectory is preferred, averaged over the posterior.
-
-        features: (N, d) of the trajectories. first, second: (M,) their numbers.
-        """
-        return _expected(*self._difference(features, first, second))[0]
-
-    def information(self, features: Array, first: NDArray[np.int64], second: NDArray[np.int64]) -> Array:
-        """(M,) nats that the answer to each pair is expected to give about the weights: the entropy of the
-        answer less what would remain if the weights were known. Arguments as in ``probability``."""
-        mean, entropy = _expected(*self._difference(features, first, second))
-        return _entropy(mean) - entropy
-
-    def _difference(self, features: Array, first: NDArray[np.int64], second: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Mean and variance (M,) of the differences of rewards."""
-        x = (features[first] - features[second]) / self.scale
-        return x @ self.mean, np.einsum("md,de,me->m", x, self.covariance, x)
+        """(...) the reward of features (..., d): of steps, or of whole trajectories."""
+        return (features / self.scale) @ self.weights
 
 
 def fit_reward(features: Array, answers: list[Answer]) -> RewardModel:
-    """The posterior of the weights. features: (N, d), one row per trajectory, by the numbers in ``answers``.
+    """The model after ``answers``. features: (N, d), one row per trajectory, by the numbers in ``answers``.
     Raises ViewpointError for features that are not finite or answers about unknown trajectories."""
     features = np.asarray(features, np.float64)
     if features.ndim != 2 or len(features) < 2 or not np.isfinite(features).all():
@@ -109,27 +86,24 @@ def fit_reward(features: Array, answers: list[Answer]) -> RewardModel:
     x = (features[first] - features[second]) / scale
     votes = np.concatenate([y, 1.0 - y])
     x, votes = np.concatenate([x, -x])[votes > 0.0], votes[votes > 0.0]
-    found = [(*_laplace(x, votes, width), width) for width in WIDTHS]
-    evidence = np.array([log_evidence for _, _, log_evidence, _ in found])
-    mean, covariance, _, _ = found[int(np.argmax(evidence))]
+    found = [_laplace(x, votes, width) for width in WIDTHS]
+    evidence = np.array([log_evidence for _, log_evidence in found])
     # The widths are equally likely beforehand: the odds are those of their average.
     highest = evidence.max()
     log_odds = highest + np.log(np.mean(np.exp(evidence - highest))) + len(answers) * np.log(2.0)
-    return RewardModel(scale, mean, covariance, float(np.exp(min(log_odds, 700.0))), len(answers))
+    best, _ = found[int(np.argmax(evidence))]
+    return RewardModel(scale, best, float(np.exp(min(log_odds, 700.0))), len(answers))
 
 
-def next_pair(model: RewardModel, features: Array, rng: np.random.Generator, pairs: int = 500) -> tuple[int, int]:
-    """The most informative of ``pairs`` random pairs of trajectories. Every ``_UNBIASED``-th question takes a
-    random pair instead: on doubtful pairs alone, honest answers look like contradictions."""
-    first = rng.integers(len(features), size=1 if model.answers % _UNBIASED == 0 else pairs)
-    second = (first + 1 + rng.integers(len(features) - 1, size=len(first))) % len(features)
-    best = int(np.argmax(model.information(features, first, second)))
-    return int(first[best]), int(second[best])
+def random_pair(count: int, rng: np.random.Generator) -> tuple[int, int]:
+    """Two different ones of ``count`` trajectories. Pairs of which the model is least sure teach it no more."""
+    first, second = rng.choice(count, 2, replace=False).tolist()
+    return first, second
 
 
-def _laplace(x: Array, votes: Array, width: float) -> tuple[Array, Array, float]:
-    """Best weights (d,), their covariance (d, d), and the log evidence of answers that all prefer what
-    ``x`` (M, d) says, with ``votes`` (M,)."""
+def _laplace(x: Array, votes: Array, width: float) -> tuple[Array, float]:
+    """Best weights (d,), and the log evidence of answers that all prefer what ``x`` (M, d) says, with ``votes``
+    (M,)."""
     count = x.shape[1]
     precision = np.eye(count) / width**2
     w = np.zeros(count)
@@ -151,18 +125,4 @@ def _laplace(x: Array, votes: Array, width: float) -> tuple[Array, Array, float]
     p = 0.5 * (1.0 + np.tanh(0.5 * (x @ w)))
     hessian = precision + (x * (votes * p * (1.0 - p))[:, None]).T @ x
     log_det = float(np.linalg.slogdet(hessian)[1])
-    covariance = np.asarray(np.linalg.inv(hessian), np.float64)
-    return w, covariance, -now - 0.5 * log_det - count * float(np.log(width))
-
-
-def _expected(mean: Array, variance: Array) -> tuple[Array, Array]:
-    """The means (M,), over a normal, of the logistic function and of its entropy, by quadrature."""
-    at = mean[:, None] + np.sqrt(np.maximum(variance, 0.0))[:, None] * _NODES
-    p = 0.5 * (1.0 + np.tanh(0.5 * at))
-    return p @ _NODE_WEIGHTS, _entropy(p) @ _NODE_WEIGHTS
-
-
-def _entropy(p: Array) -> Array:
-    """Nats."""
-    q = np.clip(p, 1e-12, 1.0 - 1e-12)
-    return -(q * np.log(q) + (1.0 - q) * np.log1p(-q))
+    return w, -now - 0.5 * log_det - count * float(np.log(width))

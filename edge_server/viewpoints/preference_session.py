@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import ViewpointError
-from edge_server.viewpoints.preference_model import Answer, RewardModel, fit_reward, next_pair
+from edge_server.viewpoints.preference_model import Answer, RewardModel, fit_reward, random_pair
 from edge_server.viewpoints.settings import REMEMBERED, REPEAT_EVERY
 
 KIND: Literal["freshfield preference answers"] = "freshfield preference answers"
@@ -112,10 +112,7 @@ class PreferenceSession:
         if n % REPEAT_EVERY == REPEAT_EVERY - 1 and new:
             k = int(rng.choice(new[: max(len(new) - REMEMBERED, 1)]))
             return Question(self.answers[k].right, self.answers[k].left, k)
-        pair = next_pair(self.model, self.features, rng)
-        # Both orders of a pair are equally informative up to rounding, which would put the better one left.
-        left, right = rng.permutation(pair).tolist()
-        return Question(left, right)
+        return Question(*random_pair(len(self.orders), rng))
 
     @property
     def agreement(self) -> tuple[int, int]:

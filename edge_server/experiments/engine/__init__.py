@@ -12,10 +12,11 @@ processes or on a Ray cluster, and are appended to the file as they come, so tha
 computes only what is missing. Without a file nothing is kept.
 
 *When a result is known.* Its key is a hash of the input, of the contents of the files it reads
-(``files=lambda point: [folder / point.data]``; folders with all that is in them), of the syntax trees of ``measure``'s
-module and all modules that it imports, directly or not (docstrings, comments and formatting do not count), of the
-versions of the packages that compute, and of the kind of processor, since kernels compiled for another kind round
-differently. So a result of older code or changed data is never reused, and nothing has to be deleted by hand.
+(``files=lambda point: [folder / point.data]``; folders with all that is in them), of the syntax trees of this project's
+modules, but of a few folders that compute nothing, and of ``measure``'s (docstrings, comments and formatting do not
+count), of the versions of the packages that compute, and of the kind of processor, since kernels compiled for another
+kind round differently. So a result of older code or changed data is never reused, and nothing has to be deleted by
+hand.
 
 *What is not part of the key.* Arguments bound by ``functools.partial(measure, folders=folders)``: bind only where
 things lie, never what changes a result, and name the files themselves by ``files``.

@@ -8,7 +8,7 @@ import hashlib
 import json
 import platform
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,11 @@ import camera_node
 import channel_emu
 import edge_server
 import freshfield
+from edge_server.experiments.engine.settings import ASIDE
 from edge_server.machine import versions
 from freshfield.plugins import files_named
 
-_PACKAGES = {str(package.__name__): package for package in (freshfield, camera_node, channel_emu, edge_server)}
+_PACKAGES = (freshfield, camera_node, channel_emu, edge_server)
 _KEY_LENGTH = 40
 
 
@@ -112,68 +113,20 @@ def _file_digest(path: Path, size: int, changed_ns: int) -> str:
 
 
 @cache
-def code_digest(module: str) -> str:
-    """Digest of the code that a module runs: the syntax trees of the module and of all modules of this project
-    that it imports, directly or not, at the top of a file or in a function. Docstrings and formatting do not count.
-
-    A module that imports others by a computed name (a registry) counts with everything below its folder.
-    """
+def code_digest(module: str = freshfield.__name__) -> str:
+    """Digest of the code that a module may run: the syntax trees of all modules of this project but those ``ASIDE``,
+    and of the module itself if it is a test's or a user's own. Docstrings and formatting do not count."""
     digest = hashlib.sha256()
-    for name in sorted(_closure(module)):
-        digest.update(f"{name}\0{_facts(name).tree}\n".encode())
+    roots = [Path(str(package.__file__)).parent for package in _PACKAGES]
+    files = {f"{root.name}/{file.relative_to(root)}": file for root in roots for file in sorted(root.rglob("*.py"))}
+    if module.split(".")[0] not in (root.name for root in roots):
+        files[module] = Path(str(sys.modules[module].__file__))
+    for name, file in files.items():
+        if not name.startswith(ASIDE):
+            tree = ast.parse(file.read_bytes())
+            _drop_docstrings(tree)
+            digest.update(f"{name}\0{ast.dump(tree)}\n".encode())
     return digest.hexdigest()
-
-
-def _closure(module: str) -> set[str]:
-    found, waiting = set[str](), [module]
-    while waiting:
-        name = waiting.pop()
-        if name not in found and _source(name) is not None:
-            found.add(name)
-            waiting += _facts(name).imports
-    return found
-
-
-@dataclasses.dataclass(frozen=True)
-class _Facts:
-    """Of one module: a digest of its syntax tree, and the names of what it imports, of which some are no modules."""
-
-    tree: str
-    imports: tuple[str, ...]
-
-
-@cache
-def _facts(module: str) -> _Facts:
-    path = _source(module)
-    assert path is not None
-    tree = ast.parse(path.read_bytes())
-    _drop_docstrings(tree)
-    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    digest = hashlib.sha256(ast.dump(tree).encode()).hexdigest()
-    # The library's names lead from there to all programs, and no program uses them.
-    imports = () if module == freshfield.__name__ else tuple(dict.fromkeys(_imports(tree, module, package)))
-    return _Facts(digest, imports)
-
-
-def _imports(tree: ast.Module, module: str, package: str) -> Iterator[str]:
-    if parent := module.rpartition(".")[0]:  # importing a module runs its packages first
-        yield parent
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            yield node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
-        elif isinstance(node, ast.Call) and "import_module" in (vars(node.func).get("attr"), vars(node.func).get("id")):
-            yield from _below(package)
-
-
-def _below(package: str) -> Iterator[str]:
-    """The modules of a package and of those within it."""
-    path = _source(package)
-    for file in sorted(path.parent.rglob("*.py")) if path is not None else ():
-        inner = file.relative_to(path.parent).with_suffix("").parts  # type: ignore[union-attr]
-        yield ".".join((package, *inner)).removesuffix(".__init__")
 
 
 def _drop_docstrings(tree: ast.Module) -> None:
@@ -182,18 +135,3 @@ def _drop_docstrings(tree: ast.Module) -> None:
             node.body = [
                 s for s in node.body if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))
             ] or [ast.Pass()]
-
-
-@cache
-def _source(module: str) -> Path | None:
-    """The file of a module of this project, or of one that does not belong to a package and is loaded already (a
-    test's or a user's own); None: there is none, or it is somebody else's."""
-    root, *inner = module.split(".")
-    package = _PACKAGES.get(root)
-    if package is None:
-        loaded = getattr(sys.modules.get(module), "__file__", None)
-        if loaded is None or "site-packages" in loaded or loaded.startswith(sys.base_prefix):
-            return None
-        return Path(loaded)
-    path = Path(str(package.__file__)).parent.joinpath(*inner)
-    return next((p for p in (path.with_suffix(".py") if inner else path, path / "__init__.py") if p.is_file()), None)

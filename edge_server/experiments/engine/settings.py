@@ -1,6 +1,7 @@
 """Numbers of the engine that runs a function over many inputs.
 
-None changes a result: they say how work is shared out and what is done when a part of the machinery fails.
+None changes a result: they say how work is shared out, what is done when a part of the machinery fails, and when a
+result is known.
 """
 
 from __future__ import annotations
@@ -18,3 +19,6 @@ PARENT_EVERY_S = 0.5
 A parent that is killed cannot end its workers. Half a second costs nothing beside tasks of seconds, and nobody waits
 for it.
 """
+
+ASIDE = ("edge_server/page/", "edge_server/report/", "channel_emu/live/")
+"""Folders whose code changes no result of repeated work: what is kept stays known when it changes."""

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments.common.arguments import OptionError
-from edge_server.experiments.fitting import ctrl_c
 from edge_server.experiments.fitting.misfits import misfits
 from edge_server.experiments.scenes.multiview_still import WHITE, mean_baselines, open_still, score_views
 from edge_server.experiments.scenes.recorded import MultiviewStill
@@ -132,7 +131,7 @@ class Fit(ViewedField):
         step, are scored all the same."""
         began_s = time.perf_counter()
         report: FitReport | None = None
-        with ctrl_c.noted() as pressed, suppress(KeyboardInterrupt):
+        with suppress(KeyboardInterrupt):
             report = self.field.fit(self.data.training, Budget(seconds=until_s - self.spent_s))
         slice_s = time.perf_counter() - began_s
         usage = self._load_meter.row(0.0)
@@ -159,7 +158,7 @@ class Fit(ViewedField):
         self.rows.append(row)
         if progress is not None:
             progress(row)
-        return report is not None and not pressed.is_set()
+        return report is not None
 
     def resume(self, folder: Path, until_s: float) -> None:
         """Go on from what ``save`` wrote. Raises OptionError if there is nothing, or it has been fitted for

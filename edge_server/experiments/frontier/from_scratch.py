@@ -17,7 +17,6 @@ from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import PerceptualMetric, Scorer
 from edge_server.fields import Budget
 from edge_server.fields.registry import make_field
-from freshfield.machine_load import LoadMeter, outside_cores
 
 _MEDIANS = ("seconds", "steps", "ms_per_step", "psnr_db", "ssim", "lpips")
 
@@ -27,14 +26,12 @@ class Still:
     """A still scene: the name of a synthetic one, or the path of a data set.
 
     size: width and height in pixels of a synthetic scene.
-    holdout, scale, frame: as in ``load_recorded``, for a data set.
+    scale: as in ``load_recorded``, for a data set.
     """
 
     scene: str
     size: int = 128
-    holdout: str = "8"
     scale: float = 1.0
-    frame: int = 0
 
     @property
     def files(self) -> list[Path]:
@@ -59,7 +56,7 @@ def views_of(still: Still) -> MultiviewStill:
     """The views of a still scene. Raises ScenarioError or DatasetError."""
     if still.scene in SCENES:
         return synthetic_still(still.scene, size=still.size)
-    data = load_recorded(Path(still.scene), still.holdout, still.scale, still.frame)
+    data = load_recorded(Path(still.scene), scale=still.scale)
     return replace(data, held_out=data.held_out or data.training[:8], background=WHITE)
 
 
@@ -74,9 +71,7 @@ def fit_from_scratch(fit: Fit, weights: Path | None = None) -> dict[str, Any]:
     still = views_of(fit.still)
     model = make_field(fit.field, fit.options, seed=fit.seed)
     model.warm_up()
-    load = LoadMeter()
     report = model.fit(still.training, Budget(seconds=fit.seconds))
-    outside = outside_cores(load.row(0.0))
     score, _ = score_views(model, still.held_out, Scorer(lpips_of(weights), background=still.background))
     return {
         "seconds": report.seconds,
@@ -85,7 +80,6 @@ def fit_from_scratch(fit: Fit, weights: Path | None = None) -> dict[str, Any]:
         "psnr_db": score.psnr_db,
         "ssim": score.ssim,
         "lpips": score.lpips,
-        "outside_cores": outside,
     }
 
 
@@ -93,7 +87,7 @@ def curves(fits: Sequence[Fit], points: Sequence[Mapping[str, Any]]) -> list[dic
     """Medians over seeds of the points with the same field and planned seconds (``planned_s``), with ``on_front``:
     whether no other row with as little planned time has as high a PSNR."""
     rows = [{**point, "field": fit.field, "planned_s": fit.seconds} for fit, point in zip(fits, points)]
-    found = over_seeds(rows, ("field", "planned_s"), (*_MEDIANS, "outside_cores"), median_or_none)
+    found = over_seeds(rows, ("field", "planned_s"), _MEDIANS, median_or_none)
     mark_front(found)
     return found
 

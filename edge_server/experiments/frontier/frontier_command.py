@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
-from camera_node.synthetic.scene import SCENES
 from edge_server.command import command_parser, run_command
-from edge_server.experiments.common.arguments import add_lpips, add_workers, parse_options
+from edge_server.experiments.common.arguments import add_lpips, add_workers, at_least, parse_options
 from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.frontier import from_scratch, update_time
 from edge_server.experiments.frontier.from_scratch import Fit, Still
@@ -28,6 +27,7 @@ from edge_server.experiments.frontier.update_time import (
     field_label,
     variants,
 )
+from edge_server.experiments.settings import LAYERS_S
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import FIELD, field_names, make_field
 from edge_server.machine import machine, versions
@@ -40,7 +40,7 @@ Fidelity against time, in two figures.
 
   edge-server frontier --quick --out runs/frontier
   edge-server frontier --scene room --seeds 3 --lpips ~/data/lpips
-  edge-server frontier --scene ~/data/lego --scale 2 --holdout 8 --field all
+  edge-server frontier --scene ~/data/lego --scale 2 --field all
 
 1. From scratch: PSNR, SSIM and LPIPS on a held-out camera against seconds of fitting, for each
    representation, with the Pareto front marked. The time of a step on this machine is measured on the way.
@@ -75,35 +75,17 @@ class Sweep:
     """
 
     seeds: int
-    planned_s: tuple[float, ...]
-    speeds: tuple[float, ...]
     update_s: tuple[float, ...]
     run_s: float
-    size: int
     moving: MovingScene
+    planned_s: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)
+    speeds: tuple[float, ...] = (0.3, 1.0, 3.0)
+    size: int = 128
 
 
-QUICK = Sweep(
-    seeds=1,
-    planned_s=(0.5, 1.0, 2.0, 4.0, 8.0),
-    speeds=(0.3, 1.0, 3.0),
-    update_s=(0.1, 0.25, 0.5, 1.0, 2.0),
-    run_s=4.0,
-    size=128,
-    moving=MovingScene(cameras=13, size=64),
-)
+QUICK = Sweep(seeds=1, update_s=(0.1, 0.25, 0.5, 1.0, 2.0), run_s=4.0, moving=MovingScene(cameras=13, size=64))
 # Unlike QUICK, it measures the cost of a step with as many and as large views as the runs have.
-FULL = Sweep(
-    seeds=3,
-    planned_s=(0.5, 1.0, 2.0, 4.0, 8.0),
-    speeds=(0.3, 1.0, 3.0),
-    update_s=(0.05, 0.1, 0.2, 0.5, 1.0, 2.0),
-    run_s=8.0,
-    size=128,
-    moving=MovingScene(cameras=19, size=128),
-)
-
-LAYERS_S = 0.02  # shortest update time of layers, as used in scenarios with layers
+FULL = Sweep(seeds=3, update_s=(0.05, 0.1, 0.2, 0.5, 1.0, 2.0), run_s=8.0, moving=MovingScene(cameras=19, size=128))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -119,9 +101,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--quick", action="store_true", help="a smaller sweep: four minutes on two cores, not half an hour")
     add("--scene", default="room", metavar="NAME|DATA", help="scene: room, tile or a data set [%(default)s]")
-    add("--holdout", default="8", metavar="K|NAME,...", help="views of a data set to test on, as in fit [%(default)s]")
     add("--scale", type=float, default=1.0, metavar="K", help="divide image sizes of a data set by K [%(default)g]")
-    add("--frame", type=int, default=0, metavar="N", help="frame of a moving data set, from 0 [%(default)s]")
     add("--field", metavar="NAME,...|all", default=FIELD, help="representations [%(default)s]")
     add(
         "--option",
@@ -130,7 +110,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="KEY=VALUE",
         help="option of the field, as in fit; may be repeated",
     )
-    add("--seeds", type=int, metavar="N", help="number of seeds [1 with --quick, else 3]")
+    add("--seeds", type=at_least(1), metavar="N", help="number of seeds [1 with --quick, else 3]")
     add_workers(parser)
     add_lpips(parser)
     add("--out", type=out_folder, default="runs/frontier", metavar="DIR", help="folder to write [%(default)s]")
@@ -141,14 +121,12 @@ def _run(args: argparse.Namespace) -> None:
     """Measure the missing points, then write tables and figures."""
     sweep = QUICK if args.quick else FULL
     if args.seeds is not None:
-        if args.seeds < 1:
-            raise ValueError(f"--seeds {args.seeds}: expected 1 or more")
         sweep = replace(sweep, seeds=args.seeds)
     fields = field_names() if args.field == "all" else tuple(args.field.split(","))
     options = parse_options(args.option)
     for field in fields:
         make_field(field, options)  # rejects wrong options now, not between two measurements
-    scene = Still(args.scene, sweep.size, args.holdout, args.scale, args.frame)
+    scene = Still(args.scene, sweep.size, args.scale)
     begun, still = time.perf_counter(), from_scratch.views_of(scene)
     lpips, missing = open_lpips(args.lpips)
     weights = None if lpips is None else weights_folder(args.lpips)
@@ -160,10 +138,7 @@ def _run(args: argparse.Namespace) -> None:
         moves = args.scene == "room"
         charged, updates = _live(engine, workers, sweep, fields, options, weights) if moves else ({}, [])
     if not moves:
-        why = "it needs the exact truth at any instant, which only a synthetic scene has (--scene room)"
-        if args.scene in SCENES:
-            why = f"nothing moves in {args.scene}"
-        print(f"figure 2 left out: {why}", flush=True)
+        print("figure 2 left out: it needs a scene that moves, and its truth at any instant (--scene room)", flush=True)
     data = {
         "scene": still.describe(),
         "policy": POLICY,

@@ -32,10 +32,7 @@ def write_output(out: Path, data: Row) -> str:
 def table(rows: Sequence[Row]) -> str:
     """Table of representations and seconds with PSNR, SSIM and LPIPS; a star marks the Pareto front."""
     digits = {"seconds": 2, "steps": 0, "ms_per_step": 2, "psnr_db": 2, "ssim": 3, "lpips": 3}
-    cells = [
-        (row["field"], *(number(row[name], n) for name, n in digits.items()), "*" if row["on_front"] else "")
-        for row in rows
-    ]
+    cells = [[row["field"], *_cells(row, digits), "*" if row["on_front"] else ""] for row in rows]
     head = ("representation", "seconds", "steps", "ms a step", "PSNR, dB", "SSIM", "LPIPS", "")
     front = "* on the Pareto front: nothing measured is both faster and more accurate"
     return f"{markdown_table(head, cells)}\n{front}"
@@ -43,23 +40,16 @@ def table(rows: Sequence[Row]) -> str:
 
 def updates_table(rows: Sequence[Row]) -> str:
     """Table of the shown fidelity by speed and seconds per update."""
-    digits = {
-        "speed_m_per_s": 1,
-        "update_s": 2,
-        "steps": 0,
-        "aaoi_ms": 0,
-        "shown_psnr_db": 2,
-        "shown_psnr_moving_db": 2,
-        "shown_ssim": 3,
-        "shown_lpips": 3,
-    }
-    cells = [
-        (field_label(row["field"], row["layers"]), *(number(row[name], n) for name, n in digits.items()))
-        for row in rows
-    ]
+    digits = {"speed_m_per_s": 1, "update_s": 2, "steps": 0, "aaoi_ms": 0}
+    digits |= {"shown_psnr_db": 2, "shown_psnr_moving_db": 2, "shown_ssim": 3, "shown_lpips": 3}
+    cells = [[field_label(row["field"], row["layers"]), *_cells(row, digits)] for row in rows]
     head = "field|m/s|an update, s|steps|age, ms|shown, dB|moving|SSIM|LPIPS"
     about = "shown: at random instants, the newest publication carried on; age: of its views at publication"
     return f"{markdown_table(head.split('|'), cells)}\n{about}"
+
+
+def _cells(row: Row, digits: dict[str, int]) -> list[str]:
+    return [number(row[name], n) for name, n in digits.items()]
 
 
 def recommendation(rows: Sequence[Row]) -> str:

@@ -22,15 +22,12 @@ from edge_server.experiments.common.tables import mean_or_none, over_seeds
 from edge_server.experiments.rollouts.episode import EpisodeFactory
 from edge_server.experiments.rollouts.rollout import named, rollout
 from edge_server.experiments.rollouts.setting import Setting
+from edge_server.experiments.settings import COSTS_S, LEAD_S, STATIC_STEPS_PER_S
 from edge_server.experiments.virtual import costs
 from edge_server.fields.registry import option_help
 from edge_server.settings import LEAST_UPDATE_MS, ComputeConfig
 from freshfield.scenario import Scenario, parse
 
-# Seconds of virtual time in which costs are measured, and until what is shown counts.
-_COSTS_S, _LEAD_S = 1.0, 5.0
-# Steps per second of the static field of layers, which run on another core.
-_STATIC_STEPS_PER_S = 250.0
 # The network of the moving scene, and which views its updates use.
 CHANNEL, POLICY = "ch5", "all"
 # What a row has of what was shown: the names of ``Outcome``.
@@ -105,7 +102,7 @@ class Charged:
 
 def measure_compute(asked: Charged) -> dict[str, float]:
     """The time of updates on this machine, a ``ComputeConfig`` as a mapping (``edge-server costs``)."""
-    found: dict[str, float] = costs.measure(asked.moving.scenario(asked.speed, asked.variant), _COSTS_S)["compute"]
+    found: dict[str, float] = costs.measure(asked.moving.scenario(asked.speed, asked.variant), COSTS_S)["compute"]
     if asked.variant.layers:
         return found
     # An update of a cycle decodes the newest frame of each camera, however many have arrived.
@@ -124,12 +121,14 @@ class MovingRun:
     update_s: float
     seconds: float
     compute: ComputeConfig
-    lead_s: float = _LEAD_S
+    lead_s: float = LEAD_S
 
     @property
     def steps(self) -> int:
         """Optimizer steps of an update: of layers those of its static field meanwhile."""
-        return static_steps(self.update_s) if self.variant.layers else steps_for(self.update_s, self.compute)
+        if self.variant.layers:
+            return max(1, round(STATIC_STEPS_PER_S * self.update_s))
+        return steps_for(self.update_s, self.compute)
 
     def setting(self) -> Setting:
         """The deployment that is run."""
@@ -173,11 +172,6 @@ def _factory(
 ) -> EpisodeFactory:
     run = MovingRun(moving, speed, Variant(field, layers, json.loads(options)), 0, 1.0, 1.0, ComputeConfig(1.0))
     return EpisodeFactory(run.setting(), Folders(lpips=weights))
-
-
-def static_steps(update_s: float) -> int:
-    """Steps of the static field of layers during one update."""
-    return max(1, round(_STATIC_STEPS_PER_S * update_s))
 
 
 def steps_for(update_s: float, compute: ComputeConfig) -> int:

@@ -82,7 +82,8 @@ class DecisionEnv(gymnasium.Env[NDArray[np.float32], Any]):
             opened = dataclasses.replace(opened, source={**opened.source, "width": size, "height": size})
         folders = folders_from()
         made = Setting(opened, decisions=decisions, steps=steps, parts=parts, **setting)
-        self.reward, _ = reward_of(self.reward_name, on, folders.lpips, read_config(opened).lpips, distance)
+        network = "none" if distance == "none" else read_config(opened).lpips
+        self.reward, _ = reward_of(self.reward_name, on, folders.lpips, network)
         self.cameras = opened.training
         self._factory, self._layout = EpisodeFactory(made, folders), layout_of(made, parts)
         shape = (len(self.cameras), self._layout.width)

@@ -22,15 +22,13 @@ from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.engine import Engine
 from edge_server.experiments.rollouts.episode import SCORES, Choice, Episode, EpisodeFactory, Outcome
 from edge_server.experiments.rollouts.setting import Setting
+from edge_server.experiments.settings import SHOWN_EVERY_MS
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.scheduler import BANDIT, Epoch, Policy, make_policy, parse_policy
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.settings import read_config
-
-# Period of the instants at which the shown image is scored, in a running deployment.
-SHOWN_EVERY_MS = 125.0
 
 PolicyMaker = Callable[[np.random.Generator], Policy]
 
@@ -39,13 +37,11 @@ PolicyMaker = Callable[[np.random.Generator], Policy]
 class Decided:
     """A decision and its outcome, as plain values.
 
-    slot: number of the decision; those of one slot in several samples of an episode are comparable.
     outcomes: by the camera that scored.
     features, action, logp: what a learned policy saw ((N, width)), its action ((N,) bool, or the index of an omega) and
         its log-probability; None and 0 for other policies.
     """
 
-    slot: int
     outcomes: dict[str, Outcome]
     features: list[list[float]] | None = None
     action: Any = None
@@ -54,7 +50,8 @@ class Decided:
 
 @dataclass(frozen=True)
 class Run:
-    """One sample of an episode: its single decisions, or of a running deployment the outcome of all of it."""
+    """One sample of an episode: its single decisions in turn, which are comparable with those of other samples, or of a
+    running deployment the outcome of all of it."""
 
     decided: list[Decided]
     whole: Outcome | None = None
@@ -84,7 +81,7 @@ def _single_decisions(factory: EpisodeFactory, seed: int, policy: Policy, camera
         seen: tuple[Any, ...] = ()
         if (last := policy.last_decision) is not None:  # of a learned policy
             seen = last.actor.spec.layout.features(last.state).tolist(), last.action.tolist(), last.logp
-        decided.append(Decided(number, outcomes, *seen))
+        decided.append(Decided(outcomes, *seen))
     return Run(decided)
 
 

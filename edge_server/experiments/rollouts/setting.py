@@ -142,20 +142,15 @@ def seeds(run: int, purpose: str, count: int, first: int = 0) -> range:
     return range(start, start + count)
 
 
-def reward_of(
-    name: str, on: str, lpips_folder: Path | None, network: str = "alex", distance: str = "lpips"
-) -> tuple[Reward, str | None]:
-    """A preset reward, and why it has no LPIPS term (None if it has what was requested).
+def reward_of(name: str, on: str, lpips_folder: Path | None, network: str = "alex") -> tuple[Reward, str | None]:
+    """A preset reward, and why it has no LPIPS term (None if it has one).
 
     name: name of the preset.
     on: whole or moving, the pixels of the PSNR.
     lpips_folder: folder of the LPIPS weights.
     network: the scenario's edge.lpips.
-    distance: lpips or none.
     """
     reward = make_reward(name, fidelity=on)
-    if distance == "none":
-        return dataclasses.replace(reward, distance=0.0), None
     missing: str | None = "the scenario's edge.lpips is none"
     if network != "none":
         _, missing = open_lpips(lpips_folder)

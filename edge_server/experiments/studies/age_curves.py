@@ -9,7 +9,7 @@ import numpy as np
 
 from edge_server.experiments.common.seed_table import Curve, Row, SeedTable
 from edge_server.experiments.common.statistics import optimum
-from edge_server.experiments.studies.drawing import curves, draw_curve, instants
+from edge_server.experiments.studies.drawing import curves, instants
 from edge_server.experiments.studies.findings import interior, optimum_falls, optimum_grows
 from edge_server.experiments.studies.study import METRICS, Claim, Study, StudyRequest
 from edge_server.experiments.studies.trial import Point, recording, run_points, scenes_here, sweep
@@ -89,8 +89,8 @@ def _delay_cases(request: StudyRequest) -> list[Point]:
 
 def _draw_delay(request: StudyRequest, table: SeedTable) -> None:
     for (scene,) in table.distinct("scene"):
-        with figure(request.out / f"mat-delay-{scene}.png", 2, height_inch=2.8) as (_, axes):
-            top, bottom = axes[:, 0]
+        with figure(request.out / f"mat-delay-{scene}.png", 1, height_inch=3.6) as (_, axes):
+            at = axes[0, 0]
             delays = [delay for (delay,) in table.distinct("delay_ms")]
             for k, metric in enumerate(MAT_DELAY.metrics):
                 _, lower, _, least = METRICS[metric]
@@ -99,12 +99,8 @@ def _draw_delay(request: StudyRequest, table: SeedTable) -> None:
                 spread = [[o.x - o.low for o in best.values()], [o.high - o.x for o in best.values()]]
                 style: dict[str, Any] = {"marker": "o", "markersize": 4, "capsize": 2, "color": CYCLE[k]}
                 xs = [d * (1 + 0.02 * (k - 1.5)) for d in best]
-                top.errorbar(xs, [o.x for o in best.values()], spread, label=METRICS[metric].label, **style)
-            label_lines(top, "best threshold (ms)", None, f"{scene}: the best of the thresholds tried")
-            for k, delay in enumerate(delays):
-                curve = table.curve("gamma_ms", "psnr_moving_db", scene=scene, delay_ms=delay)
-                draw_curve(bottom, curve, f"{delay:g} ms", k)
-            label_lines(bottom, METRICS["psnr_moving_db"].label, "threshold (ms)")
+                at.errorbar(xs, [o.x for o in best.values()], spread, label=METRICS[metric].label, **style)
+            label_lines(at, "best threshold (ms)", "mean delay (ms)", f"{scene}: the best of the thresholds tried")
 
 
 MAT_DELAY = Study(
@@ -129,8 +125,6 @@ MAT_DELAY = Study(
 LAMBDAS = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 WAITS = (15.0, 30.0, 45.0, 60.0, 90.0, 120.0, 200.0, 300.0)
 QUICK_WAITS = (15.0, 45.0, 90.0, 150.0, 300.0)
-# Sums of ages: of all cameras at the edge, as in (5.8), or of the used views, as in (6.35).
-SUMS = {"all cameras (5.8)": "age_sum_ms", "used views (6.35)": "used_age_sum_ms"}
 
 
 def _lambda_cases(request: StudyRequest) -> list[Point]:
@@ -145,21 +139,18 @@ def _lambda_cases(request: StudyRequest) -> list[Point]:
     return [p for s in scenes for p in sweep(request, s, seeds, conditions, "omega_ms", omegas)]
 
 
-def loss(row: Row, metric: str, column: str, weight: float) -> float:
-    """(5.8) for one update: squared error in units of 0.01, plus the weighted sum of ages in seconds."""
-    age_ms = row["aaoi_ms"] * row["views"] if column == "used_age_sum_ms" else row[column]
-    return float(10.0 ** (-row[metric] / 10.0) / 0.01 + weight * age_ms / 1e3)
+def loss(row: Row, metric: str, weight: float) -> float:
+    """(5.8) for one update: squared error in units of 0.01, plus the weighted sum of all cameras' ages in seconds."""
+    return float(10.0 ** (-row[metric] / 10.0) / 0.01 + weight * row["age_sum_ms"] / 1e3)
 
 
 def _losses(table: SeedTable, metric: str, labels: Row) -> dict[float, Curve]:
     """lambda -> omega -> seed -> loss."""
-    labels = dict(labels)
-    column = SUMS[labels.pop("ages")]
     rows = [r for r in table.where(**labels) if r[metric] is not None and np.isfinite(r[metric])]
     found: dict[float, Curve] = {}
     for weight, row in product(LAMBDAS, rows):
         curve = found.setdefault(weight, {})
-        curve.setdefault(float(row["omega_ms"]), {})[row["seed"]] = loss(row, metric, column, weight)
+        curve.setdefault(float(row["omega_ms"]), {})[row["seed"]] = loss(row, metric, weight)
     return found
 
 
@@ -167,14 +158,11 @@ def _draw_lambda(request: StudyRequest, table: SeedTable) -> None:
     for (scene,) in table.distinct("scene"):
         with figure(request.out / f"lambda-{scene}.png", 1, height_inch=3.6) as (_, axes):
             at = axes[0, 0]
-            for k, (metric, policy, ages) in enumerate(product(LAMBDA.metrics, ("threshold", "wait"), SUMS)):
-                curves = _losses(table, metric, {"scene": scene, "policy": policy, "ages": ages})
+            for k, (metric, policy) in enumerate(product(LAMBDA.metrics, ("threshold", "wait"))):
+                curves = _losses(table, metric, {"scene": scene, "policy": policy})
                 best = [optimum(curve, True).x for curve in curves.values()]
-                label = f"{policy}, {METRICS[metric].label}, {ages}"
-                line = "-" if k < len(CYCLE) else "--"
-                at.plot(
-                    range(len(best)), best, line, marker="o", markersize=4, color=CYCLE[k % len(CYCLE)], label=label
-                )
+                label = f"{policy}, {METRICS[metric].label}"
+                at.plot(range(len(best)), best, marker="o", markersize=4, color=CYCLE[k], label=label)
             at.set_xticks(range(len(LAMBDAS)), [f"{w:g}" for w in LAMBDAS])
             per = "lambda (per 0.01 of squared error and second of age)"
             label_lines(at, "best omega (ms)", per, scene)
@@ -189,10 +177,10 @@ LAMBDA = Study(
     tuple(
         Claim(
             "a larger lambda buys freshness: the best omega falls (5.8).",
-            optimum_falls(_losses, "ages"),
-            where={"policy": policy, "ages": ages},
+            optimum_falls(_losses),
+            where={"policy": policy},
         )
-        for policy, ages in product(("threshold", "wait"), SUMS)
+        for policy in ("threshold", "wait")
     ),
     ("scene", "channel"),
     (_draw_lambda,),

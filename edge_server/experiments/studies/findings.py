@@ -25,20 +25,6 @@ from edge_server.experiments.studies.study import METRICS, Finding, Statistic
 NO_DELAY, USE_ALL = "no delay", "all"
 
 
-def no_delay_gain(table: SeedTable, metric: str, labels: Row) -> str:
-    """How much better no delay is than using all views: the limit of any scheduler's gain."""
-    _, lower, digits, least = METRICS[metric]
-    limit = table.values(metric, **{k: v for k, v in labels.items() if k in ("scene", "field")}, policy=NO_DELAY)
-    if not limit:
-        return "the limit without delay was not measured"
-    if metric == "aaoi_ms":
-        return f"with no delay it is {number(interval(limit.values()).mean, digits)}"
-    use_all = table.values(metric, **{**labels, "policy": USE_ALL})
-    gap = paired(use_all, limit) if lower else paired(limit, use_all)
-    nothing = " (nothing to win)" if gap.above(least) is False else ""
-    return f"no delay at all is {gap.text(digits)} better than use-all{nothing}"
-
-
 def interior(x: str) -> Statistic:
     """The curve over ``x`` is better somewhere inside than at both ends."""
 
@@ -50,7 +36,7 @@ def interior(x: str) -> Statistic:
         best = optimum(curve, lower)
         text = (
             f"best at {best.x:g}{best.spread}, {best.over_first.text(digits)} better than the smallest and "
-            f"{best.over_last.text(digits)} than the largest; {no_delay_gain(table, metric, labels)}."
+            f"{best.over_last.text(digits)} than the largest."
         )
         return Finding(text, (best.over_first, best.over_last))
 
@@ -86,7 +72,7 @@ def trend(x: str, rises: bool | None = None) -> Statistic:
         first, last = min(curve), max(curve)
         change = _gain(curve[last], curve[first], lower if rises is None else not rises)
         ends = (number(interval(curve[at].values()).mean, digits) for at in (first, last))
-        text = f"from {first:g} to {last:g}: {' to '.join(ends)}; {no_delay_gain(table, metric, labels)}."
+        text = f"from {first:g} to {last:g}: {' to '.join(ends)}."
         return Finding(text, (change,))
 
     return found
@@ -122,21 +108,20 @@ def optimum_grows(parameter: str, x: str) -> Statistic:
     return found
 
 
-def optimum_falls(curves: Any, apart: str) -> Statistic:
+def optimum_falls(curves: Any) -> Statistic:
     """The best x falls as a parameter rises.
 
-    curves: (table, metric, labels) -> parameter -> curve of losses. apart: a label of verdicts, not of rows.
+    curves: (table, metric, labels) -> parameter -> curve of losses.
     """
 
     def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
         of: dict[float, Curve] = curves(table, metric, labels)
         if not of or not all(of.values()):
             return None
-        rest = {k: v for k, v in labels.items() if k != apart}
         best = ", ".join(f"{value:g}: {optimum(curve, True).x:g}" for value, curve in of.items())
         _, move = move_of_optimum(of, lower_is_better=True)
         fall = Interval(-move.mean, -move.high, -move.low, move.count)
-        text = f"best by parameter {best}; it falls by {fall}; {no_delay_gain(table, metric, rest)}."
+        text = f"best by parameter {best}; it falls by {fall}."
         return Finding(text, (fall,))
 
     return found
@@ -190,40 +175,6 @@ def level(mine: Row) -> Statistic:
                 by_seed.setdefault(row["seed"], []).append(row[metric])
         mean = interval([sum(values) / len(values) for values in by_seed.values()])
         return Finding(f"{mean.text(METRICS[metric].digits)} over {mean.count} seeds.", (mean,)) if mean.count else None
-
-    return found
-
-
-def no_worse(mine: Row, other: Row) -> Statistic:
-    """The difference of ``mine`` and ``other`` as a share of the size of the latter, for claims whose bound is a small
-    negative share. None where that is too near its zero for a percentage."""
-
-    def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
-        digits = METRICS[metric].digits
-        gap, theirs = _better_by(table, metric, labels, mine, other)
-        if not (gap.count and _far_from_zero(theirs)):
-            return None
-        base = abs(crossed(theirs).mean)
-        share = dataclasses.replace(gap, mean=gap.mean / base, low=gap.low / base, high=gap.high / base)
-        counted = _counted(table, {**labels, **mine}, gap)
-        return Finding(f"{gap.text(digits)}, that is {100 * share.mean:+.2f} %, over {counted}.", (share,))
-
-    return found
-
-
-def half_way(mine: Row, base: Row, limit: Row) -> Statistic:
-    """``mine`` is more than half of the way from ``base`` to ``limit``."""
-
-    def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
-        digits = METRICS[metric].digits
-        (low,), (high,) = (table.runs(metric, **{**labels, **of}) or [{}] for of in (base, limit))
-        half: PerSeed = {s: None if (a := low[s]) is None or (b := high.get(s)) is None else (a + b) / 2 for s in low}
-        ours = table.runs(metric, **{**labels, **mine})
-        above = difference(ours, [half])
-        if not above.count:
-            return None
-        way, counted = number(paired(high, low).mean, digits), _counted(table, {**labels, **mine}, above)
-        return Finding(f"{above.text(digits)} beyond half of a way of {way}, over {counted}.", (above,))
 
     return found
 

@@ -14,13 +14,13 @@ from typing import Any
 
 from edge_server.experiments.common.seed_table import TRAINING, Row
 from edge_server.experiments.engine.content_key import code_digest
-from edge_server.experiments.rollouts import rollout
 from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
+from edge_server.experiments.settings import TRAININGS
 from edge_server.experiments.studies.study import StudyRequest, open_engine
 from edge_server.experiments.studies.trial import Trial
 from edge_server.experiments.training.evaluation import Candidate, evaluate, fixed_candidates
 from edge_server.experiments.training.learning_curve import draw_curve
-from edge_server.experiments.training.settings import QUICK_FIELDS
+from edge_server.experiments.training.settings import QUICK_SPLAT
 from edge_server.experiments.training.trainer import TrainingConfig, read_log, train
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.settings import Action, Spec
@@ -29,8 +29,6 @@ SIZE = 64
 FOUR_VIEWPOINTS = ("cam00", "cam04", "cam09", "cam17")
 # Cameras that judge trained policies: they give no reward and no update uses them.
 REPORT = ("cam05", "cam08")
-# Number of repeated trainings, by whether it is a quick pass; their spread is part of the interval.
-TRAININGS = {True: 1, False: 3}
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,7 @@ def room(channel: Mapping[str, Any] | str = "ch5", **more: Any) -> Setting:
     """
     section = {"preset": channel} if isinstance(channel, str) else dict(channel)
     held_out = more.pop("held_out", ("cam00",))
-    scenario = Trial("room", 0, section, size=SIZE, field_options=QUICK_FIELDS["splat"]).scenario()
+    scenario = Trial("room", 0, section, size=SIZE, field_options=QUICK_SPLAT).scenario()
     apart = tuple(c for c in scenario.cameras if c in {*held_out, *REPORT})
     scenario = dataclasses.replace(scenario, held_out=apart)
     return Setting(scenario, report=REPORT, **{"steps": 50 if more.get("scratch") else 20, **more})
@@ -139,7 +137,7 @@ def _train(
     samples = 2 if training.action == "select" else 3
     config = TrainingConfig(spec, _reward(choice, request), episodes, samples=samples, seed=run)
     # Trainings with other settings or code have separate folders.
-    about = code_digest(rollout.__name__) + setting.key + repr(dataclasses.asdict(config))
+    about = code_digest() + setting.key + repr(dataclasses.asdict(config))
     label = f"{name}-{case.name}-{training.policy}-{run}".replace(" ", "-").replace(",", "").replace("/", "-")
     folder = request.out / "training" / f"{label}-{hashlib.sha256(about.encode()).hexdigest()[:8]}"
     say = partial(print, f"  {label}:", flush=True)

@@ -13,13 +13,13 @@ from edge_server.experiments.common.seed_table import Row, SeedTable
 from edge_server.experiments.common.statistics import FALSE_DISCOVERY_RATE, Interval, all_of, discoveries
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.engine import Engine
+from edge_server.experiments.settings import LEAST_DB
 from edge_server.machine import commit
 from edge_server.progress import ProgressLine
 from edge_server.scheduler.learned.settings import W_S
-from freshfield.files import write_csv, write_json, write_text
+from freshfield.files import write_csv, write_text
 
 HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"
-LEAST_DB = 0.1
 
 
 class StudyError(RuntimeError):
@@ -168,14 +168,12 @@ class Verdict:
 
     about: scene and setting.
     holds: None where it is undecided.
-    interval: of the difference that the claim is about; None where it is about several.
     """
 
     about: str
     claim: str
     found: str
     holds: bool | None
-    interval: Interval | None = None
 
     @property
     def verdict(self) -> str:
@@ -213,7 +211,7 @@ class Study:
 
 
 def run_study(study: Study, request: StudyRequest) -> list[Verdict]:
-    """Measure the cases without stored results, write OUT/NAME.csv, .json, .md and figures, and return the verdicts.
+    """Measure the cases without stored results, write OUT/NAME.csv, .md and figures, and return the verdicts.
     Raises StudyError."""
     request.out.mkdir(parents=True, exist_ok=True)
     rows = study.measure(study.cases(request), request)
@@ -224,21 +222,6 @@ def run_study(study: Study, request: StudyRequest) -> list[Verdict]:
             draw(request, table)
     verdicts = judge(study, table)
     write_text(request.out / f"{study.name}.md", markdown(study, request, table, verdicts))
-    found = {
-        "study": study.name,
-        "title": study.title,
-        "command": request.command(study.name),
-        "quick": request.quick,
-        "commit": commit(),
-        "verdicts": [
-            {
-                **{name: getattr(v, name) for name in ("about", "claim", "found", "verdict")},
-                "interval": None if v.interval is None else v.interval.rounded(4),
-            }
-            for v in verdicts
-        ],
-    }
-    write_json(request.out / f"{study.name}.json", found)
     return verdicts
 
 
@@ -262,13 +245,7 @@ def judge(study: Study, table: SeedTable) -> list[Verdict]:
     decided = iter(discoveries(tested))
     kept = [p == 0.0 or next(decided) for p in p_values]
     return [
-        Verdict(
-            about,
-            claim.text,
-            finding.text,
-            finding.above(bound) if sure else None,
-            finding.differences[-1] if len(finding.differences) == 1 else None,
-        )
+        Verdict(about, claim.text, finding.text, finding.above(bound) if sure else None)
         for (about, claim, finding, bound), sure in zip(found, kept)
     ]
 
@@ -287,7 +264,7 @@ def markdown(study: Study, request: StudyRequest, table: SeedTable, verdicts: Se
     parts = [
         f"# {study.title}",
         f"`{request.command(study.name)}`: {'quick pass' if request.quick else 'full run'}, {seeds} seeds a point{at}. "
-        f"[Rows]({study.name}.csv), [verdicts]({study.name}.json).",
+        f"[Rows]({study.name}.csv).",
         f"Intervals are 95 %. Of the {len(verdicts)} verdicts, those that are decided are corrected for their number "
         f"(Benjamini-Hochberg, false discovery rate {100 * FALSE_DISCOVERY_RATE:g} %).",
         markdown_table(["claim", HOLDS, DOES_NOT_HOLD, UNDECIDED], counted),

@@ -9,10 +9,9 @@ from collections.abc import Sequence
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, run_command
 from edge_server.embed import EmbeddingError
-from edge_server.experiments.common.arguments import add_folders, add_workers, folders_of
+from edge_server.experiments.common.arguments import add_folders, add_workers, at_least, folders_of
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.engine import EngineError
-from edge_server.experiments.rollouts.setting import SEEDS_A_PURPOSE
 from edge_server.experiments.studies.registry import CAPTURING, CASED, DEPLOYED, LEARNING, ON_A_CHANNEL, STUDIES
 from edge_server.experiments.studies.study import StudyError, StudyRequest, run_study
 from edge_server.experiments.studies.trial import scenario_of
@@ -69,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"== {name}: {study.title}", flush=True)
             for verdict in run_study(study, request):
                 print("  " + verdict.line())
-            print(f"  {time.monotonic() - began:.0f} s; {request.out / name}.md, .csv, .json and figures", flush=True)
+            print(f"  {time.monotonic() - began:.0f} s; {request.out / name}.md, .csv and figures", flush=True)
 
     errors = (ScenarioError, DatasetError, StudyError, EngineError, TrainingError, ViewpointError, EmbeddingError)
     stopped = f"what is finished is in {args.out}: run the same command again to resume"
@@ -79,10 +78,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 def checked(names: list[str], request: StudyRequest) -> list[str]:
     """The names of studies. Raises StudyError if the request does not suit all of them, ScenarioError for a scene
     that cannot be read."""
-    if request.seeds is not None and not 1 <= request.seeds <= 10_000:
-        raise StudyError(f"--seeds: expected 1 to 10000, got {request.seeds}")
-    if request.episodes is not None and not 1 <= request.episodes <= SEEDS_A_PURPOSE:
-        raise StudyError(f"--episodes: expected 1 to {SEEDS_A_PURPOSE}, got {request.episodes}")
     for scene in request.scenes or ():
         try:
             found = scenario_of(scene)
@@ -115,7 +110,7 @@ def _parser() -> argparse.ArgumentParser:
         help=f"{', '.join(STUDIES)}; all: up to representations; learning: from ppo-select on",
     )
     add("--quick", action="store_true", help="small images, few points and seeds: a quarter of an hour for all")
-    add("--seeds", type=int, metavar="N", help="seeds per point [the study's own]")
+    add("--seeds", type=at_least(1), metavar="N", help="seeds per point [the study's own]")
     add_workers(parser)
     add(
         "--case",
@@ -124,7 +119,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="WORDS",
         help=f"only cases with these words in their name, in {', '.join(CASED)}; words that no name has list all cases",
     )
-    add("--episodes", type=int, metavar="N", help="episodes of each training [the study's own]")
+    add("--episodes", type=at_least(1), metavar="N", help="episodes of each training [the study's own]")
     add(
         "--scene",
         metavar="NAME|FILE,...",

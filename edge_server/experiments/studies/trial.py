@@ -20,6 +20,7 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.rollouts.episode import Stage, open_stage
+from edge_server.experiments.settings import SHOWN_INSTANTS, STAGGER_MS
 from edge_server.experiments.studies.study import StudyError, StudyRequest, open_engine
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
@@ -36,10 +37,6 @@ from freshfield.scenario import Scenario, ScenarioError, load, parse, seed_seque
 WORLD_FPS = 100 / 3
 # Scenes whose name differs from that of their scenario.
 SCENARIOS = {"room": "room19"}
-# Offset of decision instants between successive seeds; not whole frames, so seeds sample all capture phases.
-_STAGGER_MS = 217.0
-# Number of random instants at which a publication is scored, one in each equal part of the time it is shown.
-_SHOWN_INSTANTS = 3
 _MOMENT_S = 1e-6
 _PATIENCE = 20  # times every_ms, until a trial has failed
 
@@ -81,7 +78,7 @@ class Trial:
     @property
     def first_ms(self) -> float:
         """Instant of the first decision."""
-        return 900.0 + _STAGGER_MS * (self.seed % 64)
+        return 900.0 + STAGGER_MS * (self.seed % 64)
 
     def scenario(self) -> Scenario:
         """The deployment as a scenario. Raises ScenarioError."""
@@ -316,8 +313,8 @@ def _shown_scores(publication: Publication, deployment: VirtualDeployment, rng: 
     lasts_ns = max(began_ns - deployment.decided_ns, deployment.capture_period_ns)
     snapshot = deployment.updates.field.snapshot(began_ns)
     scores = []
-    for k, random in enumerate(rng.random(_SHOWN_INSTANTS)):
-        at_ns = max(truth.nearest_ns(began_ns + round((k + random) / _SHOWN_INSTANTS * lasts_ns)), began_ns)
+    for k, random in enumerate(rng.random(SHOWN_INSTANTS)):
+        at_ns = max(truth.nearest_ns(began_ns + round((k + random) / SHOWN_INSTANTS * lasts_ns)), began_ns)
         scores.append(truth.score(snapshot.at(at_ns), at_ns))
     return {f"shown_{name}": mean_or_none([getattr(s, name) for s in scores]) for name in SHOWN}
 

@@ -1,4 +1,4 @@
-"""Figures 4.7 and 4.8, tables 4.1 and 4.3: quality and path against the number of views, by selector."""
+"""Tables 4.1 and 4.3: quality and path against the number of views, by selector."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.experiments.common.drawn_images import Image, draw_images
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row, SeedTable
 from edge_server.experiments.common.statistics import interval
@@ -18,9 +17,7 @@ from edge_server.experiments.studies.drawing import draw_curve
 from edge_server.experiments.studies.findings import better, trend
 from edge_server.experiments.studies.study import METRICS, Claim, Study, StudyRequest, open_engine
 from edge_server.experiments.studies.trial import scenario_of, scene_label, scenes_here
-from edge_server.experiments.viewpoints.drawing import draw_plan
 from edge_server.experiments.viewpoints.stage import Stage, open_stage
-from edge_server.fidelity.images import to_bytes
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Field
@@ -35,9 +32,8 @@ ARMS = {
     "FisherRF": ("fisher", 0.0),
     "coverage, short way": ("coverage", 0.3),
 }
-JUDGED = 8  # views of table 4.3 and of the figures
+JUDGED = 8  # views of table 4.3
 SCENES = {True: ("tile",), False: ("tile", "lego", "kitchen", "cell")}  # by whether it is a quick pass
-_SHOWN = ("random", "coverage", "FisherRF")
 
 
 @dataclass(frozen=True)
@@ -147,10 +143,8 @@ def measured(stage: Stage, field: Field, stops: Sequence[Stop], scorer: Scorer) 
 
 
 def _draw(request: StudyRequest, table: SeedTable) -> None:
-    """Quality and path against the number of views, the paths (4.7), and held-out views as shown (4.8)."""
-    work = workload(request)
-    for scene in scenes_here(request, SCENES[request.quick]):
-        name, stage = scene_label(scene), stage_of(scene, work, request.folders)
+    """Quality and path against the number of views."""
+    for (name,) in table.distinct("scene"):
         metrics = [m for m in ("psnr_db", "ssim", "lpips") if any(r[m] is not None for r in table.where(scene=name))]
         with figure(request.out / f"viewpoints-{name}.png", len(metrics) + 1, height_inch=2.4, sharex=True) as (
             _,
@@ -163,15 +157,6 @@ def _draw(request: StudyRequest, table: SeedTable) -> None:
                 label_lines(
                     at, METRICS[metric].label, "views" if last else None, name if metric == metrics[0] else None
                 )
-        plans = {a: plan(stage, a, 0, JUDGED, work) for a in (*_SHOWN, "coverage, short way")}
-        draw_plan(request.out / f"viewpoints-{name}-paths.png", stage, list(plans.items()))
-        fields = {arm: stage.fit(made.views, work.steps, 0) for arm, made in plans.items()}
-        rows: list[tuple[str, list[tuple[str, Image]]]] = []
-        for view in stage.held_out[:: max(len(stage.held_out) // 2, 1)][:2]:
-            shown = [("truth", view.image[..., :3])]
-            shown += [(a, to_bytes(f.render(view.camera_to_world, view.intrinsics).color)) for a, f in fields.items()]
-            rows.append((view.camera, shown))
-        draw_images(request.out / f"viewpoints-{name}-images.png", rows)
 
 
 def _tables(table: SeedTable) -> str:

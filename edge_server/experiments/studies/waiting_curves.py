@@ -152,13 +152,6 @@ IMAGES = Study(
             where={"policy": "freshest-k"},
             metrics=("aaoi_ms",),
         ),
-        Claim(
-            "some fewer, the freshest, are better than all (not in the thesis).",
-            interior("images"),
-            None,
-            {"policy": "freshest-k"},
-            ("lpips", "psnr_db", "psnr_moving_db"),
-        ),
     ),
     ("scene", "field", "channel"),
     (curves("images", "images", "images, the freshest", (*IMAGE_METRICS, "ssim"), "policy"),),

@@ -10,8 +10,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-import numpy as np
-
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import PerSeed, Row
 from edge_server.experiments.common.tables import complete_mean
@@ -25,20 +23,6 @@ from edge_server.scheduler.learned.rewards import Reward
 
 At = tuple[int, int]
 """Seed of an episode and number of a decision."""
-
-# Policies without learning, thresholds and waits aside.
-BASELINE_POLICIES = (
-    "random",
-    "all",
-    "periodic:500",
-    "round-robin:6",
-    "freshest-k:4",
-    "freshest-k:6",
-    "freshest-k:9",
-    "freshest-k:12",
-    "age-driven",
-)
-ORACLE = "oracle"
 
 
 @dataclass(frozen=True)
@@ -66,11 +50,8 @@ class Evaluation:
 
     def rows(self, reward: Reward, cameras: Sequence[str], **labels: Any) -> list[Row]:
         """A row for each candidate and seed: the mean ``reward`` of its decisions as ``cameras`` see them, and the
-        means of the outcomes; None if a decision lacks a term.
-
-        ``oracle`` is the best choice of all candidates at each decision, chosen by one fit and measured by
-        another; ``oracle KIND`` that among the values of a kind. Decisions at which nobody has a reward (nothing
-        moves in the images that score) are left out for all.
+        means of the outcomes; None if a decision lacks a term. Decisions at which nobody has a reward (nothing moves
+        in the images that score) are left out for all.
 
         labels: further labels of every row.
         """
@@ -87,12 +68,8 @@ class Evaluation:
             }
             for term in (f.name for f in fields(Outcome)):
                 mine[term] = _by_seed({at: complete_mean([getattr(o, term) for o in fits]) for at, fits in of.items()})
-            found += _rows({**labels, **candidate.labels}, mine)
-        kinds = dict.fromkeys(c.labels["policy"] for c in self.candidates if "value" in c.labels)
-        for kind in (None, *kinds):
-            of_kind = [v for c, v in zip(self.candidates, values) if kind in (None, c.labels["policy"])]
-            best = _by_seed({at: _oracle([v[at] for v in of_kind]) for at in values[0]}, scored)
-            found += _rows({**labels, "policy": f"{ORACLE} {kind}" if kind else ORACLE}, {"reward": best})
+            own = {**labels, **candidate.labels}
+            found += [{**own, "seed": seed, **{n: v.get(seed) for n, v in mine.items()}} for seed in mine["reward"]]
         return found
 
 
@@ -126,22 +103,6 @@ def evaluate(
 def _value(reward: Reward, outcome: Outcome) -> float | None:
     found = reward.of(outcome)
     return found.total if found.complete else None
-
-
-def _rows(labels: Row, values: Mapping[str, PerSeed]) -> list[Row]:
-    seeds = next(iter(values.values()))
-    return [{**labels, "seed": seed, **{name: of.get(seed) for name, of in values.items()}} for seed in seeds]
-
-
-def _oracle(fits: Sequence[Sequence[float | None]]) -> float | None:
-    """Reward of the best of several choices, each of which was fitted twice: the best is chosen by each fit and
-    measured by the other, among the choices that have both; None if none has."""
-    known = [of for of in fits if len(of) == 2 and None not in of]
-    if not known:
-        return None
-    table = np.array(known, float)
-    first, second = table.argmax(axis=0).tolist()
-    return float(table[first, 1] + table[second, 0]) / 2
 
 
 def _by_seed(values: Mapping[At, float | None], kept: Iterable[At] | None = None) -> PerSeed:

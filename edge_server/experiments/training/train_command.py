@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import math
 from collections.abc import Sequence
 from functools import partial
 
@@ -15,9 +14,8 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.engine import EngineError
 from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
 from edge_server.experiments.training.learning_curve import draw_curve
-from edge_server.experiments.training.settings import QUICK_FIELDS
-from edge_server.experiments.training.trainer import TrainingConfig, TrainingError, read_log, train
-from edge_server.fields.registry import field_names
+from edge_server.experiments.training.settings import QUICK_SPLAT
+from edge_server.experiments.training.trainer import TrainingConfig, read_log, train
 from edge_server.scheduler import BANDIT, STATE_PARTS
 from edge_server.scheduler.learned.rewards import REWARDS
 from edge_server.scheduler.learned.settings import ACTIONS, Spec
@@ -46,10 +44,11 @@ publication.
   --reward corrected  -F_w (6.36-6.38) with the sign of SSIM corrected; default for threshold and wait
   --reward thesis     -F_w as printed, which rewards a worse SSIM
 
-An episode is --decisions decisions at random instants. At each, --samples actions are carried out from copies
-of the same field, so that they can be compared: a field that knows the scene, or an empty one (--scratch, as
-in the thesis). In a synthetic scene each episode has its own motion.
-Images are small (--size) and the field is fast (--field), so that there are many decisions.
+An episode is four decisions at random instants. At each, two actions are carried out from copies of the same
+field, so that they can be compared: a field that knows the scene, or an empty one (--scratch, as in the
+thesis). In a synthetic scene each episode has its own motion. Images are small (--size) and the field is a
+small splat, so that there are many decisions. Without weights of LPIPS, or where edge.lpips is none, the
+reward has no term of distance.
 
 OUT/policy.npz is the learned policy, OUT/actor.npz the part of it that decides, OUT/training.csv and .png the
 learning curve with each term of the reward. edge-server compare says what it shows, on seeds it was not trained
@@ -70,13 +69,6 @@ def _train(args: argparse.Namespace) -> None:
     config = _config(args, setting, folders)
     args.out.mkdir(parents=True, exist_ok=True)  # first, so that an error does not waste the work
     print(f"  rewarded from {', '.join(setting.rewarding)}")
-    if config.reward.fidelity == "whole" and not config.reward.age:
-        print(
-            "  the reward is of the whole image and has no term of age: where little moves it teaches to "
-            "ignore how old views are (--on moving)"
-        )
-    if not setting.draws_motions:
-        print("  every episode has the same motion")
     say = partial(print, " ", flush=True)
     learner = train(setting, config, folders, args.jobs, args.out, say, args.ray)
     rows = read_log(args.out)
@@ -95,54 +87,38 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
     source, edge = dict(scenario.source), dict(scenario.edge)
     if source.get("kind") == "world" and args.size:
         source |= {"width": args.size, "height": args.size}
-    if args.field:
-        if args.field not in field_names():
-            raise ValueError(f"--field: expected one of {', '.join(field_names())}, got {args.field!r}")
-        edge["field"], edge["updates"] = args.field, "cycle"
-        edge["field_options"] = QUICK_FIELDS.get(args.field, {})
+    edge["field"], edge["updates"], edge["field_options"] = "splat", "cycle", QUICK_SPLAT
     edge["policy"] = {"name": "all"}
     given = dataclasses.replace(scenario, source=source, edge=edge)
     return Setting(
         given,
-        steps=(50 if args.scratch else 20) if args.fit_steps is None else args.fit_steps,
+        steps=50 if args.scratch else 20,
         scratch=args.scratch,
-        decisions=args.decisions,
         compute=read_config(given).compute,
-        parts=_parts(args.parts),
+        parts=tuple(args.parts.split(",")),
     )
 
 
 def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> TrainingConfig:
     name = args.reward or ("set" if args.kind == "select" else "corrected")
     network = read_config(setting.scenario).lpips
-    reward, missing = reward_of(name, args.on, folders.lpips, network, args.distance)
+    reward, missing = reward_of(name, args.on, folders.lpips, network)
     if missing:
         print(f"  {missing}")
     seeds(args.seed, "train", args.episodes)
-    if not 0.0 <= args.price < math.inf:
-        raise TrainingError(f"--price: expected 0 or more, got {args.price:g}")
     if args.price:
         reward = dataclasses.replace(reward, views=-args.price)
     spec = Spec(args.kind, layout_of(setting, setting.parts), _omegas(args))
-    return TrainingConfig(spec, reward, args.episodes, args.batch, args.samples, args.seed)
+    return TrainingConfig(spec, reward, args.episodes, seed=args.seed)
 
 
 def _omegas(args: argparse.Namespace) -> tuple[float, ...]:
     if args.omegas is None:
         return OMEGAS_MS.get(args.kind, ())
-    if args.kind == "select":
-        raise ValueError("--omegas: --kind select chooses cameras, not an omega")
     try:
         return tuple(float(v) for v in args.omegas.split(","))
     except ValueError:
         raise ValueError(f"--omegas: expected milliseconds such as 20,60,120, got {args.omegas!r}") from None
-
-
-def _parts(text: str) -> tuple[str, ...]:
-    asked = set(text.split(","))
-    if unknown := asked - set(STATE_PARTS):
-        raise ValueError(f"--parts: there is no {', '.join(sorted(unknown))}; choose of {', '.join(STATE_PARTS)}")
-    return tuple(part for part in STATE_PARTS if part in asked)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -151,18 +127,9 @@ def _parser() -> argparse.ArgumentParser:
     add("scenario", help="scenario file, or the name of a shipped one; needs a held-out camera")
     add("--kind", choices=ACTIONS, default="select", help="what the policy decides [%(default)s]")
     add("--episodes", type=int, default=600, metavar="N", help="episodes of training [%(default)s]")
-    add("--decisions", type=int, default=4, metavar="N", help="decisions of an episode [%(default)s]")
-    add("--batch", type=int, default=10, metavar="N", help="episodes in one policy update [%(default)s]")
-    add("--samples", type=int, default=2, metavar="N", help="actions tried at each decision [%(default)s]")
     add("--reward", choices=tuple(REWARDS), help="reward, see above [set for select, else corrected]")
     add(
         "--on", choices=("whole", "moving"), default="whole", help="pixels that the reward's PSNR is over [%(default)s]"
-    )
-    add(
-        "--distance",
-        choices=("lpips", "none"),
-        default="lpips",
-        help="distance in the reward; without weights there is none [%(default)s]",
     )
     add(
         "--price",
@@ -179,7 +146,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--omegas", metavar="MS,...", help="ms that threshold and wait choose from: 20,60,120")
     add("--scratch", action="store_true", help="each update starts from an empty field, as in the thesis")
-    add("--fit-steps", type=int, metavar="N", help="optimizer steps of an update [20; 50 with --scratch]")
     add(
         "--size",
         type=int,
@@ -187,7 +153,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar="PX",
         help="pixels a side in synthetic scenes; 0: the scenario's [%(default)s]",
     )
-    add("--field", default="splat", metavar="NAME", help="representation; '': the scenario's [%(default)s]")
     add("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
     add_workers(parser)
     add_folders(parser)

@@ -125,7 +125,7 @@ def read_log(out: Path) -> list[Row]:
 def _train_batch(
     setting: Setting, config: TrainingConfig, folders: Folders, engine: Engine, learner: Learner, number: int
 ) -> Row:
-    """Do one update of the weights; returns its row of the log. After the first, a batch without a decision or a
+    """Do one update of the weights; returns its row of the log. After the first, a batch without a
     reward changes no weights. Raises TrainingError if the first batch has no reward."""
     from edge_server.scheduler.learned.ppo import Batch
 
@@ -148,34 +148,29 @@ def _train_batch(
         raise TrainingError(_missing_reward_reason(outcomes, terms))
     row = _row(config, episode_seeds, terms, outcomes, [d.action for d in decided])
     row |= {"decisions": sum(len(runs[0].decided) for runs in samples), "fits": len(decided)}
-    if not decided:  # nothing arrived in any of its episodes
-        return row
     update = learner.update(
         Batch(
             np.array([d.features for d in decided]),
             np.array([d.action for d in decided]),
             np.array([d.logp for d in decided]),
-            np.concatenate([a for runs in samples for a in sibling_advantages(runs, config.reward)]),
+            np.concatenate([sibling_advantages(runs, config.reward).ravel() for runs in samples]),
         )
     )
     return row | {k: v for k, v in dataclasses.asdict(update).items() if k != "reward"}
 
 
-def sibling_advantages(runs: Sequence[Run], reward: Reward) -> list[NDArray[np.float64]]:
-    """For each sample of an episode its rewards minus the mean of the other samples in the same slot (leave-one-out
-    baseline); NaN for a missing reward, or if no other sample has one there. With a single sample its rewards."""
-    rewards = [
-        np.array([_complete(reward.of(mean_outcome(list(d.outcomes.values())))) for d in run.decided]) for run in runs
-    ]
+def sibling_advantages(runs: Sequence[Run], reward: Reward) -> NDArray[np.float64]:
+    """For each sample of an episode, and each of its decisions, the reward minus the mean of the other samples'
+    (leave-one-out baseline); NaN for a missing reward, or if no other sample has one there. With a single sample its
+    rewards."""
+    rewards = np.array(
+        [[_complete(reward.of(mean_outcome(list(d.outcomes.values())))) for d in run.decided] for run in runs]
+    )
     if len(runs) == 1:
         return rewards
-    slots = [[d.slot for d in run.decided] for run in runs]
-    known = [{s: r for s, r in zip(*one) if np.isfinite(r)} for one in zip(slots, rewards)]
-    found = []
-    for k, mine in enumerate(slots):
-        others = [[of[s] for j, of in enumerate(known) if j != k and s in of] for s in mine]
-        found.append(rewards[k] - np.array([np.mean(o) if o else np.nan for o in others]))
-    return found
+    others = [np.delete(rewards, k, axis=0) for k in range(len(runs))]
+    with np.errstate(invalid="ignore"):  # none of the others has one
+        return rewards - np.stack([np.nansum(of, axis=0) / np.isfinite(of).sum(axis=0) for of in others])
 
 
 def _row(
@@ -209,13 +204,10 @@ def _missing_reward_reason(outcomes: list[Outcome], found: list[RewardTerms]) ->
     """Why none of these outcomes has a reward, and what to change."""
     if not any(outcome.views for outcome in outcomes):
         return "nothing had arrived at any decision of the first batch: look at the scenario's channel"
-    missing = list(dict.fromkeys(name for r in found for name in r.missing))
-    hints = {
-        "lpips": "lpips: see edge.lpips and --lpips, or leave it out with --distance none",
-        "psnr_moving": "psnr_moving: nothing moves where the held-out cameras look; --on whole",
-    }
-    return "no decision of the first batch has a reward, it lacks " + "; ".join(
-        hints.get(name, name) for name in missing
+    missing = dict.fromkeys(name for r in found for name in r.missing)
+    return (
+        f"no decision of the first batch has a reward, it lacks {', '.join(missing)} (lpips: see --lpips, or leave it "
+        "out with edge.lpips: none; psnr_moving: nothing moves where the held-out cameras look: --on whole)"
     )
 
 
@@ -248,18 +240,11 @@ class _Checkpoint:
             return None, []
         try:
             found = json.loads(path.read_text())
-            key, name, done = found["key"], str(found["weights"]), int(found["batches"])
-        except (ValueError, KeyError, TypeError):
-            raise TrainingError(f"{path}: damaged: choose another --out, or delete it") from None
-        if key != self.key:
-            raise TrainingError(
-                f"{self.out} holds a training with other settings or of another kind of processor: "
-                "choose another --out, or delete it"
-            )
-        try:
-            lines = (self.out / "training.jsonl").read_text().splitlines()[:done]
-            return Learner.load(self.out / name), [json.loads(line) for line in lines]
-        except (OSError, ValueError) as error:
+            if found["key"] != self.key:
+                raise ValueError("it is a training with other settings or of another kind of processor")
+            lines = (self.out / "training.jsonl").read_text().splitlines()[: int(found["batches"])]
+            return Learner.load(self.out / str(found["weights"])), [json.loads(line) for line in lines]
+        except (OSError, ValueError, KeyError, TypeError) as error:
             raise TrainingError(f"{self.out}: cannot go on: {error}: choose another --out, or delete it") from None
 
     def save(self, learner: Learner, rows: list[Row]) -> None:

@@ -22,7 +22,6 @@ from edge_server.progress import ProgressLine
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.experts import SimulatedExpert
 from edge_server.viewpoints.features import StepFeatures
-from edge_server.viewpoints.policy import CandidatePolicy, PolicyConfig, train_policy
 from edge_server.viewpoints.preference_session import PERSON, PreferenceSession
 from freshfield.files import write_json
 from freshfield.transport import Transport
@@ -31,7 +30,6 @@ from freshfield.untrusted import read_bytes
 ANSWERS = "answers.json"
 SHOWN_S = 10.0  # time that the page has to fetch the plan, before the server ends
 ShowPlan = Callable[[list[str], bytes], None]
-VIEWS = 8  # views of a reconstruction, if the budget is only in meters
 
 
 def compare(
@@ -113,8 +111,3 @@ def _on_the_page(
         close()
 
     return asking.session, show
-
-
-def learn(stage: Stage, session: PreferenceSession, views: int, seed: int) -> CandidatePolicy:
-    """Train a policy by PPO on the reward model of the answers (4.14)."""
-    return train_policy(stage.candidates, session.model.reward, PolicyConfig(views=views), seed)[0]

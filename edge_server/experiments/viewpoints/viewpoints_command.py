@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, run_command
 from edge_server.experiments.common.arguments import OptionError, add_folders, at_least, folders_of
-from edge_server.experiments.viewpoints.asking import ANSWERS, VIEWS, compare, learn
+from edge_server.experiments.settings import VIEWS
+from edge_server.experiments.viewpoints.asking import ANSWERS, compare
 from edge_server.experiments.viewpoints.drawing import draw_plan
 from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
 from edge_server.fidelity.lpips_weights import open_lpips
@@ -16,7 +17,7 @@ from edge_server.fidelity.scorer import Scorer
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.capture_planner import Budget, plan_capture
 from edge_server.viewpoints.experts import TASTES
-from edge_server.viewpoints.policy import CandidatePolicy
+from edge_server.viewpoints.policy import CandidatePolicy, PolicyConfig, train_policy
 from edge_server.viewpoints.preference_session import PERSON
 from edge_server.viewpoints.registry import SELECTORS, make_selector
 from freshfield import transport
@@ -83,7 +84,7 @@ def _run(args: argparse.Namespace) -> None:
         agreed, repeated = session.agreement
         print(f"answered by {session.by}: {session.model.says()}; repeated pairs alike: {agreed} of {repeated}")
         if session.model.knows:
-            selector = learn(stage, session, views, args.seed)
+            selector, _ = train_policy(stage.candidates, session.model.reward, PolicyConfig(views=views), args.seed)
             selector.save(args.out / "policy.npz")
         else:
             print(f"planned by {selector.name} instead")
@@ -102,7 +103,7 @@ def _run(args: argparse.Namespace) -> None:
     quality = {"psnr_db": score.psnr_db, "ssim": score.ssim, "lpips": score.lpips}
     about = {"scenario": stage.name, "seed": args.seed, "travel_weight": args.travel, "steps": args.steps}
     write_json(args.out / "plan.json", {**about, **plan.as_json(stage.candidates), "held_out": quality})
-    draw_plan(args.out / "plan.png", stage, [(plan.selector, plan)])
+    draw_plan(args.out / "plan.png", stage, plan)
     for n, stop in enumerate(plan.stops, 1):
         print(f"{n:3}  candidate {stop.candidate:3}  {1e3 * stop.seconds:6.0f} ms  {stop.why}")
     if plan.note:

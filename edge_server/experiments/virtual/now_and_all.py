@@ -12,15 +12,13 @@ import numpy as np
 from msgspec.structs import asdict
 
 from camera_node.capture import Camera
+from edge_server.experiments.settings import MARKS_S, SINCE_S
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fidelity.so_far import score_frame, so_far
 from edge_server.fields import View
 from edge_server.run_records import SoFarScores
 from freshfield import payload
-
-MARKS_S = 2.0
-SINCE_S = 4.0  # the first seconds are of a field that has seen next to nothing
 
 
 class NowAndAll:

@@ -23,6 +23,7 @@ from edge_server.experiments.common.arguments import add_folders, at_least, fold
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none, number
 from edge_server.experiments.engine import processor
+from edge_server.experiments.settings import CYCLE_MS, SCORED_EVERY_MS
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.now_and_all import NowAndAll
 from edge_server.experiments.virtual.run_settings import RunSettings
@@ -60,8 +61,6 @@ the scenario, or --compute; edge-server costs measures them). The same seed give
 kind of processor: the printed digest covers every publication and the field's parameters.
 """
 _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "aaoi_ms")
-_SCORED_EVERY_MS = 250.0  # publications, and what is shown at random instants
-_CYCLE_MS = 250.0  # between two decisions
 # Seconds of virtual time between two lines of progress.
 _PROGRESS_EVERY_S = 1.0
 
@@ -306,14 +305,14 @@ def check_seconds(seconds: float) -> None:
 
 def usual_settings(config: EdgeConfig) -> RunSettings:
     """What an ``edge:`` section says of a run, scored at random instants. Two decisions are a live update's time apart
-    if updates follow arrivals, else at most _CYCLE_MS."""
+    if updates follow arrivals, else at most CYCLE_MS."""
     return RunSettings(
         steps=config.steps,
         compute=config.compute,
-        epoch_ms=config.update_ms if config.updates == "arrivals" else min(config.update_ms, _CYCLE_MS),
+        epoch_ms=config.update_ms if config.updates == "arrivals" else min(config.update_ms, CYCLE_MS),
         grace_ms=config.grace_ms,
-        score_every_ms=_SCORED_EVERY_MS,
-        shown_every_ms=_SCORED_EVERY_MS,
+        score_every_ms=SCORED_EVERY_MS,
+        shown_every_ms=SCORED_EVERY_MS,
     )
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from camera_node.capture import Camera
 from camera_node.sources.base import Shot
+from edge_server.experiments.settings import NOISE_FRAMES
 from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags
 from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
@@ -20,7 +21,6 @@ from edge_server.fields import View
 from freshfield import payload
 from freshfield.geometry import Pinhole
 
-NOISE_FRAMES = 8  # frames used to estimate a camera's noise
 # Image uint8 (H, W, 3), intrinsics, camera-to-world (4, 4).
 Seen = tuple[NDArray[np.uint8], Pinhole, NDArray[np.float64]]
 

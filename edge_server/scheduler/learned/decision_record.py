@@ -1,6 +1,6 @@
 """Decisions on disk, to be explained after a run: OUT/decisions/000123.npz.
 
-A file holds one decision: state, action, and the embedded frames as delivered. The policy is written once, as
+A file holds one decision: state, action, and the embedded frames as delivered. Each policy is written once, as
 policy-HASH.npz. Only the newest decisions that fit are kept.
 """
 
@@ -35,22 +35,13 @@ class DecisionWriter:
     thread-safe.
 
     embedding: settings of the embedder, to embed the frames again; None: nothing was embedded.
-    max_decisions, max_bytes: how much to keep on disk.
     """
 
-    def __init__(
-        self,
-        out: Path,
-        embedding: Mapping[str, Any] | None = None,
-        max_decisions: int = MAX_DECISIONS,
-        max_bytes: int = MAX_BYTES,
-    ) -> None:
+    def __init__(self, out: Path, embedding: Mapping[str, Any] | None = None) -> None:
         self._folder = out / FOLDER
         self._embedding = dict(embedding) if embedding else None
-        self._max_decisions, self._max_bytes = max_decisions, max_bytes
-        # Decision's file, policy's file, bytes written for it; those of an earlier process first.
-        self._kept = deque((p, "", p.stat().st_size) for p in _numbered(self._folder))
-        self._policy: tuple[Actor, str] | None = None
+        # Files and their sizes; those of an earlier process first.
+        self._kept = deque((p, p.stat().st_size) for p in _numbered(self._folder))
         self.lost = 0
 
     def write(self, decision: Decision) -> None:
@@ -58,26 +49,17 @@ class DecisionWriter:
         path = self._folder / f"{decision.number:06d}.npz"
         try:
             self._drop_from(decision.number)
-            policy, policy_bytes = self._policy_of(decision.actor)
-            arrays, about = _as_arrays(decision, policy, self._embedding)
+            policy = self._folder / f"policy-{decision.actor.digest[:12]}.npz"
+            if not policy.exists():
+                decision.actor.save(policy)
+            arrays, about = _as_arrays(decision, policy.name, self._embedding)
             checkpoint.save(path, arrays, about, _KIND, durable=False)
-            self._kept.append((path, policy, path.stat().st_size + policy_bytes))
+            self._kept.append((path, path.stat().st_size))
             self._make_room()
         except OSError as error:
             self.lost += 1
             if self.lost == 1:
                 log.warning("%s: cannot be written (%s): decisions are lost", path, error.strerror or error)
-
-    def _policy_of(self, actor: Actor) -> tuple[str, int]:
-        """File of the policy and its size; size 0 where it was written before."""
-        size = 0
-        if self._policy is None or self._policy[0] is not actor:
-            name = f"policy-{actor.digest[:12]}.npz"
-            if not (self._folder / name).exists():
-                actor.save(self._folder / name)
-                size = (self._folder / name).stat().st_size
-            self._policy = (actor, name)
-        return self._policy[1], size
 
     def _drop_from(self, number: int) -> None:
         """Drop decisions from this number on: they belong to an earlier run in the same folder."""
@@ -86,12 +68,9 @@ class DecisionWriter:
 
     def _make_room(self) -> None:
         while len(self._kept) > 1 and (
-            len(self._kept) > self._max_decisions or sum(size for *_, size in self._kept) > self._max_bytes
+            len(self._kept) > MAX_DECISIONS or sum(size for _, size in self._kept) > MAX_BYTES
         ):
-            path, policy, _ = self._kept.popleft()
-            path.unlink(missing_ok=True)
-            if policy and all(policy != other for _, other, _ in self._kept):
-                (self._folder / policy).unlink(missing_ok=True)
+            self._kept.popleft()[0].unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)

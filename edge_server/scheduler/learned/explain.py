@@ -1,13 +1,12 @@
 """Attributes a decision to the parts of the state, the cameras, and the regions of a camera's image.
 
 The explained quantity is the logit of the action: of an omega log p / (1 - p), of a set the sum of all
-cameras' own logits, for or against. It is compared with the logit for average cameras
-(``Actor.mean_features``), and the difference is attributed by Shapley values, so that the shares sum to it:
+cameras' own logits, for or against.
 
-* to the parts (semantics, age, pose) exactly, from all 2^3 combinations;
-* to the cameras from pairs of permutations, forward and backward, with the standard error of the estimate.
-
-A region's share is how much the logit falls when the region is painted over and the image embedded again.
+* A part's (semantics, age, pose) is its Shapley value, from all 2^3 combinations, of the difference to the logit for
+  average cameras (``Actor.mean_features``), so that the shares of the parts sum to it.
+* A camera's share is how much the logit falls when that camera is an average one.
+* A region's share is how much it falls when the region is painted over and the image embedded again.
 """
 
 from __future__ import annotations
@@ -27,10 +26,6 @@ from edge_server.scheduler.learned.state import State
 EmbedImages = Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]]
 """Images uint8 (H, W, 3) to embeddings (n, d)."""
 
-# Pairs of permutations for 18 cameras. A pair's cost grows with the square of the cameras: more cameras get
-# fewer pairs, and the standard error shows it.
-PAIRS = 16
-_CAMERAS = 18
 GRID = 8
 # The gray of letterboxes, opaque: detectors are used to seeing nothing in it.
 _PAINT = (114, 114, 114, 255)
@@ -43,9 +38,8 @@ class Explanation:
     action: the action in words.
     logit: logit of the action taken. baseline_logit: the same for average cameras.
     parts: share of each part of the state.
-    cameras, cameras_error: (N,), share of each camera, and its standard error.
-    names: names of the cameras.
-    Parts sum to logit - baseline_logit, and so do cameras.
+    cameras: (N,), share of each camera. names: names of the cameras.
+    Parts sum to logit - baseline_logit.
     """
 
     action: str
@@ -53,30 +47,25 @@ class Explanation:
     baseline_logit: float
     parts: dict[str, float]
     cameras: NDArray[np.float64]
-    cameras_error: NDArray[np.float64]
     names: tuple[str, ...]
 
 
-def explain(actor: Actor, state: State, action: Any, pairs: int | None = None) -> Explanation:
-    """Explain why ``actor`` took ``action`` (as ``Actor.act`` gives it) in ``state``; repeatable. pairs:
-    number of pairs of permutations; None: as many as take some ten milliseconds."""
-    if pairs is None:
-        pairs = min(PAIRS, max(2, round(PAIRS * (_CAMERAS / max(len(state), 1)) ** 2)))
+def explain(actor: Actor, state: State, action: Any) -> Explanation:
+    """Explain ``action`` (as ``Actor.act`` gives it) in ``state``; repeatable."""
     features = actor.spec.layout.features(state)
     baseline = np.zeros_like(features)
     if actor.mean_features is not None:
         baseline[features[:, -1] > 0] = actor.mean_features
     baseline[:, -1] = features[:, -1]  # as many cameras as have reported
-    both = action_logit(actor, np.stack([features, baseline]), action)
-    cameras, error = _camera_shares(actor, features, baseline, action, pairs)
+    each = np.eye(len(features), dtype=bool)[..., None]  # (N, N, 1), one camera an average one
+    logits = action_logit(actor, np.stack([features, baseline, *np.where(each, baseline, features)]), action)
     names = state.cameras or tuple(str(i) for i in range(len(state)))
     return Explanation(
         action=describe_action(actor, action, names),
-        logit=float(both[0]),
-        baseline_logit=float(both[1]),
+        logit=float(logits[0]),
+        baseline_logit=float(logits[1]),
         parts=_part_shares(actor, features, baseline, action),
-        cameras=cameras,
-        cameras_error=error,
+        cameras=logits[0] - logits[2:],
         names=names,
     )
 
@@ -105,17 +94,17 @@ def describe_action(actor: Actor, action: Any, names: Sequence[str]) -> str:
 
 
 def occlusion_map(
-    actor: Actor, state: State, action: Any, camera: int, image: NDArray[np.uint8], embed: EmbedImages, grid: int = GRID
+    actor: Actor, state: State, action: Any, camera: int, image: NDArray[np.uint8], embed: EmbedImages
 ) -> NDArray[np.float64]:
-    """(grid, grid) fall of the action's logit when a region of ``camera``'s image is painted gray: positive
+    """(GRID, GRID) fall of the action's logit when a region of ``camera``'s image is painted gray: positive
     regions spoke for the action. ValueError where the policy does not look at images."""
     if "semantics" not in actor.spec.layout.parts or state.embeddings is None:
         raise ValueError("this policy looks at no pictures: no region of one can have moved it")
     height, width = image.shape[:2]
-    rows = np.linspace(0, height, grid + 1).astype(int)
-    columns = np.linspace(0, width, grid + 1).astype(int)
+    rows = np.linspace(0, height, GRID + 1).astype(int)
+    columns = np.linspace(0, width, GRID + 1).astype(int)
     painted = [image]
-    for i, j in itertools.product(range(grid), repeat=2):
+    for i, j in itertools.product(range(GRID), repeat=2):
         copy = image.copy()
         copy[rows[i] : rows[i + 1], columns[j] : columns[j + 1]] = _PAINT[: image.shape[2]]
         painted.append(copy)
@@ -125,7 +114,7 @@ def occlusion_map(
         embeddings[camera] = z
         features.append(actor.spec.layout.features(replace(state, embeddings=embeddings)))
     logits = action_logit(actor, np.stack(features), action)
-    return (logits[0] - logits[1:]).reshape(grid, grid)
+    return (logits[0] - logits[1:]).reshape(GRID, GRID)
 
 
 def _part_shares(
@@ -152,23 +141,3 @@ def _part_shares(
                 share += weight * (value[(*chosen[:i], True, *chosen[i + 1 :])] - value[chosen])
         out[name] = float(share)
     return out
-
-
-def _camera_shares(
-    actor: Actor, features: NDArray[np.float64], baseline: NDArray[np.float64], action: Any, pairs: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Shapley values (N,) of the cameras and their standard errors; zero for a camera that has not
-    reported."""
-    n = len(features)
-    rng = np.random.default_rng(0)
-    found = np.zeros((pairs, n))
-    for k in range(pairs):
-        order = rng.permutation(n)
-        for way in (order, order[::-1]):
-            mixed = np.repeat(baseline[None], n + 1, axis=0)
-            for step, camera in enumerate(way):
-                mixed[step + 1 :, camera] = features[camera]
-            found[k, way] += 0.5 * np.diff(action_logit(actor, mixed, action))
-    found[:, features[:, -1] == 0.0] = 0.0  # exactly, without rounding
-    error = found.std(axis=0, ddof=1) / np.sqrt(pairs) if pairs > 1 else np.full(n, np.nan)
-    return found.mean(axis=0), error

@@ -5,9 +5,9 @@ discount or bootstrapping. The two algorithms differ only in the action distribu
 categorical over omega), which the specification says.
 
     learner = Learner(Spec("select", StateLayout(("age",))), seed=1)
-    actions, logps = learner.act(states)
+    actions, logps = learner.actor.act(states, rng)
     rewards = [...]                                  # from fields that were actually fitted
-    learner.update(learner.batch(states, actions, logps, rewards))
+    learner.update(Batch(learner.spec.layout.batch(states), actions, logps, rewards))
 
 Same seed and same rewards give the same weights bit for bit: torch runs on one thread (the networks are too
 small for more), and random numbers are numpy's.
@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,6 @@ from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.actor import KIND, MAX_BYTES, Actor, read_spec
 from edge_server.scheduler.learned.clipped_update import Acted, UpdateFigures, clipped_update
 from edge_server.scheduler.learned.settings import Spec
-from edge_server.scheduler.learned.state import State
 from edge_server.torch_threads import one_torch_thread
 
 # Advantages that differ by less than this share of the rewards' standard deviation are errors of V.
@@ -41,13 +39,11 @@ _MIN_ADVANTAGE_STD = 0.05
 # Rewards that vary by less than this share of their size, or of all rewards' standard deviation, are
 # constant.
 _CONSTANT = 1e-9
-# Rewards further from the mean than this many standard deviations are clipped to it. The deviation may grow
-# by the same factor in one batch, so that a real change of scale is followed.
-_OUTLIER = 10.0
 # Decisions that count in the running statistics, which follow a scene or a channel that changes.
 _MEMORY = 4096
 # No measured reward is larger; its square would overflow.
 _MAX_REWARD = 1e100
+# Of random numbers; of "actions" nothing is drawn any more, and a seed keeps its others.
 _STREAMS = ("weights", "actions", "order")
 
 
@@ -73,12 +69,10 @@ class Diagnostics(UpdateFigures):
     """Figures of an update; all 0 for a batch without a usable decision.
 
     reward: mean of the finite ones. dropped: decisions whose reward or log-probability was not finite.
-    explained: share of the rewards' variance that V explained before the update (None where they do not vary).
     """
 
     reward: float | None
     dropped: int
-    explained: float | None
 
 
 class Learner:
@@ -109,28 +103,6 @@ class Learner:
         weights = {name: w.detach().numpy().copy() for name, w in self._actor.items()}
         return Actor(self.spec, weights, mean_features=self._mean_features.copy())
 
-    def act(self, states: Sequence[State], explore: bool = True) -> tuple[NDArray[Any], NDArray[np.float64]]:
-        """Actions, (B, N) bool or (B,) indices of omegas, and their log-probabilities (B,). Without
-        ``explore`` the most probable ones."""
-        return self.actor.act(states, self._rng["actions"] if explore else None)
-
-    def value(self, states: Sequence[State]) -> NDArray[np.float64]:
-        """V (B,), in the reward's unit."""
-        weights = {name: w.detach().numpy() for name, w in self._value.items()}
-        found = networks.value(np, weights, self.spec.layout.batch(states))
-        return self._rewards.mean + self._rewards.scale * found
-
-    def batch(
-        self,
-        states: Sequence[State],
-        actions: NDArray[Any],
-        logps: NDArray[np.float64],
-        rewards: Sequence[float | None] | NDArray[np.float64],
-    ) -> Batch:
-        """The batch for ``update``; arguments as in ``Batch``, a missing reward may be None."""
-        found = np.array([np.nan if r is None else r for r in rewards], np.float64)
-        return Batch(self.spec.layout.batch(states), np.asarray(actions), np.asarray(logps), found)
-
     # --- learning -----------------------------------------------------------------------------------
 
     def update(self, batch: Batch) -> Diagnostics:
@@ -140,10 +112,9 @@ class Learner:
         usable = (np.abs(batch.rewards) < _MAX_REWARD) & np.isfinite(batch.logps)
         dropped = int((~usable).sum())
         if not usable.any():
-            return Diagnostics(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, None, dropped, None)
+            return Diagnostics(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, None, dropped)
         rewards = batch.rewards[usable]
         mean = float(rewards.mean())
-        rewards = self._rewards.clipped(rewards)
         self._rewards.add(rewards)
         self.updates += 1
         self.decisions += len(rewards)
@@ -152,26 +123,24 @@ class Learner:
             self._cameras_seen += len(cameras)
             self._mean_features += (cameras - self._mean_features).sum(axis=0) / self._cameras_seen
         with one_torch_thread():
-            figures, explained = self._improve(
+            figures = self._improve(
                 torch.tensor(batch.features[usable]),
                 torch.tensor(batch.actions[usable]),
                 torch.tensor(batch.logps[usable]),
                 torch.tensor(self._rewards.standardized(rewards)),
             )
-        return Diagnostics(**asdict(figures), reward=mean, dropped=dropped, explained=explained)
+        return Diagnostics(**asdict(figures), reward=mean, dropped=dropped)
 
     def _improve(
         self, features: torch.Tensor, actions: torch.Tensor, logps: torch.Tensor, rewards: torch.Tensor
-    ) -> tuple[UpdateFigures, float | None]:
-        """``clipped_update``, and the share of the rewards' variance that V explained before it."""
+    ) -> UpdateFigures:
+        """``clipped_update`` with normalized advantages."""
         spec = self.spec
         with torch.no_grad():
             baseline = networks.value(torch, self._value, features)
         spread = rewards.std(correction=0).item()
-        left = (rewards - baseline).std(correction=0).item()
         # A single reward varies against those before it, which standardized it.
         varies = spread > _CONSTANT or (len(rewards) == 1 and self._rewards.variance > 0.0)
-        explained = 1.0 - (left / spread) ** 2 if spread > _CONSTANT else None
         # Where no action made a difference, only errors of V remain.
         advantages = self._normalized_advantages(rewards - baseline) if varies else torch.zeros_like(rewards)
 
@@ -181,7 +150,7 @@ class Learner:
             return now, entropy, networks.value(torch, self._value, features[some])
 
         acted = Acted(logps, advantages, rewards)
-        return clipped_update(spec, evaluate, acted, self._parameters, self._adam, self._rng["order"]), explained
+        return clipped_update(spec, evaluate, acted, self._parameters, self._adam, self._rng["order"])
 
     @staticmethod
     def _normalized_advantages(raw: torch.Tensor) -> torch.Tensor:
@@ -289,17 +258,6 @@ class _RunningMeanStd:
         """Standard deviation; 1 while nothing has varied."""
         spread = float(np.sqrt(self.variance))
         return spread if spread > _CONSTANT * abs(self.mean) else 1.0
-
-    def clipped(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """``values`` without outliers, judged by earlier ones; the first batch by its own median and
-        quartiles."""
-        middle, spread = self.mean, self.scale
-        if not self.count:
-            low, middle, high = np.percentile(values, (25, 50, 75))
-            spread = float(high - low)
-        if spread <= _CONSTANT * abs(middle) or (self.count and self.variance == 0.0):
-            return values
-        return np.clip(values, middle - _OUTLIER * spread, middle + _OUTLIER * spread)
 
     def standardized(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         return (values - self.mean) / self.scale

@@ -5,22 +5,20 @@ from __future__ import annotations
 import json
 import os
 import signal
-import time
-from contextlib import suppress
 
 import numpy as np
 import pytest
 
 import freshfield as ff
 from edge_server.cli import main as edge_server
-from edge_server.experiments.fitting.fit import Fit, marks_s
+from edge_server.experiments.fitting.fit import marks_s
 from edge_server.experiments.scenes.multiview_still import WHITE, mean_baselines, open_still
 from edge_server.export import ExportError
 from edge_server.fidelity.images import BLACK
-from edge_server.fields import FitReport, checkpoint
+from edge_server.fields import checkpoint
 from edge_server.report.build_report import build_report
 from freshfield.geometry import look_at
-from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
+from tests.edge_server.experiments.sets import SMALL_WORDS, write_photos
 from tests.support import refused
 
 
@@ -73,22 +71,6 @@ def test_one_carried_camera_is_a_scan_and_frames_with_times_are_refined(tmp_path
     assert (final["psnr_refined_db"] is not None) == timed == ("at refined poses" in printed)
     state, _ = checkpoint.load(out / "field")
     assert json.loads(str(state["meta"]))["settings"]["gaussians"] == 8192
-
-
-def test_ctrl_c_where_python_cannot_raise_it_is_not_lost(tmp_path, monkeypatch):
-    """As in a callback of the garbage collector."""
-
-    def deaf(views, budget):
-        with suppress(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(0.2)
-        return FitReport(1, 0.2, 0.0, 1, 1)
-
-    write_photos(tmp_path / "set", 5)
-    made, before = Fit(open_still(tmp_path / "set"), "ngp", SMALL), signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(made.field, "fit", deaf)
-    assert made.run(9.0) is False and len(made.rows) == 1 and made.rows[0].psnr_db is not None
-    assert signal.getsignal(signal.SIGINT) is before
 
 
 @pytest.mark.parametrize("presses", [1, 2])

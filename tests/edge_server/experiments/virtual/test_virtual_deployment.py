@@ -173,7 +173,6 @@ def test_the_charge_is_the_scenarios_or_the_commands(tmp_path: Path, capsys):
     assert simulated(path, capsys)["update_ms"] == pytest.approx(100.0)
     assert simulated(path, capsys, "--compute", "zero")["update_ms"] == 0.0
     assert simulated(path, capsys, "--compute", "5:1", "--steps", "4")["update_ms"] == pytest.approx(21.0)
-    assert simulated(path, capsys, "--policy", "wait-flush:60")["policy"] == "wait-flush"
 
 
 def test_what_a_learned_policy_decided_is_kept_as_of_a_live_run(tmp_path: Path):

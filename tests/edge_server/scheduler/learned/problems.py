@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.ppo import Batch, Learner
 from edge_server.scheduler.learned.state import State, StateLayout
 
@@ -19,9 +20,24 @@ def collect(learner: Learner, problem: Any, seeds: Sequence[int]) -> Batch:
     """A batch of the learner's exploring decisions in the rounds of ``seeds``."""
     rounds = [problem.draw(seed) for seed in seeds]
     states = [one.state for one in rounds]
-    actions, logps = learner.act(states)
-    rewards = [one.reward(action) for one, action in zip(rounds, actions)]
-    return learner.batch(states, actions, logps, rewards)
+    actions, logps = act(learner, states)
+    return batch_of(learner, states, actions, logps, [one.reward(a) for one, a in zip(rounds, actions)])
+
+
+def act(learner: Learner, states: Sequence[State]) -> tuple[Any, Any]:
+    """Exploring actions and their log-probabilities; what a checkpoint keeps decides the luck."""
+    return learner.actor.act(states, learner._rng["actions"])
+
+
+def batch_of(learner: Learner, states: Sequence[State], actions: Any, logps: Any, rewards: Any) -> Batch:
+    return Batch(learner.spec.layout.batch(states), actions, logps, np.array(rewards, float))
+
+
+def value(learner: Learner, states: Sequence[State]) -> np.ndarray:
+    """V of states, in the reward's unit."""
+    weights = {name: w.detach().numpy() for name, w in learner._value.items()}
+    found = networks.value(np, weights, learner.spec.layout.batch(states))
+    return learner._rewards.mean + learner._rewards.scale * found
 
 
 def same(a: Learner, b: Learner) -> bool:
@@ -92,5 +108,5 @@ def teach(learner: Any, problem: Any, updates: int, batch: int = 64) -> None:
 def regret(learner: Any, problem: Any, decisions: int = 300) -> float:
     """Mean regret of the likeliest actions at instants that were never trained on."""
     drawn = [problem.draw(10**6 + i) for i in range(decisions)]
-    actions, _ = learner.act([d.state for d in drawn], explore=False)
+    actions, _ = learner.actor.act([d.state for d in drawn])
     return float(np.mean([d.regret(a) for d, a in zip(drawn, actions)]))

@@ -13,7 +13,8 @@ import pytest
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.report.explain_command import main
-from edge_server.scheduler import Epoch, make_live_policy, make_policy, parse_policy
+from edge_server.scheduler import Epoch, make_policy, parse_policy
+from edge_server.scheduler.learned import decision_record
 from edge_server.scheduler.learned.actor import Decision
 from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.decision_record import FOLDER, DecisionWriter, read_decision
@@ -83,7 +84,7 @@ def test_a_set_is_chosen_when_views_are_selected_and_is_never_empty():
 def test_the_shipped_policy_has_a_name_that_a_file_of_ones_own_takes_over(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shipped = f"bandit:{scenario.SCENARIO_FOLDER / 'card/policy.npz'}"
-    assert make_live_policy(shipped, None, np.random.default_rng(0)).name == shipped
+    assert make_policy(shipped, None, np.random.default_rng(0)).name == shipped
     data = {"cameras": {"count": 3}, "edge": {"policy": {"name": "bandit:card/policy.npz"}}}
     made = scenario.parse(data, tmp_path / "tiny.yaml")
     assert parse_policy("bandit:card/policy.npz")[0] == read_config(made).policy.name == shipped
@@ -144,17 +145,18 @@ def test_a_decision_comes_back_as_it_was(tmp_path):
     )
 
 
-def test_the_oldest_make_room_and_with_them_policies_that_nobody_needs(tmp_path):
-    record = DecisionWriter(tmp_path, max_decisions=3)
+def test_the_oldest_make_room(tmp_path, monkeypatch):
+    monkeypatch.setattr(decision_record, "MAX_DECISIONS", 3)
+    record = DecisionWriter(tmp_path)
     for number in range(6):
-        record.write(a_decision(number, seed=number // 3))
+        record.write(a_decision(number))
     folder = tmp_path / FOLDER
     assert names(folder, "0*") == ["000003.npz", "000004.npz", "000005.npz"]
-    assert len(names(folder, "policy-*")) == 1
-    again = DecisionWriter(tmp_path, max_decisions=3)  # another process of the same run goes on
+    again = DecisionWriter(tmp_path)  # another process of the same run goes on
     again.write(a_decision(6))
     assert names(folder, "0*") == ["000004.npz", "000005.npz", "000006.npz"]
-    large = DecisionWriter(tmp_path / "large", max_bytes=1)
+    monkeypatch.setattr(decision_record, "MAX_BYTES", 1)
+    large = DecisionWriter(tmp_path / "large")
     for number in range(2):
         large.write(a_decision(number))
         assert names(tmp_path / "large" / FOLDER, "0*") == [f"{number:06d}.npz"]  # the newest, however large
@@ -162,7 +164,7 @@ def test_the_oldest_make_room_and_with_them_policies_that_nobody_needs(tmp_path)
 
 def test_a_run_that_begins_anew_in_the_same_folder_forgets_the_earlier_one(tmp_path):
     for seed, numbers in ((0, range(4)), (1, range(2))):
-        writer = DecisionWriter(tmp_path, max_decisions=4)
+        writer = DecisionWriter(tmp_path)
         for number in numbers:
             writer.write(a_decision(number, seed=seed))
     assert names(tmp_path / FOLDER, "0*") == ["000000.npz", "000001.npz"]
