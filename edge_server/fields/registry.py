@@ -13,19 +13,14 @@ from edge_server.fields import Field
 from edge_server.fields.common import trainer_settings
 from freshfield import plugins
 
-_PACKAGES: dict[str, str] = {
-    "ngp": "edge_server.fields.ngp",
-    "nerfacto": "edge_server.fields.nerfacto",
-    "tensorf": "edge_server.fields.tensorf",
-    "splat": "edge_server.fields.splat",
-}
+_PACKAGES = ("ngp", "nerfacto", "tensorf", "splat")
 FIELD = "splat"
 """The usual representation."""
 
 
 def field_names() -> tuple[str, ...]:
     """The names of all representations."""
-    return tuple(_PACKAGES)
+    return _PACKAGES
 
 
 def option_help(name: str) -> dict[str, str]:
@@ -61,7 +56,7 @@ def settings_of(name: str, options: Mapping[str, Any] | None = None, seed: int =
 
 def _settings_class(name: str) -> Any:
     if name in _PACKAGES:
-        return import_module(f"{_PACKAGES[name]}.settings").SETTINGS
+        return import_module(f"edge_server.fields.{name}.settings").SETTINGS
     found = getattr(plugins.find("field", name, _PACKAGES), "Settings", None)
     if not (isinstance(found, type) and issubclass(found, trainer_settings.FieldSettings)):
         raise plugins.PluginError(f"field {name}: expected an attribute Settings, a subclass of FieldSettings")

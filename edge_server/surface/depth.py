@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Renderer
-from edge_server.surface import SurfaceError
 from edge_server.surface import settings as tuned
 from freshfield.geometry import Pinhole
 
@@ -59,7 +58,6 @@ def depth_map(
     camera_to_world: NDArray[np.float64],
     intrinsics: Pinhole,
     sure: NDArray[np.float32] | None = None,
-    steepest_deg: float = tuned.STEEPEST_DEG,
 ) -> DepthMap:
     """A depth map from depth along rays. Trust is the cosine between ray and normal: uncertainty grows as the
     surface turns away.
@@ -68,20 +66,13 @@ def depth_map(
         unknown.
     color: uint8 (H, W, 3). camera_to_world: (4, 4), OpenCV axes, meters.
     sure: float32 (H, W), factor of the trust of pixels that see a surface; None: 1.
-    steepest_deg: largest angle between ray and normal; beyond it depth is unknown.
-    Raises SurfaceError if shapes do not match or the pose is not finite.
     """
-    shape = (intrinsics.height, intrinsics.width)
-    if depth.shape != shape or color.shape != (*shape, 3):
-        raise SurfaceError(f"depth {depth.shape} and color {color.shape} do not fit a camera of {shape}")
     pose = np.asarray(camera_to_world, dtype=np.float64)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise SurfaceError("a depth map's camera_to_world must be a finite (4, 4) matrix")
     empty = np.isposinf(depth)
     depth = np.where((depth > 0) & (depth < tuned.MAX_DEPTH_M), depth, 0).astype(np.float32)
     cosine = incidence_cosine(depth, intrinsics)
     trust = cosine if sure is None else cosine * np.clip(np.nan_to_num(sure, nan=0.0), 0.0, 1.0)
-    seen = cosine >= np.cos(np.deg2rad(steepest_deg))
+    seen = cosine >= np.cos(np.deg2rad(tuned.STEEPEST_DEG))
     depth = np.where(seen, depth, np.where(empty, np.inf, 0.0)).astype(np.float32)
     trust = np.where(seen, trust, np.where(empty, tuned.EMPTY_TRUST, 0.0)).astype(np.float32)
     return DepthMap(depth, trust, np.where(empty, np.float32(1.0), cosine), color, pose, intrinsics)

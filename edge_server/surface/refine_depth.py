@@ -10,7 +10,7 @@ each side of the field's, the last ones also ask that the depth of one image lea
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -18,35 +18,20 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
-from edge_server.surface import SurfaceError
+from edge_server.fields.splat.carried_camera.discs import filled
 from edge_server.surface import settings as tuned
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.patch_images import Images, Planes, Search, View
-from edge_server.surface.kernels.patch_match import SOURCES, WORST, choose_sources, confirm, match, offer
+from edge_server.surface.kernels.patch_match import choose_sources, confirm, match
 from freshfield.geometry import seen_from
 
-
-@dataclass(frozen=True)
-class Phase:
-    """One pass over every map.
-
-    choose: whether the images to compare with are chosen anew, from the current planes.
-    offer: which of the other maps' points that fall on a pixel offers its plane: the "cheapest" or the
-    "nearest"; "": none.
-    """
-
-    search: Search
-    choose: bool = False
-    offer: str = ""
-
-
-PHASES = (
-    Phase(Search(4, tuned.REACH, 0.02, 0.4, 0.0), choose=True),
-    Phase(Search(4, tuned.REACH, 0.02, 0.4, 0.0)),
-    Phase(Search(4, tuned.REACH, 0.01, 0.3, 0.0), choose=True, offer="cheapest"),
-    Phase(Search(2, tuned.REACH, 0.005, 0.2, 0.0), offer="nearest"),
-    Phase(Search(0, tuned.REACH, 0.005, 0.2, 0.1), choose=True, offer="cheapest"),
-    Phase(Search(0, tuned.REACH, 0.002, 0.1, 0.1), choose=True, offer="nearest"),
+PASSES = (
+    Search(True, 4, tuned.REACH, 0.02, 0.4, 0.0),
+    Search(False, 4, tuned.REACH, 0.02, 0.4, 0.0),
+    Search(True, 4, tuned.REACH, 0.01, 0.3, 0.0),
+    Search(False, 2, tuned.REACH, 0.005, 0.2, 0.0),
+    Search(True, 0, tuned.REACH, 0.005, 0.2, 0.1),
+    Search(True, 0, tuned.REACH, 0.002, 0.1, 0.1),
 )
 
 
@@ -57,31 +42,28 @@ def refine_depth(
     on_map: Callable[[float], None] | None = None,
 ) -> list[DepthMap]:
     """Refine the depth of ``maps``. photos: camera images, uint8 (H, W, 3 or 4) each. on_map: called with
-    the completed share. SurfaceError: the images do not match the maps."""
-    if len(maps) != len(photos):
-        raise SurfaceError(f"{len(photos)} images do not belong to {len(maps)} depth maps")
+    the completed share."""
     pool = pool or shared_pool()
-    grays = [_gray(photo, found) for photo, found in zip(photos, maps)]
+    grays = [_gray(photo) for photo in photos]
     gains = exposures(maps, grays)
     grays = [(gray / np.float32(gain)).astype(np.float32) for gray, gain in zip(grays, gains)]
     guesses = [_fill_unknown(found) for found in maps]
     views = [_view(k, found, gray) for k, (found, gray) in enumerate(zip(maps, grays))]
     planes = [
-        Planes(guess.copy(), smooth_normals(guess, view.rays), np.full(guess.shape, WORST, np.float32))
+        Planes(guess.copy(), smooth_normals(guess, view.rays), np.full(guess.shape, tuned.WORST, np.float32))
         for guess, view in zip(guesses, views)
     ]
-    for number, phase in enumerate(PHASES):
-        # Every map is compared with the others as they were before the phase, whatever the order.
+    for number, search in enumerate(PASSES):
+        # Every map is compared with the others as they were before the pass, whatever the order.
         images = _images(maps, grays, planes)
-        offers = _offers(images, views, planes, phase.offer, pool)
-        for k, (view, guess, found, offered) in enumerate(zip(views, guesses, planes, offers)):
-            if phase.choose:
-                pool.run(choose_sources, images, view, found, number > 0)
+        for k, (view, guess, found) in enumerate(zip(views, guesses, planes)):
+            if search.choose:
+                pool.run(choose_sources, images, view, found)
             for parity in (0, 1):
-                key = np.uint64((len(PHASES) * k + number) * 2 + parity)
-                pool.run(match, images, view, guess, offered, found, parity, key, phase.search)
+                key = np.uint64((len(PASSES) * k + number) * 2 + parity)
+                pool.run(match, images, view, guess, found, parity, key, search)
             if on_map is not None:
-                on_map((number + (k + 1) / len(maps)) / (len(PHASES) + 1))
+                on_map((number + (k + 1) / len(maps)) / (len(PASSES) + 1))
     images = _images(maps, grays, planes)
     out = [_with_trust(*each, images, pool) for each in zip(maps, views, planes)]
     if on_map is not None:
@@ -146,10 +128,8 @@ def smooth_normals(depth: NDArray[np.float32], rays: NDArray[np.float64]) -> NDA
     return np.where(away, -normal, normal).astype(np.float32)
 
 
-def _gray(photo: NDArray[np.uint8], found: DepthMap) -> NDArray[np.float32]:
+def _gray(photo: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Gray levels, not rounded: a third of the noise where only shading varies."""
-    if photo.shape[:2] != found.depth.shape:
-        raise SurfaceError(f"an image of {photo.shape} does not belong to a depth map {found.depth.shape}")
     color = np.ascontiguousarray(photo[..., :3]).astype(np.float32)
     return cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32)
 
@@ -157,19 +137,12 @@ def _gray(photo: NDArray[np.uint8], found: DepthMap) -> NDArray[np.float32]:
 def _fill_unknown(found: DepthMap) -> NDArray[np.float32]:
     """Initial depth: unknown pixels take that of the nearest known one; 0 where the ray hits nothing."""
     depth = np.where(found.seen, found.depth, np.float32(0.0))
-    if not found.seen.any():
-        return depth
-    _, label = cv2.distanceTransformWithLabels(
-        (~found.seen).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    of_label = np.zeros(int(label.max()) + 1, np.float32)
-    of_label[label[found.seen]] = depth[found.seen]
-    return np.where(found.depth == 0, of_label[label], depth)
+    return np.where(found.depth == 0, filled(depth), depth)
 
 
 def _view(k: int, found: DepthMap, gray: NDArray[np.float32]) -> View:
     rays = np.ascontiguousarray(found.intrinsics.rays() @ found.camera_to_world[:3, :3].T)
-    return View(k, rays, gray, np.full((*gray.shape, SOURCES), -1, np.int16))
+    return View(k, rays, gray, np.full((*gray.shape, tuned.SOURCES), -1, np.int16))
 
 
 def _images(maps: Sequence[DepthMap], grays: Sequence[NDArray[np.float32]], planes: Sequence[Planes]) -> Images:
@@ -183,37 +156,6 @@ def _images(maps: Sequence[DepthMap], grays: Sequence[NDArray[np.float32]], plan
         gray=np.concatenate([gray.ravel() for gray in grays]),
         depth=np.concatenate([found.depth.ravel() for found in planes]),
     )
-
-
-def _offers(images: Images, views: Sequence[View], planes: Sequence[Planes], which: str, pool: Pool) -> list[Planes]:
-    """For every map, planes of other maps to try, see ``Phase``."""
-    none = [Planes(np.zeros_like(p.depth), p.normal, p.cost) for p in planes]
-    sure = [(p.depth > 0) & (p.cost < tuned.OFFERED) for p in planes]
-    if not which or not any(s.any() for s in sure):
-        return none
-    points = np.concatenate(
-        [
-            (images.origin[v.index] + v.rays[s] * p.depth[s, None]).astype(np.float32)
-            for v, p, s in zip(views, planes, sure)
-        ]
-    )
-    normals = np.concatenate([p.normal[s] for p, s in zip(planes, sure)])
-    costs = np.concatenate([p.cost[s] for p, s in zip(planes, sure)])
-    owners = np.repeat(np.arange(len(planes), dtype=np.int32), [int(s.sum()) for s in sure])
-    winner, least = np.empty(len(images.gray), np.int32), np.empty(len(images.gray), np.float32)
-    pool.run(offer, images, points, normals, costs, owners, which == "nearest", winner, least)
-    out = []
-    for view, empty, first in zip(views, none, images.first):
-        won = winner[first : first + view.gray.size].reshape(view.gray.shape)
-        some = won >= 0
-        index, ray = won[some], view.rays[some]
-        along = (normals[index] * ray).sum(axis=-1)
-        reach = (normals[index] * (points[index] - images.origin[view.index])).sum(axis=-1)
-        depth, normal = empty.depth, empty.normal.copy()
-        depth[some] = np.where(along < -1e-3, reach / np.minimum(along, -1e-3), 0.0)
-        normal[some] = normals[index]
-        out.append(Planes(depth, normal, empty.cost))
-    return out
 
 
 def _with_trust(found: DepthMap, view: View, planes: Planes, images: Images, pool: Pool) -> DepthMap:

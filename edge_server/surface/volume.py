@@ -33,17 +33,12 @@ class Grid:
     band_m: float
 
     def __post_init__(self) -> None:
-        values = np.array([*self.lower, *self.upper, self.voxel_m, self.band_m])
-        if not np.isfinite(values).all():
-            raise SurfaceError("bounds, voxel size and truncation must be finite")
-        if not self.voxel_m > 0:
-            raise SurfaceError(f"voxel size must be more than 0, not {1e3 * self.voxel_m:g} mm")
-        if self.band_m < self.voxel_m:
+        finite = np.isfinite([*self.lower, *self.upper, self.voxel_m, self.band_m]).all()
+        if not finite or not self.voxel_m > 0 or not all(low < high for low, high in zip(self.lower, self.upper)):
             raise SurfaceError(
-                f"truncation must be at least one voxel ({1e3 * self.voxel_m:g} mm), not {1e3 * self.band_m:g} mm"
+                "each lower corner must be below its upper one, and voxels larger than 0: "
+                f"{1e3 * self.voxel_m:g} mm in {self.describe()}"
             )
-        if not all(low < high for low, high in zip(self.lower, self.upper)):
-            raise SurfaceError(f"bounds: each lower corner must be below its upper one: {self.describe()}")
         entries = np.prod(self.blocks.astype(float))
         if entries > tuned.MAX_BLOCKS:
             least = self.voxel_m * (entries / tuned.MAX_BLOCKS) ** (1 / 3)

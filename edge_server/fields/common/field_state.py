@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -14,19 +14,14 @@ from edge_server.fields.common.view_store import Arrays, ViewStore
 
 VERSION = 1  # of what ``pack_state`` writes
 
+T = TypeVar("T")
 
-def pack_state(name: str, settings: Any, view_store: ViewStore, counters: dict[str, Any], arrays: Arrays) -> Arrays:
-    """The whole state of a field in one dictionary of copies.
 
-    name: of the representation. counters: facts, ready for JSON. arrays: what was learned.
-    """
-    meta = {
-        "version": VERSION,
-        "field": name,
-        "settings": msgspec.structs.asdict(settings),
-        **counters,
-        **view_store.meta(),
-    }
+def pack_state(settings: Any, view_store: ViewStore, counters: dict[str, Any], arrays: Arrays) -> Arrays:
+    """The whole state of a field in one dictionary of copies. counters: facts, ready for JSON. arrays: what was
+    learned."""
+    about = {"version": VERSION, "field": settings.name, "settings": msgspec.structs.asdict(settings)}
+    meta = {**about, **counters, **view_store.meta()}
     both = {"meta": np.array(json.dumps(meta)), **arrays, **view_store.arrays()}
     return {name: np.array(array) for name, array in both.items()}
 
@@ -90,6 +85,16 @@ def load_arrays(wanted: Arrays, state: Arrays) -> None:
             raise ValueError(f"the state lacks {name!r}, {mine.dtype} of shape {mine.shape}")
     for name, mine in wanted.items():
         mine[...] = state[name]
+
+
+def to_json(value: Any) -> Any:
+    """Structs, named tuples and arrays as plain values, exact, ready for JSON."""
+    return msgspec.to_builtins(value, enc_hook=np.ndarray.tolist)
+
+
+def from_json(told: Any, kind: type[T]) -> T:
+    """What ``to_json`` was given, of arrays of float64. ValueError: it is of another kind."""
+    return msgspec.convert(told, kind, dec_hook=lambda _, numbers: np.array(numbers, dtype=np.float64))
 
 
 def take_attributes(owner: Any, names: tuple[str, ...]) -> Arrays:

@@ -20,9 +20,8 @@ from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.common.view_store import Arrays, ViewStore
 from freshfield.geometry import Pinhole
 
-# A step at a progress of the fit in [0, 1] -> loss (None: none is known), rays, samples, and how many values
-# were not finite and left out.
-Step = Callable[[float], tuple[float | None, int, int, int]]
+# A step at a progress of the fit in [0, 1] -> loss, rays, samples, and how many values were not finite and left out.
+Step = Callable[[float], tuple[float, int, int, int]]
 
 
 class StepSnapshot(Snapshot, Protocol):
@@ -89,14 +88,13 @@ class SteppedField(ABC, Generic[S]):
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
         step_budget = StepBudget(budget, self.now)
-        one_step, rays, samples = self._begin_fit(views, step_budget, budget)
-        dropped = 0
+        one_step = self._begin_fit(views, step_budget)
+        rays = samples = dropped = 0
         losses: deque[float] = deque(maxlen=32)
         while (progress := step_budget.begin_step(self._step_time)) is not None:
             with self._lock:
                 loss, seen, used, lost = one_step(progress)
-            if loss is not None:
-                losses.append(loss)
+            losses.append(loss)
             rays, samples, dropped = rays + seen, samples + used, dropped + lost
             step_budget.end_step()
         self.dropped += dropped
@@ -126,7 +124,7 @@ class SteppedField(ABC, Generic[S]):
     def state(self) -> Arrays:
         """Everything needed to go on bit for bit: what was learned, moments, cameras, counters."""
         with self._lock:
-            return pack_state(self.settings.name, self.settings, self.view_store, self._counters(), self._arrays())
+            return pack_state(self.settings, self.view_store, self._counters(), self._arrays())
 
     def load_state(self, state: Arrays) -> None:
         """Continue from ``state``. ValueError: it is not the state of a field of this shape."""
@@ -146,8 +144,8 @@ class SteppedField(ABC, Generic[S]):
         """Begin at step 0, without a snapshot, in the box of ``view_store`` (None: no scene yet)."""
 
     @abstractmethod
-    def _begin_fit(self, views: Sequence[View], step_budget: StepBudget, budget: Budget) -> tuple[Step, int, int]:
-        """Take views in, under the lock; returns a fit's step, and the rays and samples used so far."""
+    def _begin_fit(self, views: Sequence[View], step_budget: StepBudget) -> Step:
+        """Take views in, under the lock; returns a fit's step."""
 
     @abstractmethod
     def _live(self) -> S:

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.trainer_settings import CHANGE, MARGIN_PX
 from freshfield.geometry import GeometryError, Pinhole, Pose, invertible
 from freshfield.limits import MAX_CENTER_OUTSIDE_SIDES
 
-CHANGE = 16  # of 255, after blurring: above the noise of sensors and of video compression
-MARGIN_PX = 2
 # Limits beyond any real camera, within what float32 can represent: positions (geographic grids reach 1e7 m),
 # and focal lengths as a share of the image's longer side.
 FARTHEST_M = 1e9
@@ -56,38 +55,28 @@ def check_view(view: View) -> None:
         raise ValueError(f"camera {view.camera}: {error}") from None
     if np.abs(view.camera_to_world[:3, 3]).max() > FARTHEST_M:
         raise ValueError(f"camera {view.camera}: its position is more than {FARTHEST_M:g} m from the origin")
-    if not np.all(np.isfinite(lens_row(camera))) or camera.fx <= 0 or camera.fy <= 0:
-        raise ValueError(f"camera {view.camera}: intrinsics must be finite, focal lengths positive")
     shortest, longest = (limit * max(camera.width, camera.height) for limit in FOCAL)
-    if not (shortest <= camera.fx <= longest and shortest <= camera.fy <= longest):
+    lens = np.array(lens_row(camera))
+    if not np.isfinite(lens).all() or lens[:2].min() < shortest or lens[:2].max() > longest:
         raise ValueError(
             f"camera {view.camera}: focal lengths of {camera.fx:g} and {camera.fy:g} pixels are no lens "
-            f"for an image of {camera.width} x {camera.height}"
+            f"for an image of {camera.width} x {camera.height}, or its other numbers are not finite"
         )
-    outside = (abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
-    if max(outside) > MAX_CENTER_OUTSIDE_SIDES + 0.5:
+    if np.abs(lens[2:4] / (camera.width, camera.height) - 0.5).max() > MAX_CENTER_OUTSIDE_SIDES + 0.5:
         raise ValueError(
             f"camera {view.camera}: its principal point of {camera.cx:g}, {camera.cy:g} is far outside "
             f"the image of {camera.width} x {camera.height}"
         )
     if not invertible(camera):
         raise ValueError(f"camera {view.camera}: its distortion cannot be undone over the whole image")
-    weight = view.weight
-    if weight is not None and not (
-        weight.dtype == np.float32
-        and weight.shape == image.shape[:2]
-        and bool(((weight >= 0.0) & (weight <= 1.0)).all())  # not of NaN
-    ):
-        raise ValueError(
-            f"camera {view.camera}: weight must be float32 of shape {image.shape[:2]} within 0..1, "
-            f"not {weight.dtype} of shape {weight.shape}"
-        )
-    depth = view.depth
-    if depth is not None and not (depth.dtype == np.float32 and depth.shape == image.shape[:2]):
-        raise ValueError(
-            f"camera {view.camera}: depth must be float32 of shape {image.shape[:2]}, "
-            f"not {depth.dtype} of shape {depth.shape}"
-        )
+    for name, array in (("weight", view.weight), ("depth", view.depth)):
+        if array is not None and not (array.dtype == np.float32 and array.shape == image.shape[:2]):
+            raise ValueError(
+                f"camera {view.camera}: {name} must be float32 of shape {image.shape[:2]}, "
+                f"not {array.dtype} of shape {array.shape}"
+            )
+    if view.weight is not None and not ((view.weight >= 0.0) & (view.weight <= 1.0)).all():  # nor of NaN
+        raise ValueError(f"camera {view.camera}: weight must be within 0..1")
 
 
 def moved_pixels(before: View, now: View) -> NDArray[np.bool_] | None:

@@ -11,17 +11,17 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Budget, View
+from edge_server.fields import View
 from edge_server.fields.common.cameras.camera_refinement import CameraRefinement
 from edge_server.fields.common.field_state import load_arrays
 from edge_server.fields.common.kernels.adam import PART, Rule, adam
-from edge_server.fields.common.kernels.mlp import Net
+from edge_server.fields.common.kernels.mlp import Net, init_net
 from edge_server.fields.common.kernels.rays import Space, Views
 from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, ROW, Batch, RaySampling, Scratch, train_chunks
 from edge_server.fields.common.kernels.volume_rendering import Weights
@@ -30,28 +30,27 @@ from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.scene_box import UNIT_BOX, SceneBox
 from edge_server.fields.common.stepped_field import Step, SteppedField
 from edge_server.fields.common.supervision import supervising_views
-from edge_server.fields.common.trainer_settings import BATCH, BETA2
-from edge_server.fields.common.training_schedule import (
+from edge_server.fields.common.trainer_settings import (
+    BATCH,
     BETA1_FIELD,
+    BETA2,
+    FEW_VIEWS,
+    GUIDE_WEIGHT,
     NOMINAL_RAYS,
-    StepBudget,
-    StepTimer,
-    step_key,
-    step_length,
+    SWEEP_SHARE,
 )
+from edge_server.fields.common.training_schedule import StepBudget, StepTimer, step_key, step_length
 from edge_server.fields.common.view_store import Arrays, same_views
 
 TINY: dict[str, Any] = {"batch_samples": CHUNK, "cells": 16, "samples": 16}  # for compiling kernels
 assert BATCH == CHUNK, "settings and kernels must agree on the size of a chunk"
-GUIDE_WEIGHT = 0.1  # weight of a depth guide where the settings leave it open
-FEW_VIEWS = 6  # with up to so many views, a depth guide is used in any scene
-SWEEP_SHARE = 0.5  # of a budget in seconds that a plane sweep may take
 DIRTY = 32  # parameters for one dirty flag: a segment of ``adam``, times its width
 
 
 class TrainedField(SteppedField[RaySnapshot]):
     """A radiance field that learns while it is used. See ``SteppedField``."""
 
+    shape: ClassVar[tuple[str, ...]] = ("hidden", "hidden_layers", "sh_degree", "cells")
     _encoding: Any  # a named tuple with a ``table`` of float32 parameters, see ``kernels.radiance_model``
     _bins: tuple[Any, ...] = ()  # what the encoding's kernels need for training beside ``Scratch``
     _net: Net
@@ -62,7 +61,7 @@ class TrainedField(SteppedField[RaySnapshot]):
 
     # --- the protocol -------------------------------------------------------------------------
 
-    def _begin_fit(self, views: Sequence[View], step_budget: StepBudget, budget: Budget) -> tuple[Step, int, int]:
+    def _begin_fit(self, views: Sequence[View], step_budget: StepBudget) -> Step:
         with self._lock:
             update = self.view_store.add(views)
             if update.box_changed:
@@ -72,7 +71,7 @@ class TrainedField(SteppedField[RaySnapshot]):
             assert self.view_store.box is not None
             box, cameras = self.view_store.box, self._cameras
             data = cameras.corrected(views, update.data, box)
-            data = self._add_depth_guide(views, data, box, step_budget, update.has_new_images)
+            data = self._add_depth_guide(views, data, box, step_budget)
             shape = len(self._batch.samples), *cameras.embeddings.shape
             self._batch = self._batch._replace(d_embeddings=np.zeros(shape, np.float32))
 
@@ -83,7 +82,7 @@ class TrainedField(SteppedField[RaySnapshot]):
             dropped = int(batch.dropped.sum() + self._dropped_by_task.sum())
             return loss, int(batch.rays.sum()), int(batch.samples.sum()), dropped
 
-        return one_step, 0, 0
+        return one_step
 
     def _live(self) -> RaySnapshot:
         return RaySnapshot(
@@ -103,14 +102,12 @@ class TrainedField(SteppedField[RaySnapshot]):
     def _counters(self) -> dict[str, Any]:
         return {
             "step": self.step,
-            "updates": self._updates,
             "dropped": self.dropped,
             "needed": self._occupancy.needed,
             "camera_errors": self._cameras.meta(),
         }
 
     def _load(self, meta: dict[str, Any], state: Arrays) -> None:
-        self._updates = int(meta["updates"])
         self._grow()
         load_arrays(self._arrays(), state)
         self._cameras.load(meta.get("camera_errors", {}))
@@ -133,8 +130,8 @@ class TrainedField(SteppedField[RaySnapshot]):
     # --- what a representation is -------------------------------------------------------------
 
     @abstractmethod
-    def _make(self, rng: np.random.Generator) -> tuple[Any, Net]:
-        """A fresh encoding and network for ``self.view_store.box`` (None: no scene yet)."""
+    def _make(self, rng: np.random.Generator) -> tuple[Any, int]:
+        """A fresh encoding for ``self.view_store.box`` (None: no scene yet), and its number of features."""
 
     def _tiny(self) -> Any:
         return msgspec.structs.replace(self.settings, **TINY)
@@ -154,9 +151,7 @@ class TrainedField(SteppedField[RaySnapshot]):
     def _gather(self, levels: int) -> None:
         """Add the encoding's gradient of ``self._batch`` to ``self._table_g`` and set ``self._dirty``."""
 
-    def _add_depth_guide(
-        self, views: Sequence[View], data: Views, box: SceneBox, step_budget: StepBudget, fresh: bool
-    ) -> Views:
+    def _add_depth_guide(self, views: Sequence[View], data: Views, box: SceneBox, step_budget: StepBudget) -> Views:
         """``data`` with a depth guide, if the settings ask for one and a plane sweep fits the budget."""
         s = self.settings
         weight = s.depth_guide
@@ -168,7 +163,7 @@ class TrainedField(SteppedField[RaySnapshot]):
         self._guide_weight = 0.0 if self._cameras.enabled else weight
         if self._present_guide_weight() == 0.0:
             return data
-        if fresh or self._swept is None or not same_views(views, self._swept[0]):
+        if self._swept is None or not same_views(views, self._swept[0]):
             if not step_budget.has_room(self._sweep_timer.seconds, SWEEP_SHARE, self._step_time.seconds):
                 return data
             # Imported here: other scenes need neither load nor compile it.
@@ -190,11 +185,11 @@ class TrainedField(SteppedField[RaySnapshot]):
         rng = np.random.default_rng(np.random.SeedSequence(s.seed))
         self.step = 0
         self._snapshot = None
-        self._updates = 0  # optimizer steps that Adam's bias correction counts
         self._step_time, self._sweep_timer = StepTimer(), StepTimer()
         self._guide_weight = 0.0
         self._swept = None
-        self._encoding, self._net = self._make(rng)
+        self._encoding, features = self._make(rng)
+        self._net = init_net(features, 4 + 9 * s.sh_degree + 3 * s.appearance, [s.hidden] * s.hidden_layers, rng)
         self._take_table(self._encoding.table)
         self._net_m, self._net_v, self._net_g = (np.zeros_like(self._net.params) for _ in range(3))
         self._occupancy = OccupancyGrid(s.cells, s.min_views, self.view_store.box)
@@ -267,16 +262,15 @@ class TrainedField(SteppedField[RaySnapshot]):
         self._gather(levels)
         if batch.dropped.any():
             self._repair()
-        self._updates += 1
-        fall = s.rate_end**progress
+        updates, fall = self.step + 1, s.rate_end**progress
         rule = Rule(
             rate=np.float32(s.rate * fall),
             beta1=np.float32(BETA1_FIELD),
             beta2=np.float32(BETA2),
             epsilon=np.float32(s.epsilon),
             scale=np.float32(NOMINAL_RAYS / rays),
-            correct1=np.float32(1.0 / (1.0 - BETA1_FIELD**self._updates)),
-            correct2=np.float32(1.0 / (1.0 - BETA2**self._updates)),
+            correct1=np.float32(1.0 / (1.0 - BETA1_FIELD**updates)),
+            correct2=np.float32(1.0 / (1.0 - BETA2**updates)),
         )
         rule_net = rule._replace(rate=np.float32(s.rate_net * fall))
         self.pool.run(

@@ -10,24 +10,14 @@ from collections.abc import Callable
 import numpy as np
 
 from edge_server.fields import Budget
-from edge_server.fields.common.hash_grid_settings import HashGridSettings
 from edge_server.fields.common.trainer_settings import TrainerSettings
 
-# Of encodings and their networks: a first fit has a hundred steps or so, and with .9 a tenth of them pass
-# before Adam forgets the gradients of fog that is gone.
-BETA1_FIELD = 0.65
 LATE = 1.1  # times a budget in seconds: a fit may end so late rather than make no step
-NOMINAL_RAYS = 4096.0  # gradients are scaled as if a step had so many rays: Adam's epsilon keeps its meaning
 
 
 def step_key(seed: int, step: int) -> np.uint64:
     """The random stream of one step."""
     return np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0]
-
-
-def active_levels(settings: HashGridSettings, step: int) -> int:
-    """Levels in use: coarse to fine, so that few views cannot be explained by fine noise at once."""
-    return min(settings.levels, settings.levels_start + step // settings.levels_every)
 
 
 def step_length(settings: TrainerSettings, step: int) -> float:

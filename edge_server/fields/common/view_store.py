@@ -13,12 +13,10 @@ from edge_server.fields import View
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import SceneBox, plain_background, scene_box
 from edge_server.fields.common.supervision import CameraMemory, check_view, pack_views, remember_views
-from edge_server.fields.common.trainer_settings import FieldSettings
+from edge_server.fields.common.trainer_settings import FINAL_BOX_CAMERAS, FieldSettings
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]
-
-FINAL_BOX_CAMERAS = 4  # cameras from which on a scene's box is kept
 
 
 @dataclass(frozen=True)
@@ -28,13 +26,11 @@ class PackedUpdate:
     data: what the kernels read.
     box_changed: the scene's box was found anew, so what was learned is void.
     visibility_changed: cameras or moving pixels changed, so visibility must be counted again.
-    has_new_images: some picture was not known before (a loaded field knows the pictures it was saved with).
     """
 
     data: Views
     box_changed: bool
     visibility_changed: bool
-    has_new_images: bool
 
 
 class ViewStore:
@@ -57,7 +53,7 @@ class ViewStore:
     def add(self, views: Sequence[View]) -> PackedUpdate:
         """Remember ``views`` and pack them for a fit. ValueError for one that cannot be a view."""
         if self._packed is not None and same_views(views, self._packed[0]):
-            return PackedUpdate(self._packed[1], False, False, False)
+            return PackedUpdate(self._packed[1], False, False)
         for view in views:
             check_view(view)
         visibility_changed, has_new_images = remember_views(self.memory, views)
@@ -74,7 +70,7 @@ class ViewStore:
             visibility_changed = True
         data = pack_views(views, self.box, self.memory)
         self._packed = (tuple(views), data)
-        return PackedUpdate(data, box_changed, visibility_changed or box_changed, has_new_images)
+        return PackedUpdate(data, box_changed, visibility_changed or box_changed)
 
     def keep_box(self) -> None:
         """Keep the scene's box, whatever cameras come."""

@@ -6,42 +6,31 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import msgspec
 import numpy as np
 
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT
-from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.train import CHUNK_RAYS
-from edge_server.fields.common.model_layout import init_net, make_grid
 from edge_server.fields.nerfacto.kernels.proposal import ProposalGrid, ProposalSampling
 from edge_server.fields.nerfacto.kernels.train import ProposalBins, scatter_proposal
 from edge_server.fields.nerfacto.settings import NerfactoSettings
 from edge_server.fields.ngp.field import NgpField
-from edge_server.fields.ngp.settings import STATE_SHAPE
 
 
 class NerfactoField(NgpField):
     """The hash grid of ``NgpField``, and a proposal. See ``fields.Field`` for the protocol."""
 
     Settings = NerfactoSettings
-    shape: ClassVar[tuple[str, ...]] = (
-        *(option for option in STATE_SHAPE if option != "samples"),
-        "proposal_cells",
-        "appearance",
-    )
+    shape = (*NgpField.shape, "proposal_cells", "appearance")
 
     _bins: ProposalBins
 
-    def _make(self, rng: np.random.Generator) -> tuple[ProposalGrid, Net]:
-        s = self.settings
-        grid = make_grid(s, self.view_store.box, rng)
+    def _make(self, rng: np.random.Generator) -> tuple[ProposalGrid, int]:
+        s, grid = self.settings, self._grid(rng)
         per_segment = SEGMENT * FEATURES
         rows = -(-(s.proposal_cells**3) // per_segment) * SEGMENT
         table = np.concatenate([grid.table, np.zeros((rows, FEATURES), np.float32)])
-        encoding = ProposalGrid(*grid[:-1], table, s.proposal_cells, self._sampling())
-        return encoding, init_net(FEATURES * s.levels, s, rng)
+        return ProposalGrid(*grid[:-1], table, s.proposal_cells, self._sampling()), FEATURES * s.levels
 
     def _tiny(self) -> NerfactoSettings:
         return msgspec.structs.replace(super()._tiny(), proposal_cells=8)

@@ -17,8 +17,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Budget, View
+from edge_server.fields import View
 from edge_server.fields.common.camera_rows import camera_rows
+from edge_server.fields.common.field_state import load_arrays
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.fields.common.stepped_field import Step, SteppedField
@@ -108,9 +109,9 @@ class StillField(SteppedField[SplatSnapshot]):
             self.cloud.params[:] = params
             self._snapshot = None
 
-    def _begin_fit(self, views: Sequence[View], step_budget: StepBudget, budget: Budget) -> tuple[Step, int, int]:
+    def _begin_fit(self, views: Sequence[View], step_budget: StepBudget) -> Step:
         self.take_in(views)
-        return self._one_step, 0, 0
+        return self._one_step
 
     def _live(self) -> SplatSnapshot:
         return SplatSnapshot(
@@ -134,7 +135,11 @@ class StillField(SteppedField[SplatSnapshot]):
         return {f.name: getattr(self.cloud, f.name) for f in fields(self.cloud)}
 
     def _load(self, meta: dict[str, Any], state: Arrays) -> None:
-        self.cloud = _gaussians_of(self.settings, state)
+        count, most = len(state["params"]), self.settings.gaussians
+        if count > most:
+            raise ValueError(f"the state has {count} Gaussians, this field holds {most} at most")
+        self.cloud = GaussianCloud.new(np.zeros((count, BASE + SH_COLUMNS * self.settings.sh_degree), np.float32))
+        load_arrays(StillField._arrays(self), state)  # not what a subclass adds
         self._grown = int(meta["grown"])
 
     # --- inside -------------------------------------------------------------------------------
@@ -290,22 +295,6 @@ class StillField(SteppedField[SplatSnapshot]):
         clamp_gaussians(self.cloud.params)
         for array in (self.cloud.m, self.cloud.v):
             np.nan_to_num(array, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-
-
-def _gaussians_of(settings: SplatSettings, state: Arrays) -> GaussianCloud:
-    """The Gaussians in ``state``. ValueError: they do not fit ``settings``."""
-    empty = GaussianCloud.empty(settings)
-    count = len(state["params"]) if "params" in state else 0
-    arrays = {}
-    for f in fields(GaussianCloud):
-        mine = getattr(empty, f.name)
-        shape = (count, *mine.shape[1:])
-        if f.name not in state or state[f.name].shape != shape or state[f.name].dtype != mine.dtype:
-            raise ValueError(f"the state lacks {f.name!r}, {mine.dtype} of shape {shape}")
-        arrays[f.name] = np.array(state[f.name])
-    if count > settings.gaussians:
-        raise ValueError(f"the state has {count} Gaussians, this field holds {settings.gaussians} at most")
-    return GaussianCloud(**arrays)
 
 
 make = StillField

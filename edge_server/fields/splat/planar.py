@@ -14,10 +14,8 @@ from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud
 from edge_server.fields.splat.kernels.project import DEPTH, QUATERNION, RED, SCALE, Gaussians
 from edge_server.fields.splat.kernels.rasterize import render_tiles
-from edge_server.fields.splat.settings import ASPECT
+from edge_server.fields.splat.settings import ASPECT, STEEPEST
 from freshfield.geometry import Pinhole, quaternion_normalize, quaternion_to_matrix
-
-STEEPEST = 0.1  # cosine between ray and normal below which a plane has no depth
 
 
 def gaussian_planes(gaussians: Gaussians, camera: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -37,6 +37,9 @@ GRADIENT_LIMIT = 1e6
 # Of what a Gaussian adds to one pixel. At most: no Gaussian hides everything, and an alpha that is clamped has
 # no gradient. At least: a Gaussian ends where its alpha is lower.
 ALPHA_MAX, ALPHA_MIN = 0.99, 1.0 / 255.0
+STOP = 1e-4  # transmittance below which compositing stops
+MAX_PAIRS = 1 << 22  # of a Gaussian and a tile, a camera: further Gaussians are left out, so that memory is bounded
+STEEPEST = 0.1  # cosine between ray and normal below which a Gaussian's plane has no depth (``planar``)
 
 # Semi-global matching (``kernels.semi_global``); found on the plates of `room` and of a recorded kitchen.
 SWEEP_BOUND = 0.15  # difference of a channel beyond which it does not matter how different

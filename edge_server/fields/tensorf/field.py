@@ -9,37 +9,23 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.mlp import Net
-from edge_server.fields.common.model_layout import FIRST_DENSITY, init_net
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.trained_field import DIRTY, TrainedField
+from edge_server.fields.common.trainer_settings import FIRST_DENSITY
 from edge_server.fields.tensorf.kernels.vector_matrix import CHANNELS, MODES, ROWS, Planes, scatter_planes
-from edge_server.fields.tensorf.settings import TensorfSettings
+from edge_server.fields.tensorf.settings import FINEST, TensorfSettings
 
 assert ROWS * CHANNELS == DIRTY, "scatter_planes and adam must use the same segments"
-
-FINEST = 256  # vertices a side by default: finer planes outgrow the second-level cache
 
 
 class TensorfField(TrainedField):
     """Planes, lines and a small network for color. See ``fields.Field`` for the protocol."""
 
     Settings = TensorfSettings
-    shape = (
-        "density_rank",
-        "color_rank",
-        "resolution_start",
-        "resolution",
-        "upsample",
-        "hidden",
-        "hidden_layers",
-        "sh_degree",
-        "cells",
-        "samples",
-    )
+    shape = (*TrainedField.shape, "density_rank", "color_rank", "resolution_start", "resolution", "upsample")
     settings: TensorfSettings
 
-    def _make(self, rng: np.random.Generator) -> tuple[Planes, Net]:
+    def _make(self, rng: np.random.Generator) -> tuple[Planes, int]:
         s = self.settings
         size = size_at(s, self.view_store.box, 0)
         density, color = MODES * s.density_rank // CHANNELS, MODES * s.color_rank // CHANNELS
@@ -49,7 +35,7 @@ class TensorfField(TrainedField):
         planes = Planes(
             size, density, density + color, rows, np.float32(np.log(FIRST_DENSITY)), table.reshape(-1, CHANNELS)
         )
-        return planes, init_net(CHANNELS * color, s, rng)
+        return planes, CHANNELS * color
 
     def _feature_rows(self) -> int:
         return int(self._net.widths[0]) + 1  # and one for density

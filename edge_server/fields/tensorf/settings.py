@@ -9,6 +9,8 @@ from msgspec import Meta
 from edge_server.fields.common.trainer_settings import TrainerSettings
 from freshfield.settings import about
 
+FINEST = 256  # vertices a side by default: finer planes outgrow the second-level cache
+
 
 class TensorfSettings(TrainerSettings, frozen=True):
     """What can be chosen about a ``TensorfField``.

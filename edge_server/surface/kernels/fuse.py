@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.simd import fetch_add
+from edge_server.surface import settings as tuned
 from edge_server.surface.kernels.lens import distort
 
 SIDE = 8  # voxels per side of a block
 CELLS = SIDE**3
 FAR = 1e9  # meters; interpolating infinity would give NaN
-FREE = 0.05  # weight factor of a voxel far before a surface; 1 at the surface
-CLOSE = 2.0  # maximum depth difference of neighboring pixels on one surface, in truncations
 
 
 class KernelDepth(NamedTuple):
@@ -67,7 +66,7 @@ def _depth_at(depth, u, v, band):
     d00, d01 = np.float64(depth[y0, x0]), np.float64(depth[y0, x0 + 1])
     d10, d11 = np.float64(depth[y0 + 1, x0]), np.float64(depth[y0 + 1, x0 + 1])
     low, high = min(min(d00, d01), min(d10, d11)), max(max(d00, d01), max(d10, d11))
-    if not low > 0.0 or high - low > CLOSE * band:
+    if not low > 0.0 or high - low > tuned.CLOSE * band:
         return near
     fx, fy = u - 0.5 - x0, v - 0.5 - y0
     return (d00 * (1.0 - fx) + d01 * fx) * (1.0 - fy) + (d10 * (1.0 - fx) + d11 * fx) * fy
@@ -142,7 +141,7 @@ def fuse(counter, worker, blocks, depths, voxel_m, band_m):
             old = np.float64(blocks.weight[b, k])
             clipped = min(ahead, band_m)
             if ahead >= band_m:
-                new *= FREE
+                new *= tuned.FREE
             blocks.distance[b, k] = (old * blocks.distance[b, k] + new * clipped) / (old + new)
             blocks.weight[b, k] = old + new
             if ahead < band_m:

@@ -52,13 +52,15 @@ class Planes(NamedTuple):
 
 
 class Search(NamedTuple):
-    """What one pass tries.
+    """What one pass over every map tries.
 
+    choose: whether the images to compare with are chosen anew, from the current planes.
     wide: number of planes with random normal. reach: how far their depth is from ``guess``, as a share of it.
     share, turn: largest random changes of depth (as a share of it) and of the normal.
     geometric: weight of the distance, pixels, to where the other image's depth leads back to.
     """
 
+    choose: bool
     wide: int
     reach: float
     share: float

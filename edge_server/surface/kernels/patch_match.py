@@ -15,42 +15,27 @@ import numpy as np
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, uniform
+from edge_server.surface import settings as tuned
 from edge_server.surface.kernels.patch_images import depth_shown, offset_to, project, within
 
-SOURCES = 5  # images that a pixel is compared with
 LANES = 32  # taps of a patch: 5 x 5 and four farther ones; the rest weigh nothing
 PATCH_RADIUS_PX = 3  # from the middle of a patch to its farthest tap
-SIMILAR = np.float32(15.0)  # gray levels: a tap this different weighs 1/e, so patches end at edges
-FADE = 0.1  # a tap's weight falls by exp(-FADE pixels^2)
-NOISE = np.float32(1.0)  # variance, gray levels squared, of what is no texture
-DIFFERENCE = np.float32(0.8)  # share of the difference of gray levels in the cost; the rest: 1 - correlation
-LEVELS = np.float32(4.0)  # mean difference, gray levels, that costs 1 on a plain patch; at most 2
-WORST = np.float32(3.0)  # cost of a plane that no other image shows
-SINGLE = np.float32(0.3)  # added if only one other image shows it
-MOST_PX = 3.0  # largest distance that the geometric term counts
-LEAST_COS = 0.1  # between ray and normal
-SMOOTH = np.float32(0.06)  # weight of the distance, pixels, to what neighbors' planes say; at most SMOOTH_PX
-SMOOTH_PX = 2.0
-BETTER = np.float32(1e-4)  # a plane replaces another if it is cheaper by this
-LEAST_DEG, BEST_DEG, SPREAD_DEG, MOST_DEG = 3.0, 25.0, 15.0, 70.0  # between two images' lines of sight
-HIDDEN = 0.02  # a surface nearer by this share of the distance hides a point
 
 
 @kernel
-def choose_sources(counter, worker, images, view, planes, visible):
+def choose_sources(counter, worker, images, view, planes):
     """Writes ``view.chosen``: the images that show a pixel's point best, by the angle between the lines of
-    sight and at the surface. Tasks are rows. visible: whether an image whose depth hides the point counts
-    a tenth."""
+    sight and at the surface. Tasks are rows."""
     height, width = planes.depth.shape
     k = view.index
     ox, oy, oz = images.origin[k, 0], images.origin[k, 1], images.origin[k, 2]
-    score, index = np.empty(SOURCES), np.empty(SOURCES, np.int64)
+    score, index = np.empty(tuned.SOURCES), np.empty(tuned.SOURCES, np.int64)
     while True:
         row = fetch_add(counter, 1)
         if row >= height:
             return
         for column in range(width):
-            for i in range(SOURCES):
+            for i in range(tuned.SOURCES):
                 score[i], index[i] = 0.0, -1
             d = np.float64(planes.depth[row, column])
             if d > 0.0:
@@ -66,21 +51,18 @@ def choose_sources(counter, worker, images, view, planes, visible):
                     ex, ey, ez, far = offset_to(images, s, x, y, z)
                     cosine = min(1.0, max(-1.0, (ex * rx + ey * ry + ez * rz) / far))
                     apart = np.degrees(np.arccos(cosine))
-                    if not (apart >= LEAST_DEG and apart <= MOST_DEG):
+                    if not (apart >= tuned.LEAST_DEG and apart <= tuned.MOST_DEG):
                         continue
-                    off = (apart - BEST_DEG) / SPREAD_DEG
+                    off = (apart - tuned.BEST_DEG) / tuned.SPREAD_DEG
                     facing = -(ex * nx + ey * ny + ez * nz) / far
                     good = np.exp(-0.5 * off * off) * min(1.0, max(2.0 * facing, 0.2))
-                    shown = depth_shown(images, s, u, v)
-                    if visible and shown > 0.0 and shown < far * (1.0 - HIDDEN):
-                        good *= 0.1
-                    if good > score[SOURCES - 1]:
-                        i = SOURCES - 1
+                    if good > score[tuned.SOURCES - 1]:
+                        i = tuned.SOURCES - 1
                         while i > 0 and good > score[i - 1]:
                             score[i], index[i] = score[i - 1], index[i - 1]
                             i -= 1
                         score[i], index[i] = good, s
-            for i in range(SOURCES):
+            for i in range(tuned.SOURCES):
                 view.chosen[row, column, i] = index[i]
 
 
@@ -92,7 +74,7 @@ def _pattern(across, down, fade):
         for i in range(-PATCH_RADIUS_PX, PATCH_RADIUS_PX + 1):
             if (abs(i) < PATCH_RADIUS_PX and abs(j) < PATCH_RADIUS_PX) or i == 0 or j == 0:
                 across[t], down[t] = i, j
-                fade[t] = np.exp(-FADE * (i * i + j * j))
+                fade[t] = np.exp(-tuned.FADE * (i * i + j * j))
                 t += 1
     for k in range(t, LANES):
         across[k] = down[k] = fade[k] = 0.0
@@ -109,7 +91,7 @@ def _take_patch(gray, row, column, across, down, fade, patch, weight):
         g, w = np.float32(0.0), np.float32(0.0)
         if r >= 0 and c >= 0 and r < height and c < width:
             g = gray[r, c]
-            w = exp32(-abs(g - gray[row, column]) / SIMILAR) * fade[t]
+            w = exp32(-abs(g - gray[row, column]) / tuned.SIMILAR) * fade[t]
         patch[t], weight[t] = g, w
         total += w
         mean += w * g
@@ -131,20 +113,20 @@ def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, we
     right, below = 1 if column < width - 1 else -1, 1 if row < height - 1 else -1
     rx, ry, rz = rays[row, column, 0], rays[row, column, 1], rays[row, column, 2]
     along = nx * rx + ny * ry + nz * rz
-    if not along < -LEAST_COS:
-        return WORST, 0
+    if not along < -tuned.LEAST_COS:
+        return tuned.WORST, 0
     ax, ay, az = rays[row, column + right, 0], rays[row, column + right, 1], rays[row, column + right, 2]
     bx, by, bz = rays[row + below, column, 0], rays[row + below, column, 1], rays[row + below, column, 2]
     a, b = d * along / (nx * ax + ny * ay + nz * az), d * along / (nx * bx + ny * by + nz * bz)
     if not (a > 0.0 and b > 0.0 and a < 2.0 * d and b < 2.0 * d):
-        return WORST, 0
+        return tuned.WORST, 0
     ox, oy, oz = images.origin[k, 0], images.origin[k, 1], images.origin[k, 2]
     x, y, z = ox + d * rx, oy + d * ry, oz + d * rz
     ax, ay, az = ox + a * ax, oy + a * ay, oz + a * az
     bx, by, bz = ox + b * bx, oy + b * by, oz + b * bz
-    one, two = WORST, WORST
-    levels = LEVELS + np.sqrt(spread)  # where texture is strong, so is what interpolation does to it
-    for i in range(SOURCES):
+    one, two = tuned.WORST, tuned.WORST
+    levels = tuned.LEVELS + np.sqrt(spread)  # where texture is strong, so is what interpolation does to it
+    for i in range(tuned.SOURCES):
         s = np.int64(view.chosen[row, column, i])
         if s < 0:
             break
@@ -175,18 +157,18 @@ def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, we
             cross += w * g * patch[t]
             change += w * abs(g - patch[t])
         other = max(square - level * level / total, np.float32(0.0)) / total
-        like = cross / total / np.sqrt((spread + NOISE) * (other + NOISE))
-        cost = (np.float32(1.0) - DIFFERENCE) * (np.float32(1.0) - like)
-        cost += DIFFERENCE * min(change / total / levels, np.float32(2.0))
+        like = cross / total / np.sqrt((spread + tuned.NOISE) * (other + tuned.NOISE))
+        cost = (np.float32(1.0) - tuned.DIFFERENCE) * (np.float32(1.0) - like)
+        cost += tuned.DIFFERENCE * min(change / total / levels, np.float32(2.0))
         if geometric > 0.0:
             cost += np.float32(geometric * _way_back(images, k, s, row, column, u, v, x, y, z))
         if cost < one:
             one, two = cost, one
         elif cost < two:
             two = cost
-    if two < WORST:
+    if two < tuned.WORST:
         return np.float32(0.5) * (one + two), 2
-    return one, 1 if one < WORST else 0
+    return one, 1 if one < tuned.WORST else 0
 
 
 @device_function
@@ -195,13 +177,13 @@ def _way_back(images, k, s, row, column, u, v, x, y, z):
     (u, v), leads back to; MOST_PX at most."""
     shown = depth_shown(images, s, u, v)
     if not shown > 0.0:
-        return MOST_PX
+        return tuned.MOST_PX
     ex, ey, ez, far = offset_to(images, s, x, y, z)
     far = shown / far
     ox, oy, oz = images.origin[s, 0], images.origin[s, 1], images.origin[s, 2]
     u, v = project(images, k, ox + far * ex, oy + far * ey, oz + far * ez)
     u, v = u - column - 0.5, v - row - 0.5
-    return min(MOST_PX, np.sqrt(u * u + v * v))
+    return min(tuned.MOST_PX, np.sqrt(u * u + v * v))
 
 
 @device_function
@@ -210,7 +192,7 @@ def _neighbor(planes, row, column, way):
     height, width = planes.depth.shape
     dr = 1 if way % 4 == 0 else -1 if way % 4 == 1 else 0
     dc = 1 if way % 4 == 2 else -1 if way % 4 == 3 else 0
-    least, found_row, found_column = WORST, -1, -1
+    least, found_row, found_column = tuned.WORST, -1, -1
     for m in range(3 if way < 4 else 5):
         ahead = 3 + 2 * m if way >= 4 else 1 if m == 0 else 2
         aside = 0 if way >= 4 or m == 0 else 2 * m - 3
@@ -223,41 +205,10 @@ def _neighbor(planes, row, column, way):
 
 
 @kernel
-def offer(counter, worker, images, points, normals, costs, owners, nearest, winner, least):
-    """Find for every pixel of every image the point of another map that falls on it. Tasks are images.
-
-    points, normals: float32 (M, 3), world. costs: float32 (M,). owners: int32 (M,), image that a point is of.
-    nearest: whether the nearest point wins, else the cheapest. winner: int32 (P,), index of the point, -1:
-    none; least: float32 (P,). Both are written.
-    """
-    while True:
-        k = fetch_add(counter, 1)
-        if k >= images.first.size - 1:
-            return
-        for at in range(images.first[k], images.first[k + 1]):
-            winner[at], least[at] = -1, np.float32(1e9)
-        for m in range(costs.size):
-            if owners[m] == k:
-                continue
-            x, y, z = np.float64(points[m, 0]), np.float64(points[m, 1]), np.float64(points[m, 2])
-            u, v = project(images, k, x, y, z)
-            if not within(images, k, u, v, 0):
-                continue
-            x, y, z, far = offset_to(images, k, x, y, z)
-            if not normals[m, 0] * x + normals[m, 1] * y + normals[m, 2] * z < -LEAST_COS * far:
-                continue
-            value = np.float32(far) if nearest else costs[m]
-            at = images.first[k] + np.int64(v) * images.size[k, 0] + np.int64(u)
-            if value < least[at]:
-                winner[at], least[at] = m, value
-
-
-@kernel
-def match(counter, worker, images, view, guess, offered, planes, parity, key, search):
+def match(counter, worker, images, view, guess, planes, parity, key, search):
     """One pass over the pixels of one color of the chessboard. Tasks are rows.
 
     guess: float32 (H, W), initial depth; no depth leaves ``reach`` around it.
-    offered: planes (``offer``) to try, depth 0: none; their cost is not read.
     planes: updated. parity: 1 for the pixels whose row + column is odd, else 0.
     key: uint64, stream of the pass's random numbers, which depend on the pixel alone.
     """
@@ -291,25 +242,20 @@ def match(counter, worker, images, view, guess, offered, planes, parity, key, se
                 qx, qy = np.float64(planes.normal[r, c, 0]), np.float64(planes.normal[r, c, 1])
                 qz = np.float64(planes.normal[r, c, 2])
                 along = qx * rx + qy * ry + qz * rz
-                if not along < -LEAST_COS:
+                if not along < -tuned.LEAST_COS:
                     continue
                 there = qx * view.rays[r, c, 0] + qy * view.rays[r, c, 1] + qz * view.rays[r, c, 2]
                 meets[way] = np.float64(planes.depth[r, c]) * there / along
                 normals[way, 0], normals[way, 1], normals[way, 2] = qx, qy, qz
-                nearness[way] = exp32(-abs(view.gray[r, c] - view.gray[row, column]) / SIMILAR)
+                nearness[way] = exp32(-abs(view.gray[r, c] - view.gray[row, column]) / tuned.SIMILAR)
                 total += nearness[way]
             pixel = 1.0 / (middle * step)
-            least = WORST
-            # Trial -1: the pixel's own plane; 0: the offered one; 1 to 8: of neighbors; then random ones,
-            # then random changes.
-            for trial in range(-1, 15 + search.wide):
+            least = tuned.WORST
+            # Trial 0: the pixel's own plane; 1 to 8: of neighbors; then random ones, then random changes.
+            for trial in range(15 + search.wide):
                 n = np.uint64(((row * width + column) * 64 + trial + 1) * 4)
                 qd, qx, qy, qz = d, nx, ny, nz
-                if trial == 0:
-                    qd, qx = (np.float64(offered.depth[row, column]), np.float64(offered.normal[row, column, 0]))
-                    qy = np.float64(offered.normal[row, column, 1])
-                    qz = np.float64(offered.normal[row, column, 2])
-                elif trial >= 1 and trial <= 8:
+                if trial >= 1 and trial <= 8:
                     qd = meets[trial - 1]
                     qx, qy, qz = normals[trial - 1, 0], normals[trial - 1, 1], normals[trial - 1, 2]
                 elif trial > 8:
@@ -336,13 +282,13 @@ def match(counter, worker, images, view, guess, offered, planes, parity, key, se
                     images, view, row, column, qd, qx, qy, qz, across, down, patch, weight, facts, search.geometric
                 )
                 if shown == 1:
-                    cost = min(cost + SINGLE, WORST)
+                    cost = min(cost + tuned.SINGLE, tuned.WORST)
                 if total > np.float32(0.0):
                     bumpy = np.float32(0.0)
                     for way in range(8):
-                        bumpy += nearness[way] * np.float32(min(pixel * abs(qd - meets[way]), SMOOTH_PX))
-                    cost += SMOOTH * bumpy / (total + np.float32(1.0))
-                if trial == -1 or cost < least - BETTER:
+                        bumpy += nearness[way] * np.float32(min(pixel * abs(qd - meets[way]), tuned.BUMPY_PX))
+                    cost += tuned.SMOOTH * bumpy / (total + np.float32(1.0))
+                if trial == 0 or cost < least - tuned.BETTER:
                     least, d, nx, ny, nz = cost, qd, qx, qy, qz
             planes.depth[row, column], planes.cost[row, column] = d, least
             planes.normal[row, column, 0] = nx
@@ -377,7 +323,7 @@ def confirm(counter, worker, images, view, planes, share, agree, against, rise):
             x = images.origin[k, 0] + d * view.rays[row, column, 0]
             y = images.origin[k, 1] + d * view.rays[row, column, 1]
             z = images.origin[k, 2] + d * view.rays[row, column, 2]
-            for i in range(SOURCES):
+            for i in range(tuned.SOURCES):
                 s = np.int64(view.chosen[row, column, i])
                 if s < 0:
                     break

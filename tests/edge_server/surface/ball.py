@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.surface.depth import DepthMap, depth_map
-from edge_server.surface.kernels.fuse import CLOSE, FAR, FREE, SIDE
+from edge_server.surface.kernels.fuse import FAR, SIDE
+from edge_server.surface.settings import CLOSE, FREE
 from edge_server.surface.volume import Grid, Volume
 from freshfield.geometry import Pinhole, look_at, world_rays
 

@@ -9,6 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.surface import settings
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels import patch_match
 from edge_server.surface.kernels.patch_images import Images, Planes, View
@@ -130,15 +131,15 @@ def test_the_cost_is_that_of_plain_numpy(rig):
     at = LENS.project((points - pose[:3, 3]) @ pose[:3, :3])
     other = map_coordinates(gray[1].astype(float), [at[:, 1] - 0.5, at[:, 0] - 0.5], order=1)
     own = gray[0][row + j, column + i].astype(float)
-    w = np.exp(-np.abs(own - gray[0][row, column]) / patch_match.SIMILAR - patch_match.FADE * (i * i + j * j))
+    w = np.exp(-np.abs(own - gray[0][row, column]) / settings.SIMILAR - settings.FADE * (i * i + j * j))
     w /= w.sum()
     a, b = own - w @ own, other - w @ other
-    like = (w @ (a * b)) / np.sqrt((w @ a**2 + patch_match.NOISE) * (w @ b**2 + patch_match.NOISE))
-    levels = patch_match.LEVELS + np.sqrt(w @ a**2)
+    like = (w @ (a * b)) / np.sqrt((w @ a**2 + settings.NOISE) * (w @ b**2 + settings.NOISE))
+    levels = settings.LEVELS + np.sqrt(w @ a**2)
     unlike = min(w @ np.abs(own - other) / levels, 2.0)
-    wanted = (1 - patch_match.DIFFERENCE) * (1 - like) + patch_match.DIFFERENCE * unlike
+    wanted = (1 - settings.DIFFERENCE) * (1 - like) + settings.DIFFERENCE * unlike
     assert found == pytest.approx(wanted, abs=0.02) and shown == 1
-    assert patch_match.plane_cost(images, view, row, column, depth, *-normal, *taps) == (patch_match.WORST, 0), (
+    assert patch_match.plane_cost(images, view, row, column, depth, *-normal, *taps) == (settings.WORST, 0), (
         "turned away"
     )
 

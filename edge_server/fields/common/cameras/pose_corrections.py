@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import replace
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.cameras import settings as tuned
+from edge_server.fields.common.field_state import from_json, to_json
 from freshfield.geometry import se3, se3_inverse, so3_exp, so3_log
 
 Array = NDArray[np.float64]
 
 
-@dataclass
-class PoseCorrection:
+class PoseCorrection(msgspec.Struct, array_like=True):
     """given: (4, 4), the pose it belongs to: a camera with another pose starts anew.
     rotation, shift_m: (3,), a rotation vector in radians and meters, world axes.
     at_ns: when the view was taken. steps: how many ``descend`` has made for it. track: see ``PoseCorrections``.
@@ -25,18 +27,19 @@ class PoseCorrection:
     scale: factor on reported shifts that makes them lead here from the view before; 0: none does."""
 
     given: Array
-    rotation: Array = field(default_factory=lambda: np.zeros(3))
-    shift_m: Array = field(default_factory=lambda: np.zeros(3))
+    rotation: Array = msgspec.field(default_factory=lambda: np.zeros(3))
+    shift_m: Array = msgspec.field(default_factory=lambda: np.zeros(3))
     at_ns: int = 0
     steps: int = 0
     track: str = ""
     reported: Array | None = None
     scale: float = 0.0
 
-    def moved(self, reported: Array) -> Array:
-        """The pose (4, 4) of a camera that reported ``reported``, if it moved from here as it reported."""
+    def moved(self, reported: Array, scale: float) -> Array:
+        """The pose (4, 4) of a camera that reported ``reported``, if it moved from here as it reported. scale: as
+        above."""
         move = se3_inverse(self.given if self.reported is None else self.reported) @ reported
-        move[:3, 3] *= self.scale
+        move[:3, 3] *= scale
         return self.pose @ move
 
     @property
@@ -86,7 +89,7 @@ class PoseCorrections:
     def copied(self) -> PoseCorrections:
         """A copy that later steps do not change."""
         other = PoseCorrections(self.most_m, 0.0)
-        other.most_rad, other.known = self.most_rad, {name: replace(c) for name, c in self.known.items()}
+        other.most_rad, other.known = self.most_rad, {name: copy(c) for name, c in self.known.items()}
         other.leaps = dict(self.leaps)
         return other
 
@@ -134,12 +137,11 @@ class PoseCorrections:
 
     def place(self, view: View, pose: Array, scale: float) -> View:
         """The view at another pose (4, 4) than the reported one. scale: see ``PoseCorrection``."""
-        known = self._of(view)
+        known = copy(self._of(view))
         pose = se3(so3_exp(so3_log(pose[:3, :3])), pose[:3, 3])  # else errors of rounding grow from view to view
-        zero = np.zeros(3)
-        self.known[view.camera] = replace(
-            known, given=pose, rotation=zero, shift_m=zero, reported=known.given, scale=scale
-        )
+        known.reported, known.given, known.scale = known.given, pose, scale
+        known.rotation, known.shift_m = np.zeros(3), np.zeros(3)
+        self.known[view.camera] = known
         return replace(view, camera_to_world=pose)
 
     def forget(self, camera: str) -> None:
@@ -174,7 +176,8 @@ class PoseCorrections:
         given = np.asarray(view.camera_to_world, dtype=np.float64)
         near = [self.known[name] for name in neighbors]
         if any(each.reported is not None for each in near):
-            poses = [each.moved(given) if all(each.scale for each in near) else each.pose for each in near]
+            as_reported = all(each.scale for each in near)
+            poses = [each.moved(given, each.scale) if as_reported else each.pose for each in near]
             return _between(poses, list(neighbors.values()))
         rotation, shift_m = np.zeros(3), np.zeros(3)
         for name, share in neighbors.items():
@@ -304,22 +307,13 @@ class PoseCorrections:
             c.shift_m = c.shift_m - share * mean
 
     def meta(self) -> dict[str, Any]:
-        """What a state keeps: exact, ready for JSON."""
-        return {
-            name: [c.given.tolist(), c.rotation.tolist(), c.shift_m.tolist(), c.at_ns, c.steps, c.track]
-            + ([] if c.reported is None else [c.reported.tolist(), c.scale])
-            for name, c in self.known.items()
-        }
+        """What a state keeps, ready for JSON."""
+        known: dict[str, Any] = to_json(self.known)
+        return known
 
     def load(self, meta: dict[str, Any]) -> None:
         """Restore what ``meta`` returned."""
-        self.known, self._sorted = {}, {}
-        for name, (given, rotation, shift_m, at_ns, steps, track, *located) in meta.items():
-            given, rotation, shift_m = (np.array(each, dtype=np.float64) for each in (given, rotation, shift_m))
-            known = PoseCorrection(given, rotation, shift_m, int(at_ns), int(steps), str(track))
-            if located:
-                known.reported, known.scale = np.array(located[0], dtype=np.float64), float(located[1])
-            self.known[name] = known
+        self.known, self._sorted = from_json(meta, dict[str, PoseCorrection]), {}
 
     def neighbors_in_time(self, view: View, track: str = "") -> dict[str, float]:
         """The views of a track taken last before and first after ``view``, and how much each counts, the nearer one

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic, overload
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.mlp import backward, forward
-from edge_server.fields.common.kernels.radiance_model import has, query_backward, query_color, query_density
+from edge_server.fields.common.kernels.radiance_model import implements, query_backward, query_color, query_density
 from edge_server.fields.common.kernels.simd import fetch_add
 from edge_server.fields.common.kernels.simd_vectors import Vector, require_contiguous
 
@@ -40,7 +40,7 @@ class Grid(NamedTuple):
 
 
 @device_function
-def _corner(x, res):
+def corner(x, res):
     """Lower vertex (uint32) and fraction of coordinate x in [0, 1] on a grid of res cells."""
     scaled = x * np.float32(res)
     i = min(max(np.int32(scaled), np.int32(0)), np.int32(res - 1))
@@ -115,9 +115,9 @@ def _add_pair(typingctx: Any, table: Any, row: Any, weight: Any, a: Any, b: Any)
 @device_function
 def _encode_level(dense, res, mask, x, y, z, table, out0, out1):
     for s in range(out0.size):
-        ix, fx = _corner(x[s], res)
-        iy, fy = _corner(y[s], res)
-        iz, fz = _corner(z[s], res)
+        ix, fx = corner(x[s], res)
+        iy, fy = corner(y[s], res)
+        iz, fz = corner(z[s], res)
         rows = _corners(dense, res, mask, ix, iy, iz)
         out0[s], out1[s] = _interpolate(table, rows, _weights(fx, fy, fz))
 
@@ -144,9 +144,9 @@ def encode(grid, levels, x, a, b, features):
 
 
 @device_function
-def _mark(dirty, i, j):
-    """Flag the segments of two vertices that are neighbors along x, and so mostly share one."""
-    a, b = i >> np.uint32(4), j >> np.uint32(4)
+def flag_segments(dirty, shift, i, j):
+    """Flag the segments, of 2^shift rows, of two vertices that are neighbors, and so mostly share one."""
+    a, b = i >> np.uint32(shift), j >> np.uint32(shift)
     dirty[a] = True
     if b != a:
         dirty[b] = True
@@ -159,14 +159,14 @@ def _scatter_level(dense, res, mask, x, d0, d1, gradient, dirty):
         g0, g1 = d0[s], d1[s]
         if g0 == zero and g1 == zero:  # samples behind the first opaque surface
             continue
-        ix, fx = _corner(x[0, s], res)
-        iy, fy = _corner(x[1, s], res)
-        iz, fz = _corner(x[2, s], res)
+        ix, fx = corner(x[0, s], res)
+        iy, fy = corner(x[1, s], res)
+        iz, fz = corner(x[2, s], res)
         rows, weights = _corners(dense, res, mask, ix, iy, iz), _weights(fx, fy, fz)
         for k in range(8):
             _add_pair(gradient, rows[k], weights[k], g0, g1)
         for k in range(0, 8, 2):
-            _mark(dirty, rows[k], rows[k + 1])
+            flag_segments(dirty, 4, rows[k], rows[k + 1])
 
 
 @kernel
@@ -194,38 +194,25 @@ def scatter(counter, worker, grid, levels, x, d_features, counts, gradient, dirt
                 _scatter_level(False, res, mask, x[c], d0, d1, level_gradient, level_dirty)
 
 
-@overload(query_density)
+@implements(query_density, "resolution")
 def _query_density(encoding, levels, net, x, start, end, acts):
-    if not has(encoding, "resolution"):
-        return None
-
-    def run(encoding, levels, net, x, start, end, acts):
-        encode(encoding, levels, x, start, end, acts)
-        for k in range(2 * encoding.resolution.size, net.widths[0]):  # loops: slices compile for seconds
-            padding = acts[k, start:end]
-            for s in range(padding.size):
-                padding[s] = np.float32(0.0)
-        forward(net, acts, start, end)
-
-    return run
+    encode(encoding, levels, x, start, end, acts)
+    for k in range(2 * encoding.resolution.size, net.widths[0]):  # loops: slices compile for seconds
+        padding = acts[k, start:end]
+        for s in range(padding.size):
+            padding[s] = np.float32(0.0)
+    forward(net, acts, start, end)
 
 
-@overload(query_color)
+@implements(query_color, "resolution")
 def _query_color(encoding, levels, net, x, start, end, acts):
     """``query_density`` has done it already."""
-    return (lambda encoding, levels, net, x, start, end, acts: None) if has(encoding, "resolution") else None
 
 
-@overload(query_backward)
+@implements(query_backward, "resolution")
 def _query_backward(encoding, net, acts, d_acts, n, d_params, d_features):
-    if not has(encoding, "resolution"):
-        return None
-
-    def run(encoding, net, acts, d_acts, n, d_params, d_features):
-        backward(net, acts, d_acts, n, d_params)
-        for k in range(net.widths[0]):
-            to, d = d_features[k], d_acts[k]
-            for s in range(n):
-                to[s] = d[s]
-
-    return run
+    backward(net, acts, d_acts, n, d_params)
+    for k in range(net.widths[0]):
+        to, d = d_features[k], d_acts[k]
+        for s in range(n):
+            to[s] = d[s]

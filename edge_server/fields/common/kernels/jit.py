@@ -25,12 +25,13 @@ FAST = {"contract", "reassoc", "arcp", "nsz"}
 def cache_folder(root: Path) -> Path:
     """Where compiled kernels are kept: a folder in $NUMBA_CACHE_DIR, or in the user's cache, for each state of
     the sources. numba checks only the file that a function stands in, but kernels inline functions of others, and
-    numbers of the fields' settings.
+    numbers of settings.
 
     root: the package whose folders called ``kernels`` count.
     """
     total = hashlib.sha256()
-    for path in sorted([*root.rglob("kernels/*.py"), *root.glob("fields/**/*settings.py")]):
+    numbers = [path for room in ("fields", "surface") for path in root.glob(f"{room}/**/*settings.py")]
+    for path in sorted([*root.rglob("kernels/*.py"), *numbers]):
         total.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
     user = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     folder = os.environ.get("NUMBA_CACHE_DIR") or f"{user}/freshfield"

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function
+from edge_server.fields.common.trainer_settings import FIRST_DENSITY
 
 BLOCK = 256
 # Columns that rows of activations have beyond those that are used. Rows at a distance of a power of two would all lie
@@ -28,9 +29,19 @@ class Net(NamedTuple):
     params: NDArray[np.float32]
 
 
-def param_count(widths: NDArray[np.int64]) -> int:
-    """Length of ``Net.params`` for these widths."""
-    return int(sum(o * i + o for i, o in pairwise(widths)))
+def init_net(inputs: int, outputs: int, hidden: list[int], rng: np.random.Generator) -> Net:
+    """He initialization with a small output: thin gray fog everywhere. Widths are padded to 4: ``inputs`` features in;
+    density, color, the color's harmonics and three numbers for each dimension of the appearance out."""
+    widths = np.array([(inputs + 3) // 4 * 4, *hidden, (outputs + 3) // 4 * 4], dtype=np.int64)
+    params, first = np.zeros(int(sum(o * i + o for i, o in pairwise(widths))), np.float32), 0
+    for layer, (n_in, n_out) in enumerate(pairwise(widths)):
+        last = layer == len(widths) - 2
+        spread = np.sqrt(2.0 / n_in) * (0.1 if last else 1.0)
+        params[first : first + n_in * n_out] = rng.normal(0.0, spread, int(n_in * n_out))
+        if last:
+            params[first + n_in * n_out] = np.log(FIRST_DENSITY)
+        first += int(n_in * n_out + n_out)
+    return Net(widths, params)
 
 
 @device_function

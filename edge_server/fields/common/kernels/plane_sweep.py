@@ -7,7 +7,7 @@ import numpy as np
 
 from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, distort, load_camera
 from edge_server.fields.common.kernels.jit import device_function, kernel
-from edge_server.fields.common.kernels.rays import HORIZON, pixel_direction
+from edge_server.fields.common.kernels.rays import HORIZON, origin_of, pixel_direction
 from edge_server.fields.common.kernels.simd import fetch_add
 
 MOST_VIEWS = 32  # largest number of views that vote
@@ -93,11 +93,8 @@ def score_cells(counter, worker, cams, views, blurred, flags, plain, tolerance, 
         where it is hidden, or where background shows.
     """
     total, half = cams.shape[0], np.float32(2.0) if contracted else _F1
-    red, green, blue = (
-        np.empty(MOST_VIEWS, np.float32),
-        np.empty(MOST_VIEWS, np.float32),
-        (np.empty(MOST_VIEWS, np.float32)),
-    )
+    colors = np.empty((3, MOST_VIEWS), np.float32)
+    red, green, blue = colors[0], colors[1], colors[2]
     places, pixels = np.empty((3, cells), np.float32), np.empty((MOST_VIEWS, cells), np.int32)
     tally, hidden = np.empty(cells, np.int32), np.empty(cells, np.bool_)
     sizes, firsts, weight, nowhere = views.size, views.first, views.weight, blurred.shape[0]
@@ -126,11 +123,9 @@ def score_cells(counter, worker, cams, views, blurred, flags, plain, tolerance, 
                     pixel = np.int64(pixels[v, ix])
                     if pixel == nowhere or (weight.size > 0 and weight[pixel] <= _F0):
                         continue
-                    r, g, b = (
-                        np.float32(blurred[pixel, 0]) * _BYTE,
-                        np.float32(blurred[pixel, 1]) * _BYTE,
-                        np.float32(blurred[pixel, 2]) * _BYTE,
-                    )
+                    r = np.float32(blurred[pixel, 0]) * _BYTE
+                    g = np.float32(blurred[pixel, 1]) * _BYTE
+                    b = np.float32(blurred[pixel, 2]) * _BYTE
                     red[n], green[n], blue[n] = r, g, b
                     if blurred.shape[1] == 4:
                         empty += 1 if blurred[pixel, 3] < 16 else 0
@@ -178,11 +173,7 @@ def sweep_rays(counter, worker, views, view_of, pixels, near, middle, contracted
                 np.float64(pixels[n] % width) + 0.5,
                 np.float64(pixels[n] // width) + 0.5,
             )
-            ox, oy, oz = (
-                np.float32(views.origin[v, 0]),
-                np.float32(views.origin[v, 1]),
-                np.float32(views.origin[v, 2]),
-            )
+            ox, oy, oz = origin_of(views, v)
             best, at, t = least, _F0, max(near, size)
             while t < np.float32(2.0) * horizon + middle:
                 x, y, z = ox + t * dx, oy + t * dy, oz + t * dz

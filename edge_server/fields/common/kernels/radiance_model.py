@@ -1,9 +1,9 @@
 """The interface of a representation to the shared kernels: where samples lie, their density, color and gradients.
 
 ``train``, ``render`` and ``occupancy`` are written once for all representations that are an encoding and a
-small network. An encoding is a named tuple; the module that defines it overloads the functions below for its type
-(``numba.extending.overload``), so each representation compiles only its own. Their bodies are never run. Samples of
-an encoding without a field ``sampling`` lie in the occupied cells that a ray passes (``render``, ``train``).
+small network. An encoding is a named tuple; the module that defines it has the functions below for its type
+(``implements``), so each representation compiles only its own. Their bodies here are never run. Samples of an encoding
+without a field ``sampling`` lie in the occupied cells that a ray passes (``render``, ``train``).
 
 acts: float32 (units, N); the first net.widths[0] rows are the network's input, the last net.widths[-1] rows
 its output: density in row 0 (before ``activate_density``), color in rows 1 to 3, then harmonics, then three numbers
@@ -12,14 +12,25 @@ for each dimension of the cameras' appearance.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from numba import types
+from numba.extending import overload
 
 
-def has(encoding: Any, field: str) -> bool:
-    """Whether numba's type ``encoding`` is that of a named tuple with this field: for use in overloads."""
-    return isinstance(encoding, types.BaseNamedTuple) and field in encoding.fields
+def implements(function: Callable[..., Any], field: str, there: bool = True) -> Callable[[Any], Any]:
+    """Decorate what ``function``, one of those below, is for encodings that have, or do not have, a field."""
+
+    def register(implementation: Any) -> Any:
+        def choose(encoding: Any, *_: Any) -> Any:
+            known = isinstance(encoding, types.BaseNamedTuple)
+            return implementation if known and (field in encoding.fields) == there else None
+
+        overload(function, strict=False)(choose)
+        return implementation
+
+    return register
 
 
 def query_density(encoding, levels, net, x, start, end, acts):  # type: ignore[no-untyped-def]

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba.extending import overload
 
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.mlp import PADDING
-from edge_server.fields.common.kernels.radiance_model import has, query_color, query_density, sample_rays
+from edge_server.fields.common.kernels.radiance_model import implements, query_color, query_density, sample_rays
 from edge_server.fields.common.kernels.rays import NEVER, interval, march, pixel_direction
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite
 from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, activate, add_harmonics
@@ -20,21 +19,15 @@ ROW = BATCH + PADDING  # of which BATCH are used
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
-@overload(sample_rays)
+@implements(sample_rays, "sampling", there=False)
 def _march(encoding, space, o, travel, active, count, x, line, first):
-    if has(encoding, "sampling"):
-        return None
-
-    def run(encoding, space, o, travel, active, count, x, line, first):
-        n = np.int64(0)  # typed: numba compiles callees anew for a literal
-        for k in range(count):
-            r = active[k]
-            d, t, leave = (travel[r, 0], travel[r, 1], travel[r, 2]), travel[r, 3], travel[r, 4]
-            n, travel[r, 3], _ = march(space, o, d, t, leave, x, line[0], line[1], n, n + ROUND, NEVER)
-            first[k + 1] = n
-        return count
-
-    return run
+    n = np.int64(0)  # typed: numba compiles callees anew for a literal
+    for k in range(count):
+        r = active[k]
+        d, t, leave = (travel[r, 0], travel[r, 1], travel[r, 2]), travel[r, 3], travel[r, 4]
+        n, travel[r, 3], _ = march(space, o, d, t, leave, x, line[0], line[1], n, n + ROUND, NEVER)
+        first[k + 1] = n
+    return count
 
 
 @kernel

@@ -50,26 +50,6 @@ def draw(counter, worker, tasks):
 
 
 @intrinsic
-def float_from_bits(typingctx: Any, bits: Any) -> Any:
-    """The float32 whose IEEE representation is the int32 ``bits``."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.bitcast(args[0], ir.FloatType())
-
-    return types.float32(types.int32), codegen
-
-
-@intrinsic
-def bits_of_float(typingctx: Any, value: Any) -> Any:
-    """The IEEE representation of a float32 as int32."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.bitcast(args[0], ir.IntType(32))
-
-    return types.int32(types.float32), codegen
-
-
-@intrinsic
 def count_bits(typingctx: Any, value: Any) -> Any:
     """How many bits of a uint64 are set, int64."""
 
@@ -107,7 +87,7 @@ def exp32(x):
     r = clamped - n * _LN2_HIGH - n * _LN2_LOW
     p = ((((_P0 * r + _P1) * r + _P2) * r + _P3) * r + _P4) * r + _P5
     p = p * r * r + r + _ONE
-    power = float_from_bits(np.int32((np.int32(n) + np.int32(127)) << np.int32(23)))
+    power = np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
     return p * power if x == x else x
 
 
@@ -124,8 +104,8 @@ def log32(x):
 
     The Cephes polynomial, for the same reason as ``exp32``.
     """
-    n = (bits_of_float(x) - _ROOT) >> np.int32(23)
-    m = float_from_bits(np.int32(bits_of_float(x) - (n << np.int32(23)))) - _ONE
+    n = (np.float32(x).view(np.int32) - _ROOT) >> np.int32(23)
+    m = np.int32(np.float32(x).view(np.int32) - (n << np.int32(23))).view(np.float32) - _ONE
     square = m * m
     p = (((((((_L0 * m + _L1) * m + _L2) * m + _L3) * m + _L4) * m + _L5) * m + _L6) * m + _L7) * m + _L8
     e = np.float32(n)

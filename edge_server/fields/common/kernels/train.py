@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba.extending import overload
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.mlp import PADDING
 from edge_server.fields.common.kernels.radiance_model import (
     fill_chunk,
-    has,
+    implements,
     learn_sampling,
     query_backward,
     query_color,
@@ -183,9 +182,9 @@ def begin_rays(views, ray_sampling, space, chunk, first, end, ray, travel):
         travel[r, AT], travel[r, LEAVE], travel[r, _DEPTH] = enter, leave, _F0
 
 
-@device_function
-def _march_chunk(views, ray_sampling, space, encoding, net, chunk, x, line, acts, ray, travel, span):
-    """Fill a chunk with rays (``fill_chunk``). Returns rays drawn, columns and spans.
+@implements(fill_chunk, "sampling", there=False)
+def _march_chunk(encoding, views, ray_sampling, space, net, chunk, worker, x, line, acts, ray, travel, span, bins):
+    """See there.
 
     Samples behind an opaque one would take room for a gradient of zero. So rays are followed in rounds, by
     the occupancy grid's densities, until they are opaque, and their samples come in spans. The chunk gets as
@@ -237,29 +236,12 @@ def _march_chunk(views, ray_sampling, space, encoding, net, chunk, x, line, acts
                 spans += 1
             begin = stop
         n, under_way = end, left  # those that were not followed had no room, and will have none
-    return fresh, n, spans
+    return fresh, n, spans, 0
 
 
-@overload(fill_chunk)
-def _fill_chunk(encoding, views, ray_sampling, space, net, chunk, worker, x, line, acts, ray, travel, span, bins):
-    if has(encoding, "sampling"):
-        return None
-
-    def run(encoding, views, ray_sampling, space, net, chunk, worker, x, line, acts, ray, travel, span, bins):
-        drawn, n, spans = _march_chunk(
-            views, ray_sampling, space, encoding, net, chunk, x, line, acts, ray, travel, span
-        )
-        return drawn, n, spans, 0
-
-    return run
-
-
-@overload(learn_sampling)
+@implements(learn_sampling, "sampling", there=False)
 def _learn_sampling(encoding, bins, chunk, worker, r, w, line, a, b, good):
     """Nothing to learn."""
-    if has(encoding, "sampling"):
-        return None
-    return lambda encoding, bins, chunk, worker, r, w, line, a, b, good: None
 
 
 @device_function

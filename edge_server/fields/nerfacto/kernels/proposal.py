@@ -14,20 +14,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba.extending import overload
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function
 from edge_server.fields.common.kernels.mlp import PADDING
-from edge_server.fields.common.kernels.radiance_model import has, sample_rays
+from edge_server.fields.common.kernels.radiance_model import implements, sample_rays
 from edge_server.fields.common.kernels.rays import interval, slab, unit_cube
 from edge_server.fields.common.kernels.simd import exp32, is_finite
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
-
-RAW_GAIN = 4.0  # raw density per unit of the table: it must rise in tens of steps at the hash levels' rate
-RAW_START = -1.2  # raw density where the table is 0: the thin fog that the network starts with too
-CUTOFF_DEPTH = 10.0  # optical depth behind which bins are dropped
-DARK_SHARE = 0.1  # weight of a bin without light in uniform allocation; one in full light: 1 more
+from edge_server.fields.nerfacto.settings import CUTOFF_DEPTH, DARK_SHARE, RAW_GAIN, RAW_START
 
 _F0, _F1, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 
@@ -266,22 +261,16 @@ def sample_ray(space, encoding, o, d, shift, within, bins, first, scratch, n, x,
     return count, finite, n
 
 
-@overload(sample_rays)
+@implements(sample_rays, "sampling")
 def _sample_rays(encoding, space, o, travel, active, count, x, line, first):
     """All samples of a ray at once, from the middle of the raster's places."""
-    if not has(encoding, "sampling"):
-        return None
-
-    def run(encoding, space, o, travel, active, count, x, line, first):
-        size, n, zero = encoding.sampling.bins, np.int64(0), np.int64(0)
-        bins, scratch = bin_memory(size), bin_scratch(size)
-        for k in range(count):
-            if k > 0 and n + 2 * encoding.sampling.samples + 1 > x.shape[1] - PADDING:
-                return k
-            r = active[k]
-            d = travel[r, 0], travel[r, 1], travel[r, 2]
-            _, _, n = sample_ray(space, encoding, o, d, _HALF, _HALF, bins, zero, scratch, n, x, line)
-            travel[r, 3], first[k + 1] = travel[r, 4], n
-        return count
-
-    return run
+    size, n, zero = encoding.sampling.bins, np.int64(0), np.int64(0)
+    bins, scratch = bin_memory(size), bin_scratch(size)
+    for k in range(count):
+        if k > 0 and n + 2 * encoding.sampling.samples + 1 > x.shape[1] - PADDING:
+            return k
+        r = active[k]
+        d = travel[r, 0], travel[r, 1], travel[r, 2]
+        _, _, n = sample_ray(space, encoding, o, d, _HALF, _HALF, bins, zero, scratch, n, x, line)
+        travel[r, 3], first[k + 1] = travel[r, 4], n
+    return count

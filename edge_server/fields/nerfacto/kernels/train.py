@@ -5,20 +5,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba.extending import overload
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT
 from edge_server.fields.common.kernels.jit import device_function, kernel
-from edge_server.fields.common.kernels.radiance_model import fill_chunk, has, learn_sampling, query_density
+from edge_server.fields.common.kernels.radiance_model import fill_chunk, implements, learn_sampling, query_density
 from edge_server.fields.common.kernels.rays import origin_of
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, uniform
 from edge_server.fields.common.kernels.train import AT, CHUNK, CHUNK_RAYS, LEAVE, draw_ray
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW, activate_density, samples_until_opaque
-from edge_server.fields.nerfacto.kernels.proposal import RAW_GAIN, RAW_START, bin_scratch, proposal_cells_of, sample_ray
+from edge_server.fields.nerfacto.kernels.proposal import bin_scratch, proposal_cells_of, sample_ray
+from edge_server.fields.nerfacto.settings import RAW_GAIN, RAW_START, WEIGHT_FLOOR
 
 SCATTER_TASKS = 8  # tasks of the kernel that adds up the gradient of the grid
-WEIGHT_FLOOR = 1e-3  # in the interlevel loss's denominator, so that a weight of 0 does not divide
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
@@ -50,9 +49,9 @@ def compact_columns(rows, a, b, to):
             row[to + s] = row[a + s]
 
 
-@device_function
-def _sample_chunk(views, ray_sampling, space, encoding, net, chunk, worker, x, line, acts, ray, travel, span, bins):
-    """``fill_chunk``: hidden samples are removed, and further rays fill their place."""
+@implements(fill_chunk, "sampling")
+def _sample_chunk(encoding, views, ray_sampling, space, net, chunk, worker, x, line, acts, ray, travel, span, bins):
+    """Hidden samples are removed, and further rays fill their place."""
     dts, out = line[1], acts[acts.shape[0] - net.widths[-1] :]
     limit, most = min(ray_sampling.chunk_rays, ray.shape[0]), 2 * encoding.sampling.samples + 1
     scratch, bin_first = bin_scratch(encoding.sampling.bins), bins.first[worker]
@@ -94,19 +93,6 @@ def _sample_chunk(views, ray_sampling, space, encoding, net, chunk, worker, x, l
         rays = drawn
     bins.counts[chunk] = bin_first[rays]
     return rays, n, rays, broken
-
-
-@overload(fill_chunk)
-def _fill_chunk(encoding, views, ray_sampling, space, net, chunk, worker, x, line, acts, ray, travel, span, bins):
-    if not has(encoding, "sampling"):
-        return None
-
-    def run(encoding, views, ray_sampling, space, net, chunk, worker, x, line, acts, ray, travel, span, bins):
-        return _sample_chunk(
-            views, ray_sampling, space, encoding, net, chunk, worker, x, line, acts, ray, travel, span, bins
-        )
-
-    return run
 
 
 @device_function
@@ -151,22 +137,16 @@ def interlevel_loss(encoding, cell, depth, weight, group, first, count, w, group
     return loss
 
 
-@overload(learn_sampling)
+@implements(learn_sampling, "sampling")
 def _learn_sampling(encoding, bins, chunk, worker, r, w, line, a, b, good):
-    if not has(encoding, "sampling"):
-        return None
-
-    def run(encoding, bins, chunk, worker, r, w, line, a, b, good):
-        p, q, grad = bins.first[worker, r], bins.first[worker, r + 1], bins.grad[chunk]
-        if good:
-            cell, depth, weight, group = bins.cell[chunk], bins.depth[worker], bins.weight[worker], bins.group[worker]
-            slope = bins.slope[worker]
-            interlevel_loss(encoding, cell, depth, weight, group, p, q - p, w, line[2], a, b, slope, grad)
-        else:
-            for k in range(p, q):
-                grad[k] = _F0
-
-    return run
+    p, q, grad = bins.first[worker, r], bins.first[worker, r + 1], bins.grad[chunk]
+    if good:
+        cell, depth, weight, group = bins.cell[chunk], bins.depth[worker], bins.weight[worker], bins.group[worker]
+        slope = bins.slope[worker]
+        interlevel_loss(encoding, cell, depth, weight, group, p, q - p, w, line[2], a, b, slope, grad)
+    else:
+        for k in range(p, q):
+            grad[k] = _F0
 
 
 @kernel

@@ -30,9 +30,8 @@ from edge_server.fields.splat.densification import opacity
 from edge_server.fields.splat.kernels.rasterize import EXPOSURE, Targets
 
 # What a field that begins anew, which no depth was measured for, still knows of its cameras and their frames.
-_OF_CAMERAS = ("_pixels", "_taken", "_blind", "_bare", "_seen", "_seen_m", "_left_out", "_in_a_row")
-
-_BY_CAMERA = ("left_out", "in_a_row")  # counts that a state keeps
+_OF_CAMERAS = ("_pixels", "_taken", "_blind", "_bare", "_seen", "_seen_m")
+_COUNTS = ("_taken", "_blind", "_bare", "_took_at", "_due_before", "_pixels", "_measured")  # that a state keeps
 
 _NO_DEPTH = "its frames tell no depth (it only turns, or sees plain walls): distances are guessed, move it sideways"
 
@@ -51,8 +50,6 @@ class CarriedField(ScanField):
         self._bare = True  # whether no keyframe so far shows anything
         self._took_at = 0  # step of the newest keyframe
         self._due_before = 0  # keyframes that were due before the field began anew, which counts steps from 0 again
-        self._left_out: dict[str, int] = {}  # frames of each camera that show something else
-        self._in_a_row: dict[str, int] = {}
         self._own = OwnMotion(self._poses)
         self._moving: dict[str, float] = {}  # share of a camera's newest keyframe where something moves
         self._depths: dict[str, View] = {}  # the newest keyframe of each camera that had depth
@@ -124,14 +121,14 @@ class CarriedField(ScanField):
         view = replace(given, camera=f"{given.camera}{SEPARATOR}{self._taken}", depth=usable_depth(given.depth))
         last = self._seen.get(given.camera)
         if last is not None and not self._measured:
-            self._own.compare_turns(given.camera, unturned(last, given))
+            self._own.of(given.camera).compare_turns(unturned(last, given))
         self._seen[given.camera] = given
         self._follow(view)
         shown = self._look(view)
         unseen = self._leaps_out_of_sight(reported, shown)
-        doubted = unseen or self._own.doubted(reported.camera)
+        reports = self._own.of(reported.camera)
         agrees = agreeing(view, shown, *self._exposures.of(view.camera))
-        if self._rigid is not None and len(self.cloud) and (doubted or agrees < tuned.SURE):
+        if self._rigid is not None and len(self.cloud) and (unseen or reports.doubted or agrees < tuned.SURE):
             placed = self._placed(view, shown, unseen)
             if placed is None and self._founded:
                 self._leave_out(view)
@@ -140,7 +137,7 @@ class CarriedField(ScanField):
             self._seen[given.camera] = replace(given, camera_to_world=view.camera_to_world)
             shown = self._look(view)
         else:
-            self._own.trust(given.camera)
+            reports.trust()
         self._taken += 1
         self._bare &= _is_bare(view)
         self._pixels = max(self._pixels, view.image.shape[0] * view.image.shape[1])
@@ -201,15 +198,16 @@ class CarriedField(ScanField):
         seen = (shown.opacity >= tuned.ALIGNED_OPACITY).mean()
         leaps = self._own.leaps(view, view.camera) and seen < tuned.LEAST_OVERLAP and self._founded
         if leaps and self._measured:
-            self._own.doubt(view.camera)
+            self._own.of(view.camera).doubts += 1
         return leaps
 
     def _placed(self, view: View, shown: Shown, unseen: bool) -> View | None:
         """A view where its picture was taken: near its reported pose, else near the view before. None: it shows
         something else than is to be seen from there. unseen: see ``_leaps_out_of_sight``."""
         camera = _carrier(view)
-        if self._own.astray(camera):
-            if self._own.fits_again(camera, not flat(view, shown) and self._track(view).fits):
+        reports = self._own.of(camera)
+        if reports.astray:
+            if reports.fit_again(not flat(view, shown) and self._track(view).fits):
                 return view
             found = self._search(view)
             if found is not None:
@@ -235,14 +233,14 @@ class CarriedField(ScanField):
             found = self._search(view)
             if found is not None and found[1] != 1.0:
                 if self._measured and tracked.agreeing >= tuned.LEAST_AGREEING and not unseen:
-                    self._own.doubt(camera)
-                if self._own.astray(camera):
+                    reports.doubts += 1
+                if reports.astray:
                     return self._own.located(view, camera, *found)
                 if not tracked.fits:
                     again = self._search(view, tuned.FOLLOWED) or found
                     leapt = self._own.suggest_leap(view, camera, begun, again[0])
             elif found is not None and not unseen:
-                self._own.trust(camera)
+                reports.trust()
         if unseen and self._measured:
             return None
         return view if self._plausible(view, tracked, leapt) else None
@@ -270,16 +268,14 @@ class CarriedField(ScanField):
 
     def _plausible(self, view: View, found: Alignment, leapt: bool) -> bool:
         """Whether a view shows what the field does, or so many in a row did not that this one is taken."""
-        camera = _carrier(view)
-        row = self._in_a_row.get(camera, 0)
+        reports = self._own.of(_carrier(view))
         fits = found.overlap < tuned.LEAST_OVERLAP or found.agreeing >= tuned.LEAST_AGREEING
-        taken = (fits and not leapt) or row >= tuned.PATIENCE
-        self._in_a_row[camera] = 0 if taken else row + 1
+        taken = (fits and not leapt) or reports.left_out_in_a_row >= tuned.PATIENCE
+        reports.left_out_in_a_row = 0 if taken else reports.left_out_in_a_row + 1
         return taken
 
     def _leave_out(self, view: View) -> None:
-        camera = _carrier(view)
-        self._left_out[camera] = self._left_out.get(camera, 0) + 1
+        self._own.of(_carrier(view)).left_out += 1
         self._poses.forget(view.camera)
         self._exposures.known.pop(view.camera, None)
 
@@ -304,8 +300,9 @@ class CarriedField(ScanField):
         """What is wrong with the cameras' frames and poses, for people."""
         with self._lock:
             left_out = [
-                f"{camera}: {count} frames left out: they show something else than is to be seen from their poses"
-                for camera, count in self._left_out.items()
+                f"{camera}: {known.left_out} frames left out: they show something else than their poses say"
+                for camera, known in self._own.cameras.items()
+                if known.left_out
             ]
             moving = [
                 f"{camera}: something moves in {100 * share:.0f} % of its picture: left out of learning"
@@ -315,7 +312,7 @@ class CarriedField(ScanField):
             located = self._own.troubles()
             poses = troubles(self._poses) if self._rigid is not None else []
             guessed = self._taken > tuned.BEGINS[-1] and not self._founded
-            blind = [camera for camera in self._seen if guessed and not self._own.has_no_rotation(camera)]
+            blind = [camera for camera in self._seen if guessed and not self._own.of(camera).have_no_rotation]
             unknown = [f"{camera}: {_NO_DEPTH}" for camera in blind]
         return (*left_out, *located, *moving, *poses, *unknown)
 
@@ -327,9 +324,9 @@ class CarriedField(ScanField):
         self._learn_distance(list(swept.values()))
         views, kept = [swept.get(v.camera, v) for v in self._views], {name: getattr(self, name) for name in _OF_CAMERAS}
         due = self._due_before + self.step // tuned.STEPS_A_KEYFRAME
-        turns, leaps = self._own.unturned, self._poses.leaps
+        cameras, leaps = self._own.cameras.items(), self._poses.leaps
         self._begin(views)
-        self._own.unturned, self._poses.leaps = turns, leaps
+        self._own.cameras, self._poses.leaps = {camera: known.begun_anew() for camera, known in cameras}, leaps
         for name, value in kept.items():
             setattr(self, name, value)
         self._due_before = due
@@ -449,10 +446,9 @@ class CarriedField(ScanField):
             self.cloud.keep(kept)
 
     def _counters(self) -> dict[str, Any]:
-        names = ("taken", "blind", "bare", "took_at", "due_before", "pixels", "measured", *_BY_CAMERA)
-        own = {name: getattr(self, f"_{name}") for name in names}
-        own |= {"own_motion": self._own.meta(), "depths": {camera: view.camera for camera, view in self._kept_depths()}}
-        return {**super()._counters(), **own}
+        counts = {name[1:]: getattr(self, name) for name in _COUNTS}
+        depths = {camera: view.camera for camera, view in self._kept_depths()}
+        return {**super()._counters(), **counts, "own_motion": self._own.meta(), "depths": depths}
 
     def _kept_depths(self) -> list[tuple[str, View]]:
         return [(camera, view) for camera, view in self._depths.items() if view.camera in self._index]
@@ -464,11 +460,8 @@ class CarriedField(ScanField):
 
     def _load(self, meta: dict[str, Any], state: Arrays) -> None:
         super()._load(meta, state)
-        self._taken, self._took_at, self._pixels = (int(meta[name]) for name in ("taken", "took_at", "pixels"))
-        self._due_before, self._measured = int(meta["due_before"]), bool(meta["measured"])
-        self._blind, self._bare = int(meta["blind"]), bool(meta["bare"])
-        for name in _BY_CAMERA:
-            setattr(self, f"_{name}", {str(camera): int(count) for camera, count in meta[name].items()})
+        for name in _COUNTS:
+            setattr(self, name, type(getattr(self, name))(meta[name[1:]]))
         self._own.load(meta["own_motion"])
         self._clear_views()
         views, aims = self.view_store.views, np.asarray(state["aims"], np.float64)

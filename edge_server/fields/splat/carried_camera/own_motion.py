@@ -6,72 +6,96 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.cameras.pose_corrections import Leap, PoseCorrection, PoseCorrections
+from edge_server.fields.common.field_state import from_json, to_json
 from edge_server.fields.splat.carried_camera import settings as tuned
 from edge_server.fields.splat.carried_camera.tracking import Gray, Rendered, align, align_from, gray
 from freshfield.geometry import se3, se3_inverse, so3_exp, so3_log
 
 Array = NDArray[np.float64]
 
-_COUNTS = ("doubts", "fits", "missed", "replaced", "unturned")  # that a state keeps
-
 UNITS = {"millimeters": 1000.0, "centimeters": 100.0, "inches": 39.37, "feet": 3.281, "kilometers": 0.001}
+
+
+class Reports(msgspec.Struct, forbid_unknown_fields=True):
+    """What is known of the poses that one camera reports.
+
+    doubts: keyframes in a row that were not where reported motion led.
+    fits: keyframes in a row, of a camera astray, that fit near where it reports them.
+    missed: frames in a row, of a camera astray, that were not found.
+    replaced: keyframes that were located by their pictures.
+    unturned: see ``compare_turns``.
+    at_m: position of the newest view, (3,).
+    suggested: a leap that may be. tried: how many views fit to it.
+    left_out: frames that show something else than is to be seen from there; left_out_in_a_row of the newest.
+    """
+
+    doubts: int = 0
+    fits: int = 0
+    missed: int = 0
+    replaced: int = 0
+    unturned: int = 0
+    at_m: Array | None = None
+    suggested: Leap | None = None
+    tried: int = 0
+    left_out: int = 0
+    left_out_in_a_row: int = 0
+
+    @property
+    def astray(self) -> bool:
+        """Whether they are not believed."""
+        return self.doubts >= tuned.DOUBTS
+
+    @property
+    def have_no_rotation(self) -> bool:
+        """Whether the camera turns while the rotation that it reports stays, as far as is known without depth."""
+        return self.unturned >= tuned.UNTURNED
+
+    @property
+    def doubted(self) -> bool:
+        """Whether the next view has to be looked for."""
+        return self.astray or self.suggested is not None
+
+    def trust(self) -> None:
+        """Believe them."""
+        self.doubts = self.fits = 0
+
+    def fit_again(self, fits: bool) -> bool:
+        """Note whether a view of a camera astray fits near where it is reported. Returns whether so many in a row did
+        that reported poses are believed again."""
+        self.fits = self.fits + 1 if fits else 0
+        if self.fits < tuned.DOUBTS:
+            return False
+        self.trust()
+        return True
+
+    def begun_anew(self) -> Reports:
+        """What is known of them in a field that begins anew: what its pictures showed by themselves."""
+        return Reports(unturned=self.unturned, left_out=self.left_out, left_out_in_a_row=self.left_out_in_a_row)
+
+    def compare_turns(self, contradicted: bool) -> None:
+        """Note whether a picture contradicts that its camera has not turned."""
+        self.unturned = min(max(self.unturned + (1 if contradicted else -1), 0), 2 * tuned.UNTURNED)
 
 
 class OwnMotion:
     """Which cameras' reported poses do not fit their pictures, and where their views are taken to be instead.
 
     poses: of all keyframes, where located views are noted.
-    replaced: number of keyframes of each camera that were located by their pictures.
     """
 
     def __init__(self, poses: PoseCorrections) -> None:
         self._poses = poses
-        self.doubts: dict[str, int] = {}  # keyframes in a row that were not where reported motion led
-        self.fits: dict[str, int] = {}  # keyframes in a row of a camera astray that fit near where it reports them
-        self.missed: dict[str, int] = {}  # frames in a row of a camera astray that were not found
-        self.replaced: dict[str, int] = {}
-        self.unturned: dict[str, int] = {}  # see ``compare_turns``
-        self._suggested: dict[str, tuple[Leap, int]] = {}  # a leap that may be, and how many views fit to it
-        self._reported_m: dict[str, Array] = {}  # position of a camera's newest view, (3,)
+        self.cameras: dict[str, Reports] = {}
 
-    def astray(self, camera: str) -> bool:
-        """Whether reported poses of a camera are not believed."""
-        return self.doubts.get(camera, 0) >= tuned.DOUBTS
-
-    def doubted(self, camera: str) -> bool:
-        """Whether the next view of a camera has to be looked for."""
-        return self.astray(camera) or camera in self._suggested
-
-    def doubt(self, camera: str) -> None:
-        """Note that a view fits better elsewhere than where reported motion leads."""
-        self.doubts[camera] = self.doubts.get(camera, 0) + 1
-
-    def trust(self, camera: str) -> None:
-        """Believe reported poses."""
-        self.doubts[camera] = self.fits[camera] = 0
-
-    def fits_again(self, camera: str, fits: bool) -> bool:
-        """Note whether a view of a camera astray fits near where it is reported. Returns whether so many in a row did
-        that reported poses are believed again."""
-        self.fits[camera] = self.fits.get(camera, 0) + 1 if fits else 0
-        if self.fits[camera] < tuned.DOUBTS:
-            return False
-        self.trust(camera)
-        return True
-
-    def compare_turns(self, camera: str, contradicted: bool) -> None:
-        """Note whether a picture contradicts that its camera has not turned."""
-        count = self.unturned.get(camera, 0) + (1 if contradicted else -1)
-        self.unturned[camera] = min(max(count, 0), 2 * tuned.UNTURNED)
-
-    def has_no_rotation(self, camera: str) -> bool:
-        """Whether a camera turns while the rotation that it reports stays, as far as is known without depth."""
-        return self.unturned.get(camera, 0) >= tuned.UNTURNED
+    def of(self, camera: str) -> Reports:
+        """What is known of a camera's reports, to be changed."""
+        return self.cameras.setdefault(camera, Reports())
 
     def before(self, view: View, camera: str) -> list[PoseCorrection]:
         """Corrections of the newest keyframes of a view's camera that were taken before it, in the order of time."""
@@ -81,9 +105,8 @@ class OwnMotion:
     def leaps(self, view: View, camera: str) -> bool:
         """Whether a view is reported farther from the one before than a camera can have moved. A tracker that loses
         its place leaps once; in another unit each view leaps. A quick turn is none."""
-        here = view.camera_to_world[:3, 3]
-        before = self._reported_m.get(camera, here)
-        self._reported_m[camera] = here
+        here, known = view.camera_to_world[:3, 3], self.of(camera)
+        before, known.at_m = here if known.at_m is None else known.at_m, here
         return bool(np.linalg.norm(here - before) > tuned.FARTHEST * self._poses.most_m)
 
     def suggest_leap(self, view: View, camera: str, begun: Array, found: Array) -> bool:
@@ -108,26 +131,28 @@ class OwnMotion:
         if self._poses.within(reported, found, 1.0):
             back = np.eye(4)  # an earlier leap has ended
         shift_m = float(np.linalg.norm((back @ reported - reported)[:3, 3]))
-        self._suggested[camera] = Leap(before[-1].at_ns, view.generated_ns, back, shift_m), 0
+        known = self.of(camera)
+        known.suggested, known.tried = Leap(before[-1].at_ns, view.generated_ns, back, shift_m), 0
         return True
 
     def after_leap(self, view: View, camera: str) -> View | None:
         """A view where it is if poses of its camera have leapt as is suggested; None: nothing is."""
-        if camera not in self._suggested:
+        leap = self.of(camera).suggested
+        if leap is None:
             return None
-        return replace(view, camera_to_world=self._suggested[camera][0].back @ self._as_reported(view, camera))
+        return replace(view, camera_to_world=leap.back @ self._as_reported(view, camera))
 
     def try_leap(self, camera: str, fits: bool) -> bool:
         """Note whether a view fits to the leap that is suggested. Returns whether so many did that it is believed."""
-        leap, count = self._suggested.pop(camera)
-        if not fits:
+        known = self.of(camera)
+        leap, known.tried = known.suggested, known.tried + 1
+        if leap is None or (fits and known.tried < tuned.LEAPT):
             return False
-        if count + 1 < tuned.LEAPT:
-            self._suggested[camera] = leap, count + 1
-            return False
-        self._poses.leaps[camera] = (*self._poses.leaps.get(camera, ()), leap)[-tuned.KEPT_CORRECTIONS :]
-        self.trust(camera)
-        return True
+        known.suggested = None
+        if fits:
+            self._poses.leaps[camera] = (*self._poses.leaps.get(camera, ()), leap)[-tuned.KEPT_CORRECTIONS :]
+            known.trust()
+        return fits
 
     def _back(self, camera: str) -> Array:
         leaps = self._poses.leaps.get(camera)
@@ -138,9 +163,8 @@ class OwnMotion:
 
     def located(self, view: View, camera: str, pose: Array, scale: float) -> View:
         """The view at a pose (4, 4) that its picture was found at, and no longer at the reported one."""
-        self.missed[camera] = 0
-        self.replaced[camera] = self.replaced.get(camera, 0) + 1
-        self.doubts[camera] = tuned.DOUBTS
+        known = self.of(camera)
+        known.missed, known.replaced, known.doubts = 0, known.replaced + 1, tuned.DOUBTS
         before = self.before(view, camera)
         if len(before) == 1 and before[0].reported is None:
             before[0].reported, before[0].scale = before[0].given, scale  # for frames before the first keyframe
@@ -155,16 +179,18 @@ class OwnMotion:
         before = self.before(view, camera)
         if before and not measured:
             scale = shift_scale(before)
-            return self.located(view, camera, replace(before[-1], scale=scale).moved(view.camera_to_world), scale)
-        missed = self.missed[camera] = self.missed.get(camera, 0) + 1
-        return self.located(view, camera, before[-1].pose, 0.0) if missed > tuned.LOST and before else None
+            return self.located(view, camera, before[-1].moved(view.camera_to_world, scale), scale)
+        known = self.of(camera)
+        known.missed += 1
+        return self.located(view, camera, before[-1].pose, 0.0) if known.missed > tuned.LOST and before else None
 
     def troubles(self) -> list[str]:
         """What is wrong with the cameras' reported poses, for people."""
         replaced = [
-            f"{camera}: {count} reported poses do not fit its pictures and were replaced by what the pictures show"
+            f"{camera}: {known.replaced} reported poses do not fit its pictures and were replaced by what these show"
             + misfit(self._poses.newest(camera, tuned.JUDGED))
-            for camera, count in self.replaced.items()
+            for camera, known in self.cameras.items()
+            if known.replaced
         ]
         leapt = [
             f"{camera}: its poses leapt by {leaps[-1].words}: they are taken back by as much"
@@ -173,28 +199,19 @@ class OwnMotion:
         ]
         unturned = [
             f"{camera}: reported poses have no rotation, but its pictures turn: look at how they are exported and read"
-            for camera in self.unturned
-            if self.has_no_rotation(camera)
+            for camera, known in self.cameras.items()
+            if known.have_no_rotation
         ]
         return [*replaced, *leapt, *unturned]
 
     def meta(self) -> dict[str, Any]:
         """What a state keeps, ready for JSON."""
-        places = {camera: place.tolist() for camera, place in self._reported_m.items()}
-        leaps = {camera: [_as_list(leap) for leap in leaps] for camera, leaps in self._poses.leaps.items()}
-        suggested = {camera: (_as_list(leap), count) for camera, (leap, count) in self._suggested.items()}
-        counts = {name: getattr(self, name) for name in _COUNTS}
-        return {**counts, "reported_m": places, "leaps": leaps, "suggested": suggested}
+        return {"cameras": to_json(self.cameras), "leaps": to_json(self._poses.leaps)}
 
     def load(self, meta: dict[str, Any]) -> None:
         """Restore what ``meta`` returned."""
-        for name in _COUNTS:
-            setattr(self, name, {str(camera): int(count) for camera, count in meta[name].items()})
-        self._reported_m = {str(camera): np.array(place) for camera, place in meta["reported_m"].items()}
-        self._poses.leaps = {str(camera): tuple(map(_leap, leaps)) for camera, leaps in meta["leaps"].items()}
-        self._suggested = {
-            str(camera): (_leap(leap), int(count)) for camera, (leap, count) in meta["suggested"].items()
-        }
+        self.cameras = from_json(meta["cameras"], dict[str, Reports])
+        self._poses.leaps = from_json(meta["leaps"], dict[str, tuple[Leap, ...]])
 
 
 def search(
@@ -232,7 +249,7 @@ def guessed_poses(view: View, before: Sequence[PoseCorrection]) -> list[Array]:
     """
     last = before[-1]
     scales = (1.0, shift_scale(before), 0.0)
-    poses = [*(replace(last, scale=scale).moved(view.camera_to_world) for scale in scales), last.pose]
+    poses = [*(last.moved(view.camera_to_world, scale) for scale in scales), last.pose]
     led = moved_on(view, before, tuned.FASTEST)
     return poses if led is None else [*poses, led]
 
@@ -269,7 +286,7 @@ def followed_scale(
     best: the largest share of pixels that look as expected, see ``Alignment``.
     """
     for scale in (1.0, shift_scale(before)):
-        pose = replace(before[-1], scale=scale).moved(reported)
+        pose = before[-1].moved(reported, scale)
         if align(kept, frame, pose, pose, ((1, 1),)).agreeing >= best - tuned.FOLLOWED:
             return scale
     return 0.0
@@ -298,11 +315,3 @@ def misfit(known: Sequence[PoseCorrection]) -> str:
 
 def _reported(known: PoseCorrection) -> Array:
     return known.given if known.reported is None else known.reported
-
-
-def _as_list(leap: Leap) -> list[Any]:
-    return [*leap[:2], leap.back.tolist(), leap.shift_m]
-
-
-def _leap(told: Sequence[Any]) -> Leap:
-    return Leap(int(told[0]), int(told[1]), np.array(told[2], dtype=np.float64), float(told[3]))

@@ -57,9 +57,7 @@ class ScanField(StillField):
     def correction(self, view: View) -> Correction | None:
         """See ``fields.RefinesCameras``."""
         with self._lock:
-            if self._rigid is None:
-                return None
-            return RefinedCameras(self._poses, self._exposures).correction(view)
+            return self._live().correction(view)
 
     def _live(self) -> ScanSnapshot:
         plain = super()._live()

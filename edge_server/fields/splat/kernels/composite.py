@@ -38,9 +38,8 @@ from edge_server.fields.splat.kernels.project import (
     RED,
     TILE,
 )
-from edge_server.fields.splat.settings import ALPHA_MAX, ALPHA_MIN
+from edge_server.fields.splat.settings import ALPHA_MAX, ALPHA_MIN, STOP
 
-STOP = 1e-4  # transmittance below which compositing stops
 SUMS = 9  # sums that the backward pass gathers a pair: see ``project_backward``
 
 STRIPS = 4

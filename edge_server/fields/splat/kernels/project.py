@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, SIZE, lens_terms, load_camera, rotate_to_camera
 from edge_server.fields.common.kernels.jit import device_function, kernel
-from edge_server.fields.common.kernels.simd import bits_of_float, draw, exp32, is_finite, log32
+from edge_server.fields.common.kernels.simd import draw, exp32, is_finite, log32
 from edge_server.fields.common.kernels.volume_rendering import harmonic
 from edge_server.fields.splat.settings import ALPHA_MIN, LOG_SCALE_HIGH, LOG_SCALE_LOW, RAW_OPACITY_LIMIT
 
@@ -236,7 +236,7 @@ def _write_projected(cam, gaussians, i, s, j, row, edges):
             edges[2],
             edges[3],
         )
-        far = (bits_of_float(row[DEPTH]) - _NEAREST_BITS) >> _DROPPED_BITS
+        far = (np.float32(row[DEPTH]).view(np.int32) - _NEAREST_BITS) >> _DROPPED_BITS
         edges[DEPTH_KEY] = min(max(far, np.int32(0)), np.int32((1 << DEPTH_BITS) - 1))
         edges[TILE_BITS] = np.int32(bits & np.uint64(0xFFFFFFFF))
         edges[TILE_BITS + 1] = np.int32(bits >> np.uint64(32))

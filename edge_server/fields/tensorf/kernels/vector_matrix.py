@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic, overload
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from edge_server.fields.common.kernels.hash_grid import corner, flag_segments
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.mlp import backward, forward
-from edge_server.fields.common.kernels.radiance_model import has, query_backward, query_color, query_density
+from edge_server.fields.common.kernels.radiance_model import implements, query_backward, query_color, query_density
 from edge_server.fields.common.kernels.simd import fetch_add
 from edge_server.fields.common.kernels.simd_vectors import Vector
 
@@ -109,20 +110,12 @@ def store_products_backward(typingctx: Any, table: Any, rows: Any, weights: Any,
 
 
 @device_function
-def _vertex(x, size):
-    """Lower vertex (uint32) and fraction of coordinate x in [0, 1] among ``size`` vertices."""
-    scaled = x * np.float32(size - 1)
-    i = min(max(np.int32(scaled), np.int32(0)), np.int32(size - 2))
-    return np.uint32(i), scaled - np.float32(i)
-
-
-@device_function
 def _neighbors(size, u, v, w):
     """Rows within a group and weights: the plane's four vertices around (u, v), the line's two around w."""
     one = np.uint32(1)
-    i, fu = _vertex(u, size)
-    j, fv = _vertex(v, size)
-    k, fw = _vertex(w, size)
+    i, fu = corner(u, size - 1)
+    j, fv = corner(v, size - 1)
+    k, fw = corner(w, size - 1)
     side = np.uint32(size)
     a = np.uint32(i + np.uint32(j * side))
     b = np.uint32(a + side)
@@ -189,15 +182,6 @@ def color_components(planes, x, start, end, acts):
                     row[s] = tile[s, c]
 
 
-@device_function
-def _flag_segments(dirty, a, b):
-    """Flag the segments of two neighboring vertices."""
-    i, j = a >> np.uint32(2), b >> np.uint32(2)
-    dirty[i] = True
-    if j != i:
-        dirty[j] = True
-
-
 @kernel
 def scatter_planes(counter, worker, planes, x, d_features, counts, gradient, dirty):
     """Add the factors' gradient of all samples to ``gradient``; a task is a group, so nothing races.
@@ -235,54 +219,35 @@ def scatter_planes(counter, worker, planes, x, d_features, counts, gradient, dir
                         continue
                     rows, weights = _neighbors(planes.size, u[a + s], v[a + s], w[a + s])
                     store_products_backward(table, rows, weights, d, np.uint32(s), to)
-                    _flag_segments(flags, rows[0], rows[1])
-                    _flag_segments(flags, rows[2], rows[3])
-                    _flag_segments(flags, rows[4], rows[5])
+                    for k in range(0, 6, 2):
+                        flag_segments(flags, 2, rows[k], rows[k + 1])
 
 
-@overload(query_density)
+@implements(query_density, "density_groups")
 def _query_density(encoding, levels, net, x, start, end, acts):
-    if not has(encoding, "density_groups"):
-        return None
-
-    def run(encoding, levels, net, x, start, end, acts):
-        raw_density(encoding, x, start, end, acts[acts.shape[0] - net.widths[-1]])
-
-    return run
+    raw_density(encoding, x, start, end, acts[acts.shape[0] - net.widths[-1]])
 
 
-@overload(query_color)
+@implements(query_color, "density_groups")
 def _query_color(encoding, levels, net, x, start, end, acts):
-    if not has(encoding, "density_groups"):
-        return None
-
-    def run(encoding, levels, net, x, start, end, acts):
-        # The network's output in density's row is meaningless: restore the density.
-        sigma = acts[acts.shape[0] - net.widths[-1], start:end]
-        kept = sigma.copy()
-        color_components(encoding, x, start, end, acts)
-        forward(net, acts, start, end)
-        for s in range(kept.size):
-            sigma[s] = kept[s]
-
-    return run
+    # The network's output in density's row is meaningless: restore the density.
+    sigma = acts[acts.shape[0] - net.widths[-1], start:end]
+    kept = sigma.copy()
+    color_components(encoding, x, start, end, acts)
+    forward(net, acts, start, end)
+    for s in range(kept.size):
+        sigma[s] = kept[s]
 
 
-@overload(query_backward)
+@implements(query_backward, "density_groups")
 def _query_backward(encoding, net, acts, d_acts, n, d_params, d_features):
-    if not has(encoding, "density_groups"):
-        return None
-
-    def run(encoding, net, acts, d_acts, n, d_params, d_features):
-        inputs = net.widths[0]
-        d_raw, d_sigma = d_features[inputs], d_acts[d_acts.shape[0] - net.widths[-1]]
+    inputs = net.widths[0]
+    d_raw, d_sigma = d_features[inputs], d_acts[d_acts.shape[0] - net.widths[-1]]
+    for s in range(n):
+        d_raw[s] = d_sigma[s]
+        d_sigma[s] = _F0
+    backward(net, acts, d_acts, n, d_params)
+    for k in range(inputs):
+        to, d = d_features[k], d_acts[k]
         for s in range(n):
-            d_raw[s] = d_sigma[s]
-            d_sigma[s] = _F0
-        backward(net, acts, d_acts, n, d_params)
-        for k in range(inputs):
-            to, d = d_features[k], d_acts[k]
-            for s in range(n):
-                to[s] = d[s]
-
-    return run
+            to[s] = d[s]

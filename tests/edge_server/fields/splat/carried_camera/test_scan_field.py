@@ -18,8 +18,7 @@ from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.carried_camera import scan_field
 from edge_server.fields.splat.carried_camera.scan_field import ScanField
 from edge_server.fields.splat.carried_camera.sweep import sweep_depth
-from edge_server.fields.splat.densification import opacity, raw_opacity
-from edge_server.fields.splat.kernels.project import OPACITY
+from edge_server.fields.splat.densification import opacity
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import so3_exp
 from tests.edge_server.fields.scenes import BALL_M, RADIUS_M
@@ -101,16 +100,6 @@ def _turned(k: int) -> NDArray[np.float64]:
     pose = WITHOUT[0].camera_to_world.copy()
     pose[:3, :3] = pose[:3, :3] @ so3_exp(np.deg2rad([0.0, 5.0 * k, 0.0]))
     return pose
-
-
-def test_what_is_transparent_goes_every_hundredth_step() -> None:
-    field, left = ScanField(_settings(refine=False)), []
-    field.fit(WALK, Budget(steps=0))
-    field.cloud.params[:5, OPACITY] = raw_opacity(0.01)
-    for field.step in (99, 100):
-        field._grow_if_due()
-        left.append(int((opacity(field.cloud.params) < 0.02).sum()))
-    assert left == [5, 0]
 
 
 def test_poses_and_exposures_are_refined_and_held_out_frames_take_their_neighbors() -> None:
