@@ -59,7 +59,7 @@ def pack(field: Any) -> Arrays:
         given = {"given": o.view.weight, "depth": o.view.depth, "body_m": o.body_m}
         arrays |= {name: array for name, array in given.items() if array is not None}
         if o.weight is not None:
-            arrays["weight"] = _half(o.weight)
+            arrays["weight"] = o.weight
         if o.row is not None:
             arrays |= {"matrix": o.row.matrix, "vector": o.row.vector, "around": o.row.around}
         state |= _prefixed(f"frame_{k}.", arrays)
@@ -93,7 +93,7 @@ def unpack(field: Any, state: Arrays) -> None:
     field.still.load_state(_under("still.", state))
     field.static = StaticLayer(field.still)
     field.static.load_state(_under("static.", state))
-    field.supervision = StaticSupervision(field.static, field.part_s)
+    field.supervision = StaticSupervision(field.static)
     if "depth.wrong" in state:
         field.supervision.make_depth().load_state(_under("depth.", state))
     field.cameras, field.observations, field.tracker = {}, Observations(), None
@@ -157,17 +157,11 @@ def _observation(field: Any, facts: dict[str, Any], arrays: Arrays) -> Observati
         view.camera,
         view,
         found["foreground"],
-        found["weight"].astype(np.float32) if "weight" in found else None,
+        found.get("weight"),
         row,
         body_m=found.get("body_m"),
         fresh=facts["fresh"],
     )
-
-
-def _half(weight: NDArray[np.float32]) -> NDArray[Any]:
-    """The same numbers with half the bytes, where these hold them."""
-    half = weight.astype(np.float16)
-    return half if np.array_equal(half, weight) else weight
 
 
 def _facts(view: View) -> dict[str, Any]:
