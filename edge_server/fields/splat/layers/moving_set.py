@@ -84,20 +84,12 @@ class MovingSet:
         params[:, :3] = self.places(instant_s)
         return Gaussians(params, self.settings.sh_degree)
 
-    def distance_m(self, camera: FixedCamera, instant_s: float) -> float:
-        """Distance from a camera to the middle of the Gaussians, meters."""
-        places = self.places(instant_s)
-        halves = [(len(places) - 1) // 2, len(places) // 2]
-        middle = np.partition(places.T, halves, axis=1)[:, halves].mean(axis=1)  # four times as fast as np.median
-        apart = middle - self.box.normalise(camera.view.camera_to_world[:3, 3])
-        return float(np.linalg.norm(apart)) * self.box.radius_m
-
     # --- motion -------------------------------------------------------------------------------
 
     def align(self, observation: Observation, camera: FixedCamera) -> NDArray[np.float32]:
         """Linearize a frame's error in the anchors' displacements: fills its ``row`` and ``shown``. Returns
         the opacity of the moving set, float32 (H, W)."""
-        assert camera.row is not None and observation.weight is not None and self.motion.anchors is not None
+        assert camera.row is not None and self.motion.anchors is not None
         instant_s = observation.instant_s
         gaussians = self.gaussians(instant_s)
         self.raster.project_and_bin(camera.row, gaussians, differentiate=False)
@@ -121,7 +113,6 @@ class MovingSet:
         params = np.zeros((tuned.LEAST_ALIVE, self.cloud.params.shape[1]), np.float32)
         self.cloud = GaussianCloud.new(params)
         self.renew_anchors(observation.instant_s)
-        observation.weight = np.ones(observation.foreground.shape, np.float32)
         self.align(observation, camera)
         rates = np.zeros(params.shape[1], np.float32)
         self.train(observation, camera, AdamParameters(rates, np.ones((1, 3), np.float32), np.float32(1.0)))
@@ -135,7 +126,7 @@ class MovingSet:
 
     def train(self, observation: Observation, camera: FixedCamera, parameters: AdamParameters) -> int:
         """One optimizer step on one frame, over the camera's plate. Returns pairs of Gaussian and tile."""
-        assert camera.row is not None and observation.weight is not None
+        assert camera.row is not None
         raster, cloud = self.raster, self.cloud
         gaussians = self.gaussians(observation.instant_s)
         before = gaussians.params[:, :3].copy()
@@ -168,24 +159,15 @@ class MovingSet:
                     return found
         return []
 
-    def remove_outside(
-        self, frames: Sequence[Observation], cameras: dict[str, FixedCamera], measured: bool = False
-    ) -> None:
+    def remove_outside(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:
         """Remove the Gaussians that lie outside the foregrounds that should hold them. If that is most of
-        them, remove all, with their motion: new ones are then seeded at rest.
-
-        measured: remove those that a frame's depth sees through, too.
-        """
+        them, remove all, with their motion: new ones are then seeded at rest."""
         if len(self.cloud):
             places = [self.places(o.instant_s) for o in frames]
             keep = self._inside(places, frames, cameras, tuned.KEEP_DILATION_PX) >= tuned.KEEP_INSIDE
             if keep.mean() < tuned.LOST_BELOW:
                 keep[:] = False
                 self.motion.forget()
-            elif measured:
-                from edge_server.fields.splat.layers.depth.body_depth import seen_through
-
-                keep &= ~seen_through(places, frames, cameras, self.box, self.pool)
             self._keep(keep)
 
     def seed_missing(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:
@@ -314,7 +296,6 @@ def _over_plate(observation: Observation, camera: FixedCamera) -> Targets:
     """A frame as what to learn, over the camera's plate, so that errors of the still field do not reach the moving
     set."""
     image, weight = observation.view.image, observation.weight
-    assert weight is not None
     height, width = weight.shape
     return Targets(
         np.array([0, height * width]),

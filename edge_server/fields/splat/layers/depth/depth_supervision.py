@@ -16,7 +16,7 @@ from edge_server.fields.common.scene_box import SceneBox, scene_box
 from edge_server.fields.common.threads.thread_pool import Pool, compile_kernels
 from edge_server.fields.splat.layers import settings as of_layers
 from edge_server.fields.splat.layers.depth import settings as tuned
-from edge_server.fields.splat.layers.depth.body_depth import body_depth, seen_through
+from edge_server.fields.splat.layers.depth.body_depth import body_depth
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
 from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
 from edge_server.fields.splat.layers.depth.kernels.surfaces import Meshes
@@ -280,7 +280,6 @@ def _run_kernels(pool: Pool) -> None:
     camera = FixedCamera(view, Plate(*shape, pool), row=camera_rows([np.eye(4)], [lens], box), depth=depth)
     frame = Observation(0.0, "warm-up", replace(view, depth=depth.samples[..., 0].copy()), np.ones(shape, bool))
     frame.body_m = body_depth(frame, camera, pool)
-    seen_through([np.zeros((1, 3), np.float32)], [frame], {"warm-up": camera}, box, pool)
     aside = np.eye(4)
     aside[0, 3] = 0.5
     nothing = np.zeros(shape, np.float32)

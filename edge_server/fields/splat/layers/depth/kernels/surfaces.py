@@ -29,7 +29,6 @@ class Meshes(NamedTuple):
     normal: float32 (P, 3), unit, towards the camera.
     color: float32 (P, 3) in [0, 1].
     joined: bool (P,), whether a pixel, its right, its lower and its lower right neighbor lie on one surface.
-    trust: float32 (P,), 1 within a surface, less beside its edges, 0 without depth.
     """
 
     first: NDArray[np.int64]
@@ -40,7 +39,6 @@ class Meshes(NamedTuple):
     normal: NDArray[np.float32]
     color: NDArray[np.float32]
     joined: NDArray[np.bool_]
-    trust: NDArray[np.float32]
 
 
 @device_function
@@ -126,7 +124,7 @@ def _look(meshes, k, x, y, z):
             e = (depth - d) * scale
             known = depth > _F0
             through += share if known & (e > np.float32(tuned.THROUGH)) else _F0
-            w = share * meshes.trust[p] / (_F1 + e * e * e * e) if known else _F0
+            w = share / (_F1 + e * e * e * e) if known else _F0
             agree += w
             r += w * meshes.color[p, 0]
             g += w * meshes.color[p, 1]
