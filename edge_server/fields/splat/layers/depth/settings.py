@@ -39,7 +39,6 @@ REJECT, REJECT_LEAST = (
     0.4,
 )  # a surface does not count if more cameras see through it than this times those that agree
 FORWARD = 3.0  # how much more a camera counts whose direction is like the view's, in the exponent of a cosine
-LEAST_FACING = 0.02  # cosine at which a surface counts as facing a camera, at least
 
 # --- virtual plates ---
 VIRTUAL_PLATES = 12

@@ -100,7 +100,6 @@ class SurfaceScene:
             cams=_rows([s.pose for s in surfaces], [s.lens for s in surfaces], center),
             points=one_list([s.points() - center for s in surfaces], np.float32, 3),
             depth=one_list(depths, np.float32),
-            normal=one_list([s.normals() for s in surfaces], np.float32, 3),
             color=one_list([s.color / np.float32(255.0) for s in surfaces], np.float32, 3),
             joined=one_list(joined, np.bool_),
         )
