@@ -403,7 +403,7 @@ class LayeredField:
         self.supervision.begin_again()
         self.observations = Observations()
         for camera in self.cameras.values():
-            camera.row, camera.rendered_step, camera.anew = None, -1, False
+            camera.row, camera.depth_m, camera.rendered_step, camera.anew = None, None, -1, False
 
     def make_tracker(self) -> None:
         """A tracker of nothing yet, in the static field's box."""

@@ -33,7 +33,7 @@ COUNTERS = ("layered", "origin_ns")  # of the field
 SUPERVISED = ("plates_s", "fine_s", "fine", "exposure_rounds", "anew", "with_depth", "early", "plain", "layers_shown")
 TRACKED = ("anchors_s", "seeded_s", "fits")  # of its tracker
 OF_CAMERA = ("newest_s", "rendered_step", "moves", "anew", "depth_scale", "looked_ns", "began_ns")
-ARRAYS_OF_CAMERA = ("away", "reported", "bumped")  # or None
+ARRAYS_OF_CAMERA = ("away", "depth_m", "reported", "bumped")  # or None
 
 
 def pack(field: Any) -> Arrays:
@@ -59,6 +59,8 @@ def pack(field: Any) -> Arrays:
         arrays = {"image": o.view.image, "foreground": o.foreground}
         given = {"given": o.view.weight, "depth": o.view.depth, "body_m": o.body_m}
         arrays |= {name: array for name, array in given.items() if array is not None}
+        if o.weight is not None:
+            arrays["weight"] = o.weight
         if o.row is not None:
             arrays |= {"matrix": o.row.matrix, "vector": o.row.vector, "around": o.row.around}
         state |= _prefixed(f"frame_{k}.", arrays)
@@ -156,6 +158,7 @@ def _observation(field: Any, facts: dict[str, Any], arrays: Arrays) -> Observati
         view.camera,
         view,
         found["foreground"],
+        found.get("weight"),
         row,
         body_m=found.get("body_m"),
         fresh=facts["fresh"],

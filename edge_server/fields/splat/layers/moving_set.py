@@ -84,12 +84,20 @@ class MovingSet:
         params[:, :3] = self.places(instant_s)
         return Gaussians(params, self.settings.sh_degree)
 
+    def distance_m(self, camera: FixedCamera, instant_s: float) -> float:
+        """Distance from a camera to the middle of the Gaussians, meters."""
+        places = self.places(instant_s)
+        halves = [(len(places) - 1) // 2, len(places) // 2]
+        middle = np.partition(places.T, halves, axis=1)[:, halves].mean(axis=1)  # four times as fast as np.median
+        apart = middle - self.box.normalise(camera.view.camera_to_world[:3, 3])
+        return float(np.linalg.norm(apart)) * self.box.radius_m
+
     # --- motion -------------------------------------------------------------------------------
 
     def align(self, observation: Observation, camera: FixedCamera) -> NDArray[np.float32]:
         """Linearize a frame's error in the anchors' displacements: fills its ``row`` and ``shown``. Returns
         the opacity of the moving set, float32 (H, W)."""
-        assert camera.row is not None and self.motion.anchors is not None
+        assert camera.row is not None and observation.weight is not None and self.motion.anchors is not None
         instant_s = observation.instant_s
         gaussians = self.gaussians(instant_s)
         self.raster.project_and_bin(camera.row, gaussians, differentiate=False)
@@ -113,6 +121,7 @@ class MovingSet:
         params = np.zeros((tuned.LEAST_ALIVE, self.cloud.params.shape[1]), np.float32)
         self.cloud = GaussianCloud.new(params)
         self.renew_anchors(observation.instant_s)
+        observation.weight = np.ones(observation.foreground.shape, np.float32)
         self.align(observation, camera)
         rates = np.zeros(params.shape[1], np.float32)
         self.train(observation, camera, AdamParameters(rates, np.ones((1, 3), np.float32), np.float32(1.0)))
@@ -126,7 +135,7 @@ class MovingSet:
 
     def train(self, observation: Observation, camera: FixedCamera, parameters: AdamParameters) -> int:
         """One optimizer step on one frame, over the camera's plate. Returns pairs of Gaussian and tile."""
-        assert camera.row is not None
+        assert camera.row is not None and observation.weight is not None
         raster, cloud = self.raster, self.cloud
         gaussians = self.gaussians(observation.instant_s)
         before = gaussians.params[:, :3].copy()
@@ -296,6 +305,7 @@ def _over_plate(observation: Observation, camera: FixedCamera) -> Targets:
     """A frame as what to learn, over the camera's plate, so that errors of the still field do not reach the moving
     set."""
     image, weight = observation.view.image, observation.weight
+    assert weight is not None
     height, width = weight.shape
     return Targets(
         np.array([0, height * width]),

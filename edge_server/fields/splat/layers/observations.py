@@ -29,7 +29,8 @@ class FixedCamera:
     """A camera that stands still.
 
     view: its first frame. row: float32 (1, CAMERA), see ``camera_rows``; None before there is a scene box.
-    rendered_step: step of the static field when it was last rendered from here.
+    depth_m: float32 (H, W), of the static field; None before it was rendered.
+    rendered_step: step of the static field at which that was.
     newest_s: instant of the newest frame that was aligned.
     taken: ``generated_ns`` of the latest frames taken in.
     fine: the plate at the full resolution; None where the frames taken in have it.
@@ -48,6 +49,7 @@ class FixedCamera:
     view: View
     plate: Plate
     row: NDArray[np.float32] | None = None
+    depth_m: NDArray[np.float32] | None = None
     rendered_step: int = -1
     newest_s: float = -np.inf
     taken: deque[int] = field(default_factory=lambda: deque(maxlen=tuned.FRAMES_KNOWN))
@@ -139,7 +141,7 @@ class FixedCamera:
 
     def take_rendering(self, step: int, rendering: Rendering) -> None:
         """Take over what the static field shows from here, and the step at which it does."""
-        self.rendered_step, self.anew = step, False
+        self.depth_m, self.rendered_step, self.anew = rendering.depth, step, False
         self.plate.fill_unknown(rendering.color)
 
     def correct_exposure(self, ratio: NDArray[np.float32]) -> None:
@@ -155,7 +157,7 @@ class Observation:
 
     instant_s: what it shows, seconds from the field's origin.
     foreground: bool (H, W). share: the foreground's share of the pixels.
-    weight: float32 (H, W), how much each pixel counts: in full near the foreground, less elsewhere.
+    weight: float32 (H, W), how much each pixel counts.
     row: see ``motion.ViewRow``; None: to be aligned. fresh: not aligned since its arrival.
     shown: float32 (H, W, 3) in [0, 1], the moving set over the plate when it was aligned.
     body_m: float32 (H, W), depth of what moves as ``view.depth`` says it, 0 elsewhere; None: not looked for yet.
@@ -165,20 +167,15 @@ class Observation:
     camera: str
     view: View = field(compare=False)
     foreground: NDArray[np.bool_] = field(compare=False)
+    weight: NDArray[np.float32] | None = field(default=None, compare=False)
     row: ViewRow | None = field(default=None, compare=False)
     shown: NDArray[np.float32] | None = field(default=None, compare=False)
     body_m: NDArray[np.float32] | None = field(default=None, compare=False)
     fresh: bool = field(default=True, compare=False)
     share: float = field(init=False, compare=False)
-    weight: NDArray[np.float32] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
         self.share = float(self.foreground.mean())
-        square = np.ones((tuned.NEAR_FOREGROUND_PX, tuned.NEAR_FOREGROUND_PX), np.uint8)
-        near = cv2.dilate(self.foreground.astype(np.uint8), square) > 0
-        self.weight = np.where(near, np.float32(1.0), np.float32(tuned.BACKGROUND_WEIGHT))
-        if self.view.weight is not None:
-            self.weight *= self.view.weight
 
     @property
     def knot(self) -> int:
@@ -254,6 +251,23 @@ def bumped_by(camera: FixedCamera) -> str:
 
 def _same_pose(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
     return bool((np.abs(a - b) <= tuned.SAME_POSE).all())
+
+
+def pixel_weights(
+    foreground: NDArray[np.bool_], depth_m: NDArray[np.float32] | None, distance_m: float, given: NDArray | None
+) -> NDArray[np.float32]:
+    """How much each pixel counts: in full near the foreground, less elsewhere, not at all where the static
+    field hides what moves.
+
+    foreground: bool (H, W). depth_m: float32 (H, W), depth of the static field; None: unknown.
+    distance_m: distance of the moving set. given: float32 (H, W), ``View.weight``, or None.
+    """
+    square = np.ones((tuned.NEAR_FOREGROUND_PX, tuned.NEAR_FOREGROUND_PX), np.uint8)
+    near = cv2.dilate(foreground.astype(np.uint8), square)
+    weight = np.where(near > 0, np.float32(1.0), np.float32(tuned.BACKGROUND_WEIGHT))
+    if depth_m is not None:
+        weight[~foreground & (depth_m > 0.0) & (depth_m < distance_m - tuned.OCCLUDED_M)] = 0.0
+    return weight if given is None else weight * given
 
 
 def cameras_of(views: Sequence[View]) -> list[str]:

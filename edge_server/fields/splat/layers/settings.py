@@ -84,6 +84,7 @@ BUMP_LEAST_DEG, BUMP_MOST_DEG = 0.3, 12.0  # less is below what calibration errs
 # --- how much a pixel counts ---
 NEAR_FOREGROUND_PX = 5  # width of the square by which the foreground grows, where pixels count in full
 BACKGROUND_WEIGHT = 0.5  # weight of the other pixels
+OCCLUDED_M = 0.15  # pixels do not count where the still field is nearer than the moving set by this
 
 # --- the moving set ---
 GAUSSIANS, ANCHORS = 1500, 24  # for a foreground of USUAL_SHARE of the pixels

@@ -15,7 +15,7 @@ from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters
 from edge_server.fields.splat.layers import settings as tuned
 from edge_server.fields.splat.layers.moving_set import MovingSet
-from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations, knot_of
+from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations, knot_of, pixel_weights
 
 
 class MotionTracker:
@@ -96,12 +96,20 @@ class MotionTracker:
 
     def _align(self, observation: Observation, exclude: bool) -> None:
         camera = self.cameras[observation.camera]
+        self._weigh(observation, camera)
         opacity = self.moving.align(observation, camera)
         if exclude and observation.instant_s >= camera.newest_s:
             camera.newest_s = observation.instant_s
             assert observation.shown is not None
             if observation.instant_s >= tuned.PLATE_S:  # before, what seems to move may be the plate
                 camera.plate.exclude_explained(observation.view.image, observation.shown, opacity)
+
+    def _weigh(self, observation: Observation, camera: FixedCamera) -> None:
+        if observation.weight is None:
+            distance_m = self.moving.distance_m(camera, observation.instant_s)
+            observation.weight = pixel_weights(
+                observation.foreground, camera.depth_m, distance_m, observation.view.weight
+            )
 
     def _train_appearance(self, pace: StepBudget, parameters: AdamParameters, most: int) -> tuple[int, int, int]:
         """At most so many steps on the frames of the last two knots, one frame a step, each as often as the
@@ -113,6 +121,7 @@ class MotionTracker:
         while steps < most and moving.alive and pace.has_room(self._step_time.seconds, 1.0, 0.0):
             begun = time.perf_counter()
             frame = frames[order[steps % len(frames)]]
+            self._weigh(frame, self.cameras[frame.camera])
             samples += moving.train(frame, self.cameras[frame.camera], parameters)
             rays, steps = rays + frame.foreground.size, steps + 1
             self._step_time.add(time.perf_counter() - begun)

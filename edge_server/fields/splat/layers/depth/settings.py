@@ -32,6 +32,7 @@ HOLE_MOST = 2.0  # times HOLE_COLOR, color and distance together, above which a 
 NEAREST_M = 0.05  # what is nearer to a camera is not drawn
 CUT = 0.012  # 1 / m: a mesh is cut where inverse depth jumps by more, off both slopes
 STRETCH = 400.0  # a triangle whose longest side squared is so many times its area is seen at too grazing an angle
+MIXED = 0.08  # trust in pixels beside a cut: they mix two surfaces
 AGREE = 0.03  # relative difference of depth at which two surfaces half agree
 THROUGH = 2.5  # times AGREE: a camera that measures a depth so much larger sees through a point
 REJECT, REJECT_LEAST = (
@@ -39,6 +40,7 @@ REJECT, REJECT_LEAST = (
     0.4,
 )  # a surface does not count if more cameras see through it than this times those that agree
 FORWARD = 3.0  # how much more a camera counts whose direction is like the view's, in the exponent of a cosine
+LEAST_FACING = 0.02  # cosine at which a surface counts as facing a camera, at least
 
 # --- virtual plates ---
 VIRTUAL_PLATES = 12
@@ -49,6 +51,7 @@ MARGIN_DEG = 20.0  # how much wider than the cameras' directions theirs are spre
 UNSEEN_WEIGHT = 0.1
 SILHOUETTE_SHARE = 64  # of the width: silhouettes count as at most so wide, and as narrow as RADIUS
 MOST_HOLES = 0.06  # share of the plates without depth, above which the weight is 0: cameras may see what is there
+FADE_PX = 16.0  # of an image 128 pixels wide: so far from what is seen, colors are those of the mean by 1 - 1 / e
 SURE = 0.3  # agreement above which a pixel counts as seen
 
 # --- first Gaussians ---

@@ -74,6 +74,13 @@ class Surface:
         return out
 
 
+def _trust(depth: NDArray[np.float32], joined: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """See ``Meshes``, (H, W)."""
+    around = np.pad(joined[:-1, :-1], 1, mode="edge")  # of the four squares at a pixel
+    inside = around[:-1, :-1] & around[1:, :-1] & around[:-1, 1:] & around[1:, 1:]
+    return np.where(depth > 0, np.where(inside, 1.0, tuned.MIXED), 0.0).astype(np.float32)
+
+
 @dataclass(frozen=True)
 class SurfaceScene:
     """The surfaces of all cameras, ready to be drawn; never written after construction.
@@ -90,6 +97,7 @@ class SurfaceScene:
         center = np.mean([s.pose[:3, 3] for s in surfaces], axis=0)
         sizes = np.array([(s.lens.width, s.lens.height) for s in surfaces], np.int64)
         depths, joined = [s.depth() for s in surfaces], [s.joined() for s in surfaces]
+        trust = [_trust(depth, j) for depth, j in zip(depths, joined)]
 
         def one_list(arrays: Sequence[NDArray], dtype: type, *shape: int) -> NDArray:
             return np.concatenate([np.asarray(a, dtype).reshape(-1, *shape) for a in arrays])
@@ -100,8 +108,10 @@ class SurfaceScene:
             cams=_rows([s.pose for s in surfaces], [s.lens for s in surfaces], center),
             points=one_list([s.points() - center for s in surfaces], np.float32, 3),
             depth=one_list(depths, np.float32),
+            normal=one_list([s.normals() for s in surfaces], np.float32, 3),
             color=one_list([s.color / np.float32(255.0) for s in surfaces], np.float32, 3),
             joined=one_list(joined, np.bool_),
+            trust=one_list(trust, np.float32),
         )
         return cls(center, meshes)
 

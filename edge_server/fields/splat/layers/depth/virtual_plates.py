@@ -23,7 +23,6 @@ from freshfield.geometry import look_at
 
 Array = NDArray[np.float64]
 
-_EVEN_STEPS = np.array([0.7548776662, 0.5698402910])  # whose multiples fill a square evenly (Roberts 2018)
 NAME = "virtual {}"  # of a virtual camera; no real one's name has a space
 
 
@@ -55,11 +54,21 @@ def poses_between(poses: Sequence[Array], surfaces: Sequence[Surface], count: in
     high = np.array([azimuth.max() + margin, min(elevation.max() + margin, 1.5)])
     out = []
     for k in range(count):
-        a, e = low + (high - low) * ((0.5 + k * _EVEN_STEPS) % 1.0)
+        a, e = low + (high - low) * np.array([_halton(k + 1, 2), _halton(k + 1, 3)])
         a += middle
         way = np.cos(e) * (np.sin(a) * east + np.cos(a) * north) + np.sin(e) * up
         out.append(look_at(target + radius * way, target, up))
     return out
+
+
+def _halton(number: int, base: int) -> float:
+    """The radical inverse: a sequence that fills [0, 1] evenly (Halton 1960)."""
+    value, digit = 0.0, 1.0
+    while number > 0:
+        digit /= base
+        value += digit * (number % base)
+        number //= base
+    return value
 
 
 def virtual_plates(
@@ -98,9 +107,31 @@ def beside_silhouettes(inverse: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def fill_unseen(color: NDArray[np.float32], agreement: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Give pixels that no camera sees the mean color, which is the smallest mistake where nothing is known.
+    """Give pixels that no camera sees a color: that of what is around, and farther away the mean color, which is the
+    smallest mistake where nothing is known.
 
     color: float32 (H, W, 3). agreement: float32 (H, W) in [0, 1]. Returns float32 (H, W, 3).
     """
     seen = agreement > tuned.SURE
-    return np.where(seen[..., None], color, color[seen].mean(axis=0)).astype(np.float32) if seen.any() else color
+    if seen.all() or not seen.any():
+        return color
+    filled = _pull_push(color, agreement)
+    distance = cv2.distanceTransform((~seen).astype(np.uint8), cv2.DIST_L2, 3)
+    near = np.exp(-distance / np.float32(tuned.FADE_PX * color.shape[1] / 128.0))[..., None]
+    return (filled * near + color[seen].mean(axis=0) * (1.0 - near)).astype(np.float32)
+
+
+def _pull_push(color: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Fill by a pyramid of weighted means, down and back up (Gortler et al. 1996). The color where the weight is 1, the
+    mean of what is known around where it is 0, in between the blend."""
+    height, width = weight.shape
+    weighted = color * weight[..., None]
+    if min(height, width) <= 1:
+        return weighted
+    size = (width + 1) // 2, (height + 1) // 2
+    low_weight = np.asarray(cv2.resize(weight, size, interpolation=cv2.INTER_AREA), np.float32)
+    low = cv2.resize(weighted, size, interpolation=cv2.INTER_AREA)
+    mean = np.asarray(low / np.maximum(low_weight, 1e-6)[..., None], np.float32)
+    low = _pull_push(mean, np.asarray(np.minimum(4.0 * low_weight, 1.0), np.float32))
+    up = cv2.resize(low, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(weighted + up * (1.0 - weight)[..., None], np.float32)

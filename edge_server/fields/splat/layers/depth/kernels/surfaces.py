@@ -26,8 +26,10 @@ class Meshes(NamedTuple):
     first: int64 (N + 1,), where a camera's pixels begin. size: int64 (N, 2), width and height.
     cams: float32 (N, CAMERA).
     points: float32 (P, 3), where the centers of pixels lie. depth: float32 (P,), along the axis; 0 unknown.
+    normal: float32 (P, 3), unit, towards the camera.
     color: float32 (P, 3) in [0, 1].
     joined: bool (P,), whether a pixel, its right, its lower and its lower right neighbor lie on one surface.
+    trust: float32 (P,), 1 within a surface, less beside its edges, 0 without depth.
     """
 
     first: NDArray[np.int64]
@@ -35,8 +37,10 @@ class Meshes(NamedTuple):
     cams: NDArray[np.float32]
     points: NDArray[np.float32]
     depth: NDArray[np.float32]
+    normal: NDArray[np.float32]
     color: NDArray[np.float32]
     joined: NDArray[np.bool_]
+    trust: NDArray[np.float32]
 
 
 @device_function
@@ -98,14 +102,14 @@ def draw_meshes(counter, worker, meshes, targets, inverse):
 @device_function
 def _look(meshes, k, x, y, z):
     """What camera k says about a point of a surface: how far its depth agrees, how far it sees through the point, color
-    (times the agreement), vector from the camera to the point."""
+    and normal (both times the agreement), vector from the camera to the point."""
     cam, width, height = load_camera(meshes.cams, k), meshes.size[k, 0], meshes.size[k, 1]
     tx, ty, tz = x - cam[ORIGIN], y - cam[ORIGIN + 1], z - cam[ORIGIN + 2]
     a, b, d = rotate_to_camera(cam, tx, ty, tz)
     over = _F1 / (d if d > np.float32(tuned.NEAREST_M) else _F1)
     through_lens = distort(cam, a * over, b * over)
     u, v = cam[LENS] * through_lens[0] + cam[LENS + 2], cam[LENS + 1] * through_lens[1] + cam[LENS + 3]
-    agree, through, r, g, bl = _F0, _F0, _F0, _F0, _F0
+    agree, through, r, g, bl, nx, ny, nz = _F0, _F0, _F0, _F0, _F0, _F0, _F0, _F0
     # Outside the field of view the lens polynomial may lead back into the image.
     inside = (a * over > cam[LENS + 8]) & (a * over < cam[LENS + 9]) & (b * over > cam[LENS + 10])
     inside = inside & (b * over < cam[LENS + 11]) & (u >= _F0) & (v >= _F0) & (u < width) & (v < height)
@@ -122,18 +126,21 @@ def _look(meshes, k, x, y, z):
             e = (depth - d) * scale
             known = depth > _F0
             through += share if known & (e > np.float32(tuned.THROUGH)) else _F0
-            w = share / (_F1 + e * e * e * e) if known else _F0
+            w = share * meshes.trust[p] / (_F1 + e * e * e * e) if known else _F0
             agree += w
             r += w * meshes.color[p, 0]
             g += w * meshes.color[p, 1]
             bl += w * meshes.color[p, 2]
-    return agree, through, r, g, bl, tx, ty, tz
+            nx += w * meshes.normal[p, 0]
+            ny += w * meshes.normal[p, 1]
+            nz += w * meshes.normal[p, 2]
+    return agree, through, r, g, bl, nx, ny, nz, tx, ty, tz
 
 
 @kernel
 def shade_surfaces(counter, worker, meshes, targets, inverse, color, agreement):
     """Of the surfaces that meshes put at a pixel, take the nearest one that cameras agree on, and no more of them see
-    through it; of its color the mean over the cameras, those before others that see it finely and from a
+    through it; of its color the mean over the cameras, those before others that see it finely, squarely and from a
     direction like the target's. Tasks are runs of rows.
 
     meshes, targets, inverse: see ``draw_meshes``.
@@ -175,15 +182,18 @@ def shade_surfaces(counter, worker, meshes, targets, inverse, color, agreement):
                     away = np.sqrt(px * px + py * py + pz * pz)
                     weights, r, g, bl, agree, through = _F0, _F0, _F0, _F0, _F0, _F0
                     for k in range(count):
-                        w, beyond, cr, cg, cb, tx, ty, tz = _look(
+                        w, beyond, cr, cg, cb, nx, ny, nz, tx, ty, tz = _look(
                             meshes, k, px + cam[ORIGIN], py + cam[ORIGIN + 1], pz + cam[ORIGIN + 2]
                         )
                         through += beyond
                         if w < np.float32(0.01):
                             continue
-                        far = np.sqrt(tx * tx + ty * ty + tz * tz)
+                        far2, length = tx * tx + ty * ty + tz * tz, np.sqrt(nx * nx + ny * ny + nz * nz)
+                        far = np.sqrt(far2)
+                        facing = -(nx * tx + ny * ty + nz * tz) / (far * (length + np.float32(1e-9)))
+                        fine = max(facing, np.float32(tuned.LEAST_FACING)) / far2
                         along = (tx * px + ty * py + tz * pz) / (far * away)
-                        better = np.exp(np.float32(tuned.FORWARD) * (along - _F1)) / (far * far * far)
+                        better = fine * np.sqrt(fine) * np.exp(np.float32(tuned.FORWARD) * (along - _F1))
                         r += better * cr
                         g += better * cg
                         bl += better * cb

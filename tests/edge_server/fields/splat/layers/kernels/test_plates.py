@@ -28,7 +28,7 @@ H, W = 37, 11
 # In numbers, so that a change of them is seen.
 THRESHOLD, THRESHOLD_UNKNOWN, DEVIATIONS = 10.0, 20.0, 3.5
 MEMORY, RUN, SLOWEST_RATE = 60, 12, 1.0 / 24.0
-SPECK, HOLE = 10, 0.02
+CLOSE, SPECK, HOLE = 5, 10, 0.02
 
 
 @kernel
@@ -48,10 +48,13 @@ def found(mask: np.ndarray, flag: int = 0) -> np.ndarray:
 
 def cleaned(mask: np.ndarray) -> np.ndarray:
     """The same by OpenCV."""
-    _, label, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    part = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    _, label, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=8)
     keep = stats[:, cv2.CC_STAT_AREA] >= SPECK
     keep[0] = False
-    part = keep[label].astype(np.uint8)
+    part = cv2.copyMakeBorder(keep[label].astype(np.uint8), *[CLOSE] * 4, cv2.BORDER_CONSTANT, value=0)
+    part = cv2.morphologyEx(part, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (CLOSE, CLOSE)))
+    part = np.ascontiguousarray(part[CLOSE:-CLOSE, CLOSE:-CLOSE])
     _, label, stats, _ = cv2.connectedComponentsWithStats(1 - part, connectivity=4)
     fill = stats[:, cv2.CC_STAT_AREA] <= HOLE * mask.size
     fill[0] = False
