@@ -40,8 +40,6 @@ _SHARES = (0.2, 0.6, 1.0)
 # The first part of a run builds the field; a busy machine's slowest updates are left out.
 _SETTLED_SHARE, _SLOWEST_SHARE = 0.5, 0.1
 _EPOCH_MS = 40.0
-# Parts of an update that live run in their own thread.
-_BESIDE = ("static field", "static renders")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -97,12 +95,6 @@ def fitted(rows: NDArray[np.float64]) -> ComputeConfig:
     return ComputeConfig(ms_per_step=a_step, ms_per_update=an_update, ms_per_view=a_view)
 
 
-def _beside_s(field: Any) -> float:
-    """Seconds that updates of ``field`` have spent so far on parts that live run beside them."""
-    parts: dict[str, float] = getattr(field, "part_s", {})
-    return sum(parts.get(part, 0.0) for part in _BESIDE)
-
-
 def _timed(scenario: Scenario, share: float, seconds: float, data: Path | None) -> NDArray[np.float64]:
     """Steps, frames taken in and milliseconds of the updates of a run, (n, 3). share: of the scenario's
     steps."""
@@ -119,9 +111,9 @@ def _timed(scenario: Scenario, share: float, seconds: float, data: Path | None) 
     updates, fit = deployment.updates, deployment.updates.fit
 
     def timed(selection: Any, budget: Any) -> Any:
-        before_s, began_s = _beside_s(updates.field), time.perf_counter()
+        before_s, began_s = getattr(updates.field, "beside_s", 0.0), time.perf_counter()
         done = fit(selection, budget)
-        spent_s = time.perf_counter() - began_s - (_beside_s(updates.field) - before_s)
+        spent_s = time.perf_counter() - began_s - (getattr(updates.field, "beside_s", 0.0) - before_s)
         if done is not None:
             rows.append((done[1].steps, selection.arrivals, 1e3 * spent_s))
         return done

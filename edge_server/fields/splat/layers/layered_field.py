@@ -43,7 +43,7 @@ from edge_server.fields.splat.layers.observations import (
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
 from edge_server.fields.splat.layers.static_layer import StaticLayer
 from edge_server.fields.splat.layers.static_supervision import StaticSupervision
-from edge_server.fields.splat.layers.tracker import MotionTracker, PartTimes
+from edge_server.fields.splat.layers.tracker import MotionTracker
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from freshfield.geometry import Pinhole
@@ -63,7 +63,7 @@ class LayeredField:
     the still field learns from the views themselves. A camera that is knocked begins anew where it stands then.
     Call ``fit`` from one thread only; snapshots may be taken and rendered from any thread.
 
-    part_s: seconds spent by part, in all fits.
+    beside_s: seconds that all fits have spent on what a fit of a number of seconds has done beside.
     """
 
     def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
@@ -73,7 +73,7 @@ class LayeredField:
         self.now = time.perf_counter  # the clock of budgets in seconds
         self.still = StillField(self.settings, self.pool)
         self.static = StaticLayer(self.still)
-        self.part_s = PartTimes(self.now)
+        self.beside_s = 0.0
         self.depth_network: NetworkDepth | None = None
         self._frame_time = StepTimer()
         self.reset()
@@ -99,7 +99,7 @@ class LayeredField:
         self.layered = True  # False: a camera moves, or its frames are none for layers
         self.refused: set[str] = set()  # cameras whose newest frame shows something else than their plate
         self.origin_ns: int | None = None
-        self.supervision = StaticSupervision(self.static, self.part_s, self.depth_network)
+        self.supervision = StaticSupervision(self.static, self.depth_network)
         self._published: SplatSnapshot | None = None
         self._exposed: tuple[SplatSnapshot, bytes, Gaussians] | None = None  # see ``_at_present_exposure``
 
@@ -191,7 +191,9 @@ class LayeredField:
                 return FitReport(0, pace.elapsed_s(), 0.0, 0, 0, note="the cameras' exposures are equalized")
             log.info("layers begin: the plates of %d cameras are known", len(self.cameras))
         tracker = self.tracker or self._begin_layers()
+        begun = self.now()
         self.supervision.compare(self.cameras, self.observations, beside)
+        self.beside_s += self.now() - begun
         self._find_rows()
         parameters = self.still.adam_parameters(tuned.STEP_PROGRESS)
         steps = rays = samples = 0
@@ -201,17 +203,16 @@ class LayeredField:
             self.static.wait(budget.seconds - pace.elapsed_s())  # it has the processor: nobody sees yet what moves
         else:
             steps, rays, samples = tracker.follow(pace, parameters)
-        loss = 0.0
+        loss, begun = 0.0, self.now()
         if not beside:
-            begun = self.now()
             loss, static_rays, static_samples = self.static.train(pace)
             self.static.publish()
             rays, samples = rays + static_rays, samples + static_samples
-            self.part_s.add("static field", begun)
-        self._publish()
         self._take_renderings(beside)
+        self.beside_s += self.now() - begun
+        self._publish()
         self.supervision.take_whole(taken, self.cameras, self.observations)
-        note = "" if steps or pace.steps else self._why_no_step(tracker.moving) if taken else "no new views"
+        note = "" if steps or pace.steps else "no step was made" if taken else "no new views"
         return FitReport(
             steps,
             pace.elapsed_s(),
@@ -230,17 +231,9 @@ class LayeredField:
 
     def _fit_still(self, views: Sequence[View], budget: Budget, pace: StepBudget) -> FitReport:
         """Spend what is left of a budget on the still field, on the newest view of each camera."""
-        begun, left = self.now(), budget
         if budget.seconds is not None:
-            left = Budget(seconds=max(budget.seconds - pace.elapsed_s(), 0.0))
-        report = self.still.fit(newest_of_each(views), left)
-        self.part_s.add("static field", begun)
-        return report
-
-    def _why_no_step(self, moving: MovingSet) -> str:
-        if moving.alive:
-            return "motion was followed, without time for a step"
-        return "nothing is left to learn" if self.static.finished else "only the still field learns"
+            budget = Budget(seconds=max(budget.seconds - pace.elapsed_s(), 0.0))
+        return self.still.fit(newest_of_each(views), budget)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """Render the scene at the instant of the newest view."""
@@ -316,7 +309,7 @@ class LayeredField:
         self.layered = False
         self.pool.spare(0)
         self._published, self.tracker, self.observations = None, None, Observations()
-        self.cameras, self.supervision = {}, StaticSupervision(self.static, self.part_s, self.depth_network)
+        self.cameras, self.supervision = {}, StaticSupervision(self.static, self.depth_network)
 
     def _take_in(self, views: Sequence[View]) -> list[View]:
         """Plates and foregrounds of the views not seen before. Returns these views."""
@@ -330,7 +323,6 @@ class LayeredField:
             self._frame_time.add((self.now() - begun) / len(news))
         if len(self.observations):
             self.observations.forget_before(self.observations.newest_s - tuned.EVIDENCE_S)
-        self.part_s.add("plates", begun)
         return list(news.values())
 
     def _has_seen(self, view: View) -> bool:
@@ -416,7 +408,7 @@ class LayeredField:
     def make_tracker(self) -> None:
         """A tracker of nothing yet, in the static field's box."""
         moving = MovingSet(self.settings, self.caller, self._box(), self.settings.seed)
-        self.tracker = MotionTracker(moving, self.observations, self.cameras, self.part_s)
+        self.tracker = MotionTracker(moving, self.observations, self.cameras)
 
     def _find_rows(self) -> None:
         for camera in self.cameras.values():
@@ -427,7 +419,7 @@ class LayeredField:
     def _take_renderings(self, beside: bool) -> None:
         """Give cameras depth and color of the still field, as far as it has learned since. Where no thread
         has rendered them, they are rendered here: all at first, then one a fit."""
-        begun, shown, cameras = self.now(), self.static.shown, self.cameras
+        shown, cameras = self.static.shown, self.cameras
         if not beside and shown is not None and self.static.ready:
             stale = sorted((c for c in cameras.values() if c.rendered_step < shown.step), key=lambda c: c.rendered_step)
             never = [c for c in stale if c.rendered_step < 0]
@@ -435,7 +427,6 @@ class LayeredField:
         rendered = list(self.static.rendered)
         for name in rendered[: tuned.RENDERINGS_A_FIT] if beside else rendered:
             cameras[name].take_rendering(*self.static.rendered.pop(name))
-        self.part_s.add("static renders", begun)
 
     def _box(self) -> Any:
         box = self.still.view_store.box
@@ -450,14 +441,13 @@ class LayeredField:
         if still is None:
             return
         assert tracker is not None and self.origin_ns is not None
-        begun, moving = self.now(), tracker.moving
+        moving = tracker.moving
         shown = MovingSnapshot.of(moving, self.origin_ns, self.observations.newest_s) if moving.alive else None
         exposed = self._at_present_exposure(still)
         depth = self.supervision.depth
         parts = still.box, exposed, still.background, still.pool, still.step, still.planar
         surfaces = None if depth is None else depth.scene
         self._published = LayeredSnapshot(*parts, static=exposed.params, moving=shown, surfaces=surfaces)
-        self.part_s.add("publication", begun)
 
     def _at_present_exposure(self, shown: SplatSnapshot) -> Gaussians:
         """The still field at the cameras' present exposure; the arrays of the last publication, where nothing has

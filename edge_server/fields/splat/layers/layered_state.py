@@ -27,7 +27,7 @@ from freshfield.geometry import Pinhole
 Arrays = dict[str, NDArray[Any]]
 
 NAME = "splat in layers"
-VERSION = 12
+VERSION = 13
 COUNTERS = ("layered", "origin_ns")  # of the field
 # Of its supervision.
 SUPERVISED = ("plates_s", "fine_s", "fine", "exposure_rounds", "anew", "with_depth", "early", "plain", "layers_shown")
@@ -43,8 +43,9 @@ def pack(field: Any) -> Arrays:
     cameras, observations = [], []
     for k, camera in enumerate(field.cameras.values()):
         view = camera.view
-        lens, taken = asdict(view.intrinsics), list(camera.taken)
-        cameras.append({**_facts(view), **_numbers(camera, OF_CAMERA), "taken": taken, "lens": lens})
+        lenses = [asdict(v.intrinsics) for v in (view, *(() if camera.fine is None else (camera.fine.view,)))]
+        taken = list(camera.taken)
+        cameras.append({**_facts(view), **_numbers(camera, OF_CAMERA), "taken": taken, "lenses": lenses})
         arrays = {"image": view.image, "pose": view.camera_to_world, **_prefixed("plate.", camera.plate.state())}
         if camera.fine is not None:
             arrays |= _prefixed("fine.", camera.fine.state())
@@ -59,7 +60,7 @@ def pack(field: Any) -> Arrays:
         given = {"given": o.view.weight, "depth": o.view.depth, "body_m": o.body_m}
         arrays |= {name: array for name, array in given.items() if array is not None}
         if o.weight is not None:
-            arrays["weight"] = _half(o.weight)
+            arrays["weight"] = o.weight
         if o.row is not None:
             arrays |= {"matrix": o.row.matrix, "vector": o.row.vector, "around": o.row.around}
         state |= _prefixed(f"frame_{k}.", arrays)
@@ -93,19 +94,19 @@ def unpack(field: Any, state: Arrays) -> None:
     field.still.load_state(_under("still.", state))
     field.static = StaticLayer(field.still)
     field.static.load_state(_under("static.", state))
-    field.supervision = StaticSupervision(field.static, field.part_s)
+    field.supervision = StaticSupervision(field.static)
     if "depth.wrong" in state:
         field.supervision.make_depth().load_state(_under("depth.", state))
     field.cameras, field.observations, field.tracker = {}, Observations(), None
     for k, facts in enumerate(meta["cameras"]):
         arrays = _under(f"camera_{k}.", state)
-        lens = {**facts["lens"], "distortion": tuple(facts["lens"]["distortion"])}
+        lens, *fine_lens = (Pinhole(**{**of, "distortion": tuple(of["distortion"])}) for of in facts["lenses"])
         image, pose = np.array(arrays["image"]), np.array(arrays["pose"])
-        view = View(facts["camera"], image, pose, Pinhole(**lens), facts["generated_ns"])
+        view = View(facts["camera"], image, pose, lens, facts["generated_ns"])
         check_view(view)
         plate = Plate(view.image.shape[0], view.image.shape[1], field.caller)
         plate.load_state(_under("plate.", arrays))
-        fine = FinePlate.from_state(view, _under("fine.", arrays)) if "fine.color" in arrays else None
+        fine = FinePlate.from_state(view, fine_lens[0], _under("fine.", arrays)) if fine_lens else None
         camera = FixedCamera(view, plate, fine=fine, taken=deque(facts["taken"], maxlen=FRAMES_KNOWN))
         camera.turns = list(np.array(arrays["turns"]))
         for name in ARRAYS_OF_CAMERA:
@@ -157,17 +158,11 @@ def _observation(field: Any, facts: dict[str, Any], arrays: Arrays) -> Observati
         view.camera,
         view,
         found["foreground"],
-        found["weight"].astype(np.float32) if "weight" in found else None,
+        found.get("weight"),
         row,
         body_m=found.get("body_m"),
         fresh=facts["fresh"],
     )
-
-
-def _half(weight: NDArray[np.float32]) -> NDArray[Any]:
-    """The same numbers with half the bytes, where these hold them."""
-    half = weight.astype(np.float16)
-    return half if np.array_equal(half, weight) else weight
 
 
 def _facts(view: View) -> dict[str, Any]:

@@ -81,7 +81,6 @@ class Motion:
         self.anchors: NDArray[np.float64] | None = None
         self._knots = np.zeros((WINDOW, 0, 3))  # displacements
         self._first = 0  # number of the first knot: its instant times KNOTS_PER_S
-        self._latest: tuple[float, NDArray, NDArray] = (np.nan, self._knots, self._knots)  # of ``at``
         self._reach = 0.3  # typical distance from an anchor to the next
         self._laplacian = np.zeros((0, 0))  # (K, K), of the graph of neighbors
         self._band = np.zeros((0, BAND, 0, 0), np.float32)  # memory of ``solve``, see ``kernels.solve``
@@ -115,13 +114,9 @@ class Motion:
         return base, w
 
     def at(self, instant_s: float) -> NDArray[np.float64]:
-        """Displacements (K, 3) of the anchors at an instant, scene units; not to be written into."""
-        known_s, knots, found = self._latest
-        if known_s != instant_s or knots is not self._knots:
-            base, w = self.weights(instant_s)
-            found = np.einsum("k,kac->ac", w, self._knots[base : base + 4])
-            self._latest = (instant_s, self._knots, found)
-        return found
+        """Displacements (K, 3) of the anchors at an instant, scene units."""
+        base, w = self.weights(instant_s)
+        return np.asarray(np.einsum("k,kac->ac", w, self._knots[base : base + 4]))
 
     def attach(self, points: NDArray[np.floating], instant_s: float) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """The three nearest anchors of points (N, 3) at an instant, int64 (N, 3), and their shares, float32

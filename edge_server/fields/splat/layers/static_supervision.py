@@ -20,7 +20,6 @@ from edge_server.fields.splat.layers.exposures import equalize_exposures
 from edge_server.fields.splat.layers.observations import FixedCamera, Observations
 from edge_server.fields.splat.layers.plates import plain_share
 from edge_server.fields.splat.layers.static_layer import PlateImage, StaticLayer
-from edge_server.fields.splat.layers.tracker import PartTimes
 from edge_server.fields.splat.snapshot import SplatSnapshot
 
 if TYPE_CHECKING:
@@ -49,9 +48,9 @@ class StaticSupervision:
     layers_shown: whether anything is shown that was learned from plates, since the layers began.
     """
 
-    def __init__(self, static: StaticLayer, times: PartTimes, network: NetworkDepth | None = None) -> None:
+    def __init__(self, static: StaticLayer, network: NetworkDepth | None = None) -> None:
         """network: of monocular depth, where the user has one."""
-        self.static, self.times, self.network = static, times, network
+        self.static, self.network = static, network
         self.plates_s = self.fine_s = -np.inf
         self.fine = False
         self.exposure_rounds = 0
@@ -77,15 +76,13 @@ class StaticSupervision:
     def take_depth(self, camera: FixedCamera, view: View, foreground: NDArray[np.bool_]) -> bool:
         """Take in the depth of a frame that was taken into the camera's plate. Returns whether it can be believed: it
         contradicts neither the camera's earlier depth nor the other cameras'."""
-        begun = self.times.now()
         assert view.depth is not None
         plate = self.make_depth_plate(camera)
         before = plate.refused
         taken = plate.take(view.depth, foreground, camera.plate.pool)
         if not taken and before == 0:
             log.warning("%s: its depth contradicts what it measured before, and is left out", view.camera)
-        self.times.add("depth plates", begun)
-        return taken and self.trusts_depth(view.camera)
+        return taken and view.camera not in self.make_depth().wrong
 
     def make_depth_plate(self, camera: FixedCamera) -> DepthPlate:
         """A camera's depth plate, made once a frame of it brings depth."""
@@ -104,10 +101,6 @@ class StaticSupervision:
             warm_up()
             self.depth = DepthSupervision(self.static.field.settings, self.static.field.pool, self.network)
         return self.depth
-
-    def trusts_depth(self, camera: str) -> bool:
-        """Whether a camera measures depth that does not contradict the others'."""
-        return self.depth is not None and camera not in self.depth.wrong
 
     def forget_camera(self, camera: str) -> None:
         """Forget what was learned of a camera that stands somewhere else now."""
@@ -153,17 +146,12 @@ class StaticSupervision:
     def exposures_agree(self, cameras: Cameras, observations: Observations) -> bool:
         """Begin with the plates, and correct the cameras' exposures where they differ; the field that shows that they
         agree goes on. One round a call. Returns whether it was the last."""
-        begun = self.times.now()
         if self._depth_is_known(_observed(cameras, observations)):
-            agree = self._begin_with_depth(cameras, observations)
-        else:
-            agree = self.exposure_rounds >= tuned.EXPOSURE_ROUNDS
-            self.early = observations.newest_s < tuned.PLATE_S
-            self._begin(self._plates(cameras))
-            if not agree:
-                agree = self._equalize(cameras)
-        self.times.add("exposures", begun)
-        return agree
+            return self._begin_with_depth(cameras, observations)
+        agree = self.exposure_rounds >= tuned.EXPOSURE_ROUNDS
+        self.early = observations.newest_s < tuned.PLATE_S
+        self._begin(self._plates(cameras))
+        return agree or self._equalize(cameras)
 
     def _begin(self, plates: Sequence[PlateImage]) -> None:
         """Have the still field learn ``plates``: at first on top of the views, so that layers are shown at once. Later,
@@ -179,7 +167,7 @@ class StaticSupervision:
         """Train for a few steps, and correct exposures by how plates differ from what is shown then. Returns whether
         they agreed."""
         self.exposure_rounds += 1
-        self.static.train(StepBudget(Budget(steps=tuned.EXPOSURE_STEPS), self.times.now))
+        self.static.train(StepBudget(Budget(steps=tuned.EXPOSURE_STEPS)))
         self.static.publish()
         self.static.render([camera.view for camera in cameras.values()])
         renderings = {name: rendering for name, (_, rendering) in self.static.rendered.items()}
@@ -214,7 +202,7 @@ class StaticSupervision:
 
         beside: in a thread, until it has learned them; or else only note that there is something to learn.
         """
-        begun, now_s = self.times.now(), observations.newest_s
+        now_s = observations.newest_s
         # A thread beside learns slowly: what begins anew at once would not be better than what is shown for long.
         # With depth it is better soon, and its cameras' poses are corrected then.
         learned = self.layers_shown and (self.with_depth or self.static.field.step >= tuned.EARLY_STEPS)
@@ -258,7 +246,6 @@ class StaticSupervision:
         elif beside if not self.static.finished else due:
             self.plates_s = now_s
             self._learn_again(cameras, beside)
-        self.times.add("static field", begun)
 
     def _correct(self, cameras: Cameras, observations: Observations) -> None:
         """Have cameras and frames take over what registration has found, or no longer finds."""
@@ -358,7 +345,6 @@ class StaticSupervision:
     def take_whole(self, taken: Sequence[View], cameras: Cameras, observations: Observations) -> None:
         """Take frames into their cameras' fine plates: some in each fit until all are known, then one now and then. The
         cameras take turns."""
-        begun = self.times.now()
         views = {v.camera: v for v in taken if v.whole is not None}
         seen = [o for o in observations if o.camera in views and o.view.generated_ns == views[o.camera].generated_ns]
         alone = len(cameras) < tuned.LEAST_CAMERAS
@@ -366,12 +352,11 @@ class StaticSupervision:
         if not seen or alone or observations.newest_s - self.fine_s < every_s:
             return
         self.fine_s = observations.newest_s
-        seen.sort(key=lambda o: cameras[o.camera].fine_count)
+        seen.sort(key=lambda o: fine.count if (fine := cameras[o.camera].fine) is not None else 0)
         for o in seen[: 1 if self.fine else tuned.FIRST_FINE]:
             camera, decode = cameras[o.camera], views[o.camera].whole
             if camera.fine is not None and decode is not None and (whole := decode()) is not None:
                 camera.fine.take(whole.image, o.foreground | ~camera.plate.known, camera.plate.gain)
-        self.times.add("fine plates", begun)
 
     def _fine_plates_are_known(self, cameras: Cameras, observations: Observations) -> bool:
         seen = [cameras[camera].fine for camera in {o.camera for o in observations}]

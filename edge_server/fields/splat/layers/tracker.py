@@ -6,7 +6,7 @@ for the next fit.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
 from itertools import pairwise
 
 import numpy as np
@@ -18,20 +18,6 @@ from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations, knot_of, pixel_weights
 
 
-class PartTimes(dict[str, float]):
-    """Seconds spent by part of the work, in all fits."""
-
-    def __init__(self, now: Callable[[], float]) -> None:
-        super().__init__()
-        self.now = now
-
-    def add(self, part: str, begun: float) -> float:
-        """Add the time since ``begun`` to a part's; returns now."""
-        now = self.now()
-        self[part] = self.get(part, 0.0) + now - begun
-        return now
-
-
 class MotionTracker:
     """Keeps a ``MovingSet`` at what the frames show.
 
@@ -39,10 +25,8 @@ class MotionTracker:
     fits: number of fits.
     """
 
-    def __init__(
-        self, moving: MovingSet, observations: Observations, cameras: dict[str, FixedCamera], times: PartTimes
-    ) -> None:
-        self.moving, self.observations, self.cameras, self.times = moving, observations, cameras, times
+    def __init__(self, moving: MovingSet, observations: Observations, cameras: dict[str, FixedCamera]) -> None:
+        self.moving, self.observations, self.cameras = moving, observations, cameras
         self.anchors_s = self.seeded_s = -np.inf
         self.fits = 0
         self._step_time, self._seed_time = StepTimer(), StepTimer()
@@ -70,13 +54,13 @@ class MotionTracker:
                     break
             for o in self.observations:
                 o.fresh &= o.instant_s > until_s
-        since_s, begun = newest_s - self.seeded_s, self.times.now()
+        since_s, begun = newest_s - self.seeded_s, time.perf_counter()
         has_room = pace.has_room(self._seed_time.seconds, 1.0, 0.0) or since_s >= tuned.SEED_AT_LEAST_EVERY_S
         every_s = tuned.FEW_SEED_EVERY_S if moving.few else tuned.SEED_EVERY_S
         if not moving.alive or (since_s >= every_s and has_room):
             self.seeded_s = newest_s
             self._seed()
-            self._seed_time.add(self.times.add("seeding", begun) - begun)
+            self._seed_time.add(time.perf_counter() - begun)
         large = max(o.foreground.size for o in self.observations) > tuned.FEW_STEPS_PIXELS
         steps = tuned.FEW_STEPS if moving.few and large else tuned.STEPS
         return self._train_appearance(pace, parameters, steps * len(strides))
@@ -97,7 +81,7 @@ class MotionTracker:
     def _solve(self, until_s: float, pace: StepBudget) -> float:
         """One pass of Gauss-Newton over the frames up to an instant: align those that are new, or of the
         newest knot, then solve. Returns by how many meters it has moved the anchors then (median)."""
-        motion, begun = self.moving.motion, self.times.now()
+        motion = self.moving.motion
         until = min(motion.newest_s, until_s)
         seen = [o for o in self.observations if motion.oldest_s <= o.instant_s <= until]
         due = [o for o in seen if o.row is None or o.fresh or o.knot >= knot_of(until_s)]
@@ -105,10 +89,8 @@ class MotionTracker:
             if k >= tuned.MOST_ALIGNED or not (k < tuned.LEAST_ALIGNED or pace.within(tuned.ALIGNING_SHARE)):
                 break
             self._align(o, exclude=True)
-        begun = self.times.add("alignment", begun)
         before = motion.at(until_s)
         motion.solve([o.row for o in seen if o.row is not None])
-        self.times.add("solving", begun)
         apart = np.linalg.norm(motion.at(until_s) - before, axis=1)
         return float(np.median(apart)) * motion.radius_m
 
@@ -135,17 +117,16 @@ class MotionTracker:
         moving, newest = self.moving, self.observations.newest_knot
         frames = self.observations.of_knots(newest - 1, newest)
         order = np.random.default_rng([moving.seed, self.fits, 7]).permutation(len(frames))
-        begun, rays, samples, steps = self.times.now(), 0, 0, 0
+        rays, samples, steps = 0, 0, 0
         while steps < most and moving.alive and pace.has_room(self._step_time.seconds, 1.0, 0.0):
-            step_begun = self.times.now()
+            begun = time.perf_counter()
             frame = frames[order[steps % len(frames)]]
             self._weigh(frame, self.cameras[frame.camera])
             samples += moving.train(frame, self.cameras[frame.camera], parameters)
             rays, steps = rays + frame.foreground.size, steps + 1
-            self._step_time.add(self.times.now() - step_begun)
+            self._step_time.add(time.perf_counter() - begun)
         if not steps and moving.alive:
             self._step_time.drop_longest()  # slow ones may be over; without a step nothing would tell
-        self.times.add("appearance", begun)
         return steps, rays, samples
 
     def _seed(self) -> None:
@@ -158,7 +139,7 @@ class MotionTracker:
         pixels = sum(int(o.foreground.sum()) for o in frames)
         if pixels < tuned.LEAST_FOREGROUND * frames[0].foreground.size * len(self.cameras):
             return
-        moving.remove_outside(frames, self.cameras, bool(measured))
+        moving.remove_outside(frames, self.cameras)
         if moving.motion.anchors is None:
             self._forget_rows()
         if moving.alive:

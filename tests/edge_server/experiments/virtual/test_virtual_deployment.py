@@ -197,15 +197,14 @@ def test_costs_are_measured_into_the_file_that_a_scenario_names(tmp_path: Path, 
         refused(ScenarioError, r"edge\.compute", read_config, load(write(tmp_path, compute=wrong)))
 
 
-@pytest.mark.parametrize("part", ["static field", "static renders"])
-def test_what_is_done_beside_an_update_live_is_not_charged(part: str, tmp_path: Path, monkeypatch):
+def test_what_is_done_beside_an_update_live_is_not_charged(tmp_path: Path, monkeypatch):
     def build(*given: Any, **more: Any) -> VirtualDeployment:
         deployment = build_deployment(*given, **more)
         field = deployment.updates.field
-        fit, field.part_s = field.fit, {part: 0.0}
+        fit, field.beside_s = field.fit, 0.0
 
         def slow(*given: Any) -> Any:
-            field.part_s[part] += 100.0  # says so, and does not take it
+            field.beside_s += 100.0  # says so, and does not take it
             return fit(*given)
 
         field.fit = slow
