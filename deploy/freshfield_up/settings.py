@@ -1,4 +1,7 @@
-"""Times of the launcher that somebody may want to change."""
+"""Times of the launcher that somebody may want to change.
+
+What differs from run to run is an option of the command, or a key of the scenario.
+"""
 
 TICK_S = 0.25  # between looks at the processes
 LINE_EVERY_S = 5.0  # a line for people

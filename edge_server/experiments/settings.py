@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 # What is scored in virtual time.
 SCORED_EVERY_MS = 250.0
 """Publications, and what is shown at random instants, in ``simulate`` and the study of depth."""
@@ -25,6 +27,17 @@ SHOWN_INSTANTS = 3
 """Random instants at which a publication of a trial is scored, one in each equal part of the time it is shown."""
 TRAININGS = {True: 1, False: 3}
 """Repeated trainings, by whether it is a quick pass; their spread is part of the interval."""
+
+# Training of schedulers.
+QUICK_SPLAT: dict[str, Any] = {"gaussians": 4096, "start": 2048}
+"""Options with which ``splat`` learns the small images of a training faster than with its defaults: half of its
+Gaussians, as many as an image of 64 x 64 has pixels."""
+
+FITS = 2
+"""Of every choice, whose mean is less noisy."""
+
+SMOOTHED_BATCHES = 9
+"""Batches averaged in a point of the drawn learning curve: single ones differ by more than training changes them."""
 
 # ``frontier``: virtual seconds in which costs are measured, and until what is shown counts.
 COSTS_S, LEAD_S = 1.0, 5.0

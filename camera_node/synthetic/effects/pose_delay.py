@@ -16,4 +16,5 @@ class PoseDelay(EffectParameters, frozen=True):
     kind: ClassVar[str] = "delay"
 
     def instant_s(self, t_s: float) -> float:
+        """Instant, s, whose pose the frame of ``t_s`` reports."""
         return t_s - self.delay_ms * 1e-3
