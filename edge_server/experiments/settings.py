@@ -18,16 +18,6 @@ SINCE_S = 4.0
 NOISE_FRAMES = 8
 """Of a real camera, whose noise bounds what moves."""
 
-# Studies.
-LEAST_DB = 0.1
-"""Smallest difference that supports a claim."""
-STAGGER_MS = 217.0
-"""Between the decision instants of successive seeds; not whole frames, so seeds sample all capture phases."""
-SHOWN_INSTANTS = 3
-"""Random instants at which a publication of a trial is scored, one in each equal part of the time it is shown."""
-TRAININGS = {True: 1, False: 3}
-"""Repeated trainings, by whether it is a quick pass; their spread is part of the interval."""
-
 # Training of schedulers.
 QUICK_SPLAT: dict[str, Any] = {"gaussians": 4096, "start": 2048}
 """Options with which ``splat`` learns the small images of a training faster than with its defaults: half of its

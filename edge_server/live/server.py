@@ -42,7 +42,6 @@ from edge_server.settings import EdgeConfig, cameras_move, described, embedding_
 from freshfield.clock import WallClock
 from freshfield.files import read_status, write_json
 from freshfield.ledger import Ledger
-from freshfield.limits import MAX_SNAPSHOTS
 from freshfield.scenario import Scenario, ScenarioError
 from freshfield.transport import Transport, host_port
 from freshfield.untrusted import stored_bytes
@@ -312,8 +311,8 @@ class EdgeServer:
     def _save_snapshot(self) -> Path:
         if not self.state.started:
             raise RuntimeError("the field has not been trained yet")
-        if len(list(self.options.out.glob("snapshot-*.npz"))) >= MAX_SNAPSHOTS:
-            raise RuntimeError(f"{self.options.out} holds {MAX_SNAPSHOTS} already: move some away")
+        if len(list(self.options.out.glob("snapshot-*.npz"))) >= tuned.MAX_SNAPSHOTS:
+            raise RuntimeError(f"{self.options.out} holds {tuned.MAX_SNAPSHOTS} already: move some away")
         if not self._snapshot_lock.acquire(blocking=False):
             raise RuntimeError("another one is being written")
         try:

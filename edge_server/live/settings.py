@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 # --- frames that wait in the buffer ---
-MOST_UNSELECTED = (
-    16  # most frames of a camera that wait for a field that wants every frame: half a second at 30 a second
-)
+# Most frames of a camera that wait for a field that wants every frame: half a second at 30 a second.
+MOST_UNSELECTED = 16
 # After this many takes without a frame of a camera, its next one goes first, however old (after a blackout).
 LONGEST_WAIT = 16
 AS_YOUNG_NS = 1_000_000  # ages, measured from the youngest frame, are compared in steps of this length
@@ -77,3 +76,6 @@ LAST_SCORES_S = 4.0  # for what waits at the end, and for all frames of held-out
 UPDATE_TIMES, CHECK_TIMES = 4096, 4096  # latest times of updates, and of checks of frames, whose percentiles are told
 MOST_EVENTS = 200  # kept: each is in every edge.json
 SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages
+
+MAX_SNAPSHOTS = 20
+"""Number of snapshots in the folder of a run: a user who requests more is told to move some away."""

@@ -93,9 +93,6 @@ restart. Beyond that a new stream ends the one of least use."""
 MAX_WATCHERS = 32
 """Number of watchers of decisions at once. Each looks at the state twenty times a second."""
 
-MAX_SNAPSHOTS = 20
-"""Number of snapshots in the folder of a run: a user who requests more is told to move some away."""
-
 MAX_SCRAPES = 8
 """Number of open connections to the metrics, or to the preference page; a new one ends the oldest."""
 

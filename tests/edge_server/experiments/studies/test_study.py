@@ -17,11 +17,11 @@ import yaml
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.common.statistics import Interval
-from edge_server.experiments.settings import TRAININGS
 from edge_server.experiments.studies import preferences, viewpoints
 from edge_server.experiments.studies.learned_schedulers import LEFT_OUT, WEIGHTED, WHICH_VIEWS
 from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT
 from edge_server.experiments.studies.registry import LEARNING, ON_A_CHANNEL, STUDIES
+from edge_server.experiments.studies.settings import TRAININGS
 from edge_server.experiments.studies.study import Claim, Finding, Study, StudyRequest, Verdict, judge, run_study
 from edge_server.experiments.studies.study_command import main
 from edge_server.experiments.studies.trial import Trial, run_trial
