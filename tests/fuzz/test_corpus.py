@@ -160,23 +160,17 @@ def _sessions() -> Iterable[bytes]:
         yield (Path(folder) / "a").read_bytes()
 
 
-def _scenarios() -> Iterable[bytes]:
-    return (file.read_bytes() for file in sorted(scenario.SCENARIO_FOLDER.glob("*.yaml")))
-
-
-def _checkpoint(file: Path) -> None:
-    checkpoint.load(file, most_bytes=10**6)
-
-
 # What takes an input (a folder for files, the bytes) and says in a word what became of it, raising what must never be
 # raised; honest inputs, made here, and how many of all are taken at least; milliseconds of processor time for one: what
 # a loop with other callers may be kept, or a reader of files.
+SHIPPED = partial(map, Path.read_bytes, sorted(scenario.SCENARIO_FOLDER.glob("*.yaml")))
+LOAD = partial(checkpoint.load, most_bytes=10**6)
 TARGETS = {
     "request": (request, _messages, 3, 50.0),
     "payload": (pixels, _payloads, 3, 200.0),
     "depth": (depths, _depths, 2, 50.0),
-    "scenario": (of_file("a.yaml", scenarios, scenario.ScenarioError), _scenarios, 15, 2000.0),
-    "checkpoint": (of_file("a.npz", _checkpoint, checkpoint.CheckpointError), _checkpoints, 1, 2000.0),
+    "scenario": (of_file("a.yaml", scenarios, scenario.ScenarioError), SHIPPED, 15, 2000.0),
+    "checkpoint": (of_file("a.npz", LOAD, checkpoint.CheckpointError), _checkpoints, 1, 2000.0),
     "mcap": (of_file("a.mcap", mcap, SessionError), _sessions, 1, 2000.0),
 }
 ACCEPTED = ("accepted", "read", "jpeg", "png", "zstd", "depth")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,13 @@ def ring(count: int, size: int = 48, ball_m: NDArray[np.float64] = BALL_M, dista
         pose = look_at(eye, (0.0, 0.0, 0.4))
         views.append(View(f"cam{k:02d}", picture(camera, pose, ball_m), pose, camera, k))
     return views
+
+
+def a_meter_off(view: View) -> View:
+    """With a pose a meter to the right of its picture's."""
+    pose = view.camera_to_world.copy()
+    pose[:3, 3] += pose[:3, 0]
+    return replace(view, camera_to_world=pose)
 
 
 def psnr(a: NDArray, b: NDArray) -> float:

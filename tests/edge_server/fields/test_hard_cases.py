@@ -18,7 +18,7 @@ from edge_server.fields.common.cameras import settings as refinement
 from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT
 from edge_server.fields.splat.kernels.project import OPACITY
 from freshfield.geometry import Pinhole, look_at
-from tests.edge_server.fields.scenes import mean_psnr, picture, ring
+from tests.edge_server.fields.scenes import a_meter_off, mean_psnr, picture, ring
 from tests.edge_server.fields.small import every_field, healthy, reaches, run_with_bounds_checks, small, tiny
 
 VIEWS = ring(9, size=24)
@@ -189,12 +189,6 @@ def _noise(view: View) -> View:
     return replace(view, image=np.random.default_rng(1).integers(0, 256, view.image.shape, dtype=np.uint8))
 
 
-def _a_meter_off(view: View) -> View:
-    pose = view.camera_to_world.copy()
-    pose[:3, 3] += pose[:3, 0]
-    return replace(view, camera_to_world=pose)
-
-
 def _update(field: Any, first: int, times: int, poison: Poison | None = None) -> None:
     """Every update has new frames, equal where nothing changed. first: the number of the first one."""
     for update in range(first, first + times):
@@ -217,7 +211,7 @@ def _after_db(warm: int, poison: Poison | None) -> float:
 
 # Also in the very first update: before anything is known, and where the scene's box is found.
 @pytest.mark.parametrize("warm", [WARM, 0])
-@pytest.mark.parametrize("poison", [_noise, _a_meter_off])
+@pytest.mark.parametrize("poison", [_noise, a_meter_off])
 def test_a_poisoned_view_is_survived(poison: Poison, warm: int) -> None:
     assert _after_db(warm, poison) > _after_db(warm, None) - WITHIN_DB
 

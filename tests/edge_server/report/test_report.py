@@ -144,6 +144,7 @@ def test_every_figure_is_drawn_and_inside_a_page_that_loads_nothing(run):
 def test_the_page_says_what_the_report_holds(run):
     assert_says(
         (run[0] / "report.html").read_text(),
+        *run[1]["conclusion"],
         "800 ms median of 50 updates 76 frames delivered of 200 captured",
         "shown, last fifth of the run 24.00 17.00 0.8000 –",
         "never never reported",
@@ -269,18 +270,6 @@ SO_FAR = {"now_psnr_db": 20.0, "all_psnr_db": 23.0, "frames": 9}
 TRAINED_ON = {"fidelity.scored_on": ["selected"], "fidelity.final.psnr_db": 17.4, "fidelity.shown.psnr_db": None}
 
 
-def test_three_sentences_say_what_was_shown_its_age_and_its_limit(run) -> None:
-    shown, age, limit = run[1]["conclusion"]
-    assert shown == (
-        "In the last fifth of the run, what was shown read 24.0 dB, 17.0 dB where the scene moves; "
-        "an image of one mean color reads 14.5 dB."
-    )
-    assert "(50 ms network, " in age and age.endswith("reads 26.0 dB, 9.0 above what moves.")
-    assert limit.startswith("Showing each image until the next was the limit")
-    assert "50% of the frames sent did not pass" in limit
-    assert " ".join(run[1]["conclusion"]) in (run[0] / "report.html").read_text()
-
-
 @pytest.mark.parametrize(
     ("changes", "sentence", "words"),
     [
@@ -295,6 +284,11 @@ def test_three_sentences_say_what_was_shown_its_age_and_its_limit(run) -> None:
         ({**TRAINED_ON, "fidelity.shown.psnr_still_db": None}, 2, "poses that do not fit, or too short a run"),
         ({"fidelity.shown.psnr_still_db": 15.0, "fidelity.so_far": SO_FAR}, 2, "the limit: it takes"),
         ({"updates.without_step": 3, "updates.count": 50}, 2, "6% of the updates had no time for a step of training"),
+        ({}, 0, "read 24.0 dB, 17.0 dB where the scene moves; an image of one mean color reads 14.5 dB."),
+        ({}, 1, "(50 ms network, "),
+        ({}, 1, "reads 26.0 dB, 9.0 above what moves."),
+        ({}, 2, "Showing each image until the next was the limit"),
+        ({}, 2, "50% of the frames sent did not pass"),
         ({"updates.shed": 70}, 2, "92% of those delivered were left out for lack of time"),
     ],
 )

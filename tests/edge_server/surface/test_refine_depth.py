@@ -12,9 +12,9 @@ from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import settings
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels import patch_match
-from edge_server.surface.kernels.patch_images import Images, Planes, View
+from edge_server.surface.kernels.patch_images import Planes
 from edge_server.surface.reconstruct import covering_maps
-from edge_server.surface.refine_depth import exposures, refine_depth
+from edge_server.surface.refine_depth import _images, _view, exposures, refine_depth
 from edge_server.surface.settings import REACH, UNSURE
 from freshfield.geometry import Pinhole, look_at, world_rays
 
@@ -99,17 +99,11 @@ def test_the_number_of_threads_changes_no_bit(rig):
         np.testing.assert_array_equal(a.trust, b.trust)
 
 
-def _kernel_view(k: int, maps, gray) -> tuple[Images, View]:
-    from edge_server.surface.refine_depth import _images, _view
-
-    planes = [Planes(np.where(m.seen, m.depth, 0).astype(np.float32), None, None) for m in maps]
-    return _images(maps, gray, planes), _view(k, maps[k], gray[k])
-
-
 def test_the_cost_is_that_of_plain_numpy(rig):
     maps, pictures, exact = rig
     gray = [p[..., 0].astype(np.float32) for p in pictures]
-    images, view = _kernel_view(0, maps, gray)
+    planes = [Planes(np.where(m.seen, m.depth, 0).astype(np.float32), None, None) for m in maps]
+    images, view = _images(maps, gray, planes), _view(0, maps[0], gray[0])
     view.chosen[..., 0] = 1
     row, column, normal = 30, 41, np.array([0.1, -0.05, 1.0]) / np.linalg.norm([0.1, -0.05, 1.0])
     depth = 1.01 * float(exact[0][row, column])

@@ -216,18 +216,6 @@ def test_nonsense_is_refused_and_not_an_answer():
         refused(CalibrationError, f"{what} seem to be in millimeters", calibrate, samples)
 
 
-CHESSBOARD = ("--board", "chessboard:9x6:10mm")
-
-
-def test_mistakes_are_one_line(capsys):
-    for words, why in (
-        (("--pairs", "x", "--live", "room"), "expected one of FOLDER"),
-        (("--pairs", "x", "--lens", "x"), "--lens: goes with FOLDER or --live SCENARIO, not with"),
-        (("--live", "room", "--camera", "cam00", *CHESSBOARD, "--seconds", "-1"), "positive"),
-    ):
-        assert why in refusal(capsys, main, "calibrate", "hand-eye", *words)
-
-
 @pytest.mark.parametrize(
     ("spec", "size"), [("charuco:7x5:30mm:22mm", "210.0 x 150.0"), ("chessboard:9x6:10mm", "100.0 x 70.0")]
 )

@@ -66,20 +66,16 @@ FAULTS = {"preset": "ch6", "faults": {**_SHARES, "reset": {"at_ms": [400.0]}, "b
 def test_one_seed_gives_the_same_run_bit_for_bit(channel):
     first, second = (run(scenario(channel)) for _ in range(2))
     assert first.publications and first.publications == second.publications
-    assert first.frames() == second.frames()
+    frames = first.frames()
+    assert closes(frames) and frames == second.frames()
+    if channel is FAULTS:
+        assert frames["rejected"]["crc_mismatch"] > 0 and frames["rejected"]["replayed_sequence"] > 0
+        assert frames["lost"] > 0 and frames["broken"] > 0 and frames["skipped"] > 0
     a, b = (d.updates.field.state() for d in (first, second))
     assert a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
     other = run(scenario(channel, seed=4))
     assert [p.ages_ms for p in other.publications] != [p.ages_ms for p in first.publications]
     assert digest(first) == digest(second) != digest(other)
-
-
-def test_the_books_close_with_every_fault_and_damage_is_refused():
-    deployment = run(scenario(FAULTS), seconds=2.0)
-    frames = deployment.frames()
-    assert closes(frames), frames
-    assert frames["rejected"]["crc_mismatch"] > 0 and frames["rejected"]["replayed_sequence"] > 0
-    assert frames["lost"] > 0 and frames["broken"] > 0 and frames["skipped"] > 0
 
 
 @pytest.mark.parametrize("every", [1, 5])

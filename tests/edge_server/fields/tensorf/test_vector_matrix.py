@@ -57,13 +57,6 @@ def test_density_and_components_equal_the_oracle() -> None:
     assert np.isnan(raw).all() and np.isnan(acts).all(), "rows that are not the factors' or other samples were written"
 
 
-def _gradient(planes: Planes, x, d, counts):
-    gradient = np.zeros_like(planes.table)
-    dirty = np.zeros(len(planes.table) // ROWS, np.bool_)
-    vector_matrix.scatter_planes(np.zeros(1, np.int64), 0, planes, x, d, counts, gradient, dirty)
-    return gradient, dirty
-
-
 def _loss(planes: Planes, table: torch.Tensor, x, d, counts) -> torch.Tensor:
     total = torch.zeros((), dtype=table.dtype)
     colors = (planes.groups - planes.density_groups) * CHANNELS
@@ -81,7 +74,8 @@ def test_gradient_equals_the_oracle() -> None:
     d[:, :, 5:9] = 0.0  # samples that nothing depends on
     x *= np.float32(0.4)  # most of space is left alone
     counts = np.array([100, 37])
-    gradient, dirty = _gradient(planes, x, d, counts)
+    gradient, dirty = np.zeros_like(planes.table), np.zeros(len(planes.table) // ROWS, np.bool_)
+    vector_matrix.scatter_planes(np.zeros(1, np.int64), 0, planes, x, d, counts, gradient, dirty)
     table = torch.as_tensor(planes.table).requires_grad_(True)
     _loss(planes, table, x, d, counts).backward()
     assert table.grad is not None

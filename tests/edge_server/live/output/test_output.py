@@ -169,15 +169,6 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(mcap, caplog):
     assert recorder.dropped == 7
 
 
-def test_a_server_that_starts_again_keeps_its_first_recording(mcap):
-    files = []
-    for _ in range(3):
-        recorder = Recorder(mcap, "test")
-        recorder.close()
-        files.append(recorder.file.name)
-    assert files == ["a.mcap", "a-2.mcap", "a-3.mcap"]
-
-
 def test_grafana_reads_all_of_the_dashboard():
     """Grafana's published types leave out what they do not know; ``__inputs`` is for its import alone."""
     models = pytest.importorskip("grafana_foundation_sdk.models.dashboard", reason="needs the extra dev")

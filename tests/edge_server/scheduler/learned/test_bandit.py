@@ -53,22 +53,18 @@ def epoch(now_ms, **generated_ms):
 AT = epoch(200, a=190, b=80, c=150)
 
 
-def test_waiting_is_carried_out_as_by_omega_wait():
-    p = policy("wait", favourite=1)
+@pytest.mark.parametrize(
+    ("action", "favourite", "then", "chosen"),
+    [
+        ("wait", 1, epoch(240, a=190, b=220, c=150), ("b",)),
+        ("threshold", 2, AT, ("a", "c")),
+        ("threshold", 0, AT, ("a",)),
+    ],
+)
+def test_a_decision_is_carried_out_as_by_the_fixed_policy(action, favourite, then, chosen):
+    p, fixed = policy(action, favourite), make_policy(action, OMEGAS_MS[favourite], np.random.default_rng(0))
     plan = p.plan(AT)
-    fixed = make_policy("wait", 40.0, np.random.default_rng(0))
-    assert plan == fixed.plan(AT)
-    later = epoch(240, a=190, b=220, c=150)
-    assert p.select(later, plan) == fixed.select(later, plan) == ("b",)
-
-
-def test_a_threshold_is_carried_out_as_by_omega_threshold():
-    p = policy("threshold", favourite=2)
-    plan = p.plan(AT)
-    assert plan.omega_ms == 80.0 and plan.wait_until_ns == 0
-    assert p.select(AT, plan) == ("a", "c")
-    p = policy("threshold", favourite=0)
-    assert p.select(AT, p.plan(AT)) == ("a",)  # none is that young: the freshest
+    assert plan == fixed.plan(AT) and p.select(then, plan) == fixed.select(then, plan) == chosen
 
 
 def test_a_set_is_chosen_when_views_are_selected_and_is_never_empty():

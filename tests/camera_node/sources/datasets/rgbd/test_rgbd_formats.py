@@ -21,6 +21,7 @@ from camera_node.synthetic import make_scene
 from camera_node.synthetic.depth import DepthRenderer
 from freshfield.geometry import Pinhole, look_at
 from tests.camera_node.sources.datasets.photos import edited, fails, photo_scenario, write_photos
+from tests.camera_node.sources.datasets.sets import write_image
 
 os.environ["OPENCV_IO_ENABLE_OPENEXR"] = "1"
 SCENE = make_scene("room", {"width": 64, "height": 48, "supersample": 1})
@@ -42,11 +43,6 @@ def depth(n: int, lens: Pinhole, matrix: np.ndarray | None = None) -> np.ndarray
     return DepthRenderer(SCENE.world, lens, pose(n) if matrix is None else matrix).depth(0.0)
 
 
-def save(path: Path, values: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), values[..., ::-1] if values.ndim == 3 else values)
-
-
 def quaternion(matrix: np.ndarray) -> list[float]:
     """x y z w."""
     return Rotation.from_matrix(matrix[:3, :3]).as_quat().tolist()
@@ -57,8 +53,8 @@ def write_tum(folder: Path) -> None:
     lists: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
     for n in range(COUNT):
         t_s = 1305031102.175304 + n / 30
-        save(folder / f"rgb/{t_s:.6f}.png", image(n, lens))
-        save(folder / f"depth/{t_s + 0.009:.6f}.png", np.rint(5000 * depth(n, lens)).astype(np.uint16))
+        write_image(folder / f"rgb/{t_s:.6f}.png", image(n, lens))
+        write_image(folder / f"depth/{t_s + 0.009:.6f}.png", np.rint(5000 * depth(n, lens)).astype(np.uint16))
         lists["rgb"].append(f"{t_s:.6f} rgb/{t_s:.6f}.png")
         lists["depth"].append(f"{t_s + 0.009:.6f} depth/{t_s + 0.009:.6f}.png")
         numbers = [*pose(n)[:3, 3], *quaternion(pose(n))]
@@ -73,10 +69,10 @@ def write_sevenscenes(folder: Path) -> None:
     apart[0, 3] = -0.0256  # the nominal place of a Kinect's depth sensor to its camera
     for n in range(COUNT):
         of_depth = pose(n) @ apart
-        save(folder / f"frame-{n:06d}.color.png", image(n, lens))
+        write_image(folder / f"frame-{n:06d}.color.png", image(n, lens))
         counts = np.rint(1000 * depth(n, sensor, of_depth)).astype(np.uint16)
         counts[:1] = 65535
-        save(folder / f"frame-{n:06d}.depth.png", counts)
+        write_image(folder / f"frame-{n:06d}.depth.png", counts)
         rows = ["\t ".join(f"{v: .7e}" for v in row) + "\t " for row in of_depth]
         (folder / f"frame-{n:06d}.pose.txt").write_text("\n".join(rows) + "\n")
 
@@ -85,8 +81,8 @@ def write_record3d(folder: Path) -> None:
     lens, small = Pinhole(64, 48, 60.0, 60.0, 31.0, 25.0), Pinhole(32, 24, 30.0, 30.0, 15.5, 12.5)
     poses = []
     for n in range(COUNT):
-        save(folder / f"rgb/{n}.png", image(n, lens))
-        save(folder / f"depth/{n}.exr", depth(n, small))
+        write_image(folder / f"rgb/{n}.png", image(n, lens))
+        write_image(folder / f"depth/{n}.exr", depth(n, small))
         matrix = pose(n) @ FLIP
         poses.append([*quaternion(matrix), *matrix[:3, 3]])
     # K column by column: fx 0 0, 0 fy 0, cx cy 1.
@@ -98,8 +94,8 @@ def write_polycam(folder: Path) -> None:
     lens, small = Pinhole(64, 48, 60.0, 61.0, 31.0, 25.0), Pinhole(32, 24, 30.0, 30.5, 15.5, 12.5)
     for n in range(COUNT):
         name = f"{7_000_000 + 100_000 * n}"
-        save(folder / f"keyframes/images/{name}.png", image(n, lens))
-        save(folder / f"keyframes/depth/{name}.png", np.rint(1000 * depth(n, small)).astype(np.uint16))
+        write_image(folder / f"keyframes/images/{name}.png", image(n, lens))
+        write_image(folder / f"keyframes/depth/{name}.png", np.rint(1000 * depth(n, small)).astype(np.uint16))
         matrix = TO_ARKIT @ pose(n) @ FLIP
         entry = {f"t_{r}{c}": matrix[r, c] for r in range(3) for c in range(4)}
         entry |= {"fx": 60.0, "fy": 61.0, "cx": 31.0, "cy": 25.0, "width": 64, "height": 48, "blur_score": 120.5}

@@ -20,7 +20,7 @@ from edge_server.fields.splat.carried_camera.scan_field import ScanField
 from edge_server.fields.splat.carried_camera.sweep import sweep_depth
 from edge_server.fields.splat.densification import opacity
 from edge_server.fields.splat.settings import SplatSettings
-from freshfield.geometry import so3_exp
+from freshfield.geometry import se3, so3_exp
 from tests.edge_server.fields.scenes import BALL_M, RADIUS_M
 from tests.edge_server.fields.small import same_state
 from tests.edge_server.fields.splat.carried_camera.carried import WALK, spoiled, walk
@@ -89,17 +89,12 @@ def test_views_are_swept_until_further_ones_show_hardly_anything_new(monkeypatch
 
 
 def test_where_poses_tell_no_depth_first_gaussians_lie_where_colors_agree() -> None:
-    turned = [replace(view, camera_to_world=_turned(k)) for k, view in enumerate(WITHOUT[:8])]
+    turns = [se3(so3_exp(np.deg2rad([0.0, 5.0 * k, 0.0])), np.zeros(3)) for k in range(8)]
+    turned = [replace(v, camera_to_world=WITHOUT[0].camera_to_world @ t) for v, t in zip(WITHOUT, turns)]
     for views in (WITHOUT[:1], turned):
         field = ScanField(_settings(refine=False))
         field.fit(views, Budget(steps=0))
         assert len(field.cloud) > 0 and field._seen_m == 0.0
-
-
-def _turned(k: int) -> NDArray[np.float64]:
-    pose = WITHOUT[0].camera_to_world.copy()
-    pose[:3, :3] = pose[:3, :3] @ so3_exp(np.deg2rad([0.0, 5.0 * k, 0.0]))
-    return pose
 
 
 def test_poses_and_exposures_are_refined_and_held_out_frames_take_their_neighbors() -> None:

@@ -37,14 +37,11 @@ def _arc(apart_deg: float = 4.0, count: int = 5) -> tuple[list[View], NDArray[np
     return [views[first], *views[:first], *views[first + 1 :]], depths[first]
 
 
-def _exposed(view: View, gain: float) -> View:
-    return replace(view, image=np.clip(view.image * gain, 0, 255).astype(np.uint8))
-
-
 @pytest.mark.parametrize("gain", [1.0, 0.4])
 def test_it_finds_the_depth_whatever_the_exposures(gain: float) -> None:
     (view, *others), truth = _arc()
-    depth = sweep_depth(view, [_exposed(other, gain) for other in others], DISTANCE_M, shared_pool())
+    exposed = [replace(other, image=np.clip(other.image * gain, 0, 255).astype(np.uint8)) for other in others]
+    depth = sweep_depth(view, exposed, DISTANCE_M, shared_pool())
     assert depth is not None and depth.dtype == np.float32 and depth.shape == truth.shape
     there = (depth > 0) & np.isfinite(truth)
     error = np.abs(np.log(depth[there] / truth[there]))

@@ -188,17 +188,13 @@ def test_force_and_torque_are_the_gradient_by_the_cameras_pose() -> None:
 # --- hard cases, and the lists of tiles -------------------------------------------------------------
 
 
-def _gradient(params: np.ndarray) -> np.ndarray:
-    return stepped(_camera(), params, targets_of(IMAGE[..., :3]))[1]
-
-
 def test_a_quaternion_without_direction_is_no_rotation() -> None:
     cam, params = _camera(), random_params(2)
     params[:, QUATERNION:OPACITY] = 0.0
     plain = params.copy()
     plain[:, QUATERNION] = 1.0
     np.testing.assert_array_equal(_render(params, cam)[0], _render(plain, cam)[0])
-    gradient = _gradient(params)
+    gradient = stepped(cam, params, targets_of(IMAGE[..., :3]))[1]
     assert np.isfinite(gradient).all() and not gradient[:, QUATERNION:OPACITY].any()
 
 

@@ -96,17 +96,14 @@ def _frames(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     return image, blurred, rng.uniform(80, 100, (2, H, W, 3)).astype(np.float32), static
 
 
-def _masks() -> np.ndarray:
-    return np.empty((2, H, W), np.uint8)
-
-
 def _off(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.abs(a - b).max(axis=-1)
 
 
 def test_a_frame_is_compared_with_plate_earlier_frames_and_static_field() -> None:
     plate, (image, _, earlier, static) = _plate(0), _frames(1)
-    blurred, difference, masks = np.empty((H, W, 3), np.float32), np.empty((H, W), np.float32), _masks()
+    blurred, difference = np.empty((H, W, 3), np.float32), np.empty((H, W), np.float32)
+    masks = np.empty((2, H, W), np.uint8)
     flags, counts = np.zeros((H, -(-W // 8) * 8), np.uint8), np.zeros(2, np.int64)
     limit = np.maximum(np.float32(THRESHOLD), np.float32(DEVIATIONS) * plate.deviation)
     for count in (0, 1, 2):
