@@ -1,7 +1,5 @@
 """Shared by all tests: where real data lies, and nothing that hides what a test does."""
 
-from __future__ import annotations
-
 import asyncio
 import inspect
 import os

@@ -11,8 +11,6 @@ checkout, where nothing else is changed.
 trampolines, which numba cannot compile.)
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import hashlib

@@ -1,7 +1,5 @@
 """The table of docs/how-to/tls.md, who may do what: each of its cells is a test."""
 
-from __future__ import annotations
-
 from tests.conftest import ROOT
 
 TOKENS = {"camera:cam00": "a camera's", "viewer": "a viewer's", "operator": "an operator's"}

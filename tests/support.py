@@ -1,8 +1,6 @@
 """Free ports, small worlds, waits for other threads and processes, refusals and the work that one takes, turned
 pictures."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import struct

@@ -1,7 +1,5 @@
 """The rules of the house that imports can break: arrows point one way, no circles, rooms stay small."""
 
-from __future__ import annotations
-
 import ast
 from collections import Counter
 from collections.abc import Callable

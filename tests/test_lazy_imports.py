@@ -1,7 +1,5 @@
 """Only what the scenario calls for is imported: each program in a process of its own."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

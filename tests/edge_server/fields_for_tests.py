@@ -1,7 +1,5 @@
 """A real field, small enough that an update takes milliseconds."""
 
-from __future__ import annotations
-
 from edge_server.fields.registry import make_field
 
 SIZES = {"levels": 2, "log2_table": 10, "rays": 256, "batch_samples": 4096, "samples": 24}

@@ -1,7 +1,5 @@
 """Real frames for the edge's tests: encoded, posed, checksummed, as a node would send them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What an ``edge:`` section leaves open is chosen by what cameras do; what long work says; the machine of a run."""
 
-from __future__ import annotations
-
 import io
 import os
 from pathlib import Path

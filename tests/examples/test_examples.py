@@ -1,7 +1,5 @@
 """The examples run as a reader would run them, in processes of their own, on small data."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

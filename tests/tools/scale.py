@@ -8,8 +8,6 @@ stream with at most one unanswered frame; together they offer RATE frames a seco
 other load changes less than rates. The rest is reckoned: see ``table``.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import json

@@ -1,7 +1,5 @@
 """Small ONNX graphs of a detector's form, and of forms that are none, for the embedder's tests."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

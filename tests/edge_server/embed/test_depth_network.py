@@ -1,7 +1,5 @@
 """Depth networks of the user's: what they are fed, what is taken from them, and files that are none."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

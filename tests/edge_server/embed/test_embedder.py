@@ -1,7 +1,5 @@
 """Any detector becomes an embedder, what is none is refused; frames are embedded once, and a bad one stays isolated."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Rendered frames of these tests stay out of the user's own cache."""
 
-from __future__ import annotations
-
 import pytest
 
 

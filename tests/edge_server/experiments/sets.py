@@ -1,7 +1,5 @@
 """Small recorded data sets and a small field for the tests of edge_server.experiments."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

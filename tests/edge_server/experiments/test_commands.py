@@ -1,7 +1,5 @@
 """Commands: what they cannot do is refused in one line; ``compare`` pairs policies by seed, on anybody's channel."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

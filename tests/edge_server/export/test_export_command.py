@@ -1,7 +1,5 @@
 """``edge-server export`` and ``render`` on what real fields leave behind, and what they say where they cannot."""
 
-from __future__ import annotations
-
 import json
 import sys
 import zipfile

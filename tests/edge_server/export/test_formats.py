@@ -1,7 +1,5 @@
 """What is written reads back: by libraries that are not ours where there are any, to the bit where not."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

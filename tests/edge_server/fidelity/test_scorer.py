@@ -1,7 +1,5 @@
 """Scores of images: PSNR, SSIM, LPIPS, moving pixels, baselines, and what is no image."""
 
-from __future__ import annotations
-
 import itertools
 import sys
 

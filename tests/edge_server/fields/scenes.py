@@ -1,7 +1,5 @@
 """A small analytic scene for field tests: a striped ball on a checkered plate, ray-cast without any field."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -4,8 +4,6 @@ By name: classes, settings for images of 48 pixels (SMALL) and of 24 (TINY, for 
 that a healthy field reaches in these tests. Another CPU rounds differently, which costs tenths of a decibel.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Budgets in seconds, by clocks that show work done: what is promised is kept, however busy the machine."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

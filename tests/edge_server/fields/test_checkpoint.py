@@ -1,7 +1,5 @@
 """What is saved comes back, whole or not at all; a state that is refused leaves the field as it was, bit for bit."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import replace

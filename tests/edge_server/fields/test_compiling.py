@@ -1,7 +1,5 @@
 """``warm-up`` compiles what a scenario uses; what is compiled is kept for the state of the sources."""
 
-from __future__ import annotations
-
 import pytest
 
 from edge_server.cli import main

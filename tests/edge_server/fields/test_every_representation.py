@@ -1,7 +1,5 @@
 """What every representation must do: learn, repeat itself bit for bit, keep budgets, save, resume, refuse."""
 
-from __future__ import annotations
-
 import threading
 from functools import lru_cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Hard cases of every representation, and damage to parameters: a field stays finite and useful afterwards."""
 
-from __future__ import annotations
-
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace

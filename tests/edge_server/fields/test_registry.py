@@ -1,7 +1,5 @@
 """Fields by name: lazily imported, options checked."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

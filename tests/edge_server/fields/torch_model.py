@@ -3,8 +3,6 @@
 Parameters, layout and formulas are those of ``kernels``; autograd computes the gradients.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any

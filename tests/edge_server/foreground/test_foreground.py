@@ -1,7 +1,5 @@
 """Cutting an object out with a YOLO segmentation model, and what passes whole because it cannot be cut."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Frames arrive: every refusal is named, counted and without effect on the next one; a camera's newest is kept."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Cameras that move: when one is seen to, and its earlier viewpoints."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

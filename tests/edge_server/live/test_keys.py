@@ -1,7 +1,5 @@
 """The development authority: what it makes lets every process do its own part, and no more."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import stat

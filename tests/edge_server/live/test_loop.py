@@ -1,7 +1,5 @@
 """The update loop: decisions in virtual time, and the same code as a thread on the wall clock."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

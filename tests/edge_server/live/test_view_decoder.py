@@ -1,7 +1,5 @@
 """Frames as views, decoded once, with depth at the image's pixels; cameras that move, and their earlier viewpoints."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -9,8 +9,6 @@ Nothing outside the machine is contacted: background services of the browser are
 lists every address that the page asked for.
 """
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import itertools

@@ -1,7 +1,5 @@
 """Who gets to the page and to the metrics, what a visitor may send there, and what one can cost."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import http.client

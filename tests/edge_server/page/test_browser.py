@@ -1,7 +1,5 @@
 """The page in a real browser: live values, a picture, and nothing that fails."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.edge_server.page.browser import Browser

@@ -1,7 +1,5 @@
 """The server for Foxglove, asked by a client that speaks its protocol (subprotocol foxglove.sdk.v1)."""
 
-from __future__ import annotations
-
 import json
 import re
 import struct

@@ -1,7 +1,5 @@
 """The panel's text and charts: from outside it is escaped, unknown values are dashes; a poor picture's likely cause."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from unittest.mock import MagicMock
 

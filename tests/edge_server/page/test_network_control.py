@@ -1,7 +1,5 @@
 """The visitor changes the network: from the page to an emulator that runs."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 from unittest.mock import MagicMock

@@ -1,7 +1,5 @@
 """The page as browsers receive it: it survives every failure, and bounds what it sends and costs."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 import time

@@ -1,7 +1,5 @@
 """The preference page: a whole session in Chromium, and what the server refuses."""
 
-from __future__ import annotations
-
 import json
 import socket
 from unittest.mock import MagicMock

@@ -1,7 +1,5 @@
 """What a visitor may look at and from where, and the colors of ages."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

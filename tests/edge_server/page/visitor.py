@@ -1,7 +1,5 @@
 """A visitor without a browser: speaks the viewer's wire protocol, counts what the page sends."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json

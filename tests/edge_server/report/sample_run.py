@@ -1,7 +1,5 @@
 """A run's folder, written by the parts that write it in a real run: journal and ledgers."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

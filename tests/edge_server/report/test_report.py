@@ -1,7 +1,5 @@
 """The report of a run: what it takes from the files, what of them it survives, what it concludes and shows."""
 
-from __future__ import annotations
-
 import json
 import re
 from functools import reduce

@@ -1,7 +1,5 @@
 """Each policy's exact meaning, and what all of them promise."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

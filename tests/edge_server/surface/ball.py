@@ -1,7 +1,5 @@
 """Exact depth of a ball, and a fused volume worked out voxel by voxel in plain numpy."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

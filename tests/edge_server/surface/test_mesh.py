@@ -1,7 +1,5 @@
 """Depth becomes a volume or a distance function, and that the right surface, without dirt; hard cases too."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Depth from pictures that agree: the cost against plain numpy, and plates whose depth is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Candidates, selectors and plans: what they promise; Fisher information against torch; a policy that learns."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Preferences: the reward model learns a taste from few and partly wrong answers; a session of comparisons."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

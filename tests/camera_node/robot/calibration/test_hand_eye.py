@@ -38,6 +38,15 @@ from tests.support import refusal, refused
 X, Y = known_truth.CAMERA_IN_FLANGE, known_truth.TARGET_IN_BASE
 
 
+def test_mistakes_are_one_line(capsys):
+    for words, why in (
+        (("--pairs", "x", "--live", "room"), "expected one of FOLDER"),
+        (("--pairs", "x", "--lens", "x"), "--lens: goes with FOLDER or --live SCENARIO, not with"),
+        (("--live", "room", "--camera", "cam00", "--board", "chessboard:9x6:10mm", "--seconds", "-1"), "positive"),
+    ):
+        assert why in refusal(capsys, main, "calibrate", "hand-eye", *words)
+
+
 @pytest.mark.parametrize("setup", [EYE_IN_HAND, EYE_TO_HAND])
 def test_every_method_is_exact_on_exact_samples(setup):
     exact = noisy_samples(12, np.random.default_rng(1), 0.0, 0.0, setup)

@@ -1,7 +1,5 @@
 """What the seeds tell: intervals that cover, optima that are not flattered, shares of a gap."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

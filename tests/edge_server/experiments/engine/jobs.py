@@ -1,7 +1,5 @@
 """Work for the tests of the engine, in a module of its own: processes import it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

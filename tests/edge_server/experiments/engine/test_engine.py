@@ -1,7 +1,5 @@
 """Repeated work: the same results whoever computes them, none twice, and none of other code, data or inputs."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Fits, by a command and as a library has them: what they write, going on, stopping, refusing."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

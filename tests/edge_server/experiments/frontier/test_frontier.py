@@ -1,7 +1,5 @@
 """What accuracy costs in time: measured repeatably, told in tables and figures; the best point at a speed."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A small deployment whose decisions cost milliseconds: real cameras, channel and fits."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

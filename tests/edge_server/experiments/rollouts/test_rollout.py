@@ -1,7 +1,5 @@
 """Episodes and rollouts: as the deployment has them, whoever computes them, and who rewards, reports and has luck."""
 
-from __future__ import annotations
-
 import dataclasses
 import pickle
 from functools import partial

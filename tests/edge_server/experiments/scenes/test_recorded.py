@@ -1,7 +1,5 @@
 """Recorded sets and captures of carried cameras as views: which instant, who is held out, errors for people."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Studies: sound points, trials that repeat, verdicts that follow from the figures and can come out either way."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

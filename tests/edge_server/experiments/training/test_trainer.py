@@ -1,7 +1,5 @@
 """Training: continued bit for bit after a stop, and it learns; an evaluation in which luck wins nothing."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``edge-server viewpoints``: a plan, its files, and errors for people; the arm's reach in ``cell``."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

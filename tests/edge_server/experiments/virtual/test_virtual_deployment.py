@@ -1,7 +1,5 @@
 """A deployment in virtual time: repeatable, books that close, time charged as said; the command that runs one."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

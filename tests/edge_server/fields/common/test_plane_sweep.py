@@ -1,7 +1,5 @@
 """Depth that a plane sweep finds in the pictures, and what it is worth as a guide."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

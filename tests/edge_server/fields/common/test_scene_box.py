@@ -1,7 +1,5 @@
 """Where the scene is, from the cameras alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

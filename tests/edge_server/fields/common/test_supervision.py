@@ -1,7 +1,5 @@
 """What is refused before it reaches a field: cameras that cannot be, told by name."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

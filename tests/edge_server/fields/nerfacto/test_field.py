@@ -1,7 +1,5 @@
 """What is the proposal-sampled field's own: sampling, appearances, and every ray's compositing against plain torch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

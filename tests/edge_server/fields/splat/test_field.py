@@ -1,7 +1,5 @@
 """What only the field of still Gaussians does, also with flat ones: ``test_every_representation`` has the rest."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

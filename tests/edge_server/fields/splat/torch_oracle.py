@@ -3,8 +3,6 @@
 The tests compare the kernels and their gradients with this, in float64.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Vector-matrix factors: forward and gradients against plain torch and against finite differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -1,7 +1,5 @@
 """What a live edge writes and tells, and never waits: journal and recording, whatever the disk; metrics."""
 
-from __future__ import annotations
-
 import json
 import re
 import threading

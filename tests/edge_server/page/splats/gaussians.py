@@ -1,7 +1,5 @@
 """A small layered scene of random Gaussians, without a fit."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

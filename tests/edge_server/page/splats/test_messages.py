@@ -1,7 +1,5 @@
 """What the field publishes, as records in messages: the same picture; what is no message is refused."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import fields, replace
 

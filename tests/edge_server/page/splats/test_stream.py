@@ -1,7 +1,5 @@
 """The stream on the live page's port: what arrives, who gets it, and a browser that draws it."""
 
-from __future__ import annotations
-
 import base64
 import json
 import time

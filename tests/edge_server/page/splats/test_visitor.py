@@ -1,7 +1,5 @@
 """What a visitor is sent over links of other speeds, in virtual time."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import replace

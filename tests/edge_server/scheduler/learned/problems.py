@@ -1,7 +1,5 @@
 """Bandits whose best actions are known in closed form, and states as a rig would give them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

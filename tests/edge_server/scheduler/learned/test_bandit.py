@@ -1,7 +1,5 @@
 """A checkpoint as a policy: its decisions are carried out as by fixed policies, kept on disk exactly, and explained."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from types import SimpleNamespace

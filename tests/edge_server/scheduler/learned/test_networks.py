@@ -1,7 +1,5 @@
 """One set of weights for any number of cameras, the same in numpy and torch; probabilities of sets against all 2^N."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from dataclasses import replace

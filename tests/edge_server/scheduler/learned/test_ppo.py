@@ -1,7 +1,5 @@
 """Learning happens, on bandits whose optimum is known, and repeats; checkpoints lose nothing; all stays finite."""
 
-from __future__ import annotations
-
 import re
 import zipfile
 from dataclasses import replace

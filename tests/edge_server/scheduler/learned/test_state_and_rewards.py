@@ -1,7 +1,5 @@
 """What is learned from: a state as numbers, on one scale for all; rewards as printed and corrected, term by term."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Corrections of poses: they arrive, stay within bounds; a mount that is off is told from single errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The kernels' optimizer against torch's, their exponential, logarithm and random numbers against numpy's."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numba import njit

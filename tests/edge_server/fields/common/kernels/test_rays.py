@@ -1,7 +1,5 @@
 """Pixel to ray, ray to samples, and the cells that get some: against ``freshfield.geometry``, numpy and torch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast

@@ -1,7 +1,5 @@
 """A whole chunk of rays, from weighted pixels to the gradients, and single ones, against plain torch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """The thread pool: every task once, errors reach the caller, several callers at a time."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -1,7 +1,5 @@
 """A camera walks around a small scene, with depth and errors that vary slowly, and is given to a field as live."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache

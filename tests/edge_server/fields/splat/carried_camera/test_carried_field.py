@@ -1,7 +1,5 @@
 """Views of a carried camera, one after the other, as a live edge gives them; and poses that lead astray."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """A scan: a camera walks around a small scene, with depth, wrong poses and a changing exposure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Depth from frames beside a frame, and discs from an image with depth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

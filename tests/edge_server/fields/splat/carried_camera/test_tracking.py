@@ -1,8 +1,6 @@
 """Alignment of a frame with a rendering, exposures in closed form, and what tells that something moves or that poses
 are late."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Random Gaussians in a small box, what cameras see of them, and a step, for the tests of the kernels."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The Gaussian kernels: projection, compositing, losses and gradients against torch, Adam's steps against numpy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The kernels of stereo against plain numpy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

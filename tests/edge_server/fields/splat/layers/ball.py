@@ -1,7 +1,5 @@
 """A ball that moves before fixed cameras, and fields in layers that are shown it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

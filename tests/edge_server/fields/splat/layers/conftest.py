@@ -1,7 +1,5 @@
 """What the tests of the layers share."""
 
-from __future__ import annotations
-
 import pytest
 
 from edge_server.fields.splat.layers import settings

@@ -1,8 +1,6 @@
 """The field in layers: a ball that moves before fixed cameras, a scene at rest, and cameras that move. What its
 still field learns of plates, when, and from when on it is shown."""
 
-from __future__ import annotations
-
 import itertools
 import logging
 import subprocess

@@ -1,8 +1,6 @@
 """The moving set: its motion from views, against a dense solution and in hard cases; at single instants what is
 removed, and where what is seeded lies, also of cameras with depth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

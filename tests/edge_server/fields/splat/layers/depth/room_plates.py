@@ -1,7 +1,5 @@
 """Plates of the synthetic room from fixed cameras, with their exact depth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

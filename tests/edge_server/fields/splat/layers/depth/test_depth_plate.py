@@ -1,8 +1,6 @@
 """Depth plates: medians over time, planes fitted to inverse depths, small holes; against the same rules in plain
 numpy; depth of what moves."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -6,8 +6,6 @@ differently: a single training says little, so each figure is a mean of three, a
 of such a mean beside that of eight.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial

@@ -1,7 +1,5 @@
 """A depth network of the user's fills what stereo and sensors leave out, where it agrees with them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

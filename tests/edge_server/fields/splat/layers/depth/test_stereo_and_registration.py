@@ -1,7 +1,5 @@
 """Registration of poses and depth scales, and stereo of plates, on the exact depth of the synthetic room."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Depth plates drawn from other places; large planes, virtual plates, and what cameras share."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

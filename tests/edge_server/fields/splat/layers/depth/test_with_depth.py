@@ -1,7 +1,5 @@
 """The field in layers before few cameras that measure depth, or whose plates tell it by stereo: a ball that moves."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

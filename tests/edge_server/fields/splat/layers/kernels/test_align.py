@@ -1,7 +1,5 @@
 """A view's normal equations against a Gauss-Newton by pixels, and against differences of rendered images."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

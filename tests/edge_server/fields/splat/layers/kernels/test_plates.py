@@ -1,8 +1,6 @@
 """The passes over a frame against the same rules, pixel by pixel, in plain Python, and masks against OpenCV; what
 becomes a plate, and what is foreground: a body that passes, stays, or hides in a change of light."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
