@@ -394,7 +394,8 @@ def find_data(name: str, scenario: Scenario, base: Path | None, key: str = "data
     if not path.is_absolute():
         given = base or os.environ.get("FRESHFIELD_DATA")
         if given is None or not (Path(given) / path).exists():
-            rig = "; camera-node calibrate rig writes it" if path.suffix == ".json" else ""
+            of_rig = scenario.source.get("kind") == "video" and path.suffix == ".json"
+            rig = "; camera-node calibrate rig writes it" if of_rig else ""
             folder = f"the data folder ({given or 'none given'}: --data DIR or FRESHFIELD_DATA)"
             raise ScenarioError(f"{where}: {name}: neither beside {scenario.path.name} nor in {folder}{rig}")
         path = Path(given) / path

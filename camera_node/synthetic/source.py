@@ -93,7 +93,10 @@ class WorldSource(Source):
         frame = content % self.repeats_after if self.repeats_after else content
         image: Image | bytes
         if self._effects.image:
-            exact = payload.decode(self._stored(frame), self._codec, *self._size)
+            if self.cache is None:
+                exact = self._render(frame)
+            else:
+                exact = payload.decode(self._stored(frame), self._codec, *self._size)
             image = self._effects.apply(exact, content, self._time_s(content))
         else:
             image = self._stored(frame)

@@ -118,7 +118,13 @@ def describe_exit(returncode: int) -> str:
         name = signal.Signals(-returncode).name
     except ValueError:
         name = f"signal {-returncode}"
-    why = " (by a person, or by the system because memory ran out)" if name == "SIGKILL" else ""
+    why = {
+        "SIGKILL": " (by a person, or by the system because memory ran out)",
+        "SIGSEGV": " (a crash in native code)",
+        "SIGABRT": " (a native library gave up)",
+        "SIGILL": " (an instruction this processor does not have)",
+        "SIGBUS": " (memory or disk behind a mapped file is gone)",
+    }.get(name, "")
     return f"was killed by {name}{why}"
 
 

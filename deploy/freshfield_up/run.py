@@ -26,6 +26,8 @@ from freshfield_up.status import status_line, summarize
 
 _LOADING, _COMPILING = "loading", "compiling"
 """Starts of the edge's status text until it can make a first update."""
+_NUMBER = re.compile(r"(?<![^\s(])-?[0-9.,]+(?![^\s):;%])")
+"""A word that is a number; digits of a camera's name are none."""
 
 
 def print_line(text: str) -> None:
@@ -140,7 +142,7 @@ class Launcher:
         """Say what the edge finds wrong with frames and poses, each kind once: numbers within change."""
         for line in read_status(self.options.out / "edge.json").get("troubles") or ():
             camera, _, words = str(line).partition(" ")
-            kind = f"{camera} {re.sub(r'[0-9.,]+', '', words)}"
+            kind = f"{camera} {_NUMBER.sub('', words)}"
             if kind not in self._troubles_said:
                 self._troubles_said.add(kind)
                 self._say(f"note: {line}")

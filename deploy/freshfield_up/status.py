@@ -55,11 +55,13 @@ def _edge_line(edge: Status) -> str:
         return str(edge.get("doing") or "no update yet")
     if isinstance(edge.get("so_far"), dict):
         now, whole = (fmt(number(edge, "so_far", name), ".2f") for name in ("now_psnr_db", "all_psnr_db"))
-        score = f"held out now {now} dB, all frames so far {whole} dB"
+        poses = ", at refined poses" if edge["so_far"].get("refined") else ""
+        score = f"held out now {now} dB, all frames so far {whole} dB{poses}"
     else:
         views = f" on {NOTHING_HELD_OUT}" if (edge.get("scores") or {}).get("on") == "selected" else ""
         score = f"PSNR {fmt(number(edge, 'scores', 'psnr_db'), '.2f')} dB{views}"
-    return f"{updates:.0f} updates, {fmt(number(edge, 'updates', 'ms_p50'), '.0f')} ms each, {score}"
+    paused = " (paused)" if edge.get("paused") else ""
+    return f"{updates:.0f} updates, {fmt(number(edge, 'updates', 'ms_p50'), '.0f')} ms each, {score}{paused}"
 
 
 def summarize(out: Path) -> str:

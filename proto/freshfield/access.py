@@ -85,13 +85,17 @@ class Access:
     """
 
     def __init__(self, tokens: Mapping[str, str], certificates: bool) -> None:
-        self.tokens = [(Caller.named(name), token.encode()) for name, token in tokens.items()]
+        self._tokens = [(Caller.named(name), token.encode()) for name, token in tokens.items()]
         self._certificates = certificates
 
     @property
     def open(self) -> bool:
         """Whether callers are not authenticated at all."""
-        return not self.tokens and not self._certificates
+        return not self._tokens and not self._certificates
+
+    @property
+    def has_tokens(self) -> bool:
+        return bool(self._tokens)
 
     def of_header(self, header: str) -> Caller | None:
         """The caller of an ``authorization`` header: Bearer TOKEN, or Basic with the token as password. None
@@ -106,7 +110,7 @@ class Access:
         elif kind.lower() != "bearer":
             return None
         # All tokens are compared, each in constant time, so that the time taken reveals nothing.
-        found = [known for known, expected in self.tokens if hmac.compare_digest(token, expected)]
+        found = [known for known, expected in self._tokens if hmac.compare_digest(token, expected)]
         return found[0] if found else None
 
     def of_certificate(self, context: grpc.aio.ServicerContext) -> Caller | None:
@@ -134,7 +138,7 @@ class HttpDoor:
     """
 
     def __init__(self, access: Access, listening_on: str) -> None:
-        asks = access.tokens or not (access.open or is_loopback(listening_on))
+        asks = access.has_tokens or not (access.open or is_loopback(listening_on))
         self.access = access if asks else None
         self._names = {"localhost", listening_on.lower(), socket.gethostname().lower()}
 

@@ -151,12 +151,14 @@ class LedgerReader:
     @property
     def complete(self) -> bool:
         """Whether the process exited cleanly and lost no line, so that missing events did not happen."""
-        return (last := self.last()) is not None and (last.event, last.detail) == ("closed", "")
+        last = self.last()
+        return last is not None and last.event == "closed" and not last.detail
 
     @property
     def closed(self) -> bool:
         """Whether the process exited cleanly."""
-        return (last := self.last()) is not None and last.event == "closed"
+        last = self.last()
+        return last is not None and last.event == "closed"
 
 
 def read_all(out: Path) -> list[LedgerReader]:

@@ -183,6 +183,16 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
             f"{file}: cameras.held_out_every: expected 2 or more, and as many held-out cameras as training cameras: "
             f"each shows captures of one of those; got {found.held_out_every}, {len(held_out)} of {len(ids)} held out"
         )
-    named: dict[str, Any] = {key: getattr(file_settings, key) for key in ("seed", "description", "source", "channel")}
-    named |= {"cameras": ids, "held_out": held_out, "phase": found.phase, "held_out_every": found.held_out_every}
-    return Scenario(path=file, name=file_settings.name or file.stem, edge=file_settings.edge or {}, **named)
+    return Scenario(
+        path=file,
+        name=file_settings.name or file.stem,
+        seed=file_settings.seed,
+        cameras=ids,
+        held_out=held_out,
+        description=file_settings.description,
+        source=file_settings.source,
+        channel=file_settings.channel,
+        edge=file_settings.edge or {},
+        phase=found.phase,
+        held_out_every=found.held_out_every,
+    )

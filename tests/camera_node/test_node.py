@@ -302,7 +302,9 @@ def test_data_is_found_below_the_folder_that_was_given(tmp_path, monkeypatch):
     assert find_data(str(tmp_path / "set"), scenario, None) == tmp_path / "set"
     monkeypatch.setenv("FRESHFIELD_DATA", str(tmp_path))
     assert find_data("set", scenario, None) == tmp_path / "set"
-    refused(ScenarioError, "neither beside s.yaml nor in the data folder", find_data, "other", scenario, None)
+    refused(ScenarioError, r"neither beside s.yaml nor in .*FRESHFIELD_DATA\)$", find_data, "a.json", scenario, None)
+    film = parse({"cameras": {"count": 2}, "source": {"kind": "video"}}, Path("s.yaml"))
+    refused(ScenarioError, "camera-node calibrate rig writes it$", find_data, "a.json", film, None)
     # What lies beside the scenario comes first.
     (tmp_path / "mine/set").mkdir(parents=True)
     mine = parse({"cameras": {"count": 2}}, tmp_path / "mine/s.yaml")

@@ -96,6 +96,16 @@ def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(asleep, monkeypatch):
     assert edge.process is not None and not any(child.running for child in run.processes.children)
 
 
+def test_a_trouble_is_said_once_for_each_camera_whatever_its_numbers(asleep, capfd):
+    (run := asleep(SLEEPS)).options.out.mkdir()
+    said = [f"the depth of cam0{k} contradicts the other cameras'" for k in (2, 5)]
+    for off in ("1.2 cm (median 3)", "10 cm (median 12)"):
+        (run.options.out / "edge.json").write_text(json.dumps({"troubles": [*said, f"cam01: drifts {off}: look"]}))
+        run._say_troubles()
+    said = [*said, "cam01: drifts 1.2 cm (median 3): look"]
+    assert capfd.readouterr().out.splitlines() == [f"note: {line}" for line in said]
+
+
 def test_ctrl_c_ends_a_run_and_a_second_one_kills(asleep, capfd):
     run = asleep("import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up'); time.sleep(60)")
     log = run.processes.node.log
@@ -116,6 +126,11 @@ def test_times_and_commands_are_read_and_written_as_people_write_them():
     assert launcher.command_line(["/usr/bin/freshfield", "demo", "my file"]) == "freshfield demo 'my file'"
     assert launcher.command_line(["/lib/freshfield_up/__main__.py", "demo"]) == "freshfield demo"
     assert launcher.command_line(["examples/deployment.py", "card", "6"]) == "python examples/deployment.py card 6"
+
+
+def test_the_signals_of_native_code_are_explained():
+    assert processes.describe_exit(-signal.SIGILL).endswith("SIGILL (an instruction this processor does not have)")
+    assert processes.describe_exit(-signal.SIGTERM) == "was killed by SIGTERM"
 
 
 def test_what_cannot_run_is_refused_in_one_line_before_anything_starts(tmp_path, capsys):
@@ -257,6 +272,10 @@ def test_the_line_says_what_the_processes_wrote_and_what_is_missing_or_damaged_l
         "13/13 cameras, age 1880 ms (median); 9 updates, 812 ms each, PSNR 25.12 dB; "
         "ch6, forwarded 481, delay error p99 - ms"
     )
+    so_far = {"now_psnr_db": 24.0, "all_psnr_db": 25.5, "refined": True}
+    (tmp_path / "edge.json").write_text(json.dumps({**edge, "so_far": so_far, "paused": True}))
+    said = "each, held out now 24.00 dB, all frames so far 25.50 dB, at refined poses (paused); "
+    assert said in status_line(tmp_path, 13)
     (tmp_path / "channel.json").write_text("[1, 2")
     (tmp_path / "edge.json").write_text(json.dumps({"cameras": "none", "updates": {"count": "many"}}))
     assert status_line(tmp_path, 13) == nothing

@@ -37,15 +37,28 @@ log = logging.getLogger("camera-node.arm")
 RTDE_PORT = 30004
 READER = (sys.executable, "-m", "camera_node.robot.arm.rtde_process")
 """The process that reads joint states; host and frequency follow."""
-_ROBOT_MODES = (
-    "no controller, disconnected, confirm safety, booting, powered off, powered on: brakes engaged, "
-    "idle: brakes engaged, backdrive, running"
-)
-_SAFETY_MODES = (
-    "normal, reduced, protective stop, recovery, safeguard stop, system emergency stop, robot emergency stop, "
-    "safety violation, safety fault"
-)
-_MODE_NAMES = dict(enumerate(_ROBOT_MODES.split(", "), -1)), dict(enumerate(_SAFETY_MODES.split(", "), 1))
+_ROBOT_MODES = {
+    -1: "no controller",
+    0: "disconnected",
+    1: "confirm safety",
+    2: "booting",
+    3: "powered off",
+    4: "powered on, brakes engaged",
+    5: "idle: brakes engaged",
+    6: "backdrive",
+    7: "running",
+}
+_SAFETY_MODES = {
+    1: "normal",
+    2: "reduced",
+    3: "protective stop",
+    4: "recovery",
+    5: "safeguard stop",
+    6: "system emergency stop",
+    7: "robot emergency stop",
+    8: "safety violation",
+    9: "safety fault",
+}
 
 
 def probe(host: str) -> None:
@@ -211,9 +224,9 @@ class ArmStream:
         """Report modes in which the arm cannot move; joint angles are valid in every mode."""
         wrong = []
         if mode != 7:
-            wrong.append(f"robot mode: {_MODE_NAMES[0].get(mode, mode)}")
+            wrong.append(f"robot mode: {_ROBOT_MODES.get(mode, mode)}")
         if safety not in (1, 2):
-            wrong.append(f"safety: {_MODE_NAMES[1].get(safety, safety)}")
+            wrong.append(f"safety: {_SAFETY_MODES.get(safety, safety)}")
         self._set_trouble(f"arm at {self.host}: {', '.join(wrong)}" if wrong else "")
 
     def _set_trouble(self, trouble: str) -> None:

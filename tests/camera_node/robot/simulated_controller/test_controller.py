@@ -145,6 +145,19 @@ def test_a_move_is_a_straight_line_that_ends_exactly_at_its_target_within_its_li
         assert not motion.move(*wrong) and not motion.moving
 
 
+def test_a_servo_target_is_reached_and_not_passed_by_much_and_a_quiet_client_ends_it():
+    motion = JointMotion(UR3E, HOME_RAD)
+    goal = np.array(HOME_RAD) + 0.5
+    for _ in range(400):
+        motion.servo(goal)
+        motion.step()
+        assert np.max(motion.q - goal) < 2e-4
+    assert np.abs(motion.q - goal).max() < 1e-5
+    motion.servo(goal + 3.0)
+    _, qd = run(motion)
+    assert np.abs(qd).max() > 1.0 and len(qd) * STEP_S < 0.9
+
+
 def test_the_truth_between_two_steps_and_the_same_again():
     def follow():
         arm = Controller(UR3E, start_ns=1_000)
