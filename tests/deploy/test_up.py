@@ -364,8 +364,8 @@ def start(command: str, words: list[str], before: str = "", **streams: int) -> s
 @pytest.mark.parametrize("after_s", [0.05, 0.4])
 def test_ctrl_c_while_it_starts_prints_no_traceback(after_s):
     words = ["simulate", "--preset", "ch6", "--seconds", "1e6"]
-    process = start("channel-emu", words, "print(flush=True)", stdout=subprocess.PIPE)
-    process.stdout.readline()  # Python itself has started
+    process = start("channel-emu", words, "import re, signal; print(flush=True)", stdout=subprocess.PIPE)
+    process.stdout.readline()  # Python itself has started; installed scripts import re, too
     time.sleep(after_s)
     process.send_signal(signal.SIGINT)
     errors = process.communicate(timeout=30)[1]
