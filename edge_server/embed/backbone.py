@@ -197,6 +197,10 @@ def _cut(model: onnx.ModelProto, image: str, tap: str, path: Path) -> onnx.Model
         raise EmbeddingError(
             f"{path}: the backbone holds {', '.join(unknown) or 'functions'}, which no YOLO backbone does"
         )
+    if any(node.op_type == "DynamicQuantizeLinear" and tap in node.output for node in cut.graph.node):
+        raise EmbeddingError(
+            f"{path}: {tap} is quantised with another scale for every image: export the model without that"
+        )
     del cut.graph.value_info[:]
     del cut.graph.output[:]
     # A statically quantized map holds integers, with the same offset and scale in every image.

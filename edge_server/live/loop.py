@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
@@ -56,9 +57,9 @@ class UpdateLoop:
         self._stop = threading.Event()
         self._paused = False
         self.without_step = 0  # updates without time for a step
-        self._updates = 0
-        # Updates without a step, updates, frames left out and frames arrived when this was told last, and when.
-        self._told = (0, 0, 0, 0), clock.now_ns() / 1e9
+        self._too_short: deque[bool] = deque(maxlen=tuned.TOO_SHORT_OF)
+        self._warned_short_s = float("-inf")
+        self._warned_of = (0, 0, clock.now_ns() / 1e9)  # frames shed and arrived, and when
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._main, name="loop", daemon=True)
 
@@ -153,27 +154,26 @@ class UpdateLoop:
     def _warn_of_haste(self, report: FitReport) -> None:
         """Log now and then what share of the updates made no step, and of the frames was left out, for lack of time."""
         self.without_step += report.short
-        self._updates += 1
+        self._too_short.append(report.short)
         buffer, now_s = self._updater.buffer, self._clock.now_ns() / 1e9
-        before, since_s = self._told
-        if now_s - since_s < tuned.WARN_EVERY_S:
-            return
-        counts = (self.without_step, self._updates, buffer.shed, buffer.arrivals)
-        short, updates, shed, arrivals = (now - earlier for now, earlier in zip(counts, before))
-        self._told = counts, now_s
-        if short >= tuned.TOO_SHORT * updates:
+        if sum(self._too_short) >= tuned.TOO_SHORT and now_s - self._warned_short_s >= tuned.WARN_EVERY_S:
+            self._warned_short_s = now_s
             log.warning(
                 "%d of %d updates made no step: their time went into taking in new pictures. Send smaller ones "
                 "(source.scale, or width and height), or give updates more time (edge.update_ms)",
-                short,
-                updates,
+                sum(self._too_short),
+                len(self._too_short),
             )
-        if shed > 0:
+        shed, arrived, since_s = self._warned_of
+        if now_s - since_s < tuned.WARN_EVERY_S:
+            return
+        self._warned_of = (buffer.shed, buffer.arrivals, now_s)
+        if buffer.shed > shed:
             log.warning(
                 "%d of %d frames were left out, mostly the oldest: the field has no time for them. Fewer or smaller "
                 "ones (source.fps; source.scale, or width and height) or longer updates (edge.update_ms) help",
-                shed,
-                arrivals,
+                buffer.shed - shed,
+                buffer.arrivals - arrived,
             )
 
     def _write_checkpoints(self) -> None:

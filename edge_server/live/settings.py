@@ -30,11 +30,11 @@ RESTARTS_BELOW = 16  # viewpoints: the field begins anew each time their number 
 
 # --- the loop of updates ---
 LONGEST_SLEEP_S = 0.2  # before it looks at the controls again
-TOO_SHORT = 1 / 3  # share of the updates without a step from which a warning is due
-WARN_EVERY_S = 30.0  # between two warnings of one kind, and before the first
+TOO_SHORT, TOO_SHORT_OF = 10, 30  # updates without a step, of the latest, after which a warning is due
+WARN_EVERY_S = 30.0  # between two warnings of one kind
 # For the update in progress when the server ends, without which there is no checkpoint. On a machine with five times as
 # much to do as it has cores, updates of ``ngp`` at 640 x 480 take 6 s, the longest 18. The launcher kills the server
-# after ``freshfield_up.processes.GRACE_S``, of which the checkpoint and the last pictures need some.
+# after ``freshfield_up.settings.GRACE_S``, of which the checkpoint and the last pictures need some.
 STOP_S = 20.0
 
 # --- scores: which held-out frame shows the instant of an update ---

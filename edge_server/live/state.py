@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fidelity.scorer import METRICS, SELECTED, Score
+from edge_server.fidelity.scorer import SELECTED, Score
 from edge_server.fields import Snapshot
 from edge_server.live import settings as tuned
 from edge_server.run_records import Frontier, SoFarScores
@@ -75,8 +75,14 @@ class Publication:
         """This publication with its fidelity."""
         return replace(
             self,
+            psnr_db=score.psnr_db,
+            psnr_moving_db=score.psnr_moving_db,
+            ssim=score.ssim,
+            lpips=score.lpips,
+            truth_gap_ms=score.truth_gap_ms,
             scored_on=score.camera if score.on == "held-out" else SELECTED,
-            **{name: getattr(score, name) for name in (*METRICS, "truth_gap_ms")},
+            psnr_refined_db=score.psnr_refined_db,
+            ssim_refined=score.ssim_refined,
         )
 
 

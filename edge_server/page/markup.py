@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from markupsafe import Markup
 
 from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.state import CameraView, Publication
-from edge_server.page.colors import HELD_OUT, MEASURED, PRESENT, age_color, css, scale_color
+from edge_server.page.colors import HELD_OUT, MEASURED, PRESENT, RGB, age_color, css, scale_color
 from edge_server.page.settings import FRESH_MS, STALE_MS
 from edge_server.run_records import Frontier
 from freshfield.scenario import NOTHING_HELD_OUT
@@ -20,15 +21,38 @@ from freshfield.scenario import NOTHING_HELD_OUT
 NAMED_CAMERAS = 3  # that a sentence names, of those that an update left out
 
 
-def html(macro: str, *values: Any, **more: Any) -> str:
-    """A part of the panel, by the name of its macro in ``panel.html.j2``, which says what it takes."""
-    return str(getattr(_panel, macro)(*values, **more))
+@dataclass(frozen=True)
+class Summary:
+    """The values of the tiles; None is shown as a dash. condition: live, waiting or paused.
+
+    age_parts_ms: of the age of what is shown, by name; empty before there is anything to show.
+    """
+
+    scenario: str
+    field: str
+    doing: str
+    condition: str
+    updates: int
+    update_ms: float | None
+    psnr_db: float | None
+    scored_on: str | None
+    mean_age_ms: float | None
+    worst_age_ms: float | None
+    reporting: int
+    cameras: int
+    t_s: float
+    age_parts_ms: Mapping[str, float]
 
 
-def status(s: Mapping[str, Any]) -> str:
-    """Status line, six tiles, and the parts of the age of what is shown. s: of ``panel.summary``."""
+def html(macro: str, *text: str) -> str:
+    """A part of the panel that takes one text or none, by the name of its macro in ``panel.html.j2``."""
+    return str(getattr(_panel, macro)(*text))
+
+
+def status(s: Summary) -> str:
+    """Status line, six tiles, and the parts of the age of what is shown."""
     names = {None: "held-out views", SELECTED: NOTHING_HELD_OUT}
-    return html("status", s, names.get(s["scored_on"], s["scored_on"]))
+    return str(_panel.status(s, names.get(s.scored_on, s.scored_on)))
 
 
 def frontier(found: Frontier, present: tuple[float, float, float | None] | None) -> str:
@@ -56,7 +80,17 @@ def frontier(found: Frontier, present: tuple[float, float, float | None] | None)
         (30, 106, "start", f"{math.exp(left):.0f} ms an update"),
         (310, 106, "end", f"{math.exp(left + wide):.0f} ms"),
     )
-    return html("frontier", whole, moving, [at(ms, db).split(",") for ms, db in now], ends, found.about)
+    return str(_panel.frontier(whole, moving, [at(ms, db).split(",") for ms, db in now], ends, found.about))
+
+
+def table(cameras: Sequence[CameraView], selected: Sequence[str] = ()) -> str:
+    """One row for each camera: age, frames delivered and rejected. Cameras of the last update are ticked."""
+    return str(_panel.table(cameras, selected))
+
+
+def coverage(plan: str, words: str) -> str:
+    """What fixed cameras see. plan: SVG of ``freshfield.coverage.plan_svg``."""
+    return str(_panel.coverage(plan, words))
 
 
 def decision_words(last: Publication, cameras: Sequence[CameraView], policy: str) -> str:
@@ -82,7 +116,18 @@ def decision_words(last: Publication, cameras: Sequence[CameraView], policy: str
     if last.refused:
         words += f"; refuses {', '.join(last.refused)}, which contradict the others"
     # Room for two lines, so that what is below stays where it is.
-    return html("note", f"Update {last.number + 1} {words}.", lines=2)
+    return str(_panel.note(f"Update {last.number + 1} {words}.", lines=2))
+
+
+def comparison_caption(camera: str, psnr_db: float | None, update: int, held_out: bool) -> str:
+    """The caption above the pair of images. held_out: the camera is."""
+    truth = "truth at the present" if held_out else NOTHING_HELD_OUT
+    return str(_panel.comparison_caption(camera, psnr_db, update, truth))
+
+
+def chart_caption(title: str, lines: Sequence[tuple[str, RGB]], remark: str = "") -> str:
+    """A chart's title on the left; on the right ``remark``, or the names of its lines in their colors."""
+    return str(_panel.chart_caption(title, lines, remark))
 
 
 def channel_line(channel: dict[str, Any]) -> str:

@@ -21,7 +21,6 @@ from edge_server.page.settings import AGE_PARTS_OF, LEAST_SCENE_PX, POSE_NOISE
 from edge_server.page.timelines import History, Timelines
 from edge_server.run_records import age_parts_ms
 from freshfield import coverage
-from freshfield.scenario import NOTHING_HELD_OUT
 
 MAIN_WIDTH = 372
 SIDE_WIDTH = 356
@@ -99,7 +98,7 @@ class Panel:
         if last is not None:
             self._decision.content = markup.decision_words(last, cameras, self._state.controls.policy)
             self._decision.visible = True
-        self._table.content = html("table", cameras, last.selected if last else ())
+        self._table.content = markup.table(cameras, last.selected if last else ())
         self._waiting.visible = last is None
         if channel is not None:
             self._channel.content = markup.channel_line(channel)
@@ -129,13 +128,14 @@ class Panel:
         self._reckoned_for, self._reckoned_with_depth = known, depth
         found = coverage.reckon(list(known.values()))
         words = f"{found.words}. {coverage.reached(len(cameras), depth)}"
-        self._coverage.content = html("coverage", coverage.plan_svg(known, found), words)
+        self._coverage.content = markup.coverage(coverage.plan_svg(known, found), words)
 
     def _show_comparison(self, comparison: Comparison, publications: list[Publication], held_out: bool) -> None:
         self._compared_update = comparison.number
         scored = next((p for p in reversed(publications) if p.number == comparison.number), None)
-        psnr_db, truth = scored.psnr_db if scored else None, "truth at the present" if held_out else NOTHING_HELD_OUT
-        self._caption.content = html("comparison_caption", comparison.camera, psnr_db, comparison.number, truth)
+        self._caption.content = markup.comparison_caption(
+            comparison.camera, scored.psnr_db if scored else None, comparison.number, held_out
+        )
         rows, columns = comparison.truth.shape[:2]
         height = max(1, round(PAIR_WIDTH / 2 * rows / columns))
         pair = browser_image(views.compared(comparison, PAIR_WIDTH, height, error=False, labeled=False))
@@ -153,15 +153,15 @@ def _same_places(cameras: Mapping[str, coverage.Camera], others: Mapping[str, co
     )
 
 
-def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publication]) -> dict[str, Any]:
-    """The values of the tiles: the latest score, the current ages of the training cameras; None is shown as a dash."""
+def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publication]) -> markup.Summary:
+    """The numbers of the tiles: the latest score, the current ages of the training cameras."""
     ages = [c.age_ms for c in cameras if not c.held_out and c.age_ms is not None]
     last = publications[-1] if publications else None
     scored = next((p for p in reversed(publications) if p.psnr_db is not None), None)
     db, on = (scored.psnr_db, scored.scored_on) if scored else (None, None)
     if (moving := state.so_far()) is not None:
         db, on = moving.now_psnr_db, moving.words()
-    return dict(
+    return markup.Summary(
         scenario=state.scenario,
         field=state.field_name,
         doing="paused by the operator" if state.controls.paused else state.status_line,

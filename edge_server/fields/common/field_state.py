@@ -12,7 +12,7 @@ import numpy as np
 
 from edge_server.fields.common.view_store import Arrays, ViewStore
 
-VERSION = 1  # of what ``pack_state`` writes
+VERSION = 2  # of what ``pack_state`` writes
 
 T = TypeVar("T")
 

@@ -11,7 +11,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -19,6 +19,10 @@ from edge_server.live import settings as tuned
 from edge_server.live.state import Publication
 from freshfield.session import DECISIONS, SCORES
 from freshfield.v1 import frames_pb2 as pb
+
+if TYPE_CHECKING:
+    from freshfield.session.bag_writer import BagWriter
+    from freshfield.session.writer import SessionWriter
 
 log = logging.getLogger(__name__)
 
@@ -35,12 +39,7 @@ class Recorder:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.file = _free_name(path)
         self.dropped = 0
-        writer: Any
-        if path.suffix.lower() == ".mcap":
-            from freshfield.session.writer import SessionWriter as writer
-        else:
-            from freshfield.session.bag_writer import BagWriter as writer
-        self._writer = writer(self.file, {"scenario": scenario})
+        self._writer = _writer_class(path)(self.file, {"scenario": scenario})
         self._queue: deque[tuple[int, Callable[[], None]]] = deque()
         self._queue_bytes = 0
         self._closing = False
@@ -122,6 +121,16 @@ class Recorder:
                 self._queue.clear()
             self._writer.abandon()
             log.error("%s: recording ended: %s", self.file, error)
+
+
+def _writer_class(path: Path) -> type[SessionWriter] | type[BagWriter]:
+    if path.suffix.lower() == ".mcap":
+        from freshfield.session.writer import SessionWriter
+
+        return SessionWriter
+    from freshfield.session.bag_writer import BagWriter
+
+    return BagWriter
 
 
 def _free_name(path: Path) -> Path:

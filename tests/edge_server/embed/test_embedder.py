@@ -188,6 +188,8 @@ def beyond(path: Path) -> None:
     detector(path, extra=(node("Gather", ["end", "beyond"], "some", axis=1),), weights=(channels,))
 
 
+SCALED = helper.make_node("DynamicQuantizeLinear", ["end"], ["q", "scale", "zero"], name="/model.1/q")
+
 # What is no detector, or would take more memory than there is, and how it is refused.
 WRONG = {
     "missing": (lambda path: None, "b.onnx: cannot be read: No such file"),
@@ -197,6 +199,7 @@ WRONG = {
     "no image": (partial(another_input, shape=[1, 3, 32]), "input images is not"),
     "whole numbers": (partial(another_input, shape=[1, 3, 32, 32], kind=TensorProto.INT64), "input images is not"),
     "expand": (memory_from_nothing, "backbone holds Expand, which no YOLO backbone does"),
+    "scaled": (partial(detector, extra=(SCALED,)), "q is quantised with another scale for every image"),
     "concat": (joined_with_themselves, "larger than any backbone's"),
     "chain": (long_chain, "10006 nodes, more than any network of images"),
     "claims": (partial(empty_claims, dims=(2**20, 2**20)), "larger than any backbone's"),

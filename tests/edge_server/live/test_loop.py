@@ -173,7 +173,7 @@ def test_a_field_that_fails_ends_the_loop_and_tells_who_asked_for_a_checkpoint(w
         refused(RuntimeError, "thread has failed", future.result, 30)
 
 
-@pytest.mark.parametrize(("learns_each", "expected"), [(2, [30, 60]), (1, [])])
+@pytest.mark.parametrize(("learns_each", "expected"), [(100, [10, 40, 70]), (2, [19, 49]), (4, [13, 43, 73]), (1, [])])
 def test_updates_without_time_to_learn_are_warned_of_again_every_half_minute(learns_each, expected, caplog):
     """Also where one learns now and then."""
     clock = VirtualClock()

@@ -38,7 +38,7 @@ from freshfield.geometry import Pose, look_at
 from freshfield.ledger import read_all
 from freshfield.limits import MAX_SCRAPES, MAX_WATCHERS
 from freshfield.transport import Transport, TransportError
-from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2_grpc
+from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2, frames_pb2_grpc
 from freshfield_up.settings import GRACE_S
 from tests.edge_server.fields_for_tests import TINY
 from tests.edge_server.frames import frame
@@ -243,6 +243,14 @@ def test_snapshots_do_not_fill_the_disk(serve, tmp_path):
     for k in range(MAX_SNAPSHOTS - 1):
         (tmp_path / "out" / f"snapshot-9{k:05d}.npz").touch()
     refused(RuntimeError, "holds 20 already: move some away", server.state.save_snapshot)
+
+
+def test_a_token_is_demanded_and_honoured(serve):
+    secured = Transport(tokens={"camera:*": "open sesame"})
+    with connected(serve(transport=secured)) as channel:
+        push, sent = frames_pb2_grpc.FrameStreamServiceStub(channel).Push, to_request(frame("cam01", 0, time.time_ns()))
+        assert push(iter([sent])).code() == grpc.StatusCode.UNAUTHENTICATED
+        assert next(push(iter([sent]), metadata=secured.metadata())).outcome == frames_pb2.OUTCOME_ACCEPTED
 
 
 def test_every_port_beyond_this_machine_is_protected_or_named(tmp_path):

@@ -103,11 +103,11 @@ def test_the_tiles_say_the_latest_score_and_the_ages_of_training_cameras():
     ages = (("cam00", True, 900.0), ("cam01", False, 100.0), ("cam02", False, 300.0), ("cam03", False, None))
     cameras = [CameraView(name, held_out, None, age_ms, 0, 0) for name, held_out, age_ms in ages]
     found = panel.summary(state, cameras, state.publications())
-    assert [found[k] for k in ("updates", "update_ms", "psnr_db", "scored_on")] == [6, 30.0, 21.0, "cam00"]
-    assert [found[k] for k in ("mean_age_ms", "worst_age_ms", "reporting", "cameras")] == [200.0, 300.0, 3, 4]
-    assert found["condition"] == "live"
+    assert (found.updates, found.update_ms, found.psnr_db, found.scored_on) == (6, 30.0, 21.0, "cam00")
+    assert (found.mean_age_ms, found.worst_age_ms, found.reporting, found.cameras) == (200.0, 300.0, 3, 4)
+    assert found.condition == "live"
     state.controls.paused = True
-    assert panel.summary(state, [], [])["condition"] == "paused"
+    assert panel.summary(state, [], []).condition == "paused"
 
 
 def test_what_cameras_see_is_reckoned_when_they_stand_still():
