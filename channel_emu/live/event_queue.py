@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 from channel_emu.live.timer import LoopTimer
 from channel_emu.model.nanoseconds import NEVER_NS
 from freshfield.clock import Clock
 
-LiveLink = Any  # of ``live_link``, which imports this module
+if TYPE_CHECKING:
+    from channel_emu.live.live_link import LiveLink
 
 
 class EventQueue:

@@ -40,6 +40,15 @@ def test_old_exchanges_lose_trust():
     assert estimator.estimate(100 * 10**9 + 4 * MS).offset_ns == 7 * MS
 
 
+def test_the_best_of_the_last_sixteen_exchanges_counts():
+    estimator, offsets = OffsetEstimator(drift_ppm=0.0), []
+    estimator.add(0, 5, 5, 0)  # none better: the way takes no time
+    for ns in range(100, 1700, 100):
+        estimator.add(ns, ns + 12, ns + 12, ns + 10)
+        offsets.append(estimator.estimate(ns + 10).offset_ns)
+    assert offsets == [5] * 15 + [7]
+
+
 def test_impossible_exchanges_are_ignored():
     estimator = OffsetEstimator()
     estimator.add(0, 0, 10, 5)  # the answer took longer to make than the whole exchange

@@ -16,6 +16,7 @@ from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fidelity.so_far import MOST
 from edge_server.fields import Rendering, View
 from edge_server.live import settings
+from edge_server.live.scoring import scoring_thread
 from edge_server.live.scoring.held_out import HeldOutCamera
 from edge_server.live.scoring.scoring_thread import ScoringThread
 from edge_server.live.settings import MOST_PENDING
@@ -248,6 +249,15 @@ def test_what_is_shown_is_scored_as_often_as_its_share_affords_and_before_public
     monkeypatch.setattr(settings, "RESERVE_S", settings.ALLOWANCE_S)
     scored.clear()
     assert len(_run([100, 350], range(0, 900, 10), scored)) > 10 and not scored
+
+
+def test_time_that_was_not_used_is_no_credit_beyond_the_allowance(monkeypatch: Any) -> None:
+    thread, now_s, used_s = _thread(), time.monotonic() + 1000.0, 0.0
+    monkeypatch.setattr(scoring_thread.time, "monotonic", lambda: now_s)
+    monkeypatch.setattr(scoring_thread.time, "thread_time", lambda: used_s)
+    assert thread._affordable(0.99 * settings.ALLOWANCE_S)
+    used_s += 1.1 * settings.ALLOWANCE_S
+    assert not thread._affordable()
 
 
 def test_a_metric_that_cannot_be_loaded_costs_its_own_scores_alone(caplog: pytest.LogCaptureFixture) -> None:

@@ -145,6 +145,13 @@ def test_a_move_is_a_straight_line_that_ends_exactly_at_its_target_within_its_li
         assert not motion.move(*wrong) and not motion.moving
 
 
+def test_a_servo_motion_ends_soon_after_its_client_falls_silent():
+    motion = JointMotion(UR3E, HOME_RAD)
+    motion.servo(np.add(HOME_RAD, 3.0))
+    _, qd = run(motion)
+    assert np.abs(qd).max() > 1.0 and len(qd) * STEP_S < 0.9
+
+
 def test_the_truth_between_two_steps_and_the_same_again():
     def follow():
         arm = Controller(UR3E, start_ns=1_000)

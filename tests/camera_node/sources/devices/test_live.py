@@ -115,6 +115,13 @@ def test_a_camera_that_is_silent_or_breaks_gives_no_old_frames_and_is_opened_aga
     assert stamps == sorted(set(stamps)) and feeds[0].closed and feeds[2].closed
 
 
+def test_whatever_a_driver_raises_at_the_start_is_one_line():
+    feed = Feed(breaks_after=0, trouble=RuntimeError("ioctl failed\nlast error: 5"))
+    opened = "eye", Fraction(30), lambda: feed, STANDING
+    refused(CameraError, "^eye: RuntimeError: ioctl failed last error: 5$", LiveSource, *opened)
+    assert feed.closed
+
+
 def test_the_lens_is_the_calibrations_scaled_to_the_pictures_and_missed_only_without_one():
     why = "eye: the device holds no calibration: calibrate it"
     source = LiveSource("eye", Fraction(30), lambda: Feed(None, why), STANDING, calibrated=LENS.scaled(0.5))
