@@ -104,7 +104,7 @@ class EmulatedLink:
         report = self._last or self._await(self._report(checked=False))
         preset, to, direction = self.config.preset, self.options.to, self.options.direction
         plain = preset is not None and channel_from_mapping({"preset": preset}) == self.config
-        channel = preset if plain else self.config.to_mapping()
+        channel = preset if plain else _without_none(self.config.to_mapping())
         return f"channel({channel!r}, {to=!r}, seed={self.seed}, {direction=!r})\n{show(report)}"
 
     async def _start(self) -> Proxy:
@@ -124,3 +124,10 @@ class EmulatedLink:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(_PATIENCE_S)
         self._loop.close()
+
+
+def _without_none(value: Any) -> Any:
+    """Mappings at any depth without the keys that are None."""
+    if not isinstance(value, dict):
+        return value
+    return {key: _without_none(inner) for key, inner in value.items() if inner is not None}

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Protocol
 
 from channel_emu.live.timer import LoopTimer
 from channel_emu.model.nanoseconds import NEVER_NS
 from freshfield.clock import Clock
 
-LiveLink = Any  # of ``live_link``, which imports this module
+
+class Scheduled(Protocol):
+    """A link with events."""
+
+    @property
+    def next_event_ns(self) -> int: ...
+
+    def advance(self, now_ns: int) -> None:
+        """Process the events up to the channel's instant ``now_ns``."""
 
 
 class EventQueue:
@@ -25,7 +33,7 @@ class EventQueue:
     def __init__(
         self, clock: Clock, origin_ns: int, failed: Callable[[BaseException], None], shared: bool = False
     ) -> None:
-        self.due_ns: dict[LiveLink, int] = {}
+        self.due_ns: dict[Scheduled, int] = {}
         """Instant of each link's next event."""
         self._clock = clock
         self._origin_ns = origin_ns
@@ -38,7 +46,7 @@ class EventQueue:
         """The channel's current instant."""
         return self._clock.now_ns() - self._origin_ns
 
-    def schedule(self, link: LiveLink) -> None:
+    def schedule(self, link: Scheduled) -> None:
         """Schedule the next event of a link that is new or has changed, and of those that share its server."""
         self._look_at(link)
         self._arm()
@@ -46,7 +54,7 @@ class EventQueue:
     def close(self) -> None:
         self._timer.close()
 
-    def _look_at(self, link: LiveLink) -> None:
+    def _look_at(self, link: Scheduled) -> None:
         self.due_ns[link] = link.next_event_ns
         if self._shared:
             for other in self.due_ns:

@@ -11,7 +11,7 @@ from typing import Any
 from channel_emu.model.table import Column, TableError, read_table
 from freshfield.untrusted import UntrustedError, read_text, read_yaml
 
-_UNITS_MS = {"": 1.0, "us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
+_UNITS_MS = {"us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
 _DISTRIBUTIONS = {
     "exp": "exponential",
     "det": "deterministic",
@@ -31,7 +31,7 @@ def span_ms(text: str) -> float:
     """Parse ``30ms``, ``3s``, ``2min``, ``250us`` or a bare number of ms. Raises NotationError."""
     found = re.fullmatch(r"\s*([0-9.eE+-]+)\s*(us|ms|s|min)?\s*", text)
     try:
-        value = float(found[1]) * _UNITS_MS[found[2] or ""] if found else math.nan
+        value = float(found[1]) * _UNITS_MS[found[2] or "ms"] if found else math.nan
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value >= 0):
@@ -135,7 +135,10 @@ def chain(text: str) -> dict[str, Any]:
         elif key == "states" and value:
             found["states"] = value.split("/")
         else:
-            raise NotationError(f"{text!r}: expected mu1=1/30,mu2=1/30 (and scope=per-camera, initial=s1)")
+            raise NotationError(
+                f"{text!r}: expected mu1=1/30,mu2=1/30 (and scope=per-camera, initial=s1); "
+                "more states: a scenario's `chain:`"
+            )
     return found
 
 

@@ -28,8 +28,8 @@ captured and sent, with a note. Of unknown origin, and counted apart (``stranger
 garbled id; and where nodes' ledgers are present, one that was only ever refused, of a camera that no process accepted
 or of a session whose node did not write about it.
 
-Runs are long. Ledgers are therefore read line by line, and frames share a few dozen different histories, each of
-which is kept and evaluated once.
+Runs are long. Ledgers are therefore read line by line, and each frame keeps only the number of its history:
+frames share a few dozen different histories, each of which is evaluated once.
 """
 
 from __future__ import annotations
@@ -144,40 +144,62 @@ class FrameAccounting:
         self.contradictions += [f"{frame}: {what}" for what in found[: _MAX_LISTED - len(self.contradictions)]]
 
 
-History = tuple[tuple[int, str], ...]
-"""Everything written about one frame: number of the ledger, and event (a rejection or an answer with its reason)."""
+@dataclass(frozen=True)
+class _History:
+    """Everything written about one frame: how often each role wrote each event (a rejection or an answer with
+    its reason). incomplete: roles whose ledger for this frame may lack lines (killed, or a full disk).
+    last_file, last_role: the ledger and the role furthest down the path that wrote about it."""
+
+    node: Counter[str] = field(default_factory=Counter)
+    emulator: Counter[str] = field(default_factory=Counter)
+    edge: Counter[str] = field(default_factory=Counter)
+    incomplete: frozenset[str] = frozenset()
+    last_file: int = -1
+    last_role: int = -1
+
+    def after(self, role: str, event: str, file: int, complete: bool) -> _History:
+        """The history with one more event."""
+        number = _ROLES.index(role)
+        last = (file, number) if number >= self.last_role else (self.last_file, self.last_role)
+        counts = {name: getattr(self, name) for name in _ROLES}
+        counts[role] = counts[role] + Counter([event])
+        return _History(
+            **counts, incomplete=self.incomplete | (set() if complete else {role}), last_file=last[0], last_role=last[1]
+        )
+
+
+class _Histories:
+    """Every different history, by number; 0 is the empty one. A hundred thousand frames share a few dozen, so
+    a frame costs one number and each transition is computed once."""
+
+    def __init__(self) -> None:
+        self.all = [_History()]
+        self._transitions: dict[tuple[int, int, str], int] = {}
+
+    def after(self, number: int, role: str, event: str, file: int, complete: bool) -> int:
+        """The number of history ``number`` with one more event."""
+        transition = (number, file, event)
+        result = self._transitions.get(transition)
+        if result is None:
+            result = self._transitions[transition] = len(self.all)
+            self.all.append(self.all[number].after(role, event, file, complete))
+        return result
 
 
 @dataclass
 class _LedgerContents:
     """What all ledgers say.
 
-    frames: each frame's history, by (camera, session) and sequence. accepted: cameras about which
+    frames: number of each frame's history, by (camera, session) and sequence. accepted: cameras about which
     some process wrote more than refusals. unknown_events: how often each event that no role writes was read.
     near_end: frames written about near the end of a ledger without ``closed``; bit r: of one of role r.
     """
 
-    ledgers: Sequence[LedgerReader]
-    frames: dict[tuple[str, str], dict[int, History]] = field(default_factory=dict)
+    histories: _Histories = field(default_factory=_Histories)
+    frames: dict[tuple[str, str], dict[int, int]] = field(default_factory=dict)
     accepted: set[str] = field(default_factory=set)
     unknown_events: Counter[str] = field(default_factory=Counter)
     near_end: dict[tuple[str, str, int], int] = field(default_factory=dict)
-    complete: list[bool] = field(default_factory=list)
-    """By ledger, whether it lacks no line."""
-
-
-@dataclass
-class _Evaluated:
-    """What a history comes to. node, emulator, edge: how often each wrote each event. last_role: number of the role
-    furthest down the path that wrote. incomplete: roles whose ledger for this frame may lack lines."""
-
-    node: Counter[str]
-    emulator: Counter[str]
-    edge: Counter[str]
-    last_role: int
-    incomplete: set[str]
-    counts: FrameCounts = field(default_factory=FrameCounts)
-    contradictions: list[str] = field(default_factory=list)
 
 
 def account_frames(out: Path) -> FrameAccounting:
@@ -192,45 +214,44 @@ def account_frames(out: Path) -> FrameAccounting:
             if not _without_a_line(path):
                 accounting.unreadable.append(path.name)
     accounting.ledgers = len(ledgers)
-    contents = _LedgerContents(ledgers)
+    contents = _LedgerContents()
     ends = _cut_off_ends(ledgers)
-    kept: dict[History, History] = {}
     for number, ledger in enumerate(ledgers):
-        _read_ledger(contents, number, ledger, ends, kept, accounting)
+        _read_ledger(contents, number, ledger, ends, accounting)
     unknown = sorted(contents.unknown_events.items())
     notes += [f"{count} lines with an unknown {event} left out" for event, count in unknown]
 
     has_node_ledger = any(ledger.role == "node" for ledger in ledgers)
-    evaluated: dict[History, _Evaluated] = {}
+    evaluated = [_evaluate(history) for history in contents.histories.all]
+    open_at: dict[str, Counter[int]] = {"in_flight": Counter(), "cut_off": Counter()}
     without_node = 0
     for (camera, session), frames in sorted(contents.frames.items()):
-        alike = Counter(frames.values())
-        evaluated |= {history: _evaluate(history, contents) for history in alike if history not in evaluated}
-        node_wrote = any(evaluated[history].node for history in alike)
-        for history, count in alike.items():
-            found = evaluated[history]
-            refusals = _refusals(found)
-            only_refused = node_wrote and refusals.total() == found.emulator.total() + found.edge.total()
-            if not found.node and (only_refused or (has_node_ledger and camera not in contents.accepted)):
+        node_wrote = any(contents.histories.all[number].node for number in set(frames.values()))
+        for number, count in Counter(frames.values()).items():
+            history, (counts, contradictions) = contents.histories.all[number], evaluated[number]
+            refusals = _refusals(history)
+            only_refused = node_wrote and refusals.total() == history.emulator.total() + history.edge.total()
+            if not history.node and (only_refused or (has_node_ledger and camera not in contents.accepted)):
                 for reason, copies in refusals.items():
                     accounting.unknown_origin[reason] += copies * count
                 continue
-            accounting.add(camera, found.counts, count)
-            contradictions = found.contradictions
-            if not found.node:
+            accounting.add(camera, counts, count)
+            if not history.node:
                 without_node += count
                 if node_wrote:
                     contradictions = [*contradictions, "arrived, but its node wrote nothing about it"]
-            unsent, copies = found.counts.without_end
+            open_at["in_flight"][history.last_file] += counts["in_flight"] * count
+            unsent, copies = counts.without_end
             if not contradictions and unsent <= 0 and copies <= 0:
                 continue
             newest = max(frames)
-            for sequence in sorted(s for s, other in frames.items() if other == history):
+            for sequence in sorted(s for s, other in frames.items() if other == number):
                 near, said = contents.near_end.get((camera, session, sequence), 0), contradictions
-                if unsent > 0 and sequence == newest and near & 1 and not found.last_role:
+                if unsent > 0 and sequence == newest and near & 1 and not history.last_role:
                     accounting.add(camera, FrameCounts(waiting=unsent))
-                elif copies > 0 and near >> found.last_role:
+                elif copies > 0 and near >> history.last_role:
                     accounting.add(camera, FrameCounts(cut_off=copies))
+                    open_at["cut_off"][history.last_file] += copies
                 elif unsent > 0 or copies > 0:
                     what = f"the end of {copies} sent copies" if copies > 0 else "what became of the capture"
                     said = [*contradictions, f"{what} is in no ledger"]
@@ -242,6 +263,11 @@ def account_frames(out: Path) -> FrameAccounting:
     if accounting.unknown_origin:
         count = accounting.unknown_origin.total()
         notes.append(f"{count} frames of unknown origin were refused: counted apart")
+    for what, at in open_at.items():
+        for number, copies in sorted(at.items()):
+            if copies:
+                state = what.replace("_", " ")
+                notes.append(f"{copies} {state}, last written by {ledgers[number].path.name}")
     return accounting
 
 
@@ -272,17 +298,15 @@ def _read_ledger(
     number: int,
     ledger: LedgerReader,
     ends: Sequence[tuple[int, int, int]],
-    kept: dict[History, History],
     accounting: FrameAccounting,
 ) -> None:
     """Read ledger ``number`` into ``contents``, and what is missing into ``accounting``. ends: from
-    ``_cut_off_ends``. kept: each history once, as a hundred thousand frames share a few dozen."""
+    ``_cut_off_ends``."""
     role, name, notes = ledger.role, ledger.path.name, accounting.notes
     known = _EVENTS.get(role, set())
-    lost, lost_at_end = 0, 0
-    contents.complete.append(False)
+    after, lost, lost_at_end = contents.histories.after, 0, 0
     try:
-        contents.complete[number], closed = ledger.complete, ledger.closed
+        complete, closed = ledger.complete, ledger.closed
         for e in ledger:
             event = e.event
             if event in known:
@@ -297,8 +321,7 @@ def _read_ledger(
                 if e.event != "rejected":
                     contents.accepted.add(e.camera)
                 frames = contents.frames.setdefault((e.camera, e.session), {})
-                history = (*frames.get(e.sequence, ()), (number, event))
-                frames[e.sequence] = kept.setdefault(history, history)
+                frames[e.sequence] = after(frames.get(e.sequence, 0), role, event, number, complete)
                 for ended, first_ns, last_ns in ends:
                     if first_ns <= e.t_ns <= last_ns:
                         frame = (e.camera, e.session, e.sequence)
@@ -324,28 +347,24 @@ def _read_ledger(
         notes.append(f"{name}: not closed (killed, or still running)")
 
 
-def _refusals(found: _Evaluated) -> Counter[str]:
+def _refusals(history: _History) -> Counter[str]:
     """How often emulator and edge rejected copies of the frame, by reason."""
     refusals: Counter[str] = Counter()
-    for event, count in [*found.emulator.items(), *found.edge.items()]:
+    for event, count in [*history.emulator.items(), *history.edge.items()]:
         name, _, reason = event.partition(":")
         if name == "rejected":
             refusals[reason] += count
     return refusals
 
 
-def _evaluate(history: History, contents: _LedgerContents) -> _Evaluated:
+def _evaluate(history: _History) -> tuple[FrameCounts, list[str]]:
     """The counts of one frame by what was written, and what cannot be true about it."""
-    roles = {number: contents.ledgers[number].role for number, _ in history}
-    node, emulator, edge = (Counter(e for k, e in history if roles[k] == role) for role in _ROLES)
-    incomplete = {role for number, role in roles.items() if not contents.complete[number]}
-    last_role = max(_ROLES.index(role) for role in roles.values())
-    found = _Evaluated(node, emulator, edge, last_role, incomplete)
-    counts, contradictions = found.counts, found.contradictions
+    counts = FrameCounts()
+    node, emulator, edge = history.node, history.emulator, history.edge
+    contradictions = _node_contradictions(history)
     answers = {e.partition(":")[2]: n for e, n in node.items() if e.startswith("answered:")}
     arrived, forwarded = edge.total(), emulator["forwarded"]
     if node:
-        contradictions += _node_contradictions(found)
         handed = node["sent"]
         counts.update({state: node[state] for state in ("captured", "replaced", "waiting")}, sent=min(1, handed))
     else:
@@ -356,7 +375,7 @@ def _evaluate(history: History, contents: _LedgerContents) -> _Evaluated:
     copies = handed + emulator["duplicated"]
     if arrived > copies:
         contradictions.append(f"reached the edge {arrived} times but only {copies} copies were made")
-    if emulator and arrived > forwarded and "emulator" not in incomplete:
+    if emulator and arrived > forwarded and "emulator" not in history.incomplete:
         contradictions.append(f"reached the edge {arrived} times but was forwarded {forwarded} times")
     if emulator["received"] > handed:
         contradictions.append(f"received {emulator['received']} times but sent {handed} times")
@@ -371,20 +390,23 @@ def _evaluate(history: History, contents: _LedgerContents) -> _Evaluated:
     counts["broken"] += min(emulator["broken"] or node["broken"], max(0, counts.without_end[1]))
     if (excess := -counts.without_end[1]) > 0 and not contradictions:
         contradictions.append(f"{excess} ends more than copies")
-    return found
+    return counts, contradictions
 
 
 def _is_end(event: str) -> bool:
     return event in LINK_ENDS or event.startswith("rejected")
 
 
-def _node_contradictions(found: _Evaluated) -> list[str]:
-    node, contradictions = found.node, []
+def _node_contradictions(history: _History) -> list[str]:
+    node = history.node
+    if not node:
+        return []
+    contradictions = []
     if node["captured"] != 1:
         contradictions.append(f"the node wrote captured {node['captured']} times")
-    arrived = found.emulator or found.edge
+    arrived = history.emulator or history.edge
     if node["replaced"] and (node["sent"] or arrived):
         contradictions.append("replaced at the node, yet sent")
-    elif not node["sent"] and arrived and "node" not in found.incomplete:
+    elif not node["sent"] and arrived and "node" not in history.incomplete:
         contradictions.append("arrived, but the node never wrote that it was sent")
     return contradictions

@@ -163,7 +163,7 @@ def _choose(state: CaptureState, selector: Selector, travel: NDArray[np.float64]
     if not np.isfinite(values[state.open]).all():
         raise ViewpointError(f"selector {selector.name}: a value is not finite")
     low, high = values[state.open].min(), values[state.open].max()
-    same = bool(high - low <= _EQUAL * max(abs(low), abs(high), 1e-300))
+    same = _equal(values[state.open])
     farthest = max(float(travel[state.open].max()), 1e-12)
     share = np.zeros(len(values)) if same else (values - low) / (high - low)
     total = share - (weight or float(same)) * travel / farthest
@@ -171,6 +171,11 @@ def _choose(state: CaptureState, selector: Selector, travel: NDArray[np.float64]
     rank = int((values[state.open] > values[k]).sum()) + 1
     why = f"value {values[k]:.4g}, {rank}. of {int(state.open.sum())}; {travel[k]:.2f} m away"
     return k, Stop(k, float(values[k]), float(travel[k]), 0.0, why, np.where(state.open, values, np.nan))
+
+
+def _equal(values: NDArray[np.float64]) -> bool:
+    low, high = np.nanmin(values), np.nanmax(values)
+    return bool(high - low <= _EQUAL * max(abs(low), abs(high), 1e-300))
 
 
 def _note(candidates: Candidates, budget: Budget, stops: list[Stop], refused: list[int]) -> str:
@@ -185,4 +190,6 @@ def _note(candidates: Candidates, budget: Budget, stops: list[Stop], refused: li
         used_up = budget.path_m is not None and len(stops) + len(refused) < int(candidates.reachable.sum())
         reason = "the path is used up" if used_up else "no candidate is left"
         words.append(f"Only {len(stops)} of {budget.views} views: {reason}.")
+    if stops[1:] and all(_equal(stop.values) for stop in stops[1:]):
+        words.append("All candidates were of equal value: the nearest one was taken each time.")
     return " ".join(words)

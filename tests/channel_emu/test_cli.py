@@ -56,6 +56,8 @@ def test_spans_and_rates():
 def test_mistakes_get_one_line(capsys):
     for words, why in (
         (["--arrivals", "sometimes"], "expected as-offered, periodic:30ms"),
+        (["--arrivals", "poisson:1/"], "is not a rate"),
+        (["--chain", "{generator_per_ms: [[-1, 1], [2, -2]]}"], "more states: a scenario's `chain:`"),
         (["--service", "exp:30ms,det:60ms"], "expected one distribution"),
         (["--service", "trace:/no/such/file"], "cannot be read"),
         (["--frame-bytes", "9" * 400], "frame_bytes: expected 0 to"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 from collections.abc import Sequence
 from functools import partial
 
@@ -15,7 +16,7 @@ from edge_server.experiments.engine import EngineError
 from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
 from edge_server.experiments.settings import QUICK_SPLAT
 from edge_server.experiments.training.learning_curve import draw_curve
-from edge_server.experiments.training.trainer import TrainingConfig, read_log, train
+from edge_server.experiments.training.trainer import TrainingConfig, TrainingError, read_log, train
 from edge_server.scheduler import BANDIT, STATE_PARTS
 from edge_server.scheduler.learned.rewards import REWARDS
 from edge_server.scheduler.learned.settings import ACTIONS, Spec
@@ -89,13 +90,15 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
         source |= {"width": args.size, "height": args.size}
     edge["field"], edge["updates"], edge["field_options"] = "splat", "cycle", QUICK_SPLAT
     edge["policy"] = {"name": "all"}
+    asked = args.parts.split(",")
     given = dataclasses.replace(scenario, source=source, edge=edge)
     return Setting(
         given,
         steps=50 if args.scratch else 20,
         scratch=args.scratch,
         compute=read_config(given).compute,
-        parts=tuple(args.parts.split(",")),
+        # In one order, however asked for; ``Layout`` refuses the unknown ones.
+        parts=tuple(dict.fromkeys(part for part in (*STATE_PARTS, *asked) if part in asked)),
     )
 
 
@@ -106,6 +109,8 @@ def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> Tra
     if missing:
         print(f"  {missing}")
     seeds(args.seed, "train", args.episodes)
+    if not 0.0 <= args.price < math.inf:
+        raise TrainingError(f"--price: expected 0 or more, got {args.price:g}")
     if args.price:
         reward = dataclasses.replace(reward, views=-args.price)
     spec = Spec(args.kind, layout_of(setting, setting.parts), _omegas(args))

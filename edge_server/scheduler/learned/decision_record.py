@@ -40,8 +40,8 @@ class DecisionWriter:
     def __init__(self, out: Path, embedding: Mapping[str, Any] | None = None) -> None:
         self._folder = out / FOLDER
         self._embedding = dict(embedding) if embedding else None
-        # Files and their sizes; those of an earlier process first.
-        self._kept = deque((p, p.stat().st_size) for p in _numbered(self._folder))
+        # Decision's file, policy's file, bytes written for it; those of an earlier process first.
+        self._kept = deque((p, "", p.stat().st_size) for p in _numbered(self._folder))
         self.lost = 0
 
     def write(self, decision: Decision) -> None:
@@ -49,12 +49,13 @@ class DecisionWriter:
         path = self._folder / f"{decision.number:06d}.npz"
         try:
             self._drop_from(decision.number)
-            policy = self._folder / f"policy-{decision.actor.digest[:12]}.npz"
+            policy, size = self._folder / f"policy-{decision.actor.digest[:12]}.npz", 0
             if not policy.exists():
                 decision.actor.save(policy)
+                size = policy.stat().st_size
             arrays, about = _as_arrays(decision, policy.name, self._embedding)
             checkpoint.save(path, arrays, about, _KIND, durable=False)
-            self._kept.append((path, path.stat().st_size))
+            self._kept.append((path, policy.name, path.stat().st_size + size))
             self._make_room()
         except OSError as error:
             self.lost += 1
@@ -68,9 +69,12 @@ class DecisionWriter:
 
     def _make_room(self) -> None:
         while len(self._kept) > 1 and (
-            len(self._kept) > MAX_DECISIONS or sum(size for _, size in self._kept) > MAX_BYTES
+            len(self._kept) > MAX_DECISIONS or sum(size for *_, size in self._kept) > MAX_BYTES
         ):
-            self._kept.popleft()[0].unlink(missing_ok=True)
+            path, policy, _ = self._kept.popleft()
+            path.unlink(missing_ok=True)
+            if policy and all(policy != other for _, other, _ in self._kept):
+                (self._folder / policy).unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)

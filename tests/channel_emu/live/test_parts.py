@@ -1,15 +1,17 @@
-"""The small parts of the live emulator: timer, histogram."""
+"""The small parts of the live emulator: timer, histogram, priority."""
 
 import asyncio
+import os
 import sys
 import time
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from channel_emu.live import timer
+from channel_emu.live import priority, timer
 from channel_emu.live.histogram import Histogram
 from channel_emu.live.timer import LoopTimer
 
@@ -55,3 +57,10 @@ def test_histogram_percentiles_are_within_a_bin(values, percent):
         assert exact * 0.999999 <= found <= max(exact * 1.0234, 1e-4)
     assert histogram.count == len(values) and histogram.max_ms == counted.max()
     assert histogram.mean_ms == pytest.approx(counted.mean())
+
+
+@pytest.mark.parametrize("short_slice, reached", [(True, "short-slice"), (False, "normal")])
+def test_without_real_time_the_slices_are_short_where_that_is_permitted(monkeypatch, short_slice, reached):
+    monkeypatch.setattr(os, "sched_setscheduler", Mock(side_effect=PermissionError), raising=False)
+    monkeypatch.setattr(priority, "_shorten_slice", lambda: short_slice)
+    assert priority.raise_priority() == reached

@@ -1,4 +1,5 @@
 import tempfile
+import tracemalloc
 from collections import Counter
 from pathlib import Path
 
@@ -110,6 +111,7 @@ def test_killed_processes_and_torn_lines(tmp_path):
     accounting = counts(tmp_path, captured=4, sent=3, waiting=1, delivered=2, cut_off=1)
     assert sum("unreadable line" in note for note in accounting.notes) == 2
     assert sum("not closed" in note for note in accounting.notes) == 3
+    assert any(note.startswith("1 cut off, last written by ledger-node-") for note in accounting.notes)
     assert any("ledger-edge-x-9.tsv left out" in note for note in accounting.notes)
     (tmp_path / "ledger-edge-x-9.tsv").write_bytes(b"#another-ledger\n1\ta\ts\t0\tdelivered\t\n")
     assert account_frames(tmp_path).doubts == ["ledgers that cannot be read (ledger-edge-x-9.tsv): 1"]
@@ -171,6 +173,14 @@ def test_frames_of_unknown_origin_are_counted_apart(tmp_path):
     for name in ("captured", "sent", "waiting", "delivered"):
         assert found[name] == sum(camera[name] for camera in found["by_camera"].values())
     assert any("6 frames of unknown origin" in note for note in accounting.notes)
+
+
+def test_a_frame_refused_thousands_of_times_takes_little_memory(tmp_path):
+    write(tmp_path, "edge", [("a", "s", 0, "rejected", "too_old")] * 3000)
+    tracemalloc.start()
+    assert account_frames(tmp_path).total["rejected:too_old"] == 3000
+    assert tracemalloc.get_traced_memory()[1] < 2e7
+    tracemalloc.stop()
 
 
 def test_lines_lost_to_a_full_disk_are_no_contradiction_and_do_not_close(tmp_path):

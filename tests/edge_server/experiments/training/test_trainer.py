@@ -22,7 +22,7 @@ from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from tests.edge_server.experiments.rollouts.small import NOTHING, RAW, setting
 from tests.edge_server.scheduler.learned.problems import same
-from tests.support import refused
+from tests.support import refusal, refused
 
 REWARD = make_reward("set", distance=0.0)
 CONFIG = TrainingConfig(Spec("select", StateLayout(("age", "pose")), hidden=16), REWARD, episodes=6, batch=2)
@@ -109,7 +109,10 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     before = (out / "training.csv").read_text()
     assert main(words) == 0  # finished: nothing is left to be trained
     assert (out / "training.csv").read_text() == before
-    assert main([*words[:3], *words[5:]]) == 2 and (out / "policy.npz").exists()  # refused: other settings
+    assert "other settings" in refusal(capsys, main, *words[:3], *words[5:]) and (out / "policy.npz").exists()
+    assert main([*words, "--parts", "pose,age"]) == 0  # the same parts
+    for wrong, said in (("--price=-1", "expected 0 or more, got -1"), ("--parts=age,hue", "no part is called hue")):
+        assert said in refusal(capsys, main, *words, wrong)
 
 
 @pytest.mark.stability

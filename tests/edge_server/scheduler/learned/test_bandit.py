@@ -143,8 +143,9 @@ def test_the_oldest_make_room(tmp_path, monkeypatch):
     monkeypatch.setattr(decision_record, "MAX_DECISIONS", 3)
     record = DecisionWriter(tmp_path)
     for number in range(6):
-        record.write(a_decision(number))
+        record.write(a_decision(number, seed=number // 3))
     folder = tmp_path / FOLDER
+    assert len(names(folder, "policy-*")) == 1
     assert names(folder, "0*") == ["000003.npz", "000004.npz", "000005.npz"]
     again = DecisionWriter(tmp_path)  # another process of the same run goes on
     again.write(a_decision(6))
