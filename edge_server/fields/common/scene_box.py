@@ -22,7 +22,7 @@ NEAR_SHARE = 0.4  # of the cameras' distance to the scene: no density is nearer 
 ASTRAY = 0.3  # a camera further off than this may be an outlier
 AGREED = 0.15  # half of the cameras are within this of a true meeting point
 ASIDE = 0.7  # half of them are further than this from a point where they do not meet
-MOST_TRIED = 32  # cameras whose pairs are tried
+MOST_TRIED = 32  # cameras whose pairs are tried if no meeting point was found
 FAR = 10.0  # times the usual distance between cameras: nearer ones belong together
 PLAIN = 8  # of 255: a plain background varies by no more than this
 
@@ -100,13 +100,31 @@ def scene_box(
 
 
 def _meeting_point(origins: Array, axes: Array) -> Array | None:
-    """Where the cameras look: a wrong pose in the first views must not decide for good where the scene is. A camera
-    that is far away moves the point of all so far that the right ones seem as wrong as it is."""
-    point = _where_most_meet(origins, axes)
-    if point is not None:
-        return point
+    """``converging_point`` without outliers, cameras that look past it while all others meet there: a wrong
+    pose in the first views must not decide for good where the scene is. At most a quarter are left out, and
+    none of three.
+    """
     point = converging_point(origins, axes)
-    return point if point is not None and np.median(_off_axis(origins, axes, point)) < ASIDE else None
+    kept = np.ones(len(origins), np.bool_)
+    for _ in range(len(origins) // 4):
+        if point is None:
+            break
+        worst = int(np.argmax(np.where(kept, _off_axis(origins, axes, point), -1.0)))
+        kept[worst] = False
+        others = converging_point(origins[kept], axes[kept])
+        if others is None:
+            break
+        past = _off_axis(origins, axes, others)
+        if past[worst] < max(ASTRAY, 4.0 * float(np.median(past[kept]))):
+            break
+        point = others
+    if point is not None and _agreed(origins, axes, point):
+        return point
+    # A camera that is far away moves the point so far that the right ones seem as wrong as it is.
+    better = _where_most_meet(origins, axes)
+    if better is not None or point is None:
+        return better
+    return point if np.median(_off_axis(origins, axes, point)) < ASIDE else None
 
 
 def _where_most_meet(origins: Array, axes: Array) -> Array | None:
@@ -128,8 +146,11 @@ def _where_most_meet(origins: Array, axes: Array) -> Array | None:
         return None
     point = converging_point(origins[kept], axes[kept])
     # From very far away, a camera may look past the point by kilometers at a small angle.
-    agreed = point is not None and np.median(_off_axis(origins, axes, point)) < AGREED
-    return point if agreed else points[first]
+    return point if point is not None and _agreed(origins, axes, point) else points[first]
+
+
+def _agreed(origins: Array, axes: Array, point: Array) -> bool:
+    return bool(np.median(_off_axis(origins, axes, point)) < AGREED)
 
 
 def _off_axis(origins: Array, axes: Array, point: Array) -> Array:

@@ -212,7 +212,7 @@ class LayeredField:
         self.beside_s += self.now() - begun
         self._publish()
         self.supervision.take_whole(taken, self.cameras, self.observations)
-        note = "" if steps or pace.steps else "no step was made" if taken else "no new views"
+        note = "" if steps or pace.steps else self._why_no_step(tracker.moving) if taken else "no new views"
         return FitReport(
             steps,
             pace.elapsed_s(),
@@ -234,6 +234,11 @@ class LayeredField:
         if budget.seconds is not None:
             budget = Budget(seconds=max(budget.seconds - pace.elapsed_s(), 0.0))
         return self.still.fit(newest_of_each(views), budget)
+
+    def _why_no_step(self, moving: MovingSet) -> str:
+        if moving.alive:
+            return "motion was followed, without time for a step"
+        return "nothing is left to learn" if self.static.finished else "only the still field learns"
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """Render the scene at the instant of the newest view."""

@@ -43,9 +43,8 @@ def pack(field: Any) -> Arrays:
     cameras, observations = [], []
     for k, camera in enumerate(field.cameras.values()):
         view = camera.view
-        lenses = [asdict(v.intrinsics) for v in (view, *(() if camera.fine is None else (camera.fine.view,)))]
-        taken = list(camera.taken)
-        cameras.append({**_facts(view), **_numbers(camera, OF_CAMERA), "taken": taken, "lenses": lenses})
+        lens, taken = asdict(view.intrinsics), list(camera.taken)
+        cameras.append({**_facts(view), **_numbers(camera, OF_CAMERA), "taken": taken, "lens": lens})
         arrays = {"image": view.image, "pose": view.camera_to_world, **_prefixed("plate.", camera.plate.state())}
         if camera.fine is not None:
             arrays |= _prefixed("fine.", camera.fine.state())
@@ -100,13 +99,13 @@ def unpack(field: Any, state: Arrays) -> None:
     field.cameras, field.observations, field.tracker = {}, Observations(), None
     for k, facts in enumerate(meta["cameras"]):
         arrays = _under(f"camera_{k}.", state)
-        lens, *fine_lens = (Pinhole(**{**of, "distortion": tuple(of["distortion"])}) for of in facts["lenses"])
+        lens = {**facts["lens"], "distortion": tuple(facts["lens"]["distortion"])}
         image, pose = np.array(arrays["image"]), np.array(arrays["pose"])
-        view = View(facts["camera"], image, pose, lens, facts["generated_ns"])
+        view = View(facts["camera"], image, pose, Pinhole(**lens), facts["generated_ns"])
         check_view(view)
         plate = Plate(view.image.shape[0], view.image.shape[1], field.caller)
         plate.load_state(_under("plate.", arrays))
-        fine = FinePlate.from_state(view, fine_lens[0], _under("fine.", arrays)) if fine_lens else None
+        fine = FinePlate.from_state(view, _under("fine.", arrays)) if "fine.color" in arrays else None
         camera = FixedCamera(view, plate, fine=fine, taken=deque(facts["taken"], maxlen=FRAMES_KNOWN))
         camera.turns = list(np.array(arrays["turns"]))
         for name in ARRAYS_OF_CAMERA:

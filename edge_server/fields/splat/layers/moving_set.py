@@ -168,15 +168,24 @@ class MovingSet:
                     return found
         return []
 
-    def remove_outside(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:
+    def remove_outside(
+        self, frames: Sequence[Observation], cameras: dict[str, FixedCamera], measured: bool = False
+    ) -> None:
         """Remove the Gaussians that lie outside the foregrounds that should hold them. If that is most of
-        them, remove all, with their motion: new ones are then seeded at rest."""
+        them, remove all, with their motion: new ones are then seeded at rest.
+
+        measured: remove those that a frame's depth sees through, too.
+        """
         if len(self.cloud):
             places = [self.places(o.instant_s) for o in frames]
             keep = self._inside(places, frames, cameras, tuned.KEEP_DILATION_PX) >= tuned.KEEP_INSIDE
             if keep.mean() < tuned.LOST_BELOW:
                 keep[:] = False
                 self.motion.forget()
+            elif measured:
+                from edge_server.fields.splat.layers.depth.body_depth import seen_through
+
+                keep &= ~seen_through(places, frames, cameras, self.box, self.pool)
             self._keep(keep)
 
     def seed_missing(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:

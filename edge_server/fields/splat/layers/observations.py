@@ -133,6 +133,11 @@ class FixedCamera:
         if self.fine is not None:
             self.fine.view = replace(self.fine.view, camera_to_world=pose)
 
+    @property
+    def fine_count(self) -> int:
+        """How many frames the fine plate was made of."""
+        return 0 if self.fine is None else self.fine.count
+
     def plate_image(self, fine: bool) -> PlateImage:
         """The plate as it is now, copied. fine: at the full resolution, where there is such a plate."""
         if fine and self.fine is not None:

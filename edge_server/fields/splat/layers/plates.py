@@ -255,15 +255,19 @@ class FinePlate:
         self.count += 1
 
     def state(self) -> Arrays:
-        """Everything needed to continue bit for bit, but the view."""
-        return take_attributes(self, ("color", "frames", "count"))
+        """Everything needed to continue bit for bit."""
+        lens = self.view.intrinsics
+        numbers = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion]
+        return {"lens": np.array(numbers), **take_attributes(self, ("color", "frames", "count"))}
 
     @staticmethod
-    def from_state(view: View, lens: Pinhole, state: Arrays) -> FinePlate:
-        """What ``state`` gave. view: the camera's. lens: of the full resolution. ValueError: it lacks something."""
-        fine = FinePlate(replace(view, image=np.zeros((lens.height, lens.width, 3), np.uint8), intrinsics=lens))
-        load_arrays({"color": fine.color, "frames": fine.frames}, state)
-        give_attributes(fine, ("count",), state)
+    def from_state(view: View, state: Arrays) -> FinePlate:
+        """What ``state`` gave. view: the camera's, at the lower resolution. KeyError: it lacks something."""
+        height, width = state["frames"].shape
+        fx, fy, cx, cy, k1, k2, p1, p2 = (float(n) for n in state["lens"])
+        lens = Pinhole(width, height, fx, fy, cx, cy, (k1, k2, p1, p2))
+        fine = FinePlate(replace(view, image=np.zeros((height, width, 3), np.uint8), intrinsics=lens))
+        give_attributes(fine, ("color", "frames", "count"), state)
         return fine
 
 

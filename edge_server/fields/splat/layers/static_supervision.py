@@ -82,7 +82,7 @@ class StaticSupervision:
         taken = plate.take(view.depth, foreground, camera.plate.pool)
         if not taken and before == 0:
             log.warning("%s: its depth contradicts what it measured before, and is left out", view.camera)
-        return taken and view.camera not in self.make_depth().wrong
+        return taken and self.trusts_depth(view.camera)
 
     def make_depth_plate(self, camera: FixedCamera) -> DepthPlate:
         """A camera's depth plate, made once a frame of it brings depth."""
@@ -101,6 +101,10 @@ class StaticSupervision:
             warm_up()
             self.depth = DepthSupervision(self.static.field.settings, self.static.field.pool, self.network)
         return self.depth
+
+    def trusts_depth(self, camera: str) -> bool:
+        """Whether a camera measures depth that does not contradict the others'."""
+        return self.depth is not None and camera not in self.depth.wrong
 
     def forget_camera(self, camera: str) -> None:
         """Forget what was learned of a camera that stands somewhere else now."""
@@ -352,7 +356,7 @@ class StaticSupervision:
         if not seen or alone or observations.newest_s - self.fine_s < every_s:
             return
         self.fine_s = observations.newest_s
-        seen.sort(key=lambda o: fine.count if (fine := cameras[o.camera].fine) is not None else 0)
+        seen.sort(key=lambda o: cameras[o.camera].fine_count)
         for o in seen[: 1 if self.fine else tuned.FIRST_FINE]:
             camera, decode = cameras[o.camera], views[o.camera].whole
             if camera.fine is not None and decode is not None and (whole := decode()) is not None:

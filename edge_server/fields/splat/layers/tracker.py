@@ -139,7 +139,7 @@ class MotionTracker:
         pixels = sum(int(o.foreground.sum()) for o in frames)
         if pixels < tuned.LEAST_FOREGROUND * frames[0].foreground.size * len(self.cameras):
             return
-        moving.remove_outside(frames, self.cameras)
+        moving.remove_outside(frames, self.cameras, bool(measured))
         if moving.motion.anchors is None:
             self._forget_rows()
         if moving.alive:

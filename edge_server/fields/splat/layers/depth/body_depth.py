@@ -1,9 +1,11 @@
-"""What a frame's measured depth says of what moves: where it is, and new Gaussians there.
+"""What a frame's measured depth says of what moves: where it is, new Gaussians there, and where nothing is.
 
 Imported only where frames bring depth.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +15,7 @@ from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.kernels.optimizer_step import clamp_gaussians
 from edge_server.fields.splat.kernels.project import COLOR, OPACITY, QUATERNION, SCALE
 from edge_server.fields.splat.layers.depth import settings as tuned
-from edge_server.fields.splat.layers.depth.kernels.depth_plate import find_medians
+from edge_server.fields.splat.layers.depth.kernels.body_depth import count_seen_through, measure_body
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 
 
@@ -32,25 +34,16 @@ def measured_frames(observations: Observations, cameras: dict[str, FixedCamera],
 
 
 def body_depth(observation: Observation, camera: FixedCamera, pool: Pool) -> NDArray[np.float32]:
-    """Depth of what moves in a frame, float32 (H, W), in the frame's meters, 0 elsewhere: of foreground that is off the
-    plate and measured before it."""
-    depth, plate = observation.view.depth, camera.depth
+    """Depth of what moves in a frame, float32 (H, W), in the frame's meters, 0 elsewhere."""
+    depth, image, plate = observation.view.depth, observation.view.image, camera.depth
     assert depth is not None and plate is not None
-    off = np.abs(observation.view.image - camera.plate.picture).max(axis=2) > tuned.BODY_OFF_PLATE
-    measured = (depth > tuned.BODY_LEAST_M) & (depth < tuned.BODY_MOST_M)  # NaN is neither
-    enough = plate.count >= tuned.LEAST
+    inverse, body = np.empty_like(depth), np.empty_like(depth)
     # Where neither color nor depth of the plate is known, nothing tells what moves from what stands still. Where its
     # color is known, it is too far or too dark to be measured: what is measured there is nearer.
-    where = observation.foreground & off & measured & (camera.plate.known | enough)
-    inverse = np.empty((np.count_nonzero(where), 1), np.float32)
-    pool.run(find_medians, plate.samples[where][:, None], plate.count[where][:, None], inverse)
-    known = inverse[:, 0] > 0.0
-    still_m = 1.0 / np.where(known, inverse[:, 0], 1.0)
-    nearer = depth[where] < still_m - np.maximum(tuned.BODY_NEARER_M, tuned.BODY_NEARER * still_m)
-    body_m = np.zeros_like(depth)
-    # Of a plate with many depths but no median, which shows two surfaces, nothing is nearer for sure.
-    body_m[where] = np.where(np.where(known, nearer, ~enough[where]), depth[where], 0.0)
-    return body_m
+    tells = camera.plate.known | (plate.count >= tuned.LEAST)
+    where, color = observation.foreground & tells, camera.plate.picture
+    pool.run(measure_body, depth, where, image, color, plate.samples, plate.count, inverse, body)
+    return body
 
 
 def seed_at_depth(
@@ -74,3 +67,23 @@ def seed_at_depth(
     params[:, COLOR : COLOR + 3] = view.image[y, x] / 255.0
     clamp_gaussians(params)
     return params
+
+
+def seen_through(
+    places: Sequence[NDArray[np.float32]],
+    frames: Sequence[Observation],
+    cameras: dict[str, FixedCamera],
+    box: SceneBox,
+    pool: Pool,
+) -> NDArray[np.bool_]:
+    """Whether a frame measured something behind each Gaussian, bool (N,).
+
+    places: for each frame float32 (N, 3), the Gaussians at its instant, scene units.
+    """
+    through = np.zeros(len(places[0]), np.int32)
+    for points, o in zip(places, frames, strict=True):
+        if o.view.depth is not None:
+            camera = cameras[o.camera]
+            scale = np.float32(camera.depth_scale / box.radius_m)
+            pool.run(count_seen_through, camera.row, points, o.view.depth, scale, through)
+    return through > 0

@@ -16,7 +16,7 @@ from edge_server.fields.common.scene_box import SceneBox, scene_box
 from edge_server.fields.common.threads.thread_pool import Pool, compile_kernels
 from edge_server.fields.splat.layers import settings as of_layers
 from edge_server.fields.splat.layers.depth import settings as tuned
-from edge_server.fields.splat.layers.depth.body_depth import body_depth
+from edge_server.fields.splat.layers.depth.body_depth import body_depth, seen_through
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
 from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
 from edge_server.fields.splat.layers.depth.kernels.surfaces import Meshes
@@ -120,8 +120,8 @@ class DepthSupervision:
         return {camera.name: found for camera, found in zip(cameras, logs)}
 
     def has_changed(self, cameras: Sequence[CameraPlates]) -> bool:
-        """Whether depths are known that were not when they were last learned, or differ from those. May sweep the
-        cameras."""
+        """Whether depths are known that were not when they were last learned, or differ from those. May sweep a camera
+        whose plate has changed."""
         if self.stereo is not None and self._sweep(self.stereo, cameras):
             return True
         changed = 0
@@ -160,24 +160,24 @@ class DepthSupervision:
             plates += virtual_plates(self.scene, surfaces, poses, whole, self.pool)
         return plates, surfaces
 
-    def _sweep(self, stereo: PlateStereo, cameras: Sequence[CameraPlates]) -> bool:
+    def _sweep(self, stereo: PlateStereo, cameras: Sequence[CameraPlates], every: bool = False) -> bool:
         plates = {camera.name: self._corrected(camera, None) for camera in cameras}
-        return stereo.sweep(plates, _distance_m(cameras))
+        return stereo.sweep(plates, _distance_m(cameras), every)
 
     def _filled(
-        self, cameras: Sequence[CameraPlates], surfaces: list[Surface], anew: bool
+        self, cameras: Sequence[CameraPlates], surfaces: list[Surface], every: bool
     ) -> tuple[list[Surface], bool]:
         """The surfaces with depth by stereo and network where they have none. Whether what still has none is seen by no
-        other camera. anew: see ``plates``."""
+        other camera. every: see ``PlateStereo.sweep``."""
         whole, measured = False, [surface.inverse > 0 for surface in surfaces]
         if len(cameras) >= of_layers.LEAST_CAMERAS:
             self.stereo = self.stereo or PlateStereo(self.pool)
-            self._sweep(self.stereo, cameras)
+            self._sweep(self.stereo, cameras, every)
             filled = self.stereo.fill({camera.name: surface for camera, surface in zip(cameras, surfaces)})
             if filled is not None:
                 surfaces, whole = filled, True
                 if not any(there.any() for there in measured):
-                    surfaces = self._of_stereo_alone(cameras, filled, anew)
+                    surfaces = self._of_stereo_alone(cameras, filled, every)
         if self.network is not None:
             surfaces = self.network.fill([camera.name for camera in cameras], surfaces, measured, self.pool)
             whole = whole or _are_whole(cameras, surfaces)
@@ -280,6 +280,7 @@ def _run_kernels(pool: Pool) -> None:
     camera = FixedCamera(view, Plate(*shape, pool), row=camera_rows([np.eye(4)], [lens], box), depth=depth)
     frame = Observation(0.0, "warm-up", replace(view, depth=depth.samples[..., 0].copy()), np.ones(shape, bool))
     frame.body_m = body_depth(frame, camera, pool)
+    seen_through([np.zeros((1, 3), np.float32)], [frame], {"warm-up": camera}, box, pool)
     aside = np.eye(4)
     aside[0, 3] = 0.5
     nothing = np.zeros(shape, np.float32)

@@ -25,35 +25,36 @@ _KEPT = ("images", "poses", "found")  # of a state, by camera
 
 
 class PlateStereo:
-    """Depth of plates from one another, kept until a plate or a pose differs enough from what was swept."""
+    """Depth of plates from one another, kept: a camera is swept again once its own plate or pose, or that of a camera
+    that it is compared with, differs enough from what was swept.
+
+    Matching uses the plates as they were when they last differed, so what it finds does not change between sweeps.
+    """
 
     def __init__(self, pool: Pool) -> None:
         self.pool = pool
         self._distance_m = 0.0
-        self._images: dict[str, Image] = {}  # camera -> its plate as it was matched
+        self._images: dict[str, Image] = {}  # camera -> its plate as it is matched
         self._poses: dict[str, NDArray[np.float64]] = {}
         self._found: dict[str, Image] = {}  # camera -> inverse depths, before others confirm them
+        self._due: list[str] = []  # cameras to be swept
 
-    def sweep(self, plates: Mapping[str, Surface], distance_m: float) -> bool:
-        """Sweep all cameras, unless each is as it was when they were. Returns whether they were swept.
+    def sweep(self, plates: Mapping[str, Surface], distance_m: float, every: bool = False) -> bool:
+        """Sweep every camera that never was, or else at most one of those that are due: an update that needs many is
+        not held up. Returns whether that was the last one.
 
         plates: of all cameras; what they know of depth is not used. Those of more than ``SWEEP_PIXELS`` are matched
             smaller.
-        distance_m: of the cameras to the scene; another one: depths are looked for in another range.
+        distance_m: of the cameras to the scene.
+        every: whether to sweep all that are due, as for a field that begins anew.
         """
         lenses = {name: _lens(s) for name, s in plates.items()}
-        images = {name: _prepare(s, lenses[name]) for name, s in plates.items()}
-        if (
-            distance_m == self._distance_m
-            and images.keys() == self._images.keys()
-            and not any(np.abs(self._poses[name] - s.pose).max() > SAME_POSE for name, s in plates.items())
-            and not any(_differ(self._images[name], image) for name, image in images.items())
-        ):
-            return False
-        self._distance_m, self._images = distance_m, images
-        self._poses = {name: s.pose.copy() for name, s in plates.items()}
-        self._found = {name: self._match(name, lenses) for name in plates}
-        return True
+        self._take(plates, lenses, distance_m)
+        now = self._due if every else [name for name in self._due if name not in self._found] or self._due[:1]
+        for name in now:
+            self._found[name] = self._match(name, lenses)
+        self._due = [name for name in self._due if name not in now]
+        return bool(now) and not self._due
 
     def inverses(self, plates: Mapping[str, Surface]) -> list[Image]:
         """Inverse depth of each plate that was swept, float32 (H, W), 1 / m along the optical axis; 0 where the plate
@@ -86,6 +87,29 @@ class PlateStereo:
             out.append(replace(surface, inverse=inverse, slope=np.where(known[..., None], surface.slope, slope)))
         return out
 
+    def _take(self, plates: Mapping[str, Surface], lenses: Mapping[str, Pinhole], distance_m: float) -> None:
+        """Take over the plates that differ from those kept, and note which cameras are to be swept again."""
+        if distance_m != self._distance_m:  # another camera: depths are looked for in another range
+            self._distance_m, self._due = distance_m, []
+            self._images, self._poses, self._found = {}, {}, {}
+        changed = [name for name in self._images if name not in plates]
+        for name in changed:
+            del self._images[name], self._poses[name]
+            self._found.pop(name, None)
+        for name, surface in plates.items():
+            image = _prepare(surface, lenses[name])
+            moved = np.abs(self._poses[name] - surface.pose).max() if name in self._poses else np.inf
+            if moved > tuned.SWEEP_ELSEWHERE:
+                self._found.pop(name, None)
+            if moved > SAME_POSE or _differ(self._images[name], image):
+                self._images[name], self._poses[name] = image, surface.pose.copy()
+                changed.append(name)
+        if changed:
+            near = {name: self._compared(name, lenses) for name in plates}
+            gone = any(name not in plates for name in changed)
+            due = [name for name in plates if gone or name in changed or set(near[name]) & set(changed)]
+            self._due = [name for name in self._due if name in plates and name not in due] + due
+
     def _compared(self, name: str, lenses: Mapping[str, Pinhole]) -> list[str]:
         """The cameras whose plates tell the depth of a camera's plate."""
         here, nearest_m = self._poses[name], tuned.SWEEP_NEAR * self._distance_m
@@ -108,14 +132,14 @@ class PlateStereo:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Everything needed to continue bit for bit."""
-        mine: dict[str, NDArray[Any]] = {"distance_m": np.array(self._distance_m)}
+        mine: dict[str, NDArray[Any]] = {"due": np.array(self._due, np.str_), "distance_m": np.array(self._distance_m)}
         for name in _KEPT:
             mine |= {f"{name}.{camera}": array for camera, array in getattr(self, f"_{name}").items()}
         return mine
 
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from ``state``. KeyError: it lacks something."""
-        self._distance_m = float(state["distance_m"])
+        self._due, self._distance_m = [str(camera) for camera in state["due"]], float(state["distance_m"])
         for name in _KEPT:
             arrays = {
                 key.removeprefix(f"{name}."): np.array(a) for key, a in state.items() if key.startswith(f"{name}.")

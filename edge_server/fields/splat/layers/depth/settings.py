@@ -73,14 +73,18 @@ DARK, BRIGHT = 20.0, 235.0  # only plates between these are used to estimate exp
 # Foreground is wider than what moves, and holds its shadow: what moves differs from the plate by more than this (of
 # 255), and is nearer by so many meters and by so large a share of the plate's depth.
 BODY_OFF_PLATE, BODY_NEARER_M, BODY_NEARER = 16.0, 0.1, 0.03
-BODY_LEAST_M, BODY_MOST_M = 1e-3, 1e6  # no sensor measures beyond these: what does is none
-# Depth measured longer before or after its image tells nothing of what moves: at 1 m / s it is 5 cm off. What stands
-# still is learned from it all the same.
+# Depth measured longer before or after its image tells nothing of what moves: at 1 m / s it is 5 cm off, about as much
+# as BODY_THROUGH_M. What stands still is learned from it all the same.
 BODY_GAP_NS = 50_000_000
+BODY_RADIUS_PX = 2  # pixels about one whose median says whether it was measured well, and whose mean its depth is
+BODY_LEAST = 4  # of them, that must have measured
+BODY_FLYING = 0.5 / _DISPARITY_PX_M  # 1 / m: farther from the median it flies between two surfaces
 BODY_PIXELS = 8  # fewest pixels with depth of what moves, of all frames together, from which Gaussians are seeded
 BODY_AGE_S = 0.25  # oldest frame from whose depth they are
 BODY_WRONG = 0.1  # color error, in the worst channel, above which a pixel seeds one
 BODY_SEED_PX, BODY_OPACITY = 0.8, 0.6  # its standard deviation in pixels, and its opacity
+# Depth that lies farther behind a Gaussian than their sum (the second is a share of the distance) sees through it.
+BODY_THROUGH_M, BODY_THROUGH = 0.06, 0.02
 
 # --- when what begins ---
 PLATE_S = 0.6  # as ``layers.settings.PLATE_S``, where most of the cameras have depth
@@ -115,6 +119,7 @@ SWEEP_BLUR_PX = 0.7  # interpolation blurs the other image about as much
 SWEEP_AGREE = 0.05  # difference of log depth at which another camera confirms
 SWEEP_TRUSTED = 0.5  # least share of what stereo finds that sensors, where they measure, must confirm as far as that
 SWEEP_LEAST = 0.15  # least share of the plates whose depth stereo finds: .36 with two cameras of `room`
+SWEEP_ELSEWHERE = 8e-3  # as SAME_POSE: depth found that far away is forgotten; calibrations err less
 
 # --- large planes (large_planes), by which stereo's depth is continued; found on `room` ---
 PLANES = 6  # of the scene, at most

@@ -470,7 +470,7 @@ def test_fine_plates_are_collected_in_each_fit_until_they_are_known_and_then_les
     for frame in range(60):
         for cameras in (range(6), range(6, len(ball.CAMERAS))):  # 33 ms apart
             field.fit([_small(k, frame) for k in cameras], Budget(steps=1))
-            counts = [camera.fine.count for camera in field.cameras.values()]
+            counts = [camera.fine_count for camera in field.cameras.values()]
             taken.append((field.supervision.fine, sum(counts), min(counts)))
     known = next(k for k, (fine, *_) in enumerate(taken) if fine)
     gained = np.diff([count for _, count, _ in taken])

@@ -304,6 +304,19 @@ def test_what_is_shown_rightly_is_not_seeded_again_and_the_capacity_is_kept() ->
     assert len(moving) == moving.capacity == len(moving.anchor)
 
 
+def test_a_gaussian_before_which_nothing_was_measured_is_removed() -> None:
+    """Between camera and ball: inside the camera's foreground, so that only depth tells."""
+    camera, frame = _seen_from(0)
+    near_m = BALL_M + 0.4 * (camera.view.camera_to_world[:3, 3] - BALL_M)
+    moving = _set_of(np.concatenate([BALL_M + np.zeros((20, 3)), near_m + np.zeros((9, 3))]))
+    # By a scale of .4, all that was measured would lie before the Gaussians.
+    for scale, measured, left in ((0.4, True, 29), (1.0, False, 29), (1.0, True, 20)):
+        camera.depth_scale = scale
+        moving.remove_outside([frame], {camera.view.camera: camera}, measured=measured)
+        assert len(moving) == left
+    np.testing.assert_allclose(moving.places(INSTANT_S), BOX.normalise(BALL_M) + np.zeros((20, 3)), atol=1e-3)
+
+
 @pytest.mark.stability
 def test_frames_that_measured_nothing_that_moves_are_none() -> None:
     """No depth at all, holes on the ball, NaN; a frame too old."""

@@ -38,7 +38,7 @@ def remember_depths(counter, worker, depth, foreground, samples, count):
 
 
 @device_function
-def _insert_sorted(ranked, count, value):
+def insert_sorted(ranked, count, value):
     """Put a value in its place among the first ``count`` of ``ranked``, which are sorted."""
     while count > 0 and ranked[count - 1] > value:
         ranked[count] = ranked[count - 1]
@@ -46,9 +46,25 @@ def _insert_sorted(ranked, count, value):
     ranked[count] = value
 
 
+@device_function
+def pixel_median(samples, count, y, x, ranked):
+    """The median of a pixel's depths, 1 / m; 0 if it has too few, or many of them are not alike. ranked: float32
+    (KEPT,), scratch."""
+    n = min(count[y, x], samples.shape[2])
+    if n < tuned.LEAST:
+        return _F0
+    for k in range(n):
+        insert_sorted(ranked, k, samples[y, x, k])
+    median = np.float32(0.5) * (ranked[(n - 1) // 2] + ranked[n // 2])
+    near = 0
+    for k in range(n):
+        near += np.int32(abs(ranked[k] - median) < np.float32(tuned.STEADY))
+    return median if 3 * near >= 2 * n else _F0
+
+
 @kernel
 def find_medians(counter, worker, samples, count, inverse):
-    """The median of each pixel's depths, 0 if it has too few, or many of them are not alike. Tasks are runs of rows.
+    """The median of each pixel's depths, see ``pixel_median``. Tasks are runs of rows.
 
     samples, count: see ``remember_depths``. inverse: float32 (H, W), written.
     """
@@ -60,17 +76,7 @@ def find_medians(counter, worker, samples, count, inverse):
             return
         for y in range(top, min(top + _ROWS, height)):
             for x in range(width):
-                n, near = min(count[y, x], kept), 0
-                inverse[y, x] = _F0
-                if n < tuned.LEAST:
-                    continue
-                for k in range(n):
-                    _insert_sorted(ranked, k, samples[y, x, k])
-                median = np.float32(0.5) * (ranked[(n - 1) // 2] + ranked[n // 2])
-                for k in range(n):
-                    near += np.int32(abs(ranked[k] - median) < np.float32(tuned.STEADY))
-                if 3 * near >= 2 * n:
-                    inverse[y, x] = median
+                inverse[y, x] = pixel_median(samples, count, y, x, ranked)
 
 
 @device_function
@@ -91,7 +97,7 @@ def _local_median(inverse, y, x, near):
     for j in range(max(y - 1, 0), min(y + 2, height)):
         for i in range(max(x - 1, 0), min(x + 2, width)):
             if inverse[j, i] > _F0:
-                _insert_sorted(near, n, inverse[j, i])
+                insert_sorted(near, n, inverse[j, i])
                 n += 1
     return np.float32(0.5) * (near[(n - 1) // 2] + near[n // 2]), n
 

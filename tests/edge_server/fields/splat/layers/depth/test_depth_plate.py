@@ -1,18 +1,14 @@
-"""Depth plates: medians over time, planes fitted to inverse depths, small holes; against the same rules in plain
-numpy; depth of what moves."""
+"""Depth plates: medians over time, planes fitted to inverse depths, small holes; depth of what moves. All against the
+same rules in plain numpy."""
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from edge_server.fields import View
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.layers.depth import settings
-from edge_server.fields.splat.layers.depth.body_depth import body_depth
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
-from edge_server.fields.splat.layers.observations import FixedCamera, Observation
-from edge_server.fields.splat.layers.plates import Plate
-from freshfield.geometry import Pinhole
+from edge_server.fields.splat.layers.depth.kernels.body_depth import measure_body
 
 POOL = CallerPool()
 
@@ -132,24 +128,54 @@ def test_depth_of_another_unit_is_refused_until_it_stays(factor: float) -> None:
 
 # --- of what moves ----------------------------------------------------------------------------------
 
+H, W = 23, 31
+# In numbers, so that a change of them is seen.
+OFF_PLATE, NEARER_M, NEARER, RADIUS, LEAST, FLYING = 16.0, 0.1, 0.03, 2, 4, 0.5 / 21.25
+
+
+def _body_depth(depth: np.ndarray, plate_depth: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """What the kernel finds, and what the rules say."""
+    rng = np.random.default_rng(seed)
+    foreground, image = rng.random((H, W)) < 0.8, rng.integers(0, 255, (H, W, 3), np.uint8)
+    plate = (image + rng.uniform(-40, 40, (H, W, 3))).astype(np.float32)
+    found, inverse = np.full((H, W), np.nan, np.float32), np.empty((H, W), np.float32)
+    known, unsteady = plate_depth > 0, rng.random((H, W)) < 0.1
+    samples = np.where(known, 1.0 / np.where(known, plate_depth, 1.0), 0.0)[..., None].repeat(3, axis=2)
+    samples[unsteady] = 0.2, 0.4, 0.6
+    count = np.where(known | unsteady, 3, 2).astype(np.int32)
+    POOL.run(measure_body, depth, foreground, image, plate, samples.astype(np.float32), count, inverse, found)
+    off = np.abs(image.astype(np.float32) - plate).max(axis=2)
+    with np.errstate(all="ignore"):
+        nearer = (plate_depth <= 0) | (depth < plate_depth - np.maximum(NEARER_M, NEARER * plate_depth))
+        used = foreground & ~unsteady & (depth > 1e-3) & (depth < 1e6) & nearer & (off > OFF_PLATE)
+        q = np.where(used, np.float32(1.0) / depth, 0).astype(np.float32)
+    expected = np.zeros((H, W))
+    for y, x in np.argwhere(q > 0):
+        near = q[max(y - RADIUS, 0) : y + RADIUS + 1, max(x - RADIUS, 0) : x + RADIUS + 1]
+        near = near[near > 0]
+        alike = near[np.abs(near - q[y, x]) < FLYING]
+        if len(near) >= LEAST and abs(np.sort(near)[len(near) // 2] - q[y, x]) < FLYING:
+            expected[y, x] = 1.0 / alike.mean(dtype=np.float64)
+    return found, expected
+
+
+def test_what_is_in_front_of_the_plate_is_smoothed() -> None:
+    """Two surfaces, noise, holes, and pixels that fly between the two; a plate that is partly unknown."""
+    rng = np.random.default_rng(1)
+    depth = np.where(np.arange(W) < W // 2, 1.5, 2.4) * np.ones((H, W)) + rng.normal(0, 0.01, (H, W))
+    flies = rng.random((H, W)) < 0.1
+    depth = np.where(flies, rng.uniform(1.5, 2.4, (H, W)), depth) * (rng.random((H, W)) > 0.2)
+    plate_depth = np.where(rng.random((H, W)) < 0.3, 0.0, rng.choice([2.45, 3.0], (H, W)))
+    found, expected = _body_depth(depth.astype(np.float32), plate_depth.astype(np.float32))
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert 100 < (found > 0).sum() < (depth > 0).sum()
+
 
 @pytest.mark.stability
-def test_what_moves_is_off_the_plate_and_measured_before_it() -> None:
-    """In numbers, so that a change of them is seen. The plate is gray and 4 m away, but in the last two pixels: there
-    its depth is that of two surfaces, or unknown."""
-    inf, nan = np.inf, np.nan
-    measured_m = [3.87, 3.89, 1.5, 1.5, 1.5, 0.0, nan, inf, -1.0, 1e-42, 3e38, 1.5, 9.0]
-    depth, image = np.array([measured_m], np.float32), np.full((1, 13, 3), 117, np.uint8)
-    foreground, plate = np.ones((1, 13), bool), DepthPlate.empty(1, 13)
-    image[0, 2], foreground[0, 3] = (116, 84, 100), False
-    for still_m in (4.0, 4.0, 4.0):
-        plate.take(np.full((1, 13), still_m, np.float32), np.zeros((1, 13), bool), POOL)
-    plate.samples[0, 11, :3], plate.count[0, 12] = (0.2, 0.4, 0.6), 0
-    view = View("cam", image, np.eye(4), Pinhole.from_fov(13, 1, 60.0), depth=depth)
-    camera = FixedCamera(view, Plate(1, 13, POOL), depth=plate)
-    camera.plate.picture = np.full((1, 13, 3), 100.0, np.float32)
-    camera.plate.known[:] = True
-    found = body_depth(Observation(0.0, "cam", view, foreground), camera, POOL)
-    np.testing.assert_allclose(found, [[3.87, 0, 0, 0, 1.5, 0, 0, 0, 0, 0, 0, 0, 9.0]], rtol=1e-6)
-    camera.plate.known[:] = False
-    assert body_depth(Observation(0.0, "cam", view, foreground), camera, POOL)[0, 12] == 0, "nothing tells"
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf, -1.0, 1e-42, 3e38])
+def test_depth_that_is_none_measures_nothing(value: float) -> None:
+    depth = np.full((H, W), value, np.float32)
+    depth[:, : W // 2] = 1.5
+    found, expected = _body_depth(depth, np.full((H, W), 3.0, np.float32))
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert found.any() and not found[:, W // 2 :].any()

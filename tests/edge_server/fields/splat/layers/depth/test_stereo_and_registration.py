@@ -150,9 +150,9 @@ def _named(plates: Sequence[Surface]) -> dict[str, Surface]:
     return {str(k): plate for k, plate in enumerate(plates)}
 
 
-def _swept(plates: Sequence[Surface], distance_m: float | None = None) -> PlateStereo:
+def _swept(plates: Sequence[Surface]) -> PlateStereo:
     stereo = PlateStereo(shared_pool())
-    stereo.sweep(_named(plates), distance_m or _distance_m(plates))
+    stereo.sweep(_named(plates), _distance_m(plates))
     return stereo
 
 
@@ -211,20 +211,36 @@ def test_measured_depth_stays_and_holes_are_filled() -> None:
     assert np.median(np.abs(found * truth - 1.0)[there]) < 0.03
 
 
-def test_cameras_are_swept_again_where_plates_or_poses_change() -> None:
+def test_a_camera_is_swept_again_where_plates_change_one_a_call(monkeypatch: pytest.MonkeyPatch) -> None:
     plates, _ = room_plates(4, 64)
-    stereo, distance_m = _swept(plates), _distance_m(plates)
+    swept: list[str] = []
+    match = PlateStereo._match
+    monkeypatch.setattr(
+        PlateStereo, "_match", lambda self, name, lenses: swept.append(name) or match(self, name, lenses)
+    )
+    stereo = _swept(plates)
+    assert swept == ["0", "1", "2", "3"]
+
+    def calls(now: Sequence[Surface], count: int) -> tuple[list[str], list[bool]]:
+        """Which cameras are swept in some calls, and whether each says that it was the last one due."""
+        swept.clear()
+        done = [stereo.sweep(_named(now), _distance_m(plates)) for _ in range(count)]
+        return list(swept), done
+
     noise, changed = np.random.default_rng(1).normal(0.0, 1.0, plates[0].color.shape), plates[0].color.copy()
-    assert not stereo.sweep(_named(_changed(plates, {2: plates[2].color + noise})), distance_m)
+    assert calls(_changed(plates, {2: plates[2].color + noise}), 2) == ([], [False, False])
     changed[:20, :20] = 255.0 - changed[:20, :20]
     now = _changed(plates, {0: changed})
-    moved = [*now[:3], replace(plates[3], pose=plates[3].pose + 2e-3 * np.eye(4, k=3))]
-    flat = _changed(moved[:3], {k: np.full((64, 64, 3), 128.0) for k in range(3)})
-    for what in (now, moved, moved[:3], flat):  # one is gone
-        assert stereo.sweep(_named(what), distance_m)
-        np.testing.assert_array_equal(stereo.inverses(_named(what)), _swept(what, distance_m).inverses(_named(what)))
-        assert not stereo.sweep(_named(what), distance_m), "what found nothing is not tried again"
-    assert stereo.fill(_named(flat)) is None
+    assert calls(now, 5) == (["0", "1", "2", "3"], [False, False, False, True, False])
+    np.testing.assert_array_equal(stereo.inverses(_named(now)), _swept(now).inverses(_named(now)))
+    now[3] = replace(plates[3], pose=plates[3].pose + 1e-2 * np.eye(4, k=3))
+    assert calls(now, 5)[0] == ["3", "0", "1", "2"]
+    assert sorted(calls(now[:3], 4)[0]) == ["0", "1", "2"]  # one is gone
+    corrected = [replace(p, pose=p.pose + 2e-3 * np.eye(4, k=3)) for p in now[:3]]  # a calibration: in turn, too
+    assert calls(corrected, 4) == (["0", "1", "2"], [False, False, True, False])
+    flat = _changed(corrected, {k: np.full((64, 64, 3), 128.0) for k in range(3)})
+    assert calls(flat, 4)[0] == ["0", "1", "2"] and stereo.fill(_named(flat)) is None
+    assert calls(flat, 1) == ([], [False]), "what found nothing is not tried again"
 
 
 @pytest.mark.stability
