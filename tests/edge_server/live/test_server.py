@@ -298,6 +298,7 @@ def test_files_are_written_before_anything_that_may_take_long(serve, tmp_path, m
 def test_a_closed_terminal_and_an_interrupt_in_a_scripts_background_end_the_run(number, tmp_path, monkeypatch):
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell starts it there
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup, tests ignore it
 
     def closed(server):
         os.kill(os.getpid(), number)
