@@ -45,11 +45,11 @@ publication.
   --reward corrected  -F_w (6.36-6.38) with the sign of SSIM corrected; default for threshold and wait
   --reward thesis     -F_w as printed, which rewards a worse SSIM
 
-An episode is four decisions at random instants. At each, two actions are carried out from copies of the same
-field, so that they can be compared: a field that knows the scene, or an empty one (--scratch, as in the
-thesis). In a synthetic scene each episode has its own motion. Images are small (--size) and the field is a
-small splat, so that there are many decisions. Without weights of LPIPS, or where edge.lpips is none, the
-reward has no term of distance.
+An episode is --decisions decisions at random instants. At each, --samples actions are carried out from copies
+of the same field, so that they can be compared: a field that knows the scene, or an empty one (--scratch, as in
+the thesis, whose algorithms update after each decision: --decisions 1 --batch 1 --samples 1). In a synthetic
+scene each episode has its own motion. Images are small (--size) and the field is a small splat, so that there
+are many decisions. Without weights of LPIPS, or where edge.lpips is none, the reward has no term of distance.
 
 OUT/policy.npz is the learned policy, OUT/actor.npz the part of it that decides, OUT/training.csv and .png the
 learning curve with each term of the reward. edge-server compare says what it shows, on seeds it was not trained
@@ -96,6 +96,7 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
         given,
         steps=50 if args.scratch else 20,
         scratch=args.scratch,
+        decisions=args.decisions,
         compute=read_config(given).compute,
         # In one order, however asked for; ``Layout`` refuses the unknown ones.
         parts=tuple(dict.fromkeys(part for part in (*STATE_PARTS, *asked) if part in asked)),
@@ -114,7 +115,7 @@ def _config(args: argparse.Namespace, setting: Setting, folders: Folders) -> Tra
     if args.price:
         reward = dataclasses.replace(reward, views=-args.price)
     spec = Spec(args.kind, layout_of(setting, setting.parts), _omegas(args))
-    return TrainingConfig(spec, reward, args.episodes, seed=args.seed)
+    return TrainingConfig(spec, reward, args.episodes, args.batch, args.samples, args.seed)
 
 
 def _omegas(args: argparse.Namespace) -> tuple[float, ...]:
@@ -132,6 +133,9 @@ def _parser() -> argparse.ArgumentParser:
     add("scenario", help="scenario file, or the name of a shipped one; needs a held-out camera")
     add("--kind", choices=ACTIONS, default="select", help="what the policy decides [%(default)s]")
     add("--episodes", type=int, default=600, metavar="N", help="episodes of training [%(default)s]")
+    add("--decisions", type=int, default=4, metavar="N", help="decisions of an episode [%(default)s]")
+    add("--batch", type=int, default=10, metavar="N", help="episodes in one policy update [%(default)s]")
+    add("--samples", type=int, default=2, metavar="N", help="actions tried at each decision [%(default)s]")
     add("--reward", choices=tuple(REWARDS), help="reward, see above [set for select, else corrected]")
     add(
         "--on", choices=("whole", "moving"), default="whole", help="pixels that the reward's PSNR is over [%(default)s]"
