@@ -93,12 +93,13 @@ def _parser() -> argparse.ArgumentParser:
 def _export(args: argparse.Namespace, files: dict[str, Path]) -> None:
     """Check all options, then write every file. Raises ExportError, SurfaceError."""
     settings = _mesh_settings(args)
+    saved = args.run.suffix == SAVED_STREAM
+    if saved and set(files) != {"splats"}:
+        raise ExportError(f"{args.run}: a saved stream has Gaussians alone: give --splats FILE.ply only")
     check(files, args.count)
-    if args.run.suffix == SAVED_STREAM:
+    if saved:
         from edge_server.export.splat_sequence import write_sequence
 
-        if set(files) != {"splats"}:
-            raise ExportError(f"{args.run}: a saved stream has Gaussians alone: give --splats FILE.ply only")
         print(f"{args.run}: {write_sequence(files['splats'], args.run)} frames", flush=True)
         return
     source = open_source(args.run, args.allow_plugins)
