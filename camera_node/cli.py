@@ -157,9 +157,9 @@ def _devices(_: argparse.Namespace) -> int:
 
 
 def _doctor(args: argparse.Namespace) -> int:
-    from camera_node import doctor
+    from camera_node.doctor import doctor_command
 
-    return doctor.run(args)
+    return doctor_command.run(args)
 
 
 def _run(args: argparse.Namespace) -> int:

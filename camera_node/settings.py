@@ -30,46 +30,14 @@ FPS_RANGE = (0.01, 1000.0)
 """Bounds of a rate of captures or of a recording, frames a second."""
 MAX_GAP_MS = 3.6e6
 """Longest time between a frame and its pose sample: poses an hour away belong to another recording."""
-WORLD_FPS, LIVE_FPS, PHOTO_FPS = 15.0, 15.0, 10.0
-"""Captures a second where a scenario gives no rate: of a synthetic world, of a device, of photos without times."""
 ZJU_FPS = 50.0
 """Assumed rate of ZJU-MoCap's studio, which its files do not tell."""
-WORLD_MAX_FRAMES = 3000
-"""A synthetic sequence with more different frames counts as not repeating: rendered on demand and not kept."""
-HOLD_OUT_EVERY = 8
-"""Of so many photos the first is held out, where the data set has no test images of its own."""
-SAME_SHAPE = 0.02
-"""Tolerated difference of aspect ratio between an image and what it was calibrated as: both are in whole pixels."""
-REOPEN_AFTER_S = (0.25, 0.5, 1.0, 2.0, 5.0)
-"""Pauses before a camera that failed is opened again: after the first failure, the second, ..."""
 DEPTH_STEP = 0x9E3779B9
 """2^32 by the golden ratio: shot k has depth where k * DEPTH_STEP mod 2^32 is below 2^32 / depth_every. That is one in
 depth_every shots, spread evenly (each fifth: 3, 5 or 8 apart), and also one in depth_every of each second, third, ...
 shot: a link that takes exactly so many captures a frame would never get depth if it came with each so many-th."""
-RECORDING_DEPTH_NEAR_NS = 20_000_000
-"""Time within which an image of a recorded bag gets a depth image: less than half a period of 15 images a second."""
-RECORDING_POSE_NEAR_NS = 50_000_000
-"""Largest gap from such an image to a sample of its frame's own transform: half a period of 10 samples a second."""
-RECORDING_PARENTS_NEAR_NS = 250_000_000
-"""The same of the transforms above: robots correct map -> odom only some times a second, and by little."""
 MAX_LATENCY_MS = 6e4
 """Longest latency of a camera: one that is a minute late is not live."""
-
-# --- camera-node doctor: do a carried camera's poses move as its images do? ---
-POSES_CAPTURES, POSES_LEAST_CAPTURES = 100, 20  # captures that are compared; fewer shifts correlate by chance
-POSES_WIDTH_PX = 80  # of the compared images: enough for shifts of a tenth of a pixel, and 0.3 s for all of them
-POSES_LARGEST_LAG, POSES_LAG_STEP = 4, 0.25  # captures by which poses are tried to be late or early
-POSES_MOVE_PX = 0.1  # standard deviation of shifts below which nothing can be told from them
-# Right poses of redkitchen and handheld correlate by .90 and .97; late by 100 ms they gain .05 and more at their lag.
-POSES_AGREE, POSES_GAIN = 0.7, 0.03
-POSES_LATE_MS = 60.0  # least delay that is said: what is found is off by up to 25
-POSES_FAST_M_PER_S = 10.0  # nobody carries a camera so fast: another unit
-
-
-# --- poses of a tracker that runs beside a camera ---
-TRACKER_LOOKS_S = 0.005  # how often for lines: a quarter of the 20 ms between poses of a usual tracker
-TRACKER_LATE_S = 0.1  # a frame waits so long for its pose: trackers take 20 to 60 ms, and captures are 67 ms apart
-TRACKER_LINE_BYTES = 4096  # read at once, compared again later, and longest line that is kept: one has some 100
 
 
 class SourceConfig(Settings, frozen=True, kw_only=True):

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from camera_node.cli import main as camera_node
 from channel_emu.cli import main as channel_emu
 from edge_server.cli import main as edge_server
-from freshfield_up import keys
+from freshfield_up import scenario_keys
 from freshfield_up.cli import main as freshfield
 
 if TYPE_CHECKING:
@@ -96,10 +96,10 @@ def scenario_page() -> str:
         "# Scenario keys\n\nWhat each section of a scenario file may say. `freshfield scenario keys SECTION` prints "
         "the same, and `freshfield scenario schema` the JSON Schema for editors.\n"
     ]
-    for section in keys.SECTIONS:
+    for section in scenario_keys.SECTIONS:
         parts.append(f"## {section}\n")
         table = False
-        for line in keys.text(section).splitlines():
+        for line in scenario_keys.text(section).splitlines():
             key = re.match(r" {4}(\S+) +(.*)", line)
             if key:
                 if not table:

@@ -104,7 +104,7 @@ _COMMANDS = {
     "explain": ("report.explain_command", "explain a policy's decision: shares of state parts, cameras, image regions"),
     "export": ("export.export_command", "write a run's mesh, splats, points and cameras as files for other programs"),
     "render": ("export.render_command", "render images and videos of a run from new viewpoints"),
-    "keys": ("live.keys", "make a development CA, certificates and tokens for a scenario's processes"),
+    "keys": ("live.keys_command", "make a development CA, certificates and tokens for a scenario's processes"),
     "fetch-lpips": ("fidelity.fetch_lpips", "fetch LPIPS weights with the public package and convert them for --lpips"),
 }
 

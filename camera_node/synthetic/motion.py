@@ -18,7 +18,6 @@ Vector = tuple[float, float, float]
 # Periods are whole multiples of this, so that frame sequences at the usual rates repeat after few frames:
 # 0.6 s holds 9 frames at 15 a second, 15 at 25, 18 at 30 and 20 at one every 30 ms.
 PERIOD_UNIT_S = 0.6
-MAX_SPEED_M_PER_S = 8.0
 _STANCE = 0.5  # share of a gait cycle for which a foot stands
 _PATH_SAMPLES = 120
 

@@ -15,6 +15,7 @@ import numpy as np
 from camera_node.synthetic import motion
 from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.placement import MovingBody, Part
+from camera_node.synthetic.settings import MAX_SPEED_M_PER_S
 from camera_node.synthetic.shapes import RoundCone, Shape, Sphere
 from camera_node.synthetic.textures import Bands, Plaid, Plain, Spots, Stripes, Texture
 from freshfield.geometry import Array
@@ -238,7 +239,7 @@ def _draw_walk(center: tuple[float, float], radii: tuple[float, float], speed_m_
     rng = np.random.default_rng(seed)
     dx, dy = rng.uniform(-_SHIFT_M, _SHIFT_M, 2).tolist()
     wide, deep = rng.uniform(*_RADIUS_FACTORS, 2).tolist()
-    speed = min(speed_m_per_s * float(np.exp(rng.uniform(*np.log(_SPEED_FACTORS)))), motion.MAX_SPEED_M_PER_S)
+    speed = min(speed_m_per_s * float(np.exp(rng.uniform(*np.log(_SPEED_FACTORS)))), MAX_SPEED_M_PER_S)
     direction, start = (1.0 if rng.random() < 0.5 else -1.0), float(rng.random())
     walk = make_walk((center[0] + dx, center[1] + dy), (radii[0] * wide, radii[1] * deep), speed)
     return replace(walk, direction=direction, start_s=start * walk.period_s)

@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 
 from camera_node.synthetic.lighting import Light, contact_shadow, shade_diffuse
 from camera_node.synthetic.placement import MovingBody, Part, PlacedParts, place_parts, place_static
+from camera_node.synthetic.settings import SHADOW_BIAS
 from camera_node.synthetic.shapes import nearest_hit
 from camera_node.synthetic.textures import Color
 from freshfield.geometry import Array, Pinhole, world_rays
 
 Image = NDArray[np.uint8]
 Colors = NDArray[np.float32]  # (N, 3), of rays
-
-# Shadow rays end this share of their length before the surface, so that it does not shadow itself.
-_SHADOW_BIAS = 2e-3
 
 
 @dataclass(frozen=True)
@@ -99,7 +97,7 @@ def light_visibility(world: World, points: Array) -> Array:
     for k, source in enumerate(world.light.points):
         rays = points - source[:, None]
         distance = np.maximum(np.sqrt((rays * rays).sum(axis=0)), 1e-12)
-        out[k] = cast_rays(source, rays / distance, casters, distance * (1.0 - _SHADOW_BIAS))[1] < 0
+        out[k] = cast_rays(source, rays / distance, casters, distance * (1.0 - SHADOW_BIAS))[1] < 0
     return out
 
 

@@ -217,7 +217,7 @@ def fault(name: str) -> Contract:
 
 def field(name: str) -> Contract:
     from edge_server.fields import Budget, FitReport
-    from edge_server.fields.common.trainer_settings import FieldSettings
+    from edge_server.fields.common.settings import FieldSettings
     from edge_server.fields.registry import make_field, settings_of
 
     def use(made: Any, given: list[Any]) -> Any:

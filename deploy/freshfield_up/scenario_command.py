@@ -116,14 +116,14 @@ def checked(scenario: Scenario) -> list[str]:
 
 
 def _keys(args: argparse.Namespace) -> int:
-    from freshfield_up import keys
+    from freshfield_up import scenario_keys
 
-    print(keys.text(args.section, args.name))
+    print(scenario_keys.text(args.section, args.name))
     return 0
 
 
 def _schema(_: argparse.Namespace) -> int:
-    from freshfield_up import keys
+    from freshfield_up import scenario_keys
 
-    print(json.dumps(keys.schema(), indent=2))
+    print(json.dumps(scenario_keys.schema(), indent=2))
     return 0

@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import Any
 
 from edge_server.fields import Field
-from edge_server.fields.common import trainer_settings
+from edge_server.fields.common import settings as field_settings
 from freshfield import plugins
 
 _PACKAGES = ("ngp", "nerfacto", "tensorf", "splat")
@@ -25,7 +25,7 @@ def field_names() -> tuple[str, ...]:
 
 def option_help(name: str) -> dict[str, str]:
     """Option -> what it means. ValueError: unknown representation."""
-    return trainer_settings.option_help(_settings_class(name))
+    return field_settings.option_help(_settings_class(name))
 
 
 def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 0) -> Field:
@@ -51,13 +51,13 @@ def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 
 
 def settings_of(name: str, options: Mapping[str, Any] | None = None, seed: int = 0) -> Any:
     """The settings that these options result in, with defaults. ValueError as ``make_field``."""
-    return trainer_settings.settings_from(_settings_class(name), options or {}, seed)
+    return field_settings.settings_from(_settings_class(name), options or {}, seed)
 
 
 def _settings_class(name: str) -> Any:
     if name in _PACKAGES:
         return import_module(f"edge_server.fields.{name}.settings").SETTINGS
     found = getattr(plugins.find("field", name, _PACKAGES), "Settings", None)
-    if not (isinstance(found, type) and issubclass(found, trainer_settings.FieldSettings)):
+    if not (isinstance(found, type) and issubclass(found, field_settings.FieldSettings)):
         raise plugins.PluginError(f"field {name}: expected an attribute Settings, a subclass of FieldSettings")
     return found

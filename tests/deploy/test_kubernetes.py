@@ -13,7 +13,7 @@ import yaml
 import camera_node.cli
 import channel_emu.cli
 import edge_server.cli
-from edge_server.live.keys import make_keys
+from edge_server.live.keys_command import make_keys
 from freshfield.scenario import load
 from tests.conftest import ROOT
 

@@ -22,8 +22,8 @@ from freshfield.scenario import SCENARIO_FOLDER, load
 from freshfield.settings import Settings
 from freshfield.untrusted import read_yaml
 from freshfield_up.cli import main
-from freshfield_up.keys import schema
 from freshfield_up.scenario_command import checked
+from freshfield_up.scenario_keys import schema
 from tests.conftest import data_dir
 from tests.integration.own_classes import Darker, Flat, LastFirst, Late, Turning, Youngest
 from tests.support import refusal

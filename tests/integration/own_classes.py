@@ -10,7 +10,7 @@ from camera_node.sources.base import Shot, Source
 from camera_node.synthetic.effects import EffectParameters
 from channel_emu.model.link import Fault
 from edge_server.fields import FitReport, Rendering
-from edge_server.fields.common.trainer_settings import FieldSettings
+from edge_server.fields.common.settings import FieldSettings
 from edge_server.scheduler import Policy
 from freshfield.geometry import Pinhole, Pose, look_at
 from freshfield.settings import Settings, within

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.settings import SAME_SHAPE
 from camera_node.sources.datasets.imaging import composite, image_size, read_image, resize, shrink
 from camera_node.sources.datasets.lens import Lens, exact, pinhole, undistort
 from camera_node.sources.datasets.records import (
@@ -23,6 +22,7 @@ from camera_node.sources.datasets.records import (
     file_within,
     missing_note,
 )
+from camera_node.sources.datasets.settings import SAME_SHAPE
 from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pose

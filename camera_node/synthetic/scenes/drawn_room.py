@@ -19,8 +19,9 @@ from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.person import make_walk, walking_person
 from camera_node.synthetic.placement import Part, at
 from camera_node.synthetic.render import World
-from camera_node.synthetic.scene import MAX_CAMERAS, MovingParams, Scene, pinhole
+from camera_node.synthetic.scene import Scene, pinhole
 from camera_node.synthetic.scenes.shell import room_shell
+from camera_node.synthetic.settings import MAX_CAMERAS, MovingParams
 from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Shape, Sphere
 from freshfield.geometry import Array
 from freshfield.settings import within

@@ -16,8 +16,9 @@ from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.person import Walk, make_walk, walking_person
 from camera_node.synthetic.placement import MovingBody, Part, at, facing
 from camera_node.synthetic.render import World
-from camera_node.synthetic.scene import Fov, MovingParams, Scene, pinhole
+from camera_node.synthetic.scene import Scene, pinhole
 from camera_node.synthetic.scenes.shell import room_shell
+from camera_node.synthetic.settings import Fov, MovingParams
 from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere
 from freshfield.geometry import Array
 

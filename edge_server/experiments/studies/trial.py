@@ -212,10 +212,7 @@ def run_points(points: Sequence[Point], request: StudyRequest) -> list[Row]:
             files=lambda trial: _files(trial, request.folders),
             group=lambda trial: (trial.stage, trial.field, repr(trial.field_options), trial.seed),
         )
-    return [
-        {**p.labels, "seed": p.trial.seed, **r, "f_w": f_w(r), "f_w_corrected": f_w(r, corrected=True)}
-        for p, r in zip(points, results)
-    ]
+    return [{**p.labels, "seed": p.trial.seed, **r, **f_w(r)} for p, r in zip(points, results)]
 
 
 def _files(trial: Trial, folders: Folders) -> list[Path]:

@@ -14,9 +14,9 @@ from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.kernels.plane_sweep import MOST_VIEWS, NOT_SEEN, SEES, UNMARKED, score_cells, sweep_rays
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import SceneBox, plain_background
+from edge_server.fields.common.settings import FieldSettings
 from edge_server.fields.common.supervision import pack_cameras, supervising_views
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.fields.common.trainer_settings import FieldSettings
 
 TOLERANCE = 0.08  # between colors, summed over channels: with more, walls are found where there are none
 GUIDE_CELLS = 96  # a side: finer cells hardly guide better, and cost their cube

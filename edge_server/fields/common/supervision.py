@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.common.trainer_settings import CHANGE, MARGIN_PX
+from edge_server.fields.common.settings import CHANGE, MARGIN_PX
 from freshfield.geometry import GeometryError, Pinhole, Pose, invertible
 from freshfield.limits import MAX_CENTER_OUTSIDE_SIDES
 

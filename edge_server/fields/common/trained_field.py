@@ -28,9 +28,7 @@ from edge_server.fields.common.kernels.volume_rendering import Weights
 from edge_server.fields.common.occupancy_grid import EVERY, OccupancyGrid
 from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.scene_box import UNIT_BOX, SceneBox
-from edge_server.fields.common.stepped_field import Step, SteppedField
-from edge_server.fields.common.supervision import supervising_views
-from edge_server.fields.common.trainer_settings import (
+from edge_server.fields.common.settings import (
     BATCH,
     BETA1_FIELD,
     BETA2,
@@ -39,6 +37,8 @@ from edge_server.fields.common.trainer_settings import (
     NOMINAL_RAYS,
     SWEEP_SHARE,
 )
+from edge_server.fields.common.stepped_field import Step, SteppedField
+from edge_server.fields.common.supervision import supervising_views
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer, step_key, step_length
 from edge_server.fields.common.view_store import Arrays, same_views
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from edge_server.fields import Budget
-from edge_server.fields.common.trainer_settings import TrainerSettings
+from edge_server.fields.common.settings import TrainerSettings
 
 LATE = 1.1  # times a budget in seconds: a fit may end so late rather than make no step
 

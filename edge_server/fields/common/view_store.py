@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import SceneBox, plain_background, scene_box
+from edge_server.fields.common.settings import FINAL_BOX_CAMERAS, FieldSettings
 from edge_server.fields.common.supervision import CameraMemory, check_view, pack_views, remember_views
-from edge_server.fields.common.trainer_settings import FINAL_BOX_CAMERAS, FieldSettings
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]

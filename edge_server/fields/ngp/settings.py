@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from edge_server.fields.common.trainer_settings import TrainerSettings
+from edge_server.fields.common.settings import TrainerSettings
 from freshfield.settings import within
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from edge_server.fields.common.trainer_settings import FieldSettings, ShDegree
+from edge_server.fields.common.settings import FieldSettings, ShDegree
 from freshfield.settings import about, within
 
 # Seeding: scale of new Gaussians in distances to their neighbors, their opacity, and pixels tried for each,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from edge_server.fields.common.trainer_settings import TrainerSettings
+from edge_server.fields.common.settings import TrainerSettings
 from freshfield.settings import about
 
 FINEST = 256  # vertices a side by default: finer planes outgrow the second-level cache

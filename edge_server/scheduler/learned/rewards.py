@@ -96,14 +96,15 @@ REWARDS = {
 }
 
 
-def f_w(row: Mapping[str, Any], corrected: bool = False) -> float | None:
-    """F_w of (6.36) and (6.37), smaller is better; ages in slots of 1 ms. None where a metric is missing.
+def f_w(row: Mapping[str, Any]) -> dict[str, float | None]:
+    """``f_w``: F_w of (6.36) and (6.37); ``f_w_corrected``: with the sign of SSIM turned. Smaller is better. Ages in
+    slots of 1 ms; None where a metric is missing.
 
     row: with psnr_db, ssim, lpips and aaoi_ms.
-    corrected: with the sign of SSIM turned.
     """
-    found = REWARDS["corrected" if corrected else "thesis"].of(SimpleNamespace(**row))
-    return -found.total if found.complete and found.total is not None else None
+    found = {"f_w": REWARDS["thesis"].of(SimpleNamespace(**row))}
+    found["f_w_corrected"] = REWARDS["corrected"].of(SimpleNamespace(**row))
+    return {name: -r.total if r.complete and r.total is not None else None for name, r in found.items()}
 
 
 def make_reward(name: str = "corrected", fidelity: str = "whole", **others: Any) -> Reward:

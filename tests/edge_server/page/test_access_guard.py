@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import websocket
 
-from edge_server.live.keys import make_keys
+from edge_server.live.keys_command import make_keys
 from edge_server.live.output import guarded_http
 from edge_server.live.output.prometheus import serve_metrics
 from edge_server.page import Page, access_guard, start_page

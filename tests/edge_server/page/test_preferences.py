@@ -94,6 +94,7 @@ def test_bad_requests_change_nothing(asked, body, status):
     assert found == status and len(text.splitlines()) == 1 and not kept
     turn = state(url)["turn"]
     assert request(url, "POST", "/answer", {"turn": turn, "choice": "both"})[0] == 404 and not kept
+    assert request(url, "POST", "/answer", b"{}", **{"Content-Length": "two"})[0] == 413
 
 
 def test_who_sends_without_end_is_cut_off(asked, monkeypatch):

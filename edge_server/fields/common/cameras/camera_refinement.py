@@ -20,7 +20,7 @@ from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.kernels.train import Batch
 from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.common.trainer_settings import TrainerSettings
+from edge_server.fields.common.settings import TrainerSettings
 
 Array = NDArray[np.float64]
 

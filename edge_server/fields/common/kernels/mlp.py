@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function
-from edge_server.fields.common.trainer_settings import FIRST_DENSITY
+from edge_server.fields.common.settings import FIRST_DENSITY
 
 BLOCK = 256
 # Columns that rows of activations have beyond those that are used. Rows at a distance of a power of two would all lie

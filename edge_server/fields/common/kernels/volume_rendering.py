@@ -12,7 +12,7 @@ import numpy as np
 
 from edge_server.fields.common.kernels.jit import device_function
 from edge_server.fields.common.kernels.simd import exp32, is_finite
-from edge_server.fields.common.trainer_settings import GUIDE_REACH
+from edge_server.fields.common.settings import GUIDE_REACH
 
 # Raw density is clamped before the exponential, forward and backward alike: the largest density makes one
 # step opaque many times over, the smallest makes a whole ray transparent.

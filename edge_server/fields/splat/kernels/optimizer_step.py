@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.camera import SIZE, load_camera
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import draw, is_finite, log32
-from edge_server.fields.common.trainer_settings import BETA1, BETA2
+from edge_server.fields.common.settings import BETA1, BETA2
 from edge_server.fields.splat.kernels.project import BASE, BLOCK, COLOR, OPACITY, POSITION, QUATERNION, RADIUS, SCALE
 from edge_server.fields.splat.kernels.project_backward import (
     GRADIENT,

@@ -84,7 +84,7 @@ def test_the_library_moves_stops_and_servos_the_arm(control, receive):
     assert np.allclose(_joints(receive), HOME_RAD, atol=1e-9)
 
 
-@pytest.mark.parametrize("wrong", ["beyond", "not simulated", "kinematics"])
+@pytest.mark.parametrize("wrong", ["beyond", "not simulated", "kinematics", "watchdog"])
 def test_what_it_cannot_do_stops_the_program_and_is_not_called_done(control, receive, wrong):
     """As a fault does on a real one."""
     before = receive.getActualQ()
@@ -93,6 +93,8 @@ def test_what_it_cannot_do_stops_the_program_and_is_not_called_done(control, rec
         done = False
     elif wrong == "not simulated":
         done = control.moveL([0.2, 0.2, 0.2, 0.0, 3.0, 0.0], 0.1, 0.5)
+    elif wrong == "watchdog":
+        done = control.setWatchdog(0.0)
     else:
         done = control.moveJ([99.0, *before[1:]], 1.0, 4.0)
     assert not done and not control.isProgramRunning()

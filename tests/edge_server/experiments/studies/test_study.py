@@ -67,7 +67,7 @@ def verdicts(name: str, tmp_path: Path, rule: Callable[[Any], dict[str, Any]], s
     """Of a study of trials on ``room`` whose results follow a rule."""
     points = STUDIES[name].cases(request(tmp_path, seeds=seeds, scenes=("room",)))
     rows = [{**p.labels, "seed": p.trial.seed, **rule(p.trial)} for p in points]
-    table = SeedTable([{**row, "f_w": f_w(row), "f_w_corrected": f_w(row, corrected=True)} for row in rows])
+    table = SeedTable([{**row, **f_w(row)} for row in rows])
     return judge(STUDIES[name], table)
 
 

@@ -118,8 +118,8 @@ def test_the_reward_of_sets_is_519():
 def test_the_reward_of_waiting_is_minus_f_w():
     expected = 0.015 * 60 - 0.02 * 25 + 0.2 * 0.9 + 0.3 * 0.2  # (6.36), (6.37) as printed
     row = {"psnr_db": 25.0, "ssim": 0.9, "lpips": 0.2, "aaoi_ms": 60.0}
-    assert f_w(row) == pytest.approx(expected)
-    assert f_w({**row, "lpips": None}) is None
+    assert f_w(row) == pytest.approx({"f_w": expected, "f_w_corrected": expected - 2 * 0.2 * 0.9})
+    assert f_w({**row, "lpips": None})["f_w"] is None
     assert make_reward("thesis").of(outcome()).total == pytest.approx(-expected)
     corrected = make_reward().of(outcome())
     assert corrected.total == pytest.approx(-expected + 2 * 0.2 * 0.9)

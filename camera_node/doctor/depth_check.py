@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.doctor import settings as tuned
 from camera_node.settings import SourceConfig
 from camera_node.sources.base import pixels
 from camera_node.sources.registry import open_sources
@@ -21,20 +22,6 @@ from camera_node.sources.with_effects import camera_effects
 from freshfield.depth import USUAL_M, DepthImage
 from freshfield.geometry import Array, Pinhole, Pose, se3_inverse, seen_from
 from freshfield.scenario import Scenario
-
-_MOST_POINTS = 4000  # of a camera's that are looked for: the share that agrees is then known to a percent
-_FEWEST_POINTS, _FEWEST_EDGES = 100, 200  # of which anything is said
-_SAME = 0.05  # relative difference of depths of one surface: the errors of sensors and poses are 1 to 2 %
-_AGREES = 0.75  # least share of points that agree; measured: 0.86 to 1 where depth is right
-_OVERLAPS = 0.2  # least share, of the points in each other's image, that another unit has to make agree
-_FACTORS = (1e-3, 1e-2, 0.1, 0.3048, 1 / 0.3048, 10.0, 100.0, 1e3)  # of mistaken units: mm, cm, dm, feet
-_CONSTANT = 0.95  # share of one number among those measured
-_LEAST_MEASURED = 0.02  # share of the pixels
-_JUMP = 0.1  # of inverse depth between neighbors, relative to the nearer one: an edge
-_BESIDE = 0.06  # distance from edges to where the image is compared with them, of its width
-# Least contrast of the image at edges of depth, over that beside them. Measured: 1.16 to 2.2 in the room, the
-# path-traced kitchen and a Kinect's recording; with another camera's depth 0.74 to 1.14, mostly below 1.05.
-_LEAST_CONTRAST = 1.05
 
 
 @dataclass(frozen=True)
@@ -89,11 +76,11 @@ def check(view: DepthView, others: Sequence[DepthView]) -> str:
     counts, meters = view.depth.counts, view.depth.meters()
     measured = counts > 0
     said = f"{counts.shape[1]} x {counts.shape[0]}, {1.0 - measured.mean():.0%} without depth"
-    if measured.mean() < _LEAST_MEASURED:
+    if measured.mean() < tuned.DEPTH_LEAST_MEASURED:
         raise ValueError(f"{said}: is the scene within the sensor's range and lit, is the lens free?")
     near, middle, far = np.quantile(meters[measured], (0.05, 0.5, 0.95))
     said += f", {near:.2g} to {far:.2g} m"
-    if np.bincount(counts[measured]).max() > _CONSTANT * measured.sum():
+    if np.bincount(counts[measured]).max() > tuned.DEPTH_CONSTANT * measured.sum():
         raise ValueError(f"{said}: nearly all of it is the same, {middle:.3g} m: does the sensor measure at all?")
     if not USUAL_M[0] <= middle <= USUAL_M[1]:
         raise ValueError(f"{said}: is the unit wrong?")
@@ -101,11 +88,11 @@ def check(view: DepthView, others: Sequence[DepthView]) -> str:
     known = {camera: share for camera, share in shares.items() if share is not None}
     if known:
         best, share = max(known.items(), key=lambda pair: pair[1])
-        if share < _AGREES:
+        if share < tuned.DEPTH_AGREES:
             raise ValueError(f"{said}: {share:.0%} of it agrees with {best}'s: {_explained(view, others)}")
         return f"{said}, {share:.0%} of it agrees with {best}'s"
     contrast = edge_contrast(view)
-    if contrast is not None and contrast < _LEAST_CONTRAST:
+    if contrast is not None and contrast < tuned.DEPTH_LEAST_CONTRAST:
         raise ValueError(
             f"{said}: its edges are not those of the image (contrast {contrast:.2f} of that beside them): is it "
             "registered to this image, of this instant, not mirrored?"
@@ -115,11 +102,11 @@ def check(view: DepthView, others: Sequence[DepthView]) -> str:
 
 def _explained(view: DepthView, others: Sequence[DepthView]) -> str:
     """What would make depth agree: another unit of this camera's, of another's or of all; else it is something else."""
-    for factor in _FACTORS:
+    for factor in tuned.DEPTH_FACTORS:
         for own, theirs in ((factor, 1.0), (1.0, factor), (factor, factor)):
             for other in others:
                 share, least_same = _agreement(view.scaled(own), other.scaled(theirs))
-                if (share or 0.0) >= _AGREES and least_same >= _OVERLAPS:
+                if (share or 0.0) >= tuned.DEPTH_AGREES and least_same >= tuned.DEPTH_OVERLAPS:
                     whose = other.camera if own == 1.0 else view.camera if theirs == 1.0 else "both cameras"
                     return f"that of {whose} seems to be {1.0 / factor:.3g} times what it should be: is the unit wrong?"
     return "is the pose, a lens, the scale or the instant of one of them wrong, or are near and far exchanged?"
@@ -130,7 +117,7 @@ def _agreement(a: DepthView, b: DepthView) -> tuple[float | None, float]:
     and the share of all points, of the camera with fewer of them on the other's surfaces."""
     same, through, hidden = np.array([_compared(a, b), _compared(b, a)]).T
     count = int((same + through).sum())
-    share = None if count < _FEWEST_POINTS else float(same.sum()) / count
+    share = None if count < tuned.DEPTH_FEWEST_POINTS else float(same.sum()) / count
     return share, float((same / np.maximum(1, same + through + hidden)).min())
 
 
@@ -138,14 +125,14 @@ def _compared(a: DepthView, b: DepthView) -> tuple[int, int, int]:
     """How many of a's points lie on b's surfaces, in front of them, and behind them."""
     chosen = a.depth.counts > 0
     places = np.flatnonzero(chosen)
-    chosen.flat[places[np.arange(places.size) % max(1, places.size // _MOST_POINTS) > 0]] = False
+    chosen.flat[places[np.arange(places.size) % max(1, places.size // tuned.DEPTH_MOST_POINTS) > 0]] = False
     lens, place = b.sensor()
     a_to_b = se3_inverse(a.pose.matrix()) @ b.pose.matrix() @ place
     points, at, seen = seen_from(lens, a_to_b, a.points(chosen))
     column, row = at[seen].astype(np.int64).T
     depth, surface = points[seen, 2], b.depth.meters()[row, column]
     ratio = depth[surface > 0.0] / surface[surface > 0.0]
-    through, hidden = int((ratio < 1.0 - _SAME).sum()), int((ratio > 1.0 + _SAME).sum())
+    through, hidden = int((ratio < 1.0 - tuned.DEPTH_SAME).sum()), int((ratio > 1.0 + tuned.DEPTH_SAME).sum())
     return len(ratio) - through - hidden, through, hidden
 
 
@@ -158,7 +145,7 @@ def edge_contrast(view: DepthView) -> float | None:
     gray = cv2.GaussianBlur(cv2.cvtColor(view.image[..., :3], cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
     gradient = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
     gradient = cv2.dilate(gradient, np.ones((3, 3)))  # depth and image may be a pixel apart
-    step = max(3, round(_BESIDE * width))
+    step = max(3, round(tuned.DEPTH_BESIDE * width))
     shifts = [(dx * step, dy * step) for dx in (0, 1, -1) for dy in (0, 1, -1)]
     found = []
     for shift in shifts:
@@ -166,7 +153,7 @@ def edge_contrast(view: DepthView) -> float | None:
         moved = moved[((moved >= 0) & (moved < (width, height))).all(axis=1)]
         found.append(gradient[moved[:, 1], moved[:, 0]])
     beside = float(np.concatenate(found[1:]).mean()) if found[0].size else 0.0
-    return float(found[0].mean()) / beside if found[0].size >= _FEWEST_EDGES and beside > 0.0 else None
+    return float(found[0].mean()) / beside if found[0].size >= tuned.DEPTH_FEWEST_EDGES and beside > 0.0 else None
 
 
 def _edges(meters: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -176,7 +163,7 @@ def _edges(meters: NDArray[np.float32]) -> NDArray[np.bool_]:
     for rows, out in ((inverse, edges), (inverse.T, edges.T)):
         a, b = rows[:, :-1], rows[:, 1:]
         with np.errstate(invalid="ignore"):
-            jumps = np.abs(a - b) > _JUMP * np.maximum(a, b)  # nothing, where one is NaN
+            jumps = np.abs(a - b) > tuned.DEPTH_JUMP * np.maximum(a, b)  # nothing, where one is NaN
             out[:, :-1] |= jumps & (a > b)
             out[:, 1:] |= jumps & (b > a)
     return edges

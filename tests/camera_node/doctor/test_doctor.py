@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import yaml
 
-from camera_node import coverage_check, doctor, pose_check
 from camera_node.cli import main
-from camera_node.depth_check import DepthView, check, first_views
+from camera_node.doctor import coverage_check, doctor_command, pose_check
+from camera_node.doctor.depth_check import DepthView, check, first_views
 from camera_node.settings import source_config
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.depth import DepthRenderer
@@ -65,9 +65,9 @@ def test_every_fault_is_named_in_one_call(capsys, monkeypatch, tmp_path, host):
     def broken():
         raise RuntimeError("adjtimex failed\nlast error 5")
 
-    monkeypatch.setattr(doctor, "_clock", broken)
-    monkeypatch.setattr(doctor, "LEAST_FREE_GB", 1e9)
-    monkeypatch.setattr(doctor, "_PACKAGES", {"ur": (("nowhere", "ur-rtde"),)})
+    monkeypatch.setattr(doctor_command, "_clock", broken)
+    monkeypatch.setattr(doctor_command.tuned, "LEAST_FREE_GB", 1e9)
+    monkeypatch.setattr(doctor_command, "_PACKAGES", {"ur": (("nowhere", "ur-rtde"),)})
     scenario = cell_at(tmp_path, host, cameras={"hand": "none.yaml"})
     code, parts = examined(capsys, scenario, "--to", "127.0.0.1:9")
     assert code == 1 and parts["clock"] == (False, "RuntimeError: adjtimex failed last error 5")
@@ -104,7 +104,7 @@ def test_a_camera_at_a_fraction_of_the_rate_that_was_asked_for_is_wrong(capsys, 
 
 async def test_a_peer_tells_its_time():
     peer = await Peer(clock=ClockAhead(3_000_000_000)).start()
-    found, bound = await doctor._exchange(peer.address, Transport())
+    found, bound = await doctor_command._exchange(peer.address, Transport())
     await peer.stop()
     assert abs(found - 3000.0) <= bound + 1.0
 

@@ -10,7 +10,7 @@ import pytest
 from grpc_health.v1 import health, health_pb2_grpc
 
 from edge_server.cli import main
-from edge_server.live.keys import make_keys
+from edge_server.live.keys_command import make_keys
 from freshfield.transport import Transport, TransportError, add_arguments, from_arguments
 from tests.deploy.test_up import healthy
 from tests.freshfield.test_access import Every

@@ -24,9 +24,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from camera_node.doctor import settings as tuned
 from camera_node.pose.providers import Closable, PoseGapError
 from camera_node.settings import (
-    LIVE_FPS,
     ArmConfig,
     LiveConfig,
     McapConfig,
@@ -38,19 +38,13 @@ from camera_node.settings import (
 )
 from camera_node.sources.base import rate
 from camera_node.sources.devices.feed import Image
+from camera_node.sources.devices.settings import LIVE_FPS
 from freshfield import transport
 from freshfield.clock import WallClock
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, load
 
-LEAST_FREE_GB = 2.0
-_EXCHANGES = 8
-_ANSWER_S = 2.0
-_LISTEN_S = 1.0  # to a camera; in half of it, one late frame changes the rate by a third
-_LISTEN_AT_MOST_S = 3.0  # to a slow camera
-_JUDGED_FRAMES = 5  # least number of expected frames for judging the rate; with fewer, chance decides
-_LEAST_RATE = 0.6
 # extra -> (module, distribution)
 _PACKAGES = {
     "oak": (("depthai", "depthai"),),
@@ -159,14 +153,14 @@ def _source(scenario: Scenario, config: SourceConfig, data: Path | None, plan: P
         told = "not reckoned: a recording is read once, from its beginning; the page tells it during a run"
         yield CheckResult("coverage", None, told)
     else:
-        from camera_node import coverage_check
+        from camera_node.doctor import coverage_check
 
         yield _check("coverage", coverage_check.check, scenario, config, data, plan)
 
 
 def _depth(scenario: Scenario, config: SourceConfig, data: Path | None) -> Iterator[CheckResult]:
     """The depth of each camera that measures it; nothing if none does."""
-    from camera_node import depth_check
+    from camera_node.doctor import depth_check
 
     try:
         views = depth_check.first_views(scenario, config, data)
@@ -202,7 +196,7 @@ def _data(scenario: Scenario, config: RecordedConfig, data: Path | None) -> str:
 
 
 def _poses(scenario: Scenario, config: RecordedConfig, data: Path | None) -> str:
-    from camera_node import pose_check
+    from camera_node.doctor import pose_check
 
     return pose_check.check(scenario, config, data) or "not compared: no camera moves for 20 captures"
 
@@ -247,8 +241,8 @@ def _disk(out: Path) -> str:
     with tempfile.NamedTemporaryFile(dir=place) as file:
         file.write(b"\0")
     free_gb = shutil.disk_usage(place).free / 1e9
-    if free_gb < LEAST_FREE_GB:
-        raise ValueError(f"{place}: {free_gb:.1f} GB free: make room for {LEAST_FREE_GB:g} GB, or choose --out")
+    if free_gb < tuned.LEAST_FREE_GB:
+        raise ValueError(f"{place}: {free_gb:.1f} GB free: make room for {tuned.LEAST_FREE_GB:g} GB, or choose --out")
     return f"{place}: {free_gb:.0f} GB free, can be written to"
 
 
@@ -256,7 +250,7 @@ def _network(to: str, security: transport.Transport) -> str:
     host, port = transport.host_port(to)
     try:
         begin = time.perf_counter()
-        socket.create_connection((host, port), _ANSWER_S).close()
+        socket.create_connection((host, port), tuned.ANSWER_S).close()
         connect_ms = 1e3 * (time.perf_counter() - begin)
     except OSError as error:
         raise ValueError(
@@ -281,8 +275,8 @@ async def _exchange(target: str, security: transport.Transport) -> tuple[float, 
     estimator, clock = OffsetEstimator(), WallClock()
     async with security.aio_channel(target) as channel:
         try:
-            for _ in range(_EXCHANGES):
-                await exchange(channel, security.metadata(), clock, estimator, _ANSWER_S)
+            for _ in range(tuned.EXCHANGES):
+                await exchange(channel, security.metadata(), clock, estimator, tuned.ANSWER_S)
         except grpc.RpcError as error:
             raise ValueError(
                 f"{target} takes connections but does not speak with us ({error.code().name.lower()}): "  # type: ignore[attr-defined]
@@ -318,7 +312,7 @@ def _tracker(scenario: Scenario, config: TrajectoryConfig) -> str:
     poses = trajectory_poses(scenario, config, scenario.cameras, scenario.path.parent, live=True)
     clock, said = WallClock(), []
     try:
-        time.sleep(_LISTEN_S)
+        time.sleep(tuned.LISTEN_S)
         for camera, tracked in poses.items():
             _, gap_ns = tracked.at(clock.now_ns())
             said.append(f"{camera}: a pose {gap_ns / 1e6:.0f} ms from now")
@@ -337,7 +331,7 @@ def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
 
     clock = WallClock()
     asked_hz = config.fps or LIVE_FPS
-    listen_s = min(max(_LISTEN_S, _JUDGED_FRAMES / asked_hz), _LISTEN_AT_MOST_S)
+    listen_s = min(max(tuned.LISTEN_S, tuned.JUDGED_FRAMES / asked_hz), tuned.LISTEN_AT_MOST_S)
     measured: tuple[Image, DepthImage] | None = None
     feed = open_feed(camera, config, rate(asked_hz), clock)
     try:
@@ -346,7 +340,7 @@ def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
             raise ValueError(f"it opened, but sent no frame for {config.first_frame_s:g} s")
         ages_ms, begin_s = [], time.monotonic()
         while (spent_s := time.monotonic() - begin_s) < listen_s:
-            taken = feed.grab(_LISTEN_S)
+            taken = feed.grab(tuned.LISTEN_S)
             if taken is not None:
                 ages_ms.append((clock.now_ns() - taken[0]) / 1e6)
                 if feed.depth is not None:
@@ -362,7 +356,7 @@ def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
     else:
         known = f"f = {lens.fx:.0f} px"
     rate_hz = len(ages_ms) / spent_s
-    if rate_hz < _LEAST_RATE * asked_hz and asked_hz * spent_s >= _JUDGED_FRAMES:
+    if rate_hz < tuned.LEAST_RATE * asked_hz and asked_hz * spent_s >= tuned.JUDGED_FRAMES:
         raise ValueError(
             f"{width} x {height}, but {rate_hz:.3g} frames a second of the {asked_hz:g} asked: is it too "
             "dark (more light, or a shorter exposure_us), is it on USB 2 (another port or cable), can it do "
@@ -370,7 +364,7 @@ def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
         )
     age = f", {sum(ages_ms) / len(ages_ms):.0f} ms old when they come" if ages_ms else ""
     if measured is not None and lens is not None:
-        from camera_node.depth_check import DepthView, check
+        from camera_node.doctor.depth_check import DepthView, check
 
         anywhere = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         known += f"; depth {check(DepthView(camera, measured[0], lens, anywhere, measured[1]), [])}"

@@ -1,0 +1,34 @@
+"""Numbers of what the doctor says."""
+
+LEAST_FREE_GB = 2.0
+EXCHANGES = 8
+ANSWER_S = 2.0
+LISTEN_S = 1.0  # to a camera; in half of it, one late frame changes the rate by a third
+LISTEN_AT_MOST_S = 3.0  # to a slow camera
+JUDGED_FRAMES = 5  # least number of expected frames for judging the rate; with fewer, chance decides
+LEAST_RATE = 0.6
+
+# --- a camera's depth ---
+DEPTH_MOST_POINTS = 4000  # of a camera's that are looked for: the share that agrees is then known to a percent
+DEPTH_FEWEST_POINTS, DEPTH_FEWEST_EDGES = 100, 200  # of which anything is said
+DEPTH_SAME = 0.05  # relative difference of depths of one surface: the errors of sensors and poses are 1 to 2 %
+DEPTH_AGREES = 0.75  # least share of points that agree; measured: 0.86 to 1 where depth is right
+DEPTH_OVERLAPS = 0.2  # least share, of the points in each other's image, that another unit has to make agree
+DEPTH_FACTORS = (1e-3, 1e-2, 0.1, 0.3048, 1 / 0.3048, 10.0, 100.0, 1e3)  # of mistaken units: mm, cm, dm, feet
+DEPTH_CONSTANT = 0.95  # share of one number among those measured
+DEPTH_LEAST_MEASURED = 0.02  # share of the pixels
+DEPTH_JUMP = 0.1  # of inverse depth between neighbors, relative to the nearer one: an edge
+DEPTH_BESIDE = 0.06  # distance from edges to where the image is compared with them, of its width
+# Least contrast of the image at edges of depth, over that beside them. Measured: 1.16 to 2.2 in the room, the
+# path-traced kitchen and a Kinect's recording; with another camera's depth 0.74 to 1.14, mostly below 1.05.
+DEPTH_LEAST_CONTRAST = 1.05
+
+# --- do a carried camera's poses move as its images do? ---
+POSES_CAPTURES, POSES_LEAST_CAPTURES = 100, 20  # captures that are compared; fewer shifts correlate by chance
+POSES_WIDTH_PX = 80  # of the compared images: enough for shifts of a tenth of a pixel, and 0.3 s for all of them
+POSES_LARGEST_LAG, POSES_LAG_STEP = 4, 0.25  # captures by which poses are tried to be late or early
+POSES_MOVE_PX = 0.1  # standard deviation of shifts below which nothing can be told from them
+# Right poses of redkitchen and handheld correlate by .90 and .97; late by 100 ms they gain .05 and more at their lag.
+POSES_AGREE, POSES_GAIN = 0.7, 0.03
+POSES_LATE_MS = 60.0  # least delay that is said: what is found is off by up to 25
+POSES_FAST_M_PER_S = 10.0  # nobody carries a camera so fast: another unit
