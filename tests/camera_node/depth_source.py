@@ -4,6 +4,8 @@ from fractions import Fraction
 
 import numpy as np
 
+from camera_node.capture import Camera, ShotCache
+from camera_node.settings import WorldConfig
 from camera_node.sources.base import Shot, Source
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
@@ -34,3 +36,9 @@ class DepthSource(Source):
         if self._error is not None:
             raise self._error
         return super().depth(content, shot)
+
+
+def depth_camera(every: int, contents: int | None = None, cache: ShotCache | None = None, **depth) -> Camera:
+    """One in ``every`` of its shots is to bring depth."""
+    source = DepthSource("cam01", contents, **depth)
+    return Camera(source, WorldConfig(kind="world"), cache or ShotCache(10**6), depth_every=every)

@@ -18,7 +18,7 @@ from camera_node.cli import main
 from camera_node.node import Node, NodeOptions
 from camera_node.outbox import Outbox
 from camera_node.sender import Sender
-from camera_node.settings import CameraConfig, WorldConfig, find_data, source_config
+from camera_node.settings import CameraConfig, find_data, source_config
 from camera_node.sources.base import Shot, Source
 from freshfield import ledger
 from freshfield.clock import VirtualClock
@@ -27,7 +27,7 @@ from freshfield.geometry import Pinhole
 from freshfield.scenario import ScenarioError, load, parse
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
-from tests.camera_node.depth_source import LENS, POSE, DepthSource
+from tests.camera_node.depth_source import LENS, POSE, DepthSource, depth_camera
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 from tests.integration.peer import Peer, answer, silence
 from tests.support import refusal, refused, until
@@ -124,8 +124,7 @@ async def test_the_time_allowed_for_an_answer_doubles_after_each_timeout_up_to_i
 
 
 def test_a_node_that_reached_nobody_ends_with_1(capsys):
-    words = ["run", "tile", "--camera", "cam01", "--to", NOBODY, "--seconds", "0.2", "--quiet"]
-    assert main(words) == 1
+    assert main(["run", "tile", "--camera", "cam01", "--to", NOBODY, "--seconds", "0.2", "--quiet"]) == 1
     assert f"camera-node: {NOBODY} was never reached: " in capsys.readouterr().err
 
 
@@ -146,11 +145,6 @@ def test_preparing_fills_what_fits_until_it_is_told_to_stop(tmp_path, cache, cac
     prepare(cameras, lambda: next(asked))
     assert sum(cameras[0].cached(k) is not None for k in range(3)) == cached
     assert len(cameras[1].capture(5).payload) > 0  # with or without
-
-
-def depth_camera(every: int, contents: int | None = None, cache: ShotCache | None = None, **depth) -> Camera:
-    source = DepthSource("cam01", contents, **depth)
-    return Camera(source, WorldConfig(kind="world"), cache or ShotCache(10**6), depth_every=every)
 
 
 @pytest.mark.parametrize(
@@ -275,9 +269,6 @@ def test_captures_that_are_held_out_are_left_out_and_the_others_counted_without_
     assert part.due_ns(after) == (between[-1] if between else min(due_ns for due_ns in own if due_ns > later_ns))
 
 
-VIDEO = {"kind": "video", "data": "x"}
-
-
 def config(**source):
     return source_config(parse({"cameras": {"count": 2}, "source": source}, Path("s.yaml")))
 
@@ -287,7 +278,7 @@ def test_errors_name_file_and_key():
         ({"kind": "wrold"}, "source.kind: .*'wrold'"),
         ({"kind": "world", "fbs": 3}, "source.fbs: unknown key; did you mean 'fps'"),
         ({"kind": "transforms", "data": "x", "background": "keep"}, "use png"),
-        ({**VIDEO, "trajectory": {"files": {}, "start_s": 1e300}}, "trajectory.start_s: expected"),
+        ({"kind": "video", "data": "x", "trajectory": {"files": {}, "start_s": 1e300}}, "trajectory.start_s: expected"),
         ({"kind": "world", "quality": 10**400}, "source.quality: expected .*1 to 100, got 10{99}"),
     ):
         assert str(refused(ScenarioError, message, config, **source)).startswith("s.yaml: source")

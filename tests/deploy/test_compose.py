@@ -15,8 +15,7 @@ BASE_IMAGE = "docker.io/library/python:3.11-slim-bookworm"
 
 
 def test_every_camera_of_the_scenario_has_its_container_and_only_the_page_is_published():
-    scenario = load(ROOT / "deploy" / "scenarios" / "quad.yaml")
-    assert set(CAMERAS) == set(scenario.cameras)
+    assert set(CAMERAS) == set(load("quad").cameras)
     for name, service in CAMERAS.items():
         assert re.search(rf"--camera {name}$", service["command"]) and service["environment"]["CAMERA"] == name
     published = {name: s["ports"] for name, s in SERVICES.items() if s.get("ports")}

@@ -34,7 +34,7 @@ from freshfield_up.processes import Child
 from freshfield_up.status import status_line, summarize
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde
 from tests.conftest import ROOT
-from tests.support import free_port, refused, wait_until
+from tests.support import alive, free_port, refused, wait_until
 
 SMALL = """
 name: small
@@ -339,24 +339,15 @@ time.sleep(60)
     command = [sys.executable, "-c", launcher, str(tmp_path / "log.txt")]
     with subprocess.Popen(command, cwd=deploy, stdout=subprocess.PIPE) as parent:
         pid = int(parent.stdout.readline())
-        assert Path(f"/proc/{pid}").exists()
+        assert alive(pid)
         parent.kill()
-
-    def ended() -> bool:
-        try:
-            return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
-        except FileNotFoundError:
-            return True
-
-    wait_until(ended, "the child outlived its parent")
-
-
-SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    wait_until(lambda: not alive(pid), "the child outlived its parent")
 
 
 def start(command: str, words: list[str], before: str = "", **streams: int) -> subprocess.Popen[bytes]:
     """The command as its installed script starts it. before: Python that runs first."""
-    module, _, function = SCRIPTS[command].partition(":")
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    module, _, function = scripts[command].partition(":")
     code = f"import sys; sys.argv = {[command, *words]}; {before}\nimport {module}; sys.exit({module}.{function}())"
     return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, **streams)
 

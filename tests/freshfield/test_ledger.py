@@ -40,8 +40,7 @@ def test_a_file_cut_anywhere_loses_at_most_its_last_line(tmp_path_factory, cut):
     cut = head + cut % (len(data) - head + 1)
     path.write_bytes(data[:cut])
     file = LedgerReader(path)
-    whole = data[head:cut].count(b"\n")
-    assert file.events == tuple((EVENTS * 2)[:whole])
+    assert file.events == tuple((EVENTS * 2)[: data[head:cut].count(b"\n")])
     assert file.torn == (not data[:cut].endswith(b"\n")) and not file.closed
 
 

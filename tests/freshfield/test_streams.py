@@ -120,8 +120,8 @@ async def test_among_streams_of_use_the_one_that_is_idle_longest_ends():
 
 
 class Stream:
-    open = True
-    caller = ANYBODY
+    open, caller = True, ANYBODY
+    use = staticmethod(lambda: None)
 
 
 def test_a_session_belongs_to_the_stream_that_sends_it():
@@ -132,8 +132,7 @@ def test_a_session_belongs_to_the_stream_that_sends_it():
     sessions.claim("cam00", "other", spoofer, 1)
     mine.open = False
     sessions.claim("cam00", "s", spoofer, 2)  # its stream ended
-    again = Stream()
-    sessions.claim("cam00", "s", again, 2 + SESSION_IDLE_NS)  # or is gone without a word
+    sessions.claim("cam00", "s", Stream(), 2 + SESSION_IDLE_NS)  # or is gone without a word
     refused(FrameRejected, "", sessions.claim, "cam00", "s", spoofer, 3 + SESSION_IDLE_NS)
     sessions.claim("cam00", "s", spoofer, 0)  # a clock that was set back delays nobody
     for k in range(1000):

@@ -111,9 +111,6 @@ async def test_tls_and_mutual_tls(pem):
         assert await status(ask(wrong_token, port)) == "UNAUTHENTICATED", "a certificate does not make it good"
 
 
-PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # and empty SETTINGS
-
-
 @pytest.mark.parametrize("encrypted", [False, True])
 async def test_connections_are_few_and_those_that_do_nothing_end(encrypted, pem, monkeypatch):
     """Over TLS four in their handshake take all places, and end with its time-out; else four without a call,
@@ -132,8 +129,9 @@ async def test_connections_are_few_and_those_that_do_nothing_end(encrypted, pem,
     async with serving(tls, Every(sizes)) as port:
         kept = [await asyncio.open_connection("localhost", port) for _ in range(4)]
         if not encrypted:
+            preface = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # and empty SETTINGS
             for reader, writer in kept:
-                writer.write(PREFACE)
+                writer.write(preface)
                 await reader.readexactly(1)
         await asyncio.sleep(0.2)
         surplus = [await asyncio.open_connection("localhost", port) for _ in range(20)]

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from camera_node.capture import Camera, ShotCache, build_cameras
+from camera_node.capture import Camera, build_cameras
 from camera_node.node import Node, NodeOptions
-from camera_node.settings import WorldConfig, source_config
+from camera_node.settings import source_config
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.ingest import Ingest
 from edge_server.live.output.recorder import Recorder
@@ -22,7 +22,7 @@ from freshfield.ledger import Ledger
 from freshfield.scenario import parse
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
-from tests.camera_node.depth_source import DepthSource
+from tests.camera_node.depth_source import depth_camera
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 from tests.edge_server.fields_for_tests import TINY
 from tests.integration.peer import Peer, answer
@@ -142,13 +142,9 @@ def recorded(camera: Camera, file: Path, stamps: list[tuple[str, int, int]]) -> 
 STAMPS = [("s", k, 100 * k + 1000) for k in range(4)]
 
 
-def depth_camera(depth_every: int = 1, **more) -> Camera:
-    return Camera(DepthSource("cam01", 4, **more), WorldConfig(kind="world"), ShotCache(10**6), depth_every=depth_every)
-
-
 def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
     stamps = [("a", 0, 1000), ("a", 1, 2000), ("b", 0, 1500), ("b", 1, 3000)]
-    recorded(depth_camera(), tmp_path / "a.mcap", stamps)
+    recorded(depth_camera(1, 4), tmp_path / "a.mcap", stamps)
     scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam01": "cam01", "cam02": "y"})
     with caplog.at_level(logging.WARNING):
         camera = camera_of(scenario)
@@ -159,7 +155,7 @@ def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
 
 def test_a_recorded_run_replays_with_its_depth(tmp_path):
     """As it came, also where it belongs to another instant; what shows a held-out camera sends none."""
-    sent = recorded(depth_camera(2, after_image_ns=-40_000_000), tmp_path / "a.mcap", STAMPS)
+    sent = recorded(depth_camera(2, 4, after_image_ns=-40_000_000), tmp_path / "a.mcap", STAMPS)
     scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam02": "y"})
     got = sent_by(scenario, ["cam01"])
     assert [said(request) for request in got] == [said(request) for request in sent]
@@ -172,10 +168,9 @@ def test_a_recorded_run_replays_with_its_depth(tmp_path):
 @pytest.mark.stability
 def test_depth_that_cannot_be_read_again_costs_only_the_depth(tmp_path):
     """The file is damaged after it was opened: within, checksums leave whole chunks out."""
-    camera = depth_camera()
+    camera = depth_camera(1, 4)
     recorded(camera, tmp_path / "a.mcap", STAMPS[:2])
-    scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam02": "y"})
-    replayed = camera_of(scenario)
+    replayed = camera_of(replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam02": "y"}))
     location = Session(tmp_path / "a.mcap").frames["cam01"][0].depth_location
     with (tmp_path / "a.mcap").open("r+b") as file:
         file.seek(location.offset + location.size // 2)

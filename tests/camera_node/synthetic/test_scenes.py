@@ -224,11 +224,6 @@ SHOWN = {
 VIEWS = (("cam00", 0.0), ("cam04", 1.3), ("cam08", 2.9), ("cam12", 5.0), ("cam05", 3.7))
 
 
-# A ray that just hits or misses a moving part does the other a nanosecond earlier or later, as on another kind of
-# processor, which rounds the last bits differently.
-INSTANTS_S = (0.0, 1e-9, -1e-9)
-
-
 def views(name: str, later_s: float = 0.0) -> Image:
     """Five views of a scene, side by side."""
     kind, params = SHOWN[name]
@@ -241,7 +236,9 @@ def test_a_scene_looks_as_it_did(name):
     """Of the instants the nearest counts at each pixel, to a level of gray."""
     golden = cv2.imread(str(GOLDEN / f"{name}.png"))[..., ::-1].astype(np.int16)
     off = np.full(golden.shape[:2], 255)
-    for later_s in INSTANTS_S:
+    # A ray that just hits or misses a moving part does the other a nanosecond earlier or later, as on another kind of
+    # processor, which rounds the last bits differently.
+    for later_s in (0.0, 1e-9, -1e-9):
         off = np.minimum(off, np.abs(views(name, later_s).astype(np.int16) - golden).max(axis=2))
         if (off > 1).sum() <= 3:
             return

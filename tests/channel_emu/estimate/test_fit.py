@@ -154,8 +154,7 @@ def test_a_few_huge_delays_are_no_state(tmp_path):
 
 def test_the_command_writes_a_scenario_and_a_picture(tmp_path, capsys):
     path = write_trace(tmp_path / "t.jsonl", SLOW, 1, 2, seconds=60)
-    words = ["fit", str(path), "--out", str(tmp_path / "f.yaml"), "--plot", str(tmp_path / "f.png")]
-    assert main(words) == 0
+    assert main(["fit", str(path), "--out", str(tmp_path / "f.yaml"), "--plot", str(tmp_path / "f.png")]) == 0
     text = capsys.readouterr().out
     assert "mu1_per_ms" in text and "that of two is" in text
     shown = yaml.safe_load(text[text.index("channel:") :])["channel"]

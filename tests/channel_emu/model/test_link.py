@@ -86,14 +86,12 @@ def test_a_reset_breaks_one_camera_and_frees_the_line():
     subject = links("fcfs", [50], "cab", server={"shared": True}, faults={"reset": {"mean_interval_ms": 1e9}})
     subject["a"]._next_reset_ns = 20 * MS  # at an instant of our choice
     subject["a"]._update_next_event()
-    told = play(subject, [("a", 0), ("b", 1), ("a", 2)])
-    assert told == "sa0@0 brokena0@20 brokena1@20 sb0@20 db0@70"
+    assert play(subject, [("a", 0), ("b", 1), ("a", 2)]) == "sa0@0 brokena0@20 brokena1@20 sb0@20 db0@70"
     assert subject["a"].resets == 1 and subject["b"].resets == 0
 
 
 def test_sampling_takes_the_newest_offered_frame():
-    config = channel_from_mapping({"preset": "ch6-low", "service": "none"})
-    subject = Channel(config, 3).link("cam00")
+    subject = Channel(channel_from_mapping({"preset": "ch6-low", "service": "none"}), 3).link("cam00")
     transits = [subject.offer(i * 10 * MS)[0] for i in range(4000)]
     subject.advance(40_000 * MS)
     counts = Counter(str(t.outcome) for t in transits)

@@ -73,8 +73,7 @@ def test_the_projection_keeps_lengths_and_is_the_same_in_every_process(tmp_path)
 
 
 def test_the_size_is_the_files_or_the_exporters(tmp_path):
-    free = detector(tmp_path / "free.onnx", size=None)
-    assert embedder(free).backbone.height == 640
+    assert embedder(detector(tmp_path / "free.onnx", size=None)).backbone.height == 640
     noted = detector(tmp_path / "noted.onnx", size=None, meta={"imgsz": "[64, 96]"})
     assert (embedder(noted).backbone.height, embedder(noted).backbone.width) == (64, 96)
     odd = detector(tmp_path / "odd.onnx", size=None, meta={"imgsz": "[" * 300})
@@ -83,8 +82,7 @@ def test_the_size_is_the_files_or_the_exporters(tmp_path):
 
 
 def test_the_real_yolo11n_and_the_shipped_detector_work_unchanged():
-    path = data_dir("yolo") / "yolo11n_int8_320.onnx"
-    made = embedder(path, dim=32)
+    made = embedder(data_dir("yolo") / "yolo11n_int8_320.onnx", dim=32)
     assert made.backbone.tap == "/model.10/cv2/act/Mul_output_0"
     assert (made.backbone.batch, made.backbone.height, made.backbone.channels) == (1, 320, 256)
     images = [image(90, 160), np.zeros((128, 128, 3), np.uint8), image(500, 500)]

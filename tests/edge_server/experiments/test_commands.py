@@ -14,8 +14,6 @@ from tests.edge_server.experiments.rollouts.small import RAW
 from tests.edge_server.experiments.sets import SMALL_WORDS, write_photos
 from tests.support import refusal, refused
 
-QUICK = {"fit": SMALL_WORDS, "frontier": ["--quick"], "study": ["--quick"]}
-
 
 @pytest.mark.parametrize(
     ("words", "said"),
@@ -48,13 +46,14 @@ def test_what_cannot_be_done_is_refused_in_one_line(words: str, said: str, tmp_p
     (tmp_path / "small.yaml").write_text(yaml.safe_dump(RAW))
     if "SET" in words:
         write_photos(tmp_path / "set", 3)
+    quick = {"fit": SMALL_WORDS, "frontier": ["--quick"], "study": ["--quick"]}
     places = {"SMALL": str(tmp_path / "small.yaml"), "SET": str(tmp_path / "set")}
     command, *given = [places.get(word, word) for word in words.split()]
     out = tmp_path / "out"
     written = ["--out", str(out)]
     if command == "compare":  # results: a line for each run
         written = ["--json", str(out / "scores.json"), "--results", str(out / "results.jsonl")]
-    assert said in refusal(capsys, main, command, *QUICK.get(command, []), *given, *written)
+    assert said in refusal(capsys, main, command, *quick.get(command, []), *given, *written)
     assert not out.is_file() and not any(path.is_file() and path.stat().st_size for path in out.rglob("*"))
 
 

@@ -191,8 +191,7 @@ def test_meshes_and_points_open_in_trimesh(tmp_path):
     np.testing.assert_array_equal(points.vertices, vertices)
     np.testing.assert_array_equal(points.colors[:, :3], color)
     write_mesh(tmp_path / "m.glb", mesh)
-    scene = trimesh.load(tmp_path / "m.glb", process=False)
-    read = scene.to_geometry()  # y up
+    read = trimesh.load(tmp_path / "m.glb", process=False).to_geometry()  # y up
     np.testing.assert_allclose(read.vertices, vertices[:, [0, 2, 1]] * (1, 1, -1), atol=1e-6)
     np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], color)
 

@@ -12,6 +12,7 @@ import pytest
 from edge_server.fields import Budget, checkpoint
 from tests.edge_server.fields.scenes import ring
 from tests.edge_server.fields.small import every_field, same_state, small
+from tests.support import refused
 
 VIEWS = ring(5, size=24)
 STATE = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "meta": np.array('{"x": 1}')}
@@ -25,8 +26,7 @@ def test_what_is_saved_comes_back_and_a_failed_save_leaves_it(tmp_path: Path, mo
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", no_room)
-    with pytest.raises(OSError, match="No space"):
-        checkpoint.save(path, {"a": np.zeros(3)})
+    refused(OSError, "No space", checkpoint.save, path, {"a": np.zeros(3)})
     state, about = checkpoint.load(path)
     assert about == {"field": "ngp", "step": 7} and state.keys() == STATE.keys()
     np.testing.assert_array_equal(state["a"], STATE["a"])
@@ -36,24 +36,20 @@ def test_what_is_saved_comes_back_and_a_failed_save_leaves_it(tmp_path: Path, mo
 
 def test_damage_is_told_clearly(tmp_path: Path) -> None:
     path = tmp_path / "field.npz"
-    with pytest.raises(checkpoint.CheckpointError, match="no such checkpoint"):
-        checkpoint.load(path)
+    refused(checkpoint.CheckpointError, "no such checkpoint", checkpoint.load, path)
     checkpoint.save(path, {"a": np.random.default_rng(0).random(5000)})
     whole = path.read_bytes()
     for damaged in (b"", b"garbage", whole[: len(whole) // 2], whole[:3000] + b"\0" * 40 + whole[3040:]):
         path.write_bytes(damaged)
-        with pytest.raises(checkpoint.CheckpointError, match=r"field\.npz: damaged"):
-            checkpoint.load(path)
+        refused(checkpoint.CheckpointError, r"field\.npz: damaged", checkpoint.load, path)
     np.savez(path, a=np.zeros(3))
-    with pytest.raises(checkpoint.CheckpointError, match="not a field's checkpoint"):
-        checkpoint.load(path)
+    refused(checkpoint.CheckpointError, "not a field's checkpoint", checkpoint.load, path)
 
 
 def test_objects_are_never_unpickled(tmp_path: Path) -> None:
     path = tmp_path / "field.npz"
     np.savez(path, __facts__=np.array([{"evil": 1}], dtype=object))
-    with pytest.raises(checkpoint.CheckpointError, match="damaged"):
-        checkpoint.load(path)
+    refused(checkpoint.CheckpointError, "damaged", checkpoint.load, path)
 
 
 OF_ANOTHER_SHAPE = {
@@ -116,5 +112,4 @@ def test_a_refused_state_leaves_the_field_as_it_was(name: str) -> None:
 def test_more_gaussians_than_there_is_room_for_are_refused() -> None:
     field = small("splat")
     field.fit(VIEWS, Budget(steps=1))
-    with pytest.raises(ValueError, match="holds 100 at most"):
-        small("splat", gaussians=100, start=100).load_state(field.state())
+    refused(ValueError, "holds 100 at most", small("splat", gaussians=100, start=100).load_state, field.state())

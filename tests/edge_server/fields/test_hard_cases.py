@@ -226,8 +226,6 @@ def test_a_picture_repeated_is_not_a_scene_in_motion(name: str) -> None:
     assert field.view_store.memory[SEEN[BAD].camera].moved is None
 
 
-every_network = pytest.mark.parametrize("kind", ["ngp", "tensorf", "nerfacto"])
-
 # Kinds and settings that together go through all kernels.
 THROUGH_ALL: list[tuple[str, dict[str, Any]]] = [
     ("ngp", {"batch_samples": 8192, "rays": 9}),
@@ -308,7 +306,7 @@ def test_damage_is_counted_and_healed(kind: str, damage: Callable[[Any], None]) 
 
 
 @pytest.mark.parametrize("value", [1e30, PARAMETER_LIMIT])
-@every_network
+@pytest.mark.parametrize("kind", ["ngp", "tensorf", "nerfacto"])
 def test_density_that_overflows_stays_finite(kind: str, value: float) -> None:
     """Opaque everywhere: no gradient leads out of that, but a reset does, and nothing becomes NaN."""
     field = tiny(kind)

@@ -13,8 +13,6 @@ from torch import Tensor
 from edge_server.fields.common.kernels.hash_grid import FEATURES
 from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, RAW_HIGH, RAW_LOW
 
-PRIMES = (1, 2654435761, 805459861)
-
 
 def to_torch(grid: Any) -> Any:
     """The grid, whatever it has beside a table, with that (vertices, 2) as a tensor of float64."""
@@ -30,7 +28,7 @@ def encode(grid: Any, levels: int, x: Tensor) -> Tensor:
     part = scaled - cell
     weight = _corners(torch.mul, torch.stack([1 - part, part], dim=-1))
     strides = torch.cat([torch.ones_like(res), res + 1, (res + 1) ** 2], dim=-1)
-    factor = torch.where(dense, strides, torch.tensor(PRIMES))  # (l, 3)
+    factor = torch.where(dense, strides, torch.tensor((1, 2654435761, 805459861)))  # (l, 3)
     near = cell.long() * factor
     sides = torch.stack([near, near + factor], dim=-1)
     hashed = (_corners(torch.bitwise_xor, sides) & 0xFFFFFFFF) % first.diff()[:, None]

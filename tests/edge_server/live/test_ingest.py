@@ -11,7 +11,7 @@ import zstandard
 
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.ingest import FrameAdmission, Ingest
-from freshfield import access, payload
+from freshfield import payload
 from freshfield.clock import VirtualClock
 from freshfield.depth import DepthImage, EncodedDepth
 from freshfield.frame import Frame, FrameRejected, checksum, to_request
@@ -19,6 +19,7 @@ from freshfield.geometry import Pinhole
 from freshfield.ledger import Ledger, LedgerReader
 from freshfield.v1 import frames_pb2 as pb
 from tests.edge_server.frames import frame
+from tests.freshfield.test_streams import Stream
 from tests.support import refused
 
 NOW = 10**18
@@ -43,8 +44,7 @@ def rejection(admission: FrameAdmission, item: Frame) -> str:
 
 
 def test_held_out_frames_never_reach_the_training_buffer(ingest):
-    answer = ingest.take(to_request(good(camera="cam00", held_out=True)))
-    assert answer.outcome == pb.OUTCOME_ACCEPTED
+    assert ingest.take(to_request(good(camera="cam00", held_out=True))).outcome == pb.OUTCOME_ACCEPTED
     assert [f.camera for f in ingest.test_held] == ["cam00"]
     assert ingest.buffer.newest() == {}
 
@@ -134,14 +134,9 @@ def test_a_bomb_of_depth_is_refused_and_loses_nothing_else(ingest):
 
 
 def test_another_stream_cannot_use_up_the_numbers_of_a_session(ingest):
-    class Stream:
-        open, caller = True, access.caller.get()
-        use = staticmethod(lambda: None)
-
     mine, spoofer = Stream(), Stream()
     assert ingest.take(to_request(good(1)), mine).outcome == pb.OUTCOME_ACCEPTED
-    last = frame(sequence=2**63, generated_ns=NOW)
-    assert ingest.take(to_request(last), spoofer).reason == "session_in_use"
+    assert ingest.take(to_request(frame(sequence=2**63, generated_ns=NOW)), spoofer).reason == "session_in_use"
     assert ingest.take(to_request(good(2)), mine).outcome == pb.OUTCOME_ACCEPTED
     assert ingest.rejected == {"session_in_use": 1}
 
@@ -168,8 +163,7 @@ def test_a_thousand_sessions_do_not_grow_the_admission():
 
 
 def test_an_uncertain_clock_is_given_its_uncertainty_but_no_two_seconds():
-    ahead = frame(generated_ns=NOW + 400 * MS, clock_uncertainty_ns=200 * MS)
-    FrameAdmission(["cam01"], []).admit(ahead, NOW)
+    FrameAdmission(["cam01"], []).admit(frame(generated_ns=NOW + 400 * MS, clock_uncertainty_ns=200 * MS), NOW)
     for ahead_ms, uncertain_ms in ((400, 0), (2000, 3_600_000)):
         late = frame(generated_ns=NOW + ahead_ms * MS, clock_uncertainty_ns=uncertain_ms * MS)
         assert rejection(FrameAdmission(["cam01"], []), late) == "from_future"

@@ -48,8 +48,7 @@ def test_a_place_seen_again_is_seen_anew():
     for t_ms, degrees in enumerate((0, 20, 2)):  # the third is where the first was
         given = kept.with_earlier([view("hand", degrees, t_ms, value=t_ms)])
     assert names(given) == ["hand", "hand#1"] and len(kept) == 2
-    given = kept.with_earlier([view("hand", 40, 3)])
-    assert [v.image[0, 0, 0] for v in given[1:]] == [2, 1]
+    assert [v.image[0, 0, 0] for v in kept.with_earlier([view("hand", 40, 3)])[1:]] == [2, 1]
     for degrees, places in ((7.9, 1), (8.1, 2)):
         kept = Keyframes(KeyframesConfig(apart_m=1.0, apart_deg=8.0))
         for t_ms, turned in enumerate((0, degrees)):

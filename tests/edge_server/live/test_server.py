@@ -169,12 +169,10 @@ def test_operators_see_and_change_a_running_server(serve):
     until(lambda: server.state.publications()[-1].omega_ms == 77.0)
     unknown = edge.SetPolicy.future(edge_pb2.SetPolicyRequest(name="best"))
     assert unknown.code() == grpc.StatusCode.INVALID_ARGUMENT and "freshest-k" in unknown.details()
-    path = edge.SaveSnapshot(edge_pb2.SaveSnapshotRequest()).path
-    assert checkpoint.load(path)[0]
+    assert checkpoint.load(edge.SaveSnapshot(edge_pb2.SaveSnapshotRequest()).path)[0]
     edge.ResetField(edge_pb2.ResetFieldRequest())
     until(lambda: not server.state.controls.reset_requested)
-    clock = clock_pb2_grpc.ClockServiceStub(channel)
-    answer = clock.Exchange(clock_pb2.ExchangeRequest(client_sent_ns=5))
+    answer = clock_pb2_grpc.ClockServiceStub(channel).Exchange(clock_pb2.ExchangeRequest(client_sent_ns=5))
     assert answer.client_sent_ns == 5
     assert answer.server_sent_ns >= answer.server_received_ns
     decisions.cancel()

@@ -200,8 +200,7 @@ def test_lenses_that_differ_in_each_frame_do_not_fill_the_memory(monkeypatch):
     for lens in lenses:
         for each in (lens, lenses[0]):  # the first is used all the time, and stays
             assert (depth_in_image(depth(counts, intrinsics=each), IMAGE, 0) > 0).mean() > 0.6
-    kept = [lens for lens, _, _ in module._kept]
-    assert kept == [*lenses[-2:], lenses[0]]
+    assert [lens for lens, _, _ in module._kept] == [*lenses[-2:], lenses[0]]
     monkeypatch.setattr(module, "MAX_DEPTH_RAYS_BYTES", rays_bytes - 1)
     assert (depth_in_image(depth(counts, intrinsics=lenses[1]), IMAGE, 0) > 0).mean() > 0.6
     assert not module._kept

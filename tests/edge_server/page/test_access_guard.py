@@ -164,8 +164,7 @@ def test_the_page_says_in_words_what_is_open() -> None:
 
 
 def test_a_foreign_web_site_reaches_nothing() -> None:
-    state = bare_state()
-    with page_of(state) as page:
+    with page_of(bare_state()) as page:
         own, foreign = f"127.0.0.1:{page.port}", f"evil.example:{page.port}"
         assert ask(page.port, Origin=f"http://{own}")[0] == 200
         assert ask(page.port, Origin="http://evil.example")[0] == 403

@@ -24,7 +24,7 @@ from edge_server.page.foxglove_live.settings import MOST_POINTS
 from freshfield.transport import TransportError
 from tests.conftest import ROOT
 from tests.edge_server.page.preview import CAMERAS, LENS, Preview
-from tests.support import wait_until
+from tests.support import refusal, wait_until
 
 MESSAGE = struct.Struct("<BIQ")  # opcode 1, subscription, log time
 
@@ -142,5 +142,4 @@ def test_a_taken_port_and_a_view_that_fails_are_said(served, caplog):
 def test_it_is_refused_beside_a_login_which_it_would_go_around(tmp_path, capsys):
     (tmp_path / "tokens.txt").write_text("operator abcdefghijklmnop\n")
     words = ["run", "room", "--out", str(tmp_path / "out"), "--foxglove-port", "0"]
-    assert edge_server([*words, "--token-file", str(tmp_path / "tokens.txt")]) == 2
-    assert "knows no login" in capsys.readouterr().err
+    assert "knows no login" in refusal(capsys, edge_server, *words, "--token-file", tmp_path / "tokens.txt")

@@ -15,6 +15,7 @@ from edge_server.viewpoints.preference_session import PreferenceSession
 from freshfield.transport import Transport, TransportError
 from tests.edge_server.page.browser import Browser
 from tests.edge_server.page.visitor import ask
+from tests.support import refused
 
 COUNT, FRAMES, COLUMNS = 6, 6, 3
 NEW = PreferenceSession(
@@ -109,8 +110,7 @@ def test_who_sends_without_end_is_cut_off(asked, monkeypatch):
 def test_viewers_look_and_operators_answer():
     tokens = Transport(tokens={"operator": "op-token", "viewer": "view-token"})
     page = PreferencePage(NEW, [sprite(k) for k in range(COUNT)], FRAMES, COLUMNS, lambda s: None)
-    with pytest.raises(TransportError, match="nothing is encrypted"):
-        page.serve("0.0.0.0", 0, tokens)
+    refused(TransportError, "nothing is encrypted", page.serve, "0.0.0.0", 0, tokens)
     url, close = page.serve("0.0.0.0", 0, Transport(tokens=tokens.tokens, insecure=True))
     try:
         assert request(url, "GET", "/state")[0] == 401
@@ -119,8 +119,7 @@ def test_viewers_look_and_operators_answer():
             login = {"Authorization": f"Bearer {token}"}
             assert json.loads(request(url, "GET", "/state", **login)[2])["may_change"] == may
             assert request(url, "POST", "/answer", body, **login)[0] == (200 if may else 403)
-        with pytest.raises(PageError, match="--page-port"):
-            page.serve("0.0.0.0", int(url.rpartition(":")[2]), Transport(insecure=True))
+        refused(PageError, "--page-port", page.serve, "0.0.0.0", int(url.rpartition(":")[2]), Transport(insecure=True))
     finally:
         close()
 

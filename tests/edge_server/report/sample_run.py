@@ -50,9 +50,6 @@ CHANNEL = {
 }
 
 
-SHOWN = Score("cam00", 0, 24.0, 17.0, 0.8, None, 0.0, psnr_still_db=26.0)
-
-
 def publication(number: int) -> Publication:
     """Fidelity rises to 26 dB; every tenth publication found no truth; cam03 moves nothing."""
     t_s, used, psnr = 3.1 + 0.75 * number, 2 + number % 3, 26.0 - 10.0 * 0.9**number
@@ -90,14 +87,14 @@ def write(out: Path, role: str, lines, name: str = "x", start_ns: int = 1, close
 def write_run(out: Path, publications: int = 49, ages: int = 200) -> None:
     """The folder after a clean end."""
     journal = Journal(out, lambda: EDGE)
-    rng = np.random.default_rng(0)
+    rng, shown = np.random.default_rng(0), Score("cam00", 0, 24.0, 17.0, 0.8, None, 0.0, psnr_still_db=26.0)
     for i in range(ages):
         found: dict[str, float | None] = {c: 60.0 + 40.0 * float(rng.exponential()) for c in CAMERAS[1:]}
         journal.ages(0.2 * i, {**found, "never": None})
     for number in range(publications):
         journal.published(publication(number))
         journal.scored(publication(number), final=True)
-        journal.shown(publication(number).t_s + 0.1, SHOWN, replace(publication(number), network_ms=50.0))
+        journal.shown(publication(number).t_s + 0.1, shown, replace(publication(number), network_ms=50.0))
     journal.close()
     (out / "run.json").write_text(json.dumps({"command": "freshfield demo"}))
     (out / "channel.json").write_text(json.dumps(CHANNEL))

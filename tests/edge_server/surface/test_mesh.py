@@ -15,6 +15,7 @@ from edge_server.surface.sdf import fit_sdf
 from edge_server.surface.settings import MeshSettings
 from edge_server.surface.volume import Grid, bounding_box, fuse_maps
 from tests.edge_server.surface import ball as balls
+from tests.support import refused
 
 pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
 trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed (extra surface)")
@@ -45,14 +46,12 @@ def test_the_number_of_threads_changes_no_bit_of_a_volume():
 
 def test_too_fine_a_grid_says_what_would_do(monkeypatch):
     monkeypatch.setattr(volume_module, "MOST_VOXELS", 50_000)
-    with pytest.raises(SurfaceError, match=r"5 mm has too many voxels: take [\d.]+ mm or more"):
-        fuse_maps(GRID, balls.ball_maps(4))
+    refused(SurfaceError, r"5 mm has too many voxels: take [\d.]+ mm or more", fuse_maps, GRID, balls.ball_maps(4))
     for grid, said in (
         (((-50.0,) * 3, (50.0,) * 3, 0.001, 0.004), "voxels are too many"),
         (((0, 0, 1), (1, 1, 1), 0.1, 0.4), "lower corner"),
     ):
-        with pytest.raises(SurfaceError, match=said):
-            Grid(*grid)
+        refused(SurfaceError, said, Grid, *grid)
 
 
 def test_bounds_are_those_of_what_is_seen():
@@ -130,19 +129,16 @@ def test_depth_that_is_nothing_gives_no_surface_and_says_so(value):
     volume = fuse_maps(GRID, maps)
     for array in (volume.blocks.distance, volume.blocks.weight, volume.blocks.color):
         assert np.isfinite(array).all()
-    with pytest.raises(SurfaceError, match="no surface"):
-        extract_mesh(volume)
+    refused(SurfaceError, "no surface", extract_mesh, volume)
     if not any(m.seen.any() for m in maps):
-        with pytest.raises(SurfaceError, match="no camera sees anything solid"):
-            bounding_box(maps, 0.01)
+        refused(SurfaceError, "no camera sees anything solid", bounding_box, maps, 0.01)
 
 
 @pytest.mark.stability
 def test_one_camera_that_contradicts_all_others_is_outvoted():
     maps = balls.ball_maps(30)
     liar = with_depth(maps[7], np.where(maps[7].seen, maps[7].depth - 0.06, maps[7].depth))
-    found = radii([*maps[:7], liar, *maps[8:]])
-    assert np.percentile(np.abs(found - balls.RADIUS_M), 99) < 0.004
+    assert np.percentile(np.abs(radii([*maps[:7], liar, *maps[8:]]) - balls.RADIUS_M), 99) < 0.004
 
 
 @pytest.mark.stability

@@ -31,8 +31,12 @@ GEOMETRIC = [name for name, (module, _, _) in SELECTORS.items() if module == "ge
 DOME = half_hemisphere(TARGET, 0.8, LENS, 60)
 
 
-def take(k):
-    return View(f"v{k}", np.full((16, 16, 3), k, np.uint8), DOME.poses[k], LENS)
+def taker(candidates):
+    """Captures candidate k: its gray level says which it is."""
+    return lambda k: View(f"v{k}", np.full((16, 16, 3), k, np.uint8), candidates.poses[k], LENS)
+
+
+take = taker(DOME)
 
 
 def smallest_angle(order):
@@ -88,10 +92,7 @@ def test_half_of_the_views_are_refused():
 UNIT_DOME = half_hemisphere((0, 0, 0), 1.0, LENS, 30)
 QUICK = PolicyConfig(views=4, updates=25, episodes=12, hidden=16, way=0.0, learning_rate=1e-2)
 HEIGHT, WAY = GEOMETRY.index("z"), GEOMETRY.index("way")
-
-
-def take_of_unit(k):
-    return View(f"v{k}", np.full((16, 16, 3), k, np.uint8), UNIT_DOME.poses[k], LENS)
+take_of_unit = taker(UNIT_DOME)
 
 
 def height(features):
@@ -220,10 +221,7 @@ FEW = half_hemisphere((0, 0, 0), 1.0, LENS, 12)
 @pytest.mark.parametrize("name", ["random", "coverage"])
 @hard
 def test_candidates_that_hardly_differ_are_taken_once_each(candidates: Candidates, name: str) -> None:
-    def take(k: int) -> View:
-        return View(f"v{k}", np.zeros((16, 16, 3), np.uint8), candidates.poses[k], LENS)
-
-    plan = plan_capture(candidates, make_selector(name), Budget(views=4), take, seed=0)
+    plan = plan_capture(candidates, make_selector(name), Budget(views=4), taker(candidates), seed=0)
     assert len(set(plan.order)) == len(plan.order) == min(4, len(candidates))
 
 

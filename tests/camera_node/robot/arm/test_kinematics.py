@@ -278,8 +278,7 @@ def test_a_camera_on_a_moving_flange_follows_it_and_one_that_stands_does_not(tmp
         flange.add(k * 10 * MS, Pose.from_matrix(se3(so3_exp((0, 0, 0.1 * k)), (0.01 * k, 0, 0))))
     # The arm's stamps are 20 ms ahead: the camera's 30 ms are the arm's 50 ms.
     found, gap_ns = calibration.camera_poses(flange).at(30 * MS)
-    expected = se3(so3_exp((0, 0, 0.5)), (0.05, 0, 0)) @ HELD
-    np.testing.assert_allclose(found.matrix(), expected, atol=1e-8)
+    np.testing.assert_allclose(found.matrix(), se3(so3_exp((0, 0, 0.5)), (0.05, 0, 0)) @ HELD, atol=1e-8)
     assert gap_ns == 0
     stands = read_hand_eye(written(tmp_path, setup="eye-to-hand")).camera_poses(flange)
     np.testing.assert_allclose(stands.at(7)[0].matrix(), HELD, atol=1e-8)

@@ -118,8 +118,7 @@ def test_a_board_of_another_size_than_said_is_told_and_its_size_found(setup, fac
 
 def test_a_real_arm_whose_calibration_was_published():
     folder = data_dir("handeye_visp_franka")
-    board = parse_target("chessboard:9x6:23.6mm")
-    samples, unused = read_visp_folder(folder, board, None, EYE_IN_HAND)
+    samples, unused = read_visp_folder(folder, parse_target("chessboard:9x6:23.6mm"), None, EYE_IN_HAND)
     assert len(samples) == 8 and not unused
     published = np.loadtxt(folder / "expected_eMc.txt")
     found = calibrate(samples)

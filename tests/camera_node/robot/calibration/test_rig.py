@@ -238,8 +238,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(tmp_path, capsys):
         ([tmp_path, "--board", BOARD], "cam0 never sees the target: charuco:8x5:60mm:45mm not found: no markers"),
         (["--live", "room", "--board", BOARD], "expected camera, oak or realsense"),
     ):
-        assert main(["calibrate", "rig", *map(str, words)]) == 2
-        error = capsys.readouterr().err.splitlines()[-1]
+        error = refusal(capsys, main, "calibrate", "rig", *words)
         assert error.startswith("camera-node: ") and message in error
 
 
@@ -335,17 +334,15 @@ def test_parts_that_fit_both_prints_are_told_by_a_whole_board_among_them(legacy,
         assert_where_printed(corners)
 
 
-CHESSBOARD = cv2.GaussianBlur(parse_target("chessboard:8x5:20mm").draw(600), (0, 0), 1.0)
-
-
 def test_a_board_that_is_not_found_is_examined():
+    chessboard = cv2.GaussianBlur(parse_target("chessboard:8x5:20mm").draw(600), (0, 0), 1.0)
     for spec, image, says in (
         ("charuco:7x5:30mm:22mm", printed(5, 7), "its sizes are swapped: 5x7 squares, not 7x5"),
         ("charuco:9x6:30mm:22mm", printed(7, 5), "it is a board of another size: 7x5 squares, not 9x6"),
         ("charuco:7x5:30mm:22mm:5X5_100", printed(7, 5), "its markers are of dictionary 4X4_50, not 5X5_100"),
         ("charuco:7x5:30mm:22mm", printed(7, 5)[:, ::-1], "the picture is mirrored"),
         ("charuco:7x5:30mm:22mm", np.full((300, 400), 200, np.uint8), "no markers are seen"),
-        ("chessboard:9x6:20mm", CHESSBOARD, "a board of 8x5 inner corners is seen, not of 9x6"),
+        ("chessboard:9x6:20mm", chessboard, "a board of 8x5 inner corners is seen, not of 9x6"),
     ):
         board, image = parse_target(spec), np.ascontiguousarray(image)
         assert board.find(image) is None and board.explain(image).startswith(says)

@@ -116,7 +116,6 @@ def test_rubbish_ends_its_connection_and_no_other(arm, rubbish):
         assert link.recv(100) == rtde.packet(rtde.REQUEST_VERSION, b"\1")
 
 
-SPEED = np.array(UR3E.speed_rad_s)
 six = st.tuples(*[st.floats(-6.2, 6.2, allow_subnormal=False)] * 6)
 rates = st.floats(0.8, 20.0)
 
@@ -138,7 +137,7 @@ def test_a_move_is_a_straight_line_that_ends_exactly_at_its_target_within_its_li
     assert motion.move(goal, speed, acceleration)
     q, qd = run(motion)
     assert np.array_equal(motion.q, goal) and not motion.qd.any()
-    assert np.all(np.abs(qd) <= np.minimum(speed, SPEED) + 1e-9)
+    assert np.all(np.abs(qd) <= np.minimum(speed, UR3E.speed_rad_s) + 1e-9)
     assert np.abs(np.diff(qd, axis=0, prepend=np.zeros((1, 6)))).max() <= acceleration * STEP_S + 1e-9
     way = np.array(goal) - HOME_RAD
     along = (q - HOME_RAD) @ way / (way @ way)

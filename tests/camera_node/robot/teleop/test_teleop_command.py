@@ -95,8 +95,7 @@ def test_the_operator_ends_it_and_the_arm_comes_to_rest(capsys):
         return [sample(now_ns, (0.001 * len(sent), 0.0, 0.0), len(sent) > 0)]
 
     stylus.poll.side_effect = poll
-    operator = Teleoperator(UR3E, TeleopConfig(), HOME)
-    assert teleop_command._run_loop(operator, stylus, sink, None) == 0
+    assert teleop_command._run_loop(Teleoperator(UR3E, TeleopConfig(), HOME), stylus, sink, None) == 0
     assert np.abs(sent[60].speeds).max() > 0.0 and not sent[-1].speeds.any() and 61 < len(sent) < 200
     sink.close.assert_called_once()
     assert "clutch pressed 1 times" in capsys.readouterr().out

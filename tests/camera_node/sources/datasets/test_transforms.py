@@ -347,8 +347,7 @@ def test_frames_have_the_stamps_of_the_file_and_seeking_finds_them(tmp_path):
     assert [r.time_s for r in records] == pytest.approx(stamps_s)
     for k in (39, 20, 0, 12, 11, 35, 9, 10, 38):
         assert round((float(records[k].read().mean()) - 13) / 6) == k
-    lines = [f"{k / 100} {k / 100} 0 0 0 0 0 1" for k in range(500)]
-    (tmp_path / "cam01.txt").write_text("\n".join(lines))
+    (tmp_path / "cam01.txt").write_text("\n".join(f"{k / 100} {k / 100} 0 0 0 0 0 1" for k in range(500)))
     source = opened(video_scenario(file, trajectory={"files": {"cam01": "cam01.txt"}}), ["cam01"])["cam01"]
     assert [source.read(k).pose.translation_m[0] for k in range(FRAMES)] == pytest.approx(stamps_s)
     # The other camera ends after 1.95 s: until then this one shows what is nearest, and waits in its gap.

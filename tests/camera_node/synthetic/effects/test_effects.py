@@ -105,8 +105,7 @@ def test_exposure_is_a_sine_in_stops_and_a_stop_doubles_as_far_as_white():
 @pytest.mark.parametrize("level", [20, 220])
 def test_sensor_noise_has_the_stated_variance_and_is_white(level):
     noise = start(SensorNoise(read_noise_counts=2.0, full_well_electrons=2000.0))
-    image = np.full((256, 256, 3), level, np.uint8)
-    a, b = (noise.apply(image, k).astype(float) - level for k in (0, 1))
+    a, b = (noise.apply(np.full((256, 256, 3), level, np.uint8), k).astype(float) - level for k in (0, 1))
     assert a.mean() == pytest.approx(0.0, abs=0.05)
     # Rounding to whole counts adds 1/12.
     assert a.var() == pytest.approx(4.0 + level * 255 / 2000 + 1 / 12, rel=0.02)
@@ -255,8 +254,7 @@ def test_dark_and_overexposed_pixels_stay_unmeasured():
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (48, 5)])
 def test_any_size_and_any_depth_give_counts(shape):
-    rng = np.random.default_rng(2)
-    image = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
+    image = np.random.default_rng(2).integers(0, 256, (*shape, 3), dtype=np.uint8)
     for depth in (0.0, 1e-30, 1e-3, 0.3, 8.0, 65.5, 1e4, 1e30):
         for parameters in ({}, EXACT, {"smoothing_px": 10.0, "noise_px": 100.0, "fixed_noise_px": 100.0}):
             made = DepthSensor(**parameters).start(np.random.default_rng(0))

@@ -16,7 +16,7 @@ from edge_server.experiments.engine.content_key import code_digest, result_key, 
 from edge_server.experiments.engine.engine import ResultStore, _compute_on_ray
 from edge_server.settings import ComputeConfig
 from tests.edge_server.experiments.engine.jobs import Point, end_worker, fail, measure, measure_on_ray, note
-from tests.support import refused, wait_until
+from tests.support import alive, refused, wait_until
 
 POINTS = [Point(seed, scene=scene) for scene in ("room", "tower") for seed in range(4)]
 
@@ -112,16 +112,8 @@ def test_however_it_ends_its_processes_end_too_and_what_was_finished_is_kept(how
         parent.send_signal(how)
     errors = parent.communicate(timeout=30.0)[1]
     assert errors.count("Traceback") == (how == signal.SIGINT), errors
-    wait_until(lambda: not any(_alive(pid) for pid in workers()), "a process goes on without its parent")
+    wait_until(lambda: not any(alive(pid) for pid in workers()), "a process goes on without its parent")
     assert [json.loads(line)["result"] for line in (tmp_path / "r.jsonl").read_text().splitlines()] == [0]
-
-
-def _alive(pid: int) -> bool:
-    """A process that has ended may wait for whoever adopted it to notice."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except FileNotFoundError:
-        return False
 
 
 CODE = '''

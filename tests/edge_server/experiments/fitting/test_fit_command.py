@@ -50,10 +50,8 @@ def test_it_learns_goes_on_and_leaves_report_pictures_and_checkpoint(tmp_path, c
 
 def test_a_scene_of_ours_is_fitted_by_its_name(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = ["fit", "tower", *SMALL_WORDS, "--seconds", "1", "--scale", "4", "--frame", "6"]
-    assert edge_server(words) == 0
-    printed = capsys.readouterr().out
-    assert "tower: 18 views of 32 x 32, at 0.4 s, 1 held out" in printed
+    assert edge_server(["fit", "tower", *SMALL_WORDS, "--seconds", "1", "--scale", "4", "--frame", "6"]) == 0
+    assert "tower: 18 views of 32 x 32, at 0.4 s, 1 held out" in capsys.readouterr().out
     assert report_of(tmp_path / "runs" / "fit-tower")["fidelity"]["series"][-1]["psnr_db"] > 10.0
 
 

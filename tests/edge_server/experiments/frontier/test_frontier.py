@@ -78,8 +78,7 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("edge_server.experiments.frontier.update_time.COSTS_S", 0.3)
     words = ["frontier", "--quick", "--out", str(tmp_path), *SMALL_WORDS]
     assert edge_server(words) == 0
-    first = capsys.readouterr().out
-    assert first.splitlines()[-1].startswith("for this scene: update_ms: ")
+    assert capsys.readouterr().out.splitlines()[-1].startswith("for this scene: update_ms: ")
     for name in ("frontier.png", "updates.png", "frontier.json"):
         assert (tmp_path / name).stat().st_size > 100, name
     data = json.loads((tmp_path / "frontier.json").read_text())

@@ -97,8 +97,7 @@ def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
     if policy.startswith("bandit:"):
         Learner(SELECT, seed=4).save(tmp_path / "policy.npz")
         policy = f"bandit:{tmp_path / 'policy.npz'}"
-    factory = EpisodeFactory(setting(compute=ComputeConfig(5.0)), NOTHING)
-    episode = factory.episode(5)
+    episode = EpisodeFactory(setting(compute=ComputeConfig(5.0)), NOTHING).episode(5)
     point = episode.points[0]
     choice = choose(named(policy)(np.random.default_rng(0)), episode, 0)
     found = episode.evaluate(0, choice)["cam00"]
@@ -115,13 +114,11 @@ def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
 
 @pytest.mark.parametrize("scratch", [True, False])
 def test_every_action_starts_from_the_same_field_whatever_was_evaluated_before(scratch):
-    factory = EpisodeFactory(setting(scratch=scratch), NOTHING)
-    episode = factory.episode(2)
+    episode = EpisodeFactory(setting(scratch=scratch), NOTHING).episode(2)
     asked = [(k, Choice(point.cameras[:n], point.now_ns)) for k, point in enumerate(episode.points) for n in (1, 2, 4)]
     forwards = [episode.evaluate(*a) for a in asked]
     fresh = EpisodeFactory(setting(scratch=scratch), NOTHING).episode(2)
-    backwards = [fresh.evaluate(*a) for a in reversed(asked)][::-1]
-    assert forwards == backwards
+    assert [fresh.evaluate(*a) for a in reversed(asked)] == forwards[::-1]
     assert len({o["cam00"].psnr_db for o in forwards}) == len(forwards)
 
 

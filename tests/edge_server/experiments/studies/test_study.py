@@ -163,12 +163,8 @@ def test_omega_tells_a_plateau_from_a_peak_and_from_a_curve_that_still_rises(tmp
 def test_verdicts_are_corrected_for_their_number():
     """One in twenty comparisons of equals has an interval that leaves out 0: of a hundred none is decided, and what is
     certain stays so."""
-
-    def at(table, metric, labels):
-        return Finding("", (Interval(*table.values(metric, **labels)[0]),))
-
     lucky, certain, equal = (1.0, 0.01, 1.99, 10), (1.0, 0.9, 1.1, 10), (0.0, -1.0, 1.0, 10)
-    claim = Claim("is better.", at)
+    claim = Claim("is better.", lambda table, metric, of: Finding("", (Interval(*table.values(metric, **of)[0]),)))
     study = Study("s", "s", lambda _: [], lambda cases, _: [], ("reward",), (claim,), ("scene",))
     rows = [{"scene": k, "seed": 0, "reward": row} for k, row in enumerate([lucky, certain, *[equal] * 98])]
     assert [v.verdict for v in judge(study, SeedTable(rows))] == ["undecided", "holds", *["undecided"] * 98]

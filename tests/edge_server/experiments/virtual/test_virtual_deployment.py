@@ -99,10 +99,9 @@ def test_depth_is_in_one_of_so_many_frames_and_takes_its_time_on_the_line(every)
 def test_the_links_decide_as_the_simulation_does(channel):
     what = scenario(channel)
     deployment = run(what, RunSettings(steps=1, compute=ComputeConfig(ms_per_update=500.0)), seconds=2.0)
-    config = channel_from_mapping(what.channel)
-    alone = simulate(config, list(what.training), 2.0, what.seed, frame_period_ms=1e3 / 15)
-    expected = {r.camera: r.link.counts[EventKind.DELIVERED] for r in alone.runs}
-    assert dict(deployment.delivered) == expected
+    channel = channel_from_mapping(what.channel)
+    alone = simulate(channel, list(what.training), 2.0, what.seed, frame_period_ms=1e3 / 15)
+    assert dict(deployment.delivered) == {r.camera: r.link.counts[EventKind.DELIVERED] for r in alone.runs}
 
 
 def test_the_present_is_when_the_charge_is_over():
@@ -124,8 +123,7 @@ def test_free_compute_publishes_at_the_decision_and_never_spins():
 
 def test_a_camera_that_reports_late_is_waited_for_only_as_long_as_the_grace():
     channel = {"service": {"law": "deterministic", "mean_ms": 700.0}}
-    settings = RunSettings(steps=1, grace_ms=0.0)
-    deployment = run(scenario(channel), settings, seconds=1.5)
+    deployment = run(scenario(channel), RunSettings(steps=1, grace_ms=0.0), seconds=1.5)
     assert deployment.publications[0].published_ns == 700_000_000
 
 

@@ -43,8 +43,7 @@ def test_parallel_outward_and_single_cameras_have_a_box_too() -> None:
     ahead = (np.array(one.center_m) - pose[:3, 3]) @ pose[:3, 2]
     assert ahead > 1.0
     eyes = [v.camera_to_world[:3, 3] for v in VIEWS]
-    outward = [replace(v, camera_to_world=look_at(eye, 2 * eye)) for v, eye in zip(VIEWS, eyes)]
-    box = scene_box(outward)
+    box = scene_box([replace(v, camera_to_world=look_at(eye, 2 * eye)) for v, eye in zip(VIEWS, eyes)])
     assert np.linalg.norm(np.array(box.center_m)[:2]) < 0.2 and np.isfinite(box.radius_m)
     same = [replace(VIEWS[0], camera=str(k)) for k in range(5)]
     assert np.isfinite(scene_box(same).radius_m) and scene_box(same).radius_m > 0

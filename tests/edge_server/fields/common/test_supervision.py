@@ -9,6 +9,7 @@ from edge_server.fields import Budget, View
 from edge_server.fields.common.supervision import CHANGE, FARTHEST_M, check_view, moved_pixels
 from tests.edge_server.fields.scenes import ring
 from tests.edge_server.fields.small import tiny
+from tests.support import refused
 
 VIEW = ring(1, size=16)[0]
 
@@ -41,8 +42,7 @@ def _lens(*distortion: float) -> View:
     ],
 )
 def test_cameras_that_cannot_be_are_refused_by_name(view: View, text: str) -> None:
-    with pytest.raises(ValueError, match=f"camera {VIEW.camera}: .*{text}"):
-        check_view(view)
+    refused(ValueError, f"camera {VIEW.camera}: .*{text}", check_view, view)
 
 
 def test_a_geographic_grid_and_a_long_lens_are_welcome() -> None:
@@ -55,8 +55,7 @@ def test_a_geographic_grid_and_a_long_lens_are_welcome() -> None:
 
 def test_a_field_that_was_given_what_cannot_be_goes_on() -> None:
     field = tiny("ngp")
-    with pytest.raises(ValueError, match="camera cam00: its distortion"):
-        field.fit([_lens(1e30, 0.0, 0.0, 0.0)], Budget(steps=2))
+    refused(ValueError, "camera cam00: its distortion", field.fit, [_lens(1e30, 0.0, 0.0, 0.0)], Budget(steps=2))
     assert field.step == 0 and not field.view_store.memory
     assert field.fit([VIEW], Budget(steps=2)).steps == 2
 

@@ -180,8 +180,7 @@ def _earned(weight: np.ndarray, samples: int, even: float) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_samples_are_dealt_by_weight_and_leave_no_bin_out(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    weight = rng.random(40) ** 6
+    weight = np.random.default_rng(seed).random(40) ** 6
     weight /= weight.sum() * 1.1
     samples, even = 24, 0.2
     earned = _earned(weight, samples, even)
@@ -224,8 +223,7 @@ def test_samples_lie_in_their_groups_and_stand_for_all_of_them(shift: float) -> 
         assert ((edges[0, members] <= t[k]) & (t[k] <= edges[1, members])).any()
     points = t[:, None] * np.array(TOWARDS) + np.array(START_AT)
     np.testing.assert_allclose(x[:, 2:n].T, _unit(points, True), atol=1e-5)
-    limited = proposal.place_samples(*dealt, ZERO, x[:, :3].copy(), line)
-    assert limited == 3
+    assert proposal.place_samples(*dealt, ZERO, x[:, :3].copy(), line) == 3
 
 
 def _interlevel_case(seed: int):
@@ -286,6 +284,5 @@ def test_the_proposals_gradient_is_added_up_once() -> None:
     for c, n in enumerate(counts):
         np.add.at(expected, cell[c, :n], grad[c, :n])
     np.testing.assert_allclose(gradient[SEGMENT:].reshape(-1), expected, atol=1e-5)
-    touched = (gradient.reshape(len(dirty), -1) != 0).any(axis=1)
-    np.testing.assert_array_equal(dirty, touched)
+    np.testing.assert_array_equal(dirty, (gradient.reshape(len(dirty), -1) != 0).any(axis=1))
     assert not dirty[0] and dirty.any()

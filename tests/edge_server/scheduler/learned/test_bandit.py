@@ -108,11 +108,8 @@ def test_a_policy_is_refused_where_there_are_no_embeddings_or_others_than_it_was
     updates(policy("select", parts=("semantics",), dim=1, embedding="brightness"), BRIGHTNESS)
 
 
-LAYOUT = StateLayout(("age", "pose", "semantics"), dim=3)
-
-
 def a_decision(number=0, seed=0, n=4, hold_ms=0.0):
-    actor = Learner(Spec("select", LAYOUT, hold_ms=hold_ms), seed).actor
+    actor = Learner(Spec("select", StateLayout(("age", "pose", "semantics"), dim=3), hold_ms=hold_ms), seed).actor
     s = state(n, np.random.default_rng(number), d=3, silent=1)
     s = replace(s, frames={c: frame(c, sequence=number) for c in s.cameras[:2]})
     actions, logps = actor.act([s])
@@ -147,8 +144,7 @@ def test_the_oldest_make_room(tmp_path, monkeypatch):
     folder = tmp_path / FOLDER
     assert len(names(folder, "policy-*")) == 1
     assert names(folder, "0*") == ["000003.npz", "000004.npz", "000005.npz"]
-    again = DecisionWriter(tmp_path)  # another process of the same run goes on
-    again.write(a_decision(6))
+    DecisionWriter(tmp_path).write(a_decision(6))  # another process of the same run goes on
     assert names(folder, "0*") == ["000004.npz", "000005.npz", "000006.npz"]
     monkeypatch.setattr(decision_record, "MAX_BYTES", 1)
     large = DecisionWriter(tmp_path / "large")
@@ -176,8 +172,7 @@ def test_a_decision_that_is_held_is_that_of_later_updates_too(tmp_path):
 
 
 def test_damage_is_named(tmp_path):
-    record = DecisionWriter(tmp_path)
-    record.write(a_decision(0))
+    DecisionWriter(tmp_path).write(a_decision(0))
     path = tmp_path / FOLDER / "000000.npz"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])

@@ -80,8 +80,7 @@ def untaught(action, seed=0):
 @pytest.mark.parametrize(("n", "silent"), [(1, 0), (7, 2)])
 def test_shares_sum_to_the_whole(action, n, silent):
     actor, s = untaught(action), state(n, np.random.default_rng(n), d=3, silent=silent)
-    chosen = actor.act([s])[0][0]
-    found = explain(actor, s, chosen)
+    found = explain(actor, s, actor.act([s])[0][0])
     assert sum(found.parts.values()) == pytest.approx(found.logit - found.baseline_logit, abs=1e-9)
     assert set(found.parts) == {"age", "pose", "semantics"}
     assert not found.cameras[n - silent :].any()
@@ -124,8 +123,7 @@ def test_they_sum_to_one_wherever_the_logits_are():
 def test_cameras_that_never_reported_are_no_part_of_it_and_with_nobody_the_empty_set_is_certain():
     logits = np.array([0.3, -0.2, 50.0, 1.0])
     logps = every_set(logits, mask=[1, 1, 0, 1])
-    allowed = ALL[:, 2] == 0
-    np.testing.assert_allclose(np.exp(logps[allowed]).sum(), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(np.exp(logps[ALL[:, 2] == 0]).sum(), 1.0, rtol=1e-12)
     zero = np.zeros((1, 3))
     logits = torch.zeros((1, 3), dtype=torch.float64, requires_grad=True)
     logp = set_log_probability(torch, logits, torch.tensor(zero), torch.tensor(zero))
@@ -138,8 +136,7 @@ def test_cameras_that_never_reported_are_no_part_of_it_and_with_nobody_the_empty
 
 @pytest.mark.parametrize("scale", [1.0, 30.0, 1e4])
 def test_gradients_are_finite_and_those_of_finite_differences(scale):
-    rng = np.random.default_rng(4)
-    values = scale * rng.standard_normal((6, 4)) - scale
+    values = scale * np.random.default_rng(4).standard_normal((6, 4)) - scale
     mask = np.ones((6, 4))
     mask[0, 1:] = 0.0
     chosen = np.zeros((6, 4))

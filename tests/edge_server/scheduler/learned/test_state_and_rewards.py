@@ -87,8 +87,7 @@ def test_observing_gives_ages_poses_and_embeddings_in_the_cameras_order():
     np.testing.assert_array_equal(s.reported, [True, True, False, True])
     assert s.cameras == ("c3", "c2", "c1", "c0")
     np.testing.assert_array_equal(s.embeddings, [[3, 1], [2, 1], [np.nan] * 2, [np.nan] * 2])
-    turn = newest["c3"].pose.matrix()[:3, :3]
-    np.testing.assert_allclose(so3_exp(s.poses[0, 3:]), turn, atol=1e-12)
+    np.testing.assert_allclose(so3_exp(s.poses[0, 3:]), newest["c3"].pose.matrix()[:3, :3], atol=1e-12)
 
 
 def test_poses_do_not_depend_on_where_a_rig_stands_nor_on_its_size():

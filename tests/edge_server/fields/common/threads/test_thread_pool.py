@@ -13,6 +13,7 @@ from numba import njit
 from edge_server.fields.common.kernels.simd import draw
 from edge_server.fields.common.threads import thread_pool
 from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
+from tests.support import refused
 
 # With a nice of 0 the caller is a worker itself.
 either_priority = pytest.mark.parametrize("nice", [0, 5])
@@ -71,8 +72,7 @@ def test_workers_that_are_spared_stay_idle_and_a_closed_pool_computes_nothing(ni
     pool.run(lambda counter, worker: callers.add(threading.get_ident()))
     assert callers == {threading.get_ident()}, "where one worker is left, callers compute themselves"
     pool.close()
-    with pytest.raises(RuntimeError, match="closed"):
-        pool.run(_share, done)
+    refused(RuntimeError, "closed", pool.run, _share, done)
 
 
 @either_priority
@@ -85,8 +85,7 @@ def test_an_error_reaches_the_caller_after_all_are_done_and_the_pool_lives_on(ni
         time.sleep(0.05)
         done.append(worker)
 
-    with pytest.raises(RuntimeError, match="worker 0"):
-        pool.run(fails_first)
+    refused(RuntimeError, "worker 0", pool.run, fails_first)
     assert done == [1] and _engaged(pool) == [0, 1]
     pool.close()
 
@@ -99,8 +98,7 @@ def test_the_number_of_threads_is_that_of_the_cores_the_environment_or_the_calle
     assert Pool().threads == 10
     for given, says in (("0", "at least one thread, not 0"), ("two", "expected a number of threads")):
         monkeypatch.setenv("FRESHFIELD_THREADS", given)
-        with pytest.raises(ValueError, match=says):
-            Pool()
+        refused(ValueError, says, Pool)
     assert shared_pool(1, 3) is shared_pool(1, 3) and shared_pool(1, 3) is not shared_pool(1, 4)
 
 

@@ -84,8 +84,7 @@ def test_pure_rotation_tells_no_depth_and_cameras_in_all_places_give_a_finite_on
     for k, each in enumerate(turned):
         each.camera_to_world[:3, :3] = so3_exp(np.array([0.0, 0.0, 0.03 * k])) @ view.camera_to_world[:3, :3]
     assert sweep_depth(view, turned, DISTANCE_M, shared_pool()) is None
-    small = Pinhole.from_fov(7, 5, 50.0)
-    other = replace(others[0], image=np.zeros((5, 7, 3), np.uint8), intrinsics=small)
+    other = replace(others[0], image=np.zeros((5, 7, 3), np.uint8), intrinsics=Pinhole.from_fov(7, 5, 50.0))
     for distance_m in (1e-3, DISTANCE_M, 1e5):
         depth = sweep_depth(view, [other, *others], distance_m, shared_pool())
         assert depth is None or (np.isfinite(depth).all() and (depth >= 0).all())

@@ -66,8 +66,7 @@ def test_nothing_moves_where_nothing_moves() -> None:
     ball.played(field, range(36), moves=False)
     assert field.moving is not None and len(field.moving) == 0
     assert field.static.finished
-    report = field.fit([ball.seen_by(0, 40, False)], Budget(steps=30))
-    assert report.steps == 0  # all is learned
+    assert field.fit([ball.seen_by(0, 40, False)], Budget(steps=30)).steps == 0  # all is learned
     assert ball.score_of(field.snapshot(), 2.0, moves=False) > 22.0
 
 
