@@ -106,11 +106,12 @@ def checked(scenario: Scenario) -> list[str]:
     states = f", states {', '.join(channel.state_names)}" if channel.chain else ""
     effects = f" with {', '.join(source.effects)}" if source.effects else ""
     moving = "a camera" if cameras_move(scenario) else ""
+    link = channel.preset if "preset" in scenario.channel or not scenario.channel else "its own"
     return [
         f"{scenario.path}: valid",
         f"  cameras  {len(scenario.cameras)}{held}",
         f"  source   {plugins.short_name(source.kind)}{effects}",
-        f"  channel  {channel.preset}: mean delay {channel.mean_delay_ms:.3g} ms{states}",
+        f"  channel  {link}: mean delay {channel.mean_delay_ms:.3g} ms{states}",
         f"  edge     {described(scenario, edge, moving)}",
     ]
 

@@ -75,6 +75,9 @@ def _run(args: argparse.Namespace) -> None:
     with Engine(args.results, args.jobs, args.ray, threads=1) as engine:
         table = compare(setting, folders_of(args), engine, labels, seeds(setting.scenario.seed, "test", args.seeds))
     print(as_text(table, list(labels)))
+    idle = [label for label in labels if not any(table.values("views", policy=label).values())]
+    if idle:
+        print(f"without an update, so that nothing was shown: {', '.join(idle)}")
     if args.json is not None:
         about = {"scenario": setting.scenario.name, "seeds": args.seeds, "seconds": args.seconds, "lead_s": LEAD_S}
         about |= {"seed": setting.scenario.seed, "judged_from": setting.rewarding, "motions": setting.draws_motions}

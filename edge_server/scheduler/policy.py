@@ -1,8 +1,9 @@
 """What a policy is: it looks at a decision epoch and selects the views of the next update.
 
 A decision has two halves, because a policy may wait in between: ``plan`` runs at the decision epoch and says
-how long to wait, ``select`` then picks cameras from what is in the buffer. Both are pure functions of their
-arguments (and of the policy's own seeded stream), so that live and virtual time share them.
+how long to wait, ``select`` then picks cameras from what is in the buffer. Live and virtual time share them: both know
+only their arguments, the policy's own seeded stream, and what the policy remembers of earlier calls. A run makes one
+instance.
 """
 
 from __future__ import annotations
@@ -53,9 +54,9 @@ class SelectionWindow:
     """The first half of a decision: when to select, and which frames qualify.
 
     omega_ms: shown to people; None for policies without one.
-    wait_until_ns: earliest instant of selection.
+    wait_until_ns: earliest instant of selection; there is no latest.
     generated_after_ns, received_after_ns: only frames generated, or arrived, later qualify (omega-wait); None
-    admits all.
+    admits all. ``select`` leaves the others out; nobody else does.
     flush: abort what is in transit at the decision (virtual time only).
     """
 
@@ -106,5 +107,9 @@ class Policy:
         return SelectionWindow()
 
     def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
-        """Cameras to use, at least one if any qualifies (K_t >= 1). Empty: keep waiting."""
+        """Cameras to use, at least one if any qualifies (K_t >= 1). Empty: keep waiting, until the next frame arrives;
+        then this is asked again.
+
+        epoch: of this instant. window: as planned.
+        """
         raise NotImplementedError

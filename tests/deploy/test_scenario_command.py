@@ -64,6 +64,8 @@ def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path,
     number = tmp_path / "plain" / "123.yaml"  # which YAML would not read as text
     printed(capsys, "scenario", "init", str(number), "--like", "quad")
     assert "valid" in printed(capsys, "scenario", "check", str(number))
+    number.write_text('{cameras: {count: 2}, source: {kind: world}, channel: {service: "det:60ms"}}')
+    assert "channel  its own: mean delay 60 ms" in printed(capsys, "scenario", "check", str(number))
     (tmp_path / "card").mkdir()
     assert "card: exists" in refused(capsys, "scenario", "init", str(tmp_path / "third.yaml"), "--like", "card")
     assert not (tmp_path / "third.yaml").exists()
@@ -222,8 +224,9 @@ BROKEN = {
     },
     "policy": {
         "Patient": ({"plan": lambda *_: LATE}, "six cameras: plan: it waits for more than an hour"),
-        "Nobody": ({"select": lambda *_: ("cam99",)}, "one camera: select: expected a tuple of cameras"),
-        "Nothing": ({"select": lambda *_: ()}, "one camera: select: expected a tuple of cameras, one at least"),
+        "Nobody": ({"select": lambda *_: ("cam99",)}, "one camera: select: expected cameras, one at least"),
+        "Nothing": ({"select": lambda *_: ()}, "six cameras: select: expected cameras, one at least"),
+        "List": ({"select": lambda *_: []}, "one camera: select: expected a tuple of cameras, got list"),
         "Changes": ({"select": first_of(lambda names: next(COUNT) % 7 or 1)}, "six cameras: two runs differ"),
         "AnyValue": ({"__init__": lambda s, value, rng: None}, "value out of range is refused: -1 is accepted"),
     },

@@ -56,7 +56,7 @@ def plateau(x: str, start: float) -> Statistic:
         best = at_its_best(curve, lower)
         ends = {at: _gain(curve[at], best, lower) for at in (later[0], later[-1])}
         text = ", ".join(f"at {at:g} {gap.text(digits)}" for at, gap in ends.items())
-        return Finding(f"better than the best ({optimum(curve, lower).x:g}): {text}.", tuple(ends.values()))
+        return Finding(f"gained over the best ({optimum(curve, lower).x:g}): {text}.", tuple(ends.values()))
 
     return found
 

@@ -65,7 +65,8 @@ class StudyRequest:
     out: folder of tables and figures.
     seeds: number of repetitions of a point.
     scenes: names or files of scenarios.
-    channel: section of a channel, used in place of the study's own. channel_name: what it is called.
+    channel: section of a channel, used in place of the study's own. channel_name: what it is called. channel_given: as
+        the command names it.
     jobs, ray: as in ``Engine``.
     cases: words in the names of the selected cases, for studies that consist of cases.
     episodes: episodes of one training, for studies that train.
@@ -78,6 +79,7 @@ class StudyRequest:
     scenes: tuple[str, ...] | None = None
     channel: Mapping[str, Any] | None = None
     channel_name: str = ""
+    channel_given: str = ""
     jobs: int = 1
     ray: str | None = None
     cases: tuple[str, ...] = ()
@@ -107,7 +109,7 @@ class StudyRequest:
         words = ["edge-server study", study, *(["--quick"] if self.quick else [])]
         words += [f"--seeds {self.seeds}"] if self.seeds else []
         words += [f"--scene {','.join(self.scenes)}"] if self.scenes else []
-        words += [f"--channel {self.channel_name}"] if self.channel is not None else []
+        words += [f"--channel {self.channel_given}"] if self.channel is not None else []
         words += [f"--case {case!r}" for case in self.cases]
         words += [f"--episodes {self.episodes}"] if self.episodes else []
         return " ".join(words)

@@ -16,6 +16,7 @@ from edge_server.experiments.studies.registry import CAPTURING, CASED, DEPLOYED,
 from edge_server.experiments.studies.study import StudyError, StudyRequest, run_study
 from edge_server.experiments.studies.trial import scenario_of
 from edge_server.experiments.training.trainer import TrainingError
+from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.viewpoints.candidates import ViewpointError
 from freshfield.files import out_folder
 from freshfield.scenario import ScenarioError
@@ -57,13 +58,17 @@ def main(argv: Sequence[str] | None = None) -> int:
             scenes=tuple(args.scene.split(",")) if args.scene else None,
             channel=channel,
             channel_name=channel_name,
+            channel_given=args.channel or "",
             jobs=args.jobs,
             ray=args.ray,
             cases=tuple(args.case),
             episodes=args.episodes,
         )
         names = {"all": [n for n in STUDIES if n not in (*CAPTURING, *LEARNING, *DEPLOYED)], "learning": list(LEARNING)}
-        for name in checked(names.get(args.study, [args.study]), request):
+        chosen = checked(names.get(args.study, [args.study]), request)
+        if missing := open_lpips(request.folders.lpips)[1]:
+            print(f"without LPIPS and what is computed from it: {missing}", flush=True)
+        for name in chosen:
             study, began = STUDIES[name], time.monotonic()
             print(f"== {name}: {study.title}", flush=True)
             for verdict in run_study(study, request):
@@ -124,7 +129,8 @@ def _parser() -> argparse.ArgumentParser:
         "--scene",
         metavar="NAME|FILE,...",
         help="scenarios with fixed cameras of which some are held out, such as kitchen, dynerf or my-scene.yaml "
-        "(viewpoints and preferences: cell, too); room means room19 [the study's own]",
+        "(viewpoints and preferences: cell, too); room means room19; their channels are left out unless --channel "
+        "names them [the study's own]",
     )
     add(
         "--channel",

@@ -76,12 +76,12 @@ def test_the_command_compares_and_goes_on(tmp_path: Path, capsys, monkeypatch):
     edge = {**RAW["edge"], "steps": 2, "updates": "arrivals", "update_ms": 50, "compute": {"ms_per_step": 2.0}}
     scenario, out = tmp_path / "small.yaml", tmp_path / "scores.json"
     scenario.write_text(yaml.safe_dump({**RAW, "edge": edge}))
-    words = [str(scenario), "all", "freshest-k:2", "--seeds", "2", "--seconds", "0.5", "--jobs", "1"]
+    words = [str(scenario), "all", "freshest-k:2", "wait:60000", "--seeds", "2", "--seconds", "0.5", "--jobs", "1"]
     words += ["--json", str(out), "--results", str(tmp_path / "known.jsonl"), "--channel", "ch6-slow"]
     monkeypatch.setattr("edge_server.embed.make_embedder", lambda _: pytest.fail("no policy looks at embeddings"))
     assert compare.main(words) == 0
     printed = capsys.readouterr().out
-    assert "freshest-k:2" in printed and "minus all" in printed
+    assert "freshest-k:2" in printed and "minus all" in printed and "nothing was shown: wait:60000\n" in printed
     found = json.loads(out.read_text())
     assert found["compute"]["ms_per_step"] == 2.0 and found["policies"]["freshest-k:2"]["views"][0] <= 2.0
     everything, fresh = (found["policies"][name] for name in ("all", "freshest-k:2"))

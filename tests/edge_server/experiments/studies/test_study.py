@@ -100,6 +100,7 @@ def test_figure_6_3_is_made_of_ones_own_channel_and_scene(tmp_path: Path, capsys
     assert main(["omega", "--quick", *words]) == 0
     assert "mine, slow, threshold" in capsys.readouterr().out
     assert {row["channel"] for row in csv.DictReader((out / "omega.csv").open())} == {"slow", ""}
+    assert f"--channel {channel}" in (out / "omega.md").read_text()
     known = (out / "results/trials.jsonl").read_bytes()
     assert main(["omega", "--quick", *words]) == 0  # everything is known
     assert (out / "results/trials.jsonl").read_bytes() == known
