@@ -16,6 +16,7 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.common.statistics import Interval
 from edge_server.experiments.studies import preferences, viewpoints
+from edge_server.experiments.studies.depth_rate import DepthRun, run_with_depth
 from edge_server.experiments.studies.learned_schedulers import LEFT_OUT, WEIGHTED, WHICH_VIEWS
 from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT
 from edge_server.experiments.studies.registry import LEARNING, ON_A_CHANNEL, STUDIES
@@ -266,6 +267,26 @@ def test_claims_hold_if_and_only_if_what_was_learned_is_better(gain: float, said
     ):
         found = judge(STUDIES[name], table_of({**fixed, **levels}, judged_by="moving"))
         assert answers(found, claim) == {said}, name
+
+
+def test_a_run_with_depth_counts_bytes_of_all_cameras_and_scores_its_last_third(tmp_path: Path):
+    scene = tmp_path / "mine.yaml"
+    scene.write_text(yaml.safe_dump({**RAW, "source": {**RAW["source"], "effects": {"depth_sensor": None}}}))
+    runs = {every: DepthRun(str(scene), 3, every, 0.0, 0.9) for every in (0, 1)}
+    found = {every: run_with_depth(run, Folders()) for every, run in runs.items()}
+    assert all(row["shown_psnr_db"] > 5.0 and row["aaoi_ms"] > 10.0 and row["fps"] == 15.0 for row in found.values())
+    assert 4 * 15 * 0.2 < found[0]["kilobytes_per_s"] < 0.8 * found[1]["kilobytes_per_s"]
+
+
+def test_selectors_stand_in_a_table_of_each_scene():
+    of = {"scene": "tile", "views": viewpoints.JUDGED, "ssim": 0.5, "lpips": None, "path_m": 2.0, "choice_ms": 3.0}
+    rows = [{**of, "arm": arm, "seed": k, "psnr_db": 20.0 + k} for arm in viewpoints.ARMS for k in range(2)]
+    text = viewpoints.VIEWPOINTS.tables(SeedTable(rows))
+    assert (
+        "## tile: PSNR (dB)" in text
+        and "\n| random | 20.5 [14.1, 26.9] |\n" in text
+        and "\n| FisherRF | 20.50 [" in text
+    )
 
 
 FEW_VIEWS, SOME = viewpoints.Workload((3, 8), 16, 3, 24), ("random", "coverage, short way")
