@@ -38,7 +38,7 @@ from camera_node.settings import (
 )
 from camera_node.sources.base import rate
 from camera_node.sources.devices.feed import Image
-from camera_node.sources.devices.settings import LIVE_FPS
+from camera_node.sources.settings import LIVE_FPS
 from freshfield import transport
 from freshfield.clock import WallClock
 from freshfield.depth import DepthImage

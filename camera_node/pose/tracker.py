@@ -16,7 +16,7 @@ from pathlib import Path
 
 from camera_node.pose.pairing import PoseGapError, SampleBuffer
 from camera_node.pose.providers import read_sample
-from camera_node.pose.settings import TRACKER_LATE_S, TRACKER_LINE_BYTES, TRACKER_LOOKS_S
+from camera_node.settings import TRACKER_LATE_S, TRACKER_LINE_BYTES, TRACKER_LOOKS_S
 from camera_node.sources.datasets.records import DatasetError
 from freshfield.geometry import Pose
 

@@ -1,14 +1,22 @@
-"""Real frames for the edge's tests: encoded, posed, checksummed, as a node would send them."""
+"""Real frames for the edge's tests: encoded, posed, checksummed, as a node would send them; and a real field, small
+enough that an update takes milliseconds."""
 
 from dataclasses import replace
 
 import numpy as np
 
+from edge_server.fields.registry import make_field
 from freshfield import payload
 from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose, look_at
 
 CAMERA = Pinhole.from_fov(32, 24, 60.0)
+SIZES = {"levels": 2, "log2_table": 10, "rays": 256, "batch_samples": 4096, "samples": 24}
+TINY = {**SIZES, "center_m": [0.0, 0.0, 0.0], "radius_m": 1.0}
+
+
+def tiny_field(seed: int = 0):
+    return make_field("ngp", TINY, seed)
 
 
 def frame(camera: str = "cam01", sequence: int = 0, generated_ns: int = 0, **other) -> Frame:

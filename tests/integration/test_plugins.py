@@ -30,8 +30,7 @@ from freshfield.settings import ScenarioError
 from freshfield.transport import Transport
 from tests.conftest import ROOT
 from tests.edge_server.experiments.rollouts.small import RAW
-from tests.edge_server.fields_for_tests import tiny_field
-from tests.edge_server.frames import frame
+from tests.edge_server.frames import frame, tiny_field
 from tests.support import refused
 
 FILE = Path(__file__).with_name("own_classes.py")

@@ -24,7 +24,7 @@ from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
 from tests.camera_node.depth_source import depth_camera
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
-from tests.edge_server.fields_for_tests import TINY
+from tests.edge_server.frames import TINY
 from tests.integration.peer import Peer, answer
 from tests.integration.test_node_stream import run_while
 from tests.support import free_port, refused

@@ -14,6 +14,7 @@ from edge_server.experiments.common.seed_table import Row, SeedTable
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.studies.drawing import curves
 from edge_server.experiments.studies.findings import better
+from edge_server.experiments.studies.settings import DEPTH_SCORED_FROM, DEPTH_SECONDS
 from edge_server.experiments.studies.study import Claim, Study, StudyRequest, open_engine
 from edge_server.experiments.studies.trial import scenario_of, scene_label, scenes_here
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
@@ -28,8 +29,6 @@ from freshfield.scenario import Scenario
 NONE, SOME, EACH = 0, 5, 1  # every n-th frame brings depth
 PICTURED = ("duo", "quad")
 WIDTHS_MBIT = (0.0, 8.0, 2.0)  # of each camera's line; 0: unbounded
-_SECONDS, _QUICK_SECONDS = 12.0, 6.0
-_SCORED_FROM = 2.0 / 3.0  # of the run
 _OF_FRAMES = {NONE: "no frame", SOME: "each fifth frame", EACH: "each frame"}
 METRICS = ("shown_psnr_db", "shown_psnr_moving_db", "aaoi_ms", "kilobytes_per_s")
 
@@ -55,9 +54,8 @@ class DepthRun:
 
 
 def _cases(request: StudyRequest) -> list[DepthRun]:
-    seconds = _QUICK_SECONDS if request.quick else _SECONDS
     return [
-        DepthRun(scene, seed, every, width, seconds)
+        DepthRun(scene, seed, every, width, DEPTH_SECONDS[request.quick])
         for scene in scenes_here(request, ("quad",))
         for seed in request.repeats(2, 6)
         for width in (WIDTHS_MBIT[::2] if request.quick else WIDTHS_MBIT)
@@ -93,7 +91,7 @@ def run_with_depth(run: DepthRun, folders: Folders) -> Row:
     kilobytes_per_s: what all cameras send. fps: of each. Raises ScenarioError or DatasetError.
     """
     deployment, cameras = _deployed(run, folders)
-    since_s = _SCORED_FROM * run.seconds
+    since_s = DEPTH_SCORED_FROM * run.seconds
     shown = [score for score in deployment.shown if score.published_ns >= 1e9 * since_s]
     ages = [p.aaoi_ms for p in deployment.publications if p.t_s >= since_s]
     fps = float(cameras[0].fps)
@@ -121,7 +119,7 @@ def _draw_images(request: StudyRequest, table: SeedTable) -> None:
     for scene in scenes_here(request, PICTURED):
         shown = []
         for every in (NONE, SOME):
-            run = DepthRun(scene, 0, every, 0.0, _QUICK_SECONDS if request.quick else _SECONDS)
+            run = DepthRun(scene, 0, every, 0.0, DEPTH_SECONDS[request.quick])
             deployment, _ = _deployed(run, request.folders)
             present_ns, truth = deployment.clock.now_ns(), deployment.truth
             assert truth is not None  # studies take scenes of which some camera is held out

@@ -1,6 +1,6 @@
 """Numbers of all studies.
 
-The sizes of a quick and a full pass stand in ``trial``, what one study sweeps in its file.
+The sizes of a quick and a full pass stand in ``trial``, what a study of trials sweeps in its file.
 """
 
 from __future__ import annotations
@@ -13,6 +13,12 @@ STAGGER_MS = 217.0
 
 SHOWN_INSTANTS = 3
 """Random instants at which a publication of a trial is scored, one in each equal part of the time it is shown."""
+
+DEPTH_SECONDS = {True: 6.0, False: 12.0}
+"""Length of a run with depth, by whether it is a quick pass."""
+
+DEPTH_SCORED_FROM = 2.0 / 3.0
+"""Of such a run: layers have begun by then."""
 
 TRAININGS = {True: 1, False: 3}
 """Repeated trainings, by whether it is a quick pass; their spread is part of the interval."""

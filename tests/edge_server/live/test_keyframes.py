@@ -14,8 +14,7 @@ from edge_server.live.keyframes import Keyframes
 from edge_server.scheduler import make_policy
 from edge_server.settings import KeyframesConfig
 from freshfield.geometry import Pinhole, Pose, look_at
-from tests.edge_server.fields_for_tests import tiny_field
-from tests.edge_server.frames import CAMERA, frame
+from tests.edge_server.frames import CAMERA, frame, tiny_field
 
 LENS = Pinhole.from_fov(8, 8, 60.0)
 

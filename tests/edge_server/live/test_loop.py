@@ -12,8 +12,7 @@ from edge_server.live.loop import UpdateLoop
 from edge_server.live.state import Controls
 from edge_server.scheduler import make_policy
 from freshfield.clock import Clock, VirtualClock, WallClock
-from tests.edge_server.fields_for_tests import tiny_field
-from tests.edge_server.frames import frame
+from tests.edge_server.frames import frame, tiny_field
 from tests.support import refused, wait_until
 
 MS = 1_000_000

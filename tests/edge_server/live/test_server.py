@@ -40,8 +40,7 @@ from freshfield.limits import MAX_SCRAPES, MAX_WATCHERS
 from freshfield.transport import Transport, TransportError
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2, frames_pb2_grpc
 from freshfield_up.settings import GRACE_S
-from tests.edge_server.fields_for_tests import TINY
-from tests.edge_server.frames import frame
+from tests.edge_server.frames import TINY, frame
 from tests.support import free_port, refused, wait_until
 
 

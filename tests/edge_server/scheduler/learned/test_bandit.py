@@ -21,8 +21,7 @@ from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import State, StateLayout
 from edge_server.settings import read_config
 from freshfield import scenario
-from tests.edge_server.fields_for_tests import tiny_field
-from tests.edge_server.frames import frame
+from tests.edge_server.frames import frame, tiny_field
 from tests.edge_server.scheduler.learned.problems import state
 from tests.support import refusal, refused
 

@@ -1,4 +1,4 @@
-"""Numbers of recorded data sets."""
+"""Numbers of recorded data sets and of real cameras."""
 
 PHOTO_FPS = 10.0
 """Captures a second of photos without times, where a scenario gives no rate."""
@@ -12,3 +12,8 @@ RECORDING_POSE_NEAR_NS = 50_000_000
 """Largest gap from such an image to a sample of its frame's own transform: half a period of 10 samples a second."""
 RECORDING_PARENTS_NEAR_NS = 250_000_000
 """The same of the transforms above: robots correct map -> odom only some times a second, and by little."""
+
+LIVE_FPS = 15.0
+"""Captures a second where a scenario gives no rate."""
+REOPEN_AFTER_S = (0.25, 0.5, 1.0, 2.0, 5.0)
+"""Pauses before a camera that failed is opened again: after the first failure, the second, ..."""
