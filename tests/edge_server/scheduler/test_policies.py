@@ -97,6 +97,7 @@ def test_a_value_out_of_range_is_refused_by_name_and_an_unknown_policy_lists_the
     beyond = {"threshold": -1, "wait": np.nan, "freshest-k": 0, "round-robin": 2.5, "periodic": 3.7e6, "random": np.nan}
     for name, value in beyond.items():
         refused(ValueError, "expected", make_policy, name, value, np.random.default_rng(0))
+    refused(ValueError, "no value to set", make_policy, "bandit:policy.npz", 3.0, np.random.default_rng(0))
     for name in ("best", "wait+mask", ""):
         with pytest.raises(ValueError, match=f"{re.escape(repr(name))} is not known.*; there are: .*freshest-k"):
             make_policy(name, None, np.random.default_rng(0))
