@@ -2,10 +2,10 @@
 
     python -m tests.mutation_sample --seed 1 --count 200                 # resumes; hours on two cores
 
-cosmic-ray makes the edits (operators, comparisons, conditions, loops, numbers; those that change one by less than a fifth
-are left out); this draws a sample of them, spread over the files by lines, and runs for each the tests nearest to the
-file, for 40 processor seconds: those of its name, those beside them, those that import it, those above. Slow tests are
-left out. Each edit is written into a copy of the checkout, where nothing else is changed.
+cosmic-ray makes the edits (operators, comparisons, conditions, loops, numbers; those that change one by less than a
+fifth are left out); this draws a sample of them, spread over the files by lines, and runs for each the tests nearest
+to the file, for 40 processor seconds: those of its name, those beside them, those that import it, those above. Slow
+tests are left out. Each edit is written into a copy of the checkout, where nothing else is changed.
 
 (cosmic-ray by itself runs one command for every edit of a file, in the checkout; mutmut imports everything through
 trampolines, which numba cannot compile.)
