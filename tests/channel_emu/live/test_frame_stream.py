@@ -268,7 +268,8 @@ async def test_an_operator_changes_the_channel_and_gives_it_back(tmp_path):
         assert await deliveries_of(delay_ms=80.0) == 20  # each frame enters: nothing samples them
         assert 40.0 < r.proxy.stats.latency.summary()["mean"] < 160.0
         assert await deliveries_of(loss=1.0) == 0
-        assert r.proxy._snapshot()["state"] == SET_BY_HAND
+        said = r.proxy._snapshot()
+        assert said["state"] == SET_BY_HAND and said["by_hand"] == {"delay_ms": 0.0, "loss": 1.0}
         assert 0 < await deliveries_of() <= 20 and counts["lost"] == 20
         for wrong in ({"delay_ms": float("nan")}, {"delay_ms": -1.0}, {"delay_ms": 1e9}, {"loss": 1.5}):
             with pytest.raises(grpc.aio.AioRpcError, match="0 to 1"):

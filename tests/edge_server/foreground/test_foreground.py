@@ -140,7 +140,7 @@ def test_every_head_of_a_segmentation_model_is_told_and_decoded(output, kinds, e
 @pytest.mark.parametrize(
     ("output", "kinds", "message"),
     [
-        (head((10, 20, 4, 6, 79.0, 0.0, 5.0)), 2, "scores lie in 0 to 79, not in 0 to 1"),
+        (head((10, 20, 4, 6, 1.9, 0.0, 5.0)), 2, "scores lie in 0 to 1.9, not in 0 to 1"),
         (head((0.5, 0.5, 0.1, 0.1, 0.9, 0.0, 5.0)), 2, "boxes are not in pixels"),
         (head((10, 20, 4, 6, 0.9, 0.0, 5.0)), 5, "fits no head of 5 classes"),
         (columns((*TILE, 0.9, 1.5, 5.0), cells=300), 80, "fits no head of 80 classes"),

@@ -145,7 +145,8 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
     assert {camera: known[camera]["s1"][0] for camera in known} == {
         camera: max(e.sequence for e in delivered if e.camera == camera) for camera in server.scenario.cameras
     }
-    assert serve().server.updater.number == 0
+    fresh = serve().server
+    assert fresh.updater.number == 0 and not fresh.state.started
     kept = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
     assert kept[: len(series)] == series  # what the first process wrote is still there
 

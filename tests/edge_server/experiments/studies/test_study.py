@@ -21,12 +21,22 @@ from edge_server.experiments.studies.learned_schedulers import LEFT_OUT, WEIGHTE
 from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT
 from edge_server.experiments.studies.registry import LEARNING, ON_A_CHANNEL, STUDIES
 from edge_server.experiments.studies.settings import TRAININGS
-from edge_server.experiments.studies.study import Claim, Finding, Study, StudyRequest, Verdict, judge, run_study
-from edge_server.experiments.studies.study_command import main
+from edge_server.experiments.studies.study import (
+    Claim,
+    Finding,
+    Study,
+    StudyError,
+    StudyRequest,
+    Verdict,
+    judge,
+    run_study,
+)
+from edge_server.experiments.studies.study_command import checked, main
 from edge_server.experiments.studies.trial import Trial, run_trial
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.rewards import f_w
 from tests.edge_server.experiments.rollouts.small import RAW
+from tests.support import refused
 
 
 def request(tmp_path: Path, **more: Any) -> StudyRequest:
@@ -276,6 +286,14 @@ def test_a_run_with_depth_counts_bytes_of_all_cameras_and_scores_its_last_third(
     found = {every: run_with_depth(run, Folders()) for every, run in runs.items()}
     assert all(row["shown_psnr_db"] > 5.0 and row["aaoi_ms"] > 10.0 and row["fps"] == 15.0 for row in found.values())
     assert 4 * 15 * 0.2 < found[0]["kilobytes_per_s"] < 0.8 * found[1]["kilobytes_per_s"]
+
+
+def test_a_scene_needs_a_held_out_camera(tmp_path: Path):
+    scenes = [tmp_path / "mine.yaml", tmp_path / "none.yaml"]
+    for scene, cameras in zip(scenes, (RAW["cameras"], {"count": 4})):
+        scene.write_text(yaml.safe_dump({**RAW, "cameras": cameras}))
+    assert checked(["mat"], request(tmp_path, scenes=(str(scenes[0]),))) == ["mat"]
+    refused(StudyError, "no camera is held out", checked, ["mat"], request(tmp_path, scenes=(str(scenes[1]),)))
 
 
 def test_selectors_stand_in_a_table_of_each_scene():

@@ -21,6 +21,7 @@ from edge_server.experiments.virtual.costs import main as costs_main
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.simulate import digest, main
+from edge_server.experiments.virtual.try_policy import try_policy
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.report.build_report import build_report
 from edge_server.scheduler.learned.decision_record import read_decision
@@ -165,6 +166,15 @@ def test_the_charge_is_the_scenarios_or_the_commands(tmp_path: Path, capsys):
     assert simulated(path, capsys)["update_ms"] == pytest.approx(100.0)
     assert simulated(path, capsys, "--compute", "zero")["update_ms"] == 0.0
     assert simulated(path, capsys, "--compute", "5:1", "--steps", "4")["update_ms"] == pytest.approx(21.0)
+
+
+def test_a_policy_is_tried_from_a_library(tmp_path: Path):
+    trial = try_policy("freshest-k:2", write(tmp_path), 1.5)
+    decided = [(row.t_s, row.aaoi_ms) for row in trial.decisions]
+    assert (
+        trial.policy == "freshest-k" and len(decided) > 2 and trial.ages_ms.tolist() == [list(row) for row in decided]
+    )
+    assert trial.shown[:, 1].tolist() == [score.psnr_db for score in trial.scores] and trial.psnr_db > 5.0
 
 
 def test_what_a_learned_policy_decided_is_kept_as_of_a_live_run(tmp_path: Path):
