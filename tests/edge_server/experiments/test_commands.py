@@ -1,6 +1,7 @@
 """Commands: what they cannot do is refused in one line; ``compare`` pairs policies by seed, on anybody's channel."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,8 @@ import yaml
 from edge_server.cli import main
 from edge_server.experiments import compare
 from edge_server.experiments.common.channels import read_channel
-from freshfield.scenario import ScenarioError
+from edge_server.experiments.common.folders import Folders
+from freshfield.scenario import ScenarioError, load
 from tests.edge_server.experiments.rollouts.small import RAW
 from tests.edge_server.experiments.sets import SMALL_WORDS, write_photos
 from tests.support import refusal, refused
@@ -65,6 +67,9 @@ def test_a_channel_is_a_preset_a_scenario_or_a_section_alone(tmp_path: Path):
     found, name = read_channel(str(tmp_path / "mine.yaml"))
     assert name == "mine" and found["service"] == f"trace:{tmp_path / 'delays.txt'}"
     (tmp_path / "whole.yaml").write_text(yaml.safe_dump({**RAW, "channel": section}))
+    (tmp_path / "set").mkdir()
+    recorded = replace(load(str(tmp_path / "whole.yaml")), source={"data": "set"})
+    assert Folders(tmp_path).files_of(recorded) == [tmp_path / "set", tmp_path / "delays.txt"]
     assert read_channel(str(tmp_path / "whole.yaml"))[0] == found
     (tmp_path / "wrong.yaml").write_text("{discipline: sometimes}")
     for text in (str(tmp_path / "wrong.yaml"), str(tmp_path / "none.yaml"), "sms"):

@@ -47,10 +47,13 @@ def test_each_place_has_the_age_of_the_newest_frame_that_looks_at_it():
         return CameraView(name, held_out, replace(frame(camera=name), pose=pose, intrinsics=LENS), age_ms, 1, 0)
 
     cameras = [camera("old", 0.0, 5000.0), camera("new", 2.3, 20.0), camera("truth", 0.0, 1.0, held_out=True)]
-    image = views.age_view(flat(), FRONT, LENS, [*cameras, CameraView("never", False, None, None, 0, 0)])
+    rendering = flat()
+    rendering.depth[:8], rendering.opacity[:8] = 0.01, 0.0  # empty
+    image = views.age_view(rendering, FRONT, LENS, [*cameras, CameraView("never", False, None, None, 0, 0)])
     light = views.AGE_VIEW_LIGHT + (1 - views.AGE_VIEW_LIGHT) * 0.5
     assert image[24, 4] / light * 255 == pytest.approx(STALE, abs=2)
     assert image[24, 60] / light * 255 == pytest.approx(FRESH, abs=2)
+    assert image[2, 30] / light * 255 == pytest.approx(UNKNOWN, abs=2)
     assert views.age_view(flat(), FRONT, LENS, [])[24, 30] / light * 255 == pytest.approx(UNKNOWN, abs=2)
 
 
