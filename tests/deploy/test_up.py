@@ -317,7 +317,7 @@ def test_stop_terminates_first_and_kills_after_the_grace_time(tmp_path):
         child.start()
         wait_until(lambda child=child: "\nup\n" in child.log.read_text(), "it did not start")
     began = time.monotonic()
-    processes.stop([obedient, stubborn], grace_s=1.0)
+    processes.stop([python(tmp_path, ""), obedient, stubborn], grace_s=1.0)  # the first has not begun
     assert time.monotonic() - began < 5.0
     assert not obedient.running and not stubborn.running
     assert not obedient.killed and obedient.process.returncode == 0 and "goodbye" in obedient.log.read_text()
