@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from camera_node import sender as sender_module
 from camera_node.capture import Camera, ShotCache, build_cameras, prepare
 from camera_node.capture_schedule import OnceSchedule, PartialSchedule, RateSchedule
 from camera_node.cli import main
@@ -29,7 +30,7 @@ from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
 from tests.camera_node.depth_source import LENS, POSE, DepthSource, depth_camera
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
-from tests.integration.peer import Peer, answer, silence
+from tests.integration.peer import Peer, answer
 from tests.support import refusal, refused, until
 
 NOBODY = "127.0.0.1:1"
@@ -76,17 +77,13 @@ async def test_frames_that_go_without_their_depth_are_counted():
 
 @pytest.mark.parametrize(
     ("respond", "failure"),
-    [
-        (answer(pb.OUTCOME_DROPPED_BUSY), None),
-        (answer(pb.OUTCOME_REJECTED, "lens"), "all frames were refused: lens "),
-        (silence, None),
-    ],
+    [(answer(pb.OUTCOME_DROPPED_BUSY), None), (answer(pb.OUTCOME_REJECTED, "lens"), "all frames were refused: lens ")],
 )
 async def test_the_end_says_if_every_frame_was_refused(respond, failure):
     peer = await Peer(respond=respond).start()
     node = node_of([Eye("cam01")], peer.address)
     running = asyncio.ensure_future(node.run())
-    await peer.until(3 if respond is not silence else 1)
+    await peer.until(3)
     node.stop()
     await running
     await peer.stop()
@@ -121,6 +118,16 @@ async def test_the_time_allowed_for_an_answer_doubles_after_each_timeout_up_to_i
         allowed_s.append(sender._patience_s)
     assert allowed_s == [0.02, 0.04, 0.05, 0.05] and outbox.counts["broken"] == 4
     assert not sender.connected, "it never was"
+
+
+async def test_an_answer_is_waited_for_eight_times_as_long_as_the_slowest_recent_one(monkeypatch):
+    sender = Sender(Outbox("cam01", "s", None, VirtualClock(0)), MagicMock(), (), lambda: None, MagicMock(), {}, 60.0)
+    call, allowed_s = MagicMock(write=AsyncMock(), read=AsyncMock(return_value=pb.PushResponse())), []
+    for took_s in (0.1, 1.0, 0.5, 10.0):
+        monkeypatch.setattr(sender_module, "time", MagicMock(monotonic=MagicMock(side_effect=[0.0, took_s])))
+        await sender._exchange(call, Frame("cam01", "s", 0, 0, POSE, LENS, "jpeg", b""))
+        allowed_s.append(sender._patience_s)
+    assert allowed_s == pytest.approx([1.25, 8.0, 7.6, 60.0])
 
 
 def test_a_node_that_reached_nobody_ends_with_1(capsys):

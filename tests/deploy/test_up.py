@@ -34,7 +34,7 @@ from freshfield_up.processes import Child
 from freshfield_up.status import status_line, summarize
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde
 from tests.conftest import ROOT
-from tests.support import alive, free_port, refused, wait_until
+from tests.support import alive, free_port, refusal, refused, wait_until
 
 SMALL = """
 name: small
@@ -134,20 +134,16 @@ def test_the_signals_of_native_code_are_explained():
 
 
 def test_what_cannot_run_is_refused_in_one_line_before_anything_starts(tmp_path, capsys):
-    def refusal(scenario: str | Path, port: int, out: str = "new", *more: str) -> str:
-        assert main(["demo", str(scenario), "--out", str(tmp_path / out), "--port", str(port), *more]) == 2
-        said = capsys.readouterr().err
-        assert said.count("\n") == 1 and not (tmp_path / "new").exists()
-        return said
-
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        assert "is taken by another program" in refusal("room", taken.getsockname()[1])
+        words = ("demo", "room", "--out", tmp_path / "new", "--port", taken.getsockname()[1])
+        assert "is taken by another program" in refusal(capsys, main, *words)
+    assert not (tmp_path / "new").exists()
     (out := tmp_path / "run").mkdir()
     (out / "run.json").write_text("{}")
     (learned := out / "learned.npz").write_bytes(b"weights")
-    said = refusal("room", free_port(), "run", "--policy", f"bandit:{learned}")
+    said = refusal(capsys, main, "demo", "room", "--out", out, "--port", free_port(), "--policy", f"bandit:{learned}")
     assert "is emptied first; choose another --out" in said and learned.read_bytes() == b"weights"
 
 

@@ -60,21 +60,20 @@ async def opened(channel, say: bytes | None = None):
     return call
 
 
-async def poured(channel) -> grpc.StatusCode:
-    """Takes what is poured; the status at the end."""
-    call = channel.unary_stream("/t/Pour")(b"")
-    with suppress(grpc.RpcError):
-        async for _ in call:
-            pass
+async def ended(call) -> grpc.StatusCode:
+    """How a call ends whose answers are read."""
+    with suppress(grpc.aio.AioRpcError):
+        if hasattr(call, "read"):
+            while await call.read() is not grpc.aio.EOF:
+                pass
     return await call.code()
 
 
 async def test_a_stream_that_ends_in_the_midst_of_an_answer_is_told_why():
     async with echoing(OpenStreams(8)) as channel:
-        calls = [asyncio.create_task(poured(channel)) for _ in range(200)]
+        calls = [asyncio.create_task(ended(channel.unary_stream("/t/Pour")(b""))) for _ in range(200)]
         await until(lambda: sum(not call.done() for call in calls) <= 8)
-        ended = [call.result() for call in calls if call.done()]
-        assert ended == 192 * [grpc.StatusCode.RESOURCE_EXHAUSTED]
+        assert [call.result() for call in calls if call.done()] == 192 * [grpc.StatusCode.RESOURCE_EXHAUSTED]
         for call in calls:
             call.cancel()
 
@@ -101,7 +100,8 @@ async def test_before_the_server_stops_every_stream_is_told_so_and_nothing_is_lo
         calls.append(channel.stream_stream("/t/Echo")())  # opens while the server ends
         assert [await call.code() for call in calls] == 3 * [grpc.StatusCode.UNAVAILABLE]
         assert [await call.details() for call in calls] == 3 * ["the server ends"]
-        assert await poured(channel) is grpc.StatusCode.UNAVAILABLE  # one that begins with an answer
+        pouring = channel.unary_stream("/t/Pour")(b"")  # begins with an answer
+        assert await ended(pouring) is grpc.StatusCode.UNAVAILABLE
         assert not streams._silent and not streams._used
     # gRPC's poller may wake the closed event loop of an earlier test.
     assert all("PollerCompletionQueue._handle_events" in line for line in caplog.messages)
@@ -138,15 +138,6 @@ def test_a_session_belongs_to_the_stream_that_sends_it():
     for k in range(1000):
         sessions.claim("cam00", f"s{k}", spoofer, k)
     assert len(sessions._sent["cam00"]) == MAX_SESSIONS_PER_CAMERA
-
-
-async def ended(call) -> grpc.StatusCode:
-    """How a call ends whose answers are read."""
-    with suppress(grpc.aio.AioRpcError):
-        if hasattr(call, "read"):
-            while await call.read() is not grpc.aio.EOF:
-                pass
-    return await call.code()
 
 
 async def test_a_call_of_which_no_message_comes_ends(monkeypatch):

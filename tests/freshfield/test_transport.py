@@ -4,8 +4,6 @@ import argparse
 import asyncio
 import contextlib
 import dataclasses
-import shutil
-import subprocess
 from pathlib import Path
 
 import grpc
@@ -13,6 +11,7 @@ import grpc.aio
 import numpy as np
 import pytest
 
+from edge_server.live.keys_command import _certify, make_keys
 from freshfield import transport
 from freshfield.limits import MAX_PAYLOAD_BYTES
 from freshfield.transport import Transport, TransportError, host_port, peer_text
@@ -74,51 +73,47 @@ def test_host_and_port_are_told_apart():
 
 
 @pytest.fixture(scope="module")
-def pem(tmp_path_factory):
-    """An authority, a server's and a client's certificate, and a stranger's."""
-    if shutil.which("openssl") is None:
-        pytest.skip("openssl is not installed")
-    folder = tmp_path_factory.mktemp("pem")
-
-    def openssl(line: str) -> None:
-        subprocess.run(["openssl", *line.split()], check=True, capture_output=True, cwd=folder)
-
-    for name in ("ca", "stranger"):
-        openssl(f"req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN={name} -keyout {name}.key -out {name}.pem")
-    (folder / "ext").write_text("subjectAltName=DNS:localhost")
-    for name, subject in (("server", "server"), ("client", "viewer")):
-        openssl(f"req -newkey rsa:2048 -nodes -subj /CN={subject} -keyout {name}.key -out {name}.csr")
-        signing = "-CA ca.pem -CAkey ca.key -days 2 -CAcreateserial -extfile ext"
-        openssl(f"x509 -req -in {name}.csr {signing} -out {name}.pem")
+def keys(tmp_path_factory):
+    """Of a deployment, as ``edge-server keys`` makes them; of one whom it certified and whose name is no caller's; and
+    a stranger's."""
+    folder = tmp_path_factory.mktemp("keys")
+    make_keys(folder / "ours", [], [], [])
+    for name, authority in (("nobody", folder / "ours"), ("stranger", None)):
+        (folder / name).mkdir()
+        _certify(folder / name, name, (), authority)
     return folder
 
 
-async def test_tls_and_mutual_tls(pem):
-    server_tls = Transport(cert=pem / "server.pem", key=pem / "server.key")
-    mutual = Transport(cert=pem / "server.pem", key=pem / "server.key", ca=pem / "ca.pem")
-    trusting, deceived = Transport(ca=pem / "ca.pem"), Transport(ca=pem / "stranger.pem")
-    known = Transport(cert=pem / "client.pem", key=pem / "client.key", ca=pem / "ca.pem")
+def own(folder: Path) -> dict[str, Path]:
+    """A certificate and its key."""
+    return {"cert": folder / "cert.pem", "key": folder / "key.pem"}
+
+
+async def test_tls_and_mutual_tls(keys):
+    server_tls, ca = Transport(**own(keys / "ours/edge")), keys / "ours/edge/ca.pem"
+    trusting, deceived = Transport(ca=ca), Transport(ca=keys / "stranger/cert.pem")
+    known, nobody = (Transport(**own(keys / who), ca=ca) for who in ("ours/viewer", "nobody"))
 
     async with serving(server_tls, Every(sizes)) as port:
         assert await ask(trusting, port) == b"42"
         for client in (deceived, Transport()):
             assert await status(ask(client, port)) == "UNAVAILABLE"
-    async with serving(mutual, Every(sizes)) as port:
+    async with serving(dataclasses.replace(server_tls, ca=ca), Every(sizes)) as port:
         assert await ask(known, port) == b"42"
         assert await status(ask(trusting, port)) == "UNAVAILABLE"
-        assert await status(ask(mutual, port)) == "UNAUTHENTICATED", "its name is no caller's"
+        assert await status(ask(nobody, port)) == "UNAUTHENTICATED", "its name is no caller's"
         wrong_token = dataclasses.replace(known, tokens={"": "wrong"})
         assert await status(ask(wrong_token, port)) == "UNAUTHENTICATED", "a certificate does not make it good"
 
 
 @pytest.mark.parametrize("encrypted", [False, True])
-async def test_connections_are_few_and_those_that_do_nothing_end(encrypted, pem, monkeypatch):
+async def test_connections_are_few_and_those_that_do_nothing_end(encrypted, keys, monkeypatch):
     """Over TLS four in their handshake take all places, and end with its time-out; else four without a call,
     which have said that they speak HTTP/2."""
     changed = {"grpc.max_allowed_incoming_connections": 4, "grpc.max_connection_idle_ms": 1000}
     changed |= {"grpc.server_handshake_timeout_ms": 1000 if encrypted else 60_000}
-    tls = Transport(cert=pem / "server.pem", key=pem / "server.key") if encrypted else Transport()
-    caller = Transport(ca=pem / "ca.pem") if encrypted else Transport()
+    tls = Transport(**own(keys / "ours/edge")) if encrypted else Transport()
+    caller = Transport(ca=keys / "ours/edge/ca.pem") if encrypted else Transport()
     fewer = [(name, changed.get(name, value)) for name, value in transport.SERVER_OPTIONS]
     monkeypatch.setattr(transport, "SERVER_OPTIONS", fewer)
 
@@ -173,7 +168,7 @@ def parsed(*arguments: str) -> Transport:
     return transport.from_arguments(parser.parse_args(arguments))
 
 
-def test_options_become_a_transport(pem, tmp_path):
+def test_options_become_a_transport(keys, tmp_path):
     token, damaged = tmp_path / "token", tmp_path / "damaged.pem"
     token.write_text("  secret\n")
     assert parsed() == Transport()
@@ -188,7 +183,7 @@ def test_options_become_a_transport(pem, tmp_path):
         (("--tls-ca", str(tmp_path / "none.pem")), "cannot read"),
         (("--tls-cert", str(token)), "go together"),
         (("--tls-ca", str(damaged)), r"damaged\.pem holds no certificate"),
-        (("--tls-cert", str(damaged), "--tls-key", str(pem / "server.key")), r"cannot use --tls-cert .*damaged\.pem"),
+        (("--tls-cert", str(damaged), "--tls-key", str(damaged)), r"cannot use --tls-cert .*damaged\.pem"),
     ):
         refused(TransportError, why, parsed, *words)
 

@@ -5,7 +5,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -22,7 +21,6 @@ from freshfield.limits import MAX_CAPTURE_AGE_NS
 from freshfield.transport import Transport
 from tests.camera_node.sources.datasets.photos import photo_scenario, picture, write_photos
 from tests.integration.peer import ClockAhead, Peer, answer, silence, wrong_number
-from tests.support import until
 
 
 def make_node(tmp_path: Path, to: str, seconds: float | None = None, cameras: int = 3, **options) -> Node:
@@ -135,24 +133,6 @@ async def test_a_peer_that_talks_nonsense_or_not_at_all_is_left(tmp_path, respon
         assert sequences == sorted(set(sequences))  # nothing is ever sent twice
 
 
-@pytest.mark.slow  # waits out two timeouts
-async def test_answers_much_later_than_before_mean_a_dead_stream_and_a_slow_link_is_given_time(tmp_path):
-    peer = await Peer().start()
-    node = make_node(tmp_path, peer.address, cameras=2, response_timeout_s=60.0)
-
-    async def work():
-        await peer.until(40)
-        peer.respond = silence
-        await until(lambda: peer.streams >= 4)
-        peer.respond = answer(after_s=1.6)  # more than was waited for until then
-        await peer.until(len(peer.frames) + 12)
-
-    await run_while(node, work())
-    await peer.stop()
-    for c in check_books(tmp_path / "out").values():
-        assert 1 <= c["broken"] <= 4 and c["answered"] >= 23
-
-
 def test_offset_of_a_wrong_clock_is_estimated(tmp_path):
     ahead_ns = 7_000_000_000
     peer = Peer(clock=ClockAhead(ahead_ns))
@@ -187,15 +167,12 @@ async def test_a_peer_that_comes_late_and_dies_again_and_again(tmp_path):
     peer = await Peer().start()
     await peer.stop()  # the port is known now, and nobody listens
     node = make_node(tmp_path, peer.address)
-    gaps_s = []
 
     async def work():
         await asyncio.sleep(0.7)
         for _ in range(4):
-            begin = time.perf_counter()
             await peer.start()
             await peer.until_each(CAMERAS, 5)
-            gaps_s.append(time.perf_counter() - begin)
             await peer.stop()
             await asyncio.sleep(0.3)
         await peer.start()
@@ -209,10 +186,6 @@ async def test_a_peer_that_comes_late_and_dies_again_and_again(tmp_path):
         assert sequences == sorted(set(sequences))
         assert len(sequences) <= counts[camera]["sent"] <= len(sequences) + counts[camera]["broken"]
         assert node.senders[camera].connections >= 5
-    assert max(gaps_s) < 10  # back-off is capped: five frames at 20 a second arrive within seconds of every restart
-    # What waited through an outage was replaced by newer captures, not kept.
-    late_ms = [(a - f.generated_edge_ns) / 1e6 for a, f in zip(peer.arrived_ns, peer.frames)]
-    assert sorted(late_ms)[len(late_ms) // 2] < 100 and max(late_ms) < 1000
 
 
 async def test_sigterm_ends_cleanly_with_the_last_answer(tmp_path):

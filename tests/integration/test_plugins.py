@@ -112,7 +112,6 @@ def test_what_is_of_the_wrong_kind_is_refused_by_name(folder):
         (lambda: channel_from_mapping({"faults": {f"{own}Youngest": {}}}), r"from channel_emu\.model\.link\.Fault"),
         (lambda: make_field(f"{own}Youngest"), "expected an attribute Settings"),
         (lambda: source(kind=f"{own}Youngest"), r"raw.yaml: source.kind: .*base\.Source"),
-        (lambda: source(kind=f"{own}Turning", level=256), r"raw.yaml: source.level: expected .*0 to 255"),
     ):
         refused(ScenarioError, why, use)
 

@@ -1,7 +1,6 @@
 """From a node to an edge that records, and from the recording through a node: the same, each message."""
 
 import asyncio
-import json
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +13,6 @@ from camera_node.settings import source_config
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.ingest import Ingest
 from edge_server.live.output.recorder import Recorder
-from edge_server.live.server import EdgeServer, ServerOptions
-from edge_server.settings import read_config
 from freshfield.clock import WallClock
 from freshfield.frame import Frame, to_request
 from freshfield.ledger import Ledger
@@ -24,16 +21,13 @@ from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
 from tests.camera_node.depth_source import depth_camera
 from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
-from tests.edge_server.frames import TINY
 from tests.integration.peer import Peer, answer
-from tests.integration.test_node_stream import run_while
-from tests.support import free_port, refused
+from tests.support import refused
 
 pytest.importorskip("mcap", reason="MCAP is not installed (extra mcap)")
 
 from freshfield.session.reader import Session
 from freshfield.session.writer import SessionWriter
-from tests.support import until
 
 CAMERAS = {"count": 3, "held_out": ["cam00"]}
 
@@ -49,11 +43,6 @@ def camera_of(scenario) -> Camera:
     return camera
 
 
-def node_of(scenario, to: str, cameras=None, seconds: float | None = None) -> Node:
-    built = build_cameras(scenario, source_config(scenario), cameras or scenario.cameras)
-    return Node(scenario, built, NodeOptions(to=to, transport=Transport(), seconds=seconds))
-
-
 def sent_by(scenario, cameras=None, seconds=None, take=None, after_s: float = 0.0) -> list[pb.PushRequest]:
     """What a node sends until it ends by itself (or after some seconds); ``take`` answers, after a while."""
     got: list[pb.PushRequest] = []
@@ -64,7 +53,9 @@ def sent_by(scenario, cameras=None, seconds=None, take=None, after_s: float = 0.
 
     async def scene() -> None:
         peer = await Peer(respond=respond).start()
-        await asyncio.wait_for(node_of(scenario, peer.address, cameras, seconds).run(), 20)
+        built = build_cameras(scenario, source_config(scenario), cameras or scenario.cameras)
+        node = Node(scenario, built, NodeOptions(to=peer.address, transport=Transport(), seconds=seconds))
+        await asyncio.wait_for(node.run(), 20)
         await peer.stop()
 
     asyncio.run(scene())
@@ -177,25 +168,3 @@ def test_depth_that_cannot_be_read_again_costs_only_the_depth(tmp_path):
         file.write(b"\xff" * (location.size - location.size // 2))
     assert replayed.capture(0).payload == camera.capture(0).payload
     assert replayed.capture(0).encoded_depth is None and replayed.depth_failed == 1
-
-
-@pytest.mark.slow
-async def test_a_whole_edge_server_records_what_it_decides(tmp_path):
-    """Decisions, and their scores when these are known, beside the frames they were made on."""
-    field = {"field": "ngp", "field_options": TINY, "update_ms": 100, "grace_ms": 500, "lpips": "none"}
-    edge = parse({"name": "edge", "seed": 3, "cameras": CAMERAS, "edge": field}, tmp_path / "e.yaml")
-    address = f"127.0.0.1:{free_port()}"
-    server = EdgeServer(edge, read_config(edge), ServerOptions(address, tmp_path / "out", record=tmp_path / "b.mcap"))
-    running = asyncio.ensure_future(asyncio.to_thread(server.run))
-
-    scored = until(lambda: any(p.psnr_db is not None for p in server.state.publications()), 100.0)
-    await run_while(node_of(photo_scenario(write_photos(tmp_path / "data", 24), 3, fps=25), address), scored)
-    server.stop()
-    await running
-    status, found = json.loads((tmp_path / "out/edge.json").read_text()), Session(tmp_path / "b.mcap")
-    written = found.messages.total()
-    assert status["recording"] == {"file": "b.mcap", "written": written, "dropped": 0, "failed": False}
-    delivered = {c["camera"]: c["delivered"] for c in status["cameras"]}
-    assert {camera: len(frames) for camera, frames in found.frames.items()} == delivered
-    assert found.cut is None and found.messages["/decisions"] == status["updates"]["count"]
-    assert 0 < found.messages["/scores"] <= found.messages["/decisions"]

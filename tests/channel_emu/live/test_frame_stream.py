@@ -18,6 +18,7 @@ from channel_emu.live.camera_stream import PUSH
 from channel_emu.live.frame_proxy import SET_BY_HAND
 from channel_emu.live.live_link import Message
 from channel_emu.live.proxy import EmulatorFailed
+from channel_emu.live.replay_link import ReplayLink
 from channel_emu.live.settings import CREDITS
 from channel_emu.model import trace
 from channel_emu.model.chain import ChainError
@@ -31,6 +32,7 @@ from freshfield.transport import Transport
 from freshfield.v1 import channel_pb2, channel_pb2_grpc, clock_pb2, clock_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
 from tests.channel_emu.live.emulator import CAMERAS, answer_to, emulate, make, offer
+from tests.channel_emu.model.test_trace import record
 from tests.edge_server.frames import frame
 from tests.freshfield.serving import status
 from tests.integration.peer import Peer, silence
@@ -93,22 +95,11 @@ async def test_live_decisions_are_those_of_virtual_time(tmp_path, section):
     assert section is not FAST or status["state"] in status["states"] == ["low", "high"]
 
 
-async def test_a_trace_replayed_at_another_pace_is_decided_and_delivered_alike(tmp_path):
-    """Each delivery as long after its offer as recorded, later by the delay error alone."""
-    paths = tmp_path / "0" / "t.jsonl", tmp_path / "1" / "t.jsonl"
-    for path, section, period_s in zip(paths, (FAST, QUICK), (0.004, 0.006)):
-        replay = None if path is paths[0] else trace.read(paths[0])
-        async with emulate(path.parent, section, trace=path, replay=replay) as r:
-            await r.stream(60, period_s)
-            await r.settled()
-    assert frame_account(tmp_path / "1")["sent"] == 240
-    recorded, replayed = (trace.read(path).by_camera() for path in paths)
-    for camera in CAMERAS:
-        for then, now in zip(recorded[camera], replayed[camera], strict=True):
-            assert (then.outcome, then.drawn_ns) == (now.outcome, now.drawn_ns)
-            if then.outcome == "delivered":
-                assert then.ended_ns - then.offered_ns == now.ended_ns - now.offered_ns
-                assert now.actual_ns is None or now.actual_ns >= now.ended_ns
+async def test_a_trace_decides_in_place_of_the_channel_for_the_cameras_that_it_has(tmp_path):
+    """Each message as recorded, at any pace: ``test_trace``."""
+    found, _ = record(tmp_path / "t.jsonl", {"preset": "ch5"}, 20)
+    _, flows = make(tmp_path, "127.0.0.1:1", {}, ("a", "cam00"), replay=found)
+    assert [isinstance(flow.link.model, ReplayLink) for flow in flows] == [True, False]
 
 
 async def test_the_account_closes_with_every_fault(tmp_path):

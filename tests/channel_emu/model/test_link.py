@@ -78,8 +78,9 @@ def test_what_others_cause_is_told_at_once():
     assert subject["b"].next_event_ns == 10 * MS  # in the past: there is news
     assert [(e.kind, e.at_ns) for e in subject["b"].advance(12 * MS)] == [(EventKind.STARTED, 10 * MS)]
     assert subject["b"].next_event_ns == 20 * MS
-    # One clock for all: c cannot offer before what was decided already.
+    # One clock for all, held where it runs backwards: c cannot offer before what was decided already.
     assert subject["c"].offer(5 * MS)[0].offered_ns == 12 * MS and subject["c"].clock_backwards == 1
+    assert subject["c"].advance(5 * MS) == [] and subject["c"].clock_backwards == 2
 
 
 def test_a_reset_breaks_one_camera_and_frees_the_line():
@@ -146,16 +147,6 @@ def test_a_change_keeps_due_instants_and_lets_in_what_waits_to_be_sampled():
     again = subject.offer(800 * MS)[0]
     subject.advance(900 * MS)
     assert again.drawn_ns == 50 * MS and again.started_ns > again.offered_ns
-
-
-def test_a_clock_that_runs_backwards_is_held_and_counted():
-    subject = links("drop-new", [10])["a"]
-    subject.offer(50 * MS)
-    transit, _ = subject.offer(20 * MS)
-    assert transit.offered_ns == 50 * MS and transit.outcome is EventKind.DROPPED_BUSY
-    assert subject.clock_backwards == 1
-    assert subject.advance(10 * MS) == [] and subject.clock_backwards == 2
-    assert [e.at_ns for e in subject.advance(60 * MS)] == [60 * MS]
 
 
 CAMERAS = "abc"

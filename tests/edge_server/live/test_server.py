@@ -151,6 +151,18 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
     assert kept[: len(series)] == series  # what the first process wrote is still there
 
 
+def test_a_run_is_recorded_with_its_frames_decisions_and_scores(serve, tmp_path):
+    reader = pytest.importorskip("freshfield.session.reader", reason="MCAP is not installed (extra mcap)")
+    run = serve(record=tmp_path / "b.mcap").fed()
+    until(lambda: any(p.psnr_db is not None for p in run.server.state.publications()))
+    run.end()
+    status, found = json.loads((tmp_path / "out/edge.json").read_text()), reader.Session(tmp_path / "b.mcap")
+    written = found.messages.total()
+    assert status["recording"] == {"file": "b.mcap", "written": written, "dropped": 0, "failed": False}
+    assert sum(map(len, found.frames.values())) == len(run.answers) and found.cut is None
+    assert 0 < found.messages["/scores"] <= found.messages["/decisions"] == status["updates"]["count"]
+
+
 def test_operators_see_and_change_a_running_server(serve):
     run = serve()
     server, channel = run.server, connected(run)

@@ -64,7 +64,6 @@ def test_a_dry_run_writes_a_trajectory_within_its_limits(tmp_path, capsys):
     flange = np.array([[float(row[f"{axis}_m"]) for axis in "xyz"] for row in rows])
     assert np.ptp(flange[:, 1]) > 0.01
     assert np.allclose(flange[-1], UR3E.forward(joints[-1])[:3, 3], atol=1e-6)
-    assert np.allclose(joints[-1], joints[-2]), "it ends at rest"
 
 
 def test_an_arm_that_has_been_stopped_is_sent_nothing_more(monkeypatch):
