@@ -131,7 +131,7 @@ async def test_an_answer_is_waited_for_eight_times_as_long_as_the_slowest_recent
 
 
 def test_a_node_that_reached_nobody_ends_with_1(capsys):
-    assert main(["run", "tile", "--camera", "cam01", "--to", NOBODY, "--seconds", "0.2", "--quiet"]) == 1
+    assert main(["run", "tile", "--camera-index", "0", "--to", NOBODY, "--seconds", "0.2", "--quiet"]) == 1
     assert f"camera-node: {NOBODY} was never reached: " in capsys.readouterr().err
 
 
@@ -313,6 +313,7 @@ def test_mistakes_are_one_line_and_exit_code_2(capsys, tmp_path):
     (tmp_path / "bad.yaml").write_text("cameras: {count: 20}\nsource: {kind: world, scene: room}\n")
     for words, message in (
         (["room", "--camera", "cam01,cam77"], "has no camera cam77; it has cam00, "),
+        (["room", "--camera-index", "13"], "--camera-index 13: expected 0 to 12"),
         (["room", "--all", "--to", "host:0"], "--to: expected HOST:PORT"),
         (["room", "--all", "--seconds", "nan"], "--seconds: expected"),
         ([tmp_path / "bad.yaml", "--all"], "bad.yaml: source: "),

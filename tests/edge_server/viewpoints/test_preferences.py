@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edge_server.viewpoints.candidates import ViewpointError, half_hemisphere
-from edge_server.viewpoints.experts import SimulatedExpert
+from edge_server.viewpoints.experts import SimulatedExpert, judge
 from edge_server.viewpoints.features import GEOMETRY, StepFeatures
 from edge_server.viewpoints.preference_model import Answer, fit_reward, random_pair
 from edge_server.viewpoints.preference_session import PreferenceSession, Question
@@ -51,6 +51,15 @@ def test_after_sixty_answers_with_one_in_ten_wrong_it_agrees_as_the_expert_does(
         itself = 1 - 2 * 0.1 * 0.9  # the same answer twice
         found.append(agreement(model, features[80:], expert) / itself)
     assert np.mean(found) >= 0.9
+
+
+def test_tastes_are_of_the_object_of_edges_and_of_detail():
+    truth = np.zeros((16, 16, 3))
+    truth[4:12, 4:12] = 1.0
+    assert judge("object", [truth * 0.8], [truth]) == pytest.approx(-0.04)  # squared, over the object alone
+    assert judge("edges", [truth], [truth]) == judge("texture", [truth], [truth]) == 0.0
+    step = judge("edges", [truth * 0.9, truth * 0.5], [truth, truth])
+    assert step == pytest.approx(3 * judge("edges", [truth * 0.9], [truth])) and step < -0.1
 
 
 def test_from_contradictions_it_knows_nothing():
