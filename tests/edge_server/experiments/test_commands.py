@@ -11,6 +11,7 @@ from edge_server.cli import main
 from edge_server.experiments import compare
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.common.folders import Folders
+from edge_server.experiments.common.seed_table import SeedTable
 from freshfield.scenario import ScenarioError, load
 from tests.edge_server.experiments.rollouts.small import RAW
 from tests.edge_server.experiments.sets import SMALL_WORDS, write_photos
@@ -74,6 +75,14 @@ def test_a_channel_is_a_preset_a_scenario_or_a_section_alone(tmp_path: Path):
     (tmp_path / "wrong.yaml").write_text("{discipline: sometimes}")
     for text in (str(tmp_path / "wrong.yaml"), str(tmp_path / "none.yaml"), "sms"):
         refused(ScenarioError, "--channel", read_channel, text)
+
+
+def test_a_star_marks_what_is_decided_and_not_what_is_equal():
+    gained = {"all": [0.0] * 6, "the same": [0.0] * 6, "better": [2.0, 2.1, 1.9, 2.0, 2.2, 1.8]}
+    same = dict.fromkeys(compare.COLUMNS, 1.0)
+    rows = [{**same, "policy": p, "seed": k, "psnr_db": 20.0 + g} for p, of in gained.items() for k, g in enumerate(of)]
+    starred = [line for line in compare.as_text(SeedTable(rows), list(gained)).splitlines() if "*" in line]
+    assert len(starred) == 1 and starred[0].startswith("better") and starred[0].count("*") == 1
 
 
 def test_the_command_compares_and_goes_on(tmp_path: Path, capsys, monkeypatch):

@@ -212,6 +212,9 @@ def test_the_table_the_file_and_json_which_is_not_lost_with_its_file(tmp_path, c
     expected, said = calibrate(samples), [found[key] for key in ("residual_mm", "residual_deg", "std_mm", "std_deg")]
     assert said == pytest.approx([*expected.residuals.rms, expected.refined.std_mm, expected.refined.std_deg])
     np.testing.assert_allclose(found["transform"], loaded.transform, atol=1e-8)
+    samples.target[0, 0, 3] += 0.1
+    pairs.write_text(json.dumps([[h.tolist(), t.tolist()] for h, t in zip(samples.flange, samples.target)]))
+    assert hand_eye("--pairs", pairs, "--json") == 0 and "does not fit the others" in capsys.readouterr().err
 
 
 def test_nonsense_is_refused_and_not_an_answer():

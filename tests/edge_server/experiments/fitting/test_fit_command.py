@@ -117,7 +117,7 @@ def made(tmp_path_factory) -> tuple[ff.Fit, object]:
     seen = []
     data = ff.load(folder / "set", holdout=3, scale=2)
     fit = ff.fit(data, seconds=1.0, field="splat", options=SMALL_SPLAT, progress=seen.append)
-    assert seen == fit.rows and len(data.held_out) == 3
+    assert seen == fit.rows and len(data.held_out) == 3 and fit._scored_views is data.held_out
     fit.save(folder / "out")
     return fit, folder
 

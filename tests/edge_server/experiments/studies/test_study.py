@@ -285,6 +285,7 @@ def test_a_run_with_depth_counts_bytes_of_all_cameras_and_scores_its_last_third(
     runs = {every: DepthRun(str(scene), 3, every, 0.0, 0.9) for every in (0, 1)}
     found = {every: run_with_depth(run, Folders()) for every, run in runs.items()}
     assert all(row["shown_psnr_db"] > 5.0 and row["aaoi_ms"] > 10.0 and row["fps"] == 15.0 for row in found.values())
+    assert {run.seed for run in STUDIES["depth"].cases(request(tmp_path))} == {0, 1}
     assert 4 * 15 * 0.2 < found[0]["kilobytes_per_s"] < 0.8 * found[1]["kilobytes_per_s"]
 
 
