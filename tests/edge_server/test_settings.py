@@ -1,9 +1,11 @@
 """What an ``edge:`` section leaves open is chosen by what cameras do; what long work says; the machine of a run."""
 
+import importlib
 import io
 import os
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from edge_server.embed import EmbeddingConfig
@@ -11,6 +13,7 @@ from edge_server.machine import machine
 from edge_server.progress import ProgressLine
 from edge_server.settings import MOST_CARRIED, SCAN, EdgeConfig, KeyframesConfig, cameras_move, read_config
 from freshfield.scenario import ScenarioError, parse
+from freshfield.settings import Settings
 from tests.support import refused
 
 STILL = EdgeConfig("splat", {"layers": True}, updates="arrivals", update_ms=20.0, steps=10)
@@ -20,6 +23,24 @@ MANY_MOVING = EdgeConfig("splat", updates="cycle", update_ms=800.0, steps=100, k
 
 def scenario(edge=None, **source):
     return parse({"cameras": {"count": 3}, "source": source, "edge": edge}, Path("x.yaml"))
+
+
+def kinds_of(kind):
+    for each in kind.__subclasses__():
+        yield each
+        yield from kinds_of(each)
+
+
+def test_every_default_lies_within_its_own_bounds():
+    rooms = ("camera_node", "camera_node.synthetic", "channel_emu.model", "edge_server.fields.nerfacto")
+    for room in (*rooms, "edge_server.fields.splat", "edge_server.fields.tensorf"):
+        importlib.import_module(f"{room}.settings")
+    known = [(each, field) for each in kinds_of(Settings) for field in msgspec.structs.fields(each)]
+    assert len(known) > 300
+    for each, field in known:
+        if not field.required:
+            made = field.default if field.default is not msgspec.NODEFAULT else field.default_factory()
+            assert msgspec.convert(msgspec.to_builtins(made), field.type) == made, f"{each.__name__}.{field.name}"
 
 
 def test_an_empty_section_works_in_layers_before_fixed_cameras_and_as_a_scan_before_moving_ones():

@@ -14,7 +14,7 @@ from edge_server.report import figures
 from edge_server.report.build_report import SERIES, assemble, build_report, fidelity, updates
 from edge_server.report.conclusion import conclusion
 from edge_server.report.events import silences
-from edge_server.report.figures import draw_fidelity, draw_frontier
+from edge_server.report.figures import draw_ages, draw_fidelity, draw_frontier
 from edge_server.report.run_files import continuous, read_run_files
 from edge_server.report.settings import MOST_EVENTS
 from edge_server.run_records import AgesRow, EdgeStatus, UpdateCounts, UpdateRow
@@ -175,6 +175,7 @@ def test_a_killed_run_is_reported_with_notes_on_what_is_torn(tmp_path, capsys):
     assert report["updates"]["count"] == 0 and report["frames"]["captured"] == 0
     assert report["age_ms"] == {"mean": None, "p50": None, "p95": None, "by_camera": {}}
     assert "The field was never updated" in page and "No ledgers" in page
+    assert not draw_ages(report, read_run_files(tmp_path / "empty"), tmp_path / "none.png")
 
 
 def test_rows_are_in_order_of_time_also_across_a_restart(tmp_path):

@@ -278,6 +278,10 @@ def test_the_source_plays_back_and_forth_at_its_own_pace(tmp_path):
     np.testing.assert_allclose(source.read(0).pose.matrix(), look_at([3, 1, 1], [0, 0, 0]), atol=1e-9)
     source.release()
     assert shade(source.read(31)) == 31
+    clip = Clip(tmp_path / "videos/cam01.mp4")
+    for index, decoded in ((20, [20]), (19, [*range(8, 20)]), (9, [*range(8, 20)]), (7, [*range(8)]), (30, [30])):
+        clip.frame(index, 32, 24)
+        assert [*clip._block] == decoded, "backwards, twelve at once"
 
 
 def test_a_trajectory_gives_the_poses(tmp_path):
