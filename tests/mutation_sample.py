@@ -144,13 +144,10 @@ def _slight(edit: Edit) -> bool:
     """Whether it changes a number by less than a fifth. Whether 50 ppm or 51 are right no test should say."""
     if edit.operator != "core/NumberReplacer":
         return False
-    before, after = ((ROOT / edit.file).read_text(), edit.made())
-    old, new = next((a, b) for a, b in zip(_tokens(before), _tokens(after)) if a != b)
-    return new[0].isdigit() and abs(float(ast.literal_eval(old)) - float(ast.literal_eval(new))) < 0.2 * float(old)
-
-
-def _tokens(text: str) -> list[str]:
-    return [token.string for token in tokenize.generate_tokens(io.StringIO(text).readline)]
+    texts = ((ROOT / edit.file).read_text(), edit.made())
+    tokens = (tokenize.generate_tokens(io.StringIO(text).readline) for text in texts)
+    old, new = next((a.string, b.string) for a, b in zip(*tokens) if a.string != b.string)
+    return new[0].isdigit() and abs(ast.literal_eval(old) - ast.literal_eval(new)) < 0.2 * ast.literal_eval(old)
 
 
 @cache
@@ -202,7 +199,7 @@ def failure(copy: Path, words: Sequence[str], limit_s: float) -> str | None:
         )
     except subprocess.TimeoutExpired:
         return _ENDED  # it waits in compiled code, where no signal ends a test
-    found = re.search(r"^(?:FAILED|ERROR) (.*?)(?: - .*)?$", done.stdout, re.MULTILINE)
+    found = re.search(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", done.stdout, re.MULTILINE)
     if found is not None:
         return found[1]
     return None if done.returncode in (0, 5) or "session-timeout" in done.stdout else _ENDED  # 5: none is quick
@@ -235,7 +232,7 @@ def caught_by(copy: Path, edit: Edit, broken: list[str]) -> str | None:
         while (
             found := _failure(copy, edit, [*(f"--deselect={test}" for test in broken), *tests], limit_s)
         ) is not None:
-            if found == _ENDED or not _fails(copy, found):
+            if found == _ENDED or found in broken or not _fails(copy, found):
                 return found
             broken.append(found)
     return None

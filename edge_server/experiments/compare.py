@@ -77,7 +77,7 @@ def _run(args: argparse.Namespace) -> None:
     print(as_text(table, list(labels)))
     idle = [label for label in labels if not any(table.values("views", policy=label).values())]
     if idle:
-        print(f"without an update, so that nothing was shown: {', '.join(idle)}")
+        print(f"without an update after the lead: {', '.join(idle)}")
     if args.json is not None:
         about = {"scenario": setting.scenario.name, "seeds": args.seeds, "seconds": args.seconds, "lead_s": LEAD_S}
         about |= {"seed": setting.scenario.seed, "judged_from": setting.rewarding, "motions": setting.draws_motions}

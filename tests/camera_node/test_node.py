@@ -130,6 +130,21 @@ async def test_an_answer_is_waited_for_eight_times_as_long_as_the_slowest_recent
     assert allowed_s == pytest.approx([1.25, 8.0, 7.6, 60.0])
 
 
+async def test_pauses_grow_until_a_session_has_worked(monkeypatch):
+    outbox, failures = Outbox("cam01", "s", None, VirtualClock(0)), []
+    sender = Sender(outbox, MagicMock(), (), lambda: None, MagicMock(), {})
+    monkeypatch.setattr(sender_module, "backoff_s", lambda failed, *_: failures.append(failed) or 0.0)
+
+    async def session():
+        outbox.counts["sent"] += len(failures) == 2  # the third has worked for a while
+        raise ZeroDivisionError if len(failures) == 4 else TimeoutError
+
+    sender._session = session
+    with pytest.raises(ZeroDivisionError):
+        await sender.run()
+    assert failures == [0, 1, 0, 1]
+
+
 def test_a_node_that_reached_nobody_ends_with_1(capsys):
     assert main(["run", "tile", "--camera-index", "0", "--to", NOBODY, "--seconds", "0.2", "--quiet"]) == 1
     assert f"camera-node: {NOBODY} was never reached: " in capsys.readouterr().err

@@ -11,8 +11,8 @@ from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose, look_at
 
 CAMERA = Pinhole.from_fov(32, 24, 60.0)
-SIZES = {"levels": 2, "log2_table": 10, "rays": 256, "batch_samples": 4096, "samples": 24}
-TINY = {**SIZES, "center_m": [0.0, 0.0, 0.0], "radius_m": 1.0}
+TINY = {"levels": 2, "log2_table": 10, "rays": 256, "batch_samples": 4096, "samples": 24}
+TINY |= {"center_m": [0.0, 0.0, 0.0], "radius_m": 1.0}
 
 
 def tiny_field(seed: int = 0):

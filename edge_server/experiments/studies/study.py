@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -109,7 +110,7 @@ class StudyRequest:
         words = ["edge-server study", study, *(["--quick"] if self.quick else [])]
         words += [f"--seeds {self.seeds}"] if self.seeds else []
         words += [f"--scene {','.join(self.scenes)}"] if self.scenes else []
-        words += [f"--channel {self.channel_given}"] if self.channel is not None else []
+        words += [f"--channel {shlex.quote(self.channel_given)}"] if self.channel is not None else []
         words += [f"--case {case!r}" for case in self.cases]
         words += [f"--episodes {self.episodes}"] if self.episodes else []
         return " ".join(words)

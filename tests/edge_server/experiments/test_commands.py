@@ -68,9 +68,8 @@ def test_a_channel_is_a_preset_a_scenario_or_a_section_alone(tmp_path: Path):
     found, name = read_channel(str(tmp_path / "mine.yaml"))
     assert name == "mine" and found["service"] == f"trace:{tmp_path / 'delays.txt'}"
     (tmp_path / "whole.yaml").write_text(yaml.safe_dump({**RAW, "channel": section}))
-    (tmp_path / "set").mkdir()
-    recorded = replace(load(str(tmp_path / "whole.yaml")), source={"data": "set"})
-    assert Folders(tmp_path).files_of(recorded) == [tmp_path / "set", tmp_path / "delays.txt"]
+    recorded = replace(load(str(tmp_path / "whole.yaml")), source={"data": "mine.yaml"})
+    assert Folders(tmp_path).files_of(recorded) == [tmp_path / "mine.yaml", tmp_path / "delays.txt"]
     assert read_channel(str(tmp_path / "whole.yaml"))[0] == found
     (tmp_path / "wrong.yaml").write_text("{discipline: sometimes}")
     for text in (str(tmp_path / "wrong.yaml"), str(tmp_path / "none.yaml"), "sms"):
@@ -79,8 +78,7 @@ def test_a_channel_is_a_preset_a_scenario_or_a_section_alone(tmp_path: Path):
 
 def test_a_star_marks_what_is_decided_and_not_what_is_equal():
     gained = {"all": [0.0] * 6, "the same": [0.0] * 6, "better": [2.0, 2.1, 1.9, 2.0, 2.2, 1.8]}
-    same = dict.fromkeys(compare.COLUMNS, 1.0)
-    rows = [{**same, "policy": p, "seed": k, "psnr_db": 20.0 + g} for p, of in gained.items() for k, g in enumerate(of)]
+    rows = [{"policy": p, "seed": k, "psnr_db": 20.0 + g} for p, of in gained.items() for k, g in enumerate(of)]
     starred = [line for line in compare.as_text(SeedTable(rows), list(gained)).splitlines() if "*" in line]
     assert len(starred) == 1 and starred[0].startswith("better") and starred[0].count("*") == 1
 
@@ -95,7 +93,7 @@ def test_the_command_compares_and_goes_on(tmp_path: Path, capsys, monkeypatch):
     monkeypatch.setattr("edge_server.embed.make_embedder", lambda _: pytest.fail("no policy looks at embeddings"))
     assert compare.main(words) == 0
     printed = capsys.readouterr().out
-    assert "freshest-k:2" in printed and "minus all" in printed and "nothing was shown: wait:60000\n" in printed
+    assert "freshest-k:2" in printed and "minus all" in printed and "after the lead: wait:60000\n" in printed
     found = json.loads(out.read_text())
     assert found["compute"]["ms_per_step"] == 2.0 and found["policies"]["freshest-k:2"]["views"][0] <= 2.0
     everything, fresh = (found["policies"][name] for name in ("all", "freshest-k:2"))

@@ -3,12 +3,14 @@
 import json
 import os
 import signal
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
 import freshfield as ff
 from edge_server.cli import main as edge_server
+from edge_server.experiments.fitting.ctrl_c import postponed
 from edge_server.experiments.fitting.fit import marks_s
 from edge_server.experiments.scenes.multiview_still import WHITE, mean_baselines, open_still
 from edge_server.export import ExportError
@@ -132,6 +134,15 @@ def test_what_was_saved_loads_and_renders_the_same(made):
     np.testing.assert_array_equal(again.render(pose, size=(40, 30)), color)
     assert fit.seed == ff.Fit(fit.data, "splat", SMALL_SPLAT).seed == 0
     assert fit.psnr.shape == (len(fit.rows), 2) and fit.psnr[-1, 0] == pytest.approx(1.0, rel=0.3)
+
+
+def test_ctrl_c_stays_as_it_is_outside_of_the_main_thread():
+    def inside():
+        with postponed("wait"):
+            return signal.getsignal(signal.SIGINT)
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(inside).result() is signal.getsignal(signal.SIGINT)
 
 
 @pytest.mark.stability

@@ -299,7 +299,7 @@ def test_a_scene_needs_a_held_out_camera(tmp_path: Path):
 
 def test_selectors_stand_in_a_table_of_each_scene():
     of = {"scene": "tile", "views": viewpoints.JUDGED, "ssim": 0.5, "lpips": None, "path_m": 2.0, "choice_ms": 3.0}
-    rows = [{**of, "arm": arm, "seed": k, "psnr_db": 20.0 + k} for arm in viewpoints.ARMS for k in range(2)]
+    rows = [{**of, "arm": arm, "seed": k, "psnr_db": 20.0 + k} for arm in viewpoints.ARMS for k in (0, 1)]
     text = viewpoints.VIEWPOINTS.tables(SeedTable(rows))
     assert (
         "## tile: PSNR (dB)" in text
