@@ -19,8 +19,10 @@ def test_age_is_now_minus_generation_on_the_edges_clock():
     assert buffer.ages_ms(200 * MS) == {"cam01": 120.0, "cam02": None}
 
 
-# Overtaken on its way; ahead of the edge's clock, within the tolerance; from the future, which gives way to any.
-@pytest.mark.parametrize(("first_ms", "then_ms", "newest_is_first"), [(60, 30, 1), (400, 120, 1), (1300, 120, 0)])
+# Overtaken; of one instant; ahead of the edge's clock, within the tolerance; from the future, which gives way to any.
+@pytest.mark.parametrize(
+    ("first_ms", "then_ms", "newest_is_first"), [(60, 30, 1), (60, 60, 1), (400, 120, 1), (1300, 120, 0)]
+)
 def test_which_of_two_frames_is_the_newest(first_ms, then_ms, newest_is_first):
     buffer = FrameBuffer(["cam01"])
     buffer.put(frame(sequence=2, generated_ns=first_ms * MS), 100 * MS)

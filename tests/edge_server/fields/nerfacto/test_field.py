@@ -28,6 +28,13 @@ from tests.edge_server.fields.torch_model import encode, mlp, ray_weights, shade
 VIEWS = ring(6, size=24)
 
 
+def test_samples_are_uniform_at_first_and_then_follow_the_proposal() -> None:
+    field = NerfactoField(structs.replace(SMALL["nerfacto"], even=0.4, anneal=40))
+    for step, share in ((0, 1.0), (10, 0.85), (40, 0.4), (400, 0.4)):
+        field.step = step
+        assert field._sampling().uniform_share == pytest.approx(share)
+
+
 def test_appearances_take_up_what_differs_between_cameras() -> None:
     """A room's pictures with gains of 0.7 to 1.4; scored against the picture at the mean exposure."""
     still = synthetic_still("room", cameras=13, size=48)
