@@ -102,6 +102,24 @@ async def test_a_trace_decides_in_place_of_the_channel_for_the_cameras_that_it_h
     assert [isinstance(flow.link.model, ReplayLink) for flow in flows] == [True, False]
 
 
+async def test_a_trace_replayed_at_another_pace_is_decided_and_delivered_alike(tmp_path):
+    """Each delivery as long after its offer as recorded, later by the delay error alone."""
+    paths = tmp_path / "0" / "t.jsonl", tmp_path / "1" / "t.jsonl"
+    for path, section, period_s in zip(paths, (FAST, QUICK), (0.004, 0.006)):
+        replay = None if path is paths[0] else trace.read(paths[0])
+        async with emulate(path.parent, section, trace=path, replay=replay) as r:
+            await r.stream(60, period_s)
+            await r.settled()
+    assert frame_account(tmp_path / "1")["sent"] == 240
+    recorded, replayed = (trace.read(path).by_camera() for path in paths)
+    for camera in CAMERAS:
+        for then, now in zip(recorded[camera], replayed[camera], strict=True):
+            assert (then.outcome, then.drawn_ns) == (now.outcome, now.drawn_ns)
+            if then.outcome == "delivered":
+                assert then.ended_ns - then.offered_ns == now.ended_ns - now.offered_ns
+                assert now.actual_ns is None or now.actual_ns >= now.ended_ns
+
+
 async def test_the_account_closes_with_every_fault(tmp_path):
     async with emulate(tmp_path, {**QUICK, "faults": {"loss": 0.2, "duplication": 0.2, "corruption": 0.2}}) as r:
         await r.stream(60, 0.005)
