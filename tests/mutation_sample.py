@@ -13,12 +13,14 @@ trampolines, which numba cannot compile.)
 
 import argparse
 import ast
+import contextlib
 import hashlib
 import io
 import os
 import random
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tokenize
@@ -187,22 +189,20 @@ def failure(copy: Path, words: Sequence[str], limit_s: float) -> str | None:
     """The first test that fails in the copy, or takes longer than the limit. words: tests, and options of pytest."""
     options = ["-qx", "-m", _SELECT, "-p", "no:cacheprovider", f"--timeout={limit_s}", f"--session-timeout={limit_s}"]
     paths = os.pathsep.join(str(copy / part) for part in ("proto", "", "deploy"))
+    command = [sys.executable, "-m", "pytest", *options, *words]
+    piped = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True, "start_new_session": True}
+    pytest = subprocess.Popen(command, cwd=copy, env={**os.environ, "PYTHONPATH": paths}, **piped)
     try:
-        done = subprocess.run(
-            [sys.executable, "-m", "pytest", *options, *words],
-            cwd=copy,
-            env={**os.environ, "PYTHONPATH": paths},
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=2 * limit_s,
-        )
+        said, _ = pytest.communicate(timeout=3 * limit_s)
     except subprocess.TimeoutExpired:
         return _ENDED  # it waits in compiled code, where no signal ends a test
-    found = re.search(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", done.stdout, re.MULTILINE)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(pytest.pid, signal.SIGKILL)  # and what its tests have started
+    found = re.search(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", said, re.MULTILINE)
     if found is not None:
         return found[1]
-    return None if done.returncode in (0, 5) or "session-timeout" in done.stdout else _ENDED  # 5: none is quick
+    return None if pytest.wait() in (0, 5) or "session-timeout" in said else _ENDED  # 5: none is quick
 
 
 def copy_checkout(copy: Path) -> None:

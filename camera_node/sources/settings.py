@@ -14,6 +14,6 @@ RECORDING_PARENTS_NEAR_NS = 250_000_000
 """The same of the transforms above: robots correct map -> odom only some times a second, and by little."""
 
 LIVE_FPS = 15.0
-"""Captures a second where a scenario gives no rate."""
+"""Captures a second of a device where a scenario gives no rate."""
 REOPEN_AFTER_S = (0.25, 0.5, 1.0, 2.0, 5.0)
 """Pauses before a camera that failed is opened again: after the first failure, the second, ..."""

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 
 import freshfield.geometry
-from camera_node.synthetic.settings import MAX_DISK_BYTES
 from freshfield import payload
 from freshfield.files import write_bytes
 
+MAX_DISK_BYTES = 2 << 30  # here, since what settings.py says is part of the key of rendered frames
 _NAME = re.compile("[0-9a-f]{32}")  # name of the folder of one camera's frames
 _pruned: set[Path] = set()  # roots that this process has pruned
 # Files of this package that do not influence what an image looks like.

@@ -40,6 +40,6 @@ def folders_from(data: Path | None = None, lpips: Path | None = None) -> Folders
 def _texts(section: Any) -> list[str]:
     """Every text in a section of a scenario, and the parts of one in short notation (``trace:FILE``)."""
     if isinstance(section, str):
-        return section.split(":")
+        return [section, *filter(None, section.split(":")[1:])]
     values = section.values() if isinstance(section, dict) else section if isinstance(section, list) else ()
     return [text for value in values for text in _texts(value)]

@@ -66,7 +66,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         names = {"all": [n for n in STUDIES if n not in (*CAPTURING, *LEARNING, *DEPLOYED)], "learning": list(LEARNING)}
         chosen = checked(names.get(args.study, [args.study]), request)
-        if missing := open_lpips(request.folders.lpips)[1]:
+        judged = {metric for name in chosen for metric in STUDIES[name].metrics}
+        if judged & {"lpips", "f_w"} and (missing := open_lpips(request.folders.lpips)[1]):
             print(f"without LPIPS and what is computed from it: {missing}", flush=True)
         for name in chosen:
             study, began = STUDIES[name], time.monotonic()
@@ -129,8 +130,8 @@ def _parser() -> argparse.ArgumentParser:
         "--scene",
         metavar="NAME|FILE,...",
         help="scenarios with fixed cameras of which some are held out, such as kitchen, dynerf or my-scene.yaml "
-        "(viewpoints and preferences: cell, too); room means room19; their channels are left out unless --channel "
-        "names them [the study's own]",
+        "(viewpoints and preferences: cell, too); room means room19; depth keeps their channels, the others take "
+        "them where --channel names them [the study's own]",
     )
     add(
         "--channel",

@@ -18,7 +18,6 @@ from channel_emu.live.camera_stream import PUSH
 from channel_emu.live.frame_proxy import SET_BY_HAND
 from channel_emu.live.live_link import Message
 from channel_emu.live.proxy import EmulatorFailed
-from channel_emu.live.replay_link import ReplayLink
 from channel_emu.live.settings import CREDITS
 from channel_emu.model import trace
 from channel_emu.model.chain import ChainError
@@ -32,7 +31,6 @@ from freshfield.transport import Transport
 from freshfield.v1 import channel_pb2, channel_pb2_grpc, clock_pb2, clock_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
 from tests.channel_emu.live.emulator import CAMERAS, answer_to, emulate, make, offer
-from tests.channel_emu.model.test_trace import record
 from tests.edge_server.frames import frame
 from tests.freshfield.serving import status
 from tests.integration.peer import Peer, silence
@@ -93,13 +91,6 @@ async def test_live_decisions_are_those_of_virtual_time(tmp_path, section):
     assert status["running"] is False and status["counts"]["delivered"] == account["delivered"]
     assert status["delay_error_ms"]["count"] == account["delivered"]
     assert section is not FAST or status["state"] in status["states"] == ["low", "high"]
-
-
-async def test_a_trace_decides_in_place_of_the_channel_for_the_cameras_that_it_has(tmp_path):
-    """Each message as recorded, at any pace: ``test_trace``."""
-    found, _ = record(tmp_path / "t.jsonl", {"preset": "ch5"}, 20)
-    _, flows = make(tmp_path, "127.0.0.1:1", {}, ("a", "cam00"), replay=found)
-    assert [isinstance(flow.link.model, ReplayLink) for flow in flows] == [True, False]
 
 
 async def test_a_trace_replayed_at_another_pace_is_decided_and_delivered_alike(tmp_path):
