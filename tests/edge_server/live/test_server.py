@@ -152,7 +152,9 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
 
 
 def test_a_run_is_recorded_with_its_frames_decisions_and_scores(serve, tmp_path):
-    reader = pytest.importorskip("freshfield.session.reader", reason="MCAP is not installed (extra mcap)")
+    pytest.importorskip("mcap", reason="MCAP is not installed (extra mcap)")
+    from freshfield.session import reader
+
     run = serve(record=tmp_path / "b.mcap").fed()
     until(lambda: any(p.psnr_db is not None for p in run.server.state.publications()))
     run.end()
