@@ -2,11 +2,13 @@
 pictures."""
 
 import asyncio
+import importlib
 import socket
 import struct
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -85,6 +87,20 @@ def work_ms(call: Callable[[], Any]) -> float:
         call()
         times.append((time.thread_time() - begun) * 1e3)
     return min(times)
+
+
+def axes_drawn(monkeypatch: pytest.MonkeyPatch, module: str) -> list[Any]:
+    """Takes the axes, (rows, columns), of every figure that ``module`` draws from now on."""
+    kept, draw = [], importlib.import_module(module).figure
+
+    @contextmanager
+    def figure(*args: Any, **options: Any) -> Iterator[Any]:
+        with draw(*args, **options) as (fig, axes):
+            kept.append(axes)
+            yield fig, axes
+
+    monkeypatch.setattr(f"{module}.figure", figure)
+    return kept
 
 
 def lines_run(call: Callable[[], Any]) -> int:

@@ -176,6 +176,18 @@ def test_one_camera_sees_what_faces_it():
     assert found.further_seen_by[0] == pytest.approx(1 - 2 * FACING, abs=0.03)
 
 
+def test_a_further_camera_counts_what_it_shows_first_and_half_again_what_two_then_see():
+    def worth(shares):
+        return 1 - shares[0] + 0.5 * sum(shares[2:])
+
+    for azimuths in ([0, 40], [0, 90, 200]):
+        rig = [camera(azimuth) for azimuth in azimuths]
+        found = reckon(rig)
+        assert found.further_seen_by == reckon([*rig, (LENS, found.further_pose)]).seen_by
+        others = [worth(reckon([*rig, camera(azimuth)]).seen_by) for azimuth in range(0, 360, 15)]
+        assert worth(found.further_seen_by) > max(others) - 0.01 and worth(found.further_seen_by) > min(others) + 0.1
+
+
 @pytest.mark.stability
 @pytest.mark.parametrize(
     "poses",

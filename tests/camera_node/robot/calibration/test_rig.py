@@ -336,6 +336,11 @@ def test_parts_that_fit_both_prints_are_told_by_a_whole_board_among_them(legacy,
 
 def test_a_board_that_is_not_found_is_examined():
     chessboard = cv2.GaussianBlur(parse_target("chessboard:8x5:20mm").draw(600), (0, 0), 1.0)
+    others = {}
+    for across, down in ((9, 5), (7, 5), (8, 6), (8, 4)):  # which look the same upside down
+        squares = np.kron(np.indices((down + 1, across + 1)).sum(axis=0) % 2 * 255, np.ones((50, 50))).astype(np.uint8)
+        board = cv2.GaussianBlur(np.pad(squares, 50, constant_values=255), (0, 0), 1.0)
+        others[f"{across}x{down}"] = board
     for spec, image, says in (
         ("charuco:7x5:30mm:22mm", printed(5, 7), "its sizes are swapped: 5x7 squares, not 7x5"),
         ("charuco:9x6:30mm:22mm", printed(7, 5), "it is a board of another size: 7x5 squares, not 9x6"),
@@ -343,6 +348,7 @@ def test_a_board_that_is_not_found_is_examined():
         ("charuco:7x5:30mm:22mm", printed(7, 5)[:, ::-1], "the picture is mirrored"),
         ("charuco:7x5:30mm:22mm", np.full((300, 400), 200, np.uint8), "no markers are seen"),
         ("chessboard:9x6:20mm", chessboard, "a board of 8x5 inner corners is seen, not of 9x6"),
+        *(("chessboard:8x5:20mm", board, f"a board of {size} inner corners is seen") for size, board in others.items()),
     ):
         board, image = parse_target(spec), np.ascontiguousarray(image)
         assert board.find(image) is None and board.explain(image).startswith(says)

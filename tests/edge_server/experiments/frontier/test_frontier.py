@@ -8,13 +8,14 @@ from msgspec import structs
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.frontier import from_scratch, frontier_command, update_time
-from edge_server.experiments.frontier.output import recommendation
+from edge_server.experiments.frontier.output import draw_frontier, draw_updates, recommendation
 from edge_server.experiments.virtual import costs
 from edge_server.live.frontier import best_point, read_frontier
+from edge_server.report.style import CYCLE
 from edge_server.run_records import FrontierPoint
 from edge_server.settings import ComputeConfig
 from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS
-from tests.support import refused
+from tests.support import axes_drawn, refused
 
 TINY = update_time.MovingScene(cameras=4, size=32)
 
@@ -68,6 +69,42 @@ def test_the_last_line_recommends_an_update_time_at_a_persons_speed():
     assert recommendation(rows) == "for this scene: update_ms: 400"
     assert recommendation([row(1.0, 0.004, 20, 18)]) == "for this scene: update_ms: 10", "the shortest there is"
     assert recommendation([]) == "for this scene: update_ms: any"
+
+
+def curves(ax):
+    return {line.get_label(): (line.get_color(), line.get_linestyle(), line.get_xydata().tolist()) for line in ax.lines}
+
+
+def test_figures_show_what_was_measured_and_encircle_the_best(tmp_path, monkeypatch):
+    drawn = axes_drawn(monkeypatch, "edge_server.experiments.frontier.output")
+    rows = [
+        {"field": field, "layers": layers, "speed_m_per_s": speed, "planned_update_s": at, "update_s": at}
+        | {"shown_psnr_db": 20 + speed + at, "shown_psnr_moving_db": 15 + speed - at}
+        for field, layers, speed, at in [("ngp", False, 1, 2.0), ("ngp", False, 1, 0.5), ("splat", True, 3, 1.0)]
+    ]
+    draw_updates(tmp_path / "updates.png", rows)
+    (slow, fast), (slow_moving, _) = drawn.pop()
+    assert curves(slow) == {
+        "ngp": (CYCLE[0], "-", [[0.5, 21.5], [2.0, 23.0]]),
+        "splat in layers": (CYCLE[1], "--", []),
+        "best": ("#222222", "None", [[2.0, 23.0]]),
+    }
+    assert curves(fast)["splat in layers"][2] == [[1.0, 24.0]] and curves(slow_moving)["best"][2] == [[0.5, 15.5]]
+    assert (slow.get_title(loc="left"), fast.get_title(loc="left")) == ("1 m/s", "3 m/s")
+    assert slow_moving.get_xlabel() and not slow.get_xlabel() and slow_moving.get_xticks().tolist() == [0.5, 1.0, 2.0]
+
+    rows = [
+        {"field": "ngp", "planned_s": s, "seconds": s, "psnr_db": db, "ssim": 0.5, "lpips": None, "on_front": front}
+        for s, db, front in [(2.0, 22.0, True), (0.5, 20.0, True), (1.0, 19.0, False)]
+    ]
+    draw_frontier(
+        tmp_path / "frontier.png", rows, {"scene": "tile", "ms_per_step": {"ngp": 0.25}, "lpips_network": None}
+    )
+    ((psnr,), (ssim,)) = drawn.pop()
+    ngp, front = curves(psnr)["ngp (0.2 ms a step)"][2], curves(psnr)["Pareto front"][2]
+    assert (ngp, front) == ([[0.5, 20.0], [1.0, 19.0], [2.0, 22.0]], [[0.5, 20.0], [2.0, 22.0]])
+    assert "tile" in psnr.get_title(loc="left") and "Pareto front" not in curves(ssim) and ssim.get_xlabel()
+    assert "higher" in ssim.get_ylabel() and (tmp_path / "frontier.png").stat().st_size > 1000
 
 
 @pytest.mark.slow

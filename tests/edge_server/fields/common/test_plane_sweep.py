@@ -8,7 +8,7 @@ import pytest
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget, View
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.plane_sweep import GUIDE_RAYS, depth_guide, foreground_mask
+from edge_server.fields.common.plane_sweep import GUIDE_RAYS, _square_centers, depth_guide, foreground_mask
 from edge_server.fields.common.scene_box import SceneBox, scene_box
 from edge_server.fields.common.supervision import pack_views
 from edge_server.fields.common.threads.thread_pool import shared_pool
@@ -46,6 +46,15 @@ def test_depth_is_where_the_scene_is(size: int) -> None:
     data, larger = _packed(grown)
     assert larger.radius_m == pytest.approx(100.0 * box.radius_m)
     assert np.mean(np.isclose(_guide(grown, data, larger), found, rtol=1e-3)) > 0.99, "in units of the scene"
+
+
+@pytest.mark.parametrize(("height", "width", "side"), [(5, 7, 1), (6, 8, 2), (7, 10, 3), (9, 13, 4), (2, 5, 4)])
+def test_a_pixel_speaks_for_the_square_that_it_lies_in_the_middle_of(height: int, width: int, side: int) -> None:
+    y, x = np.divmod(_square_centers(height, width, side), width)
+    for found, axis, length in ((y, 0, height), (x, 1, width)):
+        at = np.moveaxis(found, axis, 0)[:, 0]
+        assert len(at) == -(-length // side) and (np.moveaxis(found, axis, 0) == at[:, None]).all()
+        assert at.tolist() == [min(k * side + side // 2, length - 1) for k in range(len(at))]
 
 
 def test_what_is_transparent_or_of_one_color_has_no_depth() -> None:

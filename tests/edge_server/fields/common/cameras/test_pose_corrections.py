@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from edge_server.fields import View
+from edge_server.fields.common.cameras import settings as tuned
+from edge_server.fields.common.cameras.appearance import AppearanceEmbeddings
 from edge_server.fields.common.cameras.constant_correction import constant_correction
 from edge_server.fields.common.cameras.pose_corrections import Leap, PoseCorrections, normal_matrix
 from freshfield.geometry import Pinhole, look_at, se3, se3_inverse, so3_exp, so3_log, world_rays
@@ -233,3 +235,20 @@ def test_a_turn_and_a_shift_that_undo_each_other_do_not_accuse_the_mount(rotatio
     found = constant_correction(given, [pose @ mount for pose in given])
     assert found is not None and found.sure is (away_m is None)
     assert found.cancels_m == (away_m and pytest.approx(away_m, abs=0.1))
+
+
+def test_an_appearance_takes_adams_steps_and_their_mean_stays_at_zero():
+    """Of a constant gradient each step is as long as the rate, the first one too."""
+    names, gradient = ("a", "b", "c"), np.array([[[0.3], [-0.3], [0.0]]], np.float32)
+    learned = AppearanceEmbeddings(1, 0)
+    first = learned.rows(names)
+    for steps in (1, 2, 3):
+        learned.learn(names, gradient, 1)
+        moved = learned.rows(names) - first
+        np.testing.assert_allclose(moved[:, 0], tuned.APPEARANCE_RATE * steps * np.array([-1, 1, 0]), rtol=1e-3, atol=1e-6)
+    learned.learn(names, np.full((2, 3, 1), np.nan, np.float32), 100)
+    np.testing.assert_allclose(learned.rows(names) - first, moved, err_msg="what is no number teaches nothing")
+    for _ in range(2000):
+        learned.learn(names, gradient, 1)
+    assert np.ptp(learned.rows(names)) <= 2 * tuned.APPEARANCE_MOST + 1e-6
+    assert learned.rows(names).mean() == pytest.approx(0.0, abs=1e-6)

@@ -11,7 +11,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.occupancy import Cells, sample_density, threshold
-from edge_server.fields.common.kernels.rays import COARSE, HORIZON, NEVER, Space, interval, march, pixel_direction
+from edge_server.fields.common.kernels.rays import (
+    COARSE,
+    HORIZON,
+    NEVER,
+    Space,
+    interval,
+    march,
+    pixel_direction,
+    unit_cube,
+)
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
 from edge_server.fields.common.occupancy_grid import OccupancyGrid, cell_centers
 from edge_server.fields.common.scene_box import scene_box
@@ -26,6 +35,7 @@ from tests.edge_server.fields.torch_model import encode, mlp, to_torch
 
 _direction = njit(lambda lens, rotation, u, v: pixel_direction(lens, rotation, u, v))
 _interval = njit(lambda space, o, d: interval(space, o, d))
+_unit_cube = njit(lambda contracted, x, y, z: unit_cube(contracted, x, y, z))
 
 CELLS = 16
 
@@ -200,3 +210,14 @@ def test_cells_that_reach_the_bound_are_occupied(bound: float, kept: str) -> Non
     np.testing.assert_array_equal(occupied, expected)
     blocks = expected.reshape((cells // COARSE, COARSE) * 3).any(axis=(1, 3, 5))
     np.testing.assert_array_equal(coarse, blocks.ravel())
+
+
+def test_every_point_lies_in_the_unit_cube_and_far_ones_are_contracted() -> None:
+    """Mip-NeRF 360's contraction by the largest coordinate: p where |p| <= 1, (2 - 1/|p|) p/|p| beyond."""
+    for point in np.random.default_rng(0).normal(size=(60, 3)) * np.geomspace(0.1, 1e6, 60)[:, None]:
+        far = np.abs(point).max()
+        contracted = point if far <= 1 else (2 - 1 / far) * point / far
+        at = tuple(map(np.float32, point))
+        np.testing.assert_allclose(_unit_cube(True, *at), np.clip(contracted / 4 + 0.5, 0, 1), atol=1e-6)
+        np.testing.assert_allclose(_unit_cube(False, *at), np.clip(point / 2 + 0.5, 0, 1), atol=1e-6)
+        assert max(*_unit_cube(True, *at), *_unit_cube(False, *at)) < 1.0
