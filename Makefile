@@ -59,7 +59,7 @@ endef
 BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrome 2>/dev/null))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test docs lint format types bench figures mutants proto proto-check lock images clean
+.PHONY: help demo test docs lint format types bench figures mutants reference proto proto-check lock images clean
 
 help:  ## what there is to make
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 22
@@ -94,6 +94,9 @@ format: .venv/.ok-test  ## ruff: apply the format and the safe fixes
 types: .venv/.ok-test  ## mypy
 	$(PY) -m mypy
 	MYPYPATH=proto:deploy $(PY) -m mypy deploy/freshfield_up
+
+reference: .venv/.ok-test  ## write docs/reference/scenario.md anew: keys, bounds and defaults, as the code has them
+	$(PY) docs/site_pages.py
 
 bench: .venv/.ok-test  ## what a frame costs emulator and ingest, by the number of cameras: runs/bench.json
 	@mkdir -p runs

@@ -1,6 +1,9 @@
-"""Pages of the site that no file holds: every command's --help, every key of a scenario, and files from outside docs/.
+"""Pages of the site that are made from the code: every command's --help, every key of a scenario, and files from
+outside docs/.
 
-A hook of mkdocs (``mkdocs.yml``); the site is built where freshfield is installed with the extra ``edge``.
+A hook of mkdocs (``mkdocs.yml``); the site is built where freshfield is installed with the extra ``edge``. Run as a
+program (``make reference``) it writes the page of keys, which is kept as a file: who changes a default or a bound sees
+it there, and so does who reviews it.
 """
 
 from __future__ import annotations
@@ -33,13 +36,14 @@ PROGRAMS = {
 # Files of the repository that are pages of the site: file -> page.
 OUTSIDE = {"deploy/lab/README.md": "lab.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 ROOT = Path(__file__).resolve().parent.parent
+SCENARIO_PAGE = ROOT / "docs" / "reference" / "scenario.md"
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages."""
     from mkdocs.structure.files import File  # the tests, which have no mkdocs, read the help from here
 
-    made = {"reference/commands.md": commands_page(), "reference/scenario.md": scenario_page()}
+    made = {"reference/commands.md": commands_page()}
     made |= {page: (ROOT / file).read_text() for file, page in OUTSIDE.items()}
     for page, text in made.items():
         files.append(File.generated(config, page, content=text))
@@ -94,10 +98,10 @@ def scenario_page() -> str:
     """Keys, bounds, units and defaults of a scenario's sections, as the settings that read it have them."""
     parts = [
         "# Scenario keys\n\nWhat each section of a scenario file may say. `freshfield scenario keys SECTION` prints "
-        "the same, and `freshfield scenario schema` the JSON Schema for editors.\n"
+        "the same, and `freshfield scenario schema` the JSON Schema for editors. `make reference` writes this page.\n"
     ]
     for section in scenario_keys.SECTIONS:
-        parts.append(f"## {section}\n")
+        parts.append(f"\n## {section}\n")
         table = False
         for line in scenario_keys.text(section).splitlines():
             key = re.match(r" {4}(\S+) +(.*)", line)
@@ -111,4 +115,8 @@ def scenario_page() -> str:
             else:
                 parts.append(re.sub(r"^(?=[\w, ]+: )", "\n", line.strip()))  # what a docstring says of a key
             table = key is not None
-    return "\n".join(parts)
+    return re.sub(r"\n{3,}", "\n\n", "\n".join([*parts, ""])).replace("``", "`")
+
+
+if __name__ == "__main__":
+    SCENARIO_PAGE.write_text(scenario_page())

@@ -1,5 +1,6 @@
 """The documentation: links resolve, commands and files exist."""
 
+import difflib
 import importlib
 import importlib.util
 import re
@@ -53,6 +54,12 @@ def test_every_page_is_in_the_site_s_navigation_and_the_readme_is_short():
     for page in (ROOT / "docs").rglob("*.md"):
         path = page.relative_to(ROOT / "docs").as_posix()
         assert path.startswith("results/") or re.search(rf"[ ]{re.escape(path)}$", shown, re.M), path
+
+
+def test_keys_bounds_and_defaults_of_scenarios_are_as_the_reference_says():
+    told, known = site_pages.scenario_page().splitlines(), site_pages.SCENARIO_PAGE.read_text().splitlines()
+    differs = "\n".join(difflib.unified_diff(known, told, "docs/reference/scenario.md", "the code", lineterm="", n=0))
+    assert not differs, f"'make reference' writes it; a default that changes needs a line of CHANGELOG\n{differs}"
 
 
 @pytest.mark.parametrize("page", CURRENT)

@@ -245,7 +245,9 @@ def test_an_appearance_takes_adams_steps_and_their_mean_stays_at_zero():
     for steps in (1, 2, 3):
         learned.learn(names, gradient, 1)
         moved = learned.rows(names) - first
-        np.testing.assert_allclose(moved[:, 0], tuned.APPEARANCE_RATE * steps * np.array([-1, 1, 0]), rtol=1e-3, atol=1e-6)
+        np.testing.assert_allclose(
+            moved[:, 0], tuned.APPEARANCE_RATE * steps * np.array([-1, 1, 0]), rtol=1e-3, atol=1e-6
+        )
     learned.learn(names, np.full((2, 3, 1), np.nan, np.float32), 100)
     np.testing.assert_allclose(learned.rows(names) - first, moved, err_msg="what is no number teaches nothing")
     for _ in range(2000):
