@@ -218,6 +218,10 @@ OWN_CLASSES = [(kind, f"{OWN}:{good.__name__}") for kind, good in BASES.items()]
 # Kind -> name of a class -> how it differs from the good one, and what the command says.
 BROKEN = {
     "source": {
+        "Swaps": (
+            {"camera": property(lambda s: "cam01", lambda s, v: None)},
+            "the first frames: camera: not the one of the call",
+        ),
         "Fast": ({"fps": 10}, "the first frames: fps: expected a Fraction"),
         "Ends": ({"contents": 3, "content": lambda s, tick: tick}, "the first frames: content: expected 0 to contents"),
         "Picture": ({"read": lambda s, n: Turning.read(s, n).image}, "the first frames: read: expected a Shot"),

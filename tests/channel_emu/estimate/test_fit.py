@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from matplotlib.figure import Figure
 from scipy import linalg
 
 from channel_emu.cli import main
@@ -152,7 +153,9 @@ def test_a_few_huge_delays_are_no_state(tmp_path):
     assert any("rests on 2 frames" in w for w in found.warnings)
 
 
-def test_the_command_writes_a_scenario_and_a_picture(tmp_path, capsys):
+def test_the_command_writes_a_scenario_and_a_picture(tmp_path, capsys, monkeypatch):
+    drawn, save = [], Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *a, **k: drawn.append(figure.axes) or save(figure, *a, **k))
     path = write_trace(tmp_path / "t.jsonl", SLOW, 1, 2, seconds=60)
     assert main(["fit", str(path), "--out", str(tmp_path / "f.yaml"), "--plot", str(tmp_path / "f.png")]) == 0
     text = capsys.readouterr().out
@@ -160,6 +163,13 @@ def test_the_command_writes_a_scenario_and_a_picture(tmp_path, capsys):
     shown = yaml.safe_load(text[text.index("channel:") :])["channel"]
     assert channel_from_mapping(shown) == channel_from_mapping(scenario.load(tmp_path / "f.yaml").channel)
     assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
+    ((delays, chance),) = drawn
+    start_s, delay_ms = delays.collections[0].get_offsets().data.T
+    at_s, second = chance.lines[0].get_data()
+    assert at_s[0] <= start_s.min() + 1 and start_s.max() - 1 <= at_s[-1] <= start_s.max() < 60.5
+    slow = np.interp(start_s, at_s, second) > 0.5
+    assert np.nanmean(delay_ms[slow]) > 3 * np.nanmean(delay_ms[~slow])
+    assert [line.get_label().split(":")[0] for line in delays.lines] == ["mean_1_ms", "mean_2_ms"]
 
 
 @pytest.mark.stability

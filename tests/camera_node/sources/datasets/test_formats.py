@@ -415,7 +415,7 @@ def test_missing_images_are_counted_and_missing_depth_costs_only_depth(tmp_path,
     for file in depths[1:2]:
         file.unlink()
     found = load(name, folder)
-    assert found.missing == 1 and len(found) == len(images) - 1 == len(whole_set) - 1
+    assert (found.missing, whole_set.missing) == (1, 0) and len(found) == len(images) - 1 == len(whole_set) - 1
     assert f"1 of {len(images)} images are missing" in found.notes[0]
     assert not depths or [record.depth is None for record in found] == [True, False]
     for file in images[1:]:

@@ -155,6 +155,21 @@ def test_files_count_by_their_contents_not_by_their_place_or_time(tmp_path):
     refused(OSError, "", result_key, measure, 1, [tmp_path / "missing"])
 
 
+def test_a_class_from_outside_counts_with_all_that_it_imports_from_its_folder(tmp_path):
+    """A module beside it, a package beside it, and what these import."""
+    texts = {"mine.py": "import beside, package\nimport json", "beside.py": "import further", "further.py": "x = 1"}
+    texts |= {"package/__init__.py": "", "package/part.py": "y = 1", "unrelated.py": "z = 1"}
+    (tmp_path / "package").mkdir()
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    keys = [result_key(measure, {"policy": f"{tmp_path}/mine.py:Mine:3"})]
+    for name in texts:
+        (tmp_path / name).write_text("changed = True")
+        keys.append(result_key(measure, {"policy": f"{tmp_path}/mine.py:Mine:3"}))
+        (tmp_path / name).write_text(texts[name])
+    assert len(set(keys[:-1])) == len(texts) and keys[-1] == keys[0]
+
+
 @pytest.fixture
 def digest(tmp_path, monkeypatch):
     """The digest of the code of a module with a text."""
