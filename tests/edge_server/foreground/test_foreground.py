@@ -150,6 +150,9 @@ def test_every_head_of_a_segmentation_model_is_told_and_decoded(output, kinds, e
 def test_a_head_that_is_not_understood_is_refused_with_the_command_that_exports_one(output, kinds, message):
     with pytest.raises(EmbeddingError, match=rf"test: .*{message}.*yolo export model=yolo11n-seg.pt format=onnx"):
         decode(output, 0.5, "test", 2 if output.shape[2] == 6 else 1, kinds)
+    for kind, coefficients in ((1.5, 1), (1.0, 0)):
+        with pytest.raises(EmbeddingError, match="fits no head of 80 classes"):
+            decode(columns((*TILE, 0.9, kind, 5.0), cells=300), 0.5, "test", coefficients, 80, end_to_end=True)
 
 
 def test_models_without_masks_and_of_other_kinds_are_refused_by_what_they_are():

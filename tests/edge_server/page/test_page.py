@@ -210,6 +210,16 @@ def test_who_looks_at_truth_gets_each_comparison_once_and_the_picture_before_the
     assert loop._work(9e9) and (sent.call_args.args[0] == 200).mean() < 0.2
 
 
+def test_what_no_camera_has_seen_is_asked_for_finer_pictures_and_not_while_a_visitor_moves():
+    state, scene = bare_state(), BallScene(0.0)
+    scene.unseen = MagicMock(side_effect=lambda pose, camera: np.ones((camera.height, camera.width), bool))
+    loop = RenderLoop(state)
+    shown_to(loop)
+    state.publish(publication(0), scene)
+    for asked in (0, 1, 2):
+        assert loop._work(1e9 * (1 + asked)) and scene.unseen.call_count == asked
+
+
 @pytest.mark.parametrize("raises", [False, True])
 def test_the_page_outlives_a_broken_field_and_stops_at_once(raises):
     before, state, field = set(threading.enumerate()), bare_state(), Broken(raises)

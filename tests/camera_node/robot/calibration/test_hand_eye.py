@@ -3,6 +3,7 @@ programs save them, and guided, with the real detector on rendered images."""
 
 import json
 import re
+import time
 import warnings
 from fractions import Fraction
 
@@ -361,6 +362,14 @@ class Recording(Source):
         if content == 1:
             raise ValueError("no pose near enough")
         return Shot(self._images[content // 2], Pose.from_matrix(self._poses[content // 2]), LENS)
+
+
+def test_a_source_that_never_repeats_follows_the_time_of_day_as_in_a_node(monkeypatch):
+    asked, endless = [], Recording(taken()[1])
+    endless.contents = None
+    monkeypatch.setattr(endless, "content", lambda tick: asked.append(tick) or 0)
+    next(guided._shots(endless, "png", None))
+    assert asked[0] / 500 == pytest.approx(time.time(), abs=60)
 
 
 def test_what_it_saves_is_what_the_node_takes_it_for(tmp_path, monkeypatch, capsys):

@@ -3,6 +3,7 @@
 import dataclasses
 import pickle
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from edge_server.fields.registry import make_field
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
+from edge_server.scheduler.policy import SelectionWindow
 from edge_server.settings import ComputeConfig
 from freshfield.scenario import ScenarioError
 from tests.edge_server.experiments.rollouts.small import FIELD, NOTHING, scenario, setting
@@ -110,6 +112,26 @@ def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
         assert getattr(found, name) == getattr(expected, name), name
     assert found.views == len(expected.selected)
     assert point.now_ns + round(found.wait_ms * 1e6) == expected.published_ns
+
+
+@pytest.mark.parametrize("patience", [0, 2, 10**9])
+def test_a_policy_that_selects_nothing_is_asked_again_at_each_arrival_and_gets_all_in_the_end(patience):
+    episode = EpisodeFactory(setting(), NOTHING).episode(5)
+    point = episode.points[0]
+    arrivals_ns, asked_ns = [point.now_ns], []
+    while (arrives_ns := point.next_arrival_ns(arrivals_ns[-1])) is not None:
+        arrivals_ns.append(arrives_ns)
+
+    def select(epoch, window):
+        asked_ns.append(epoch.now_ns)
+        return ("cam01",) if len(asked_ns) > patience else ()
+
+    choice = choose(SimpleNamespace(plan=lambda epoch: SelectionWindow(), select=select), episode, 0)
+    assert asked_ns == arrivals_ns[: patience + 1] and len(arrivals_ns) > 4
+    if patience < len(arrivals_ns):
+        assert (choice.cameras, choice.at_ns) == (("cam01",), arrivals_ns[patience])
+    else:
+        assert (set(choice.cameras), choice.at_ns) == (set(point.newest(point.until_ns)), point.until_ns)
 
 
 @pytest.mark.parametrize("scratch", [True, False])

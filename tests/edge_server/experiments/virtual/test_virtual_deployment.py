@@ -124,8 +124,14 @@ def test_free_compute_publishes_at_the_decision_and_never_spins():
 
 def test_a_camera_that_reports_late_is_waited_for_only_as_long_as_the_grace():
     channel = {"service": {"law": "deterministic", "mean_ms": 700.0}}
-    deployment = run(scenario(channel), RunSettings(steps=1, grace_ms=0.0), seconds=1.5)
-    assert deployment.publications[0].published_ns == 700_000_000
+    what = scenario(channel, cameras={**RAW["cameras"], "phase": "spread"})
+    at_once, soon, all_there = (
+        run(what, RunSettings(steps=1, grace_ms=grace_ms), seconds=1.5).publications[0]
+        for grace_ms in (0.0, 5.0, 900.0)
+    )
+    assert at_once.published_ns > 700_000_000 and len(at_once.selected) == 1
+    assert soon.published_ns - at_once.published_ns == 5_000_000
+    assert 5_000_000 < all_there.published_ns - at_once.published_ns < 66_700_000 and len(all_there.selected) == 4
 
 
 def test_what_is_shown_is_the_newest_publication_carried_on_to_seeded_instants() -> None:
