@@ -88,7 +88,7 @@ def test_a_camera_is_opened_and_watched(capsys, tmp_path):
         _, parts = examined(capsys, file)
     assert parts["camera eye"][0] and parts["camera eye"][1].startswith("64 x 48, ")
     assert parts["camera eye"][1].endswith("stamped by their arrival, less latency_ms; its lens as calibrated")
-    assert parts["calibration"] == (True, "calibration.json: 1 cameras")
+    assert parts["calibration"] == (True, "calibration.json: 1 cameras") and "tracker" not in parts
     (tmp_path / "calibration.json").write_text(json.dumps({"other": CALIBRATION["eye"]}))
     _, parts = examined(capsys, file)
     assert parts["calibration"] == (False, "calibration.json: it lacks eye")

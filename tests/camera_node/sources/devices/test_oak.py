@@ -85,6 +85,8 @@ def test_only_a_device_that_was_calibrated_straightens_pictures_and_fixes_its_fo
     asked = camera.requestOutput.call_args_list
     straightened = [each.kwargs["enableUndistortion"] for each in asked if "enableUndistortion" in each.kwargs]
     assert straightened == [False, True, True]
+    queues = camera.requestOutput.return_value.createOutputQueue.call_args_list
+    assert not any(queue.kwargs["blocking"] for queue in queues), "what nobody takes must not stop the device"
     assert camera.initialControl.setManualFocus.call_args_list == [((131,),)]
     assert hasattr(dai.CameraControl(), "setManualFocus")
 

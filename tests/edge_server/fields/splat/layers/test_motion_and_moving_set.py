@@ -18,7 +18,8 @@ from edge_server.fields.splat.layers.motion import DIFFERENCES, WINDOW, Motion, 
 from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 from edge_server.fields.splat.layers.plates import Plate
-from edge_server.fields.splat.layers.settings import FIXED, FREE, KNOTS_PER_S
+from edge_server.fields.splat.layers.settings import FIXED, FREE, KNOTS_PER_S, MAX_AHEAD_S
+from edge_server.fields.splat.layers.snapshot import MovingSnapshot
 from edge_server.fields.splat.settings import SplatSettings
 from tests.edge_server.fields.scenes import BALL_M, RADIUS_M, ring, seen
 
@@ -252,6 +253,16 @@ def test_a_set_that_has_lost_most_of_its_gaussians_forgets_its_motion(outside: i
     moving.remove_outside(list(frames), {c.view.camera: c for c in cameras})
     assert len(moving) == left == len(moving.anchor)
     assert (moving.motion.anchors is None) == (left == 0)
+
+
+def test_what_is_shown_is_as_much_later_than_the_newest_frame_as_motion_can_be_told_ahead() -> None:
+    moving = _displaced_set(20)
+    shown = MovingSnapshot.of(moving, 5_000_000_000, INSTANT_S)
+    newest_ns = 5_000_000_000 + round(INSTANT_S * 1e9)
+    late = [shown.ahead_s(newest_ns + later_ms * 1_000_000) for later_ms in (-100, 0, 120, 900)]
+    assert late == pytest.approx([-0.1, 0.0, 0.12, MAX_AHEAD_S]) and shown.ahead_s(None) == 0.0
+    then_m = moving.motion.displaced(shown.params[:, :3], shown.anchor, shown.share, INSTANT_S + 0.12)
+    np.testing.assert_array_equal(shown.params_at(0.12)[:, :3], then_m)
 
 
 def test_new_gaussians_lie_where_the_foreground_is_while_the_anchors_are_displaced(monkeypatch) -> None:
