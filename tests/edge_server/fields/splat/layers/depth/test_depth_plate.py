@@ -97,6 +97,15 @@ def test_small_holes_are_filled_by_the_plane_of_a_pixel_beside_them() -> None:
         assert found[*hole] > 0 and (same & beside).any()
 
 
+@pytest.mark.parametrize("turns", range(4))
+def test_a_wide_hole_at_a_border_stays_but_for_its_rim(turns: int) -> None:
+    inverse = np.full((20, 20), 0.5, np.float32)
+    inverse[:, : settings.HOLE_PX + 4] = 0.0
+    found = np.rot90(smooth(np.rot90(inverse, turns).copy(), np.full((20, 20, 3), 90.0), POOL)[0], -turns)
+    assert (found[:, :4] == 0).all()
+    np.testing.assert_allclose(found[:, 4:], 0.5, rtol=1e-5)
+
+
 @pytest.mark.stability
 def test_what_no_sensor_measures_is_no_depth() -> None:
     plate = DepthPlate.empty(2, 4)
