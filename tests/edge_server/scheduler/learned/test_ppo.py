@@ -1,5 +1,6 @@
 """Learning happens, on bandits whose optimum is known, and repeats; checkpoints lose nothing; all stays finite."""
 
+import contextlib
 import re
 import zipfile
 from dataclasses import replace
@@ -11,7 +12,7 @@ import torch
 
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import distributions as d
-from edge_server.scheduler.learned import networks
+from edge_server.scheduler.learned import networks, ppo
 from edge_server.scheduler.learned.actor import MAX_BYTES, Actor
 from edge_server.scheduler.learned.clipped_update import Acted, clipped_update
 from edge_server.scheduler.learned.ppo import Diagnostics, Learner, _RunningMeanStd
@@ -185,6 +186,19 @@ def test_running_statistics_of_rewards_are_those_of_all_of_them():
     assert standardized.std() == pytest.approx(1.0) and standardized.mean() == pytest.approx(0.0, abs=1e-12)
     running.add(np.zeros(5000))
     assert running.count == 4096, "what is older fades"
+
+
+def test_advantages_are_what_rewards_exceed_the_value_by_in_units_of_their_spread(monkeypatch):
+    learner, seen = Learner(select(), 0), []
+    teach(learner, FreshOnes(), 3)
+    taken = collect(learner, FreshOnes(), range(500, 564))
+    monkeypatch.setattr(ppo, "clipped_update", lambda _, evaluate, acted, *rest: seen.append((evaluate, acted)))
+    with contextlib.suppress(TypeError):  # of what this does not return
+        learner.update(taken)
+    ((evaluate, acted),) = seen
+    above = (acted.returns - evaluate(torch.arange(64))[2]).detach().numpy()
+    np.testing.assert_allclose(acted.advantages, (above - above.mean()) / above.std(), rtol=1e-6)
+    assert 0.5 < acted.returns.std() < 2.0
 
 
 def test_a_minibatch_is_clipped_where_its_ratio_leaves_the_range():
