@@ -4,6 +4,7 @@ import json
 import re
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib import import_module
 from itertools import count
 from types import SimpleNamespace
@@ -103,6 +104,13 @@ def test_one_message_of_each_kind_and_the_layout_that_shows_them(served):
     assert len(shown) > 6
     for topic, _, value in (name.partition(".") for name in shown):
         assert not value or value in json.loads(client.channels[topic]["schema"])["properties"], topic
+
+
+def test_where_no_camera_is_held_out_the_first_stands_for_it(served):
+    preview, server = served
+    cameras = preview.state.cameras
+    preview.state.cameras = lambda: [replace(camera, held_out=False) for camera in cameras()]
+    assert Client(server).first("/truth/image")[0].frame_id == preview.names[0]
 
 
 def test_points_are_the_gaussians_that_are_seen(served):

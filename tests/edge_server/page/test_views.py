@@ -109,6 +109,11 @@ def test_the_visitor_stands_behind_what_the_cameras_look_at_as_they_hold_up():
     assert np.linalg.norm(view.position - TARGET) == pytest.approx(1.9 * 3.0)
     assert np.allclose(view.look_at, TARGET, atol=1e-6) and view.radius_m == pytest.approx(3.0)
     assert np.allclose(view.up, (0, 0, 1), atol=1e-9)
+    alone, abreast = rig(1, 0), np.repeat(rig(1, 0), 3, axis=0)
+    abreast[:, :3, 3] += abreast[:, :3, 0] * [[-1.5], [0.0], [1.5]]  # looking the same way
+    for cameras, ahead_m in ((alone, 1.0), (abreast, 3.0)):
+        target = cameras[:, :3, 3].mean(axis=0) + ahead_m * cameras[0, :3, 2]
+        assert np.allclose(initial_viewpoint(cameras).look_at, target)
     poses[:, :3, :2] *= -1  # held upside down
     assert np.allclose(initial_viewpoint(poses).up, (0, 0, -1), atol=1e-9)
     ring = rig(12, 330)  # has no behind, so the visitor stands behind its first camera

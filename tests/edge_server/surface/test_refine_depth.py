@@ -1,19 +1,21 @@
 """Depth from pictures that agree: the cost against plain numpy, and plates whose depth is known."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from edge_server.fields import Rendering, View
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import settings
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels import patch_match
 from edge_server.surface.kernels.patch_images import Planes
-from edge_server.surface.reconstruct import covering_maps
+from edge_server.surface.reconstruct import covering_maps, make_depth_maps
 from edge_server.surface.refine_depth import _images, _view, exposures, refine_depth
-from edge_server.surface.settings import REACH, UNSURE
+from edge_server.surface.settings import REACH, UNSURE, MeshSettings
 from freshfield.geometry import Pinhole, look_at, world_rays
 
 LENS = Pinhole.from_fov(72, 72, 45.0)
@@ -147,6 +149,19 @@ def test_unknown_pixels_take_the_nearest_depth_and_empty_ones_none(rig):
     error = np.abs(found[0].depth - exact[0])[31:39, 31:39]
     assert np.isfinite(error).all() and np.median(error) < 0.0006
     assert np.isposinf(found[0].depth[:, :6]).all()
+
+
+@pytest.mark.parametrize("sharpen", [False, True])
+def test_depth_is_sharpened_where_that_is_asked_for_and_there_are_two_views(rig, sharpen) -> None:
+    maps, pictures, exact = rig
+    opaque = np.ones((72, 72), np.float32)
+    of = {m.camera_to_world.tobytes(): Rendering(m.color / np.float32(255.0), m.depth, opaque) for m in maps}
+    field = SimpleNamespace(render=lambda pose, lens: of[pose.tobytes()])
+    views = [View(f"cam{k}", picture, pose, LENS) for k, (picture, pose) in enumerate(zip(pictures, POSES))]
+    found = make_depth_maps(field, views, MeshSettings(sharpen=sharpen))
+    assert (np.median(errors(found, exact)) < 0.002) == sharpen and len(found) == 4
+    (alone,) = make_depth_maps(field, views[:1], MeshSettings(sharpen=sharpen))
+    np.testing.assert_array_equal(alone.depth, maps[0].depth)
 
 
 def test_only_the_maps_that_see_most_together_are_sharpened() -> None:

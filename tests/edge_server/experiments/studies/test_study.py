@@ -89,6 +89,12 @@ def answers(found: list[Verdict], *words: str) -> set[str]:
     return said
 
 
+def test_every_study_has_cases_and_whole_no_fewer_than_in_a_quick_pass(tmp_path: Path):
+    for name, study in STUDIES.items():
+        whole, quick = (len(study.cases(StudyRequest(short, tmp_path, Folders()))) for short in (False, True))
+        assert whole >= quick > 0, name
+
+
 @pytest.mark.parametrize("name", ON_A_CHANNEL)
 @pytest.mark.parametrize("quick", [True, False])
 def test_every_point_is_a_deployment_that_can_be_read(name: str, quick: bool, tmp_path: Path):
