@@ -257,9 +257,9 @@ def _lens(d: dict[str, Any], image: Path, sizes: dict[str, tuple[int, int]], cam
                 "and h, the size that fl_x and cx belong to"
             )
     fx, fy = _focal(d, "x", width, where), _focal(d, "y", height, where)
-    if fx is None and fy is None:
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    if fx is None or fy is None:
         raise DatasetError(f"{where}: neither 'fl_x' nor 'camera_angle_x' is given")
-    fx, fy = fx or fy or 0.0, fy or fx or 0.0
     if width < 1 or height < 1 or not (fx > 0 and fy > 0):
         raise DatasetError(f"{where}: size {width} x {height}, focal lengths {fx:g}, {fy:g} are impossible")
     names = ("k1", "k2", "k3", "k4", "p1", "p2")

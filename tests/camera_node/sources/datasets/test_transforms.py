@@ -106,6 +106,14 @@ def load_edited(file, change=None, **top):
 BENDS = {"k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": 0.0001}
 
 
+def test_a_lens_has_pixels_and_a_focal_length(tmp_path):
+    file = write_photos(tmp_path, 2)
+    for width, height, fx, fy in ((0, 24, 40, 41), (32, 0, 40, 41), (32, 24, 0, 41), (32, 24, 40, -41)):
+        fails("are impossible", load_edited, file, w=width, h=height, fl_x=fx, fl_y=fy)
+        fails("no pixels|focal lengths are", Lens, width, height, fx, fy, 16.0, 12.0)
+    assert load_edited(file, w=32, h=24, fl_x=40, fl_y=41)[0].intrinsics.fy == 41 and Lens(1, 1, 1.0, 1.0, 0.5, 0.5)
+
+
 def lens_of(fx=40.0, fy=41.0, radial=(), tangential=(0.0, 0.0), fisheye=False):
     return Lens(32, 24, fx, fy, 16.0, 12.0, radial, tangential, fisheye)
 
