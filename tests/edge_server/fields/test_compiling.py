@@ -1,8 +1,12 @@
 """``warm-up`` compiles what a scenario uses; what is compiled is kept for the state of the sources."""
 
+from pathlib import Path
+
+import numba
 import pytest
 
 from edge_server.cli import main
+from edge_server.fields import compiling
 from edge_server.fields.common.kernels.jit import cache_folder
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.splat.carried_camera.carried_field import CarriedField
@@ -29,6 +33,8 @@ def test_warm_up_compiles_what_is_used(words: list[str], expected: list[tuple[ty
 
 def test_compiled_kernels_are_kept_apart_for_every_state_of_the_sources(tmp_path, monkeypatch) -> None:
     """Or an edit to one file would leave yesterday's code running where it is inlined into another."""
+    package = Path(compiling.__file__).parents[1]
+    assert str(cache_folder(package)) == numba.config.CACHE_DIR and package.name == "edge_server"
     source, other = tmp_path / "fields" / "kernels" / "a.py", tmp_path / "fields" / "field.py"
     source.parent.mkdir(parents=True)
     source.write_text("x = 1")
