@@ -44,6 +44,10 @@ def _fetch() -> tuple[dict[str, Any], dict[str, Any]]:
         import torchvision
     except ImportError as error:
         raise FetchError(f"needs {error.name}: pip install 'freshfield[edge,lpips]'") from None
+    except RuntimeError as error:  # torchvision's, built for another torch
+        raise FetchError(
+            f"torchvision cannot be loaded ({error}): install it from the index of torch"
+        ) from None
     file = Path(lpips.__file__).parent / "weights" / "v0.1" / "alex.pth"
     try:
         lins = torch.load(file, map_location="cpu", weights_only=True)

@@ -325,6 +325,11 @@ def test_the_command_says_where_it_wrote_what_it_fetched_or_what_is_wrong(tmp_pa
         without.setitem(sys.modules, "lpips", None)
         needs = "needs lpips: pip install 'freshfield[edge,lpips]'"
         assert needs in refusal(capsys, edge_server, "fetch-lpips", "--out", tmp_path)
+    with monkeypatch.context() as unfit:
+        (tmp_path / "lpips.py").write_text("raise RuntimeError('operator torchvision::nms does not exist')")
+        unfit.syspath_prepend(tmp_path)
+        said = refusal(capsys, edge_server, "fetch-lpips", "--out", tmp_path)
+        assert "nms does not exist): install it from the index of torch" in said
     monkeypatch.setattr(fetch_lpips, "_fetch", lambda: (features, lins))
     assert edge_server(["fetch-lpips", "--out", str(tmp_path)]) == 0
     assert capsys.readouterr().out.split() == [str(tmp_path / name) for name in FILES]
