@@ -96,6 +96,19 @@ def test_one_camera_is_seen_from_before_it_then_from_the_fields_box_and_looked_t
     np.testing.assert_array_equal(client.camera.position, refined[:3, 3])
 
 
+def test_a_camera_that_moves_is_shown_where_it_is_and_one_that_stands_is_not_sent_again():
+    server = MagicMock()
+    scene, add = Scene(server, bare_state()), server.scene.add_camera_frustum
+    scene._viewpoint, shown = SimpleNamespace(radius_m=2.0), add.return_value
+    for x_m in (0.0, 0.0, 0.5):
+        pose = Pose.from_matrix(look_at((x_m, -3.0, 1.0), (0.0, 0.0, 0.0)))
+        newest = replace(frame(camera="cam00"), pose=pose, intrinsics=LENS)
+        shown.position = shown.wxyz = None
+        scene._frustum(CameraView("cam00", False, newest, 1.0, 1, 0), newest)
+        assert (shown.position, shown.wxyz) == ((pose.translation_m, pose.quaternion) if x_m else (None, None))
+    assert add.call_count == 1 and add.call_args.kwargs["position"] != pose.translation_m
+
+
 def test_the_tiles_say_the_latest_score_and_the_ages_of_training_cameras():
     state = bare_state()
     state.publish(replace(publication(4), update_ms=20.0, psnr_db=21.0, scored_on="cam00"), Broken())

@@ -58,6 +58,9 @@ def test_tastes_are_of_the_object_of_edges_and_of_detail():
     truth[4:12, 4:12] = 1.0
     assert judge("object", [truth * 0.8], [truth]) == pytest.approx(-0.04)  # squared, over the object alone
     assert judge("edges", [truth], [truth]) == judge("texture", [truth], [truth]) == 0.0
+    at_a_corner = truth.copy()
+    at_a_corner[12:, 12:] = 1.0  # of four corners one is the object's
+    assert judge("object", [at_a_corner * 0.8], [at_a_corner]) == pytest.approx(-0.04)
 
 
 def test_from_contradictions_it_knows_nothing():

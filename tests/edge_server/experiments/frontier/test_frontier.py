@@ -43,6 +43,14 @@ def test_a_cycle_is_charged_a_frame_of_each_camera_and_layers_every_frame(layers
     assert tuple(update_time.measure_compute(of).values()) == charged
 
 
+def test_layers_charge_the_steps_of_their_still_field_one_at_least():
+    run = update_time.MovingRun(
+        TINY, 1.0, update_time.Variant("splat", True, {}), 5, 0.1, 0.6, ComputeConfig(30.0, 10.0)
+    )
+    a_second = replace(run, update_s=1.0).steps
+    assert replace(run, update_s=0.5).steps == a_second / 2 > 2 and replace(run, update_s=1e-4).steps == 1
+
+
 def test_the_front_is_what_nothing_beats_in_both():
     points = [(1.0, 20.0), (2.0, 19.0), (2.0, 25.0), (3.0, 25.0), (4.0, 26.0)]
     rows = [{"planned_s": planned_s, "psnr_db": psnr_db} for planned_s, psnr_db in points]

@@ -2,6 +2,8 @@
 removed, and where what is seeded lies, also of cameras with depth."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -18,8 +20,9 @@ from edge_server.fields.splat.layers.motion import DIFFERENCES, WINDOW, Motion, 
 from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 from edge_server.fields.splat.layers.plates import Plate
-from edge_server.fields.splat.layers.settings import FIXED, FREE, KNOTS_PER_S, MAX_AHEAD_S
+from edge_server.fields.splat.layers.settings import FIXED, FREE, KNOTS_PER_S, MAX_AHEAD_S, STRIDE_S
 from edge_server.fields.splat.layers.snapshot import MovingSnapshot
+from edge_server.fields.splat.layers.tracker import MotionTracker
 from edge_server.fields.splat.settings import SplatSettings
 from tests.edge_server.fields.scenes import BALL_M, RADIUS_M, ring, seen
 
@@ -253,6 +256,17 @@ def test_a_set_that_has_lost_most_of_its_gaussians_forgets_its_motion(outside: i
     moving.remove_outside(list(frames), {c.view.camera: c for c in cameras})
     assert len(moving) == left == len(moving.anchor)
     assert (moving.motion.anchors is None) == (left == 0)
+
+
+@pytest.mark.parametrize(
+    ("fresh", "followed"), [((0.5, 2.5, 3.0), (1.0, 3.0)), ((3.0,), (3.0,)), ((0.4, 1.3, 3.0), (1.0, 2.0, 3.0))]
+)
+def test_motion_is_followed_in_strides_that_hold_a_new_frame(fresh: tuple, followed: tuple) -> None:
+    """The last frame that was followed is at 0; instants in strides."""
+    kept = [SimpleNamespace(instant_s=STRIDE_S * at, fresh=at > 0) for at in (0.0, *fresh)]
+    observations = MagicMock(newest_s=STRIDE_S * fresh[-1], __iter__=lambda _: iter(kept))
+    strides = MotionTracker(_displaced_set(20), observations, {})._strides()
+    assert strides == pytest.approx([STRIDE_S * end for end in followed])
 
 
 def test_what_is_shown_is_as_much_later_than_the_newest_frame_as_motion_can_be_told_ahead() -> None:
