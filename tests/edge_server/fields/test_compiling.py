@@ -8,6 +8,7 @@ import pytest
 from edge_server.cli import main
 from edge_server.fields import compiling
 from edge_server.fields.common.kernels.jit import cache_folder
+from edge_server.fields.common.kernels.train import train_chunks
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.splat.carried_camera.carried_field import CarriedField
 from edge_server.fields.splat.layers.layered_field import LayeredField
@@ -29,6 +30,12 @@ def test_warm_up_compiles_what_is_used(words: list[str], expected: list[tuple[ty
         monkeypatch.setattr(kind, "warm_up", lambda field, cameras: found.append((type(field), cameras)) or 0.0)
     assert main(["warm-up", *words]) == 0
     assert found == expected
+
+
+def test_a_kernel_goes_by_its_function_s_name() -> None:
+    found = train_chunks.py_func
+    assert (found.__module__, found.__qualname__) == ("edge_server.fields.common.kernels.train", "train_chunks")
+    assert found.__doc__.startswith("Tasks are chunks.")
 
 
 def test_compiled_kernels_are_kept_apart_for_every_state_of_the_sources(tmp_path, monkeypatch) -> None:

@@ -291,6 +291,13 @@ def test_the_filter_follows_each_part_by_its_own_speed(axis):
     position, quaternion = filtered(0.02 * axis, turned(0.7), 0.01)  # 2 m/s, 20 rad/s
     assert position == pytest.approx(0.02 * share(2.0 + 3.0 * share(2.0) * 2.0) * axis)
     assert quaternion == pytest.approx(turned(0.5 + 0.2 * share(2.0 + 3.0 * share(2.0) * 20.0)))
+    for faulty_s, taken_s in ((60.0, 0.5), (0.0, 1e-4), (-3.0, 1e-4)):  # of a clock that leaps
+        found = []
+        for dt_s in (faulty_s, taken_s):
+            filtered.reset()
+            filtered(np.zeros(3), turned(0.5), 0.01)
+            found.append(filtered(0.1 * axis, turned(0.7), dt_s)[0])
+        np.testing.assert_array_equal(*found)
 
 
 TWIST = TeleopConfig(gain_per_s=4.0, speed_m_s=0.2, speed_rad_s=6.0, acceleration_rad_s2=40.0)
