@@ -158,7 +158,9 @@ def test_a_session_goes_on_where_its_file_ends():
     [
         (lambda f: f.update(version=2), "version"),
         (lambda f: f.update(made_of="of other pictures"), "other reconstructions"),
-        (lambda f: f["answers"][2].update(left=20), "answer 2: 20 and"),
+        (lambda f: f["answers"][2].update(left=len(ORDERS), right=0), f"answer 2: {len(ORDERS)} and 0"),
+        (lambda f: f["answers"][2].update(left=0, right=len(ORDERS)), f"answer 2: 0 and {len(ORDERS)}"),
+        (lambda f: f["answers"][2].update(left=-1, right=0), "answer 2: -1 and 0"),
         (lambda f: f["answers"][2].update(left=1, right=1), "no pair"),
         (lambda f: f["answers"][2].update(repeats=2), "answer 2: does not repeat answer 2"),
         (lambda f: f["answers"][2].update(by="simulated expert (edges)"), "they are not mixed"),
