@@ -112,7 +112,8 @@ def test_images_depth_and_the_chain_of_transforms_of_a_bag(tmp_path, storage, as
     if as_file:
         bag = next(file for file in bag.iterdir() if file.suffix in (".mcap", ".db3"))
     _, found = open_dataset(bag)
-    assert found.cameras == (EYE,) and found.moving and len(found) == 3 and not found.notes and not found.missing and found.carried
+    assert found.cameras == (EYE,) and found.moving and found.carried and len(found) == 3
+    assert not found.notes and not found.missing
     still = load_recorded(bag, holdout="3")
     assert still.carried and still.timed and (len(still.training), len(still.held_out)) == (2, 1)
     for n, record in enumerate(found):
