@@ -1,9 +1,10 @@
-"""The examples run as a reader would run them, in processes of their own, on small data."""
+"""The examples run as a reader would run them, on small data."""
 
 import json
-import os
+import runpy
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -25,15 +26,20 @@ edge: {field: ngp, lpips: none}
 pytestmark = pytest.mark.timeout(600)
 
 
-def start(name: str, *words: object) -> str:
-    """What the example prints."""
-    command = [sys.executable, str(ROOT / "examples" / name), *map(str, words)]
-    done = subprocess.run(command, env={**os.environ, "MPLBACKEND": "agg"}, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+@pytest.fixture
+def start(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Runs an example with words, and gives what it prints."""
+    monkeypatch.setenv("MPLBACKEND", "agg")
+
+    def run(name: str, *words: object) -> str:
+        monkeypatch.setattr(sys, "argv", [name, *map(str, words)])
+        runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+        return capfd.readouterr().out
+
+    return run
 
 
-def test_own_data_become_splats_and_a_video(tmp_path: Path) -> None:
+def test_own_data_become_splats_and_a_video(start, tmp_path: Path) -> None:
     write_photos(tmp_path / "set", 9)
     said = start("own_data.py", tmp_path / "set", tmp_path / "set.ply", 1)
     assert "set: 7 views of 32 x 32" in said and "dB" in said
@@ -43,12 +49,12 @@ def test_own_data_become_splats_and_a_video(tmp_path: Path) -> None:
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 3 and video.get(cv2.CAP_PROP_FRAME_WIDTH) == 320
 
 
-def test_ages_are_plotted(tmp_path: Path) -> None:
+def test_ages_are_plotted(start, tmp_path: Path) -> None:
     assert "mean age" in start("channel_ages.py", tmp_path / "ages.png")
     assert cv2.imread(str(tmp_path / "ages.png")) is not None
 
 
-def test_a_policy_of_ones_own_is_tried(tmp_path: Path) -> None:
+def test_a_policy_of_ones_own_is_tried(start, tmp_path: Path) -> None:
     quick = "field: splat, field_options: {gaussians: 128, start: 96, seed_cells: 8}"
     (tmp_path / "small.yaml").write_text(SMALL.replace("field: ngp", quick))
     lines = start("own_policy.py", tmp_path / "small.yaml", 2).splitlines()
@@ -56,14 +62,14 @@ def test_a_policy_of_ones_own_is_tried(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_deployment_runs_from_a_script(tmp_path: Path) -> None:
+def test_a_deployment_runs_from_a_script(start, tmp_path: Path) -> None:
     (tmp_path / "small.yaml").write_text(SMALL)
     said = start("deployment.py", tmp_path / "small.yaml", 6, tmp_path / "run")
     assert "all frames accounted for: True" in said and "http://127.0.0.1:" in said
 
 
 @pytest.mark.slow
-def test_arrays_of_ones_own_reach_an_edge(tmp_path: Path) -> None:
+def test_arrays_of_ones_own_reach_an_edge(start, tmp_path: Path) -> None:
     scenario, edge = tmp_path / "mine.yaml", f"127.0.0.1:{free_port()}"
     scenario.write_text(ONE_CAMERA)
     words = ["-m", "edge_server.cli", "run", str(scenario), "--listen", edge, "--out", str(tmp_path / "edge")]

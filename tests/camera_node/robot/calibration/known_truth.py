@@ -84,9 +84,9 @@ def photo(target: Target, lens: Pinhole, camera_in_target: Array, noise: float =
         return np.full((lens.height, lens.width), 110, np.uint8)
     drawn = np.pad(target.draw(960 // target.modules * target.modules), 60, constant_values=255)
     pixel_m = target.size_m[0] / (drawn.shape[1] - 120)
-    eye, rays = camera_in_target[:3, 3], _fine_rays(lens) @ camera_in_target[:3, :3].T.astype(np.float32)
-    meets_m = eye[:2] - eye[2] / rays[..., 2:] * rays[..., :2]
-    at = (meets_m / pixel_m + 59.5).astype(np.float32)
+    eye, turn = (camera_in_target[:3, 3] / pixel_m).astype(np.float32), camera_in_target[:3, :3].astype(np.float32)
+    rays = cv2.transform(_fine_rays(lens), turn)
+    at = eye[:2] - eye[2] / rays[..., 2:] * rays[..., :2] + np.float32(59.5)
     image = cv2.remap(drawn, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110)
     image = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA).astype(np.float64)
     return np.clip(image + np.random.default_rng(seed).normal(0, noise, image.shape), 0, 255).astype(np.uint8)

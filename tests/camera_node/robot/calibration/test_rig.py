@@ -93,7 +93,7 @@ def errors(poses: dict[str, np.ndarray]) -> tuple[float, float]:
 
 
 def test_a_rig_is_exact_from_exact_corners_and_stands_where_the_target_lay():
-    found = calibrate_rig(sightings(0.0), START, True)
+    found = calibrate_rig(sightings(0.0, 10), START, True)
     assert max(found.error_px.values()) < 1e-3 and found.origin == "00"
     # The board's top left corner is the origin, x along its top, y up along it: half a board from the world's middle.
     shift = se3(np.eye(3), [0.24, -0.15, 0.0])
@@ -114,12 +114,12 @@ def test_errors_are_within_their_own_deviations_and_within_3_mm_and_a_fifth_of_a
     assert mm < 6 * max(found.std_mm.values()) and deg < 6 * max(found.std_deg.values())
     assert list(found.error_px.values()) == pytest.approx([0.2 * 2**0.5] * 4, rel=0.1)  # of both coordinates
     with pytest.raises(CalibrationError, match="--origin 99: no camera saw the target then; there are 00, 01, 02"):
-        calibrate_rig(sightings(0.1), START, True, "99")
+        calibrate_rig(sightings(0.1, 8), START, True, "99")
 
 
 @pytest.mark.stability
 def test_a_moment_that_was_mixed_up_is_left_out_and_named():
-    views = sightings(0.1)
+    views = sightings(0.1, 12)
     views["cam2"]["07"] = views["cam2"]["11"]
     found = calibrate_rig(views, START, True)
     assert list(found.unused) == ["cam2 at 07"]
@@ -155,7 +155,7 @@ def test_pictures_of_noisy_webcams_give_a_file_that_a_scenario_reads(tmp_path, c
     for name in ("cam1", "cam2"):
         for folder in ("all", "few"):
             (tmp_path / folder / name).mkdir(parents=True)
-        for k, board in enumerate([*boards(9), *near("cam1"), *near("cam2")]):
+        for k, board in enumerate([*boards(7), *near("cam1")[:4], *near("cam2")[:4]]):
             image = taken_of(name, board, 4.0, 100 * int(name[3]) + k)
             for folder in ("all", "few")[: 1 + (k < 6)]:
                 cv2.imwrite(str(tmp_path / folder / name / f"{k:02d}.png"), image)
