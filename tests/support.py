@@ -8,7 +8,7 @@ import struct
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -39,6 +39,17 @@ def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], time
         assert time.monotonic() < end, what if isinstance(what, str) else what()
         time.sleep(0.02)
     return value
+
+
+def patiently(call: Callable[[], Any], error: type[Exception], timeout_s: float = 20.0) -> Any:
+    """The first result of ``call``, which raises ``error`` before: a busy machine may be late."""
+
+    def attempt() -> list[Any]:
+        with suppress(error):
+            return [call()]
+        return []
+
+    return wait_until(attempt, f"still {error.__name__}", timeout_s)[0]
 
 
 async def until(condition: Callable[[], Any], timeout_s: float = 30.0) -> None:

@@ -1,5 +1,4 @@
-"""Classes from outside: found by file, module or entry point; errors that say what is wrong; nothing loaded unasked.
-Scenario files and their sections: strict, with one clear line for everything that is wrong."""
+"""Classes from outside: found by file, module or entry point; errors that say what is wrong; nothing loaded unasked."""
 
 import sys
 from importlib.metadata import EntryPoint

@@ -27,6 +27,7 @@ from freshfield.machine_load import rss_mb
 from freshfield.transport import Transport
 from tests.channel_emu.live.emulator import Edge, make
 from tests.edge_server.frames import frame
+from tests.support import until
 
 CAMERAS = (1, 10, 100, 1000)
 RECKONED = (10, 100, 1000, 10_000)
@@ -51,9 +52,7 @@ async def _edge(count: int, out: Path, link: Connection) -> None:
 async def _emulator(count: int, out: Path, port: int, link: Connection) -> None:
     proxy, flows = make(out, f"127.0.0.1:{port}", {}, names(count))
     await proxy.start()
-    async with asyncio.timeout(120):
-        while not all(flow.connected for flow in flows):
-            await asyncio.sleep(0.05)
+    await until(lambda: all(flow.connected for flow in flows), 120.0)
     await _answer(link, proxy.port)
     await proxy.stop()
 

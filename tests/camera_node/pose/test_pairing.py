@@ -2,7 +2,6 @@
 
 import os
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from camera_node.pose.providers import read_tum
 from camera_node.pose.tracker import TrackerPoses
 from freshfield.geometry import Pose, se3, so3_exp
 from tests.camera_node.sources.datasets.photos import fails
-from tests.support import refused
+from tests.support import patiently, refused
 
 MS = 1_000_000
 
@@ -105,15 +104,9 @@ def _written(file, text: str, mode: str = "a") -> None:
         out.write(text)
 
 
-def _x(poses: TrackerPoses, k: float, within_s: float = 5.0) -> float:
-    """The position at step ``k``; a busy machine may be late."""
-    until = time.monotonic() + within_s
-    while True:
-        try:
-            return poses.at(START_NS + round(k * STEP_NS))[0].translation_m[0]
-        except PoseGapError:
-            if time.monotonic() > until:
-                raise
+def _x(poses: TrackerPoses, k: float) -> float:
+    """The position at step ``k``."""
+    return patiently(lambda: poses.at(START_NS + round(k * STEP_NS))[0].translation_m[0], PoseGapError)
 
 
 @pytest.fixture

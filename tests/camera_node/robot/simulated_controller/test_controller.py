@@ -1,6 +1,5 @@
 """The real client library against the simulated controller; a world camera in the hand of its arm."""
 
-import contextlib
 import dataclasses
 import math
 import socket
@@ -27,7 +26,7 @@ from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario, load
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
-from tests.support import refused, wait_until
+from tests.support import patiently, refused, wait_until
 
 
 @pytest.fixture(scope="module")
@@ -198,18 +197,12 @@ def at(host: str, **source: object) -> Scenario:
     return dataclasses.replace(CELL, source={**CELL.source, "arm": arm, **changed})
 
 
-def take(camera):
-    """One frame of now, or none yet on a busy machine."""
-    with contextlib.suppress(PoseGapError):
-        return camera.capture(int(time.time() * camera.fps))
-
-
 def test_what_it_sees_and_what_it_claims_agree_where_the_arm_stands(host):
     scenario = at(host, effects={"depth_sensor": {"nearest_m": 0.1}}, depth_every=1)
     with simulated_arm(host, f"--joints={','.join(map(str, LOOKING))}"):
         fixed, hand = build_cameras(scenario, source_config(scenario), scenario.cameras)
         assert hand.waits and not fixed.waits
-        shot = wait_until(lambda: take(hand), "no frame", 2.0)
+        shot = patiently(lambda: hand.capture(int(time.time() * hand.fps)), PoseGapError, 2.0)
         config = source_config(scenario).arm
         mount = load_hand_eyes(scenario, config, ["hand"])["hand"].transform
         place = base_matrix(config) @ UR3E.forward(np.deg2rad(LOOKING)) @ mount
