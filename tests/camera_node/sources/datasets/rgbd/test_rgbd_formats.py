@@ -2,7 +2,6 @@
 
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -103,12 +102,7 @@ def write_polycam(folder: Path) -> None:
         (folder / f"keyframes/cameras/{name}.json").write_text(json.dumps(entry))
 
 
-WRITERS: dict[str, Callable[[Path], None]] = {
-    "tum": write_tum,
-    "sevenscenes": write_sevenscenes,
-    "record3d": write_record3d,
-    "polycam": write_polycam,
-}
+WRITERS = {"tum": write_tum, "sevenscenes": write_sevenscenes, "record3d": write_record3d, "polycam": write_polycam}
 
 
 @pytest.mark.parametrize("name", WRITERS)
