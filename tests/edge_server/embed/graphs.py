@@ -8,7 +8,6 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch.nn.functional import conv2d
 
-RNG = np.random.default_rng(4)
 CHANNELS = 6
 
 

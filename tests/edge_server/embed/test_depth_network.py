@@ -26,10 +26,8 @@ WEIGHTS = (0.5, -1.0, 2.0)
 
 def weighted(path: Path, kind: type = np.float32) -> Path:
     """Of any size: the sum of the normalized channels with ``WEIGHTS``, (1, height, width)."""
-    nodes = [
-        helper.make_node("Conv", ["images", "weights"], ["map"]),
-        helper.make_node("Squeeze", ["map", "axis"], ["depth"]),
-    ]
+    convolution = helper.make_node("Conv", ["images", "weights"], ["map"])
+    nodes = [convolution, helper.make_node("Squeeze", ["map", "axis"], ["depth"])]
     constants = {"weights": np.array(WEIGHTS, kind).reshape(1, 3, 1, 1), "axis": np.array([1], np.int64)}
     types = {} if kind == np.float32 else {"kind": TensorProto.FLOAT16, "gives": TensorProto.FLOAT16}
     return save(path, nodes, ["n", 3, "h", "w"], ("depth", ["n", "h", "w"]), constants, **types)
@@ -37,13 +35,8 @@ def weighted(path: Path, kind: type = np.float32) -> Path:
 
 def constant(path: Path, output: list[int], value: float = 1.0, channels: int = 3, kind: int = TensorProto.FLOAT):
     """Of 28 x 28 pixels: gives a constant of this shape."""
-    constants = {"value": np.full(output, value, np.float32), "none": np.float32(0)}
-    nodes = [
-        helper.make_node("Cast", ["images"], ["floats"], to=TensorProto.FLOAT),
-        helper.make_node("ReduceMean", ["floats"], ["mean"], keepdims=0),
-        helper.make_node("Mul", ["mean", "none"], ["zero"]),
-        helper.make_node("Add", ["value", "zero"], ["depth"]),
-    ]
+    constants = {"value": np.full(output, value, np.float32)}
+    nodes = [helper.make_node("Identity", ["value"], ["depth"])]
     return save(path, nodes, [1, channels, 28, 28], ("depth", output), constants, kind=kind)
 
 

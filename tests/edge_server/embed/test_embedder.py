@@ -139,10 +139,8 @@ def test_a_nan_of_one_frame_costs_no_other_frame_of_its_batch(tmp_path):
     assert np.isfinite(rows).all()
     assert rows[0].any() and not rows[1].any() and (rows[0] == rows[2]).all()
     cache, square = EmbeddingCache(made, ViewDecoder().view), Pinhole.from_fov(32, 32, 60.0)
-    items = [
-        frame(f"cam{k}", intrinsics=square, payload=payload.encode(np.full((32, 32, 3), v, np.uint8)))
-        for k, v in enumerate((0, 255, 0))
-    ]
+    sent = [payload.encode(np.full((32, 32, 3), level, np.uint8)) for level in (0, 255, 0)]
+    items = [frame(f"cam{k}", intrinsics=square, payload=each) for k, each in enumerate(sent)]
     for _ in range(3):
         rows, ok = cache.of(items)
         assert ok.tolist() == [True, False, True] and np.isfinite(rows).all() and not rows[1].any()
@@ -158,18 +156,9 @@ def another_input(path: Path, shape: list[int], kind: int = TensorProto.FLOAT) -
     onnx.save(model, str(path))
 
 
-def memory_from_nothing(path: Path) -> None:
-    huge = numpy_helper.from_array(np.array([1, 1, 200_000, 200_000], np.int64), "huge")
-    detector(path, extra=(node("Expand", ["end", "huge"], "big"),), weights=(huge,))
-
-
-def joined_with_themselves(path: Path) -> None:
-    nodes = tuple(node("Concat", [f"t{k}" if k else "end"] * 2, f"t{k + 1}", axis=1) for k in range(40))
-    detector(path, extra=nodes)
-
-
-def long_chain(path: Path) -> None:
-    detector(path, extra=tuple(node("Relu", [f"t{k}" if k else "end"], f"t{k + 1}") for k in range(MAX_NODES)))
+def chain(kind: str, count: int, times: int = 1, **attributes) -> tuple[onnx.NodeProto, ...]:
+    """Each node reads the one before it so many times."""
+    return tuple(node(kind, [f"t{k}" if k else "end"] * times, f"t{k + 1}", **attributes) for k in range(count))
 
 
 def empty_claims(path: Path, dims: tuple[int, ...]) -> None:
@@ -181,11 +170,10 @@ def no_text(path: Path) -> None:
     path.write_bytes(detector(path).read_bytes().replace(b"images", b"\xffmages"))
 
 
-def beyond(path: Path) -> None:
-    channels = numpy_helper.from_array(np.array([0, 1, 2, 99], np.int64), "beyond")
-    detector(path, extra=(node("Gather", ["end", "beyond"], "some", axis=1),), weights=(channels,))
-
-
+# Memory from nothing, and channels beyond those that there are.
+HUGE = numpy_helper.from_array(np.array([1, 1, 200_000, 200_000], np.int64), "huge")
+BEYOND = numpy_helper.from_array(np.array([0, 1, 2, 99], np.int64), "beyond")
+EXPAND, GATHER = node("Expand", ["end", "huge"], "big"), node("Gather", ["end", "beyond"], "some", axis=1)
 SCALED = helper.make_node("DynamicQuantizeLinear", ["end"], ["q", "scale", "zero"], name="/model.1/q")
 
 # What is no detector, or would take more memory than there is, and how it is refused.
@@ -196,14 +184,14 @@ WRONG = {
     "classifier": (partial(detector, neck=False), "not a YOLO detection model"),
     "no image": (partial(another_input, shape=[1, 3, 32]), "input images is not"),
     "whole numbers": (partial(another_input, shape=[1, 3, 32, 32], kind=TensorProto.INT64), "input images is not"),
-    "expand": (memory_from_nothing, "backbone holds Expand, which no YOLO backbone does"),
+    "expand": (partial(detector, extra=(EXPAND,), weights=(HUGE,)), "holds Expand, which no YOLO backbone does"),
     "scaled": (partial(detector, extra=(SCALED,)), "q is quantised with another scale for every image"),
-    "concat": (joined_with_themselves, "larger than any backbone's"),
-    "chain": (long_chain, "10006 nodes, more than any network of images"),
+    "concat": (partial(detector, extra=chain("Concat", 40, times=2, axis=1)), "larger than any backbone's"),
+    "chain": (partial(detector, extra=chain("Relu", MAX_NODES)), "10006 nodes, more than any network of images"),
     "claims": (partial(empty_claims, dims=(2**20, 2**20)), "larger than any backbone's"),
     "small claims": (partial(empty_claims, dims=(1, 6, 8, 8)), "cannot load it"),
     "part of it": (partial(detector, meta={"freshfield.projection": "AAAAAAAA" * 11}), "projection is damaged"),
-    "breaks when it is run": (beyond, "ONNX Runtime cannot run it"),
+    "breaks when it is run": (partial(detector, extra=(GATHER,), weights=(BEYOND,)), "ONNX Runtime cannot run it"),
 }
 
 

@@ -151,18 +151,14 @@ def render(*words) -> int:
     return edge_server(["render", *map(str, words)])
 
 
-def frames(file: Path) -> list[np.ndarray]:
-    video, found = cv2.VideoCapture(str(file)), []
-    while (taken := video.read())[0]:
-        found.append(taken[1])
-    return found
-
-
 def test_an_orbit_is_a_video_and_two_runs_stand_side_by_side(run, tmp_path, capsys):
     file = tmp_path / "orbit.mp4"
     assert render(run, "--beside", run, "--orbit", file, "--seconds", 0.4, "--fps", 10, "--size", "64x48") == 0
     assert "4 images of 128 x 48" in capsys.readouterr().out
-    both = np.array(frames(file), int)
+    video, frames = cv2.VideoCapture(str(file)), []
+    while (taken := video.read())[0]:
+        frames.append(taken[1])
+    both = np.array(frames, int)
     assert both.shape == (4, 48, 128, 3) and np.abs(both[0] - both[2]).mean() > 1
     assert np.abs(both[:, :, :64] - both[:, :, 64:]).mean() < 4  # it is compressed
 

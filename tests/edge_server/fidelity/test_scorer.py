@@ -249,19 +249,13 @@ def test_poison_is_refused_by_name_and_never_scored(poison, which):
     refused(ImageError, f"{which}.*row 39, column 39", Scorer().score, "h", pair[0], 0, pair[1], 0)
 
 
-def metric():
-    lpips, reason = open_lpips(data_dir("lpips"))
-    assert lpips is not None, reason
-    return lpips
-
-
 def example(name):
     return cv2.imread(str(data_dir("lpips") / f"ex_{name}.png"))[..., ::-1]
 
 
 def test_values_published_with_the_weights():
     """Of the authors' example images."""
-    lpips = metric()
+    lpips, _ = open_lpips(data_dir("lpips"))
     assert lpips(example("p0"), example("ref")) == pytest.approx(0.7219, abs=1e-4)
     assert lpips(example("p1"), example("ref")) == pytest.approx(0.1376, abs=1e-4)
     assert lpips(example("ref"), example("ref")) == 0.0
@@ -270,7 +264,7 @@ def test_values_published_with_the_weights():
 
 
 def test_a_mask_blackens_the_rest_and_weighs_each_cell_of_a_slice_by_its_share():
-    lpips = metric()
+    lpips, _ = open_lpips(data_dir("lpips"))
     a, b = np.random.default_rng(3).random((2, 64, 96, 3))
     mask = np.ones((64, 96), bool)
     mask[:, 70:] = mask[50:, :10] = False

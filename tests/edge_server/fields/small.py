@@ -4,13 +4,9 @@ By name: classes, settings for images of 48 pixels (SMALL) and of 24 (TINY, for 
 that a healthy field reaches in these tests. Another CPU rounds differently, which costs tenths of a decibel.
 """
 
-import os
-import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +25,6 @@ from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
 from edge_server.fields.splat.settings import ASPECT, POSITION_LIMIT, RAW_OPACITY_LIMIT, SplatSettings
 from edge_server.fields.tensorf.field import TensorfField
 from edge_server.fields.tensorf.settings import TensorfSettings
-from tests.conftest import ROOT
 from tests.edge_server.fields.scenes import picture, psnr, ring
 
 _SMALL: dict[str, Any] = {"hidden": 16, "rays": 1024, "batch_samples": 8192, "cells": 32, "threads": 2}
@@ -143,13 +138,3 @@ def same_state(a: Any, b: Any, settings: bool = False) -> None:
     for name in one:
         if settings or not name.endswith("meta"):
             np.testing.assert_array_equal(one[name], two[name], err_msg=name)
-
-
-def run_with_bounds_checks(code: str, folder: Path, request: pytest.FixtureRequest) -> None:
-    """Fails unless ``code`` ends well with numba's bounds checks, which need a process and kernels of their own.
-    folder: for kernels where pytest keeps no cache."""
-    cached = getattr(request.config, "cache", None)
-    kernels = str(cached.mkdir("numba-boundscheck")) if cached is not None else str(folder)
-    environment = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": kernels}
-    out = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=ROOT)
-    assert out.returncode == 0, out.stderr[-2000:]

@@ -56,9 +56,8 @@ def test_a_warm_start_follows_what_moved(name: str) -> None:
     [("ngp", {}), ("nerfacto", {"appearance": 3, "sh_degree": 1}), ("tensorf", {"sh_degree": 1}), ("splat", {})],
 )
 def test_results_are_the_seeds_bit_for_bit_whatever_the_thread_count(name: str, extra: dict[str, Any]) -> None:
-    one, three, other = (
-        made.small(name, **changed, **extra) for changed in ({"threads": 1}, {"threads": 3}, {"seed": 1})
-    )
+    differing = {"threads": 1}, {"threads": 3}, {"seed": 1}
+    one, three, other = (made.small(name, **changed, **extra) for changed in differing)
     reports = []
     for field in (one, three, other):
         field.fit(made.SEEN[:5], Budget(steps=15))

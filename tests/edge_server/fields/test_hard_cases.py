@@ -1,10 +1,14 @@
 """Hard cases of every representation, and damage to parameters: a field stays finite and useful afterwards."""
 
+import os
+import subprocess
+import sys
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from itertools import product
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +20,9 @@ from edge_server.fields.common.cameras import settings as refinement
 from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT
 from edge_server.fields.splat.kernels.project import OPACITY
 from freshfield.geometry import Pinhole, look_at
+from tests.conftest import ROOT
 from tests.edge_server.fields.scenes import a_meter_off, mean_psnr, picture, ring
-from tests.edge_server.fields.small import every_field, healthy, reaches, run_with_bounds_checks, small, tiny
+from tests.edge_server.fields.small import every_field, healthy, reaches, small, tiny
 
 VIEWS = ring(9, size=24)
 pytestmark = pytest.mark.stability
@@ -253,53 +258,33 @@ def go_through_all() -> None:
         assert np.isfinite(out.color).all()
 
 
-def _poison_table(field: Any) -> None:
-    field._encoding.table[::7] = np.nan  # of nerfacto, the proposal's too
-
-
-def _poison_net(field: Any) -> None:
-    field._net.params[3] = np.nan
-
-
-def _poison_moments(field: Any) -> None:
-    field._table_m[::5] = np.inf
-    field._net_v[::3] = np.nan
-
-
-def _poison_gradient(field: Any) -> None:
-    field._table_g[::3] = np.nan
-    field._dirty[:] = True
-
-
-def _poison_gaussians(field: Any, array: str, column: int, value: float) -> None:
-    getattr(field.cloud, array)[::7, column] = value
-
-
-# Of splat: an array, its column, and what every seventh Gaussian then holds there.
-OF_GAUSSIANS = [("params", 0, np.nan), ("params", 3, 1e30), ("params", OPACITY, -np.inf), ("params", 12, 1e38)]
-OF_GAUSSIANS = [*OF_GAUSSIANS, ("v", 0, np.nan)]
-OF_NETWORKS = (_poison_table, _poison_net, _poison_moments, _poison_gradient)
-NOT_COUNTED = _poison_moments  # as no gradient is lost
+# Arrays of a field, places in them, and what is then there. Of nerfacto's table, the proposal's part too.
+OF_NETWORKS = {
+    "table": [("_encoding.table", np.s_[::7], np.nan)],
+    "net": [("_net.params", 3, np.nan)],
+    "moments": [("_table_m", np.s_[::5], np.inf), ("_net_v", np.s_[::3], np.nan)],
+    "gradient": [("_table_g", np.s_[::3], np.nan), ("_dirty", np.s_[:], True)],
+}
+_OF_CLOUD = [("params", 0, np.nan), ("params", 3, 1e30), ("params", OPACITY, -np.inf), ("params", 12, 1e38)]
+OF_GAUSSIANS = {(n, k): [(f"cloud.{n}", np.s_[::7, k], x)] for n, k, x in [*_OF_CLOUD, ("v", 0, np.nan)]}
+DAMAGE: dict[Any, Any] = {**OF_NETWORKS, **OF_GAUSSIANS}
 
 
 @pytest.mark.parametrize(
-    ("kind", "damage"),
-    [
-        *product(("ngp", "tensorf", "nerfacto"), OF_NETWORKS),
-        *(("splat", partial(_poison_gaussians, array=a, column=k, value=x)) for a, k, x in OF_GAUSSIANS),
-    ],
+    ("kind", "what"), [*product(("ngp", "tensorf", "nerfacto"), OF_NETWORKS), *product(["splat"], OF_GAUSSIANS)]
 )
-def test_damage_is_counted_and_healed(kind: str, damage: Callable[[Any], None]) -> None:
+def test_damage_is_counted_and_healed(kind: str, what: Any) -> None:
     """What is not finite is left out, counted if it is a network's gradient, and gone some steps later."""
     field, soon = tiny(kind), 120 if kind == "splat" else 40
     field.fit(VIEWS, Budget(steps=40))
-    damage(field)
+    for array, places, value in DAMAGE[what]:
+        attrgetter(array)(field)[places] = value
     field._snapshot = None
     out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
     assert np.isfinite(out.color).all() and np.isfinite(out.depth).all()
     report = field.fit(VIEWS, Budget(steps=soon))
     assert field.dropped == report.dropped
-    assert kind == "splat" or (report.dropped > 0) == (damage is not NOT_COUNTED)
+    assert kind == "splat" or (report.dropped > 0) == (what != "moments"), "no gradient is lost"
     assert field.fit(VIEWS, Budget(steps=100)).dropped == 0, f"still not finite {soon} steps later"
     healthy(field, VIEWS)
     assert mean_psnr(field, VIEWS) > (17.0 if kind == "splat" else 15.0)
@@ -324,5 +309,10 @@ def test_density_that_overflows_stays_finite(kind: str, value: float) -> None:
 
 @pytest.mark.slow
 def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.FixtureRequest) -> None:
-    """Whole fits and renderings with numba's bounds checks, in one process: most kernels are shared."""
-    run_with_bounds_checks(f"from {__name__} import *\ngo_through_all()", tmp_path, request)
+    """Whole fits and renderings with numba's bounds checks, which need a process and kernels of their own."""
+    cached = getattr(request.config, "cache", None)
+    kernels = str(cached.mkdir("numba-boundscheck")) if cached is not None else str(tmp_path)
+    environment = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": kernels}
+    words = [sys.executable, "-c", f"from {__name__} import *\ngo_through_all()"]
+    out = subprocess.run(words, env=environment, capture_output=True, text=True, cwd=ROOT)
+    assert out.returncode == 0, out.stderr[-2000:]

@@ -62,6 +62,9 @@ class Shows:
     def __init__(self, image):
         self.image, self.poses = np.asarray(image, np.float32), []
 
+    def at(self, present_ns):
+        return brightness(present_ns)
+
     def render(self, camera_to_world, intrinsics):
         self.poses.append(camera_to_world[0, 3])
         return Rendering(self.image, self.image[..., 0], self.image[..., 0])
@@ -69,6 +72,11 @@ class Shows:
 
 def shows(ms):
     return Shows(truth_at(ms) / 255)
+
+
+def brightness(at_ns):
+    """A snapshot that renders its instant, in seconds, as a brightness."""
+    return Shows(np.full((SIDE, SIDE, 3), at_ns / 1e9))
 
 
 def publication(ms):
@@ -162,21 +170,6 @@ def test_a_poisoned_rendering_goes_unscored_and_the_log_says_where(caplog):
     assert len(held_out.publish(publication(391), shows(0))) == 1, "the next is scored"
 
 
-class Brightness:
-    """A snapshot that renders its instant, in seconds, as a brightness."""
-
-    def __init__(self, at_ns: int) -> None:
-        self.at_ns = at_ns
-
-    def at(self, present_ns: int) -> Brightness:
-        return Brightness(present_ns)
-
-    def render(self, camera_to_world: Any, intrinsics: Pinhole) -> Rendering:
-        flat = np.ones((intrinsics.height, intrinsics.width), np.float32)
-        color = np.repeat(flat[..., None] * np.float32(self.at_ns / 1e9), 3, axis=-1)
-        return Rendering(color, flat, flat)
-
-
 def _run(
     publications: list[int], frames: range, scored: list[Publication] | None = None, scorer: Scorer | None = None
 ) -> list[tuple[Score, Publication]]:
@@ -190,7 +183,7 @@ def _run(
         if of_frame:
             thread.held_out_frame(bright(ms))
         else:
-            thread.published(publication(ms), Brightness(ms * MS), [])
+            thread.published(publication(ms), brightness(ms * MS), [])
         time.sleep(0.002)  # nothing may fall out of its short inbox
     thread.stop()
     return shown
@@ -215,9 +208,9 @@ def _thread(*cameras: str) -> ScoringThread:
 
 def test_a_thread_that_falls_behind_keeps_no_snapshots() -> None:
     """Each is as large as the field."""
-    alive, thread = weakref.WeakSet[Brightness](), _thread()
+    alive, thread = weakref.WeakSet[Shows](), _thread()
     for k in range(100):
-        alive.add(snapshot := Brightness(k * 20 * MS))
+        alive.add(snapshot := brightness(k * 20 * MS))
         thread.published(publication(k * 20), snapshot, [])
     del snapshot
     assert len(alive) == settings.WAITING_PUBLICATIONS
@@ -227,7 +220,7 @@ def test_snapshots_replaced_before_the_next_scored_capture_are_dropped() -> None
     thread = _thread()
     thread._next_shown_ns["cam00"] = 500 * MS
     for ms in range(20, 600, 20):
-        thread._score_later(publication(ms), Brightness(ms * MS), [])
+        thread._score_later(publication(ms), brightness(ms * MS), [])
     assert [p.published_ns // MS for p, _ in thread._recent] == [500, 520, 540, 560, 580]
 
 
@@ -236,7 +229,7 @@ def test_a_silent_held_out_camera_keeps_no_snapshots(monkeypatch: Any) -> None:
     thread = _thread("cam00", "cam01")
     for ms in range(20, 260, 20):
         thread._held_out["cam00"].take(bright(ms))
-        thread._score_later(publication(ms), Brightness(ms * MS), [])
+        thread._score_later(publication(ms), brightness(ms * MS), [])
     assert len(thread._recent) == 1
 
 
@@ -278,7 +271,7 @@ def test_where_nothing_is_held_out_the_mean_color_is_that_of_the_views() -> None
     thread = ScoringThread([], Scorer(), lambda of, _, final: told.append((of, final)), lambda *_: None)
     images = [np.full((SIDE, SIDE, 3), level, np.uint8) for level in (102, 153)]  # 0.4 and 0.6: 0.1 from their mean
     views = [View(f"cam{k}", image, np.eye(4), LENS) for k, image in enumerate(images)]
-    thread._score_selected(publication(500), Brightness(500 * MS), views)
+    thread._score_selected(publication(500), brightness(500 * MS), views)
     ((scored, final),) = told
     assert final and thread.baselines.mean.nearest_view_db is None
     np.testing.assert_allclose([scored.psnr_db, thread.baselines.mean.mean_color_db], 20.0, atol=1e-3)
@@ -290,7 +283,7 @@ def test_of_a_held_out_camera_that_moves_the_newest_frame_and_all_so_far_are_tol
     for ms in range(0, 500, 5):
         thread._held_out["cam00"].take(bright(ms, x_m=0.002 * ms))
     thread._held_out["cam00"].take(replace(bright(500), payload=b"damaged"))
-    thread._recent.append((publication(0), Brightness(500 * MS)))
+    thread._recent.append((publication(0), brightness(500 * MS)))
     thread._look_back()  # the newest is damaged
     thread._look_back()
     assert thread.so_far is not None and thread.so_far.frames == 3  # two in turn, and the newest

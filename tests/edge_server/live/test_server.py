@@ -142,9 +142,8 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
     again = serve(resume=out / "field.npz").server
     assert again.updater.field.step > 0 and again.updater.number == len(series)
     known = again.ingest.admission.last_frames()
-    assert {camera: known[camera]["s1"][0] for camera in known} == {
-        camera: max(e.sequence for e in delivered if e.camera == camera) for camera in server.scenario.cameras
-    }
+    last = {camera: max(e.sequence for e in delivered if e.camera == camera) for camera in server.scenario.cameras}
+    assert {camera: known[camera]["s1"][0] for camera in known} == last
     fresh = serve().server
     assert fresh.updater.number == 0 and not fresh.state.started
     kept = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
@@ -200,9 +199,8 @@ def test_a_camera_that_moves_begins_the_field_anew_as_a_scan_and_a_resumed_run_k
     made = tiny_scenario(tmp_path, field="splat", field_options=small)
     run = serve(made)
     server = run.server
-    assert server.state.chosen == (
-        "splat in layers, updated at arrivals for 100 ms: no camera moves; the scenario sets field, update_ms"
-    )
+    said = "splat in layers, updated at arrivals for 100 ms: no camera moves; the scenario sets field, update_ms"
+    assert server.state.chosen == said
     run.fed(moving="cam02")
     until(lambda: "cam02 moves" in server.state.chosen)
     moved = server.updater.number

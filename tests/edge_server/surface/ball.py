@@ -15,29 +15,17 @@ DISTORTED_LENS = Pinhole(64, 64, 88.0, 87.0, 31.0, 33.0, (-0.2, 0.05, 0.002, -0.
 TILTED_LENS = Pinhole(64, 64, 88.0, 87.0, 31.0, 33.0, (0.0, 0.0, 0.0, -0.02))
 
 
-def ball_depth(camera: Pinhole, pose: NDArray, radius_m: float = RADIUS_M) -> NDArray[np.float32]:
-    """Depth (H, W) along the rays to a ball around the origin, inf beside it."""
-    origin, rays = world_rays(camera, pose)
-    along = rays @ origin
-    root = along * along - (origin @ origin - radius_m**2)
-    return np.where(root > 0, -along - np.sqrt(np.maximum(root, 0)), np.inf).astype(np.float32)
-
-
-def poses_around(count: int, distance_m: float = 0.4) -> list[NDArray]:
-    """Poses spread over a sphere, looking at the origin (a Fibonacci spiral)."""
-    k = np.arange(count) + 0.5
+def ball_maps(count: int = 20, camera: Pinhole = LENS) -> list[DepthMap]:
+    """A ball seen from all sides (a Fibonacci spiral of cameras), gray with a red upper half."""
+    k, maps = np.arange(count) + 0.5, []
     z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
     ring = np.sqrt(1 - z * z)
-    eyes = distance_m * np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=-1)
-    return [look_at(eye, (0, 0, 0)) for eye in eyes]
-
-
-def ball_maps(count: int = 20, camera: Pinhole = LENS) -> list[DepthMap]:
-    """A ball seen from all sides, gray with a red upper half."""
-    maps = []
-    for pose in poses_around(count):
-        depth = ball_depth(camera, pose)
+    for eye in 0.4 * np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=-1):
+        pose = look_at(eye, (0, 0, 0))
         origin, rays = world_rays(camera, pose)
+        along = rays @ origin
+        root = along * along - (origin @ origin - RADIUS_M**2)
+        depth = np.where(root > 0, -along - np.sqrt(np.maximum(root, 0)), np.inf).astype(np.float32)
         up = (origin + rays * np.where(np.isfinite(depth), depth, 0)[..., None])[..., 2] > 0
         color = np.where(up[..., None], np.array([200, 20, 20]), 90).astype(np.uint8)
         maps.append(depth_map(depth, color, pose, camera))

@@ -99,9 +99,8 @@ def test_a_ball_comes_out_as_a_ball(ball):
     assert abs(radius.mean() - balls.RADIUS_M) < 3e-4 and np.abs(radius - balls.RADIUS_M).max() < 0.003
     # Faces look outwards, so the volume is positive.
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * balls.RADIUS_M**3, rel=0.02)
-    top, bottom = (
-        mesh.visual.vertex_colors[side, :3] for side in (mesh.vertices[:, 2] > 0.01, mesh.vertices[:, 2] < -0.01)
-    )
+    color, up = mesh.visual.vertex_colors[:, :3], mesh.vertices[:, 2]
+    top, bottom = color[up > 0.01], color[up < -0.01]
     assert np.abs(top.astype(int) - (200, 20, 20)).mean() < 6 and np.abs(bottom.astype(int) - 90).mean() < 6
 
 

@@ -133,9 +133,8 @@ def test_the_cost_is_that_of_plain_numpy(rig):
     unlike = min(w @ np.abs(own - other) / levels, 2.0)
     wanted = (1 - settings.DIFFERENCE) * (1 - like) + settings.DIFFERENCE * unlike
     assert found == pytest.approx(wanted, abs=0.02) and shown == 1
-    assert patch_match.plane_cost(images, view, row, column, depth, *-normal, *taps) == (settings.WORST, 0), (
-        "turned away"
-    )
+    away = patch_match.plane_cost(images, view, row, column, depth, *-normal, *taps)
+    assert away == (settings.WORST, 0), "turned away"
 
 
 def test_unknown_pixels_take_the_nearest_depth_and_empty_ones_none(rig):

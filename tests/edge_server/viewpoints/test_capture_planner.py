@@ -91,7 +91,7 @@ def test_half_of_the_views_are_refused():
 
 UNIT_DOME = half_hemisphere((0, 0, 0), 1.0, LENS, 30)
 QUICK = PolicyConfig(views=4, updates=25, episodes=12, hidden=16, way=0.0, learning_rate=1e-2)
-HEIGHT, WAY = GEOMETRY.index("z"), GEOMETRY.index("way")
+HEIGHT = GEOMETRY.index("z")
 take_of_unit = taker(UNIT_DOME)
 
 

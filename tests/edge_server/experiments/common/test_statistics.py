@@ -22,10 +22,8 @@ def test_an_interval_is_students_t_of_the_differences_of_pairs():
 def test_too_few_values_have_no_interval():
     assert interval([None, 2.0]).count == 1 and math.isnan(interval([2.0]).low)
     assert interval([]).count == 0 and interval([2.0]).above(1.0) is None
-    assert Interval(1.0, 0.5, 1.5, 9).above(0.4) is True
-    assert Interval(1.0, 0.5, 1.5, 9).above(1.6) is False
-    assert Interval(1.0, 0.5, 1.5, 9).above(1.0) is None
-    assert Interval(1.0, 0.5, 1.5, 9).above(1.5) is None  # its end is part of it
+    for bound, above in ((0.4, True), (1.6, False), (1.0, None), (1.5, None)):  # its end is part of it
+        assert Interval(1.0, 0.5, 1.5, 9).above(bound) is above
     assert Interval(1.0, 1.0, 1.0, 9).above(1.0) is False  # all values alike
 
 

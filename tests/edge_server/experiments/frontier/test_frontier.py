@@ -142,14 +142,8 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
 
 
 # Milliseconds an update, dB of the whole image and of what moves, meters a second.
-POINTS = [
-    FrontierPoint(100.0, 20.0, 18.0, 1.0),
-    FrontierPoint(400.0, 21.0, 17.5, 1.0),
-    FrontierPoint(400.0, 24.0, 17.0, 1.0),
-    FrontierPoint(2000.0, 24.5, 14.0, 1.0),
-    FrontierPoint(100.0, 19.0, 17.0, 4.0),
-    FrontierPoint(400.0, 19.0, 13.0, 4.0),
-]
+WALKED = [(100.0, 20.0, 18.0, 1.0), (400.0, 21.0, 17.5, 1.0), (400.0, 24.0, 17.0, 1.0), (2000.0, 24.5, 14.0, 1.0)]
+POINTS = [FrontierPoint(*point) for point in (*WALKED, (100.0, 19.0, 17.0, 4.0), (400.0, 19.0, 13.0, 4.0))]
 
 
 def test_of_points_that_seeds_cannot_tell_apart_the_quickest_is_chosen():

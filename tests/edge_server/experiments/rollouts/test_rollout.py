@@ -159,9 +159,8 @@ SELECT = Spec("select", StateLayout(("age", "pose")), hidden=8)
 
 def following_arrivals(**more) -> Setting:
     """Updates that follow arrivals, with computing charged."""
-    small = setting(
-        compute=ComputeConfig(ms_per_step=2.0, ms_per_view=1.0), deployed=True, lead_ms=400.0, span_ms=1200.0
-    )
+    compute = ComputeConfig(ms_per_step=2.0, ms_per_view=1.0)
+    small = setting(compute=compute, deployed=True, lead_ms=400.0, span_ms=1200.0)
     edge = {**small.scenario.edge, "updates": "arrivals", "update_ms": 50.0, "steps": 2, "grace_ms": 0.0, **more}
     return dataclasses.replace(small, scenario=dataclasses.replace(small.scenario, edge=edge))
 

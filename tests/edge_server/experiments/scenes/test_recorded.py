@@ -159,14 +159,8 @@ def test_what_cannot_be_used_is_said_and_costs_nothing_else(tmp_path):
 
 def test_a_rate_above_the_recordings_gives_each_image_once(monkeypatch):
     shot = SimpleNamespace(pose=SimpleNamespace(matrix=lambda: np.eye(4)), intrinsics=Pinhole.from_fov(8, 6, 60.0))
-    source = SimpleNamespace(
-        camera="hand",
-        fps=60.0,
-        repeats_after=12,
-        content=lambda tick: (tick // 2) % 5,
-        read=lambda content: shot,
-        release=list,
-    )
+    source = SimpleNamespace(camera="hand", fps=60.0, repeats_after=12, read=lambda content: shot, release=list)
+    source.content = lambda tick: (tick // 2) % 5
     monkeypatch.setattr(captures, "pixels", lambda shot, codec: np.zeros((6, 8, 3), np.uint8))
     found, wrong = captures._views(source, SimpleNamespace(codec="jpeg", depth_every=None))
     assert list(found) == [f"hand/{k:04d}" for k in range(5)] and not wrong  # then it begins again

@@ -15,22 +15,13 @@ import yaml
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.common.statistics import Interval
-from edge_server.experiments.studies import preferences, viewpoints
+from edge_server.experiments.studies import preferences, study, viewpoints
 from edge_server.experiments.studies.depth_rate import DepthRun, run_with_depth
 from edge_server.experiments.studies.learned_schedulers import LEFT_OUT, WEIGHTED, WHICH_VIEWS
 from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT
 from edge_server.experiments.studies.registry import LEARNING, ON_A_CHANNEL, STUDIES
 from edge_server.experiments.studies.settings import TRAININGS
-from edge_server.experiments.studies.study import (
-    Claim,
-    Finding,
-    Study,
-    StudyError,
-    StudyRequest,
-    Verdict,
-    judge,
-    run_study,
-)
+from edge_server.experiments.studies.study import Claim, Finding, Study, StudyError, StudyRequest, Verdict, judge
 from edge_server.experiments.studies.study_command import checked, main
 from edge_server.experiments.studies.trial import Trial, run_trial
 from edge_server.scheduler import make_policy
@@ -183,10 +174,10 @@ def test_verdicts_are_corrected_for_their_number():
     certain stays so."""
     lucky, certain, equal = (1.0, 0.01, 1.99, 10), (1.0, 0.9, 1.1, 10), (0.0, -1.0, 1.0, 10)
     claim = Claim("is better.", lambda table, metric, of: Finding("", (Interval(*table.values(metric, **of)[0]),)))
-    study = Study("s", "s", lambda _: [], lambda cases, _: [], ("reward",), (claim,), ("scene",))
+    better = Study("s", "s", lambda _: [], lambda cases, _: [], ("reward",), (claim,), ("scene",))
     rows = [{"scene": k, "seed": 0, "reward": row} for k, row in enumerate([lucky, certain, *[equal] * 98])]
-    assert [v.verdict for v in judge(study, SeedTable(rows))] == ["undecided", "holds", *["undecided"] * 98]
-    assert [v.verdict for v in judge(study, SeedTable(rows[:2]))] == ["holds", "holds"]
+    assert [v.verdict for v in judge(better, SeedTable(rows))] == ["undecided", "holds", *["undecided"] * 98]
+    assert [v.verdict for v in judge(better, SeedTable(rows[:2]))] == ["holds", "holds"]
 
 
 def test_a_claim_of_several_differences_is_as_sure_as_its_weakest_part():
@@ -307,11 +298,8 @@ def test_selectors_stand_in_a_table_of_each_scene():
     of = {"scene": "tile", "views": viewpoints.JUDGED, "ssim": 0.5, "lpips": None, "path_m": 2.0, "choice_ms": 3.0}
     rows = [{**of, "arm": arm, "seed": k, "psnr_db": 20.0 + k} for arm in viewpoints.ARMS for k in (0, 1)]
     text = viewpoints.VIEWPOINTS.tables(SeedTable(rows))
-    assert (
-        "## tile: PSNR (dB)" in text
-        and "\n| random | 20.5 [14.1, 26.9] |\n" in text
-        and "\n| FisherRF | 20.50 [" in text
-    )
+    for line in ("## tile: PSNR (dB)", "\n| random | 20.5 [14.1, 26.9] |\n", "\n| FisherRF | 20.50 ["):
+        assert line in text
 
 
 FEW_VIEWS, SOME = viewpoints.Workload((3, 8), 16, 3, 24), ("random", "coverage, short way")
@@ -328,8 +316,8 @@ def test_both_studies_run_whole(tmp_path, monkeypatch):
     monkeypatch.setattr(preferences, "_ARMS", SOME[:1])
     monkeypatch.setattr(preferences, "TASTES", {"edges": preferences.TASTES["edges"]})
     request = StudyRequest(True, tmp_path, Folders(), seeds=2)
-    for study in (viewpoints.VIEWPOINTS, preferences.PREFERENCES):
-        assert run_study(study, request)
+    for each in (viewpoints.VIEWPOINTS, preferences.PREFERENCES):
+        assert study.run_study(each, request)
     assert "Simulated experts only" in (tmp_path / "preferences.md").read_text()
     table = list(csv.DictReader((tmp_path / "viewpoints.csv").open()))
     assert {r["arm"] for r in table} == set(SOME) and len(table) == len(SOME) * 2 * 2
@@ -340,5 +328,5 @@ def test_both_studies_run_whole(tmp_path, monkeypatch):
     # The same command again finds everything done: not even a policy is trained.
     before = (tmp_path / "preferences.csv").read_bytes()
     monkeypatch.setattr(preferences, "train_policy", None)
-    run_study(preferences.PREFERENCES, request)
+    study.run_study(preferences.PREFERENCES, request)
     assert (tmp_path / "preferences.csv").read_bytes() == before

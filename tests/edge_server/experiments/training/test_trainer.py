@@ -111,8 +111,7 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     assert (out / "training.csv").read_text() == before
     assert "other settings" in refusal(capsys, main, *words[:3], *words[5:]) and (out / "policy.npz").exists()
     assert main([*words, "--parts", "pose,age"]) == 0  # the same parts
-    for wrong, said in (("--price=-1", "expected 0 or more, got -1"), ("--parts=age,hue", "no part is called hue")):
-        assert said in refusal(capsys, main, *words, wrong)
+    assert "expected 0 or more, got -1" in refusal(capsys, main, *words, "--price=-1")
 
 
 @pytest.mark.stability

@@ -177,9 +177,8 @@ def test_the_charge_is_the_scenarios_or_the_commands(tmp_path: Path, capsys):
 def test_a_policy_is_tried_from_a_library(tmp_path: Path):
     trial = try_policy("freshest-k:2", write(tmp_path), 1.5)
     decided = [(row.t_s, row.aaoi_ms) for row in trial.decisions]
-    assert (
-        trial.policy == "freshest-k" and len(decided) > 2 and trial.ages_ms.tolist() == [list(row) for row in decided]
-    )
+    assert trial.policy == "freshest-k" and len(decided) > 2
+    assert trial.ages_ms.tolist() == [list(row) for row in decided]
     assert trial.shown[:, 1].tolist() == [score.psnr_db for score in trial.scores] and trial.psnr_db > 5.0
 
 
@@ -269,9 +268,8 @@ def test_at_twice_the_load_frames_are_left_out_and_what_is_shown_does_not_age() 
     """A processor that takes in less than 100 frames a second; sixty of them, and twice as many."""
     options = {"layers": True, "gaussians": 300, "start": 200, "seed_cells": 12, "threads": 1}
     edge = {"field": "splat", "field_options": options, "policy": {"name": "all"}, "updates": "arrivals"}
-    settings = RunSettings(
-        steps=1, compute=ComputeConfig(ms_per_update=5.0, ms_per_view=10.0), epoch_ms=40.0, score_every_ms=None
-    )
+    compute = ComputeConfig(ms_per_update=5.0, ms_per_view=10.0)
+    settings = RunSettings(steps=1, compute=compute, epoch_ms=40.0, score_every_ms=None)
     ages = []
     for fps in (15.0, 30.0):
         deployment = run(scenario({}, edge=edge, source=small_world(fps=fps)), settings, seconds=6.0)

@@ -39,9 +39,8 @@ def test_appearances_take_up_what_differs_between_cameras() -> None:
     """A room's pictures with gains of 0.7 to 1.4; scored against the picture at the mean exposure."""
     still = synthetic_still("room", cameras=13, size=48)
     gains = np.exp(np.random.default_rng(2).permutation(np.linspace(-0.35, 0.35, 12)))
-    views = [
-        replace(v, image=np.clip(v.image * g + 0.5, 0, 255).astype(np.uint8)) for v, g in zip(still.training, gains)
-    ]
+    lit = [(v, np.clip(v.image * gain + 0.5, 0, 255)) for v, gain in zip(still.training, gains)]
+    views = [replace(v, image=image.astype(np.uint8)) for v, image in lit]
     scores, looks = [], None
     for appearance in (0, 4):
         field = NerfactoField(structs.replace(SMALL["nerfacto"], appearance=appearance))
@@ -132,9 +131,8 @@ def _encoding(values: np.ndarray) -> proposal.ProposalGrid:
 def _bins_of(space: Space, encoding: proposal.ProposalGrid, shift: float = 0.4, leave: float = 6.0, bins: int = BINS):
     cell, depth = np.full(bins + 5, -1, np.int32), np.full(bins + 5, np.nan, F)
     edges, at = np.empty((2, bins + 1), F), np.empty((2, bins), np.int32)
-    count, finite = proposal.make_bins(
-        space, encoding, bins, START_AT, TOWARDS, F(0.1), F(leave), F(shift), 5, cell, depth, edges, at
-    )
+    ray = START_AT, TOWARDS, F(0.1), F(leave), F(shift)
+    count, finite = proposal.make_bins(space, encoding, bins, *ray, 5, cell, depth, edges, at)
     return cell[5 : 5 + count], depth[5 : 5 + count], edges[:, :count].copy(), finite
 
 
@@ -178,19 +176,15 @@ def _allocated(weight: np.ndarray, samples: int, even: float, shift: float):
     return group, share[:groups]
 
 
-def _earned(weight: np.ndarray, samples: int, even: float) -> np.ndarray:
-    left, right = np.r_[weight[0], weight[:-1]], np.r_[weight[1:], weight[-1]]
-    wide = 0.5 * (np.maximum(left, weight) + np.maximum(weight, right))
-    light = 1.0 - np.r_[0.0, np.cumsum(weight)[:-1]] + proposal.DARK_SHARE
-    return samples * ((1 - even) * wide / wide.sum() + even * light / light.sum())
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_samples_are_dealt_by_weight_and_leave_no_bin_out(seed: int) -> None:
     weight = np.random.default_rng(seed).random(40) ** 6
     weight /= weight.sum() * 1.1
     samples, even = 24, 0.2
-    earned = _earned(weight, samples, even)
+    left, right = np.r_[weight[0], weight[:-1]], np.r_[weight[1:], weight[-1]]
+    wide = 0.5 * (np.maximum(left, weight) + np.maximum(weight, right))
+    light = 1.0 - np.r_[0.0, np.cumsum(weight)[:-1]] + proposal.DARK_SHARE
+    earned = samples * ((1 - even) * wide / wide.sum() + even * light / light.sum())
     counts = np.zeros(40)
     for shift in np.linspace(0, 1, 64, endpoint=False):
         group, share = _allocated(weight, samples, even, shift)

@@ -55,17 +55,6 @@ def test_density_and_components_equal_the_oracle() -> None:
     assert np.isnan(raw).all() and np.isnan(acts).all(), "rows that are not the factors' or other samples were written"
 
 
-def _loss(planes: Planes, table: torch.Tensor, x, d, counts) -> torch.Tensor:
-    total = torch.zeros((), dtype=table.dtype)
-    colors = (planes.groups - planes.density_groups) * CHANNELS
-    for c, n in enumerate(counts):
-        found = _oracle(planes, table, torch.as_tensor(x[c, :, :n].T, dtype=table.dtype))
-        wanted = torch.as_tensor(d[c, :, :n].T, dtype=table.dtype)
-        total = total + (found[:, planes.density_groups :].reshape(n, colors) * wanted[:, :colors]).sum()
-        total = total + (found[:, : planes.density_groups].sum(dim=(1, 2)) * wanted[:, colors]).sum()
-    return total
-
-
 def test_gradient_equals_the_oracle() -> None:
     planes, (x, rng) = _planes(), _points(100)
     d = rng.normal(size=(2, 49, 100)).astype(np.float32)
@@ -75,7 +64,12 @@ def test_gradient_equals_the_oracle() -> None:
     gradient, dirty = np.zeros_like(planes.table), np.zeros(len(planes.table) // ROWS, np.bool_)
     vector_matrix.scatter_planes(np.zeros(1, np.int64), 0, planes, x, d, counts, gradient, dirty)
     table = torch.as_tensor(planes.table).requires_grad_(True)
-    _loss(planes, table, x, d, counts).backward()
+    colors = (planes.groups - planes.density_groups) * CHANNELS
+    for c, n in enumerate(counts):
+        found, wanted = _oracle(planes, table, torch.as_tensor(x[c, :, :n].T)), torch.as_tensor(d[c, :, :n].T)
+        of_color = (found[:, planes.density_groups :].reshape(n, colors) * wanted[:, :colors]).sum()
+        of_density = (found[:, : planes.density_groups].sum(dim=(1, 2)) * wanted[:, colors]).sum()
+        (of_color + of_density).backward()
     assert table.grad is not None
     np.testing.assert_allclose(gradient, table.grad.numpy(), atol=2e-3)
     touched = (gradient.reshape(len(dirty), -1) != 0).any(axis=1)

@@ -130,9 +130,8 @@ def test_a_decision_comes_back_as_it_was(tmp_path):
         np.testing.assert_array_equal(getattr(back.state, name), getattr(given.state, name))
     assert back.state.cameras == given.state.cameras and back.actor.digest == given.actor.digest
     assert found.embedding == {"model": "default", "dim": 3}
-    assert {camera: image.shape for camera, image in found.images.items()} == dict.fromkeys(
-        ("cam00", "cam01"), (24, 32, 3)
-    )
+    shapes = {camera: image.shape for camera, image in found.images.items()}
+    assert shapes == {"cam00": (24, 32, 3), "cam01": (24, 32, 3)}
 
 
 def test_the_oldest_make_room(tmp_path, monkeypatch):

@@ -37,9 +37,8 @@ def features(n, silent=0, seed=0, batch=5):
 def test_cameras_have_no_order_and_what_never_reported_changes_nothing():
     x, order = features(7), np.random.default_rng(1).permutation(7)
     each = networks.logits(np, SELECT, actor(SELECT), x)
-    np.testing.assert_allclose(
-        networks.logits(np, SELECT, actor(SELECT), x[:, order]), each[:, order], rtol=1e-9, atol=1e-12
-    )
+    turned = networks.logits(np, SELECT, actor(SELECT), x[:, order])
+    np.testing.assert_allclose(turned, each[:, order], rtol=1e-9, atol=1e-12)
     whole = networks.logits(np, WAIT, actor(WAIT), x)
     np.testing.assert_allclose(networks.logits(np, WAIT, actor(WAIT), x[:, order]), whole, rtol=1e-9, atol=1e-12)
     x = features(6, silent=2)
@@ -69,11 +68,8 @@ def untaught(action, seed=0):
     """An actor with an opinion, though a random one."""
     actor = Learner(Spec(action, LAYOUT, () if action == "select" else OMEGAS_MS), seed).actor
     rng = np.random.default_rng(seed)
-    return replace(
-        actor,
-        weights={**actor.weights, "out": 50.0 * actor.weights["out"]},
-        mean_features=rng.standard_normal(LAYOUT.width),
-    )
+    weights = {**actor.weights, "out": 50.0 * actor.weights["out"]}
+    return replace(actor, weights=weights, mean_features=rng.standard_normal(LAYOUT.width))
 
 
 @pytest.mark.parametrize("action", ["select", "wait", "threshold"])

@@ -18,19 +18,8 @@ from edge_server.scheduler.learned.clipped_update import Acted, clipped_update
 from edge_server.scheduler.learned.ppo import Diagnostics, Learner, _RunningMeanStd
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import State, StateLayout
-from tests.edge_server.scheduler.learned.problems import (
-    OMEGAS_MS,
-    FreshOnes,
-    Waits,
-    act,
-    batch_of,
-    collect,
-    regret,
-    same,
-    state,
-    teach,
-    value,
-)
+from tests.edge_server.scheduler.learned import problems
+from tests.edge_server.scheduler.learned.problems import FreshOnes, Waits, act, batch_of, collect, state, teach, value
 from tests.support import refused
 
 
@@ -38,7 +27,7 @@ def select(**more) -> Spec:
     return Spec("select", FreshOnes.layout, **more)
 
 
-WAIT = Spec("wait", Waits.layout, OMEGAS_MS)
+WAIT = Spec("wait", Waits.layout, problems.OMEGAS_MS)
 
 
 @pytest.mark.parametrize(("problem", "spec"), [(FreshOnes(), select()), (Waits(), WAIT)], ids=["sets", "omegas"])
@@ -47,7 +36,7 @@ def test_512_decisions_are_enough_to_learn_from(problem, spec):
     loses .104, the best fixed one .05."""
     learner = Learner(spec, 0)
     teach(learner, problem, 8)
-    assert regret(learner, problem) < 0.02
+    assert problems.regret(learner, problem) < 0.02
 
 
 def test_a_batch_of_one_decision_learns_against_the_value():
@@ -71,7 +60,7 @@ def test_a_checkpoint_goes_on_bit_for_bit(tmp_path):
     resumed = Learner.load(tmp_path / "policy.npz")
     for number in (2, 3):
         resumed.update(collect(resumed, FreshOnes(), range(64 * number, 64 * (number + 1))))
-    assert same(through, resumed)
+    assert problems.same(through, resumed)
     assert (resumed.updates, resumed.decisions) == (4, 256)
     s = [state(6, np.random.default_rng(0))]
     assert value(through, s) == value(resumed, s)
@@ -203,13 +192,10 @@ def test_advantages_are_what_rewards_exceed_the_value_by_in_units_of_their_sprea
 
 def test_a_minibatch_is_clipped_where_its_ratio_leaves_the_range():
     """Two actions, twice as probable as when they were taken: the gain is clipped at 1 + clip, the loss is not."""
-    now = torch.log(torch.tensor([0.8, 0.8], dtype=torch.float64)).requires_grad_()
-    zeros, values = torch.zeros(2, dtype=torch.float64), torch.tensor([1.0, 1.0], dtype=torch.float64)
-    acted = Acted(
-        torch.log(torch.tensor([0.4, 0.4], dtype=torch.float64)),
-        torch.tensor([1.0, -1.0], dtype=torch.float64),
-        torch.tensor([3.0, -1.0], dtype=torch.float64),
-    )
+    zeros, values = torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64)
+    now, before = (values * np.log(probability) for probability in (0.8, 0.4))
+    acted = Acted(before, torch.tensor([1.0, -1.0]).double(), torch.tensor([3.0, -1.0]).double())
+    now.requires_grad_()
     spec = select(passes=1, clip=0.2, value=0.5, entropy=0.0)
     adam = torch.optim.Adam([now], lr=1e-9)
     rng = np.random.default_rng(0)
@@ -224,7 +210,7 @@ HARD = StateLayout(("age", "pose", "semantics"), dim=4)
 
 @pytest.fixture(params=["select", "wait"])
 def spec(request) -> Spec:
-    return Spec(request.param, HARD, OMEGAS_MS if request.param == "wait" else ())
+    return Spec(request.param, HARD, problems.OMEGAS_MS if request.param == "wait" else ())
 
 
 EXTREME_AGES_MS = [0.0, -0.0, 1e12, -1e12, np.inf, -np.inf, np.nan, 5e-324, 1.7e308, 80.0]
@@ -301,7 +287,7 @@ def test_rewards_that_are_no_numbers_are_left_out_and_counted():
         diagnostics = learner.update(batch)
         finite(learner, diagnostics)
         assert diagnostics.dropped == 22
-    assert regret(learner, problem) < 0.03
+    assert problems.regret(learner, problem) < 0.03
     nothing = collect(learner, problem, range(8))
     nothing.rewards[:] = np.nan
     diagnostics = learner.update(nothing)

@@ -174,9 +174,8 @@ def test_a_step_by_rendered_colors_is_gauss_newtons_and_its_mean_is_taken_from_a
     error = 0.52 - 128 / 255
     weight = 1.0 / (1.0 + 3.0 * error**2 / 0.15**2) / 384
     prior = 0.01 / (np.array([np.deg2rad(60.0)] * 3 + [1.0] * 3) / scale) ** 2
-    step = np.linalg.solve(
-        np.einsum("nci,ncj->ij", s, s) * weight + np.diag(prior), s.sum(axis=(0, 1)) * error * weight
-    )
+    normal = np.einsum("nci,ncj->ij", s, s) * weight + np.diag(prior)
+    step = np.linalg.solve(normal, s.sum(axis=(0, 1)) * error * weight)
     assert np.abs(step).max() < 1.0
     for view, share in ((gray, -0.4), (SEEN[1], 0.4)):
         known = poses.known[view.camera]

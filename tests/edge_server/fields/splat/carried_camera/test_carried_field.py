@@ -15,20 +15,11 @@ from freshfield.geometry import look_at, se3, so3_exp
 from tests.edge_server.fields.scenes import a_meter_off, seen
 from tests.edge_server.fields.small import same_state
 from tests.edge_server.fields.splat.carried_camera import carried
-from tests.edge_server.fields.splat.carried_camera.carried import (
-    BAD_FROM,
-    LENS,
-    SEEDS,
-    WALK,
-    carried_field,
-    given,
-    slow,
-    walk,
-)
+from tests.edge_server.fields.splat.carried_camera.carried import BAD_FROM, WALK, carried_field, given, slow, walk
 
 
 def test_frames_become_keyframes_and_held_out_ones_take_their_neighbors_corrections() -> None:
-    views = carried.spoiled(WALK)
+    views = carried.spoiled(WALK[:BAD_FROM])
     field = carried.played(views)
     assert len(field.views) == len(views) - len(views[:: carried.HELD])
     raw_db, refined_db = carried.scored_db(field, views)
@@ -64,10 +55,10 @@ def test_a_frame_is_taken_once_and_not_before_its_turn() -> None:
 
 def test_keyframes_taken_near_each_other_go_first_and_memory_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tuned, "KEPT_PIXELS", 0)
-    monkeypatch.setattr(tuned, "LEAST_KEPT", 20)
-    one = WALK[::2]
+    monkeypatch.setattr(tuned, "LEAST_KEPT", 12)
+    one = WALK[::3]
     field = carried.played([*one, *(replace(view, generated_ns=view.generated_ns + 8_000_000_000) for view in one)])
-    assert len(field.views) == len(field._cams) == len(field._aims) == len(field._targets.exposure) == 20
+    assert len(field.views) == len(field._cams) == len(field._aims) == len(field._targets.exposure) == 12
     at_m = np.stack([view.camera_to_world[:3, 3] for view in field.views])
     apart_m = np.linalg.norm(at_m[:, None] - at_m[None], axis=2) + 10.0 * np.eye(len(at_m))
     assert apart_m[: -tuned.NEWEST, : -tuned.NEWEST].min() > 0.25  # spread over the whole round
@@ -185,7 +176,7 @@ def test_a_bad_beginning_is_forgotten_within_two_seconds(begin, depth: bool) -> 
     What a camera that only turns, or sees nothing, guesses of the scene cost up to 11 dB for as long as it was kept."""
     clean, lost = walk(depth=depth)[:50], []
     views = [replace(view, generated_ns=view.generated_ns + 2_000_000_000) for view in clean]
-    for seed in SEEDS:
+    for seed in carried.SEEDS:
         found_db = carried.by_seconds(views, views, given(carried_field(seed=seed), _beginning(begin, clean[0])))
         lost.append(np.array(carried.undisturbed(depth, seed))[:4] - found_db)
     assert np.mean(lost, axis=0).max() < MOST_LOST[begin][not depth]
@@ -231,7 +222,7 @@ def test_poses_that_never_fit_give_way_to_pictures_where_depth_is_measured(spoil
     trainings; as they are, such poses cost up to 11 dB for as long as was looked. The walk takes a keyframe each 4
     degrees and 15 cm, which 48 x 40 pixels show coarsely."""
     views, lost = [spoil(k, view) for k, view in enumerate(WALK)], []
-    for seed in SEEDS:
+    for seed in carried.SEEDS:
         field = carried_field(seed=seed)
         found_db = carried.by_seconds(views, views, field)
         assert len(field.views) > 60
@@ -245,7 +236,7 @@ def test_poses_that_never_fit_give_way_to_pictures_where_depth_is_measured(spoil
 def test_without_depth_it_is_said_that_poses_have_no_rotation(turns: bool) -> None:
     """A camera that slides along the scene without turning is not accused. In pictures of the walk, half as large, a
     keyframe moves corners by less than a pixel."""
-    lens, views = LENS.scaled(2.0), []
+    lens, views = carried.LENS.scaled(2.0), []
     for k in range(20):
         pose = WALK[0].camera_to_world.copy()
         pose[:3, 3] += (0.04 * k - 0.4) * pose[:3, 0]
@@ -261,9 +252,9 @@ def test_without_depth_it_is_said_that_poses_have_no_rotation(turns: bool) -> No
 @pytest.mark.stability
 def test_without_depth_any_unit_of_poses_is_as_good() -> None:
     """With a distance that was guessed in meters, poses in millimeters ended 10 dB lower."""
-    views = [_in_unit(1000.0)(k, view) for k, view in enumerate(walk(depth=False)[:30])]
+    views = [_in_unit(1000.0)(k, view) for k, view in enumerate(walk(depth=False)[:20])]
     field = carried.played(views)
-    assert carried.scored_db(field, views)[1] > carried.begun(False)[1][1] - 1.0
+    assert carried.scored_db(field, views)[1] > carried.begun(False)[1][0] - 1.0
     assert not any("tell no depth" in line or "hand-eye" in line for line in field.troubles)
 
 
@@ -288,7 +279,7 @@ def _relocalized(k: int, view: View) -> View:
 def test_poses_that_leap_and_stay_so_are_taken_back(depth: bool) -> None:
     """Taken as they are after ten frames, they cost 4 dB of all held-out frames so far for as long as was looked."""
     views, lost = [_relocalized(k, view) for k, view in enumerate(walk(depth=depth))], []
-    for seed in SEEDS:
+    for seed in carried.SEEDS:
         field, found_db = carried.gone_on(views, views, seed)
         lost.append((np.array(carried.undisturbed(depth, seed)) - found_db)[3:])
         (said,) = (line for line in field.troubles if line.startswith("hand: its poses leapt by 1."))
@@ -306,10 +297,8 @@ def test_a_camera_that_is_carried_elsewhere_meanwhile_has_not_leapt(frames: int,
     that it had gone: 2 m."""
     clean, begin = walk(depth=depth), BAD_FROM + round(1.25 * frames)
     bad = [_covered(view) for view in clean[BAD_FROM : BAD_FROM + frames]] if covered else []
-    after = [
-        replace(view, generated_ns=100_000_000 * k)
-        for k, view in enumerate(clean[begin : begin + 14], BAD_FROM + frames)
-    ]
+    goes_on = enumerate(clean[begin : begin + 14], BAD_FROM + frames)
+    after = [replace(view, generated_ns=100_000_000 * k) for k, view in goes_on]
     field = given(carried.resumed_from(carried.begun(depth)[0]), [*bad, *after])
     assert not any("leapt" in line for line in field.troubles)
     for view in after[4:]:
@@ -334,7 +323,7 @@ def test_it_resumes_bit_for_bit_whatever_the_number_of_threads(led_astray, begin
     field, resumed = carried.resumed_from(carried.begun(True)[0]) if begin else carried_field(), carried_field(1)
     resumed.load_state(given(field, views[begin : until + 1]).state())
     for each in (field, resumed):
-        given(each, views[until + 1 : until + 10])
+        given(each, views[until + 1 : until + 6])
     assert said in str([*field.troubles]) and resumed.troubles == field.troubles
     same_state(field, resumed)
     assert field._poses.meta() == resumed._poses.meta()

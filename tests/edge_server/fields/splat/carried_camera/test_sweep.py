@@ -93,12 +93,6 @@ def test_pure_rotation_tells_no_depth_and_cameras_in_all_places_give_a_finite_on
 DISC_LENS = Pinhole(50, 38, 40.0, 40.0, 25.0, 19.0, (-0.05, 0.01, 0.0, 0.0))
 
 
-def _tilted(slope: float) -> np.ndarray:
-    """Depth of the plane z = 2 + slope x, camera axes."""
-    rays = DISC_LENS.rays()
-    return (2.0 / (1.0 - slope * rays[..., 0] / rays[..., 2])).astype(np.float32)
-
-
 def test_leaves_cover_what_is_wanted_once_and_are_small_where_there_is_detail() -> None:
     rng = np.random.default_rng(1)
     color = np.full((38, 50, 3), 0.5, np.float32)
@@ -118,7 +112,8 @@ def test_leaves_cover_what_is_wanted_once_and_are_small_where_there_is_detail() 
 
 @pytest.mark.parametrize("slope", [0.0, 0.7, -0.7])
 def test_discs_lie_flat_on_the_surface(slope: float) -> None:
-    depth, pose = _tilted(slope), look_at((0.3, -2.0, 0.5), (0.0, 0.0, 0.2))
+    rays, pose = DISC_LENS.rays(), look_at((0.3, -2.0, 0.5), (0.0, 0.0, 0.2))
+    depth = (2.0 / (1.0 - slope * rays[..., 0] / rays[..., 2])).astype(np.float32)  # z = 2 + slope x, camera axes
     color = np.broadcast_to(np.array([0.2, 0.5, 0.7], np.float32), (*depth.shape, 3)).copy()
     leaves = quadtree(color, np.ones(depth.shape, bool), (4,), 1.0)
     params = discs(color, depth, leaves, DISC_LENS, pose, 0.6, np.full(len(leaves.row), 0.8, np.float32))

@@ -27,9 +27,8 @@ def _wall(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         at = pose[:3, 3] + rays * far[..., None]
         far = far + (2.0 + 0.2 * np.sin(2.0 * at[..., 0]) - at[..., 2]) / rays[..., 2]
     at = pose[:3, 3] + rays * far[..., None]
-    shade = (
-        0.5 + 0.2 * np.sin(9.0 * at[..., 0]) * np.cos(7.0 * at[..., 1]) + 0.15 * np.sin(23.0 * at[..., 1] + at[..., 0])
-    )
+    shade = 0.5 + 0.2 * np.sin(9.0 * at[..., 0]) * np.cos(7.0 * at[..., 1])
+    shade += 0.15 * np.sin(23.0 * at[..., 1] + at[..., 0])
     return shade.astype(np.float32), (far * WALL.rays()[..., 2]).astype(np.float32)
 
 

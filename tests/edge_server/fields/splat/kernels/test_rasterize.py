@@ -19,15 +19,8 @@ from edge_server.fields.splat.kernels.project import BASE, BLOCK, COLOR, OPACITY
 from edge_server.fields.splat.kernels.rasterize import LOSSES, MOMENTS, render_tiles
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.splat import torch_oracle
-from tests.edge_server.fields.splat.kernels.small_cloud import (
-    BACK,
-    BOX,
-    as_gaussians,
-    binned,
-    random_params,
-    stepped,
-    targets_of,
-)
+from tests.edge_server.fields.splat.kernels import small_cloud
+from tests.edge_server.fields.splat.kernels.small_cloud import BACK, BOX, as_gaussians, binned, random_params
 
 LENS = Pinhole(21, 18, 22.0, 24.0, 10.0, 9.5)
 BENT = replace(LENS, distortion=(-0.12, 0.03, 0.01, -0.015))
@@ -86,16 +79,16 @@ def test_gradients_equal_the_oracle(lens: Pinhole, sh_degree: int, weighed: bool
     params, cam = random_params(sh_degree=sh_degree, seed=3), _camera(lens)
     image, share = IMAGE[..., : 3 if over_plate else 4], np.ones(IMAGE.shape[:2])
     weight, behind, alpha = (WEIGHT if weighed else None), BACK, _double(IMAGE[..., 3:] / 255.0)
-    targets = targets_of(image, weight)
+    targets = small_cloud.targets_of(image, weight)
     if weighed:
         share = share * WEIGHT
     if over_plate:
         plate, alpha = RNG.uniform(0, 255, image.shape).astype(np.float32), torch.ones(1)
-        targets, behind = targets_of(image, weight, plate.reshape(-1, 3), BACK), plate / 255.0
+        targets, behind = small_cloud.targets_of(image, weight, plate.reshape(-1, 3), BACK), plate / 255.0
         # Tiles without a Gaussian have nothing to learn, and no loss.
         y, x = np.mgrid[0 : lens.height, 0 : lens.width] // TILE
         share = share * (np.diff(binned(cam, params).lists.first[0]) > 0)[y * -(-lens.width // TILE) + x]
-    losses, gradient, _ = stepped(cam, params, targets)
+    losses, gradient, _ = small_cloud.stepped(cam, params, targets)
     theirs = _double(params).requires_grad_(True)
     color = _oracle(theirs, _double(cam[0]), sh_degree, behind)[0]
     error = color - _double(IMAGE[..., :3] / 255.0) * alpha - (1 - alpha) * _double(behind)
@@ -103,7 +96,7 @@ def test_gradients_equal_the_oracle(lens: Pinhole, sh_degree: int, weighed: bool
     loss.backward()
     assert losses[:, 0].sum() == pytest.approx(loss.item(), rel=1e-4)
     _same(gradient, theirs.grad, 3e-3)
-    np.testing.assert_array_equal(stepped(cam, params, targets, Pool(3, 0))[1], gradient)
+    np.testing.assert_array_equal(small_cloud.stepped(cam, params, targets, Pool(3, 0))[1], gradient)
 
 
 # --- what hand-held images add: exposures, dissimilarity, and the gradient by the camera's pose -------
@@ -114,8 +107,8 @@ def _step(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Losses, the gradient by the parameters, and force and torque."""
     row = np.array([[*GAIN, *BIAS, FACTOR]], np.float32)[: int(exposed)]
-    targets = targets_of(IMAGE[..., :3], WEIGHT, np.zeros((0, 3), np.float32), BACK, row, np.float32(share))
-    return stepped(_camera(BENT), params, targets, pool)
+    targets = small_cloud.targets_of(IMAGE[..., :3], WEIGHT, np.zeros((0, 3), np.float32), BACK, row, np.float32(share))
+    return small_cloud.stepped(_camera(BENT), params, targets, pool)
 
 
 def _at_the_fields_exposure() -> tuple[Tensor, Tensor]:
@@ -192,7 +185,7 @@ def test_a_quaternion_without_direction_is_no_rotation() -> None:
     plain = params.copy()
     plain[:, QUATERNION] = 1.0
     np.testing.assert_array_equal(_render(params, cam)[0], _render(plain, cam)[0])
-    gradient = stepped(cam, params, targets_of(IMAGE[..., :3]))[1]
+    gradient = small_cloud.stepped(cam, params, small_cloud.targets_of(IMAGE[..., :3]))[1]
     assert np.isfinite(gradient).all() and not gradient[:, QUATERNION:OPACITY].any()
 
 

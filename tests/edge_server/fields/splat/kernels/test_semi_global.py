@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.scene_box import UNIT_BOX
@@ -33,11 +34,6 @@ def _difference(image: NDArray, other: NDArray, to_other: NDArray, d: int) -> tu
     return np.where(seen, np.minimum(worst / tuned.SWEEP_BOUND, 1.0) * COST, COST * tuned.SWEEP_UNSEEN), seen
 
 
-def _mean(values: NDArray) -> NDArray:
-    wide = np.pad(values, 1, mode="edge")
-    return sum(wide[i : i + HEIGHT, j : j + WIDTH] for i in range(3) for j in range(3)) / 9.0
-
-
 @pytest.fixture(scope="module")
 def images() -> NDArray[np.float32]:
     found = np.random.default_rng(3).random((4, 3, HEIGHT, WIDTH)).astype(np.float32) * np.float32(0.3)
@@ -63,7 +59,7 @@ def test_costs_are_those_of_the_images_that_differ_least(images: NDArray[np.floa
         each = []
         for j in range(1, count):
             differs, seen = _difference(images[0], images[j], se3_inverse(POSES[j]) @ POSES[0], d)
-            each.append(np.where(seen, _mean(differs), np.inf))
+            each.append(np.where(seen, uniform_filter(differs, 3, mode="nearest"), np.inf))
         first, second = np.sort([*each, np.full((HEIGHT, WIDTH), np.inf)], axis=0)[:2]
         weigh = (count - 1 >= tuned.SWEEP_SECOND_OF) & np.isfinite(second)
         expected = first + tuned.SWEEP_SECOND * np.where(weigh, np.where(weigh, second, 0) - first, 0)

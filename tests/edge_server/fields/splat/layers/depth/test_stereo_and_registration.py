@@ -72,18 +72,14 @@ def test_cameras_that_share_nothing_stay_as_they_were_reported() -> None:
             assert found.scale == 1.0
 
 
-def _plates(k: int, surface: Surface) -> CameraPlates:
-    view = View(f"cam{k:02d}", surface.color.astype(np.uint8), surface.pose, surface.lens)
-    plate, depth = PlateImage(view, surface.color, surface.known), DepthPlate.empty(SIZE, SIZE)
-    meters = np.where(surface.inverse > 0, 1.0 / np.maximum(surface.inverse, 1e-6), 0.0).astype(np.float32)
-    for _ in range(settings.LEAST):
-        depth.take(meters, np.zeros((SIZE, SIZE), bool), shared_pool())
-    return CameraPlates(plate, plate, depth, surface.pose)
-
-
 def test_a_camera_that_joins_is_registered_with_the_others() -> None:
-    surfaces = room_surfaces(3, SIZE)
-    cameras = [_plates(k, s) for k, s in enumerate([*surfaces[:2], _bumped(surfaces[2])])]
+    surfaces, cameras = room_surfaces(3, SIZE), []
+    for k, surface in enumerate([*surfaces[:2], _bumped(surfaces[2])]):
+        view = View(f"cam{k:02d}", surface.color.astype(np.uint8), surface.pose, surface.lens)
+        plate, measured = PlateImage(view, surface.color, surface.known), DepthPlate.empty(SIZE, SIZE)
+        for _ in range(settings.LEAST):
+            measured.take(surface.depth(), np.zeros((SIZE, SIZE), bool), shared_pool())
+        cameras.append(CameraPlates(plate, plate, measured, surface.pose))
     depth = DepthSupervision(SplatSettings(), shared_pool())
     depth.plates(cameras[:2], anew=True)
     assert set(depth.corrections) == {"cam00", "cam01"} and not depth.troubles
@@ -116,9 +112,8 @@ def test_brightness_corrects_poses_under_which_stereo_has_found_the_depth() -> N
         reported = [of.pose for of in told]
         found = register_stereo(surfaces, reported, 3.0)
         assert all(c.scale == 1.0 and not c.is_large and "depth" not in str(c) for c in found)
-        px.append(
-            [_off_lines_px(poses, true, plates[0].lens) for poses in ([p.pose for p in told], [c.pose for c in found])]
-        )
+        poses = [p.pose for p in told], [c.pose for c in found]
+        px.append([_off_lines_px(each, true, plates[0].lens) for each in poses])
     # From there, the prior is still about the reported poses.
     there = [replace(s, pose=c.pose) for s, c in zip(surfaces, found)]
     for one, other in zip(found, register_stereo(there, reported, 3.0)):
@@ -214,9 +209,7 @@ def test_a_camera_is_swept_again_where_plates_change_one_a_call(monkeypatch: pyt
     plates, _ = room_plates(4, 64)
     swept: list[str] = []
     match = PlateStereo._match
-    monkeypatch.setattr(
-        PlateStereo, "_match", lambda self, name, lenses: swept.append(name) or match(self, name, lenses)
-    )
+    monkeypatch.setattr(PlateStereo, "_match", lambda self, name, of: swept.append(name) or match(self, name, of))
     stereo = _swept(plates)
     assert swept == ["0", "1", "2", "3"]
 

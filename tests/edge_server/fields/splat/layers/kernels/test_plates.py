@@ -7,18 +7,9 @@ import pytest
 
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.threads.thread_pool import CallerPool
+from edge_server.fields.splat.layers.kernels import plates
 from edge_server.fields.splat.layers.kernels.masks import clean_mask
-from edge_server.fields.splat.layers.kernels.plates import (
-    CHANGING,
-    FOREGROUND,
-    LIKE_STATIC,
-    MODES,
-    PlateArrays,
-    blur,
-    compare_with_plate,
-    count_exposure,
-    vote,
-)
+from edge_server.fields.splat.layers.kernels.plates import MODES, PlateArrays, blur, compare_with_plate, vote
 from edge_server.fields.splat.layers.plates import FinePlate, Plate, plain_share
 from tests.edge_server.fields.scenes import ring
 
@@ -117,10 +108,12 @@ def test_a_frame_is_compared_with_plate_earlier_frames_and_static_field() -> Non
             expected = _off(blurred, plate.blurred[0])
             found = flags[:, :W]
             np.testing.assert_allclose(difference, expected, rtol=1e-6)
-            np.testing.assert_array_equal(found & FOREGROUND > 0, np.where(plate.known, expected > limit, unknown))
-            np.testing.assert_array_equal(found & CHANGING > 0, changing)
-            np.testing.assert_array_equal(found & LIKE_STATIC > 0, has_static & (beyond <= THRESHOLD))
-            for flag, mask in ((FOREGROUND, masks[0]), (CHANGING, masks[1])):
+            np.testing.assert_array_equal(
+                found & plates.FOREGROUND > 0, np.where(plate.known, expected > limit, unknown)
+            )
+            np.testing.assert_array_equal(found & plates.CHANGING > 0, changing)
+            np.testing.assert_array_equal(found & plates.LIKE_STATIC > 0, has_static & (beyond <= THRESHOLD))
+            for flag, mask in ((plates.FOREGROUND, masks[0]), (plates.CHANGING, masks[1])):
                 np.testing.assert_array_equal(mask, cleaned(found & flag > 0))
             assert counts.tolist() == [masks[0].sum(), masks[1].sum()]
 
@@ -169,7 +162,7 @@ def test_votes(trusts: bool) -> None:
     flags, picture = rng.integers(0, 8, (H, W), np.uint8), np.empty((H, W, 3), np.float32)
     votes = changing == 0
     if trusts:
-        votes |= (flags & LIKE_STATIC > 0) & (foreground == 0)
+        votes |= (flags & plates.LIKE_STATIC > 0) & (foreground == 0)
     frame = (image, blurred, difference, flags, foreground, changing)
     CallerPool().run(vote, *frame, trusts, held, found, static, True, picture)
     for y in range(H):
@@ -198,7 +191,7 @@ def test_exposure_is_counted_where_the_plate_tells_it() -> None:
     plate, counts = _plate(5), np.zeros((3, 3), np.int64)
     plate.means[:, :10] = 10.0  # too dark
     image = np.clip(plate.means[0] * [1.0, 1.1, 0.9] + 0.5, 0, 255).astype(np.uint8)
-    CallerPool().run(count_exposure, image, plate, counts)
+    CallerPool().run(plates.count_exposure, image, plate, counts)
     used = plate.known[::2, ::2][5:].sum()
     np.testing.assert_array_equal(counts, [[used, 0, 0], [used, used, 0], [used, 0, used]])
 
