@@ -196,7 +196,7 @@ def test_what_a_learned_policy_decided_is_kept_as_of_a_live_run(tmp_path: Path):
 
 def test_costs_are_measured_into_the_file_that_a_scenario_names(tmp_path: Path, capsys):
     out = tmp_path / "costs.json"
-    assert costs_main([str(write(tmp_path, steps=5)), "--seconds", "1.2", "--out", str(out)]) == 0
+    assert costs_main([str(write(tmp_path, steps=5)), "--seconds", "0.6", "--out", str(out)]) == 0
     found = json.loads(out.read_text())["compute"]
     assert sum(found.values()) > 0.0
     assert read_config(load(write(tmp_path, compute="costs.json"))).compute == ComputeConfig(**found)

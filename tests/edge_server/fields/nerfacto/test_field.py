@@ -44,7 +44,7 @@ def test_appearances_take_up_what_differs_between_cameras() -> None:
     scores, looks = [], None
     for appearance in (0, 4):
         field = NerfactoField(structs.replace(SMALL["nerfacto"], appearance=appearance))
-        field.fit(views, Budget(steps=300))
+        field.fit(views, Budget(steps=200))
         scores.append(score(field, still.held_out[0]))
         looks = field._cameras.appearances
     assert scores[1] > scores[0] + 1.0

@@ -61,7 +61,9 @@ def test_keyframes_taken_near_each_other_go_first_and_memory_stays(monkeypatch: 
     assert len(field.views) == len(field._cams) == len(field._aims) == len(field._targets.exposure) == 12
     at_m = np.stack([view.camera_to_world[:3, 3] for view in field.views])
     apart_m = np.linalg.norm(at_m[:, None] - at_m[None], axis=2) + 10.0 * np.eye(len(at_m))
-    assert apart_m[: -tuned.NEWEST, : -tuned.NEWEST].min() > 0.25  # spread over the whole round
+    assert apart_m[: -tuned.NEWEST, : -tuned.NEWEST].min() > 0.25
+    passed_m = np.stack([view.camera_to_world[:3, 3] for view in one])
+    assert np.linalg.norm(passed_m[:, None] - at_m, axis=2).min(axis=1).max() < 1.2, "spread over the whole round"
     assert carried.scored_db(field, WALK)[1] > 20.0
 
 

@@ -311,7 +311,7 @@ def test_late_frames_from_where_a_camera_stood_before_change_nothing(order: tupl
 def test_few_cameras_with_large_pictures_train_fewer_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     field, size = LayeredField(ball.SMALL), ball.HELD.image[..., 0].size
     for frame in range(40):
-        field.fit(ball.frame_of(frame, cameras=4), Budget(steps=30))
+        field.fit(ball.frame_of(frame, cameras=4), Budget(steps=8))
     for frame, (most_pixels, steps) in enumerate([(size, 10), (size - 1, 6)], 40):
         monkeypatch.setattr(settings, "FEW_STEPS_PIXELS", most_pixels)
         assert field.fit(ball.frame_of(frame, cameras=4), Budget(steps=30)).steps == steps
