@@ -81,8 +81,8 @@ def answers(found: list[Verdict], *words: str) -> set[str]:
 
 
 def test_every_study_has_cases_and_whole_no_fewer_than_in_a_quick_pass(tmp_path: Path):
-    for name, study in STUDIES.items():
-        whole, quick = (len(study.cases(StudyRequest(short, tmp_path, Folders()))) for short in (False, True))
+    for name, each in STUDIES.items():
+        whole, quick = (len(each.cases(StudyRequest(short, tmp_path, Folders()))) for short in (False, True))
         assert whole >= quick > 0, name
 
 
