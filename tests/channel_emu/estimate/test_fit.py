@@ -3,6 +3,7 @@ against sums over all paths and small steps of time."""
 
 import itertools
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +74,9 @@ def test_a_slow_chain_from_delays_alone(tmp_path):
     low, high = found.channel["chain"]["states"]
     visits = f"  a visit lasts {1 / mu1:.4g} ms in {low}, {1 / mu2:.4g} ms in {high}; shares of time "
     assert f"{visits}{mu2 / (mu1 + mu2):.3f}, {mu1 / (mu1 + mu2):.3f}" in format_fit(found).splitlines()
+    for name, value in found.parameters.items():
+        low, high = value.interval
+        assert re.search(rf"{name} +{value.value:.5g}  \[{low:.5g}, {high:.5g}\]", format_fit(found)), name
 
 
 def test_delays_and_losses_together_and_a_shape(tmp_path):

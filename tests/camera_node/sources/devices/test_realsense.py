@@ -150,7 +150,7 @@ def test_a_camera_that_cannot_stream_both_streams_color(pipeline, caplog, every)
     profile = pipeline.profile
     pipeline.start.side_effect = [RuntimeError("Couldn't resolve requests"), profile] if every else [profile]
     profile.get_stream.return_value.as_video_stream_profile.return_value.get_intrinsics.return_value = intrinsics()
-    profile.get_streams.return_value = []
+    profile.get_streams.return_value = [MagicMock(stream_type=lambda: rs.stream.color)]
     feed = realsense.RealsenseFeed("eye", None, config(depth_every=every), Fraction(15), WallClock())
     assert pipeline.start.call_count == (2 if every else 1) and feed.intrinsics is not None and feed.depth is None
     assert ("eye: no depth of 640 x 400 at 15 a second: Couldn't" in caplog.text) == bool(every)
