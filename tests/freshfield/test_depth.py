@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from freshfield.depth import DepthImage, EncodedDepth
 from freshfield.geometry import Pinhole, Pose
-from freshfield.limits import MAX_DEPTH_GAP_NS, MAX_IMAGE_SIDE_PX, MAX_PAYLOAD_BYTES
+from freshfield.limits import MAX_DEPTH_GAP_NS, MAX_IMAGE_SIDE_PX, MAX_PAYLOAD_BYTES, METERS_PER_COUNT
 from freshfield.payload import PayloadError
 from tests.support import MOST_MS, refused, work_ms
 
@@ -96,6 +96,13 @@ def test_what_must_not_be_decoded_is_refused_by_name(kind):
     depth, reason = REFUSED[kind]
     error = refused(PayloadError, ".", depth.check, LENS, 1)
     assert error.reason == reason and work_ms(lambda: refused(PayloadError, "", depth.check, LENS, 1)) < MOST_MS
+
+
+def test_the_bounds_themselves_are_within():
+    for scale in METERS_PER_COUNT:
+        replace(GOOD, meters_per_count=scale).check(LENS, 1)
+    for gap_ns in (-MAX_DEPTH_GAP_NS, MAX_DEPTH_GAP_NS):
+        replace(GOOD, after_image_ns=gap_ns).check(LENS, 1)
 
 
 def test_registered_depth_may_be_smaller_but_not_of_another_shape():

@@ -1,8 +1,11 @@
 """The stream on the live page's port: what arrives, who gets it, and a browser that draws it."""
 
+import asyncio
 import base64
 import json
 import time
+from contextlib import nullcontext
+from unittest.mock import MagicMock
 
 import cv2
 import numpy as np
@@ -11,7 +14,7 @@ import websocket
 
 from edge_server.page import Page, start_page
 from edge_server.page.splats.messages import StreamReader, read_saved
-from edge_server.page.splats.stream import STREAM
+from edge_server.page.splats.stream import STREAM, SplatStream
 from freshfield.limits import MAX_VISITORS
 from freshfield.transport import Transport
 from tests.edge_server.fields.scenes import psnr
@@ -87,6 +90,13 @@ def test_who_acknowledges_without_reading_does_not_fill_the_memory():
         (connected,) = page._splats._connected
         assert connected.queue.qsize() <= 1
         drawer.socket.close()
+
+
+def test_who_reads_slowly_holds_up_nobody():
+    connected = [MagicMock(lock=nullcontext(), queue=asyncio.Queue()) for _ in range(3)]
+    connected[1].queue.put_nowait(b"not yet read")
+    SplatStream(bare_state(), lambda: None)._tick(connected)
+    assert [each.visitor.message.called for each in connected] == [True, False, True]
 
 
 def test_the_rules_of_the_page_hold_for_the_stream():
