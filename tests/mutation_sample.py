@@ -96,13 +96,15 @@ class Edit:
         return f"{self.file}:{self.line}: {old.strip()}  ->  {new.strip()}"
 
 
+def tracked(*folders: str) -> list[str]:
+    """The files below ``folders``, or all, that git knows."""
+    return subprocess.check_output(["git", "-C", str(ROOT), "ls-files", *folders], text=True).splitlines()
+
+
 def files() -> list[str]:
     """The source files, generated ones left out."""
-    listed = subprocess.run(
-        ["git", "-C", str(ROOT), "ls-files", *SOURCES], capture_output=True, text=True, check=True
-    ).stdout.splitlines()
     generated = ("_pb2.py", "_pb2_grpc.py")
-    return [name for name in listed if name.endswith(".py") and not name.endswith(generated)]
+    return [name for name in tracked(*SOURCES) if name.endswith(".py") and not name.endswith(generated)]
 
 
 def places(file: str) -> dict[Span, list[Edit]]:
@@ -211,8 +213,7 @@ def failure(copy: Path, words: Sequence[str], limit_s: float) -> str | None:
 def copy_checkout(copy: Path) -> None:
     """Where edits run, always at the same place: compiled kernels are kept by place."""
     shutil.rmtree(copy, ignore_errors=True)
-    listed = subprocess.run(["git", "-C", str(ROOT), "ls-files"], capture_output=True, text=True, check=True).stdout
-    for name in listed.splitlines():
+    for name in tracked():
         if (ROOT / name).is_file():
             (copy / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, copy / name)

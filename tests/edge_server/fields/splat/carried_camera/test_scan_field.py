@@ -66,6 +66,15 @@ def test_first_gaussians_lie_on_measured_depth() -> None:
     assert len(near) > 50 and near.mean() > 0.9
 
 
+def test_pixels_of_no_weight_or_that_show_nothing_do_not_supervise() -> None:
+    shown = np.dstack([WALK[0].image[..., :3], np.full(WALK[0].image.shape[:2], 255, np.uint8)])
+    weight = np.ones(shown.shape[:2], np.float32)
+    shown[:4, :, 3], weight[:, :6] = 0, 0.0
+    color, there = ScanField(_settings())._as_rendered(replace(WALK[0], image=shown, weight=weight))
+    assert there[4:, 6:].all() and there.sum() == there[4:, 6:].size
+    np.testing.assert_allclose(color, WALK[0].image[..., :3] / 255, atol=1e-6)
+
+
 def test_views_are_swept_until_further_ones_show_hardly_anything_new(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spread ones first. To sweep all of them took two seconds before the first step of a fit."""
     swept: list[int] = []
