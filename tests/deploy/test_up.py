@@ -199,9 +199,9 @@ def test_an_earlier_run_outlives_starts_that_fail(tmp_path):
     (tmp_path / "report.json").write_text("good")
     for failed in (2, 3):
         prepare(tmp_path, {"run": failed}).close()
-        (tmp_path / "log-edge.txt").write_text(f"start {failed} failed")
+        (tmp_path / f"log-cam0{failed}.txt").write_text("failed")
     assert [p.name for p in (tmp_path / EARLIER).iterdir()] == ["report.json"]
-    assert {p.name for p in tmp_path.iterdir()} == {MARKER, EARLIER, "log-edge.txt"}
+    assert {p.name for p in tmp_path.iterdir()} == {MARKER, EARLIER, "log-cam03.txt"}
 
 
 def test_a_start_that_is_killed_before_its_marker_is_written_or_while_it_moves_files_loses_none(tmp_path):
