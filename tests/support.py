@@ -7,8 +7,8 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -100,17 +100,11 @@ def work_ms(call: Callable[[], Any]) -> float:
     return min(times)
 
 
-def axes_drawn(monkeypatch: pytest.MonkeyPatch, module: str) -> list[Any]:
-    """Takes the axes, (rows, columns), of every figure that ``module`` draws from now on."""
-    kept, draw = [], importlib.import_module(module).figure
-
-    @contextmanager
-    def figure(*args: Any, **options: Any) -> Iterator[Any]:
-        with draw(*args, **options) as (fig, axes):
-            kept.append(axes)
-            yield fig, axes
-
-    monkeypatch.setattr(f"{module}.figure", figure)
+def axes_drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Takes the axes of every figure that is saved from now on."""
+    figure = importlib.import_module("matplotlib.figure").Figure
+    kept, save = [], figure.savefig
+    monkeypatch.setattr(figure, "savefig", lambda drawn, *a, **k: kept.append(drawn.axes) or save(drawn, *a, **k))
     return kept
 
 

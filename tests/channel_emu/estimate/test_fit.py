@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from matplotlib.figure import Figure
 from scipy import linalg
 
 from channel_emu.cli import main
@@ -24,7 +23,7 @@ from channel_emu.model.settings import channel_from_mapping
 from channel_emu.model.trace import TraceWriter
 from channel_emu.virtual.simulate import simulate
 from freshfield import scenario
-from tests.support import refused
+from tests.support import axes_drawn, refused
 
 RATES = {"mu1_per_ms": 1 / 1000, "mu2_per_ms": 1 / 500}
 # A slow channel: periodic frames, delays of 20 and 120 ms.
@@ -154,8 +153,7 @@ def test_a_few_huge_delays_are_no_state(tmp_path):
 
 
 def test_the_command_writes_a_scenario_and_a_picture(tmp_path, capsys, monkeypatch):
-    drawn, save = [], Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *a, **k: drawn.append(figure.axes) or save(figure, *a, **k))
+    drawn = axes_drawn(monkeypatch)
     path = write_trace(tmp_path / "t.jsonl", SLOW, 1, 2, seconds=60)
     assert main(["fit", str(path), "--out", str(tmp_path / "f.yaml"), "--plot", str(tmp_path / "f.png")]) == 0
     text = capsys.readouterr().out

@@ -84,14 +84,14 @@ def curves(ax):
 
 
 def test_figures_show_what_was_measured_and_encircle_the_best(tmp_path, monkeypatch):
-    drawn = axes_drawn(monkeypatch, "edge_server.experiments.frontier.output")
+    drawn = axes_drawn(monkeypatch)
     rows = [
         {"field": field, "layers": layers, "speed_m_per_s": speed, "planned_update_s": at, "update_s": at}
         | {"shown_psnr_db": 20 + speed + at, "shown_psnr_moving_db": 15 + speed - at}
         for field, layers, speed, at in [("ngp", False, 1, 2.0), ("ngp", False, 1, 0.5), ("splat", True, 3, 1.0)]
     ]
     draw_updates(tmp_path / "updates.png", rows)
-    (slow, fast), (slow_moving, _) = drawn.pop()
+    slow, fast, slow_moving, _ = drawn.pop()
     assert curves(slow) == {
         "ngp": (CYCLE[0], "-", [[0.5, 21.5], [2.0, 23.0]]),
         "splat in layers": (CYCLE[1], "--", []),
@@ -108,7 +108,7 @@ def test_figures_show_what_was_measured_and_encircle_the_best(tmp_path, monkeypa
     draw_frontier(
         tmp_path / "frontier.png", rows, {"scene": "tile", "ms_per_step": {"ngp": 0.25}, "lpips_network": None}
     )
-    ((psnr,), (ssim,)) = drawn.pop()
+    psnr, ssim = drawn.pop()
     ngp, front = curves(psnr)["ngp (0.2 ms a step)"][2], curves(psnr)["Pareto front"][2]
     assert (ngp, front) == ([[0.5, 20.0], [1.0, 19.0], [2.0, 22.0]], [[0.5, 20.0], [2.0, 22.0]])
     assert "tile" in psnr.get_title(loc="left") and "Pareto front" not in curves(ssim) and ssim.get_xlabel()
