@@ -50,13 +50,20 @@ def scenario_of(seed: int) -> Scenario:
         channel["queue_limit"] = QUEUE_LIMIT
     faults = {"loss": 0.1, "duplication": 0.1, "corruption": 0.1, "reset": {"at_ms": [900.0]}}
     channel["faults"] = {name: about for name, about in faults.items() if rng.random() < 0.4}
-    policy = dict(zip(("name", "value"), parse_policy(str(rng.choice(POLICIES)))))
-    edge = {"field": "splat", "field_options": _SMALL, "updates": "cycle", "policy": policy}
-    cameras = {"count": 5, "held_out": ["cam00"], "phase": str(rng.choice(["locked", "spread"]))}
-    # With its own motion, its frames, which no other seed needs, are not kept on disk.
-    source, name = small_world(motion_seed=seed), f"chaos-{seed}"
-    sections = {"cameras": cameras, "source": source, "channel": channel, "edge": edge}
-    return parse({"name": name, "seed": seed, **sections}, Path(f"{name}.yaml"))
+    name, value = parse_policy(str(rng.choice(POLICIES)))
+    edge = {"field": "splat", "field_options": _SMALL, "updates": "cycle", "policy": {"name": name, "value": value}}
+    return parse(
+        {
+            "name": f"chaos-{seed}",
+            "seed": seed,
+            "cameras": {"count": 5, "held_out": ["cam00"], "phase": str(rng.choice(["locked", "spread"]))},
+            # With its own motion, its frames, which no other seed needs, are not kept on disk.
+            "source": small_world(motion_seed=seed),
+            "channel": channel,
+            "edge": edge,
+        },
+        Path(f"chaos-{seed}.yaml"),
+    )
 
 
 def draw_faults(seed: int, cameras: tuple[str, ...]) -> tuple[Fault, ...]:

@@ -28,22 +28,38 @@ INT64 = st.integers(-(2**63), 2**63 - 1)
 
 
 def frame(**changes) -> Frame:
-    values = {"camera": "cam07", "session": "12-ab", "sequence": 5, "codec": "png", "payload": DATA["png"]}
-    times = {"generated_ns": 1_700_000_000_123_456_789, "clock_offset_ns": -5, "clock_uncertainty_ns": 7}
-    lens = Pinhole(16, 12, 20.0, 21.0, 8.0, 6.0, (0.1, -0.01, 0.001, 0.0))
-    place = {"pose": Pose((0.5, 0.5, -0.5, 0.5), (1.0, -2.0, 3.0)), "pose_gap_ns": 11, "intrinsics": lens}
-    return Frame(**(values | times | place | {"held_out": True} | changes))
+    values = {
+        "camera": "cam07",
+        "session": "12-ab",
+        "sequence": 5,
+        "generated_ns": 1_700_000_000_123_456_789,
+        "pose": Pose((0.5, 0.5, -0.5, 0.5), (1.0, -2.0, 3.0)),
+        "intrinsics": Pinhole(16, 12, 20.0, 21.0, 8.0, 6.0, (0.1, -0.01, 0.001, 0.0)),
+        "codec": "png",
+        "payload": DATA["png"],
+        "held_out": True,
+        "clock_offset_ns": -5,
+        "clock_uncertainty_ns": 7,
+        "pose_gap_ns": 11,
+    }
+    return Frame(**{**values, **changes})
 
 
 ids = st.from_regex(r"[A-Za-z0-9._-]{1,64}", fullmatch=True)
 
 
-of_headers = {"camera": ids, "session": ids, "sequence": st.integers(0, 2**64 - 1), "held_out": st.booleans()}
-of_headers |= {"generated_ns": INT64, "clock_offset_ns": INT64, "clock_uncertainty_ns": st.integers(0, 2**63 - 1)}
-
-
 @given(
-    changes=st.fixed_dictionaries(of_headers),
+    changes=st.fixed_dictionaries(
+        {
+            "camera": ids,
+            "session": ids,
+            "sequence": st.integers(0, 2**64 - 1),
+            "generated_ns": INT64,
+            "held_out": st.booleans(),
+            "clock_offset_ns": INT64,
+            "clock_uncertainty_ns": st.integers(0, 2**63 - 1),
+        }
+    ),
     q=st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: max(map(abs, q)) > 1e-3),
     t=st.tuples(*[st.floats(-1e6, 1e6)] * 3),
     codec=st.sampled_from(payload.CODECS),

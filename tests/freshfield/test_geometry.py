@@ -107,10 +107,18 @@ def test_rays_converge_where_least_squares_says():
     assert geometry.converging_point(origins, np.tile(ways[0], (5, 1))) is None, "they are parallel"
 
 
-sides = {"width": st.integers(16, 640), "height": st.integers(16, 480)}
-lengths = {"fx": st.floats(200, 600), "fy": st.floats(200, 600), "cx": st.floats(100, 400), "cy": st.floats(100, 300)}
-bends = st.tuples(st.floats(-0.05, 0.1), st.floats(-0.02, 0.05), *[st.floats(-0.002, 0.002)] * 2)
-lenses = st.builds(Pinhole, **sides, **lengths, distortion=bends)
+lenses = st.builds(
+    Pinhole,
+    width=st.integers(16, 640),
+    height=st.integers(16, 480),
+    fx=st.floats(200, 600),
+    fy=st.floats(200, 600),
+    cx=st.floats(100, 400),
+    cy=st.floats(100, 300),
+    distortion=st.tuples(
+        st.floats(-0.05, 0.1), st.floats(-0.02, 0.05), st.floats(-0.002, 0.002), st.floats(-0.002, 0.002)
+    ),
+)
 
 
 @given(lenses, st.integers(0, 2**32))

@@ -97,6 +97,22 @@ def test_frames_arrive_as_captured(tmp_path):
     assert status["cameras"]["cam01"]["outcomes"] == {"accepted": counts["cam01"]["answered"]}
 
 
+def test_a_slow_peer_gets_the_newest_frame_and_never_two(tmp_path):
+    peer = Peer(respond=answer(after_s=0.4))
+    run_against(peer, tmp_path, seconds=2.6)
+    counts = check_books(tmp_path / "out")
+    assert peer.most_unanswered == 1
+    for camera, c in counts.items():
+        frames = [f for f in peer.frames if f.camera == camera]
+        assert c["replaced"] > c["sent"]
+        # 20 captures a second, an answer every 0.4 s: about eight captures lie between two sent ones.
+        steps = [b.sequence - a.sequence for a, b in pairwise(frames)]
+        assert 6 <= np.median(steps) <= 12
+    # What was sent had been captured just then, not when the last answer was awaited.
+    late_ms = [(a - f.generated_edge_ns) / 1e6 for a, f in zip(peer.arrived_ns, peer.frames)]
+    assert np.median(late_ms) < 120
+
+
 @pytest.mark.parametrize("respond", [silence, wrong_number])
 async def test_a_peer_that_talks_nonsense_or_not_at_all_is_left(tmp_path, respond):
     peer = await Peer(respond=respond).start()

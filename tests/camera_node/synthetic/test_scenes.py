@@ -211,8 +211,13 @@ def test_the_first_frame_a_process_writes_makes_room_and_the_longest_unused_goes
 
 
 GOLDEN = Path(__file__).parent / "golden"
-SHOWN = {"drawn_room": ("drawn_room", {"layout_seed": 2}), "room": ("room", {"people": 2})}
-SHOWN |= {"tower": ("tower", {}), "tile": ("tile", {}), "bench": ("tile", {"bench": True})}
+SHOWN = {
+    "drawn_room": ("drawn_room", {"layout_seed": 2}),
+    "room": ("room", {"people": 2}),
+    "tower": ("tower", {}),
+    "tile": ("tile", {}),
+    "bench": ("tile", {"bench": True}),
+}
 VIEWS = (("cam00", 0.0), ("cam04", 1.3), ("cam08", 2.9), ("cam12", 5.0), ("cam05", 3.7))
 
 
@@ -238,8 +243,14 @@ def test_a_scene_looks_as_it_did(name):
 
 
 # Their surfaces, edges, corners and axes lie on the grid of origins below.
-SOLIDS = [Sphere(0.5), Box((0.5, 0.3, 0.7)), Cylinder(0.4, 0.6)]
-SOLIDS += [RoundCone(*sizes) for sizes in ((0.4, 0.1, 0.9), (0.2, 0.4, 0.3), (0.3, 0.3, 0.6))]
+SOLIDS = [
+    Sphere(0.5),
+    Box((0.5, 0.3, 0.7)),
+    Cylinder(0.4, 0.6),
+    RoundCone(0.4, 0.1, 0.9),
+    RoundCone(0.2, 0.4, 0.3),
+    RoundCone(0.3, 0.3, 0.6),
+]
 
 
 @pytest.mark.stability

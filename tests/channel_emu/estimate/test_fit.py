@@ -27,8 +27,12 @@ from tests.support import axes_drawn, refused
 
 RATES = {"mu1_per_ms": 1 / 1000, "mu2_per_ms": 1 / 500}
 # A slow channel: periodic frames, delays of 20 and 120 ms.
-SLOW = {"arrivals": {"process": "periodic", "period_ms": 30.0}, "chain": RATES, "discipline": "drop-new"}
-SLOW |= {"service": {"law": "exponential", "mean_ms": [20.0, 120.0]}}
+SLOW = {
+    "arrivals": {"process": "periodic", "period_ms": 30.0},
+    "chain": RATES,
+    "service": {"law": "exponential", "mean_ms": [20.0, 120.0]},
+    "discipline": "drop-new",
+}
 HEAD = "offered_ms,delivered_ms\n"
 SLOW_TRUE = {**RATES, "mean_1_ms": 20.0, "mean_2_ms": 120.0}
 

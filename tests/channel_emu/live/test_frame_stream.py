@@ -37,8 +37,12 @@ from tests.integration.peer import Peer, silence
 from tests.support import free_port, until
 
 # The thesis's channel six times faster, so that a test takes seconds.
-FAST = {"preset": "ch6", "arrivals": {"rate_per_ms": [1 / 20, 1 / 5]}, "service": {"mean_ms": [5.0, 10.0]}}
-FAST |= {"chain": {"mu1_per_ms": 1 / 50, "mu2_per_ms": 1 / 50}}
+FAST = {
+    "preset": "ch6",
+    "arrivals": {"rate_per_ms": [1 / 20, 1 / 5]},
+    "chain": {"mu1_per_ms": 1 / 50, "mu2_per_ms": 1 / 50},
+    "service": {"mean_ms": [5.0, 10.0]},
+}
 ONE_LINE = {"service": "exp:1.5ms", "queue_limit": 6, "discipline": "lcfs-preempt", "server": {"shared": True}}
 QUICK = {"service": "exp:4ms"}
 

@@ -35,8 +35,13 @@ def test_zero_delays_deliver_everything_and_huge_ones_saturate(discipline):
 @pytest.mark.slow
 def test_a_chain_that_always_switches():
     """40 switches a millisecond: the channel is its average."""
-    section = {"preset": "ch6", "discipline": "parallel", "service_state": "modulated"}
-    found = run(section | {"chain": {"mu1_per_ms": 40.0, "mu2_per_ms": 40.0}}, seconds=2)
+    section = {
+        "preset": "ch6",
+        "chain": {"mu1_per_ms": 40.0, "mu2_per_ms": 40.0},
+        "discipline": "parallel",
+        "service_state": "modulated",
+    }
+    found = run(section, seconds=2)
     assert found["state_share"]["low"] == pytest.approx(0.5, abs=0.01)
     # Speeds 1/30 and 1/60 average to 1/40.
     assert found["delay_ms"]["mean"] == pytest.approx(40, abs=4 * 40 / max(found["delivered"], 1) ** 0.5)

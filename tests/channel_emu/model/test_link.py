@@ -91,6 +91,18 @@ def test_a_reset_breaks_one_camera_and_frees_the_line():
     assert subject["a"].resets == 1 and subject["b"].resets == 0
 
 
+def test_sampling_takes_the_newest_offered_frame():
+    subject = Channel(channel_from_mapping({"preset": "ch6-low", "service": "none"}), 3).link("cam00")
+    transits = [subject.offer(i * 10 * MS)[0] for i in range(4000)]
+    subject.advance(40_000 * MS)
+    counts = Counter(str(t.outcome) for t in transits)
+    # Sampled at the first arrival after each offer: one per 120 ms on average, and each within its period.
+    assert counts["delivered"] == pytest.approx(4000 * (1 - 2.718281828 ** (-10 / 120)), rel=0.12)
+    for t in transits:
+        if t.outcome is EventKind.DELIVERED:
+            assert t.started_ns is not None and 0 <= t.started_ns - t.offered_ns <= 10 * MS
+
+
 @pytest.mark.parametrize("discipline", DISCIPLINES)
 def test_a_flush_breaks_off_what_is_inside_and_frees_the_line(discipline):
     """What is due at the instant of the flush arrives."""
@@ -107,9 +119,13 @@ def test_a_flush_breaks_off_what_is_inside_and_frees_the_line(discipline):
 
 
 def test_a_change_keeps_due_instants_and_lets_in_what_waits_to_be_sampled():
-    section = {"discipline": "parallel", "service": "det:50ms", "faults": {"reset": {"at_ms": [500]}}}
-    section |= {"arrivals": {"process": "poisson", "rate_per_ms": [1.0, 0.0]}}
-    section |= {"chain": {"mu1_per_ms": 1e-9, "mu2_per_ms": 1e-9, "initial": "s1"}}
+    section = {
+        "arrivals": {"process": "poisson", "rate_per_ms": [1.0, 0.0]},
+        "discipline": "parallel",
+        "service": "det:50ms",
+        "chain": {"mu1_per_ms": 1e-9, "mu2_per_ms": 1e-9, "initial": "s1"},
+        "faults": {"reset": {"at_ms": [500]}},
+    }
     channel = Channel(channel_from_mapping(section), 0)
     subject = channel.link("cam00")
     sampled = subject.offer(0)[0]

@@ -71,17 +71,27 @@ class Browser(contextlib.AbstractContextManager):
         self._ids = itertools.count(1)
         self._profile = tempfile.mkdtemp(prefix="freshfield-browser-")
         self._socket: websocket.WebSocket | None = None
-        window = f"--window-size={width},{height}", f"--user-data-dir={self._profile}", "about:blank"
-        command, nothing = [chromium(), *FLAGS.split(), *window], subprocess.DEVNULL
-        self._process = subprocess.Popen(command, stdout=nothing, stderr=nothing, start_new_session=True)
+        self._process = subprocess.Popen(
+            [
+                chromium(),
+                *FLAGS.split(),
+                f"--window-size={width},{height}",
+                f"--user-data-dir={self._profile}",
+                "about:blank",
+            ],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
         try:
             address = wait_until(self._debugger, "the browser did not start", timeout_s)
             self._socket = websocket.create_connection(address, timeout=timeout_s, suppress_origin=True)
             for domain in ("Page", "Runtime", "Network", "Log"):
                 self.call(f"{domain}.enable")
             # The window's own decorations would eat into the size asked for.
-            size = {"width": width, "height": height, "deviceScaleFactor": 1}
-            self.call("Emulation.setDeviceMetricsOverride", **size, mobile=False)
+            self.call(
+                "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
+            )
             self.call("Page.navigate", url=url)
         except BaseException:
             self.close()

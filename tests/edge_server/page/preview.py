@@ -31,10 +31,16 @@ UPDATE_S = 0.8
 
 
 def bare_state(cameras: list[CameraView] | None = None) -> EdgeState:
-    refused = {"set_policy": MagicMock(side_effect=ValueError("no policies here"))}
-    refused["save_snapshot"] = MagicMock(side_effect=OSError("full"))
-    clock = {"start_ns": 0, "now_ns": time.monotonic_ns}
-    return EdgeState("bare", (), Controls("all", None), cameras=lambda: cameras or [], **clock, **refused)
+    return EdgeState(
+        scenario="bare",
+        policies=(),
+        controls=Controls("all", None),
+        cameras=lambda: cameras or [],
+        start_ns=0,
+        now_ns=time.monotonic_ns,
+        set_policy=MagicMock(side_effect=ValueError("no policies here")),
+        save_snapshot=MagicMock(side_effect=OSError("full")),
+    )
 
 
 def publication(number: int) -> Publication:

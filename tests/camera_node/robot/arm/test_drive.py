@@ -29,8 +29,13 @@ from freshfield.scenario import load
 from tests.camera_node.robot.arm.simulated import simulated_arm, start_cli, wait_until_moving, write_cell
 from tests.support import refused, wait_until
 
-PATH = {"azimuths_deg": [-150, -120], "elevations_deg": [60], "rolls_deg": [0]}
-PATH |= {"speed_rad_s": 3.0, "acceleration_rad_s2": 20.0}
+PATH = {
+    "azimuths_deg": [-150, -120],
+    "elevations_deg": [60],
+    "rolls_deg": [0],
+    "speed_rad_s": 3.0,
+    "acceleration_rad_s2": 20.0,
+}
 
 
 @pytest.fixture

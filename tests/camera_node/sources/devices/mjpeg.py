@@ -12,8 +12,17 @@ import numpy as np
 
 SIZE = (64, 48)
 BLOCKS = 8
-LENS = {"width": SIZE[0], "height": SIZE[1], "K": [[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]]}
-CALIBRATION = {"eye": LENS | {"R_world_to_cam": np.eye(3).tolist(), "t_world_to_cam": [0.0, 0.0, 1.0]}}
+
+
+CALIBRATION = {
+    "eye": {
+        "width": SIZE[0],
+        "height": SIZE[1],
+        "K": [[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]],
+        "R_world_to_cam": np.eye(3).tolist(),
+        "t_world_to_cam": [0.0, 0.0, 1.0],
+    }
+}
 
 
 def camera_file(folder: Path, device: str, **source: Any) -> Path:

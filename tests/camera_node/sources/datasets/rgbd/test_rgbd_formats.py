@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -102,7 +103,12 @@ def write_polycam(folder: Path) -> None:
         (folder / f"keyframes/cameras/{name}.json").write_text(json.dumps(entry))
 
 
-WRITERS = {"tum": write_tum, "sevenscenes": write_sevenscenes, "record3d": write_record3d, "polycam": write_polycam}
+WRITERS: dict[str, Callable[[Path], None]] = {
+    "tum": write_tum,
+    "sevenscenes": write_sevenscenes,
+    "record3d": write_record3d,
+    "polycam": write_polycam,
+}
 
 
 @pytest.mark.parametrize("name", WRITERS)
