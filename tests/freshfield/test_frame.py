@@ -101,8 +101,9 @@ def with_depth() -> pb.PushRequest:
 
 
 @pytest.mark.stability
-def test_each_refusal_has_its_reason():
-    for path, value, reason in (
+@pytest.mark.parametrize(
+    ("path", "value", "reason"),
+    [
         ("header.camera_id", "../../etc", "bad_id"),
         ("header.session_id", "s s", "bad_id"),
         ("header.codec", 99, "unknown_codec"),
@@ -126,11 +127,13 @@ def test_each_refusal_has_its_reason():
         ("depth.width", 9, "depth_size_mismatch"),
         ("depth.intrinsics.fx", math.nan, "depth_bad_intrinsics"),
         ("depth.to_camera.qw", 0.5, "depth_bad_pose"),
-    ):
-        request = with_depth()
-        setattr(*place(request, path), value)
-        found = refusal(request)
-        assert found.reason == reason and str(found).startswith("depth: ") == reason.startswith("depth_")
+    ],
+)
+def test_each_refusal_has_its_reason(path, value, reason):
+    request = with_depth()
+    setattr(*place(request, path), value)
+    found = refusal(request)
+    assert found.reason == reason and str(found).startswith("depth: ") == reason.startswith("depth_")
 
 
 @pytest.mark.stability

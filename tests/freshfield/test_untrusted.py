@@ -45,8 +45,9 @@ def test_an_alias_bomb_is_refused_at_once(text):
     tracemalloc.stop()
 
 
-def test_what_is_no_yaml_is_one_line():
-    for text, why in (
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
         ("[" * 10_000, "nested too deeply"),
         ("a: [1", "not YAML"),
         ("a: " + "9" * 5000, "not YAML"),
@@ -61,8 +62,11 @@ def test_what_is_no_yaml_is_one_line():
         ("{? [1]: a}", "unhashable key"),
         ("? !x [1]\n: 2", "not YAML"),
         ("{1: a, 1.0: b}", "the key '1.0' is there twice"),
-    ):
-        assert why in one_line(read_yaml, text)
+    ],
+    ids=lambda v: v[:12],
+)
+def test_what_is_no_yaml_is_one_line(text, why):
+    assert why in one_line(read_yaml, text)
 
 
 def test_nesting_costs_no_more_than_its_bound():
@@ -93,15 +97,19 @@ def test_numbers_are_those_of_yaml_1_2():
         assert read(yaml.dump(kept, Dumper=untrusted.YamlWriter)) == kept, "names stay words, numbers stay themselves"
 
 
-def test_what_is_no_json_is_one_line():
-    for text, why in (
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
         ('{"a": 1, "b": {"c": 1, "d": 2, "c": 1}}', "the key 'c' is there twice"),
         ("[" * 10**5, "nested too deeply"),
         ("{", "Expecting"),
         ("9" * 5000, "limit"),
-    ):
-        assert why in one_line(read_json, text)
-        assert read_json('{"a": [{"a": 1}, {"a": 2}]}') == {"a": [{"a": 1}, {"a": 2}]}
+    ],
+    ids=["twice", "deep", "cut", "long"],
+)
+def test_what_is_no_json_is_one_line(text, why):
+    assert why in one_line(read_json, text)
+    assert read_json('{"a": [{"a": 1}, {"a": 2}]}') == {"a": [{"a": 1}, {"a": 2}]}
 
 
 def test_a_wide_value_takes_no_more_than_itself():

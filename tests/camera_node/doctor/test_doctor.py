@@ -181,19 +181,23 @@ def test_right_depth_is_described():
 
 
 @pytest.mark.stability
-def test_wrong_depth_is_told_of_the_camera_that_has_it():
-    for change, told in (
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
         (lambda v: v.scaled(0.3048), "that of cam01 seems to be 0.305 times what it should be: is the unit wrong"),
         (lambda v: recounted(v, lambda c: np.where(c > 0, 3000, 0)), "nearly all of it is the same, 3 m"),
         (lambda v: recounted(v, np.zeros_like), "100% without depth: is the scene within the sensor's range"),
         (lambda v: recounted(v, lambda c: np.where(c > 0, 8000 - c, 0)), "are near and far exchanged"),
         (lambda v: recounted(v, lambda c: c[:, ::-1]), "is the pose, a lens"),
         (lambda v: replace(v, pose=POSE), "is the pose, a lens"),
-    ):
-        first, *others = rig()
-        lines = said([change(first), *others])
-        assert lines[0].startswith("WRONG") and told in lines[0], lines[0]
-        assert not any(line.startswith("WRONG") for line in lines[1:]), lines
+    ],
+    ids=["feet", "constant", "holes", "inverted", "mirrored", "nowhere"],
+)
+def test_wrong_depth_is_told_of_the_camera_that_has_it(change, told):
+    first, *others = rig()
+    lines = said([change(first), *others])
+    assert lines[0].startswith("WRONG") and told in lines[0], lines[0]
+    assert not any(line.startswith("WRONG") for line in lines[1:]), lines
 
 
 @pytest.mark.stability
@@ -243,10 +247,12 @@ def compared(found: np.ndarray) -> str:
 
 
 @pytest.mark.stability
-def test_poses_of_another_instant_are_said_with_their_delay():
-    for late_s, message in ((0.0, "move together"), (0.1, "some 1[0-9]{2} ms late"), (-0.2, "some 2[0-9]{2} ms early")):
-        with pytest.raises(ValueError, match=message) if late_s else nullcontext():
-            assert message in compared(poses(late_s))
+@pytest.mark.parametrize(
+    ("late_s", "message"), [(0.0, "move together"), (0.1, "some 1[0-9]{2} ms late"), (-0.2, "some 2[0-9]{2} ms early")]
+)
+def test_poses_of_another_instant_are_said_with_their_delay(late_s, message):
+    with pytest.raises(ValueError, match=message) if late_s else nullcontext():
+        assert message in compared(poses(late_s))
 
 
 @pytest.mark.stability

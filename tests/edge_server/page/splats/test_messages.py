@@ -64,8 +64,9 @@ def lying(block, *numbers):
 
 
 @pytest.mark.stability
-def test_a_message_that_lies_is_refused_and_loses_nothing():
-    for data in (
+@pytest.mark.parametrize(
+    "data",
+    [
         lying(SCENE, (0, 2)),  # another version
         lying(SCENE, (2, 0x7FC00000)),  # NaN
         lying(BLOCKS[1], (2, 21)),  # one more than there are
@@ -76,13 +77,15 @@ def test_a_message_that_lies_is_refused_and_loses_nothing():
         lying(BLOCKS[4], (1, 2**31)),
         messages.write_message(0, 0.0, []) + struct.pack("<II", messages.STATUS, 4) + b"[1] ",
         messages.write_message(0, float("nan"), []),
-    ):
-        reader = messages.StreamReader()
-        reader.read(messages.write_message(0, 0.0, [SCENE, messages.StaticBlock(1, 40, 0, SCALES, RECORDS)]))
-        before = reader.at(0.0)
-        refused(messages.MessageError, "", reader.read, data)
-        np.testing.assert_array_equal(reader.at(0.0), before)
-        assert len(before) == 40
+    ],
+)
+def test_a_message_that_lies_is_refused_and_loses_nothing(data):
+    reader = messages.StreamReader()
+    reader.read(messages.write_message(0, 0.0, [SCENE, messages.StaticBlock(1, 40, 0, SCALES, RECORDS)]))
+    before = reader.at(0.0)
+    refused(messages.MessageError, "", reader.read, data)
+    np.testing.assert_array_equal(reader.at(0.0), before)
+    assert len(before) == 40
 
 
 def test_displacements_are_those_of_the_motion():
