@@ -15,10 +15,12 @@ import posixpath
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
+from unittest import mock
 
 from camera_node.cli import main as camera_node
 from channel_emu.cli import main as channel_emu
 from edge_server.cli import main as edge_server
+from freshfield import plugins
 from freshfield_up import scenario_keys
 from freshfield_up.cli import main as freshfield
 
@@ -100,10 +102,12 @@ def scenario_page() -> str:
         "# Scenario keys\n\nWhat each section of a scenario file may say. `freshfield scenario keys SECTION` prints "
         "the same, and `freshfield scenario schema` the JSON Schema for editors. `make reference` writes this page.\n"
     ]
-    for section in scenario_keys.SECTIONS:
+    with mock.patch.object(plugins, "installed", lambda kind: []):  # only what is built in
+        texts = {section: scenario_keys.text(section) for section in scenario_keys.SECTIONS}
+    for section, text in texts.items():
         parts.append(f"\n## {section}\n")
-        table = False
-        for line in scenario_keys.text(section).splitlines():
+        table = begun = False
+        for line in text.splitlines():
             key = re.match(r" {4}(\S+) +(.*)", line)
             if key:
                 if not table:
@@ -111,10 +115,15 @@ def scenario_page() -> str:
                 about = key[2].replace("|", "\\|").replace("*", "\\*")
                 parts.append(f"| `{key[1]}` | {about} |")
             elif line and not line.startswith(" "):
-                parts.append("" if line == section else f"\n### `{line}`\n")
+                title = f"`{line}`" if "{" in line or "." in line else line
+                heading = f"\n### {title}\n" if begun or line != section else ""
+                parts.append(f"\n{line}\n" if "; " in line else heading)
             else:
-                parts.append(re.sub(r"^(?=[\w, ]+: )", "\n", line.strip()))  # what a docstring says of a key
+                words = line.strip()
+                told = re.match(r"[\w, ]+: ", words) and parts[-1].endswith((".", ")"))  # a docstring, of a key
+                parts.append(("\n" if told else "") + re.sub(r"^([+*-]) ", r"\\\1 ", words))
             table = key is not None
+            begun = begun or table
     return re.sub(r"\n{3,}", "\n\n", "\n".join([*parts, ""])).replace("``", "`")
 
 

@@ -96,8 +96,10 @@ class EdgeConfig(Settings, frozen=True):
     field: Annotated[str, about("the representation (edge_server.fields.registry)")] = FIELD
     field_options: Annotated[dict[str, Any], about("its settings")] = msgspec.field(default_factory=dict)
     policy: Annotated[PolicyConfig, about("which views an update uses")] = msgspec.field(default_factory=PolicyConfig)
-    updates: Literal["cycle", "arrivals"] = CYCLE["updates"]
-    update_ms: Annotated[float, within(LEAST_UPDATE_MS, LONGEST_MS, "fitting time of an update")] = CYCLE["update_ms"]
+    updates: Annotated[Literal["cycle", "arrivals"], about("by what cameras do, see above")] = CYCLE["updates"]
+    update_ms: Annotated[float, within(LEAST_UPDATE_MS, LONGEST_MS, "fitting time; by what cameras do, see above")] = (
+        CYCLE["update_ms"]
+    )
     frontier: Annotated[str | None, about("frontier.json of edge-server frontier, relative to the scenario")] = None
     steps: Annotated[int, within(1, 10_000_000, "optimizer steps of an update in virtual time")] = CYCLE["steps"]
     compute: Annotated[ComputeConfig, about("cost of an update in virtual time")] = msgspec.field(

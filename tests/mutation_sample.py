@@ -5,7 +5,7 @@
 cosmic-ray makes the edits (operators, comparisons, conditions, loops, numbers; those that change one by less than a
 fifth are left out); this draws a sample of them, spread over the files by lines, and runs for each the tests nearest
 to the file, for 40 processor seconds: those of its name, those beside them, those that import it, those above; then
-those of the documentation, which says keys, bounds and defaults. Slow tests are left out. Each edit is written into a
+those of the documentation, which says keys, bounds, defaults. Slow tests are left out. Each edit is written into a
 copy of the checkout, where nothing else is changed.
 
 (cosmic-ray by itself runs one command for every edit of a file, in the checkout; mutmut imports everything through

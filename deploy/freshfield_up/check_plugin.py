@@ -298,13 +298,13 @@ def source(name: str) -> Contract:
         scenario = parse(plugins.absolute(told, Path()), Path("check-plugin"))
         config = source_config(scenario)
         opened = open_sources(scenario, config, scenario.cameras)
-        return {name: Camera(made, config, ShotCache(0), depth_every=1) for name, made in opened.items()}
+        return {camera: Camera(each, config, ShotCache(0), depth_every=1) for camera, each in opened.items()}
 
     def use(made: Any, ticks: Any) -> Any:
         answers = {}
-        for tick, (name, camera) in itertools.product(ticks, made.items()):
+        for tick, (asked, camera) in itertools.product(ticks, made.items()):
             own = camera.source
-            expect(own.camera == name, "camera: not the one of the call")
+            expect(own.camera == asked, "camera: not the one of the call")
             right = isinstance(own.fps, Fraction) and FPS_RANGE[0] <= own.fps <= FPS_RANGE[1]
             expect(right, f"fps: expected a Fraction, {FPS_RANGE[0]} to {FPS_RANGE[1]:g}, got {own.fps!r}")
             expect(isinstance(own.intrinsics, Pinhole), "intrinsics: expected a freshfield.geometry.Pinhole")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import inspect
-from collections.abc import Callable, Iterable, Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from channel_emu.model import faults, presets
 from channel_emu.model.settings import NOTATIONS, ChannelConfig
 from freshfield import plugins
 from freshfield.scenario import Cameras, ScenarioFile
-from freshfield.settings import ScenarioError, Settings, bare_type, describe
+from freshfield.settings import ScenarioError, Settings, bare_type, describe, told_default
 
 REFERENCE = ":"
 """JSON Schema's pattern of FILE.py:CLASS and MODULE:CLASS, whose parameters no schema of ours knows."""
@@ -112,7 +113,7 @@ def _of_path(_: type) -> dict[str, Any]:
 
 
 def _cameras() -> Iterator[str]:
-    yield from describe(ScenarioFile, ("cameras", "source", "channel", "edge"))
+    yield from ("the scenario itself", "", *describe(ScenarioFile, ("cameras", "source", "channel", "edge")))
     yield from _described("cameras", Cameras)
 
 
@@ -122,8 +123,7 @@ def _source() -> Iterator[str]:
     shown: set[type] = set()
     for kind, model in _known("source", MODELS, _source_keys):
         parents = [p for p in reversed(model.__mro__[1:]) if issubclass(p, SourceConfig) and p is not SourceConfig]
-        yield from ("", *(f"  {line}" for p in parents for line in _doc(p)))
-        yield from _described(f"source: {{kind: {kind}, ...}}", model, common, shown)
+        yield from _described(f"source: {{kind: {kind}, ...}}", model, common, shown, parents)
 
 
 def _source_keys(kind: str) -> type[SourceConfig]:
@@ -137,8 +137,8 @@ def _effects() -> Iterator[str]:
 
 
 def _channel() -> Iterator[str]:
+    yield f"  presets: {', '.join(presets.PRESETS)} (channel-emu presets)"
     yield from _described("channel", ChannelConfig)
-    yield from ("", f"  presets: {', '.join(presets.PRESETS)} (channel-emu presets)")
 
 
 def _faults() -> Iterator[str]:
@@ -158,7 +158,9 @@ def _edge() -> Iterator[str]:
             yield from _described(title, model, shown=shown)
     for name in _field_options():
         yield from _field(name)
-    for name, _ in _known("policy", (), _policy_class):
+    from edge_server.scheduler import POLICIES
+
+    for name, _ in _known("policy", POLICIES, _policy_class):
         yield from _policy(name)
 
 
@@ -168,13 +170,15 @@ def _field(name: str) -> Iterator[str]:
     default = settings_of(name)
     yield from ("", f"edge.field_options of field {name}", "")
     for option, about in option_help(name).items():
-        yield f"    {option:22} default {getattr(default, option)!r}; {about}"
+        told = told_default(getattr(default, option), about)
+        yield f"    {option:22} {'; '.join(part for part in (told, about) if part)}"
 
 
 def _policy(name: str) -> Iterator[str]:
     found = _policy_class(name)
     yield from ("", f"edge.policy: {{name: {name}}}", "", *(f"  {line}".rstrip() for line in _doc(found)), "")
-    yield f"    {'value':22} " + (f"default {found.value!r}; {found.parameter}" if found.parameter else "it takes none")
+    about = f"{told_default(found.value, '')}; {found.parameter}" if found.parameter else "it takes none"
+    yield f"    {'value':22} {about}"
 
 
 def _policy_class(name: str) -> Any:
@@ -242,12 +246,20 @@ _NAMED: dict[str, Callable[[str], Iterator[str]]] = {
 
 
 def _described(
-    title: str, model: type[Settings], leave_out: tuple[str, ...] = (), shown: set[type] | None = None
+    title: str,
+    model: type[Settings],
+    leave_out: tuple[str, ...] = (),
+    shown: set[type] | None = None,
+    parents: Sequence[type[Settings]] = (),
 ) -> Iterator[str]:
-    """Title, docstring and keys of a struct, and of the structs within it that are not yet in ``shown``."""
+    """Title, docstrings and keys of a struct, and of the structs within it that are not yet in ``shown``.
+
+    parents: bases whose docstrings tell of some of its keys.
+    """
     shown = set() if shown is None else shown
     shown.add(model)
-    yield from ("", title, "", *(f"  {line}".rstrip() for line in _doc(model)), "", *describe(model, leave_out))
+    docs = [f"  {line}".rstrip() for each in (model, *parents) if _doc(each) for line in (*_doc(each), "")]
+    yield from ("", title, "", *(docs or [""]), *describe(model, leave_out))
     for field in msgspec.structs.fields(model):
         inner = bare_type(field.type)
         if isinstance(inner, type) and issubclass(inner, Settings) and inner not in shown:
@@ -255,4 +267,7 @@ def _described(
 
 
 def _doc(model: type) -> list[str]:
-    return (inspect.getdoc(model) or "").splitlines()
+    """Its own docstring; of a fault that has none the first line of its module's."""
+    module = sys.modules[model.__module__].__doc__ or ""
+    own = model.__dict__.get("__doc__") or (module.partition("\n")[0] if model.__name__ == "Params" else "")
+    return inspect.cleandoc(own).splitlines()

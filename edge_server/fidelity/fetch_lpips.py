@@ -46,7 +46,7 @@ def _fetch() -> tuple[dict[str, Any], dict[str, Any]]:
         raise FetchError(f"needs {error.name}: pip install 'freshfield[edge,lpips]'") from None
     except RuntimeError as error:  # torchvision's, built for another torch
         raise FetchError(
-            f"torchvision cannot be loaded ({error}): install it from the index of torch"
+            f"lpips or torchvision cannot be loaded ({error}): install it from the index of torch"
         ) from None
     file = Path(lpips.__file__).parent / "weights" / "v0.1" / "alex.pth"
     try:

@@ -11,6 +11,7 @@ in one line that names the file, the key and what was expected. ``describe`` lis
 from __future__ import annotations
 
 import difflib
+import json
 import math
 import re
 import typing
@@ -86,11 +87,18 @@ def describe(model: type[Settings], leave_out: tuple[str, ...] = ()) -> list[str
         elif field.default is msgspec.NODEFAULT:
             default = "empty"
         else:
-            default = "not given" if field.default in (None, "") else f"default {field.default!r}"
+            default = told_default(field.default, _help(field.type))
         allowed, text = _allowed(field.type), _help(field.type)
         about = "; ".join(part for part in (default, allowed, text) if part)
         lines.append(f"    {field.name:22} {about}")
     return lines
+
+
+def told_default(value: Any, text: str) -> str:
+    """A default in words, as a scenario file writes it; empty if the help ``text`` says what happens without one."""
+    if value in (None, "", ()):
+        return "" if "not given: " in text else "not given"
+    return f"default {value if isinstance(value, str) else json.dumps(msgspec.to_builtins(value, enc_hook=str))}"
 
 
 def _path(kind: type, value: Any) -> Any:
@@ -180,10 +188,14 @@ def _allowed(kind: Any) -> str:
     for meta in _metas(kind):
         low, high = (meta.gt if meta.ge is None else meta.ge), meta.le
         if low is not None and high is not None:
-            return f"{low:.10g} to {high:.10g}"
+            return f"{_bound(low)} to {_bound(high)}"
         if low is not None:
-            return f"{'more than' if meta.ge is None else 'at least'} {low:.10g}"
+            return f"{'more than' if meta.ge is None else 'at least'} {_bound(low)}"
     return ""
+
+
+def _bound(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:.10g}"
 
 
 def _help(kind: Any) -> str:

@@ -72,13 +72,15 @@ def test_an_image_installs_all_that_the_project_and_its_packages_ask_for(locks):
     assert ("torch" in locked) == ("edge" in locks)
 
 
-def test_an_image_installs_locked_wheels_and_the_project_alone():
-    for image, locks in (("camera", {"build", "camera"}), ("edge", {"build", "edge", "torch-$TORCH"})):
-        text = (ROOT / "deploy" / f"{image}.Dockerfile").read_text().replace("\\\n", " ")
-        installs = re.findall(r"pip install ([^\n&]*)", text)
-        assert len(installs) == 3 and all("--no-deps" in words for words in installs)
-        assert all(("--require-hashes" in words) != ("--no-index /dist/" in words) for words in installs)
-        assert set(re.findall(r"-r deploy/locks/(\S+)\.txt", text)) == locks
+@pytest.mark.parametrize(
+    ("image", "locks"), [("camera", {"build", "camera"}), ("edge", {"build", "edge", "torch-$TORCH"})]
+)
+def test_an_image_installs_locked_wheels_and_the_project_alone(image, locks):
+    text = (ROOT / "deploy" / f"{image}.Dockerfile").read_text().replace("\\\n", " ")
+    installs = re.findall(r"pip install ([^\n&]*)", text)
+    assert len(installs) == 3 and all("--no-deps" in words for words in installs)
+    assert all(("--require-hashes" in words) != ("--no-index /dist/" in words) for words in installs)
+    assert set(re.findall(r"-r deploy/locks/(\S+)\.txt", text)) == locks
     assert {Requirement(text).name for text in BUILD} <= LOCKS["build"].keys()
     assert "!deploy/locks" in (ROOT / ".dockerignore").read_text().splitlines()
 

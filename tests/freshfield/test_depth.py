@@ -121,7 +121,11 @@ def packed(*words: int, side: int = 4) -> EncodedDepth:
 
 
 @pytest.mark.stability
-def test_counts_outside_the_table_are_undecodable():
-    for depth in (packed(5, 1, 1, 1, 3, *[0] * 12), packed(5, 65535, *[1] * 15), packed(65535, 1, *[1] * 36, side=6)):
-        depth.check(Pinhole.from_fov(depth.width, depth.height, 60.0), 1)
-        assert refused(PayloadError, "", depth.decode).reason == "undecodable"
+@pytest.mark.parametrize(
+    "depth",
+    [packed(5, 1, 1, 1, 3, *[0] * 12), packed(5, 65535, *[1] * 15), packed(65535, 1, *[1] * 36, side=6)],
+    ids=["beyond the table", "far beyond the table", "a table beyond 16 bits"],
+)
+def test_counts_outside_the_table_are_undecodable(depth):
+    depth.check(Pinhole.from_fov(depth.width, depth.height, 60.0), 1)
+    assert refused(PayloadError, "", depth.decode).reason == "undecodable"

@@ -257,7 +257,8 @@ def _lens(d: dict[str, Any], image: Path, sizes: dict[str, tuple[int, int]], cam
                 "and h, the size that fl_x and cx belong to"
             )
     fx, fy = _focal(d, "x", width, where), _focal(d, "y", height, where)
-    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    fx = fy if fx is None else fx
+    fy = fx if fy is None else fy
     if fx is None or fy is None:
         raise DatasetError(f"{where}: neither 'fl_x' nor 'camera_angle_x' is given")
     if width < 1 or height < 1 or not (fx > 0 and fy > 0):

@@ -13,7 +13,7 @@ Probability = Annotated[float, within(0.0, 1.0, "of each frame")]
 
 
 class Params(Settings, frozen=True):
-    """Parameters of a ``ChanceFault``.
+    """A fault that hits each frame with a probability.
 
     probability: one number, or one for each chain state in which transmission may start (for losses, the
         Gilbert-Elliott model).

@@ -46,24 +46,24 @@ class FieldSettings(Settings, frozen=True):
 
     center_m: Annotated[
         tuple[float, float, float] | None,
-        about("center of the scene's box, x y z in meters; None: found from the cameras"),
+        about("center of the scene's box, x y z in meters; not given: found from the cameras"),
     ] = None
     radius_m: Annotated[
         Annotated[float, Meta(gt=0)] | None,
-        about("half the side of the scene's box, meters; None: found from the cameras"),
+        about("half the side of the scene's box, meters; not given: found from the cameras"),
     ] = None
     near_m: Annotated[
         Annotated[float, Meta(gt=0)] | None,
-        about("near plane, meters: nothing closer to a camera is rendered; None: found from the cameras"),
+        about("near plane, meters: nothing closer to a camera is rendered; not given: found from the cameras"),
     ] = None
     contracted: Annotated[
-        bool | None, about("whether the scene extends beyond its box (rooms, outdoors); None: found from the cameras")
+        bool | None, about("whether the scene goes on beyond its box (rooms, outdoors); not given: found from cameras")
     ] = None
     background: Annotated[str, about("auto (plain, or the mean color), white, black, or '#rrggbb'")] = "auto"
     seed: Annotated[int, within(0, (1 << 63) - 1, "seed of initial values and of all sampling")] = 0
     threads: Annotated[
         Annotated[int, Meta(ge=1, le=1024)] | None,
-        about("worker threads; results do not depend on it. None: $FRESHFIELD_THREADS, or one a core, at most 8"),
+        about("worker threads; results do not depend on it; not given: $FRESHFIELD_THREADS, or one a core, at most 8"),
     ] = None
     nice: Annotated[int, within(0, 19, "niceness added to worker threads (Linux); in a server 5")] = 0
     min_views: int = 2

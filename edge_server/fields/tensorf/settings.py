@@ -24,7 +24,7 @@ class TensorfSettings(TrainerSettings, frozen=True):
 
     resolution: Annotated[
         Annotated[int, Meta(ge=4, le=1024)] | None,
-        about("vertices a side in the end; None: about a pixel, 256 at most"),
+        about("vertices a side in the end; not given: about a pixel, 256 at most"),
     ] = None
     density_rank: int = 8
     color_rank: int = 16

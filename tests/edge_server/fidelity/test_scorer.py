@@ -310,20 +310,23 @@ def test_torn_and_wrong_weights_give_a_reason_and_no_metric(tmp_path):
     assert lpips is None and "[64]" in reason and "[64, 192, 384, 256, 256]" in reason
 
 
-def test_the_command_says_where_it_wrote_what_it_fetched_or_what_is_wrong(tmp_path, monkeypatch, capsys):
-    published = [dict(np.load(data_dir("lpips") / name)) for name in FILES]
-    features = {name.removeprefix("features."): array for name, array in published[0].items()}
-    lins = {f"{name}.model.1.weight": array.reshape(1, -1, 1, 1) for name, array in published[1].items()}
-    refused(FetchError, "cannot be used", convert, {k: v for k, v in features.items() if k != "3.bias"}, lins, tmp_path)
+def test_what_the_command_lacks_is_one_line(tmp_path, monkeypatch, capsys):
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "lpips", None)
         needs = "needs lpips: pip install 'freshfield[edge,lpips]'"
         assert needs in refusal(capsys, edge_server, "fetch-lpips", "--out", tmp_path)
-    with monkeypatch.context() as unfit:
-        (tmp_path / "lpips.py").write_text("raise RuntimeError('operator torchvision::nms does not exist')")
-        unfit.syspath_prepend(tmp_path)
-        said = refusal(capsys, edge_server, "fetch-lpips", "--out", tmp_path)
-        assert "nms does not exist): install it from the index of torch" in said
+    (tmp_path / "lpips.py").write_text("raise RuntimeError('operator torchvision::nms does not exist')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "lpips", raising=False)
+    said = refusal(capsys, edge_server, "fetch-lpips", "--out", tmp_path)
+    assert "nms does not exist): install it from the index of torch" in said
+
+
+def test_the_command_says_where_it_wrote_what_it_fetched(tmp_path, monkeypatch, capsys):
+    published = [dict(np.load(data_dir("lpips") / name)) for name in FILES]
+    features = {name.removeprefix("features."): array for name, array in published[0].items()}
+    lins = {f"{name}.model.1.weight": array.reshape(1, -1, 1, 1) for name, array in published[1].items()}
+    refused(FetchError, "cannot be used", convert, {k: v for k, v in features.items() if k != "3.bias"}, lins, tmp_path)
     monkeypatch.setattr(fetch_lpips, "_fetch", lambda: (features, lins))
     assert edge_server(["fetch-lpips", "--out", str(tmp_path)]) == 0
     assert capsys.readouterr().out.split() == [str(tmp_path / name) for name in FILES]

@@ -32,7 +32,7 @@ def test_warm_up_compiles_what_is_used(words: list[str], expected: list[tuple[ty
     assert found == expected
 
 
-def test_a_kernel_goes_by_its_function_s_name() -> None:
+def test_a_kernel_has_its_function_s_name_place_and_docstring() -> None:
     found = train_chunks.py_func
     assert (found.__module__, found.__qualname__) == ("edge_server.fields.common.kernels.train", "train_chunks")
     assert found.__doc__.startswith("Tasks are chunks.")

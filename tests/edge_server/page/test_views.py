@@ -73,10 +73,13 @@ def test_truth_and_rendering_are_as_large_as_they_fit(size, beside):
     assert error[size[1] // 2, size[0] // 2] == pytest.approx(4 * 5 / 255, abs=1e-3)
 
 
+def test_colors_are_of_256_levels():
+    assert all(0 <= part <= 255 for color in vars(colors).values() if isinstance(color, tuple) for part in color)
+
+
 def test_ends_and_middle_of_the_scale():
     assert age_color(0.0) == age_color(FRESH_MS) == FRESH
     assert age_color(STALE_MS) == age_color(1e9) == STALE
-    assert all(0 <= part <= 255 for color in vars(colors).values() if isinstance(color, tuple) for part in color)
     assert age_color(math.sqrt(FRESH_MS * STALE_MS)) == MIDDLE
     assert age_color(-30.0) == FRESH  # a clock a little ahead
     assert (age_color(None), age_color(float("nan")), age_color(float("inf"))) == (UNKNOWN, STALE, STALE)

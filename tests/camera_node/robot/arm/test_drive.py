@@ -12,7 +12,6 @@ import time
 import numpy as np
 import pytest
 
-from camera_node.cli import main
 from camera_node.clocks import ArrivalClock
 from camera_node.pose.providers import PoseGapError
 from camera_node.robot.arm import ArmError
@@ -138,21 +137,22 @@ def test_signals_end_a_motion_and_a_closed_terminal_too_unless_it_is_ignored(und
             signal.signal(number, handler)
 
 
-def test_a_real_arm_is_asked_about_first_and_not_driven_through_half_the_bench(cell, capfd):
+def test_a_real_arm_is_asked_about_first_and_not_driven_through_half_the_bench(cell):
     file, host = cell
     stands_deg, joints = near(file)
-    words = ["drive-arm", str(real(cell)), "--rounds", "1"]
     with simulated_arm(host, joints):
-        assert main(words) == 2
-        out, said = capfd.readouterr()
-        assert "say that its space is clear with --yes" in said
+        process = start_cli("drive-arm", real(cell))
+        out, said = process.communicate(timeout=20)
+        assert process.returncode == 2 and "say that its space is clear with --yes" in said
         now = TruthClient(host).joints(WallClock().now_ns())
         assert np.allclose(now, np.deg2rad(stands_deg), atol=1e-4)
         # Before the question, and from the nearest viewpoint on.
         first_deg = np.abs(shown(out)[0] - stands_deg).max()
         assert f"the first move turns a joint by {first_deg:.0f}" in out and 0 < first_deg <= 30.01
     with simulated_arm(host, "--joints=-20,-90,90,-90,90,0"):
-        assert main([*words, "--yes"]) == 2 and "the first move would turn a joint by" in capfd.readouterr().err
+        process = start_cli("drive-arm", real(cell), "--yes")
+        said = process.communicate(timeout=20)[1]
+        assert process.returncode == 2 and "the first move would turn a joint by" in said
 
 
 WITHIN_S = 20.0  # of a busy machine; what is waited for takes a fraction of it

@@ -144,15 +144,18 @@ def of_turns(turns, noise=(0.002, 0.0005)) -> Samples:
 
 
 @pytest.mark.stability
-def test_degenerate_motions_are_refused_with_the_reason():
-    for turns, reason in (
+@pytest.mark.parametrize(
+    ("turns", "reason"),
+    [
         ([[0.02 * (-1) ** k, 0.01 * k, 0.3 * k] for k in range(8)], "parallel axes"),
         ([np.eye(3)[k % 3] * 0.035 * (k // 3) for k in range(6)], "hardly turned"),
         ([[0, 0, 0], [np.pi, 0, 0], [0, np.pi, 0], [0, 0, np.pi]], "near 180 degrees"),
         ([[0, 0, 0], [0.5, 0.5, 0]], "too few poses: 2"),
         ([], "too few poses: 0"),
-    ):
-        refused(CalibrationError, reason, calibrate, of_turns(turns))
+    ],
+)
+def test_degenerate_motions_are_refused_with_the_reason(turns, reason):
+    refused(CalibrationError, reason, calibrate, of_turns(turns))
 
 
 @pytest.mark.stability
@@ -225,21 +228,23 @@ def test_nonsense_is_refused_and_not_an_answer():
         refused(CalibrationError, f"{what} seem to be in millimeters", calibrate, samples)
 
 
-def test_a_printed_target_measures_what_is_said(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("spec", "size"), [("charuco:7x5:30mm:22mm", "210.0 x 150.0"), ("chessboard:9x6:10mm", "100.0 x 70.0")]
+)
+def test_a_printed_target_measures_what_is_said(spec, size, tmp_path, capsys):
     """Also where a square is not whole pixels."""
-    for spec, size in (("charuco:7x5:30mm:22mm", "210.0 x 150.0"), ("chessboard:9x6:10mm", "100.0 x 70.0")):
-        file = tmp_path / "board.png"
-        assert main(["calibrate", "target", spec, "--out", str(file), "--dpi", "200"]) == 0
-        assert f"it must measure {size} mm" in capsys.readouterr().out
-        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        width = round(parse_target(spec).size_m[0] / 0.0254 * 200)
-        assert image.shape[1] == width + 2 * (width // 10), "a white border of a tenth"
-        corners = parse_target(spec).find(image)
-        # Pixels a meter, over the whole target: what --dpi says.
-        pixels = np.ptp(corners.pixels[:, 0]) / np.ptp(corners.points[:, 0])
-        assert pixels == pytest.approx(200 / 0.0254, rel=0.001)
-        words = ["calibrate", "target", spec, "--out", file, "--dpi", "nan"]
-        assert "--dpi: makes a picture nan pixels wide" in refusal(capsys, main, *words)
+    file = tmp_path / "board.png"
+    assert main(["calibrate", "target", spec, "--out", str(file), "--dpi", "200"]) == 0
+    assert f"it must measure {size} mm" in capsys.readouterr().out
+    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    width = round(parse_target(spec).size_m[0] / 0.0254 * 200)
+    assert image.shape[1] == width + 2 * (width // 10), "a white border of a tenth"
+    corners = parse_target(spec).find(image)
+    # Pixels a meter, over the whole target: what --dpi says.
+    pixels = np.ptp(corners.pixels[:, 0]) / np.ptp(corners.points[:, 0])
+    assert pixels == pytest.approx(200 / 0.0254, rel=0.001)
+    words = ["calibrate", "target", spec, "--out", file, "--dpi", "nan"]
+    assert "--dpi: makes a picture nan pixels wide" in refusal(capsys, main, *words)
 
 
 FLANGES = np.array([se3(so3_exp([0.1 * k, 0.2, -0.3]), [0.1, 0.2 * k, 0.3]) for k in range(3)])

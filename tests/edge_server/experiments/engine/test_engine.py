@@ -76,11 +76,12 @@ def test_what_is_known_is_not_computed_again_and_one_key_is_computed_once(tmp_pa
     assert line["inputs"] == {"seed": 0, "size": 100, "scene": "room"} and line["result"] == os.getpid()
 
 
-def test_after_an_error_the_file_has_what_was_finished(tmp_path):
-    with pytest.raises(ValueError, match="seed 3 cannot"), opened(tmp_path / "r.jsonl") as engine:
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_after_an_error_the_file_has_what_was_finished(jobs, tmp_path):
+    with pytest.raises(ValueError, match="seed 3 cannot"), opened(tmp_path / "r.jsonl", jobs=jobs) as engine:
         engine.run(fail, [Point(seed) for seed in range(4)])
     kept = [json.loads(line)["result"] for line in (tmp_path / "r.jsonl").read_text().splitlines()]
-    assert kept == [0, 1, 2]
+    assert set(kept) <= {0, 1, 2} and (jobs == 2 or kept == [0, 1, 2])
 
 
 PARENT = """
