@@ -254,9 +254,9 @@ def test_without_depth_it_is_said_that_poses_have_no_rotation(turns: bool) -> No
 @pytest.mark.stability
 def test_without_depth_any_unit_of_poses_is_as_good() -> None:
     """With a distance that was guessed in meters, poses in millimeters ended 10 dB lower."""
-    views = [_in_unit(1000.0)(k, view) for k, view in enumerate(walk(depth=False)[:20])]
+    views = [_in_unit(1000.0)(k, view) for k, view in enumerate(walk(depth=False)[:30])]
     field = carried.played(views)
-    assert carried.scored_db(field, views)[1] > carried.begun(False)[1][0] - 1.0
+    assert carried.scored_db(field, views)[1] > carried.begun(False)[1][1] - 1.0
     assert not any("tell no depth" in line or "hand-eye" in line for line in field.troubles)
 
 
