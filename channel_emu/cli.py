@@ -107,7 +107,7 @@ def _serve(
     failed."""
     from channel_emu.live.priority import raise_priority, return_freed_memory
     from channel_emu.live.proxy import EmulatorFailed, ProxyOptions
-    from channel_emu.live.settings import SWITCH_INTERVAL_S
+    from channel_emu.live.tuned_numbers import SWITCH_INTERVAL_S
     from channel_emu.model import trace
 
     chosen = ProxyOptions(

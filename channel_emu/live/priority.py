@@ -13,7 +13,7 @@ import ctypes
 import os
 import platform
 
-from channel_emu.live.settings import SLICE_NS
+from channel_emu.live.tuned_numbers import SLICE_NS
 
 _SYS_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 _M_MMAP_THRESHOLD = -3

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from freshfield.transport import add_arguments, from_arguments
 from freshfield_up.net import is_serving
-from freshfield_up.settings import FRESH_S
+from freshfield_up.tuned_numbers import FRESH_S
 
 
 def is_fresh(folder: Path, camera: str | None) -> bool:

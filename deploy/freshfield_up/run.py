@@ -19,7 +19,7 @@ from freshfield.files import read_status
 from freshfield.machine_load import LoadMeter
 from freshfield.scenario import Scenario
 from freshfield_up import console, folder, net
-from freshfield_up import settings as tuned
+from freshfield_up import tuned_numbers as tuned
 from freshfield_up.commands import Options, ProcessSet, process_set, program
 from freshfield_up.processes import Child, kill, stop
 from freshfield_up.status import status_line, summarize

@@ -11,7 +11,7 @@ from edge_server.command import command_parser, run_command
 from edge_server.export import ExportError
 from edge_server.export.exporter import KINDS, Exporter, check
 from edge_server.export.run_source import open_source
-from edge_server.export.settings import POINTS
+from edge_server.export.tuned_numbers import POINTS
 from edge_server.progress import ProgressLine
 from edge_server.surface import SurfaceError
 from edge_server.surface.settings import MeshSettings

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.export import ExportError
-from edge_server.export.settings import JPEG_QUALITY
+from edge_server.export.tuned_numbers import JPEG_QUALITY
 from edge_server.fidelity.images import to_bytes
 from edge_server.fields import View
 

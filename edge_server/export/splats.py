@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edge_server.export import ExportError
 from edge_server.export.ply import write_table
-from edge_server.export.settings import SPZ_BITS, SPZ_WHOLE_BITS
+from edge_server.export.tuned_numbers import SPZ_BITS, SPZ_WHOLE_BITS
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSITION, QUATERNION, SCALE, Gaussians
 from edge_server.fields.splat.planar import unit_quaternions

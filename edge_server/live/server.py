@@ -25,7 +25,7 @@ from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.common.threads.thread_pool import SERVER_NICE
 from edge_server.fields.registry import make_field
-from edge_server.live import settings as tuned
+from edge_server.live import tuned_numbers as tuned
 from edge_server.live.field_updater import open_updater
 from edge_server.live.frontier import open_frontier
 from edge_server.live.grpc_services import GrpcThread

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.page.settings import FRESH_MS, STALE_MS
+from edge_server.page.tuned_numbers import FRESH_MS, STALE_MS
 
 RGB = tuple[int, int, int]
 

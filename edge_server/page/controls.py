@@ -18,7 +18,7 @@ import viser
 from edge_server.live.state import EdgeState
 from edge_server.page.markup import frontier, html
 from edge_server.page.rendering import RenderLoop
-from edge_server.page.settings import NOTICE_S
+from edge_server.page.tuned_numbers import NOTICE_S
 from edge_server.page.views import ERROR, HINT, PICTURE, TRUTH, VIEWS
 from edge_server.scheduler import make_policy, policy_help, short_name
 

@@ -17,7 +17,7 @@ import viser
 
 from edge_server.page.controls import notify
 from edge_server.page.markup import html
-from edge_server.page.settings import ANSWER_S, MAX_SLIDER_DELAY_MS, NETWORKS, SLIDER_SETTLES_S, STATUS_LAG_S
+from edge_server.page.tuned_numbers import ANSWER_S, MAX_SLIDER_DELAY_MS, NETWORKS, SLIDER_SETTLES_S, STATUS_LAG_S
 from freshfield.transport import Transport, peer_text
 from freshfield.v1 import channel_pb2, channel_pb2_grpc
 

@@ -17,8 +17,8 @@ from edge_server.page.diagnosis import poor_picture
 from edge_server.page.markup import html
 from edge_server.page.network_control import EmulatorControl, NetworkControl
 from edge_server.page.rendering import browser_image
-from edge_server.page.settings import AGE_PARTS_OF, LEAST_SCENE_PX, POSE_NOISE
 from edge_server.page.timelines import History, Timelines
+from edge_server.page.tuned_numbers import AGE_PARTS_OF, LEAST_SCENE_PX, POSE_NOISE
 from edge_server.run_records import age_parts_ms
 from freshfield import coverage
 

@@ -14,7 +14,7 @@ from edge_server.fidelity.scorer import fidelity_title
 from edge_server.live.state import CameraView, Publication
 from edge_server.page.colors import FRESH, HELD_OUT, MIDDLE, RGB, STALE, UNKNOWN, css
 from edge_server.page.markup import chart_caption
-from edge_server.page.settings import WINDOW_S
+from edge_server.page.tuned_numbers import WINDOW_S
 
 LINE_PX = 1.6
 # More points than the chart has pixels would be sent but not seen.

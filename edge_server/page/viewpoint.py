@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edge_server.page.settings import ABOVE_CAMERAS_DEG, DISTANCE, ELEVATION_DEG
+from edge_server.page.tuned_numbers import ABOVE_CAMERAS_DEG, DISTANCE, ELEVATION_DEG
 from freshfield.geometry import Pinhole, converging_point, quaternion_to_matrix, world_up
 
 Array = NDArray[np.float64]

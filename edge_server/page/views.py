@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edge_server.fields import Rendering
 from edge_server.live.state import CameraView, Comparison
 from edge_server.page.colors import UNKNOWN, age_colors
-from edge_server.page.settings import AGE_VIEW_LIGHT, AGE_VIEW_STEP, ERROR_GAIN, LABEL_PX, SOLID
+from edge_server.page.tuned_numbers import AGE_VIEW_LIGHT, AGE_VIEW_STEP, ERROR_GAIN, LABEL_PX, SOLID
 from freshfield.geometry import Pinhole, seen_from, world_rays
 
 PICTURE, DEPTH, AGE, TRUTH, ERROR = "picture", "depth", "age", "truth | picture", "error"

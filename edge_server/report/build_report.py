@@ -15,7 +15,7 @@ from edge_server.report.conclusion import conclusion
 from edge_server.report.events import events
 from edge_server.report.frame_accounting import account_frames
 from edge_server.report.run_files import RunFiles, read_run_files
-from edge_server.report.settings import FINAL_SHARE
+from edge_server.report.tuned_numbers import FINAL_SHARE
 from edge_server.run_records import (
     AgesRow,
     Baseline,

@@ -7,7 +7,7 @@ from itertools import groupby
 from typing import Any
 
 from edge_server.report.run_files import RunFiles
-from edge_server.report.settings import MOST_EVENTS, SILENT_MS, TOGETHER_S
+from edge_server.report.tuned_numbers import MOST_EVENTS, SILENT_MS, TOGETHER_S
 from edge_server.run_records import AgesRow, ChannelChange, Event
 
 _NAMED = 3  # cameras in a line

@@ -40,7 +40,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from edge_server.report.settings import CUT_OFF_NS
+from edge_server.report.tuned_numbers import CUT_OFF_NS
 from freshfield.ledger import LedgerReader
 
 # Ends that the emulator's link gives a frame. ``broken`` is not one: a later process may know better.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import Candidates
-from edge_server.viewpoints.settings import LIKENESS_RAD
+from edge_server.viewpoints.tuned_numbers import LIKENESS_RAD
 
 Array = NDArray[np.float64]
 

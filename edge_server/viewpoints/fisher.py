@@ -19,7 +19,7 @@ from edge_server.fields.splat.kernels.rasterize import Targets
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.registry import CaptureState
-from edge_server.viewpoints.settings import PRIOR, RANDOM_IMAGES
+from edge_server.viewpoints.tuned_numbers import PRIOR, RANDOM_IMAGES
 from freshfield.geometry import Pinhole
 
 

@@ -9,7 +9,8 @@ from concurrent import futures
 import grpc
 import pytest
 
-from channel_emu.live import call_flow, proxy, settings
+from channel_emu.live import call_flow, proxy
+from channel_emu.live import tuned_numbers as tuned
 from channel_emu.testing import EmulatedLink, channel
 from tests.support import refused, wait_until
 
@@ -191,7 +192,7 @@ def test_damage_and_doubles(channel, greeter):
 
 
 def test_methods_that_a_client_invents_share_one_link(channel, greeter, monkeypatch):
-    monkeypatch.setattr(settings, "MOST_METHODS", 2)
+    monkeypatch.setattr(tuned, "MOST_METHODS", 2)
     link = channel("ideal", to=greeter.address)
     for n in range(5):
         code_of(client(link).unary_unary(f"/a.B/C{n}"), b"")  # the service has none of them

@@ -16,7 +16,7 @@ import numpy as np
 
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.joint_states import ArmStream, probe
-from camera_node.robot.arm.settings import CONTROL_S, SIMULATED_STALE_S, STALE_S, STOPPING_S
+from camera_node.robot.arm.tuned_numbers import CONTROL_S, SIMULATED_STALE_S, STALE_S, STOPPING_S
 from camera_node.settings import ArmConfig
 from freshfield.clock import WallClock
 

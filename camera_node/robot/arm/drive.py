@@ -28,7 +28,7 @@ from camera_node.robot.arm.control import (
     stop_within_timeout,
 )
 from camera_node.robot.arm.joint_states import ArmStream
-from camera_node.robot.arm.settings import (
+from camera_node.robot.arm.tuned_numbers import (
     ARRIVED_RAD,
     FARTHEST_RAD,
     MOVED_RAD,

@@ -28,7 +28,7 @@ from camera_node.pose.providers import PoseGapError
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.arm.rtde_process import SAMPLE
-from camera_node.robot.arm.settings import BACKOFF_S, CONNECT_S, PROBE_S, STALE_S
+from camera_node.robot.arm.tuned_numbers import BACKOFF_S, CONNECT_S, PROBE_S, STALE_S
 from freshfield.clock import Clock
 from freshfield.geometry import Array, Pose
 

@@ -16,7 +16,7 @@ import struct
 import sys
 import time
 
-from camera_node.robot.arm.settings import CONNECT_S
+from camera_node.robot.arm.tuned_numbers import CONNECT_S
 
 SAMPLE = struct.Struct("<d6d2i")
 """Controller's time in seconds, six joint angles in radians, robot mode, safety mode."""

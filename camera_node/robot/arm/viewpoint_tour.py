@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.arm.settings import CHECKED_POSTURES, FARTHEST_RAD, MARGIN_M, TOOL_M, TOOL_RADIUS_M
+from camera_node.robot.arm.tuned_numbers import CHECKED_POSTURES, FARTHEST_RAD, MARGIN_M, TOOL_M, TOOL_RADIUS_M
 from camera_node.settings import PathConfig
 from freshfield.geometry import Array, on_sphere, se3, se3_inverse, so3_exp
 

@@ -27,7 +27,8 @@ from camera_node.robot.calibration.hand_eye.samples import (
     diversity,
     rotation_vectors,
 )
-from camera_node.robot.calibration.settings import (
+from camera_node.robot.calibration.targets import WHICH_PRINT, Target, estimate_pose, to_gray
+from camera_node.robot.calibration.tuned_numbers import (
     EXPLAIN_EVERY,
     GOOD_MM,
     GOOD_POSES,
@@ -37,7 +38,6 @@ from camera_node.robot.calibration.settings import (
     STILL_DEG,
     STILL_MM,
 )
-from camera_node.robot.calibration.targets import WHICH_PRINT, Target, estimate_pose, to_gray
 from camera_node.settings import ArmConfig, source_config
 from camera_node.sources.base import Source, pixels
 from camera_node.sources.devices.feed import Image

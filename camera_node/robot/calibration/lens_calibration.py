@@ -11,7 +11,8 @@ import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array
-from camera_node.robot.calibration.settings import (
+from camera_node.robot.calibration.targets import Corners
+from camera_node.robot.calibration.tuned_numbers import (
     LONGEST_FOCAL,
     MIN_CORNERS,
     MIN_TILT_DEG,
@@ -19,7 +20,6 @@ from camera_node.robot.calibration.settings import (
     OUTLIER_ERROR,
     SHORTEST_FOCAL,
 )
-from camera_node.robot.calibration.targets import Corners
 from camera_node.sources.rig_calibration import calibration_entry
 from freshfield.geometry import Pinhole
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.settings import AMBIGUOUS, MIN_CORNERS, MIN_MARKERS
+from camera_node.robot.calibration.tuned_numbers import AMBIGUOUS, MIN_CORNERS, MIN_MARKERS
 from freshfield.geometry import Array, Pinhole, se3
 
 GrayImage = NDArray[np.uint8]

@@ -12,7 +12,7 @@ from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.control import connect_control, joints_in_motion, stop_within_timeout
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.arm.settings import STOP_RAD_S2
+from camera_node.robot.arm.tuned_numbers import STOP_RAD_S2
 from camera_node.robot.teleop.settings import LOOKAHEAD_S, MAX_LAG_RAD, SERVO_GAIN
 from camera_node.robot.teleop.teleoperator import Command
 

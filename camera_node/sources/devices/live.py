@@ -21,7 +21,7 @@ from camera_node.settings import LiveConfig, beside
 from camera_node.sources.base import Shot, Source, rate
 from camera_node.sources.devices.feed import CameraError, Feed, Image, as_camera_error
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
-from camera_node.sources.settings import LIVE_FPS, REOPEN_AFTER_S
+from camera_node.sources.tuned_numbers import LIVE_FPS, REOPEN_AFTER_S
 from freshfield.clock import Clock, WallClock
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose

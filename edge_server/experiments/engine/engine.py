@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import cv2
 
 from edge_server.experiments.engine.content_key import plain, result_key, surroundings
-from edge_server.experiments.engine.settings import BATCH, PARENT_EVERY_S, RETRIES
+from edge_server.experiments.engine.tuned_numbers import BATCH, PARENT_EVERY_S, RETRIES
 from edge_server.fields.common.threads.thread_pool import MOST_USEFUL, THREADS_VARIABLE
 from edge_server.progress import ProgressLine
 from freshfield.files import Lines

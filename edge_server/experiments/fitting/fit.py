@@ -28,7 +28,7 @@ from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Scorer
 from edge_server.fields import Budget, FitReport, RefinesCameras, checkpoint
 from edge_server.fields.registry import FIELD, make_field, option_help
-from edge_server.fields.splat.carried_camera.settings import scan_options
+from edge_server.fields.splat.carried_camera.tuned_numbers import scan_options
 from edge_server.machine import run_facts
 from edge_server.run_records import UpdateRow
 from freshfield.files import write_json

@@ -27,7 +27,7 @@ from edge_server.experiments.frontier.update_time import (
     field_label,
     variants,
 )
-from edge_server.experiments.settings import LAYERS_S
+from edge_server.experiments.tuned_numbers import LAYERS_S
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import FIELD, field_names, make_field
 from edge_server.machine import machine, versions

@@ -22,7 +22,7 @@ from edge_server.experiments.common.tables import mean_or_none, over_seeds
 from edge_server.experiments.rollouts.episode import EpisodeFactory
 from edge_server.experiments.rollouts.rollout import named, rollout
 from edge_server.experiments.rollouts.setting import Setting
-from edge_server.experiments.settings import COSTS_S, LEAD_S, STATIC_STEPS_PER_S
+from edge_server.experiments.tuned_numbers import COSTS_S, LEAD_S, STATIC_STEPS_PER_S
 from edge_server.experiments.virtual import costs
 from edge_server.fields.registry import option_help
 from edge_server.settings import LEAST_UPDATE_MS, ComputeConfig

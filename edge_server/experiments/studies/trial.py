@@ -20,8 +20,8 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.rollouts.episode import Stage, open_stage
-from edge_server.experiments.studies.settings import SHOWN_INSTANTS, STAGGER_MS
 from edge_server.experiments.studies.study import StudyError, StudyRequest, open_engine
+from edge_server.experiments.studies.tuned_numbers import SHOWN_INSTANTS, STAGGER_MS
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment

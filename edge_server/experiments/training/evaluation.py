@@ -17,7 +17,7 @@ from edge_server.experiments.engine import Engine
 from edge_server.experiments.rollouts.episode import Outcome, mean_outcome
 from edge_server.experiments.rollouts.rollout import run_rollouts
 from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting
-from edge_server.experiments.settings import FITS
+from edge_server.experiments.tuned_numbers import FITS
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.rewards import Reward
 

@@ -14,9 +14,9 @@ from edge_server.experiments.common.arguments import add_folders, add_workers, f
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.engine import EngineError
 from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
-from edge_server.experiments.settings import QUICK_SPLAT
 from edge_server.experiments.training.learning_curve import draw_curve
 from edge_server.experiments.training.trainer import TrainingConfig, TrainingError, read_log, train
+from edge_server.experiments.tuned_numbers import QUICK_SPLAT
 from edge_server.scheduler import BANDIT, STATE_PARTS
 from edge_server.scheduler.learned.rewards import REWARDS
 from edge_server.scheduler.learned.settings import ACTIONS, Spec

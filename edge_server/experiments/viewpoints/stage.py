@@ -16,7 +16,7 @@ from camera_node.synthetic.scene import Scene
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
 from edge_server.experiments.scenes.multiview_still import WHITE, known_options, score_views
 from edge_server.experiments.scenes.recorded import load_recorded
-from edge_server.experiments.settings import HELD_OUT
+from edge_server.experiments.tuned_numbers import HELD_OUT
 from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.fidelity.images import BLACK, Color, to_bytes, to_unit
 from edge_server.fidelity.scorer import Score, Scorer

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from camera_node.capture import Camera
 from camera_node.sources.base import Shot
-from edge_server.experiments.settings import NOISE_FRAMES
+from edge_server.experiments.tuned_numbers import NOISE_FRAMES
 from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags
 from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer, mean_score

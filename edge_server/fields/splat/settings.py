@@ -1,6 +1,6 @@
 """Settings of the Gaussian field: options that a scenario may set, and the numbers that were tuned once.
 
-The texts of the options become help. Numbers of the layers stand in ``layers.settings``.
+The texts of the options become help. Numbers of the layers stand in ``layers.tuned_numbers``.
 """
 
 from __future__ import annotations

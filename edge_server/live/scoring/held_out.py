@@ -20,7 +20,7 @@ from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fidelity.so_far import FrameScore, score_frame, stays
 from edge_server.fields import Snapshot, View
-from edge_server.live import settings as tuned
+from edge_server.live import tuned_numbers as tuned
 from edge_server.live.state import Publication
 from freshfield import payload
 from freshfield.frame import Frame

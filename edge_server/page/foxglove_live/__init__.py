@@ -31,7 +31,7 @@ from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSIT
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.live.state import CameraView, EdgeState, Publication
-from edge_server.page.foxglove_live.settings import (
+from edge_server.page.foxglove_live.tuned_numbers import (
     BACKLOG,
     IDLE_S,
     JPEG_QUALITY,

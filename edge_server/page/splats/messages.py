@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.page.splats.records import RECORD, from_records
-from edge_server.page.splats.settings import MOST_ANCHORS, VERSION
+from edge_server.page.splats.tuned_numbers import MOST_ANCHORS, VERSION
 
 HEAD = struct.Struct("<Id")
 BLOCK = struct.Struct("<II")

@@ -13,12 +13,13 @@ import grpc.aio
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from channel_emu.live import live_link, settings
+from channel_emu.live import live_link
+from channel_emu.live import tuned_numbers as tuned
 from channel_emu.live.camera_stream import PUSH
 from channel_emu.live.frame_proxy import SET_BY_HAND
 from channel_emu.live.live_link import Message
 from channel_emu.live.proxy import EmulatorFailed
-from channel_emu.live.settings import CREDITS
+from channel_emu.live.tuned_numbers import CREDITS
 from channel_emu.model import trace
 from channel_emu.model.chain import ChainError
 from channel_emu.model.channel import Channel
@@ -284,7 +285,7 @@ FULL = Path("/dev/full")
 @pytest.mark.parametrize("edge_is_there", [False, True], ids=["in the timer", "in the upstream task"])
 async def test_a_full_disk_ends_the_emulator_and_its_other_books_are_closed(tmp_path, monkeypatch, edge_is_there):
     """A frame comes due whose fate cannot be recorded: broken at once, or forwarded by the stream's task."""
-    monkeypatch.setattr(settings, "FIRST_WAIT_S", 5.0 if edge_is_there else 0.1)
+    monkeypatch.setattr(tuned, "FIRST_WAIT_S", 5.0 if edge_is_there else 0.1)
     edge = await Peer().start() if edge_is_there else None
     address = edge.address if edge else f"127.0.0.1:{free_port()}"
     proxy, (flow,) = make(tmp_path, address, SHORT, trace=tmp_path / "t.jsonl")

@@ -15,12 +15,12 @@ from edge_server.fidelity.psnr import PSNR_CEILING_DB
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fidelity.so_far import MOST
 from edge_server.fields import Rendering, View
-from edge_server.live import settings
+from edge_server.live import tuned_numbers as tuned
 from edge_server.live.scoring import scoring_thread
 from edge_server.live.scoring.held_out import HeldOutCamera
 from edge_server.live.scoring.scoring_thread import ScoringThread
-from edge_server.live.settings import MOST_PENDING
 from edge_server.live.state import Publication
+from edge_server.live.tuned_numbers import MOST_PENDING
 from freshfield import payload
 from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose
@@ -190,7 +190,7 @@ def _run(
 
 
 def test_the_newest_publication_is_shown_carried_on_to_the_capture(monkeypatch: Any) -> None:
-    monkeypatch.setattr(settings, "SHOWN_SHARE", 1e-9)
+    monkeypatch.setattr(tuned, "SHOWN_SHARE", 1e-9)
     shown = _run([100, 350, 600], range(0, 900, 10))
     assert len(shown) > 1
     for score, of in shown:
@@ -213,7 +213,7 @@ def test_a_thread_that_falls_behind_keeps_no_snapshots() -> None:
         alive.add(snapshot := brightness(k * 20 * MS))
         thread.published(publication(k * 20), snapshot, [])
     del snapshot
-    assert len(alive) == settings.WAITING_PUBLICATIONS
+    assert len(alive) == tuned.WAITING_PUBLICATIONS
 
 
 def test_snapshots_replaced_before_the_next_scored_capture_are_dropped() -> None:
@@ -225,7 +225,7 @@ def test_snapshots_replaced_before_the_next_scored_capture_are_dropped() -> None
 
 
 def test_a_silent_held_out_camera_keeps_no_snapshots(monkeypatch: Any) -> None:
-    monkeypatch.setattr(settings, "SILENT_CAMERA_NS", 100 * MS)
+    monkeypatch.setattr(tuned, "SILENT_CAMERA_NS", 100 * MS)
     thread = _thread("cam00", "cam01")
     for ms in range(20, 260, 20):
         thread._held_out["cam00"].take(bright(ms))
@@ -234,12 +234,12 @@ def test_a_silent_held_out_camera_keeps_no_snapshots(monkeypatch: Any) -> None:
 
 
 def test_what_is_shown_is_scored_as_often_as_its_share_affords_and_before_publications(monkeypatch: Any) -> None:
-    monkeypatch.setattr(settings, "SHOWN_SHARE", 0.5)
+    monkeypatch.setattr(tuned, "SHOWN_SHARE", 0.5)
     scored: list[Publication] = []
     shown = _run([100, 350], range(0, 900, 10), scored)
     assert len(shown) > 10 and len(scored) == 2
     assert all((score.ssim is not None) == (k % 4 == 0) for k, (score, _) in enumerate(shown))
-    monkeypatch.setattr(settings, "RESERVE_S", settings.ALLOWANCE_S)
+    monkeypatch.setattr(tuned, "RESERVE_S", tuned.ALLOWANCE_S)
     scored.clear()
     assert len(_run([100, 350], range(0, 900, 10), scored)) > 10 and not scored
 

@@ -22,7 +22,7 @@ from camera_node.robot.calibration.hand_eye.samples import (
     diversity,
     rotation_vectors,
 )
-from camera_node.robot.calibration.settings import (
+from camera_node.robot.calibration.tuned_numbers import (
     FARTHEST_M,
     GOOD_POSES,
     LARGE_RESIDUAL_DEG,

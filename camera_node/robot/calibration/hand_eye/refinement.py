@@ -23,7 +23,7 @@ from scipy.optimize import least_squares
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration.hand_eye.closed_form import start as closed_form_start
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, rotation_vectors
-from camera_node.robot.calibration.settings import DEGREES_OF_FREEDOM, MIN_NOISE, OUTLIER_WEIGHT, ROUNDS, SETTLED
+from camera_node.robot.calibration.tuned_numbers import DEGREES_OF_FREEDOM, MIN_NOISE, OUTLIER_WEIGHT, ROUNDS, SETTLED
 from freshfield.geometry import se3, se3_inverse
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, SETUPS
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.settings import HALF_TURN_MARGIN_DEG, MIN_POSES, MIN_SPREAD_DEG, MIN_TURN_DEG
+from camera_node.robot.calibration.tuned_numbers import HALF_TURN_MARGIN_DEG, MIN_POSES, MIN_SPREAD_DEG, MIN_TURN_DEG
 from freshfield.geometry import Array, se3_inverse
 
 _MAX_SAMPLES = 80  # have 3160 pairs

@@ -13,8 +13,14 @@ import cv2
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 
-from camera_node.robot.calibration.settings import FIRST_DAMPING, LAST_DAMPING, MOST_STEPS, ROBUST_PX, SMALLEST_GAIN
 from camera_node.robot.calibration.targets import Array, Corners
+from camera_node.robot.calibration.tuned_numbers import (
+    FIRST_DAMPING,
+    LAST_DAMPING,
+    MOST_STEPS,
+    ROBUST_PX,
+    SMALLEST_GAIN,
+)
 from freshfield.geometry import Pinhole, se3, so3_log
 
 _LENS = 8  # fx, fy, cx, cy, k1, k2, p1, p2, in the order of projectPoints' derivatives

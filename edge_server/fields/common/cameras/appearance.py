@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.cameras import settings as tuned
+from edge_server.fields.common.cameras import tuned_numbers as tuned
 from edge_server.fields.common.settings import BETA1, BETA2
 
 Array = NDArray[np.float64]

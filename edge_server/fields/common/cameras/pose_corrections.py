@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common.cameras import settings as tuned
+from edge_server.fields.common.cameras import tuned_numbers as tuned
 from edge_server.fields.common.field_state import from_json, to_json
 from freshfield.geometry import se3, se3_inverse, so3_exp, so3_log
 

@@ -30,7 +30,8 @@ def cache_folder(root: Path) -> Path:
     root: the package whose folders called ``kernels`` count.
     """
     total = hashlib.sha256()
-    numbers = [path for room in ("fields", "surface") for path in root.glob(f"{room}/**/*settings.py")]
+    names = ("settings.py", "tuned_numbers.py")
+    numbers = [path for room in ("fields", "surface") for name in names for path in root.glob(f"{room}/**/{name}")]
     for path in sorted([*root.rglob("kernels/*.py"), *numbers]):
         total.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
     user = os.environ.get("XDG_CACHE_HOME") or "~/.cache"

@@ -22,7 +22,7 @@ from edge_server.fields.common.cameras.pose_corrections import PoseCorrections, 
 from edge_server.fields.common.plane_sweep import foreground_mask
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.view_store import Arrays, same_views
-from edge_server.fields.splat.carried_camera import settings as tuned
+from edge_server.fields.splat.carried_camera import tuned_numbers as tuned
 from edge_server.fields.splat.carried_camera.discs import discs, filled, quadtree, usable_depth
 from edge_server.fields.splat.carried_camera.exposures import Exposures
 from edge_server.fields.splat.carried_camera.refined_cameras import RefinedCameras, ScanSnapshot

@@ -19,9 +19,9 @@ from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.layers.motion import ViewRow
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
-from edge_server.fields.splat.layers.settings import FRAMES_KNOWN
 from edge_server.fields.splat.layers.static_layer import StaticLayer
 from edge_server.fields.splat.layers.static_supervision import StaticSupervision
+from edge_server.fields.splat.layers.tuned_numbers import FRAMES_KNOWN
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Rendering, View
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.fields.splat.layers import settings as tuned
+from edge_server.fields.splat.layers import tuned_numbers as tuned
 from edge_server.fields.splat.layers.bump import degrees_of, find_turn
 from edge_server.fields.splat.layers.motion import ViewRow
 from edge_server.fields.splat.layers.plates import FinePlate, Plate

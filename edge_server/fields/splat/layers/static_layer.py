@@ -22,7 +22,7 @@ from edge_server.fields.common.threads.thread_pool import lower_priority
 from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import Gaussians
-from edge_server.fields.splat.layers import settings as tuned
+from edge_server.fields.splat.layers import tuned_numbers as tuned
 from edge_server.fields.splat.snapshot import SplatSnapshot
 
 Arrays = dict[str, NDArray]

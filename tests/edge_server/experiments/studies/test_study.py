@@ -20,10 +20,10 @@ from edge_server.experiments.studies.depth_rate import DepthRun, run_with_depth
 from edge_server.experiments.studies.learned_schedulers import LEFT_OUT, WEIGHTED, WHICH_VIEWS
 from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT
 from edge_server.experiments.studies.registry import LEARNING, ON_A_CHANNEL, STUDIES
-from edge_server.experiments.studies.settings import TRAININGS
 from edge_server.experiments.studies.study import Claim, Finding, Study, StudyError, StudyRequest, Verdict, judge
 from edge_server.experiments.studies.study_command import checked, main
 from edge_server.experiments.studies.trial import Trial, run_trial
+from edge_server.experiments.studies.tuned_numbers import TRAININGS
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.rewards import f_w
 from tests.edge_server.experiments.rollouts.small import RAW

@@ -11,7 +11,7 @@ import pytest
 
 from channel_emu.live.tcp_proxy import PIECE_BYTES, TIMEOUT_S
 from edge_server.page.splats import messages
-from edge_server.page.splats import settings as tuned
+from edge_server.page.splats import tuned_numbers as tuned
 from edge_server.page.splats.published import Published, Publisher
 from edge_server.page.splats.records import from_records
 from edge_server.page.splats.visitor import LinkWindow, Visitor

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.scene_box import converging_point
-from edge_server.fields.splat.layers.depth import settings as tuned
+from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
 from edge_server.fields.splat.layers.depth.surfaces import Surface
 
 

@@ -2,21 +2,21 @@
 
 import pytest
 
-from edge_server.fields.splat.layers import settings
-from edge_server.fields.splat.layers.depth import settings as depth_settings
+from edge_server.fields.splat.layers import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import tuned_numbers as depth_numbers
 
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Plates of one second, and a short schedule."""
-    monkeypatch.setattr(settings, "PLATE_S", 1.0)
-    monkeypatch.setattr(settings, "SHOWN_AFTER", 60)
-    monkeypatch.setattr(settings, "SCHEDULE", 200)
-    monkeypatch.setattr(settings, "ROUNDS_FIRST", 5)
-    monkeypatch.setattr(settings, "ROUNDS_AGAIN", 3)
+    monkeypatch.setattr(tuned, "PLATE_S", 1.0)
+    monkeypatch.setattr(tuned, "SHOWN_AFTER", 60)
+    monkeypatch.setattr(tuned, "SCHEDULE", 200)
+    monkeypatch.setattr(tuned, "ROUNDS_FIRST", 5)
+    monkeypatch.setattr(tuned, "ROUNDS_AGAIN", 3)
 
 
 @pytest.fixture
 def shown_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """What depth teaches, too."""
-    monkeypatch.setattr(depth_settings, "SHOWN_AFTER", (20, 40))
+    monkeypatch.setattr(depth_numbers, "SHOWN_AFTER", (20, 40))

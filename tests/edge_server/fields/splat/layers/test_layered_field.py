@@ -18,7 +18,7 @@ from msgspec import structs
 from edge_server.fields import Budget, View
 from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.splat.field import StillField
-from edge_server.fields.splat.layers import settings
+from edge_server.fields.splat.layers import tuned_numbers as tuned
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.layers.layered_state import VERSION
 from edge_server.fields.splat.layers.plates import Plate
@@ -313,7 +313,7 @@ def test_few_cameras_with_large_pictures_train_fewer_steps(monkeypatch: pytest.M
     for frame in range(40):
         field.fit(ball.frame_of(frame, cameras=4), Budget(steps=8))
     for frame, (most_pixels, steps) in enumerate([(size, 10), (size - 1, 6)], 40):
-        monkeypatch.setattr(settings, "FEW_STEPS_PIXELS", most_pixels)
+        monkeypatch.setattr(tuned, "FEW_STEPS_PIXELS", most_pixels)
         assert field.fit(ball.frame_of(frame, cameras=4), Budget(steps=30)).steps == steps
 
 
@@ -342,7 +342,7 @@ def test_cameras_of_different_exposures_agree_on_one(monkeypatch: pytest.MonkeyP
     white = np.array([(np.asarray(c.view.image).max(axis=2) > 235).mean() > 0.75 for c in differing.cameras.values()])
     assert (found[white] == 1.0).all() and white.any() == (level == 1.0)
     assert level == 1.0 or np.log(found / gains).std() < 0.3 * np.log(gains).std()
-    monkeypatch.setattr(settings, "EXPOSURE_ROUNDS", 0)
+    monkeypatch.setattr(tuned, "EXPOSURE_ROUNDS", 0)
     assert score(differing) > score(begun()) + (1.5 if level < 1.0 else -0.5)
 
 
@@ -350,7 +350,7 @@ def test_layers_begin_before_plates_are_certain_and_the_still_field_anew_when_th
     """It goes on from the views with the plates known so far; what it shows stays until the one that begins anew is
     better."""
     for name, value in {"EARLY_S": 0.6, "PLATE_S": 2.0, "EARLY_SHOWN_AFTER": 40}.items():
-        monkeypatch.setattr(settings, name, value)
+        monkeypatch.setattr(tuned, name, value)
     field = LayeredField(ball.SMALL)
     ball.played(field, range(14), steps=10)
     assert field.tracker is not None and field.supervision.early
@@ -396,7 +396,7 @@ def test_a_still_field_that_began_anew_is_shown_once_it_fits_as_well_as_what_it_
     static, plates = field.static, [camera.plate_image(fine=False) for camera in field.cameras.values()]
     error, step = field.still.error(), field.still.step
     assert 0.0 < error < 0.01 and field.still.step == step
-    monkeypatch.setattr(settings, "SHOWN_AT_LATEST", 90)
+    monkeypatch.setattr(tuned, "SHOWN_AT_LATEST", 90)
     ready = {}
     for better_than in (1.0, error, 1e-9):
         static.forget()
@@ -424,7 +424,7 @@ def test_in_seconds_the_still_field_begins_anew_once_it_has_learned_and_is_shown
     times = {"EARLY_S": 0.6, "PLATE_S": 1.2, "PLATES_SURE_S": 2.0}
     steps = dict(zip(("EARLY_SHOWN_AFTER", "EARLY_STEPS"), learned, strict=True))
     for name, value in (times | steps).items():
-        monkeypatch.setattr(settings, name, value)
+        monkeypatch.setattr(tuned, name, value)
     field, asked, take = LayeredField(ball.SMALL), list[bool](), Plate.take
 
     def told(self: Plate, image: Any, may_refuse: bool = False, by_itself: bool = False) -> Any:
@@ -451,7 +451,7 @@ def test_plates_do_not_wait_for_a_camera_that_has_gone_silent() -> None:
     for frame in range(20):
         field.fit(ball.frame_of(frame, False, len(ball.CAMERAS) if frame < 3 else 6), Budget(steps=1))
     assert field.moving is not None
-    assert list(field.moving_shares.values()) == [settings.LEAST_SHARE] * 6  # of those that still tell
+    assert list(field.moving_shares.values()) == [tuned.LEAST_SHARE] * 6  # of those that still tell
 
 
 def _small(camera: int, frame: int) -> View:

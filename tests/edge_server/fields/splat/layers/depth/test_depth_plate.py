@@ -6,7 +6,7 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
-from edge_server.fields.splat.layers.depth import settings
+from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
 from edge_server.fields.splat.layers.depth.kernels.body_depth import measure_body
 
@@ -20,14 +20,14 @@ def _plane(inverse: NDArray[np.float32], image: NDArray[np.float32], y: int, x: 
     dx, dy = i - x, j - y
     near = q[(np.abs(dx) <= 1) & (np.abs(dy) <= 1) & (q > 0)]
     a, b, c = float(np.median(near)), 0.0, 0.0
-    if len(near) < 4 and abs(a - q[y, x]) > 4 * settings.NOISE:
+    if len(near) < 4 and abs(a - q[y, x]) > 4 * tuned.NOISE:
         a = q[y, x]
-    window = (np.maximum(np.abs(dx), np.abs(dy)) <= settings.RADIUS) & (q > 0)
-    color = np.abs(image.astype(float) - image[y, x]).sum(axis=2) / settings.SMOOTH_COLOR
-    for k in range(settings.ROUNDS):
-        e = (q - (a + b * dx + c * dy)) / (settings.NOISE * (2.0 if k == 0 else 1.0))
-        w = np.exp(-(dx**2 + dy**2) / (2.0 * settings.SPREAD_PX**2)) / ((1 + e**2) * (1 + color**2))
-        w = w * (window & (np.abs(e) <= settings.OUTLIER))
+    window = (np.maximum(np.abs(dx), np.abs(dy)) <= tuned.RADIUS) & (q > 0)
+    color = np.abs(image.astype(float) - image[y, x]).sum(axis=2) / tuned.SMOOTH_COLOR
+    for k in range(tuned.ROUNDS):
+        e = (q - (a + b * dx + c * dy)) / (tuned.NOISE * (2.0 if k == 0 else 1.0))
+        w = np.exp(-(dx**2 + dy**2) / (2.0 * tuned.SPREAD_PX**2)) / ((1 + e**2) * (1 + color**2))
+        w = w * (window & (np.abs(e) <= tuned.OUTLIER))
         if w.sum() < 0.5:
             break
         mx, my = (w * dx).sum() / w.sum(), (w * dy).sum() / w.sum()
@@ -42,7 +42,7 @@ def _scene(rng: np.random.Generator, size: int = 24) -> tuple[NDArray[np.float32
     """Inverse depths of a slanted wall before another one, with noise and holes, and an image."""
     y, x = np.mgrid[:size, :size]
     q = np.where(x < size // 2, 0.5 + 0.01 * x, 0.25 + 0.004 * y)
-    q += settings.NOISE * 0.7 * rng.standard_normal((size, size))
+    q += tuned.NOISE * 0.7 * rng.standard_normal((size, size))
     q[rng.random((size, size)) < 0.05] = 0.0
     image = np.where((x < size // 2)[..., None], 60.0, 180.0) + rng.uniform(0, 10, (size, size, 3))
     return q.astype(np.float32), image.astype(np.float32)
@@ -54,13 +54,13 @@ def test_medians_are_those_of_numpy() -> None:
     for _ in range(40):
         depth = rng.uniform(1.0, 1.0 + rng.random((9, 11)) * 0.3).astype(np.float32)
         plate.take(np.where(rng.random((9, 11)) < 0.6, depth, 0).astype(np.float32), rng.random((9, 11)) < 0.2, POOL)
-    assert plate.count.max() > settings.KEPT and plate.is_known(np.ones((9, 11), bool))
+    assert plate.count.max() > tuned.KEPT and plate.is_known(np.ones((9, 11), bool))
     found = plate.medians(POOL)
     assert (found == 0).any() and (found > 0).any()
     for y, x in np.ndindex(9, 11):
-        kept = plate.samples[y, x, : min(plate.count[y, x], settings.KEPT)]
-        median = np.median(kept) if len(kept) >= settings.LEAST else 0.0
-        steady = 3 * np.count_nonzero(np.abs(kept - np.float32(median)) < settings.STEADY) >= 2 * len(kept)
+        kept = plate.samples[y, x, : min(plate.count[y, x], tuned.KEPT)]
+        median = np.median(kept) if len(kept) >= tuned.LEAST else 0.0
+        steady = 3 * np.count_nonzero(np.abs(kept - np.float32(median)) < tuned.STEADY) >= 2 * len(kept)
         assert found[y, x] == pytest.approx(median if steady else 0.0, rel=1e-6)
 
 
@@ -82,7 +82,7 @@ def test_small_holes_are_filled_by_the_plane_of_a_pixel_beside_them() -> None:
     y, x = np.mgrid[:24, :24]
     for hole in np.argwhere(inverse == 0):
         dy, dx = hole[0] - y, hole[1] - x
-        beside = (inverse > 0) & (np.maximum(np.abs(dx), np.abs(dy)) <= settings.HOLE_PX)
+        beside = (inverse > 0) & (np.maximum(np.abs(dx), np.abs(dy)) <= tuned.HOLE_PX)
         continued = found + slope[..., 0] * dx + slope[..., 1] * dy
         same = np.isclose(continued, found[*hole], rtol=1e-5) & (slope == slope[*hole]).all(axis=2)
         assert found[*hole] > 0 and (same & beside).any()
@@ -91,7 +91,7 @@ def test_small_holes_are_filled_by_the_plane_of_a_pixel_beside_them() -> None:
 @pytest.mark.parametrize("turns", range(4))
 def test_a_wide_hole_at_a_border_stays_but_for_its_rim(turns: int) -> None:
     inverse = np.full((20, 20), 0.5, np.float32)
-    inverse[:, : settings.HOLE_PX + 4] = 0.0
+    inverse[:, : tuned.HOLE_PX + 4] = 0.0
     found = np.rot90(smooth(np.rot90(inverse, turns).copy(), np.full((20, 20, 3), 90.0), POOL)[0], -turns)
     assert (found[:, :4] == 0).all()
     np.testing.assert_allclose(found[:, 4:], 0.5, rtol=1e-5)
@@ -120,7 +120,7 @@ def test_depth_of_another_unit_is_refused_until_it_stays(factor: float) -> None:
     near[16:20] = 0.0
     assert plate.take(near, nothing, pool)
     wrong = depth * np.float32(factor)
-    assert not any(plate.take(wrong, nothing, pool) for _ in range(settings.MOST_REFUSED))
+    assert not any(plate.take(wrong, nothing, pool) for _ in range(tuned.MOST_REFUSED))
     np.testing.assert_allclose(plate.medians(pool), 0.5)
     assert all(plate.take(wrong, nothing, pool) for _ in range(4)) and plate.refused == 0
     np.testing.assert_allclose(plate.medians(pool), 0.5 / factor, rtol=1e-5)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.threads.thread_pool import shared_pool
-from edge_server.fields.splat.layers.depth import settings
+from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate
 from edge_server.fields.splat.layers.depth.depth_supervision import CameraPlates, DepthSupervision
 from edge_server.fields.splat.layers.depth.plate_stereo import PlateStereo
@@ -77,7 +77,7 @@ def test_a_camera_that_joins_is_registered_with_the_others() -> None:
     for k, surface in enumerate([*surfaces[:2], _bumped(surfaces[2])]):
         view = View(f"cam{k:02d}", surface.color.astype(np.uint8), surface.pose, surface.lens)
         plate, measured = PlateImage(view, surface.color, surface.known), DepthPlate.empty(SIZE, SIZE)
-        for _ in range(settings.LEAST):
+        for _ in range(tuned.LEAST):
             measured.take(surface.depth(), np.zeros((SIZE, SIZE), bool), shared_pool())
         cameras.append(CameraPlates(plate, plate, measured, surface.pose))
     depth = DepthSupervision(SplatSettings(), shared_pool())

@@ -11,7 +11,7 @@ from edge_server.fields import View
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.splat.kernels.project import COLOR, QUATERNION, SCALE
-from edge_server.fields.splat.layers.depth import settings
+from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
 from edge_server.fields.splat.layers.depth.depth_plate import smooth
 from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
 from edge_server.fields.splat.layers.depth.large_planes import Plane, continued, large_planes
@@ -88,8 +88,8 @@ def test_virtual_plates_are_spread_between_the_cameras() -> None:
         angles.append(np.degrees(np.arctan2(away[1], away[0])))
     assert min(angles) > -21.0 and max(angles) < 73.0 and np.ptp(angles) > 60.0
     plates = virtual_plates(SCENE, SURFACES, poses, True, POOL)
-    assert len(plates) == settings.VIRTUAL_PLATES and all(" " in plate.view.camera for plate in plates)
-    assert all(plate.known.min() == np.float32(settings.UNSEEN_WEIGHT) for plate in plates)
+    assert len(plates) == tuned.VIRTUAL_PLATES and all(" " in plate.view.camera for plate in plates)
+    assert all(plate.known.min() == np.float32(tuned.UNSEEN_WEIGHT) for plate in plates)
     assert any((plate.known == 0).any() for plate in virtual_plates(SCENE, SURFACES, poses, False, POOL))
 
 
@@ -97,7 +97,7 @@ def test_virtual_plates_are_spread_between_the_cameras() -> None:
 def test_pixels_beside_a_silhouette_are_found(width: int, near: int | None) -> None:
     q = np.tile(np.linspace(0.2, 0.5, 40, dtype=np.float32)[:, None], (1, width))  # a floor
     assert not beside_silhouettes(q).any()
-    q[10:20, 8:18] += np.float32(2.0 * settings.CUT)  # a box on it: the jump lies between two pixels
+    q[10:20, 8:18] += np.float32(2.0 * tuned.CUT)  # a box on it: the jump lies between two pixels
     left, right = (range(k - 1 - near, k + 1 + near) if near is not None else () for k in (8, 18))
     assert np.flatnonzero(beside_silhouettes(q)[15]).tolist() == [*left, *right]
 

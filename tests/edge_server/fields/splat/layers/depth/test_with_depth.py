@@ -10,8 +10,8 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget
-from edge_server.fields.splat.layers import settings as layer_settings
-from edge_server.fields.splat.layers.depth import settings as depth_settings
+from edge_server.fields.splat.layers import tuned_numbers as layer_numbers
+from edge_server.fields.splat.layers.depth import tuned_numbers as depth_numbers
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from tests.edge_server.fields.scenes import seen
 from tests.edge_server.fields.small import same_state
@@ -89,7 +89,7 @@ def test_depth_of_some_frames_or_cameras_does(kind: str, lost_db: float) -> None
 
 def test_depth_of_another_instant_says_nothing_of_what_moves() -> None:
     """The plates keep it; the moving set takes only what was measured within BODY_GAP_NS of the image."""
-    gaps_ns = (0, depth_settings.BODY_GAP_NS, -depth_settings.BODY_GAP_NS - 1)
+    gaps_ns = (0, depth_numbers.BODY_GAP_NS, -depth_numbers.BODY_GAP_NS - 1)
     field = LayeredField(SMALL)
     RIG.run(field, range(16), lambda k, frame, v: replace(v, depth_ns=v.generated_ns + gaps_ns[k]), steps=5)
     measured = {o.camera for o in field.observations if o.view.depth is not None}
@@ -144,9 +144,9 @@ def test_broken_depth_costs_little(kind: str) -> None:
 
 def test_stereo_shows_what_is_between_few_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
     scores = []
-    monkeypatch.setattr(layer_settings, "PLAIN_CAMERAS", 0)
-    for most in (0, layer_settings.STEREO_CAMERAS):
-        monkeypatch.setattr(layer_settings, "STEREO_CAMERAS", most)
+    monkeypatch.setattr(layer_numbers, "PLAIN_CAMERAS", 0)
+    for most in (0, layer_numbers.STEREO_CAMERAS):
+        monkeypatch.setattr(layer_numbers, "STEREO_CAMERAS", most)
         field = WITHOUT.run(LayeredField(SMALL), range(36))
         assert field.supervision.with_depth == (most > 0)
         scores.append(WITHOUT.score(field, 35))
@@ -156,8 +156,8 @@ def test_stereo_shows_what_is_between_few_cameras(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(("plain_rows", "plain"), [(0, False), (14, True), (64, False)])
 def test_with_more_cameras_stereo_is_used_where_some_of_the_plates_is_plain(plain_rows, plain, monkeypatch) -> None:
     """Of the images the uppermost rows show a plain sky, which the others would, too, but for a grain."""
-    monkeypatch.setattr(layer_settings, "STEREO_CAMERAS", 2)
-    monkeypatch.setattr(layer_settings, "PLAIN_CAMERAS", 3)
+    monkeypatch.setattr(layer_numbers, "STEREO_CAMERAS", 2)
+    monkeypatch.setattr(layer_numbers, "PLAIN_CAMERAS", 3)
     grain = np.random.default_rng(0).integers(-12, 13, WITHOUT.held.image.shape)
     grain[:plain_rows] = 0
     field = LayeredField(SMALL)

@@ -87,7 +87,7 @@ BODY_SEED_PX, BODY_OPACITY = 0.8, 0.6  # its standard deviation in pixels, and i
 BODY_THROUGH_M, BODY_THROUGH = 0.06, 0.02
 
 # --- when what begins ---
-PLATE_S = 0.6  # as ``layers.settings.PLATE_S``, where most of the cameras have depth
+PLATE_S = 0.6  # as ``layers.tuned_numbers.PLATE_S``, where most of the cameras have depth
 SHOWN_AFTER = 50, 200  # steps after which the first field, and one that began anew, is shown
 CHANGED_SHARE = 0.01  # of the pixels: with more depths that are new or have changed, the static field learns again
 

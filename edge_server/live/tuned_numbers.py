@@ -34,7 +34,7 @@ TOO_SHORT, TOO_SHORT_OF = 10, 30  # updates without a step, of the latest, after
 WARN_EVERY_S = 30.0  # between two warnings of one kind
 # For the update in progress when the server ends, without which there is no checkpoint. On a machine with five times as
 # much to do as it has cores, updates of ``ngp`` at 640 x 480 take 6 s, the longest 18. The launcher kills the server
-# after ``freshfield_up.settings.GRACE_S``, of which the checkpoint and the last pictures need some.
+# after ``freshfield_up.tuned_numbers.GRACE_S``, of which the checkpoint and the last pictures need some.
 STOP_S = 20.0
 
 # --- scores: which held-out frame shows the instant of an update ---
