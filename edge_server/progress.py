@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
-from edge_server.settings import LONG_WORK_S, REDRAWN_S
+from edge_server import tuned_numbers as tuned
 
 
 class ProgressLine:
@@ -33,7 +33,7 @@ class ProgressLine:
                 self._share, self._changed_s = share, now
             if not known:
                 self._stage, self._began, self._announced = stage, (now, share), False
-            if share >= 1.0 or not known or now - self._printed_s >= REDRAWN_S:
+            if share >= 1.0 or not known or now - self._printed_s >= tuned.REDRAWN_S:
                 self._print(now)
 
     @contextmanager
@@ -46,7 +46,7 @@ class ProgressLine:
         ended = threading.Event()
 
         def redraw() -> None:
-            while not ended.wait(REDRAWN_S):
+            while not ended.wait(tuned.REDRAWN_S):
                 with self._lock:
                     if self._stage and self._share < 1.0:
                         self._print(time.perf_counter())
@@ -70,7 +70,7 @@ class ProgressLine:
         if done > 0.0:  # at the pace so far, less what has passed since the last part ended
             left_s = (self._changed_s - began_s) * (1.0 - self._share) / done - (now - self._changed_s)
         if not self._terminal:
-            if left_s > LONG_WORK_S and not self._announced and not self._quiet:
+            if left_s > tuned.LONG_WORK_S and not self._announced and not self._quiet:
                 self._announced = True
                 print(f"  {self._stage}: some {left_s:.0f} s", file=self._stream, flush=True)
             return

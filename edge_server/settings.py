@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import msgspec
 from msgspec.structs import replace
 
+from edge_server import tuned_numbers as tuned
 from edge_server.fields.registry import FIELD
 from edge_server.scheduler import Policy, resolve_checkpoint
 from freshfield.limits import LONGEST_MS
@@ -27,24 +28,10 @@ if TYPE_CHECKING:
     from edge_server.embed.embedder import Embedder
 
 
-LONG_WORK_S = 10.0
-"""Of a stage of a command that is announced in a pipe, too: nobody wonders about less."""
-REDRAWN_S = 1.0
-"""Between two drawings of a command's progress: the seconds that it tells change no faster."""
 LEAST_UPDATE_MS = 10.0
 """Shortest fitting time of an update: a shorter one is not worth the decoding of its views."""
 MOST_MS = 1e9
 """Largest cost that virtual time charges."""
-ARRIVALS: dict[str, Any] = {"updates": "arrivals", "update_ms": 20.0, "steps": 10}
-"""Of a field in layers that follows arrivals."""
-CYCLE: dict[str, Any] = {"updates": "cycle", "update_ms": 800.0, "steps": 100}
-"""Of everything else."""
-CARRIED: dict[str, Any] = {"updates": "cycle", "update_ms": 80.0, "steps": 8}
-"""Of a scan by cameras that move: a third of what a keyframe gets, so that a new one shows as soon as it is seeded."""
-MOST_CARRIED = 4
-"""Cameras: photos that are dealt to twelve (``fox``) are no tracks, and read 8 dB less as a scan (19 against 27)."""
-SCAN: dict[str, Any] = {"scan": True, "refine": True, "carried": True, "gaussians": 60_000}
-"""Options of ``splat`` for that; few pixels bound the Gaussians further."""
 CHOSEN = ("field", "layers", "updates", "update_ms", "steps", "keyframes")
 
 
@@ -96,12 +83,12 @@ class EdgeConfig(Settings, frozen=True):
     field: Annotated[str, about("the representation (edge_server.fields.registry)")] = FIELD
     field_options: Annotated[dict[str, Any], about("its settings")] = msgspec.field(default_factory=dict)
     policy: Annotated[PolicyConfig, about("which views an update uses")] = msgspec.field(default_factory=PolicyConfig)
-    updates: Annotated[Literal["cycle", "arrivals"], about("by what cameras do, see above")] = CYCLE["updates"]
+    updates: Annotated[Literal["cycle", "arrivals"], about("by what cameras do, see above")] = tuned.CYCLE["updates"]
     update_ms: Annotated[float, within(LEAST_UPDATE_MS, LONGEST_MS, "fitting time; by what cameras do, see above")] = (
-        CYCLE["update_ms"]
+        tuned.CYCLE["update_ms"]
     )
     frontier: Annotated[str | None, about("frontier.json of edge-server frontier, relative to the scenario")] = None
-    steps: Annotated[int, within(1, 10_000_000, "optimizer steps of an update in virtual time")] = CYCLE["steps"]
+    steps: Annotated[int, within(1, 10_000_000, "optimizer steps of an update in virtual time")] = tuned.CYCLE["steps"]
     compute: Annotated[ComputeConfig, about("cost of an update in virtual time")] = msgspec.field(
         default_factory=ComputeConfig
     )
@@ -136,13 +123,13 @@ def with_defaults(section: Mapping[str, Any], moving: bool, cameras: int) -> dic
     if usual and not moving and "layers" not in options:
         found["field_options"] = options = {**options, "layers": True}
     layers = bool(options.get("layers"))
-    if usual and moving and not layers and cameras <= MOST_CARRIED and "keyframes" not in found:
-        found["field_options"] = {**SCAN, **options}
-        return {**CARRIED, **found}
+    if usual and moving and not layers and cameras <= tuned.MOST_CARRIED and "keyframes" not in found:
+        found["field_options"] = {**tuned.SCAN, **options}
+        return {**tuned.CARRIED, **found}
     if moving and not layers:
         found.setdefault("keyframes", {})
-    found.setdefault("updates", (ARRIVALS if layers else CYCLE)["updates"])
-    times = ARRIVALS if layers and found["updates"] == "arrivals" else CYCLE
+    found.setdefault("updates", (tuned.ARRIVALS if layers else tuned.CYCLE)["updates"])
+    times = tuned.ARRIVALS if layers and found["updates"] == "arrivals" else tuned.CYCLE
     return {**times, **found}
 
 

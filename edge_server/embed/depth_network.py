@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server import tuned_numbers as tuned
 from edge_server.embed import EmbeddingError
-from edge_server.embed.backbone import MAX_SIDE
 from edge_server.embed.embedder import INPUT_TYPES, open_model, reason_of
 from edge_server.embed.letterbox import checked
 
@@ -24,7 +24,6 @@ MEAN, DEVIATION = np.array(
 )  # of ImageNet, channels in [0, 1]
 PATCH = 14  # pixels a side of what DINOv2, its encoder, takes as one token
 SIDE = 518  # shorter side of the images it was trained on
-MOST_ASPECT = 2.5  # of its input: attention's memory grows with the square of the pixels
 
 
 class DepthNetwork:
@@ -43,8 +42,8 @@ class DepthNetwork:
             raise EmbeddingError(f"{file}: expected a model of images (1, 3, height, width) of float32 or float16")
         self._input, self._type = inputs[0].name, INPUT_TYPES[inputs[0].type]
         self._fixed = [side if isinstance(side, int) else 0 for side in shape[2:]]
-        if max(self._fixed) > MAX_SIDE:
-            raise EmbeddingError(f"{file}: images of {self._fixed} pixels are larger than {MAX_SIDE} a side")
+        if max(self._fixed) > tuned.MAX_INPUT_PX:
+            raise EmbeddingError(f"{file}: images of {self._fixed} pixels are larger than {tuned.MAX_INPUT_PX} a side")
         self(np.zeros((PATCH, PATCH, 3), np.uint8))  # a model that cannot run, or gives something else, fails here
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -67,7 +66,7 @@ class DepthNetwork:
 
     def _size(self, height: int, width: int) -> tuple[int, int]:
         """Height and width of the model's input for an image."""
-        most = MOST_ASPECT * min(height, width)
+        most = tuned.DEPTH_MOST_ASPECT * min(height, width)
         scale = SIDE / (min(height, width) * PATCH)
         free = [PATCH * max(1, round(scale * min(side, most))) for side in (height, width)]
         return self._fixed[0] or free[0], self._fixed[1] or free[1]

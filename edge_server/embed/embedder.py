@@ -12,15 +12,14 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
+from edge_server import tuned_numbers as tuned
 from edge_server.embed import EmbeddingError
-from edge_server.embed.backbone import MAX_FILE_BYTES, OUTPUT, Backbone, parse_model
+from edge_server.embed.backbone import OUTPUT, Backbone, parse_model
 from edge_server.embed.letterbox import GRAY, blob, checked
 from edge_server.embed.projection import mean_and_axes
 from freshfield.limits import MAX_MODEL_BYTES
 from freshfield.untrusted import read_bytes
 
-# Images per run if the model takes any number: larger batches exceed the caches and take longer per image.
-_BATCH = 4
 # What ONNX Runtime calls the types of images that are fed to models.
 INPUT_TYPES: dict[str, type[np.floating]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
@@ -39,7 +38,7 @@ class Embedder:
         self._mean, self._axes = mean_and_axes(backbone.projection, backbone.channels, dim, of)
         self.name = f"{backbone.name}-{backbone.digest} {backbone.tap} {backbone.width}x{backbone.height} d{dim}"
         self._session = open_session(backbone.model, backbone.name)
-        self.step = backbone.batch or _BATCH
+        self.step = backbone.batch or tuned.EMBEDDING_BATCH
         """Images per run."""
         # A model that cannot run fails here, not at the first decision.
         self.pooled([np.full((8, 8, 3), GRAY, np.uint8)])
@@ -90,7 +89,7 @@ class Embedder:
 def open_model(file: Path) -> ort.InferenceSession:
     """Open the ONNX model in ``file``, which may come from anywhere. Raises EmbeddingError."""
     try:
-        data = read_bytes(file, MAX_FILE_BYTES)
+        data = read_bytes(file, tuned.MAX_MODEL_FILE_BYTES)
     except OSError as error:
         raise EmbeddingError(f"{file}: cannot be read: {error.strerror}; name a model in ONNX format") from None
     parse_model(data, file)

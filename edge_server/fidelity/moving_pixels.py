@@ -14,21 +14,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server import tuned_numbers as tuned
 from edge_server.fidelity.images import Image, to_unit
-
-LAGS_MS = (60.0, 120.0, 200.0, 300.0)
-BOUND = 0.03
-NOISE_SIGMAS = 4.0
 
 _BLOCK = 8
 # Ratio of median to mean of a mean square of 192 normal values (8 x 8 pixels, 3 channels).
 _CHI2_MEDIAN = (1.0 - 2.0 / (9.0 * 3 * _BLOCK**2)) ** 3
-# No usable camera is noisier; a larger estimate means that the camera itself moves.
-_NOISE_LIMIT = 0.05
-_MAX_PAIRS = 32
 
 
-def moving_mask(truth: NDArray, earlier: Sequence[NDArray], bound: float = BOUND) -> NDArray[np.bool_]:
+def moving_mask(truth: NDArray, earlier: Sequence[NDArray], bound: float = tuned.MOVING_BOUND) -> NDArray[np.bool_]:
     """Mask (H, W) of the pixels of ``truth`` that differ from any of ``earlier`` by more than ``bound``.
 
     Images are as ``images.to_unit`` takes them. Without earlier frames the mask is empty.
@@ -42,7 +36,9 @@ def moving_mask(truth: NDArray, earlier: Sequence[NDArray], bound: float = BOUND
     return mask
 
 
-def frames_at_lags(times_ns: Sequence[int], present_ns: int, lags_ms: Sequence[float] = LAGS_MS) -> list[int]:
+def frames_at_lags(
+    times_ns: Sequence[int], present_ns: int, lags_ms: Sequence[float] = tuned.MOVING_LAGS_MS
+) -> list[int]:
     """Indices into ``times_ns`` of the frames nearest to each of ``lags_ms`` before ``present_ns``, without
     repeats.
 
@@ -95,14 +91,14 @@ class NoiseEstimate:
         """Take two successive frames of the camera."""
         sigma = pair_noise(to_unit(a, "frame"), to_unit(b, "frame"))
         if sigma is not None:
-            self.pairs = [*self.pairs, sigma][-_MAX_PAIRS:]
+            self.pairs = [*self.pairs, sigma][-tuned.NOISE_PAIRS :]
 
     @property
     def sigma(self) -> float:
         """Standard deviation in [0, 1] units; 0 before the first pair."""
-        return min(float(np.median(self.pairs)), _NOISE_LIMIT) if self.pairs else 0.0
+        return min(float(np.median(self.pairs)), tuned.NOISE_LIMIT) if self.pairs else 0.0
 
     @property
     def bound(self) -> float:
         """A larger difference is motion rather than noise."""
-        return max(BOUND, NOISE_SIGMAS * self.sigma)
+        return max(tuned.MOVING_BOUND, tuned.MOVING_NOISE_SIGMAS * self.sigma)

@@ -14,8 +14,9 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server import tuned_numbers as tuned
 from edge_server.fidelity.images import BLACK, Color, ImageError, to_unit
-from edge_server.fidelity.moving_pixels import BOUND, moving_mask
+from edge_server.fidelity.moving_pixels import moving_mask
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.ssim import TAPS, ssim
 from freshfield.scenario import NOTHING_HELD_OUT
@@ -97,7 +98,7 @@ class Scorer:
         truth: NDArray,
         generated_ns: int,
         earlier: Sequence[NDArray] = (),
-        bound: float = BOUND,
+        bound: float = tuned.MOVING_BOUND,
         psnr_only: bool = False,
         mask: NDArray[np.bool_] | None = None,
         lpips: bool = True,

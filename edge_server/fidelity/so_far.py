@@ -11,12 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from edge_server import tuned_numbers as tuned
 from edge_server.fidelity.refined import render_refined
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Renderer, View
 from edge_server.run_records import SoFarScores
-
-MOST = 64  # frames: at the end of a run each is rendered, 10 ms at 320 x 240
 
 
 class FrameScore(NamedTuple):
@@ -49,7 +48,7 @@ def so_far(scores: Sequence[FrameScore], now: FrameScore) -> SoFarScores:
 
 
 def stays(number: int, count: int) -> bool:
-    """Whether the frame of this number, counted from 0, stays with ``count`` so far: the newest, and at most MOST
-    others, evenly spread."""
-    stride = 1 << (max(count - 1, 0) // MOST).bit_length()
+    """Whether the frame of this number, counted from 0, stays with ``count`` so far: the newest, and at most
+    SO_FAR_FRAMES others, evenly spread."""
+    stride = 1 << (max(count - 1, 0) // tuned.SO_FAR_FRAMES).bit_length()
     return number % stride == 0 or number == count - 1

@@ -17,20 +17,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server import tuned_numbers as tuned
 from edge_server.embed import EmbeddingError
-from edge_server.embed.backbone import MAX_SIDE, exported_size
+from edge_server.embed.backbone import exported_size
 from edge_server.embed.embedder import INPUT_TYPES, open_model, reason_of
 from edge_server.embed.letterbox import blob, checked, placed
 from edge_server.foreground import MODELS, SHIPPED
 
 Array = NDArray[np.float64]
 
-NMS_IOU = 0.6
 _EXPORT = "yolo export model=yolo11n-seg.pt format=onnx"
 # Least and greatest score, with what float16 rounds.
 _SCORES = (-1e-3, 1.0 + 1e-3)
-# Boxes that enter non-maximum suppression, by score.
-_MOST = 300
 
 
 @dataclass(frozen=True)
@@ -123,7 +121,7 @@ def decode(
     if (
         shaped and end_to_end is None
     ):  # a raw head of two classes has as many columns, but scores where that has classes
-        fits = output.shape[2] == 6 + coefficients and output.shape[1] <= _MOST and kinds != 2
+        fits = output.shape[2] == 6 + coefficients and output.shape[1] <= tuned.NMS_BOXES and kinds != 2
         end_to_end = fits and _whole(output[0, :, 5])
     if not shaped or (not end_to_end and min(output.shape[1:]) < 5 + coefficients):
         raise EmbeddingError(
@@ -161,13 +159,13 @@ def decode(
     surest = scores.max(axis=1)
     sound = np.isfinite(table).all(axis=1) & (surest >= confidence) & (corners[:, 2:] > corners[:, :2]).all(axis=1)
     best = np.flatnonzero(sound)
-    best = best[np.argsort(-surest[best], kind="stable")][:_MOST]
+    best = best[np.argsort(-surest[best], kind="stable")][: tuned.NMS_BOXES]
     rows = np.concatenate([corners, surest[:, None], found[:, None], table[:, end:]], axis=1)[best]
     if end_to_end or not len(rows):
         return [tuple(map(float, row)) for row in rows]
     rectangles = np.concatenate([rows[:, :2], rows[:, 2:4] - rows[:, :2]], axis=1)
     classes = rows[:, 5].astype(int).tolist()
-    kept = cv2.dnn.NMSBoxesBatched(rectangles.tolist(), rows[:, 4].tolist(), classes, 0.0, NMS_IOU)
+    kept = cv2.dnn.NMSBoxesBatched(rectangles.tolist(), rows[:, 4].tolist(), classes, 0.0, tuned.NMS_IOU)
     return [tuple(map(float, rows[k])) for k in sorted(int(i) for i in kept)]
 
 
@@ -189,8 +187,8 @@ def _size(shape: list[Any], meta: dict[str, str], file: Path) -> tuple[int, int]
     height, width = (side if isinstance(side, int) else 0 for side in shape[2:])
     if not (height and width):
         height, width = exported_size(meta)
-    if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE):
-        raise EmbeddingError(f"{file}: images of {width} x {height} are not within 1 to {MAX_SIDE} a side")
+    if not (1 <= height <= tuned.MAX_INPUT_PX and 1 <= width <= tuned.MAX_INPUT_PX):
+        raise EmbeddingError(f"{file}: images of {width} x {height} are not within 1 to {tuned.MAX_INPUT_PX} a side")
     return height, width
 
 

@@ -11,7 +11,8 @@ import pytest
 from edge_server.embed import EmbeddingConfig
 from edge_server.machine import machine
 from edge_server.progress import ProgressLine
-from edge_server.settings import MOST_CARRIED, SCAN, EdgeConfig, KeyframesConfig, cameras_move, read_config
+from edge_server.settings import EdgeConfig, KeyframesConfig, cameras_move, read_config
+from edge_server.tuned_numbers import MOST_CARRIED, SCAN
 from freshfield.scenario import ScenarioError, parse
 from freshfield.settings import Settings
 from tests.support import refused

@@ -15,13 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags
+from edge_server.fidelity.moving_pixels import NoiseEstimate, frames_at_lags
 from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fidelity.so_far import FrameScore, score_frame, stays
 from edge_server.fields import Snapshot, View
 from edge_server.live import tuned_numbers as tuned
 from edge_server.live.state import Publication
+from edge_server.tuned_numbers import MOVING_BOUND, MOVING_LAGS_MS
 from freshfield import payload
 from freshfield.frame import Frame
 from freshfield.geometry import Pose
@@ -29,7 +30,7 @@ from freshfield.geometry import Pose
 log = logging.getLogger(__name__)
 
 # Longer than the longest lag, so that the frame nearest to it is still here at low frame rates.
-HISTORY_NS = round((LAGS_MS[-1] + 1000.0) * 1e6)
+HISTORY_NS = round((MOVING_LAGS_MS[-1] + 1000.0) * 1e6)
 
 Image = NDArray[np.float32]
 
@@ -183,7 +184,7 @@ class HeldOutCamera:
         lags = frames_at_lags([each.taken_ns for each in truths], truth.taken_ns)
         found = [self._decode(truths[i]) for i in lags if truths[i].frame.pose == pose]
         earlier = [each for each in found if each is not None]
-        bound = self.noise.bound if self._noisy else BOUND
+        bound = self.noise.bound if self._noisy else MOVING_BOUND
         view, refined = truth.view(image), None
         if not isinstance(shown, np.ndarray):
             refined = render_refined(shown, view)

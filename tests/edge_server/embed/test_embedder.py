@@ -8,6 +8,7 @@ import pytest
 
 from edge_server.embed.cache import EmbeddingCache
 from edge_server.live.view_decoder import ViewDecoder
+from edge_server.tuned_numbers import MAX_GRAPH_NODES
 from freshfield.frame import Frame
 from tests.edge_server.frames import damaged_frame, frame
 from tests.support import refused
@@ -19,7 +20,6 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
-from edge_server.embed.backbone import MAX_NODES
 from edge_server.embed.letterbox import GRAY
 from freshfield import payload
 from freshfield.geometry import Pinhole
@@ -187,7 +187,7 @@ WRONG = {
     "expand": (partial(detector, extra=(EXPAND,), weights=(HUGE,)), "holds Expand, which no YOLO backbone does"),
     "scaled": (partial(detector, extra=(SCALED,)), "q is quantised with another scale for every image"),
     "concat": (partial(detector, extra=chain("Concat", 40, times=2, axis=1)), "larger than any backbone's"),
-    "chain": (partial(detector, extra=chain("Relu", MAX_NODES)), "10006 nodes, more than any network of images"),
+    "chain": (partial(detector, extra=chain("Relu", MAX_GRAPH_NODES)), "10006 nodes, more than any network of images"),
     "claims": (partial(empty_claims, dims=(2**20, 2**20)), "larger than any backbone's"),
     "small claims": (partial(empty_claims, dims=(1, 6, 8, 8)), "cannot load it"),
     "part of it": (partial(detector, meta={"freshfield.projection": "AAAAAAAA" * 11}), "projection is damaged"),

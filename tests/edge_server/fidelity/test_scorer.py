@@ -15,12 +15,13 @@ from edge_server.fidelity.baselines import BaselineMean, baseline, mean_color_db
 from edge_server.fidelity.fetch_lpips import FetchError, convert
 from edge_server.fidelity.images import ImageError
 from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, open_lpips, weights_folder
-from edge_server.fidelity.moving_pixels import BOUND, NoiseEstimate, frames_at_lags, moving_mask
+from edge_server.fidelity.moving_pixels import NoiseEstimate, frames_at_lags, moving_mask
 from edge_server.fidelity.psnr import PSNR_CEILING_DB, psnr
 from edge_server.fidelity.scorer import Scorer, mean_score
 from edge_server.fidelity.ssim import ssim
 from edge_server.fields import View
 from edge_server.run_records import Baseline
+from edge_server.tuned_numbers import MOVING_BOUND
 from freshfield.geometry import Pinhole, look_at
 from tests.conftest import data_dir
 from tests.support import refusal, refused
@@ -31,9 +32,9 @@ MS = 1_000_000
 def test_a_pixel_moves_if_any_channel_of_any_earlier_frame_differs():
     now = np.full((4, 4, 3), 0.5)
     one, two = now.copy(), now.copy()
-    one[0, 0, 2] += 1.1 * BOUND
-    two[3, 3, 1] -= 1.1 * BOUND
-    two[1, 1] += 0.9 * BOUND
+    one[0, 0, 2] += 1.1 * MOVING_BOUND
+    two[3, 3, 1] -= 1.1 * MOVING_BOUND
+    two[1, 1] += 0.9 * MOVING_BOUND
     assert list(zip(*np.nonzero(moving_mask(now, [one, two])))) == [(0, 0), (3, 3)]
     assert not moving_mask(now, []).any(), "without earlier frames nothing is known to move"
 
@@ -61,7 +62,7 @@ def test_noise_is_measured_through_8_bits_and_a_moving_third(sigma):
     # Rounding to 8 bits is noise too: 1/sqrt(12) of a step, though none where noise is far below a step.
     upper = np.hypot(sigma, 1 / 255 / np.sqrt(12))
     assert 0.6 * sigma <= estimate.sigma <= 1.05 * upper
-    assert estimate.bound == max(BOUND, 4 * estimate.sigma)
+    assert estimate.bound == max(MOVING_BOUND, 4 * estimate.sigma)
 
 
 RNG = np.random.default_rng(5)

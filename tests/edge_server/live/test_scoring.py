@@ -13,7 +13,6 @@ import pytest
 
 from edge_server.fidelity.psnr import PSNR_CEILING_DB
 from edge_server.fidelity.scorer import Score, Scorer
-from edge_server.fidelity.so_far import MOST
 from edge_server.fields import Rendering, View
 from edge_server.live import tuned_numbers as tuned
 from edge_server.live.scoring import scoring_thread
@@ -21,6 +20,7 @@ from edge_server.live.scoring.held_out import HeldOutCamera
 from edge_server.live.scoring.scoring_thread import ScoringThread
 from edge_server.live.state import Publication
 from edge_server.live.tuned_numbers import MOST_PENDING
+from edge_server.tuned_numbers import SO_FAR_FRAMES
 from freshfield import payload
 from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose
@@ -289,7 +289,8 @@ def test_of_a_held_out_camera_that_moves_the_newest_frame_and_all_so_far_are_tol
     assert thread.so_far is not None and thread.so_far.frames == 3  # two in turn, and the newest
     thread._look_back(whole=True)
     found = thread.so_far
-    assert MOST // 2 <= found.frames <= MOST and not found.refined  # spread over the run, the damaged one forgotten
+    # Spread over the run, the damaged one forgotten.
+    assert SO_FAR_FRAMES // 2 <= found.frames <= SO_FAR_FRAMES and not found.refined
     assert found.now_psnr_db > 35.0 and 8.0 < found.all_psnr_db < 20.0
     words = f"now {found.now_psnr_db:.2f} dB, all {found.frames} frames so far {found.all_psnr_db:.2f} dB"
     assert found.words() == words

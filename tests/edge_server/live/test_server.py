@@ -31,7 +31,8 @@ from edge_server.scheduler.learned.decision_record import read_decision
 from edge_server.scheduler.learned.networks import init_actor
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
-from edge_server.settings import SCAN, read_config
+from edge_server.settings import read_config
+from edge_server.tuned_numbers import SCAN
 from freshfield import scenario
 from freshfield.frame import to_request
 from freshfield.geometry import Pose, look_at

@@ -1,0 +1,46 @@
+"""Numbers of the edge server whose folder has no such file of its own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+# --- what the edge does where a scenario leaves it open (settings) ---
+# Of a field in layers that follows arrivals; of everything else.
+ARRIVALS: dict[str, Any] = {"updates": "arrivals", "update_ms": 20.0, "steps": 10}
+CYCLE: dict[str, Any] = {"updates": "cycle", "update_ms": 800.0, "steps": 100}
+# Of a scan by cameras that move: a third of what a keyframe gets, so that a new one shows as soon as it is seeded.
+CARRIED: dict[str, Any] = {"updates": "cycle", "update_ms": 80.0, "steps": 8}
+# Cameras: photos that are dealt to twelve (``fox``) are no tracks, and read 8 dB less as a scan (19 against 27).
+MOST_CARRIED = 4
+# Options of ``splat`` for that; few pixels bound the Gaussians further.
+SCAN: dict[str, Any] = {"scan": True, "refine": True, "carried": True, "gaussians": 60_000}
+
+# --- how far a command is (progress) ---
+LONG_WORK_S = 10.0  # of a stage of a command that is announced in a pipe, too: nobody wonders about less
+REDRAWN_S = 1.0  # between two drawings of a command's progress: the seconds that it tells change no faster
+
+# --- networks in ONNX (embed) ---
+# The file may come from anywhere. Twice the largest detectors of the family, 230 MB.
+MAX_MODEL_FILE_BYTES = 512 * 2**20
+MAX_TENSOR_ELEMENTS = 2**26  # largest tensor per image: six times the largest of YOLO11x at 640 pixels
+MAX_INPUT_PX = 2048
+# Three times the largest of the family, quantized. ONNX Runtime takes 1 s to load a chain of so many, 12 s of 30,000.
+MAX_GRAPH_NODES = 10_000
+# Images per run if the model takes any number: larger batches exceed the caches and take longer per image.
+EMBEDDING_BATCH = 4
+DEPTH_MOST_ASPECT = 2.5  # of the depth network's input: attention's memory grows with the square of the pixels
+
+# --- the foreground's detector (foreground) ---
+NMS_IOU = 0.6
+NMS_BOXES = 300  # that enter non-maximum suppression, by score
+
+# --- which pixels move (fidelity.moving_pixels) ---
+MOVING_LAGS_MS = (60.0, 120.0, 200.0, 300.0)
+MOVING_BOUND = 0.03
+MOVING_NOISE_SIGMAS = 4.0
+# No usable camera is noisier; a larger estimate means that the camera itself moves.
+NOISE_LIMIT = 0.05
+NOISE_PAIRS = 32  # newest pairs of frames from which noise is estimated
+
+# --- a moving held-out camera's frames so far (fidelity.so_far) ---
+SO_FAR_FRAMES = 64  # at the end of a run each is rendered, 10 ms at 320 x 240
