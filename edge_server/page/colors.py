@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.page.tuned_numbers import FRESH_MS, STALE_MS
+from edge_server.page.tuned_numbers import COLOR_STEPS, FRESH_MS, STALE_MS
 
 RGB = tuple[int, int, int]
 
@@ -26,8 +26,6 @@ cannot tell sky blue from the fresh green."""
 MEASURED: RGB = (0, 114, 178)
 PRESENT: RGB = (213, 94, 0)
 """Measured lines and the present point of a chart: blue and vermilion, as in the figures."""
-# Frustums change color in steps, so that an idle page sends almost nothing.
-STEPS = 24
 
 
 def age_color(age_ms: float | None) -> RGB:
@@ -46,13 +44,13 @@ def age_colors(ages_ms: NDArray[np.float64]) -> NDArray[np.float32]:
     return (np.array(_SCALE, np.float32) / 255)[_steps(ages_ms)]
 
 
-_SCALE = [scale_color(step / STEPS) for step in range(STEPS + 1)]
+_SCALE = [scale_color(step / COLOR_STEPS) for step in range(COLOR_STEPS + 1)]
 
 
 def _steps(ages_ms: Any) -> Any:
-    """Positions of ages on the scale: 0 fresh to STEPS stale, clamped."""
+    """Positions of ages on the scale: 0 fresh to COLOR_STEPS stale, clamped."""
     ages_ms = np.clip(np.nan_to_num(ages_ms, nan=STALE_MS), FRESH_MS, STALE_MS)
-    return np.round(np.log(ages_ms / FRESH_MS) / np.log(STALE_MS / FRESH_MS) * STEPS).astype(int)
+    return np.round(np.log(ages_ms / FRESH_MS) / np.log(STALE_MS / FRESH_MS) * COLOR_STEPS).astype(int)
 
 
 def css(color: RGB) -> str:

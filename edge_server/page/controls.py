@@ -18,7 +18,7 @@ import viser
 from edge_server.live.state import EdgeState
 from edge_server.page.markup import frontier, html
 from edge_server.page.rendering import RenderLoop
-from edge_server.page.tuned_numbers import NOTICE_S
+from edge_server.page.tuned_numbers import NOTICE_S, SNAPSHOT_NOTICE_S
 from edge_server.page.views import ERROR, HINT, PICTURE, TRUTH, VIEWS
 from edge_server.scheduler import make_policy, policy_help, short_name
 
@@ -103,7 +103,7 @@ class ControlPanel:
 
     def _snapshot(self, client: Any) -> None:
         path = self._state.save_snapshot()
-        notify(client, "Snapshot saved", str(path), seconds=30.0)
+        notify(client, "Snapshot saved", str(path), seconds=SNAPSHOT_NOTICE_S)
 
     def _attempt(self, client: Any, what: str, action: Any) -> None:
         """Call ``action``; if it fails, notify the client and show the values still in force."""

@@ -17,7 +17,14 @@ import viser
 
 from edge_server.page.controls import notify
 from edge_server.page.markup import html
-from edge_server.page.tuned_numbers import ANSWER_S, MAX_SLIDER_DELAY_MS, NETWORKS, SLIDER_SETTLES_S, STATUS_LAG_S
+from edge_server.page.tuned_numbers import (
+    ANSWER_S,
+    MAX_SLIDER_DELAY_MS,
+    NETWORKS,
+    SLIDER_SETTLES_S,
+    SLIDER_STEP_MS,
+    STATUS_LAG_S,
+)
 from freshfield.transport import Transport, peer_text
 from freshfield.v1 import channel_pb2, channel_pb2_grpc
 
@@ -63,7 +70,9 @@ class NetworkControl:
         self._timer: threading.Timer | None = None
         self._refresh_after_s = 0.0
         self.buttons: Any = gui.add_button_group("network", (SCENARIO, *NETWORKS))
-        self.delay: Any = gui.add_slider("delay, ms", 0, MAX_SLIDER_DELAY_MS, 10, 0, hint="Mean delay of a frame.")
+        self.delay: Any = gui.add_slider(
+            "delay, ms", 0, MAX_SLIDER_DELAY_MS, SLIDER_STEP_MS, 0, hint="Mean delay of a frame."
+        )
         self.loss: Any = gui.add_slider("loss, %", 0, 100, 1, 0, hint="Share of the frames that never arrive.")
         self.words: Any = gui.add_html("")
         self.buttons.on_click(self._pressed)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 import threading
 
-log = logging.getLogger(__name__)
+from edge_server.page import tuned_numbers as tuned
 
-AFTER_ERROR_S = 1.0
+log = logging.getLogger(__name__)
 
 
 class PageThread:
@@ -31,7 +31,7 @@ class PageThread:
             self._stopped = True
             self._wake.notify_all()
         if self._thread.is_alive():
-            self._thread.join(timeout=5.0)
+            self._thread.join(timeout=tuned.THREAD_END_S)
 
     def wake(self) -> None:
         """Begin the next step at once, also where one is at work and has looked already."""
@@ -49,7 +49,7 @@ class PageThread:
             except Exception as error:  # the page must never stop the server
                 self._say(error)
                 with self._wake:
-                    self._wake.wait_for(lambda: self._stopped, AFTER_ERROR_S)
+                    self._wake.wait_for(lambda: self._stopped, tuned.AFTER_ERROR_S)
                 continue
             with self._wake:
                 self._wake.wait_for(lambda: self._stopped or self._asked, max(seconds, 0.0))

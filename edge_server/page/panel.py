@@ -18,13 +18,17 @@ from edge_server.page.markup import html
 from edge_server.page.network_control import EmulatorControl, NetworkControl
 from edge_server.page.rendering import browser_image
 from edge_server.page.timelines import History, Timelines
-from edge_server.page.tuned_numbers import AGE_PARTS_OF, LEAST_SCENE_PX, POSE_NOISE
+from edge_server.page.tuned_numbers import (
+    AGE_PARTS_OF,
+    LEAST_SCENE_PX,
+    MAIN_PANEL_PX,
+    PAIR_JPEG_QUALITY,
+    PAIR_PX,
+    POSE_NOISE,
+    SIDE_PANEL_PX,
+)
 from edge_server.run_records import age_parts_ms
 from freshfield import coverage
-
-MAIN_WIDTH = 372
-SIDE_WIDTH = 356
-PAIR_WIDTH = 640  # pixels of two images beside each other
 
 
 class Panel:
@@ -35,7 +39,7 @@ class Panel:
         gui = server.gui
         gui.set_panel_label("freshfield")
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(MAIN_WIDTH)
+        gui.main_panel.set_width(MAIN_PANEL_PX)
         gui.add_html(html("intro"))
         if state.warnings:
             gui.add_html(html("warning", f"Insecure: {'; '.join(state.warnings)}."))
@@ -67,7 +71,7 @@ class Panel:
             self._reckoned_for: dict[str, coverage.Camera] = {}
             self._reckoned_with_depth = False
         side.dock_left()
-        side.set_width(SIDE_WIDTH)
+        side.set_width(SIDE_PANEL_PX)
         self._gui, self._side = gui, side
         self._made_room: WeakSet[viser.ClientHandle] = WeakSet()
 
@@ -137,11 +141,11 @@ class Panel:
             comparison.camera, scored.psnr_db if scored else None, comparison.number, held_out
         )
         rows, columns = comparison.truth.shape[:2]
-        height = max(1, round(PAIR_WIDTH / 2 * rows / columns))
-        pair = browser_image(views.compared(comparison, PAIR_WIDTH, height, error=False, labeled=False))
+        height = max(1, round(PAIR_PX / 2 * rows / columns))
+        pair = browser_image(views.compared(comparison, PAIR_PX, height, error=False, labeled=False))
         if self._pair is None:
             order = self._caption.order + 0.5  # below its caption
-            self._pair = self._gui.add_image(pair, format="jpeg", jpeg_quality=88, order=order)
+            self._pair = self._gui.add_image(pair, format="jpeg", jpeg_quality=PAIR_JPEG_QUALITY, order=order)
         else:
             self._pair.image = pair
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Rendering, Snapshot
 from edge_server.live.state import Comparison, EdgeState
+from edge_server.page import tuned_numbers as tuned
 from edge_server.page import views
 from edge_server.page.page_thread import PageThread
 from edge_server.page.viewpoint import row_band, visitor_camera
@@ -47,17 +48,9 @@ class DetailLevel:
     max_rows: int
 
 
-# While the visitor moves, at rest, and at rest with nothing new to show. An image below min_rows is not worth
-# its fixed cost, the wait for a training step of the field to end.
+# While the visitor moves, and at rest; the last level: at rest with nothing new to show.
 MOVING, NEWER = 0, 1
-LEVELS = (DetailLevel(0.08, 0.5, 64, 240), DetailLevel(0.20, 0.2, 120, 480), DetailLevel(1.2, 0.15, 200, 720))
-# Shortest budget for the image of a new publication: at a share of .2 that is seven pictures a second.
-LEAST_S = 0.03
-BAND_S = 0.1
-MIN_GAP_S = IDLE_S = 0.05
-SETTLE_S = 0.25
-STRIPE_PX, SHADE = 6, 0.7  # width and brightness of the stripes over what no camera has seen
-COARSE = 4  # that is asked at so many times fewer pixels a side: it takes a few milliseconds then
+LEVELS = tuple(DetailLevel(*level) for level in tuned.RENDER_LEVELS)
 
 
 BrowserView = tuple[NDArray[np.float64], NDArray[np.float64], float, int, int]
@@ -92,7 +85,7 @@ class RenderLoop(PageThread):
         super().__init__("page-render", "rendering for a visitor")
         self._state = state
         self._visitors: dict[int, ClientState] = {}
-        self._rows = [1.5 * level.min_rows for level in LEVELS]
+        self._rows = [tuned.FIRST_ROWS * level.min_rows for level in LEVELS]
         self._not_before = [0.0] * len(LEVELS)
         self._took_s = [level.budget_s for level in LEVELS]  # the last whole image of each level
 
@@ -141,7 +134,9 @@ class RenderLoop(PageThread):
     # --- the thread -----------------------------------------------------------------------------
 
     def _step(self) -> float:
-        return 0.0 if self._work(perf_counter()) else IDLE_S if self._visitors else 0.5
+        if self._work(perf_counter()):
+            return 0.0
+        return tuned.RENDER_IDLE_S if self._visitors else tuned.RENDER_UNVISITED_S
 
     def _work(self, now: float) -> bool:
         """Do the most urgent work; False if nothing is due."""
@@ -169,7 +164,7 @@ class RenderLoop(PageThread):
         """The level to render next for a visitor; None if it has the finest or must wait."""
         if visitor.level < 0:
             level = MOVING
-        elif now - visitor.moved_at < SETTLE_S:
+        elif now - visitor.moved_at < tuned.RENDER_SETTLE_S:
             return None
         elif visitor.renderer is not renderer:
             level = NEWER
@@ -198,11 +193,13 @@ class RenderLoop(PageThread):
         finally:
             spent = perf_counter() - began
             for each in levels:  # the second bound matters if rendering is cheap: it spares network and browser
-                self._not_before[each] = began + max(spent / LEVELS[each].max_share, MIN_GAP_S)
+                self._not_before[each] = began + max(spent / LEVELS[each].max_share, tuned.RENDER_MIN_GAP_S)
         if image is None:
             return
         if visitor.client.client_id in self._visitors:  # has not left meanwhile
-            visitor.client.scene.set_background_image(browser_image(image), format="jpeg", jpeg_quality=85)
+            visitor.client.scene.set_background_image(
+                browser_image(image), format="jpeg", jpeg_quality=tuned.PICTURE_JPEG_QUALITY
+            )
             visitor.sent += 1
         with self._wake:
             if visitor.serial == serial:
@@ -224,7 +221,7 @@ class RenderLoop(PageThread):
         if visitor.view == views.AGE:
             return views.age_view(rendering, pose, camera, self._state.cameras())
         if level and isinstance(shown, TellsUnseen):
-            return hatched(rendering.color, shown.unseen(pose, camera.scaled(1.0 / COARSE)))
+            return hatched(rendering.color, shown.unseen(pose, camera.scaled(1.0 / tuned.UNSEEN_COARSE)))
         return rendering.color
 
     def _budget_s(self, number: int) -> float:
@@ -233,12 +230,12 @@ class RenderLoop(PageThread):
         level, newest = LEVELS[number], self._state.newest()
         if number != NEWER or newest is None:
             return level.budget_s
-        return float(np.clip(level.max_share * newest.update_ms / 1e3, LEAST_S, level.budget_s))
+        return float(np.clip(level.max_share * newest.update_ms / 1e3, tuned.RENDER_LEAST_S, level.budget_s))
 
     def _adapt(self, number: int, spent: float) -> None:
         """Change the rows of the next image so that it takes about the time budget of its level."""
         level, self._took_s[number] = LEVELS[number], spent
-        change = np.clip(np.sqrt(self._budget_s(number) / max(spent, 1e-4)), 0.7, 1.3)
+        change = np.clip(np.sqrt(self._budget_s(number) / max(spent, 1e-4)), *tuned.ROWS_CHANGE)
         self._rows[number] = float(np.clip(self._rows[number] * change, level.min_rows, level.max_rows))
 
     def _render(
@@ -246,7 +243,7 @@ class RenderLoop(PageThread):
     ) -> Rendering | None:
         """The image, rendered in bands; None if the visitor has moved meanwhile. Every band projects the whole
         field again, so that there are no more of them than the time of the last such image calls for."""
-        bands = max(1, round(self._took_s[level] / BAND_S)) if level else 1
+        bands = max(1, round(self._took_s[level] / tuned.RENDER_BAND_S)) if level else 1
         edges = np.linspace(0, camera.height, min(bands, camera.height) + 1).astype(int)
         parts = []
         for top, bottom in pairwise(edges):
@@ -266,8 +263,8 @@ def hatched(image: NDArray[np.float32], unseen: NDArray[np.bool_] | None) -> NDA
     height, width = image.shape[:2]
     y, x = np.arange(height), np.arange(width)
     there = unseen[(y * unseen.shape[0] // height)[:, None], x * unseen.shape[1] // width]
-    stripe = (x + y[:, None]) // STRIPE_PX % 2 == 0
-    return np.where((there & stripe)[..., None], image * np.float32(SHADE), image)
+    stripe = (x + y[:, None]) // tuned.STRIPE_PX % 2 == 0
+    return np.where((there & stripe)[..., None], image * np.float32(tuned.STRIPE_SHADE), image)
 
 
 def browser_image(color: NDArray[np.float32]) -> NDArray[np.uint8]:

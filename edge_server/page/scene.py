@@ -93,7 +93,7 @@ class Scene:
             thickness_units="screen",
             color=color,
             format="jpeg",
-            jpeg_quality=75,
+            jpeg_quality=tuned.THUMBNAIL_JPEG_QUALITY,
             wxyz=frame.pose.quaternion,
             position=frame.pose.translation_m,
             cast_shadow=False,

@@ -14,12 +14,8 @@ from edge_server.fidelity.scorer import fidelity_title
 from edge_server.live.state import CameraView, Publication
 from edge_server.page.colors import FRESH, HELD_OUT, MIDDLE, RGB, STALE, UNKNOWN, css
 from edge_server.page.markup import chart_caption
-from edge_server.page.tuned_numbers import WINDOW_S
+from edge_server.page.tuned_numbers import CHART_HEIGHT_PX, CHART_LINE_PX, CHART_POINTS, CHART_SAMPLES, WINDOW_S
 
-LINE_PX = 1.6
-# More points than the chart has pixels would be sent but not seen.
-MAX_POINTS = 300
-HEIGHT = 104
 STATE_WORDS = {"low": "good", "high": "bad"}
 """The thesis's names of a network's states, low and high traffic, for people."""
 
@@ -28,7 +24,7 @@ class History:
     """Ages and the channel's state, sampled by the page with or without visitors: at most the last
     ``window_s`` seconds and ``most`` samples."""
 
-    def __init__(self, window_s: float = WINDOW_S, most: int = 1200) -> None:
+    def __init__(self, window_s: float = WINDOW_S, most: int = CHART_SAMPLES) -> None:
         self._window_s = window_s
         self._samples: deque[tuple[float, float, float, float]] = deque(maxlen=most)
         self.state_names: list[str] = []
@@ -140,7 +136,7 @@ class _Chart:
     def _make(self, lines: Sequence[tuple[str, RGB]], data: tuple[NDArray, ...]) -> Any:
         series: list[Any] = [{"label": "s"}]
         for label, color in lines:
-            line: dict[str, Any] = {"label": label, "stroke": css(color), "width": LINE_PX}
+            line: dict[str, Any] = {"label": label, "stroke": css(color), "width": CHART_LINE_PX}
             line |= {"points": {"show": False}}
             series.append(line | ({"fill": css(color) + "30"} if self._stepped else {}))
         axis: dict[str, Any] = {"font": "10px sans-serif", "gap": 3, "ticks": {"size": 3}}
@@ -150,7 +146,7 @@ class _Chart:
         return self._gui.add_uplot(
             data=data,
             series=tuple(series),
-            height=HEIGHT,
+            height=CHART_HEIGHT_PX,
             scales=scales,
             axes=cast(Any, ({"size": 22} | axis, {"size": 38, "space": 22} | axis)),
             legend={"show": False},
@@ -163,8 +159,8 @@ def _column(values: Any) -> NDArray:
 
 
 def _decimate(*columns: NDArray) -> tuple[NDArray, ...]:
-    """At most MAX_POINTS rows, the last one kept."""
-    step = max(1, -(-len(columns[0]) // MAX_POINTS))
+    """At most CHART_POINTS rows, the last one kept."""
+    step = max(1, -(-len(columns[0]) // CHART_POINTS))
     return tuple(np.ascontiguousarray(c[::-1][::step][::-1], dtype=np.float64) for c in columns)
 
 

@@ -1,4 +1,4 @@
-"""Times and ages of the live page."""
+"""Times, ages and sizes of the live page."""
 
 from __future__ import annotations
 
@@ -61,3 +61,63 @@ REFUSED_SHARE = 0.2
 """Of a camera's frames, from which on refusals explain a bad picture."""
 LEAST_SCENE_PX = 320
 """Of the scene beside both panels; a phone, where they are below the scene, is as wide."""
+
+# --- rendering for visitors (rendering) ---
+RENDER_LEVELS = ((0.08, 0.5, 64, 240), (0.20, 0.2, 120, 480), (1.2, 0.15, 200, 720))
+"""While the visitor moves, at rest, and at rest with nothing new to show: seconds for one image, largest share of all
+time for such images, fewest and most rows (``DetailLevel``). An image of fewer rows is not worth its fixed cost, the
+wait for a training step of the field to end."""
+RENDER_LEAST_S = 0.03
+"""Shortest budget for the image of a new publication: at a share of .2 that is seven pictures a second."""
+RENDER_BAND_S = 0.1
+"""Of a band of rows, between two of which an image may be abandoned."""
+RENDER_MIN_GAP_S = RENDER_IDLE_S = 0.05
+"""Between two images of a level at least; between two looks at what visitors need."""
+RENDER_UNVISITED_S = 0.5
+"""The same while nobody visits."""
+RENDER_SETTLE_S = 0.25
+"""A visitor who has not moved for this long is at rest."""
+FIRST_ROWS, ROWS_CHANGE = 1.5, (0.7, 1.3)
+"""Rows of a level's first image, in its fewest, and factors by which the next image's may change."""
+PICTURE_JPEG_QUALITY = 85
+STRIPE_PX, STRIPE_SHADE = 6, 0.7
+"""Width and brightness of the stripes over what no camera has seen."""
+UNSEEN_COARSE = 4
+"""That is asked at so many times fewer pixels a side: it takes a few milliseconds then."""
+DEPTH_PERCENTILES = (2, 98)
+"""Of a picture's depth, that are its nearest and farthest colors."""
+
+# --- panels and charts (panel, timelines, markup, controls, colors) ---
+MAIN_PANEL_PX, SIDE_PANEL_PX = 372, 356
+"""Widths."""
+PAIR_PX, PAIR_JPEG_QUALITY = 640, 88
+"""Of two images beside each other: their width together."""
+THUMBNAIL_JPEG_QUALITY = 75
+CHART_LINE_PX, CHART_HEIGHT_PX = 1.6, 104
+CHART_POINTS = 300
+"""More points than the chart has pixels would be sent but not seen."""
+CHART_SAMPLES = 1200
+"""Kept of ages and the channel's state."""
+NAMED_CAMERAS = 3
+"""That a sentence names, of those that an update left out."""
+SNAPSHOT_NOTICE_S = 30.0
+"""For which the path of a saved snapshot stays."""
+SLIDER_STEP_MS = 10
+"""Of the slider of delay."""
+COLOR_STEPS = 24
+"""Frustums change color in steps, so that an idle page sends almost nothing."""
+
+# --- the starting viewpoint (viewpoint) ---
+VERTICAL_FOV_DEG = 60.0
+SCATTERED = 0.25
+"""A shorter mean of unit vectors has no meaning: cameras surround the scene, or roll freely."""
+AHEAD_OF_SPREAD, LEAST_AHEAD_M = 3.0, 1.0
+"""Where optical axes do not meet, cameras look at a point so far ahead, in their mean distance from their middle."""
+
+# --- threads and answers (page_thread, preferences) ---
+AFTER_ERROR_S = 1.0
+"""Until a thread's next step, after one that failed."""
+THREAD_END_S = 5.0
+"""For a thread to end, when the page does."""
+MAX_ANSWER_BYTES = 2**10
+"""Of an answer to a question about preferences: a hundred would do."""

@@ -7,14 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edge_server.page.tuned_numbers import ABOVE_CAMERAS_DEG, DISTANCE, ELEVATION_DEG
+from edge_server.page.tuned_numbers import (
+    ABOVE_CAMERAS_DEG,
+    AHEAD_OF_SPREAD,
+    DISTANCE,
+    ELEVATION_DEG,
+    LEAST_AHEAD_M,
+    SCATTERED,
+    VERTICAL_FOV_DEG,
+)
 from freshfield.geometry import Pinhole, converging_point, quaternion_to_matrix, world_up
 
 Array = NDArray[np.float64]
 
-VERTICAL_FOV_RAD = float(np.deg2rad(60.0))
-# A shorter mean of unit vectors has no meaning: cameras surround the scene, or roll freely.
-_SCATTERED = 0.25
+VERTICAL_FOV_RAD = float(np.deg2rad(VERTICAL_FOV_DEG))
 
 
 @dataclass(frozen=True)
@@ -41,8 +47,8 @@ def initial_viewpoint(poses: ArrayLike, center: ArrayLike | None = None) -> View
     center = center if meeting is None else meeting
     if center is None:
         spread = float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).mean())
-        ahead = axes.mean(axis=0) if np.linalg.norm(axes.mean(axis=0)) > _SCATTERED else axes[0]
-        center = eyes.mean(axis=0) + ahead / np.linalg.norm(ahead) * max(3.0 * spread, 1.0)
+        ahead = axes.mean(axis=0) if np.linalg.norm(axes.mean(axis=0)) > SCATTERED else axes[0]
+        center = eyes.mean(axis=0) + ahead / np.linalg.norm(ahead) * max(AHEAD_OF_SPREAD * spread, LEAST_AHEAD_M)
     center = np.asarray(center, dtype=np.float64)
     radius = float(np.median(np.linalg.norm(eyes - center, axis=1)))
     radius = max(radius, 1e-2)
@@ -54,7 +60,7 @@ def _outward(offsets: Array, up: Array, radius: float) -> Array:
     """Unit vector from the center to the visitor, above the mean camera. offsets: (N, 3) meters."""
     flat = offsets - (offsets @ up)[:, None] * up
     behind = flat.mean(axis=0)
-    if np.linalg.norm(behind) < _SCATTERED * radius:  # a ring of cameras: behind the first
+    if np.linalg.norm(behind) < SCATTERED * radius:  # a ring of cameras: behind the first
         behind = flat[0]
     if np.linalg.norm(behind) < 1e-6 * radius:  # it looks straight down: any side
         least = np.zeros(3)

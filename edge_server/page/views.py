@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edge_server.fields import Rendering
 from edge_server.live.state import CameraView, Comparison
 from edge_server.page.colors import UNKNOWN, age_colors
-from edge_server.page.tuned_numbers import AGE_VIEW_LIGHT, AGE_VIEW_STEP, ERROR_GAIN, LABEL_PX, SOLID
+from edge_server.page.tuned_numbers import AGE_VIEW_LIGHT, AGE_VIEW_STEP, DEPTH_PERCENTILES, ERROR_GAIN, LABEL_PX, SOLID
 from freshfield.geometry import Pinhole, seen_from, world_rays
 
 PICTURE, DEPTH, AGE, TRUTH, ERROR = "picture", "depth", "age", "truth | picture", "error"
@@ -30,7 +30,7 @@ def depth_view(rendering: Rendering) -> Image:
     known = (rendering.opacity > SOLID) & np.isfinite(rendering.depth) & (rendering.depth > 0)
     if not known.any():
         return np.broadcast_to(BACKDROP, rendering.color.shape)
-    near, far = np.percentile(rendering.depth[known], (2, 98))
+    near, far = np.percentile(rendering.depth[known], DEPTH_PERCENTILES)
     share = np.clip((rendering.depth - near) / max(far - near, 1e-6), 0, 1)
     levels = (255 * (1 - np.where(known, share, 1))).astype(np.uint8)
     colors = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1] / np.float32(255)

@@ -10,8 +10,8 @@ from edge_server.live.state import CameraView, Publication
 from edge_server.page import markup, timelines
 from edge_server.page.colors import FRESH, HELD_OUT, STALE, css, scale_color
 from edge_server.page.diagnosis import poor_picture
-from edge_server.page.timelines import MAX_POINTS, History
-from edge_server.page.tuned_numbers import FLAT_SCORES
+from edge_server.page.timelines import History
+from edge_server.page.tuned_numbers import CHART_POINTS, FLAT_SCORES
 from edge_server.run_records import Frontier, FrontierPoint, age_parts_ms
 from tests.edge_server.page.preview import publication
 
@@ -181,4 +181,4 @@ def test_the_charts_show_ages_scored_updates_of_the_window_and_states_by_name():
         history.sample(202.0 + k, views(1000.0 + k), None)
     charts.refresh(history, [])
     t, mean, _ = made[-1].data  # thinned, with the newest
-    assert len(t) <= MAX_POINTS and t[-1] == 1000.0 and np.array_equal(mean[-9:], t[-9:] + 798.0)
+    assert len(t) <= CHART_POINTS and t[-1] == 1000.0 and np.array_equal(mean[-9:], t[-9:] + 798.0)

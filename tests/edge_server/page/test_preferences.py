@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from edge_server.live.output import guarded_http
+from edge_server.live import tuned_numbers as tuned
 from edge_server.page import PageError
-from edge_server.page.preferences import MAX_BODY_BYTES, PreferencePage
+from edge_server.page.preferences import PreferencePage
+from edge_server.page.tuned_numbers import MAX_ANSWER_BYTES
 from edge_server.viewpoints.preference_session import PreferenceSession
 from freshfield.transport import Transport, TransportError
 from tests.edge_server.page.browser import Browser
@@ -83,7 +84,7 @@ def test_answers_are_of_the_pair_that_was_shown_written_and_nothing_is_answered_
 
 @pytest.mark.parametrize(
     ("body", "status"),
-    [(b"[1]", 400), ({"choice": "left"}, 409), (b"x" * 16 * MAX_BODY_BYTES, 413), (b"[" * MAX_BODY_BYTES, 400)],
+    [(b"[1]", 400), ({"choice": "left"}, 409), (b"x" * 16 * MAX_ANSWER_BYTES, 413), (b"[" * MAX_ANSWER_BYTES, 400)],
 )
 def test_bad_requests_change_nothing(asked, body, status):
     _, url, kept = asked
@@ -99,7 +100,7 @@ def test_bad_requests_change_nothing(asked, body, status):
 
 
 def test_who_sends_without_end_is_cut_off(asked, monkeypatch):
-    monkeypatch.setattr(guarded_http, "LINGER_S", 0.2)
+    monkeypatch.setattr(tuned, "HTTP_LINGER_S", 0.2)
     host, port = asked[1].removeprefix("http://").split(":")
     with socket.create_connection((host, int(port)), timeout=10) as endless, pytest.raises(ConnectionError):
         endless.sendall(b"POST /answer HTTP/1.1\r\nContent-Length: 999999999\r\n\r\n")
