@@ -9,13 +9,11 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from edge_server.live import tuned_numbers as tuned
 from edge_server.run_records import Frontier, FrontierPoint
 from edge_server.settings import EdgeConfig
 from freshfield.scenario import Scenario
 from freshfield.untrusted import read_json, read_text
-
-# Assumed of a scene whose speed is not given: a person walking.
-USUAL_SPEED_M_PER_S = 1.0
 
 
 def read_frontier(path: Path | None, representation: str, layers: bool = False) -> list[FrontierPoint]:
@@ -64,7 +62,7 @@ def points_of(rows: Sequence[Mapping[str, Any]]) -> list[FrontierPoint]:
     ]
 
 
-def best_point(points: Sequence[FrontierPoint], speed_m_per_s: float = USUAL_SPEED_M_PER_S) -> FrontierPoint:
+def best_point(points: Sequence[FrontierPoint], speed_m_per_s: float = tuned.USUAL_SPEED_M_PER_S) -> FrontierPoint:
     """The best of the points measured at the speed nearest to ``speed_m_per_s``.
 
     More time is not always better: what moves ages meanwhile. Of the points that are within the standard
@@ -90,7 +88,7 @@ def open_frontier(scenario: Scenario, config: EdgeConfig) -> Frontier:
     """The frontier that a scenario names, else the shipped one. Raises ValueError if the named one cannot be
     read or has no points for the scenario's field."""
     path = None if config.frontier is None else scenario.path.parent / config.frontier
-    speed = float(scenario.source.get("speed_m_per_s", USUAL_SPEED_M_PER_S))
+    speed = float(scenario.source.get("speed_m_per_s", tuned.USUAL_SPEED_M_PER_S))
     try:
         points = read_frontier(path, config.field, bool(config.field_options.get("layers")))
     except ValueError as error:

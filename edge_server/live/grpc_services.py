@@ -9,6 +9,7 @@ import threading
 import grpc
 import grpc.aio
 
+from edge_server.live import tuned_numbers as tuned
 from edge_server.live.ingest import Ingest
 from edge_server.live.state import EdgeState, Publication
 from freshfield.clock import Clock
@@ -18,9 +19,6 @@ from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2
 
 log = logging.getLogger(__name__)
-
-# Period of looking for new decisions; updates take hundreds of milliseconds.
-_WATCH_S = 0.05
 
 
 class ClockService(clock_pb2_grpc.ClockServiceServicer):
@@ -72,7 +70,7 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
                 for publication in self._state.publications(since=seen):
                     seen = publication.number
                     await call.write(edge_pb2.WatchDecisionsResponse(decision=to_decision(publication)))
-                await asyncio.sleep(_WATCH_S)
+                await asyncio.sleep(tuned.WATCH_S)
 
     async def ResetField(
         self, request: edge_pb2.ResetFieldRequest, context: grpc.aio.ServicerContext

@@ -15,11 +15,12 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from edge_server.live.tuned_numbers import CERTIFICATE_DAYS
 from freshfield.files import out_folder
 from freshfield.scenario import load
 from freshfield.transport import TransportError
 
-_REQUEST = "openssl req -x509 -days 365 -noenc -newkey ec -pkeyopt ec_paramgen_curve:prime256v1"
+_REQUEST = f"openssl req -x509 -days {CERTIFICATE_DAYS} -noenc -newkey ec -pkeyopt ec_paramgen_curve:prime256v1"
 # Of the authority. Python 3.13 verifies strictly (RFC 5280): an authority says what its key is for, and every
 # certificate which key it holds and which signed it.
 _AUTHORITY = ("basicConstraints=critical,CA:TRUE", "keyUsage=critical,keyCertSign,cRLSign", "subjectKeyIdentifier=hash")

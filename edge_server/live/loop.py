@@ -131,7 +131,7 @@ class UpdateLoop:
         self._on_status(learning or f"fitting {len(selection.items)} views")
         fitted = self._updater.fit(selection, budget)
         if fitted is None:
-            self._stop.wait(0.01)  # every selected frame is damaged: newer ones will come
+            self._stop.wait(tuned.ALL_DAMAGED_S)
             return
         views, report = fitted
         self._warn_of_haste(report)

@@ -221,7 +221,7 @@ class EdgeServer:
             self.loop.stop()
             self._write_field()  # first: who asked for the end does not wait for ever
             self.scoring.stop(tuned.LAST_SCORES_S)
-            grpc.join(1.0)
+            grpc.join(tuned.GRPC_END_S)
             self._write_final()
             for page in opened:
                 page.stop()

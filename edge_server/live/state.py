@@ -160,7 +160,7 @@ class EdgeState:
     status_line: str = ""
     warnings: list[str] = field(default_factory=list)
     events: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=tuned.MOST_EVENTS))
-    _publications: deque[Publication] = field(default_factory=lambda: deque(maxlen=4096))
+    _publications: deque[Publication] = field(default_factory=lambda: deque(maxlen=tuned.KEPT_PUBLICATIONS))
     _shown: deque[Score] = field(default_factory=lambda: deque(maxlen=tuned.SHOWN_OF))
     _renderer: Snapshot | None = None
     _comparison: Comparison | None = None

@@ -30,6 +30,7 @@ RESTARTS_BELOW = 16  # viewpoints: the field begins anew each time their number 
 
 # --- the loop of updates ---
 LONGEST_SLEEP_S = 0.2  # before it looks at the controls again
+ALL_DAMAGED_S = 0.01  # wait where every selected frame is damaged: newer ones will come
 TOO_SHORT, TOO_SHORT_OF = 10, 30  # updates without a step, of the latest, after which a warning is due
 WARN_EVERY_S = 30.0  # between two warnings of one kind
 # For the update in progress when the server ends, without which there is no checkpoint. On a machine with five times as
@@ -38,6 +39,8 @@ WARN_EVERY_S = 30.0  # between two warnings of one kind
 STOP_S = 20.0
 
 # --- scores: which held-out frame shows the instant of an update ---
+# More than the longest lag of what moves, so that the frame nearest to it is still here at low frame rates.
+HISTORY_BEYOND_LAGS_MS = 1000.0
 HISTORY_FRAMES = 128
 MOST_PENDING = 8  # publications that wait for their truth: more means that no held-out frames arrive
 GAP_PERIODS = 0.55  # the truth may be half a period from the present; the rest is jitter of a real camera's clock
@@ -76,6 +79,15 @@ LAST_SCORES_S = 4.0  # for what waits at the end, and for all frames of held-out
 UPDATE_TIMES, CHECK_TIMES = 4096, 4096  # latest times of updates, and of checks of frames, whose percentiles are told
 MOST_EVENTS = 200  # kept: each is in every edge.json
 SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages
+KEPT_PUBLICATIONS = 4096  # latest ones of ``EdgeState``
+WATCH_S = 0.05  # between two looks of the operator service at new decisions; updates take hundreds of milliseconds
+USUAL_SPEED_M_PER_S = 1.0  # assumed of a scene whose speed is not given (``frontier``): a person walking
+
+# --- connections and keys ---
+CERTIFICATE_DAYS = 365  # of ``keys``
+WAITING_CONNECTIONS = 128  # to HTTP: with the usual five, a client waits seconds to be accepted during a flood
+HTTP_LINGER_S = 2.0  # most for which what still comes is read after an answer
+GRPC_END_S = 1.0  # for the server of gRPC, when the edge ends
 
 MAX_SNAPSHOTS = 20
 """Number of snapshots in the folder of a run: a user who requests more is told to move some away."""

@@ -12,6 +12,7 @@ from socketserver import ThreadingMixIn
 from typing import Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
+from edge_server.live import tuned_numbers as tuned
 from freshfield.access import HttpDoor, HttpRefused
 from freshfield.limits import MAX_SCRAPES, SCRAPE_TIMEOUT_S
 from freshfield.transport import Transport, TransportError
@@ -20,8 +21,6 @@ log = logging.getLogger(__name__)
 
 CALLER = "freshfield.caller"
 """Key of the ``access.Caller`` in the environment of an application's requests."""
-
-LINGER_S = 2.0
 
 
 class _Handler(WSGIRequestHandler):
@@ -35,7 +34,7 @@ class _Server(ThreadingMixIn, WSGIServer):
     """One thread per connection. If there are more than MAX_SCRAPES, a new connection ends the oldest."""
 
     daemon_threads = True
-    request_queue_size = 128  # with the usual five, a client waits seconds to be accepted during a flood
+    request_queue_size = tuned.WAITING_CONNECTIONS
 
     def __init__(self, host: str, port: int) -> None:
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -63,12 +62,12 @@ class _Server(ThreadingMixIn, WSGIServer):
 
 
 def _read_to_its_end(connection: socket.socket) -> None:
-    """Say that the answer is complete, then read and forget what still comes, for LINGER_S at most.
+    """Say that the answer is complete, then read and forget what still comes, for HTTP_LINGER_S at most.
 
     Closing with bytes unread resets the connection, and the client loses an answer that it has not read, such
     as the refusal of a body that is too large.
     """
-    until = time.monotonic() + LINGER_S
+    until = time.monotonic() + tuned.HTTP_LINGER_S
     connection.shutdown(socket.SHUT_WR)
     while (left := until - time.monotonic()) > 0:
         connection.settimeout(left)

@@ -29,8 +29,7 @@ from freshfield.geometry import Pose
 
 log = logging.getLogger(__name__)
 
-# Longer than the longest lag, so that the frame nearest to it is still here at low frame rates.
-HISTORY_NS = round((MOVING_LAGS_MS[-1] + 1000.0) * 1e6)
+HISTORY_NS = round((MOVING_LAGS_MS[-1] + tuned.HISTORY_BEYOND_LAGS_MS) * 1e6)
 
 Image = NDArray[np.float32]
 
