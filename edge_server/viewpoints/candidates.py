@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edge_server.viewpoints import tuned_numbers as tuned
 from freshfield.geometry import Pinhole, look_at
 
 Array = NDArray[np.float64]
 
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
-MOST_CANDIDATES = 10_000
-ELEVATIONS_DEG = 12.0, 80.0  # between which candidates lie
 
 
 class ViewpointError(ValueError):
@@ -78,13 +77,13 @@ def half_hemisphere(
 
     Raises ViewpointError unless ``count`` is 1 to MOST_CANDIDATES and ``radius_m`` is positive.
     """
-    if not 1 <= count <= MOST_CANDIDATES or not radius_m > 0.0:
+    if not 1 <= count <= tuned.MOST_CANDIDATES or not radius_m > 0.0:
         raise ViewpointError(
-            f"expected 1 to {MOST_CANDIDATES} candidates at a radius above 0, got {count} at {radius_m:g} m"
+            f"expected 1 to {tuned.MOST_CANDIDATES} candidates at a radius above 0, got {count} at {radius_m:g} m"
         )
     target = np.asarray(target, np.float64)
     k = np.arange(count)
-    low, high = np.sin(np.deg2rad(ELEVATIONS_DEG))
+    low, high = np.sin(np.deg2rad(tuned.CANDIDATE_ELEVATIONS_DEG))
     elevation = np.arcsin(low + (high - low) * (k + 0.5) / count)  # equal areas
     first, last = np.deg2rad(azimuths_deg)
     azimuth = first + (last - first) * ((offset + _GOLDEN * k) % 1.0)

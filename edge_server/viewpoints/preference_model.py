@@ -13,11 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import ViewpointError
-from edge_server.viewpoints.tuned_numbers import LEAST_ODDS, WIDTHS
+from edge_server.viewpoints.tuned_numbers import LEAST_ODDS, NEWTON_STEPS, WIDTHS
 
 Array = NDArray[np.float64]
-
-_NEWTON_STEPS = 50
 
 
 @dataclass(frozen=True)
@@ -112,7 +110,7 @@ def _laplace(x: Array, votes: Array, width: float) -> tuple[Array, float]:
         return float(votes @ np.logaddexp(0.0, -x @ w) + 0.5 * w @ w / width**2)
 
     now = cost(w)
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(NEWTON_STEPS):
         p = 0.5 * (1.0 + np.tanh(0.5 * (x @ w)))
         gradient = x.T @ (votes * (p - 1.0)) + w / width**2
         hessian = precision + (x * (votes * p * (1.0 - p))[:, None]).T @ x

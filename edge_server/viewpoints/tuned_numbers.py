@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+# Candidates.
+MOST_CANDIDATES = 10_000
+CANDIDATE_ELEVATIONS_DEG = 12.0, 80.0
+"""Between which they lie."""
+
 # The policy over candidates (PPO).
 PASSES = 4
 """Over a batch of captures, fewer than the schedulers' 10: new captures cost predictions of the reward, no fits."""
@@ -44,6 +49,8 @@ REMEMBERED = 2
 WIDTHS = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Of the prior (standard deviations of the weights), that the evidence chooses from. By the scale of the features, a
 width is also the standard deviation of the reward difference of a usual pair."""
+NEWTON_STEPS = 50
+"""At most, to the most probable weights."""
 LEAST_ODDS = 10.0
 """Against a coin, from which on answers count as informative. Answers by a coin reach them at most once in so many
 times (Markov's inequality, for exact evidence)."""

@@ -17,7 +17,7 @@ from edge_server.experiments.engine import Engine
 from edge_server.experiments.studies.tuned_numbers import LEAST_DB
 from edge_server.machine import commit
 from edge_server.progress import ProgressLine
-from edge_server.scheduler.learned.settings import W_S
+from edge_server.scheduler.learned.tuned_numbers import W_S
 from freshfield.files import write_csv, write_text
 
 HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from camera_node.capture import Camera
 from camera_node.sources.base import Shot
-from edge_server import tuned_numbers as tuned
 from edge_server.experiments.tuned_numbers import NOISE_FRAMES
 from edge_server.fidelity.moving_pixels import NoiseEstimate, frames_at_lags
 from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import View
+from edge_server.tuned_numbers import MOVING_BOUND, MOVING_LAGS_MS
 from freshfield import payload
 from freshfield.geometry import Pinhole
 
@@ -53,7 +53,7 @@ class ExactTruth:
     def score(self, field: Any, present_ns: int) -> Score:
         """Mean score over the held-out cameras. Earlier renders define the moving pixels; an
         analytic scene has them before the first frame, too."""
-        lags_ns = [round(lag * 1e6) for lag in tuned.MOVING_LAGS_MS]
+        lags_ns = [round(lag * 1e6) for lag in MOVING_LAGS_MS]
         scores = []
         for camera, (intrinsics, pose) in self.cameras.items():
             truth = self.image(camera, present_ns / 1e9)
@@ -73,7 +73,7 @@ class CapturedTruth:
         self._scorer = scorer
         self._cameras = tuple(cameras)
         self._bounds = {
-            c.name: noise_bound(_image(c, c.capture(k)) for k in range(NOISE_FRAMES)) if noisy else tuned.MOVING_BOUND
+            c.name: noise_bound(_image(c, c.capture(k)) for k in range(NOISE_FRAMES)) if noisy else MOVING_BOUND
             for c in cameras
         }
 
@@ -99,7 +99,7 @@ class CapturedTruth:
         for camera in self._cameras:
             tick = _nearest(camera, present_ns)
             shot = camera.capture(tick)
-            ticks = range(max(0, tick - round(1.5 * tuned.MOVING_LAGS_MS[-1] * float(camera.fps) / 1e3)), tick + 1)
+            ticks = range(max(0, tick - round(1.5 * MOVING_LAGS_MS[-1] * float(camera.fps) / 1e3)), tick + 1)
             times = [_instant_ns(camera, k) for k in ticks]
             lags = [ticks[i] for i in frames_at_lags(times, times[-1])]
             before = [camera.capture(k) for k in lags]
@@ -119,7 +119,7 @@ def _score(
     view: View,
     present_ns: int,
     earlier: list[NDArray[np.uint8]],
-    bound: float = tuned.MOVING_BOUND,
+    bound: float = MOVING_BOUND,
 ) -> Score:
     shown = field.render(view.camera_to_world, view.intrinsics).color
     score = scorer.score(view.camera, shown, present_ns, view.image, view.generated_ns, earlier, bound)

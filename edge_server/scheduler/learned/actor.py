@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned import networks
+from edge_server.scheduler.learned import tuned_numbers as tuned
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import State
 
 KIND = "scheduler"
 """Kind of file that a learner's checkpoint declares."""
-# Largest unpacked checkpoint: both networks and Adam's moments at their largest.
-MAX_BYTES = 2**29
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ class Actor:
     def load(path: Path | str) -> Actor:
         """The actor of a learner's checkpoint. checkpoint.CheckpointError (a ValueError) for any other
         file."""
-        arrays, about = checkpoint.load(path, kind=KIND, most_bytes=MAX_BYTES)
+        arrays, about = checkpoint.load(path, kind=KIND, most_bytes=tuned.MAX_CHECKPOINT_BYTES)
         spec = read_spec(path, about)
         expected = networks.init_actor(spec, np.random.default_rng(0))
         found: dict[str, NDArray[np.float64]] = {}

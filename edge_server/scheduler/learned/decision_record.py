@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import checkpoint
+from edge_server.scheduler.learned import tuned_numbers as tuned
 from edge_server.scheduler.learned.actor import Actor, Decision
 from edge_server.scheduler.learned.state import State
 from freshfield import payload
@@ -25,8 +26,6 @@ from freshfield.untrusted import stored_bytes
 log = logging.getLogger(__name__)
 
 FOLDER = "decisions"
-MAX_DECISIONS = 500
-MAX_BYTES = 64_000_000
 _KIND = "decision"
 
 
@@ -69,7 +68,7 @@ class DecisionWriter:
 
     def _make_room(self) -> None:
         while len(self._kept) > 1 and (
-            len(self._kept) > MAX_DECISIONS or sum(size for *_, size in self._kept) > MAX_BYTES
+            len(self._kept) > tuned.KEPT_DECISIONS or sum(size for *_, size in self._kept) > tuned.KEPT_DECISIONS_BYTES
         ):
             path, policy, _ = self._kept.popleft()
             path.unlink(missing_ok=True)

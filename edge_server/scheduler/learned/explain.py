@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.scheduler.learned import tuned_numbers as tuned
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.state import State
 
 EmbedImages = Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]]
 """Images uint8 (H, W, 3) to embeddings (n, d)."""
 
-GRID = 8
 # The gray of letterboxes, opaque: detectors are used to seeing nothing in it.
 _PAINT = (114, 114, 114, 255)
 
@@ -96,15 +96,15 @@ def describe_action(actor: Actor, action: Any, names: Sequence[str]) -> str:
 def occlusion_map(
     actor: Actor, state: State, action: Any, camera: int, image: NDArray[np.uint8], embed: EmbedImages
 ) -> NDArray[np.float64]:
-    """(GRID, GRID) fall of the action's logit when a region of ``camera``'s image is painted gray: positive
-    regions spoke for the action. ValueError where the policy does not look at images."""
+    """(REGIONS_A_SIDE, REGIONS_A_SIDE) fall of the action's logit when a region of ``camera``'s image is painted gray:
+    positive regions spoke for the action. ValueError where the policy does not look at images."""
     if "semantics" not in actor.spec.layout.parts or state.embeddings is None:
         raise ValueError("this policy looks at no pictures: no region of one can have moved it")
     height, width = image.shape[:2]
-    rows = np.linspace(0, height, GRID + 1).astype(int)
-    columns = np.linspace(0, width, GRID + 1).astype(int)
+    rows = np.linspace(0, height, tuned.REGIONS_A_SIDE + 1).astype(int)
+    columns = np.linspace(0, width, tuned.REGIONS_A_SIDE + 1).astype(int)
     painted = [image]
-    for i, j in itertools.product(range(GRID), repeat=2):
+    for i, j in itertools.product(range(tuned.REGIONS_A_SIDE), repeat=2):
         copy = image.copy()
         copy[rows[i] : rows[i + 1], columns[j] : columns[j + 1]] = _PAINT[: image.shape[2]]
         painted.append(copy)
@@ -114,7 +114,7 @@ def occlusion_map(
         embeddings[camera] = z
         features.append(actor.spec.layout.features(replace(state, embeddings=embeddings)))
     logits = action_logit(actor, np.stack(features), action)
-    return (logits[0] - logits[1:]).reshape(GRID, GRID)
+    return (logits[0] - logits[1:]).reshape(tuned.REGIONS_A_SIDE, tuned.REGIONS_A_SIDE)
 
 
 def _part_shares(

@@ -28,19 +28,15 @@ from numpy.typing import NDArray
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned import networks
-from edge_server.scheduler.learned.actor import KIND, MAX_BYTES, Actor, read_spec
+from edge_server.scheduler.learned import tuned_numbers as tuned
+from edge_server.scheduler.learned.actor import KIND, Actor, read_spec
 from edge_server.scheduler.learned.clipped_update import Acted, UpdateFigures, clipped_update
 from edge_server.scheduler.learned.settings import Spec
 from edge_server.torch_threads import one_torch_thread
 
-# Advantages that differ by less than this share of the rewards' standard deviation are errors of V.
-# Normalization does not scale them up to 1.
-_MIN_ADVANTAGE_STD = 0.05
 # Rewards that vary by less than this share of their size, or of all rewards' standard deviation, are
 # constant.
 _CONSTANT = 1e-9
-# Decisions that count in the running statistics, which follow a scene or a channel that changes.
-_MEMORY = 4096
 # No measured reward is larger; its square would overflow.
 _MAX_REWARD = 1e100
 # Of random numbers; of "actions" nothing is drawn any more, and a seed keeps its others.
@@ -160,7 +156,7 @@ class Learner:
         if len(raw) == 1:
             return raw
         centered = raw - raw.mean()
-        return centered / torch.clamp(centered.std(correction=0), min=_MIN_ADVANTAGE_STD)
+        return centered / torch.clamp(centered.std(correction=0), min=tuned.MIN_ADVANTAGE_STD)
 
     # --- keeping ------------------------------------------------------------------------------------
 
@@ -187,7 +183,7 @@ class Learner:
     @staticmethod
     def load(path: Path | str) -> Learner:
         """A learner as ``save`` left it. checkpoint.CheckpointError (a ValueError) for anything else."""
-        arrays, about = checkpoint.load(path, kind=KIND, most_bytes=MAX_BYTES)
+        arrays, about = checkpoint.load(path, kind=KIND, most_bytes=tuned.MAX_CHECKPOINT_BYTES)
         spec = read_spec(path, about)
         if "seed" not in about:
             raise checkpoint.CheckpointError(
@@ -251,7 +247,7 @@ class _RunningMeanStd:
         new, gap = n / (self.count + n), mean - self.mean
         self.variance = (1 - new) * self.variance + new * float(values.var()) + new * (1 - new) * gap * gap
         self.mean += new * gap
-        self.count = min(self.count + n, _MEMORY)
+        self.count = min(self.count + n, tuned.REMEMBERED_DECISIONS)
 
     @property
     def scale(self) -> float:
@@ -266,7 +262,7 @@ class _RunningMeanStd:
     def from_json(data: dict[str, Any]) -> _RunningMeanStd:
         """ValueError for what ``as_json`` cannot have written."""
         count, mean, variance = int(data["count"]), float(data["mean"]), float(data["variance"])
-        if not (0 <= count <= _MEMORY and math.isfinite(mean) and 0.0 <= variance < math.inf):
+        if not (0 <= count <= tuned.REMEMBERED_DECISIONS and math.isfinite(mean) and 0.0 <= variance < math.inf):
             raise ValueError(f"rewards of mean {mean} and variance {variance}, {count} of them")
         return _RunningMeanStd(count, mean, variance)
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, Literal
 
-from edge_server.scheduler.learned.settings import W_L, W_P, W_S, W_T
+from edge_server.scheduler.learned import tuned_numbers as tuned
 
 TERMS = ("psnr", "ssim", "distance", "age", "views")
 
@@ -90,9 +90,9 @@ class Reward:
 
 # Name -> reward. ``set``: (5.19) with the weights of 5.6.2; the others: -F_w (6.38).
 REWARDS = {
-    "set": Reward("set", psnr=0.02, ssim=0.5, distance=-1.0),
-    "thesis": Reward("thesis", psnr=-W_P, ssim=-W_S, distance=-W_L, age=-W_T),
-    "corrected": Reward("corrected", psnr=-W_P, ssim=W_S, distance=-W_L, age=-W_T),
+    "set": Reward("set", psnr=tuned.SET_P, ssim=tuned.SET_S, distance=tuned.SET_L),
+    "thesis": Reward("thesis", psnr=-tuned.W_P, ssim=-tuned.W_S, distance=-tuned.W_L, age=-tuned.W_T),
+    "corrected": Reward("corrected", psnr=-tuned.W_P, ssim=tuned.W_S, distance=-tuned.W_L, age=-tuned.W_T),
 }
 
 

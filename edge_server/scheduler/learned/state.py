@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.scheduler.learned import tuned_numbers as tuned
+
 if TYPE_CHECKING:
     from freshfield.frame import Frame
 
@@ -21,12 +23,6 @@ STATE_PARTS = ("semantics", "age", "pose")
 
 
 POSE_WIDTH = 6
-# The widest configurable embedding (edge_server.embed).
-MAX_DIM = 4096
-# Features are clipped to this many standard deviations: what lies beyond is a broken value, not information.
-FEATURE_LIMIT = 8.0
-# A feature that hardly varied where it was standardized says nothing; scaling must not turn it into noise.
-_MIN_SPREAD = 1e-3
 
 
 @dataclass(frozen=True)
@@ -90,7 +86,7 @@ class StateLayout:
             raise ValueError(f"state: no part is called {', '.join(unknown)}; there are {', '.join(STATE_PARTS)}")
         if not self.parts:
             raise ValueError(f"state: no parts; choose some of {', '.join(STATE_PARTS)}")
-        require_int("state: dim", self.dim, 0, MAX_DIM)
+        require_int("state: dim", self.dim, 0, tuned.MAX_DIM)
         if ("semantics" in self.parts) != (self.dim > 0):
             raise ValueError(f"state: dim {self.dim} with parts {', '.join(self.parts)}: semantics has a dim")
         if not (0 < self.age_scale_ms < np.inf and 0 < self.oldest_ms < np.inf):
@@ -141,7 +137,7 @@ class StateLayout:
         rows = embeddings[np.isfinite(embeddings).all(axis=1)]
         if len(rows) < 2:
             return self
-        spread = np.maximum(rows.std(axis=0), _MIN_SPREAD * max(1.0, float(np.abs(rows).max())))
+        spread = np.maximum(rows.std(axis=0), tuned.MIN_SPREAD * max(1.0, float(np.abs(rows).max())))
         return replace(self, center=tuple(rows.mean(axis=0).tolist()), spread=tuple(spread.tolist()))
 
     def _age(self, state: State) -> NDArray[np.float64]:
@@ -150,8 +146,8 @@ class StateLayout:
         return np.log1p(ages / self.age_scale_ms)[:, None]
 
     def _pose(self, state: State) -> NDArray[np.float64]:
-        poses = np.nan_to_num(state.poses, nan=0.0, posinf=FEATURE_LIMIT, neginf=-FEATURE_LIMIT)
-        return np.clip(poses, -FEATURE_LIMIT, FEATURE_LIMIT)
+        poses = np.nan_to_num(state.poses, nan=0.0, posinf=tuned.FEATURE_LIMIT, neginf=-tuned.FEATURE_LIMIT)
+        return np.clip(poses, -tuned.FEATURE_LIMIT, tuned.FEATURE_LIMIT)
 
     def _semantics(self, state: State) -> NDArray[np.float64]:
         if state.embeddings is None:
@@ -166,7 +162,7 @@ class StateLayout:
             z[unknown] = 0.0
         # A whole embedding initially weighs as much as one other feature; otherwise its d features drown the
         # age.
-        return np.clip(z, -FEATURE_LIMIT, FEATURE_LIMIT) / np.sqrt(self.dim)
+        return np.clip(z, -tuned.FEATURE_LIMIT, tuned.FEATURE_LIMIT) / np.sqrt(self.dim)
 
 
 def require_int(name: str, value: object, least: int, most: int) -> None:

@@ -12,7 +12,7 @@ from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.report.explain_command import main
 from edge_server.scheduler import Epoch, make_policy, parse_policy
-from edge_server.scheduler.learned import decision_record
+from edge_server.scheduler.learned import tuned_numbers as tuned
 from edge_server.scheduler.learned.actor import Decision
 from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.decision_record import FOLDER, DecisionWriter, read_decision
@@ -135,7 +135,7 @@ def test_a_decision_comes_back_as_it_was(tmp_path):
 
 
 def test_the_oldest_make_room(tmp_path, monkeypatch):
-    monkeypatch.setattr(decision_record, "MAX_DECISIONS", 3)
+    monkeypatch.setattr(tuned, "KEPT_DECISIONS", 3)
     record = DecisionWriter(tmp_path)
     for number in range(6):
         record.write(a_decision(number, seed=number // 3))
@@ -144,7 +144,7 @@ def test_the_oldest_make_room(tmp_path, monkeypatch):
     assert names(folder, "0*") == ["000003.npz", "000004.npz", "000005.npz"]
     DecisionWriter(tmp_path).write(a_decision(6))  # another process of the same run goes on
     assert names(folder, "0*") == ["000004.npz", "000005.npz", "000006.npz"]
-    monkeypatch.setattr(decision_record, "MAX_BYTES", 1)
+    monkeypatch.setattr(tuned, "KEPT_DECISIONS_BYTES", 1)
     large = DecisionWriter(tmp_path / "large")
     for number in range(2):
         large.write(a_decision(number))

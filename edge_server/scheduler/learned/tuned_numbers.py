@@ -1,0 +1,35 @@
+"""Numbers of learning to schedule that no specification sets."""
+
+from __future__ import annotations
+
+# --- rewards ---
+# Weights of (6.37) as 6.5 prints them: PSNR per dB, SSIM, LPIPS, age per millisecond.
+W_P, W_S, W_L, W_T = -0.02, 0.2, 0.3, 0.015
+SET_P, SET_S, SET_L = 0.02, 0.5, -1.0  # of (5.19), as 5.6.2 has them: PSNR per dB, SSIM, LPIPS
+
+# --- what a specification and a checkpoint may ask for (settings, state, actor) ---
+# A specification may come from an untrusted file. These bound what is allocated for it: with both networks
+# and Adam's moments half a gigabyte, far more than a decision needs.
+MAX_HIDDEN = 1024
+MAX_OMEGAS = 4096
+MAX_FIRST_WEIGHTS = 2**22
+MAX_DIM = 4096  # the widest configurable embedding (edge_server.embed)
+MAX_CHECKPOINT_BYTES = 2**29  # unpacked: both networks and Adam's moments at their largest
+
+# --- features of a state (state) ---
+# Features are clipped to this many standard deviations: what lies beyond is a broken value, not information.
+FEATURE_LIMIT = 8.0
+# A feature that hardly varied where it was standardized says nothing; scaling must not turn it into noise.
+MIN_SPREAD = 1e-3
+
+# --- learning (ppo) ---
+# Advantages that differ by less than this share of the rewards' standard deviation are errors of V.
+# Normalization does not scale them up to 1.
+MIN_ADVANTAGE_STD = 0.05
+# Decisions that count in the running statistics, which follow a scene or a channel that changes.
+REMEMBERED_DECISIONS = 4096
+
+# --- decisions on disk, and what explains them (decision_record, explain) ---
+KEPT_DECISIONS = 500
+KEPT_DECISIONS_BYTES = 64_000_000
+REGIONS_A_SIDE = 8  # of an image, whose shares are found by occluding them
