@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.export import ExportError
-from edge_server.export.tuned_numbers import JPEG_QUALITY
+from edge_server.export.tuned_numbers import JPEG_QUALITY, RENDERED_FPS
 from edge_server.fidelity.images import to_bytes
 from edge_server.fields import View
 
@@ -33,7 +33,7 @@ def write_images(folder: Path, shots: Iterable[View]) -> None:
 
 
 def write_video(
-    file: Path | str, images: Iterable[NDArray[np.uint8] | NDArray[np.float32]], fps: float = 25.0
+    file: Path | str, images: Iterable[NDArray[np.uint8] | NDArray[np.float32]], fps: float = RENDERED_FPS
 ) -> tuple[int, int, int]:
     """Write a video, or the first image where the file is one. The file is replaced once all of it is there.
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from edge_server.command import command_parser, run_command
 from edge_server.export import ExportError
+from edge_server.export import tuned_numbers as tuned
 from edge_server.export.camera_paths import Step, lens, looking, orbit, read_nerfstudio, vertical_fov_deg
 from edge_server.export.images import IMAGE_ENDINGS, Image, checked_file, write_video
 from edge_server.export.run_source import Source, open_source
@@ -60,7 +61,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     add("--size", metavar="WxH", help="pixels [the cameras' shape, 480 high; a path's own]")
     add("--fov", type=float, metavar="DEG", help="vertical field of view [the cameras'; a path's own]")
     add("--seconds", type=float, default=8.0, metavar="S", help="length of an orbit [%(default)g]")
-    add("--fps", type=float, metavar="N", help="images a second [25; a path's own]")
+    add("--fps", type=float, metavar="N", help=f"images a second [{tuned.RENDERED_FPS:g}; a path's own]")
     return parser
 
 
@@ -102,7 +103,7 @@ def _path(args: argparse.Namespace, source: Source) -> tuple[list[Step], float, 
     if args.path is not None:
         steps, fps, size = read_nerfstudio(args.path)
         return steps, args.fps or fps, asked or size
-    fps, fov = args.fps or 25.0, vertical_fov_deg(source.views[0].intrinsics)
+    fps, fov = args.fps or tuned.RENDERED_FPS, vertical_fov_deg(source.views[0].intrinsics)
     if args.camera is not None:
         step, size = source.camera_step(args.camera, asked, args.fov)
         return [step], fps, size
@@ -122,12 +123,14 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 
 def _depth_colors(render: Callable[[int], list[Rendering]], count: int) -> Callable[[Rendering], Image]:
-    """Colors of depth by nearness (1 / depth), on the scale of eight images of the path."""
+    """Colors of depth by nearness (1 / depth), on the scale of DEPTH_SCALE_OF images of the path."""
     samples = [
-        r.depth[r.depth > 0] for k in np.unique(np.linspace(0, count - 1, 8).astype(int)) for r in render(int(k))
+        r.depth[r.depth > 0]
+        for k in np.unique(np.linspace(0, count - 1, tuned.DEPTH_SCALE_OF).astype(int))
+        for r in render(int(k))
     ]
     near = 1.0 / np.concatenate(samples) if any(len(s) for s in samples) else np.ones(1)
-    low, high = np.percentile(near, [2, 98])
+    low, high = np.percentile(near, tuned.DEPTH_PERCENTILES)
 
     def colors(rendering: Rendering) -> Image:
         there = rendering.depth > 0

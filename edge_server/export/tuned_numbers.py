@@ -12,6 +12,10 @@ SAME = 0.01
 
 DEFAULT_HEIGHT_PX = 480
 """Of a rendering, at the shape of the cameras' images."""
+RENDERED_FPS = 25.0
+"""Images a second, unless told otherwise."""
+DEPTH_PERCENTILES, DEPTH_SCALE_OF = (2, 98), 8
+"""Of nearness, that are the ends of the colors of depth, and images of a path that they are taken from."""
 MOST_NAMED = 20
 """Cameras in an error."""
 

@@ -7,10 +7,8 @@ from itertools import groupby
 from typing import Any
 
 from edge_server.report.run_files import RunFiles
-from edge_server.report.tuned_numbers import MOST_EVENTS, SILENT_MS, TOGETHER_S
+from edge_server.report.tuned_numbers import MOST_EVENTS, NAMED_CAMERAS, SILENT_MS, TOGETHER_S
 from edge_server.run_records import AgesRow, ChannelChange, Event
-
-_NAMED = 3  # cameras in a line
 
 
 def events(files: RunFiles) -> list[dict[str, Any]]:
@@ -36,7 +34,9 @@ def silences(rows: Sequence[AgesRow]) -> list[Event]:
         together = [gap for gap in gaps if gap[0] - first_s <= TOGETHER_S]
         gaps = gaps[len(together) :]
         names = sorted({gap[2] for gap in together})
-        who = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+        who = ", ".join(names[:NAMED_CAMERAS]) + (
+            f" and {len(names) - NAMED_CAMERAS} more" if len(names) > NAMED_CAMERAS else ""
+        )
         ends_s = [end_s for _, end_s, _ in together if end_s is not None]
         if len(ends_s) < len(together):
             found.append(Event(first_s, f"{who}: no further frame"))

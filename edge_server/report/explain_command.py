@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.command import command_parser, run_command
+from edge_server.report import tuned_numbers as tuned
 from edge_server.report.style import BLUE, GRAY, VERMILION, figure
 from edge_server.scheduler.learned.decision_record import RecordedDecision, read_decision
 from edge_server.scheduler.learned.explain import EmbedImages, Explanation, explain, occlusion_map
@@ -29,9 +30,6 @@ sum to the difference. A camera's share is what the logit falls where it is an a
 Shares of regions are found by occluding them and embedding the image again; that needs a policy with
 embeddings in its state.
 """
-
-# Cameras with a bar of their own.
-MAX_BARS = 20
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -106,7 +104,7 @@ def as_text(found: RecordedDecision, e: Explanation, camera: str | None, regions
         *(f"  {name:12} {share:+.3f}" for name, share in e.parts.items()),
         "by camera, if it were an average one",
     ]
-    order = np.argsort(-np.abs(e.cameras))[:MAX_BARS]
+    order = np.argsort(-np.abs(e.cameras))[: tuned.MOST_BARS]
     lines += [f"  {e.names[i]:12} {e.cameras[i]:+.3f}" for i in order]
     if camera is not None and regions is not None:
         row, column = np.unravel_index(int(np.abs(regions).argmax()), regions.shape)
@@ -122,11 +120,11 @@ def draw(
 ) -> None:
     """Draw bars by part and by camera, and the image with the shares of its regions."""
     columns = 3 if image is not None and regions is not None else 2
-    height = 1.4 + 0.16 * max(6, min(MAX_BARS, len(e.cameras)))
+    height = 1.4 + 0.16 * max(6, min(tuned.MOST_BARS, len(e.cameras)))
     with figure(path, 1, columns, height_inch=height) as (fig, axes):
         fig.suptitle(f"{e.action}: logit {e.logit:+.2f}, of average cameras {e.baseline_logit:+.2f}")
         _bars(axes[0, 0], list(e.parts), np.array(list(e.parts.values())), "by part of the state")
-        order = np.argsort(-np.abs(e.cameras))[:MAX_BARS]
+        order = np.argsort(-np.abs(e.cameras))[: tuned.MOST_BARS]
         names = [e.names[i] for i in order]
         _bars(axes[0, 1], names, e.cameras[order], "by camera")
         if image is not None and regions is not None:

@@ -12,13 +12,11 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from edge_server.fidelity.scorer import SELECTED, fidelity_title
+from edge_server.report import tuned_numbers as tuned
 from edge_server.report.run_files import RunFiles
 from edge_server.report.style import BLUE, GRAY, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, label_lines
 
 Report = dict[str, Any]
-# Factor by which errors are brightened to be visible.
-_ERROR_GAIN = 4.0
-_MAX_LABELS = 24
 
 
 def draw_all(report: Report, files: RunFiles) -> dict[str, Path]:
@@ -117,7 +115,7 @@ def draw_ages(report: Report, files: RunFiles, path: Path) -> bool:
         mean, p50, p95 = (np.array([s[k] for s in spreads.values()]) for k in ("mean", "p50", "p95"))
         by_camera.vlines(x, p50, p95, color=SKY, linewidth=5, label="median to 95 %")
         by_camera.plot(x, mean, "o", color=BLUE, markersize=4.5, label="mean")
-        step = max(1, -(-len(x) // _MAX_LABELS))
+        step = max(1, -(-len(x) // tuned.MOST_LABELS))
         by_camera.set_xticks(x[::step], list(spreads)[::step], rotation=60, ha="right", fontsize=8)
         by_camera.set_ylim(bottom=0)
         by_camera.grid(axis="x", visible=False)
@@ -180,13 +178,13 @@ def draw_comparison(report: Report, files: RunFiles, path: Path) -> bool:
     truth, rendered = _image(files, "truth"), _image(files, "rendered")
     if truth is None or rendered is None or truth.shape != rendered.shape:
         return False
-    error = np.clip(np.abs(truth - rendered) * _ERROR_GAIN, 0.0, 1.0)
+    error = np.clip(np.abs(truth - rendered) * tuned.ERROR_GAIN, 0.0, 1.0)
     height = 2.75 * truth.shape[0] / truth.shape[1] + 0.35
     with figure(path, 1, 3, height_inch=height) as (_, axes):
         truth_is = "held-out truth" if report["kind"] == "fit" else "truth at the present"
         if SELECTED in report["fidelity"]["scored_on"]:
             truth_is = "a training view"
-        titles = (truth_is, "the field's rendering", f"error, {_ERROR_GAIN:g} times")
+        titles = (truth_is, "the field's rendering", f"error, {tuned.ERROR_GAIN:g} times")
         for ax, image, title in zip(axes[0], (truth, rendered, error), titles):
             ax.imshow(image, interpolation="nearest")
             ax.set_title(title)

@@ -40,7 +40,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from edge_server.report.tuned_numbers import CUT_OFF_NS
+from edge_server.report.tuned_numbers import CUT_OFF_NS, MOST_CONTRADICTIONS
 from freshfield.ledger import LedgerReader
 
 # Ends that the emulator's link gives a frame. ``broken`` is not one: a later process may know better.
@@ -56,8 +56,6 @@ _EVENTS = {
 _ROLES = tuple(_EVENTS)
 # What the edge and the emulator write in place of an id that they cannot accept.
 _GARBLED = "?"
-# Enough to see what went wrong; the count says how often.
-_MAX_LISTED = 20
 
 
 class FrameCounts(Counter[str]):
@@ -141,7 +139,7 @@ class FrameAccounting:
     def contradict(self, frame: str, found: Sequence[str]) -> None:
         """Take what cannot be true about a frame."""
         self.contradiction_count += len(found)
-        self.contradictions += [f"{frame}: {what}" for what in found[: _MAX_LISTED - len(self.contradictions)]]
+        self.contradictions += [f"{frame}: {what}" for what in found[: MOST_CONTRADICTIONS - len(self.contradictions)]]
 
 
 @dataclass(frozen=True)

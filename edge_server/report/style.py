@@ -17,16 +17,13 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from PIL import Image
 
+from edge_server.report import tuned_numbers as tuned
+
 # Okabe and Ito's palette, ordered so that neighbors differ in lightness too.
 BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"
 ORANGE, SKY, PURPLE = "#E69F00", "#56B4E9", "#CC79A7"
 INK, GRAY, PALE = "#222222", "#777777", "#E4E4E4"
 CYCLE = (BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE)
-WIDTH_INCH = 8.4
-_COLORS = 64  # in a file: a quarter of the bytes, without a visible difference in curves
-_OF_PICTURES, _MEANS = 256, 3  # the same of pictures, and rounds of k-means that keep their rare colors: a third
-
-_IN_A_ROW, _ROW_PT = 4, 20.0  # of a legend: entries, and height of the row
 
 _RC: Any = {
     "font.family": "sans-serif",
@@ -52,21 +49,23 @@ _RC: Any = {
     "lines.linewidth": 1.6,
     "legend.frameon": False,
     "legend.fontsize": 8.5,
-    "figure.dpi": 110,
+    "figure.dpi": tuned.FIGURE_DPI,
     "figure.constrained_layout.use": True,
 }
 
 
 @contextmanager
 def figure(
-    path: Path, rows: int = 1, columns: int = 1, height_inch: float = 2.6, dpi: int = 110, **kwargs
+    path: Path, rows: int = 1, columns: int = 1, height_inch: float = 2.6, dpi: int = tuned.FIGURE_DPI, **kwargs
 ) -> Iterator[tuple]:
     """``with figure(path, rows) as (fig, axes):`` draws in the common style and writes ``path`` (PNG).
 
     axes: array (rows, columns). height_inch: height of a row. kwargs go to ``plt.subplots``.
     """
     with plt.rc_context(_RC):
-        fig, axes = plt.subplots(rows, columns, figsize=(WIDTH_INCH, height_inch * rows), squeeze=False, **kwargs)
+        fig, axes = plt.subplots(
+            rows, columns, figsize=(tuned.FIGURE_WIDTH_INCH, height_inch * rows), squeeze=False, **kwargs
+        )
         try:
             yield fig, axes
             drawn = io.BytesIO()
@@ -74,9 +73,9 @@ def figure(
             image = Image.open(drawn).convert("RGB")
             if not any(axis.images for axis in fig.axes):  # curves, no pictures
                 # Pillow's own choice, median cut, takes a rare color for its neighbor's.
-                image = image.quantize(_COLORS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+                image = image.quantize(tuned.FIGURE_COLORS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
             else:
-                image = image.quantize(_OF_PICTURES, kmeans=_MEANS)
+                image = image.quantize(tuned.PICTURE_COLORS, kmeans=tuned.PICTURE_MEANS)
             # Without a creation date, so that the same run draws the same bytes.
             image.save(path, optimize=True)
         finally:
@@ -90,9 +89,9 @@ def label_lines(axes: Axes, y: str, x: str | None = None, title: str | None = No
     if x:
         axes.set_xlabel(x)
     count = len(axes.get_legend_handles_labels()[0])
-    above = 1 < count <= _IN_A_ROW
+    above = 1 < count <= tuned.LEGEND_IN_A_ROW
     if title:
-        axes.set_title(title, pad=_ROW_PT if above else None)
+        axes.set_title(title, pad=tuned.LEGEND_ROW_PT if above else None)
     if above:
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=count, columnspacing=1.2)
     elif count > 1:

@@ -22,3 +22,22 @@ cameras' frames. A process that starts again counts from zero, and takes longer 
 CUT_OFF_NS = 10 * 10**9
 """A killed process takes with it the frames that it wrote about in its last moments. The thesis's links hold a
 frame for a second or two; a frame without a line this near to the end was lost by something else."""
+MOST_CONTRADICTIONS = 20
+"""That are listed, enough to see what went wrong; the count says how often."""
+NAMED_CAMERAS = 3
+"""In a line of an event."""
+
+# --- figures (style, figures, explain_command) ---
+FIGURE_WIDTH_INCH, FIGURE_DPI = 8.4, 110
+FIGURE_COLORS = 64
+"""In a file: a quarter of the bytes, without a visible difference in curves."""
+PICTURE_COLORS, PICTURE_MEANS = 256, 3
+"""The same of pictures, and rounds of k-means that keep their rare colors: a third."""
+LEGEND_IN_A_ROW, LEGEND_ROW_PT = 4, 20.0
+"""Entries of a legend, and height of the row."""
+ERROR_GAIN = 4.0
+"""Factor by which errors are brightened to be visible."""
+MOST_LABELS = 24
+"""Cameras with a label of their own."""
+MOST_BARS = 20
+"""Cameras with a bar of their own where a decision is explained."""
