@@ -14,6 +14,7 @@ import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, run_command
+from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.common.arguments import add_folders, add_workers, at_least, folders_of
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.common.folders import Folders
@@ -42,8 +43,6 @@ Computing is charged as edge.compute says. The first policy is the one that the 
 Intervals are 95 % (Student's t, over seeds; differences paired by seed). A star marks the differences that are
 decided at a false discovery rate of 5 % over all of them (Benjamini-Hochberg).
 """
-# Decisions have no effect until the layers of a field have begun.
-LEAD_S, SPAN_S = 5.0, 8.0
 # metric -> (head of its column, digits, whether it is compared)
 COLUMNS = {
     "psnr_db": ("shown (dB)", 2, True),
@@ -79,7 +78,8 @@ def _run(args: argparse.Namespace) -> None:
     if idle:
         print(f"without an update after the lead: {', '.join(idle)}")
     if args.json is not None:
-        about = {"scenario": setting.scenario.name, "seeds": args.seeds, "seconds": args.seconds, "lead_s": LEAD_S}
+        about = {"scenario": setting.scenario.name, "seeds": args.seeds}
+        about |= {"seconds": args.seconds, "lead_s": tuned.COMPARE_LEAD_S}
         about |= {"seed": setting.scenario.seed, "judged_from": setting.rewarding, "motions": setting.draws_motions}
         about |= {"compute": as_mapping(setting.compute), "machine": machine(), "commit": commit()}
         args.json.parent.mkdir(parents=True, exist_ok=True)
@@ -95,7 +95,7 @@ def setting_of(scenario: Scenario, seconds: float, channel: str | None = None) -
     if channel is not None:
         scenario = dataclasses.replace(scenario, channel=read_channel(channel)[0])
     compute = read_config(scenario).compute
-    return Setting(scenario, deployed=True, lead_ms=LEAD_S * 1e3, span_ms=seconds * 1e3, compute=compute)
+    return Setting(scenario, deployed=True, lead_ms=tuned.COMPARE_LEAD_S * 1e3, span_ms=seconds * 1e3, compute=compute)
 
 
 def compare(
@@ -173,7 +173,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--seeds", type=at_least(1), default=8, metavar="N", help="number of seeds [%(default)s]")
     add("--channel", metavar="FILE|PRESET", help="a channel in place of the scenario's: a file, or a preset")
-    add("--seconds", type=float, default=SPAN_S, metavar="S", help=f"seconds scored, after {LEAD_S:g} [%(default)g]")
+    add(
+        "--seconds",
+        type=float,
+        default=tuned.COMPARE_SPAN_S,
+        metavar="S",
+        help=f"seconds scored, after {tuned.COMPARE_LEAD_S:g} [%(default)g]",
+    )
     add_workers(parser)
     add("--json", type=out_file, metavar="FILE", help="write the comparison to FILE")
     add("--results", type=out_file, metavar="FILE", help="keep finished runs in FILE, and use those it has [none]")

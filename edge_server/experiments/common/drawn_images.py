@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.experiments import tuned_numbers as tuned
 from edge_server.report.style import figure
 
 Image = NDArray[np.uint8]
-_HEIGHT = 220  # pixels of an image in a figure
 
 
 def draw_images(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, Image]]]]) -> None:
@@ -23,8 +23,8 @@ def draw_images(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, Image]
             for at in line:
                 at.axis("off")
             for at, (label, image) in zip(line, images):
-                width = round(image.shape[1] * _HEIGHT / image.shape[0])
-                at.imshow(cv2.resize(image, (width, _HEIGHT), interpolation=cv2.INTER_NEAREST))
+                width = round(image.shape[1] * tuned.DRAWN_HEIGHT_PX / image.shape[0])
+                at.imshow(cv2.resize(image, (width, tuned.DRAWN_HEIGHT_PX), interpolation=cv2.INTER_NEAREST))
                 at.set_title(label, fontsize=8, fontweight="normal", loc="center")
             line[0].text(
                 -0.06, 0.5, title, rotation=90, va="center", ha="right", fontsize=9, transform=line[0].transAxes

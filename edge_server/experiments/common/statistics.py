@@ -12,15 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.common.tables import number
 
 _LEVEL = 0.95
 _Curve = Mapping[float, Mapping[int, float | None]]
-_RESAMPLES = 2000
-# Least number of seeds for resampling; fewer say too little about how seeds differ.
-FEWEST = 5
-# Expected share of wrong verdicts among those that are decided.
-FALSE_DISCOVERY_RATE = 0.05
 
 
 @dataclass(frozen=True)
@@ -70,7 +66,7 @@ class Interval:
         return float(2.0 * stats.t.sf(deviations, degrees))
 
 
-def discoveries(p_values: Sequence[float], rate: float = FALSE_DISCOVERY_RATE) -> list[bool]:
+def discoveries(p_values: Sequence[float], rate: float = tuned.FALSE_DISCOVERY_RATE) -> list[bool]:
     """Which of several hypotheses are rejected at a false discovery rate (Benjamini-Hochberg).
 
     p_values: of all hypotheses that are tested together.
@@ -138,7 +134,7 @@ class Optimum:
     """The optimum of a curve over seeds.
 
     x: where the mean is best; the smallest x where it is within the least difference of the best.
-    low, high: ends of the 95 % interval of x by resampling seeds; NaN for fewer than ``FEWEST``.
+    low, high: ends of the 95 % interval of x by resampling seeds; NaN for fewer than ``FEWEST_SEEDS``.
     over_first, over_last: how much better the best is than the two ends of the curve. Chosen on one half of
         the seeds and measured on the other, and the other way round, because a maximum is biased upwards on
         the seeds that chose it.
@@ -173,7 +169,7 @@ def optimum(curve: _Curve, lower_is_better: bool = False, least: float = 0.0) ->
         raise ValueError("no seed has a value at every point of the curve")
     table = _table(curve, seeds, lower_is_better)
     low, high = np.nan, np.nan
-    if len(seeds) >= FEWEST:
+    if len(seeds) >= tuned.FEWEST_SEEDS:
         bests = np.array(xs)[_first_best(table[_picks(len(seeds))].mean(1), least)]
         low, high = np.percentile(bests, [2.5, 97.5], method="nearest")
     over_first, over_last = (interval(_chosen(table) - table[:, end]) for end in (0, -1))
@@ -200,7 +196,7 @@ def _table(curve: _Curve, seeds: Sequence[int], lower_is_better: bool) -> NDArra
 
 def _picks(count: int) -> NDArray[np.int64]:
     """Indices (resamples, count) of resampled seeds, always the same for one count."""
-    return np.random.default_rng(5).integers(0, count, (_RESAMPLES, count))
+    return np.random.default_rng(5).integers(0, count, (tuned.RESAMPLES, count))
 
 
 def _chosen(table: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -233,7 +229,7 @@ def move_of_optimum(
 
     Returns the slope of the best x against the parameter, and the best x at the last parameter minus that at
     the first. Intervals by resampling seeds, the same ones for every parameter; their ends are NaN for fewer
-    than ``FEWEST`` seeds.
+    than ``FEWEST_SEEDS`` seeds.
     """
     parameters = list(curves)
     seeds = _common_seeds(list(curves.values()))
@@ -249,6 +245,7 @@ def move_of_optimum(
     slope = best @ away / (away @ away) if len(parameters) > 1 else np.full(len(best), np.nan)
     # Rounded, because a level line has a slope of 1e-16 or so of either sign.
     found = np.stack([np.round(slope, 9), best[:, -1] - best[:, 0]], axis=1)
-    lows, highs = np.percentile(found[1:], [2.5, 97.5], axis=0) if len(seeds) >= FEWEST else np.full((2, 2), np.nan)
+    enough = len(seeds) >= tuned.FEWEST_SEEDS
+    lows, highs = np.percentile(found[1:], [2.5, 97.5], axis=0) if enough else np.full((2, 2), np.nan)
     line, move = (Interval(float(m), float(a), float(b), len(seeds)) for m, a, b in zip(found[0], lows, highs))
     return line, move

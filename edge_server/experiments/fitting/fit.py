@@ -17,6 +17,7 @@ from msgspec.structs import asdict
 from numpy.typing import NDArray
 
 from camera_node.sources.datasets.records import DatasetError
+from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.common.arguments import OptionError
 from edge_server.experiments.fitting.misfits import misfits
 from edge_server.experiments.scenes.multiview_still import WHITE, mean_baselines, open_still, score_views
@@ -33,13 +34,6 @@ from edge_server.machine import run_facts
 from edge_server.run_records import UpdateRow
 from freshfield.files import write_json
 from freshfield.machine_load import LoadMeter, outside_cores
-
-# Seconds after which to evaluate: dense while a field learns fastest, then every 30 s. The last slice is at least this
-# share of the whole: the learning rate falls within a slice, and a field needs a long one to converge.
-_MARKS_S, _THEN_EVERY_S, _LAST_SHARE = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0), 30.0, 0.4
-_SHORTEST_S = 0.05  # of a slice
-# Number of training views that are scored if no view is held out.
-_SCORED_OF_TRAINING = 8
 
 
 class Fit(ViewedField):
@@ -89,7 +83,7 @@ class Fit(ViewedField):
         self.outside: float | None = None
         self.spent_s, self.spent_steps = 0.0, 0
         self._scorer = Scorer(metric, background=WHITE)
-        self._scored_views = data.held_out or data.training[:_SCORED_OF_TRAINING]
+        self._scored_views = data.held_out or data.training[: tuned.SCORED_OF_TRAINING]
         self._shown: NDArray[np.float32] | None = None
         self._processes: list[dict[str, Any]] = []
         self._load_meter = LoadMeter("fit")
@@ -120,7 +114,7 @@ class Fit(ViewedField):
         check_seconds(until_s)
         try:
             for mark_s in marks_s(until_s):
-                if mark_s - self.spent_s >= _SHORTEST_S and not self._run_slice(mark_s, progress):
+                if mark_s - self.spent_s >= tuned.SHORTEST_SLICE_S and not self._run_slice(mark_s, progress):
                     return False
         except KeyboardInterrupt:  # during an evaluation: the last complete one is kept
             return False
@@ -171,7 +165,7 @@ class Fit(ViewedField):
             self._processes = _read_lines(folder / "processes.jsonl")
         except (OSError, ValueError, KeyError) as error:
             raise OptionError(f"--resume: {folder} holds no fit to go on from: {error}") from None
-        if self.spent_s > until_s - _SHORTEST_S:
+        if self.spent_s > until_s - tuned.SHORTEST_SLICE_S:
             raise OptionError(
                 f"--resume: {folder} has been fitted for {self.spent_s:.1f} s already: give more --seconds"
             )
@@ -302,8 +296,9 @@ def fit(
 
 def marks_s(total_s: float) -> list[float]:
     """Seconds of fitting after which to evaluate, the last being ``total_s``."""
-    later = np.arange(_MARKS_S[-1] + _THEN_EVERY_S, total_s, _THEN_EVERY_S)
-    return [m for m in (*_MARKS_S, *map(float, later)) if m <= (1.0 - _LAST_SHARE) * total_s] + [total_s]
+    later = np.arange(tuned.FIT_MARKS_S[-1] + tuned.FIT_THEN_EVERY_S, total_s, tuned.FIT_THEN_EVERY_S)
+    before_s = (1.0 - tuned.FIT_LAST_SHARE) * total_s
+    return [m for m in (*tuned.FIT_MARKS_S, *map(float, later)) if m <= before_s] + [total_s]
 
 
 def check_seconds(seconds: float) -> None:

@@ -6,14 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Field, RefinesCameras, View
-
-# A view is named that reads so many dB less than the median, and so many standard deviations of them all: some views of
-# a recording are blurred or show more detail. What reads more than LOOKS_RIGHT_DB fits, whatever the others read.
-MISFIT_DB, DEVIATIONS, LOOKS_RIGHT_DB = 6.0, 4.0, 30.0
-MOST_NAMED = 5  # views; of the others their number is said
 
 
 def misfits(field: Field, views: Sequence[View], scorer: Scorer) -> list[str]:
@@ -25,7 +21,7 @@ def misfits(field: Field, views: Sequence[View], scorer: Scorer) -> list[str]:
     db = np.array([np.nan if score is None else score for score in scores])
     usual = float(np.nanmedian(db))
     deviation_db = 1.4826 * float(np.nanmedian(np.abs(db - usual)))  # of normally distributed ones
-    least = min(usual - max(MISFIT_DB, DEVIATIONS * deviation_db), LOOKS_RIGHT_DB)
+    least = min(usual - max(tuned.MISFIT_DB, tuned.MISFIT_DEVIATIONS * deviation_db), tuned.LOOKS_RIGHT_DB)
     lines = []
     for k in np.argsort(db, kind="stable"):
         known = field.correction(views[k])
@@ -36,5 +32,5 @@ def misfits(field: Field, views: Sequence[View], scorer: Scorer) -> list[str]:
             f"frame {views[k].camera}: its pose does not fit its picture, or it shows something else: {db[k]:.1f} dB, "
             f"the others {usual:.1f}, though its pose was moved by {moved_m:.2g} m; leave it out"
         )
-    more = len(lines) - MOST_NAMED
-    return [*lines[:MOST_NAMED], f"and {more} more frames"] if more > 0 else lines
+    more = len(lines) - tuned.MISFITS_NAMED
+    return [*lines[: tuned.MISFITS_NAMED], f"and {more} more frames"] if more > 0 else lines

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from camera_node.capture import Camera
 from camera_node.settings import WorldConfig, source_config
+from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none
-from edge_server.experiments.rollouts.setting import GRID_MS, Setting
+from edge_server.experiments.rollouts.setting import Setting
 from edge_server.experiments.virtual.from_scenario import build_deployment, build_truth, exact_scene, training_cameras
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.truth import ExactTruth, Truth
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
     from edge_server.embed import Embedder
 
 Image = Callable[[str, float], NDArray[np.uint8]]
-_TRUTHS_KEPT = 8192
 SCORES = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
 # Instant of the first decision of the deployment's own edge: never within an episode.
 _NEVER_MS = 1e11
@@ -127,7 +127,7 @@ class _Recorder(FrameBuffer):
 
 def _remembered(image: Image, period_ns: int | None) -> Image:
     """``image`` with a cache; with ``period_ns``, instants one period apart share a rendering."""
-    known = lru_cache(_TRUTHS_KEPT)(lambda camera, at_ns: image(camera, at_ns / 1e9))
+    known = lru_cache(tuned.TRUTHS_KEPT)(lambda camera, at_ns: image(camera, at_ns / 1e9))
     return lambda camera, t_s: known(camera, round(t_s * 1e9) % period_ns if period_ns else round(t_s * 1e9))
 
 
@@ -217,9 +217,9 @@ class Episode:
         self._factory, setting = factory, factory.setting
         self.seed = seed
         rng = factory.scenario(seed).rng("decisions")
-        lead, span = setting.lead_ms / GRID_MS, setting.span_ms / GRID_MS
+        lead, span = setting.lead_ms / tuned.INSTANT_GRID_MS, setting.span_ms / tuned.INSTANT_GRID_MS
         at = np.sort(rng.integers(round(lead), round(lead + span), setting.decisions))
-        self.instants_ns = [int(tick) * GRID_MS * 10**6 for tick in at]
+        self.instants_ns = [int(tick) * tuned.INSTANT_GRID_MS * 10**6 for tick in at]
         self._until_ns = self.instants_ns[-1] + round(setting.horizon_ms * 1e6)
         self._deployment, self._record = self._recorded()
         self._views: dict[tuple[str, int], View | None] = {}

@@ -13,26 +13,17 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
+from edge_server.experiments import tuned_numbers as tuned
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.state import StateLayout
 from edge_server.settings import ComputeConfig, open_embedder, read_config
 from freshfield.scenario import Scenario, ScenarioError
 
-# Rendering a truth costs ten times a score. Instants lie on a grid that contains the lags of moving pixels
-# (60, 120, 200, 300 ms), so that evaluations share renderings.
-GRID_MS = 10
 # Training, model selection and testing use disjoint seeds.
 PURPOSES = ("train", "choose", "test")
 SEEDS_A_PURPOSE = 10**6
 _SEEDS_A_RUN = 10**7
-# Values that thresholds and waits are chosen from, in milliseconds.
-_WAITS_MS = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0)
-OMEGAS_MS = {
-    "threshold": (20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 150.0, 200.0, 300.0, 500.0),
-    "wait": _WAITS_MS,
-    "wait-arrived": _WAITS_MS,
-}
 
 
 @dataclass(frozen=True)
@@ -87,10 +78,12 @@ class Setting:
             raise ValueError("report: every held-out camera only reports, so that there is no reward")
         if min(self.steps, self.warm_steps, self.decisions) < 1:
             raise ValueError("steps, warm_steps and decisions: expected at least 1")
-        if not (self.span_ms >= GRID_MS and self.horizon_ms > 0.0 and 0.0 < self.refresh_ms < self.lead_ms):
+        if not (
+            self.span_ms >= tuned.INSTANT_GRID_MS and self.horizon_ms > 0.0 and 0.0 < self.refresh_ms < self.lead_ms
+        ):
             raise ValueError(
-                f"span_ms: expected at least {GRID_MS}; horizon_ms: more than 0; refresh_ms: more than 0 and "
-                "less than lead_ms"
+                f"span_ms: expected at least {tuned.INSTANT_GRID_MS}; horizon_ms: more than 0; "
+                "refresh_ms: more than 0 and less than lead_ms"
             )
 
     def __hash__(self) -> int:

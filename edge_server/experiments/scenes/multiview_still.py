@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from camera_node.synthetic import SCENES, make_scene
 from camera_node.synthetic.scene import HELD_OUT, Scene
 from camera_node.synthetic.settings import WORLD_FPS
+from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.common.arguments import OptionError
 from edge_server.experiments.scenes.captures import SUFFIXES, load_captures
-from edge_server.experiments.scenes.recorded import LEAST_WEIGHT, MultiviewStill, load_recorded
+from edge_server.experiments.scenes.recorded import MultiviewStill, load_recorded
 from edge_server.fidelity.baselines import baseline
 from edge_server.fidelity.images import BLACK, Color
 from edge_server.fidelity.refined import render_refined, with_refined
@@ -25,10 +26,9 @@ from edge_server.fields import Field, View
 from freshfield.scenario import SCENARIO_FOLDER
 
 WHITE: Color = (1.0, 1.0, 1.0)
-_SCENE_SIZE = 128  # image width and height of a synthetic scene, before its scale
 
 
-def synthetic_still(name: str, cameras: int = 19, size: int = 128, t_s: float = 0.0) -> MultiviewStill:
+def synthetic_still(name: str, cameras: int = 19, size: int = tuned.STILL_SIZE_PX, t_s: float = 0.0) -> MultiviewStill:
     """The cameras of scene ``name`` at one instant, ``size`` pixels a side; cam00 is held out. Raises
     ScenarioError."""
     scene = make_scene(name, {"count": cameras, "width": size, "height": size})
@@ -56,7 +56,7 @@ def open_still(
         if value is not None:
             raise OptionError(f"--{name} is for data sets; the scene {data} holds out {HELD_OUT}")
     t_s = frame / WORLD_FPS
-    still = synthetic_still(str(data), size=max(8, round(_SCENE_SIZE / scale)), t_s=t_s)
+    still = synthetic_still(str(data), size=max(8, round(tuned.STILL_SIZE_PX / scale)), t_s=t_s)
     return replace(still, instant=f"at {t_s:g} s")
 
 
@@ -104,7 +104,7 @@ def score_views(field: Field, views: Sequence[View], scorer: Scorer) -> tuple[Sc
     correction if it has one."""
     scores, shown = [], None
     for view in views:
-        mask = None if view.weight is None else view.weight > LEAST_WEIGHT
+        mask = None if view.weight is None else view.weight > tuned.LEAST_SCORED_WEIGHT
         image = field.render(view.camera_to_world, view.intrinsics).color
         score = scorer.score(view.camera, image, 0, view.image, 0, mask=mask)
         refined = render_refined(field, view)

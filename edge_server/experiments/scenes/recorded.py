@@ -8,13 +8,12 @@ from pathlib import Path
 
 from camera_node.sources.datasets.formats import open_dataset
 from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
+from edge_server.experiments import tuned_numbers as tuned
 from edge_server.fidelity.images import BLACK, Color
 from edge_server.fields import View
 
 # Value of --holdout for the split that the data set itself defines.
 OWN_SPLIT = "split"
-# A pixel whose weight is larger is scored: undistortion and shrinking leave some that are masked in part.
-LEAST_WEIGHT = 0.5
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,9 @@ def load_recorded(
     training, held_out = split(list(found), holdout or (OWN_SPLIT if own else "8"), own)
     wrong: dict[str, Exception] = {}
     views = {key: _view(key, found[key], wrong) for key in (*training, *held_out)}
-    blank = [key for key, v in views.items() if v.weight is not None and not (v.weight > LEAST_WEIGHT).any()]
+    blank = [
+        key for key, v in views.items() if v.weight is not None and not (v.weight > tuned.LEAST_SCORED_WEIGHT).any()
+    ]
     if not set(training) - set(blank):
         raise DatasetError(f"{file}: masks leave nothing of the training images: are they inverted?")
     notes = dataset.notes

@@ -14,14 +14,14 @@ from typing import Any
 
 from edge_server.experiments.common.seed_table import TRAINING, Row
 from edge_server.experiments.engine.content_key import code_digest
-from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
+from edge_server.experiments.rollouts.setting import Setting, layout_of, reward_of, seeds
 from edge_server.experiments.studies.study import StudyRequest, open_engine
 from edge_server.experiments.studies.trial import Trial
 from edge_server.experiments.studies.tuned_numbers import TRAININGS
 from edge_server.experiments.training.evaluation import Candidate, evaluate, fixed_candidates
 from edge_server.experiments.training.learning_curve import draw_curve
 from edge_server.experiments.training.trainer import TrainingConfig, read_log, train
-from edge_server.experiments.tuned_numbers import QUICK_SPLAT
+from edge_server.experiments.tuned_numbers import OMEGAS_MS, QUICK_SPLAT, SCRATCH_STEPS, TRAINING_STEPS
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.settings import Action, Spec
 
@@ -91,7 +91,9 @@ def room(channel: Mapping[str, Any] | str = "ch5", **more: Any) -> Setting:
     scenario = Trial("room", 0, section, size=SIZE, field_options=QUICK_SPLAT).scenario()
     apart = tuple(c for c in scenario.cameras if c in {*held_out, *REPORT})
     scenario = dataclasses.replace(scenario, held_out=apart)
-    return Setting(scenario, report=REPORT, **{"steps": 50 if more.get("scratch") else 20, **more})
+    return Setting(
+        scenario, report=REPORT, **{"steps": SCRATCH_STEPS if more.get("scratch") else TRAINING_STEPS, **more}
+    )
 
 
 Cases = Callable[[StudyRequest], Sequence[LearningCase]]

@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row, SeedTable
-from edge_server.experiments.common.statistics import FALSE_DISCOVERY_RATE, Interval, all_of, discoveries
+from edge_server.experiments.common.statistics import Interval, all_of, discoveries
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.engine import Engine
 from edge_server.experiments.studies.tuned_numbers import LEAST_DB
+from edge_server.experiments.tuned_numbers import FALSE_DISCOVERY_RATE
 from edge_server.machine import commit
 from edge_server.progress import ProgressLine
 from edge_server.scheduler.learned.tuned_numbers import W_S

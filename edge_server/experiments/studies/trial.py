@@ -21,7 +21,13 @@ from edge_server.experiments.common.seed_table import Row
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.rollouts.episode import Stage, open_stage
 from edge_server.experiments.studies.study import StudyError, StudyRequest, open_engine
-from edge_server.experiments.studies.tuned_numbers import SHOWN_INSTANTS, STAGGER_MS
+from edge_server.experiments.studies.tuned_numbers import (
+    FIRST_DECISION_MS,
+    SHOWN_INSTANTS,
+    STAGGER_MS,
+    TRIAL_FPS,
+    TRIAL_PATIENCE,
+)
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
@@ -33,12 +39,9 @@ from edge_server.live.state import Publication
 from edge_server.scheduler.learned.rewards import f_w
 from freshfield.scenario import Scenario, ScenarioError, load, parse, seed_sequence
 
-# Synthetic scenes use the thesis's capture period of 30 ms.
-WORLD_FPS = 100 / 3
 # Scenes whose name differs from that of their scenario.
 SCENARIOS = {"room": "room19"}
 _MOMENT_S = 1e-6
-_PATIENCE = 20  # times every_ms, until a trial has failed
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ class Trial:
     @property
     def first_ms(self) -> float:
         """Instant of the first decision."""
-        return 900.0 + STAGGER_MS * (self.seed % 64)
+        return FIRST_DECISION_MS + STAGGER_MS * (self.seed % 64)
 
     def scenario(self) -> Scenario:
         """The deployment as a scenario. Raises ScenarioError."""
@@ -86,7 +89,7 @@ class Trial:
         source, edge = dict(shipped.source), dict(shipped.edge)
         cameras: Row = {"ids": list(shipped.cameras), "held_out": list(shipped.held_out)}
         if source.get("kind") == "world":
-            source |= {"width": self.size, "height": self.size, "fps": WORLD_FPS}
+            source |= {"width": self.size, "height": self.size, "fps": TRIAL_FPS}
             if self.speed_m_per_s is not None and source.get("scene") != "tile":  # nothing moves there
                 source["speed_m_per_s"] = self.speed_m_per_s
             if self.cameras is not None:
@@ -273,7 +276,7 @@ def _decided(trial: Trial, folders: Folders, look: Callable[[Publication, Virtua
     )
     # Stop just before the second decision, whose update may not be needed.
     deployment.run((trial.first_ms + trial.every_ms) / 1e3 - _MOMENT_S)
-    for _ in range(_PATIENCE):
+    for _ in range(TRIAL_PATIENCE):
         if found:
             return found[0]
         deployment.run(trial.every_ms / 1e3)

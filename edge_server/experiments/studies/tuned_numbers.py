@@ -8,6 +8,15 @@ from __future__ import annotations
 LEAST_DB = 0.1
 """Smallest difference that supports a claim."""
 
+TRIAL_FPS = 100 / 3
+"""Of synthetic scenes: the thesis's capture period of 30 ms."""
+
+TRIAL_PATIENCE = 20
+"""Times ``every_ms``, until a trial has failed."""
+
+FIRST_DECISION_MS = 900.0
+"""Least instant of a trial's first decision."""
+
 STAGGER_MS = 217.0
 """Between the decision instants of successive seeds; not whole frames, so seeds sample all capture phases."""
 

@@ -13,10 +13,10 @@ from edge_server.command import command_parser, run_command
 from edge_server.experiments.common.arguments import add_folders, add_workers, folders_of
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.engine import EngineError
-from edge_server.experiments.rollouts.setting import OMEGAS_MS, Setting, layout_of, reward_of, seeds
+from edge_server.experiments.rollouts.setting import Setting, layout_of, reward_of, seeds
 from edge_server.experiments.training.learning_curve import draw_curve
 from edge_server.experiments.training.trainer import TrainingConfig, TrainingError, read_log, train
-from edge_server.experiments.tuned_numbers import QUICK_SPLAT
+from edge_server.experiments.tuned_numbers import OMEGAS_MS, QUICK_SPLAT, SCRATCH_STEPS, TRAINING_STEPS
 from edge_server.scheduler import BANDIT, STATE_PARTS
 from edge_server.scheduler.learned.rewards import REWARDS
 from edge_server.scheduler.learned.settings import ACTIONS, Spec
@@ -94,7 +94,7 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
     given = dataclasses.replace(scenario, source=source, edge=edge)
     return Setting(
         given,
-        steps=50 if args.scratch else 20,
+        steps=SCRATCH_STEPS if args.scratch else TRAINING_STEPS,
         scratch=args.scratch,
         decisions=args.decisions,
         compute=read_config(given).compute,

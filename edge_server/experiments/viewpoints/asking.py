@@ -8,15 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.common.arguments import OptionError
-from edge_server.experiments.viewpoints.reconstructions import (
-    COLUMNS,
-    FRAMES,
-    identity,
-    sprites,
-    taste_score,
-    varied_plans,
-)
+from edge_server.experiments.viewpoints.reconstructions import identity, sprites, taste_score, varied_plans
 from edge_server.experiments.viewpoints.stage import Stage
 from edge_server.progress import ProgressLine
 from edge_server.viewpoints.candidates import ViewpointError
@@ -28,7 +22,6 @@ from freshfield.transport import Transport
 from freshfield.untrusted import read_bytes
 
 ANSWERS = "answers.json"
-SHOWN_S = 10.0  # time that the page has to fetch the plan, before the server ends
 ShowPlan = Callable[[list[str], bytes], None]
 
 
@@ -97,7 +90,9 @@ def _on_the_page(
     """made: pictures of the reconstructions. path: of the answers."""
     from edge_server.page.preferences import PageError, PreferencePage
 
-    asking = PreferencePage(session, made, FRAMES, COLUMNS, lambda s: write_json(path, s.as_json()))
+    asking = PreferencePage(
+        session, made, tuned.PATH_FRAMES, tuned.PATH_COLUMNS, lambda s: write_json(path, s.as_json())
+    )
     try:
         url, close = asking.serve(*page, transport)
     except PageError as error:
@@ -107,7 +102,7 @@ def _on_the_page(
 
     def show(lines: list[str], png: bytes) -> None:
         asking.show_plan(lines, png)
-        asking.seen.wait(SHOWN_S)
+        asking.seen.wait(tuned.PLAN_SHOWN_S)
         close()
 
     return asking.session, show

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.viewpoints.stage import Stage
 from edge_server.fidelity.images import to_bytes, to_unit
 from edge_server.fields import Field
@@ -22,12 +23,6 @@ from freshfield.files import write_bytes, write_json
 from freshfield.geometry import so3_exp
 
 Array = NDArray[np.float64]
-
-# Number of images of a reconstruction along the path, and of columns in their common JPEG.
-FRAMES, COLUMNS = 24, 6
-_WIDEST_PX = 320
-_FARTHEST_DEG = 60.0  # from the middle of the path
-_QUALITY = 92  # JPEG quality, so that its artifacts do not affect the comparison
 
 
 def varied_plan(stage: Stage, k: int, views: int) -> Plan:
@@ -50,14 +45,14 @@ def taste_score(stage: Stage, field: Field, taste: str) -> float:
     return judge(taste, shown, [to_unit(v.image, background=stage.background) for v in stage.held_out])
 
 
-def viewing_path(candidates: Candidates, frames: int = FRAMES) -> list[Array]:
+def viewing_path(candidates: Candidates, frames: int = tuned.PATH_FRAMES) -> list[Array]:
     """Poses (4, 4) along an arc round the target, through the middle of the reachable candidates."""
     reachable = np.flatnonzero(candidates.reachable)
     away = candidates.directions[reachable]
     pose = candidates.poses[reachable[np.argmax(away @ away.mean(axis=0))]]
     right, up, back = pose[:3, 0], -pose[:3, 1], -pose[:3, 2]
     low, high = np.quantile(np.arctan2(away @ right, away @ back), [0.1, 0.9])
-    farthest = np.deg2rad(_FARTHEST_DEG)
+    farthest = np.deg2rad(tuned.PATH_FARTHEST_DEG)
     made = []
     for angle in np.linspace(max(low, -farthest), min(high, farthest), frames):
         turn = so3_exp(angle * up)
@@ -69,13 +64,14 @@ def viewing_path(candidates: Candidates, frames: int = FRAMES) -> list[Array]:
 
 
 def sprite(stage: Stage, field: Field) -> bytes:
-    """Render a reconstruction along the path, as a JPEG with FRAMES images, COLUMNS in a row."""
+    """Render a reconstruction along the path, as a JPEG with PATH_FRAMES images, PATH_COLUMNS in a row."""
     lens = stage.candidates.lens
-    lens = lens.scaled(min(1.0, _WIDEST_PX / lens.width))
+    lens = lens.scaled(min(1.0, tuned.PATH_WIDEST_PX / lens.width))
     shown = [to_bytes(field.render(pose, lens).color) for pose in viewing_path(stage.candidates)]
-    rows = [np.concatenate(shown[k : k + COLUMNS], axis=1) for k in range(0, FRAMES, COLUMNS)]
+    columns = tuned.PATH_COLUMNS
+    rows = [np.concatenate(shown[k : k + columns], axis=1) for k in range(0, tuned.PATH_FRAMES, columns)]
     bgr = np.concatenate(rows)[..., ::-1]
-    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, tuned.PATH_JPEG_QUALITY])[1].tobytes()
 
 
 def varied_plans(stage: Stage, count: int, views: int, seed: int) -> list[Plan]:

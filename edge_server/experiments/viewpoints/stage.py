@@ -16,7 +16,7 @@ from camera_node.synthetic.scene import Scene
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
 from edge_server.experiments.scenes.multiview_still import WHITE, known_options, score_views
 from edge_server.experiments.scenes.recorded import load_recorded
-from edge_server.experiments.tuned_numbers import HELD_OUT
+from edge_server.experiments.tuned_numbers import HELD_OUT, NEAR_OF_RADIUS, STAGE_EMBEDDING_DIM
 from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.fidelity.images import BLACK, Color, to_bytes, to_unit
 from edge_server.fidelity.scorer import Score, Scorer
@@ -26,7 +26,6 @@ from edge_server.viewpoints.candidates import Candidates, ViewpointError, from_p
 from edge_server.viewpoints.policy import Embed
 from freshfield.scenario import Scenario, load
 
-_EMBEDDING = 8  # numbers per image
 _BETWEEN = 0.25  # offset of ``half_hemisphere``
 
 
@@ -115,7 +114,7 @@ def _world(scenario: Scenario, source: WorldConfig, count: int, size: int | None
         reached = tests.within(_arm_reaches(scenario, source, tests)).reachable
         tests = Candidates(tests.poses[reached], lens, target, reached[reached])
     held_out = tuple(_render(scene, f"test{k:02d}", tests, k) for k in range(len(tests)))
-    return Stage(scenario.name, candidates, held_out, known_options(scene, 0.3 * radius_m), scene=scene)
+    return Stage(scenario.name, candidates, held_out, known_options(scene, NEAR_OF_RADIUS * radius_m), scene=scene)
 
 
 def _arm_reaches(scenario: Scenario, source: SourceConfig, candidates: Candidates) -> NDArray[np.bool_]:
@@ -148,7 +147,7 @@ def open_embedder(background: Color) -> tuple[Embed | None, str | None]:
     background: color behind transparent images.
     """
     try:
-        embedder = make_embedder(EmbeddingConfig(dim=_EMBEDDING))
+        embedder = make_embedder(EmbeddingConfig(dim=STAGE_EMBEDDING_DIM))
     except EmbeddingError as error:
         return None, str(error)
 

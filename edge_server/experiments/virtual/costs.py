@@ -20,6 +20,7 @@ from scipy.optimize import nnls
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, run_command
+from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.common.arguments import add_folders, folders_of
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
@@ -35,11 +36,6 @@ Name the file in the scenario (edge.compute: FILE); training and simulation then
 
   edge-server costs card --out deploy/scenarios/card/costs.json
 """
-# Steps of an update, as shares of the scenario's.
-_SHARES = (0.2, 0.6, 1.0)
-# The first part of a run builds the field; a busy machine's slowest updates are left out.
-_SETTLED_SHARE, _SLOWEST_SHARE = 0.5, 0.1
-_EPOCH_MS = 40.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -75,7 +71,7 @@ def measure(scenario: Scenario, seconds: float, data: Path | None = None) -> dic
     scenario = dataclasses.replace(
         scenario, edge={**scenario.edge, "policy": {"name": "all"}, "compute": "zero", "embedding": None}
     )
-    rows = np.concatenate([_timed(scenario, share, seconds, data) for share in _SHARES])
+    rows = np.concatenate([_timed(scenario, share, seconds, data) for share in tuned.COSTS_SHARES])
     compute = fitted(rows)
     return {
         "compute": as_mapping(compute),
@@ -89,7 +85,7 @@ def measure(scenario: Scenario, seconds: float, data: Path | None = None) -> dic
 
 def fitted(rows: NDArray[np.float64]) -> ComputeConfig:
     """Fit the costs by non-negative least squares. rows: (n, 3): steps, frames taken in, milliseconds."""
-    kept = rows[rows[:, 2] <= np.quantile(rows[:, 2], 1.0 - _SLOWEST_SHARE)]
+    kept = rows[rows[:, 2] <= np.quantile(rows[:, 2], 1.0 - tuned.COSTS_SLOWEST_SHARE)]
     design = np.column_stack([kept[:, :2], np.ones(len(kept))])
     a_step, a_view, an_update = (round(float(ms), 3) for ms in nnls(design, kept[:, 2])[0])
     return ComputeConfig(ms_per_step=a_step, ms_per_update=an_update, ms_per_view=a_view)
@@ -100,7 +96,7 @@ def _timed(scenario: Scenario, share: float, seconds: float, data: Path | None) 
     steps."""
 
     def settings(edge: EdgeConfig) -> RunSettings:
-        return RunSettings(steps=max(1, round(share * edge.steps)), epoch_ms=_EPOCH_MS, score_every_ms=None)
+        return RunSettings(steps=max(1, round(share * edge.steps)), epoch_ms=tuned.COSTS_EPOCH_MS, score_every_ms=None)
 
     def camera_moves(edge: EdgeConfig, camera: str) -> None:
         rows.clear()  # of a field that it will not have
@@ -123,4 +119,4 @@ def _timed(scenario: Scenario, share: float, seconds: float, data: Path | None) 
     deployment.run(seconds)
     if len(rows) < 2:
         raise ValueError(f"{scenario.path}: no updates in {seconds:g} s of virtual time")
-    return np.array(rows[round(_SETTLED_SHARE * len(rows)) :], float)
+    return np.array(rows[round(tuned.COSTS_SETTLED_SHARE * len(rows)) :], float)

@@ -11,6 +11,7 @@ from camera_node.capture import Camera, build_cameras
 from camera_node.settings import SourceConfig, WorldConfig, errors_of, source_config
 from camera_node.synthetic import Scene, make_scene
 from channel_emu.model.settings import channel_from_mapping
+from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.truth import CapturedTruth, ExactTruth, Truth
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
@@ -24,9 +25,6 @@ from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:
     from edge_server.embed import Embedder
-
-# Encoded frames kept in memory: in virtual time a minute of nineteen cameras passes in seconds.
-_CACHE_BYTES = 512 * 2**20
 
 
 def build_deployment(
@@ -87,7 +85,7 @@ def training_cameras(scenario: Scenario, data: Path | None = None) -> list[Camer
             f"{scenario.path}: source: its cameras or its arm keep real time and cannot be run in virtual "
             "time: use freshfield demo, or camera-node and edge-server run"
         )
-    return build_cameras(scenario, source, scenario.training, data, _CACHE_BYTES)
+    return build_cameras(scenario, source, scenario.training, data, tuned.FRAME_CACHE_BYTES)
 
 
 def build_truth(
@@ -103,7 +101,7 @@ def build_truth(
         names = dict(zip(scenario.cameras, scenario.cameras if set(scenario.cameras) <= set(known) else known))
         cameras = {camera: known[names[camera]] for camera in scenario.held_out}
         return ExactTruth(scorer, cameras, lambda camera, t_s: scene.render(names[camera], t_s))
-    held_out = build_cameras(scenario, source, scenario.held_out, data, _CACHE_BYTES)
+    held_out = build_cameras(scenario, source, scenario.held_out, data, tuned.FRAME_CACHE_BYTES)
     return CapturedTruth(scorer, held_out, edge.noisy_truth)
 
 

@@ -23,7 +23,7 @@ from edge_server.experiments.common.arguments import add_folders, at_least, fold
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none, number
 from edge_server.experiments.engine import processor
-from edge_server.experiments.tuned_numbers import CYCLE_MS, SCORED_EVERY_MS
+from edge_server.experiments.tuned_numbers import CYCLE_MS, PROGRESS_EVERY_S, SCORED_EVERY_MS
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.now_and_all import NowAndAll
 from edge_server.experiments.virtual.run_settings import RunSettings
@@ -61,8 +61,6 @@ the scenario, or --compute; edge-server costs measures them). The same seed give
 kind of processor: the printed digest covers every publication and the field's parameters.
 """
 _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "aaoi_ms")
-# Seconds of virtual time between two lines of progress.
-_PROGRESS_EVERY_S = 1.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -273,7 +271,7 @@ def show(found: dict[str, Any]) -> str:
 def _run(deployment: VirtualDeployment, seconds: float, quiet: bool) -> None:
     began, done_s = time.monotonic(), 0.0
     while done_s < seconds:
-        step_s = min(_PROGRESS_EVERY_S, seconds - done_s)
+        step_s = min(PROGRESS_EVERY_S, seconds - done_s)
         deployment.run(step_s)
         done_s += step_s
         if not quiet:

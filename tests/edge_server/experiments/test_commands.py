@@ -9,6 +9,7 @@ import yaml
 
 from edge_server.cli import main
 from edge_server.experiments import compare
+from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
@@ -84,7 +85,7 @@ def test_a_star_marks_what_is_decided_and_not_what_is_equal():
 
 
 def test_the_command_compares_and_goes_on(tmp_path: Path, capsys, monkeypatch):
-    monkeypatch.setattr(compare, "LEAD_S", 0.6)
+    monkeypatch.setattr(tuned, "COMPARE_LEAD_S", 0.6)
     edge = {**RAW["edge"], "steps": 2, "updates": "arrivals", "update_ms": 50, "compute": {"ms_per_step": 2.0}}
     scenario, out = tmp_path / "small.yaml", tmp_path / "scores.json"
     scenario.write_text(yaml.safe_dump({**RAW, "edge": edge}))
