@@ -56,6 +56,8 @@ MISFITS_NAMED = 5
 """Views; of the others their number is said."""
 STILL_SIZE_PX = 128
 """Image width and height of a synthetic scene, before its scale."""
+NAMED_VIEWS = 6
+"""In an error."""
 LEAST_SCORED_WEIGHT = 0.5
 """A pixel whose weight is larger is scored: undistortion and shrinking leave some that are masked in part."""
 

@@ -31,7 +31,7 @@ from websockets.http11 import Request, Response
 
 from edge_server.page.branding import branded
 from edge_server.page.splats.stream import STREAM, file_response
-from edge_server.page.tuned_numbers import SAY_EVERY_S
+from edge_server.page.tuned_numbers import CLOSE_S, SAY_EVERY_S
 from freshfield.access import ANYBODY, CHANGE, Caller, HttpDoor, HttpRefused
 from freshfield.limits import (
     MAX_CLICKS_HZ,
@@ -149,7 +149,7 @@ class AccessGuard:
                 "max_size": MAX_VISITOR_MESSAGE_BYTES,
                 "max_queue": 4,
                 "logger": logger,
-                "close_timeout": 2.0,
+                "close_timeout": CLOSE_S,
                 "ssl": self._tls,
                 "process_request": lambda connection, request: self._answer(connection, request, process),
                 "create_connection": self._accepted,

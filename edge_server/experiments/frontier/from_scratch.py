@@ -13,6 +13,7 @@ from camera_node.synthetic.scene import SCENES
 from edge_server.experiments.common.tables import median_or_none, over_seeds
 from edge_server.experiments.scenes.multiview_still import WHITE, score_views, synthetic_still
 from edge_server.experiments.scenes.recorded import MultiviewStill, load_recorded
+from edge_server.experiments.tuned_numbers import SCORED_OF_TRAINING
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import PerceptualMetric, Scorer
 from edge_server.fields import Budget
@@ -57,7 +58,7 @@ def views_of(still: Still) -> MultiviewStill:
     if still.scene in SCENES:
         return synthetic_still(still.scene, size=still.size)
     data = load_recorded(Path(still.scene), scale=still.scale)
-    return replace(data, held_out=data.held_out or data.training[:8], background=WHITE)
+    return replace(data, held_out=data.held_out or data.training[:SCORED_OF_TRAINING], background=WHITE)
 
 
 @cache

@@ -105,7 +105,7 @@ def split(names: Sequence[str], holdout: str, own: Collection[str] = ()) -> tupl
         wanted = [name.strip() for name in holdout.split(",") if name.strip()]
         for name in wanted:
             if not any(_is_called(view, name) for view in names):
-                some = ", ".join(names[:6])
+                some = ", ".join(names[: tuned.NAMED_VIEWS])
                 raise DatasetError(f"--holdout: no image or camera {name!r} among {len(names)}: {some}, ...")
         out = {view for view in names if any(_is_called(view, name) for name in wanted)}
     else:
