@@ -17,6 +17,7 @@ from typing import Any
 from freshfield import scenario as scenarios
 from freshfield.files import read_status
 from freshfield.scenario import ScenarioError
+from freshfield_up import tuned_numbers as tuned
 from freshfield_up.commands import Options
 from freshfield_up.net import LOOPBACK, free_ports, is_free
 from freshfield_up.run import Launcher, print_line
@@ -73,7 +74,7 @@ class Deployment:
         """Raises FolderError or MissingCommand where it cannot start, DeploymentError where a process fails."""
         self._thread.start()
         try:
-            while not self._launcher.ready.wait(0.1) and not self._ended.is_set():
+            while not self._launcher.ready.wait(tuned.STARTED_POLL_S) and not self._ended.is_set():
                 pass
         except BaseException:  # Ctrl-C while it starts
             self._end()
