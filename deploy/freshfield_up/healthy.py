@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 from freshfield.transport import add_arguments, from_arguments
-from freshfield_up.net import is_serving
+from freshfield_up.ports import is_serving
 from freshfield_up.tuned_numbers import FRESH_S, HEALTH_ANSWER_S
 
 
